@@ -1,29 +1,27 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
-
+# SPDX-License-Identifier: Apache-2.0
 """
-Faults of the recording itself, which would make a diagnosis of effects meaningless.
+What is corrected or left out before a comparison, and faults that make a diagnosis meaningless.
 
-They are axes, units, clocks, the range, the reference, and missing samples.
+They are stamps, axes, units, clocks, the range, the reference, and missing samples. At rest
+f = g·[sin α·cos β, −sin α·sin β, cos α]: a wrong sign of β looks like an inverted y, and one of α
+like inverted x and y. The explanation with fewer changes is named.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
-from adxl_ros.diagnose.baseline_comparison import at_search_rate, BaselineComparison, Reference
+from adxl_ros.diagnose.comparison import (
+    at_search_rate,
+    BaselineComparison,
+    compare,
+    DataFault,
+    Reference,
+    SHORTEST_S,
+    SMALLEST_MOTION_G,
+)
 from adxl_ros.diagnose.noise_detectors import (
     coarse_codes,
     code_step_v,
@@ -31,17 +29,68 @@ from adxl_ros.diagnose.noise_detectors import (
     isolated_samples,
     repeated_samples,
 )
+from adxl_ros.diagnose.reference import (
+    fading_frequency_hz,
+    LeftOut,
+    seen_step_rad,
+    stated_poses,
+    too_coarse,
+    without_reading,
+)
+from adxl_ros.diagnose.sim_alignment import align_force
+from adxl_ros.files.recording_columns import JOINTS, Recording
+from adxl_ros.model import noise
+from adxl_ros.model.kinematics import specific_force
+from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.axis_polarity import find_polarity_fault
+from adxl_ros.simulate.motion import Motion
 import numpy as np
 
-SHORTEST_S = 30.0
-"""Shortest time, s, that the recordings of a moving sensor last together. Chosen: a few turns of
-the stage."""
+_SAME_ROUGHNESS = 1.05
+"""Ratio of the steps of two residuals up to which they are equal. Chosen: above its scatter by
+noise in a thousand samples."""
+_LONGEST_STEP_S = 0.5
+"""Longest time between samples, s, that follow a moving stage. Chosen: the motion between two
+samples is unknown, and stamps in milliseconds are far beyond."""
+_SMALLEST_MOVE_RAD = 0.01
+"""Range of an angle, rad, above which the stage moves. Chosen: beyond the jitter of an encoder."""
+_ROUNDINGS_S = (0.1, 0.01, 1e-3, 1e-4, 1e-5, 1e-6)
+"""Steps that stamps may be rounded to, s, the largest first: decimals of a second."""
+_ROUNDING_TOLERANCE = 0.01
+"""Deviation from a rounded stamp, in its steps, that is accepted. Chosen: float64 seconds since
+1970 deviate by 0.2 µs."""
+_EVEN_STAMPS = 1e-4
+"""Deviation from a line, in samples, up to which stamps are even. Chosen: the simulator then
+needs no interpolation."""
+_MENTIONED = 0.01
+"""Deviation from a line, in samples, from which the report mentions it. Chosen: below it nothing
+shows in the slowest motion."""
+_LARGEST_SCATTER = 0.45
+"""Largest deviation from a line, in samples, by which a stamp still shows the number of its
+sample. Chosen: below one half."""
+_LARGEST_BURST = 64.0
+"""Largest deviation of stamps in bursts, in samples. Chosen: a buffer of a serial port."""
+_BURSTS = 0.5
+"""Median step of stamps in bursts, divided by the mean step, is below this. Chosen: a few lost
+samples do not change the one, and hardly the other."""
+_USUAL_STEPS = 1.5
+"""Steps up to this many medians count as one sample. Chosen: halfway to two."""
+_ROUNDS = 3
+"""Rounds that number the samples by the line and fit the line. Chosen: numbers then stay."""
+_SAMPLES = 4000
+"""Largest number of samples that are compared. Chosen: a few for each second."""
+_WRONG = 0.2
+"""Share of the output's variance that the angles do not explain, from which they may be wrong.
+Chosen: it is 0.03 where the sensor is mounted 10° off."""
+_RIGHT = 0.1
+"""The same share up to which changed angles explain the output. Chosen: half of `_WRONG`."""
+_AGED_ZERO_G = 0.01
+"""Zero-g, g, from which its sign tells an inverted axis from a wrong angle. Chosen: that of a
+healthy unit ages by less."""
+_TURN = 2 * np.pi
+"""Largest angle, rad, that is not looked at as one in degrees."""
 _FEWEST_SAMPLES = 50
 """Fewest samples of any recording. Chosen: one for each of 48 blocks."""
-_SMALLEST_MOTION_G = 0.05
-"""Standard deviation of the simulated force, g, from which an axis is compared. Chosen: ten times
-the noise of an ADXL203."""
 _LARGEST_UNEXPLAINED_MOTION_G = 0.3
 """Range of the output, g, that drift and noise cannot explain without a reference. Chosen: 17°
 of tilt."""
@@ -83,6 +132,10 @@ _SMALLEST_STEP_V = 1e-9
 """Step of an ADC, V, that stands for none. Chosen: above rounding errors."""
 _SMALLEST_NORM = 1e-12
 """Smallest product of the norms of two signals: it keeps the divisor from 0."""
+_DEAD_SHARE = 1e-4
+"""Share of its simulated range that a wired axis covers. Chosen: below that of any wrong unit."""
+_LARGEST_LEVEL_G = 1e3
+"""Largest median output, g. Chosen: above that of any sensor on a stage."""
 _UNIT_TOLERANCE = 0.1
 """Relative deviation of a gain from the ratio of two units. Chosen: above any scale error."""
 _UNIT_RATIOS = {
@@ -94,25 +147,252 @@ _UNIT_RATIOS = {
 """Gain of an output in the wrong unit, and which unit it has instead of which."""
 
 
+def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, may_shift: bool
+                    ) -> BaselineComparison | DataFault:
+    """Put a recording beside the simulator, without the parts that have no reference."""
+    notes: list[str] = []
+    even = even_stamps(recording.time_s)
+    if even is not None and even.certain:
+        recording = replace(recording, time_s=even.time_s)
+        notes += [even.note] if even.note else []
+    fault = find_clock_fault(recording.time_s)
+    if fault is not None:
+        return fault
+    fault = _too_slow(recording)
+    if fault is not None:
+        return fault
+    if sim is not None:
+        aligned = align_force(recording, sensor, sim, may_shift)
+        if isinstance(aligned, DataFault):
+            return aligned
+        recording, sim = aligned.recording, aligned.sim
+        notes += aligned.notes
+    else:
+        fault = find_encoder_fault(recording, sensor)
+        if fault is not None:
+            return fault
+    left_out: list[LeftOut] = []
+    if sim is None:
+        step_rad = seen_step_rad(recording, sensor.stage_resolution_rad)
+        if step_rad > sensor.stage_resolution_rad:
+            notes.append(f'the stage reads in steps of {np.degrees(step_rad):.3g}°, not of '
+                         f'{np.degrees(sensor.stage_resolution_rad):.3g}° as stated: this is used')
+            sensor = replace(sensor, stage_resolution_rad=step_rad)
+        recording, left_out = stated_poses(recording, sensor)
+    comparison = compare(recording, sensor, sim)
+    if even is not None and not even.certain and len(even.time_s) == len(recording):
+        evenly = replace(recording, time_s=even.time_s)
+        even_comparison = compare(evenly, sensor, sim)
+        if _roughness(even_comparison) < _SAME_ROUGHNESS * _roughness(comparison):
+            recording, comparison = evenly, even_comparison
+            notes += [even.note] if even.note else []
+    if comparison.reference is not Reference.STAGE:
+        left_out = []
+    left_out += without_reading(recording, comparison)
+    # What moves too fast is looked for where the reference is stated.
+    for found in (left_out, too_coarse(recording, _without(comparison, left_out))):
+        comparison = _without(comparison, found)
+        notes += [part.text(recording.time_s) for part in found]
+    fading_hz = fading_frequency_hz(comparison)
+    if fading_hz is not None:
+        notes.append(f'--sim is smoother than the sensor: above {fading_hz:.3g} Hz it lacks '
+                     'motion that the recording has; effects that show in fast motion are not '
+                     'named')
+    return replace(comparison, notes=tuple(notes), fading_hz=fading_hz)
+
+
+def _roughness(comparison: BaselineComparison) -> float:
+    """Return the mean square of the residual's steps, V²: wrong instants add to it in motion."""
+    return float(np.nanmean(np.diff(comparison.residual_v(comparison.sensor), axis=0) ** 2))
+
+
+def _too_slow(recording: Recording) -> DataFault | None:
+    """Find stamps that are too far apart to follow the stage, as milliseconds in place of s."""
+    step_s = float(np.median(np.diff(recording.time_s)))
+    angles = [recording.columns[name] for name in ('alpha_rad', 'beta_rad')
+              if name in recording.columns]
+    moves = any(np.nanmax(angle) - np.nanmin(angle) > _SMALLEST_MOVE_RAD for angle in angles
+                if np.isfinite(angle).any())
+    if not moves or step_s <= _LONGEST_STEP_S:
+        return None
+    return DataFault('unit', 'bad_data', f'time_s: {step_s:.3g} s between samples while the stage '
+                     f'moves, at most {_LONGEST_STEP_S:g} s are followed; divide stamps in '
+                     'milliseconds by 1000')
+
+
 @dataclass(frozen=True)
-class DataFault:
+class EvenStamps:
     """
-    A fault of the recording.
+    The instants of samples that were taken evenly.
 
     Attributes
     ----------
-    name
-        Name in the report: `verdict.data_fault`.
-    status
-        Status of the verdict: 'bad_data' or 'insufficient'.
-    message
-        What is wrong and what to do, one line.
+    time_s
+        The instants, s, (n,).
+    certain
+        Whether rounding or bursts explain all deviations; otherwise the samples themselves may
+        have been taken unevenly.
+    note
+        What was changed, for people; empty where it does not matter.
 
     """
 
-    name: str
-    status: str
-    message: str
+    time_s: np.ndarray
+    certain: bool
+    note: str
+
+
+def even_stamps(stamps_s: np.ndarray) -> EvenStamps | None:
+    """Find the even instants behind stamps."""
+    steps_s = np.diff(stamps_s)
+    if len(steps_s) < 2 or steps_s.min() <= 0:
+        return None
+    if np.median(steps_s) < _BURSTS * steps_s.mean():
+        return _from_bursts(stamps_s)
+    # Stamps that scatter by more than their steps look like lost samples.
+    time_s, slope_s, largest = min(
+        (_line(stamps_s, number) for number in (np.arange(len(stamps_s)),
+                                                _numbers(stamps_s, steps_s))),
+        key=lambda line: line[2])
+    if largest < _EVEN_STAMPS or largest > _LARGEST_SCATTER:
+        return None
+    rounding_s = _rounding_s(stamps_s)
+    if largest * slope_s < (0.5 + _ROUNDING_TOLERANCE) * rounding_s:
+        note = f'stamps are rounded to {rounding_s:g} s, and {_even_text(slope_s)}'
+        return EvenStamps(time_s, True, note if largest > _MENTIONED else '')
+    note = f'stamps scatter by up to {1e3 * largest * slope_s:.3g} ms, and {_even_text(slope_s)}'
+    return EvenStamps(time_s, False, note if largest > _MENTIONED else '')
+
+
+def _line(stamps_s: np.ndarray, number: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """Return stamps on a line over their numbers, s, its slope, s, and the largest deviation."""
+    slope_s, begin_s = np.polyfit(number, stamps_s - stamps_s[0], 1)
+    time_s = stamps_s[0] + begin_s + slope_s * number
+    return time_s, float(slope_s), float(np.abs(stamps_s - time_s).max() / slope_s)
+
+
+def _even_text(step_s: float) -> str:
+    """Return which clock is used."""
+    return f'an even rate of {1 / step_s:.6g} Hz explains them: it is used'
+
+
+def _numbers(stamps_s: np.ndarray, steps_s: np.ndarray) -> np.ndarray:
+    """Return the number of each sample, counting missing ones, (n,)."""
+    step_s = float(np.mean(steps_s[steps_s < _USUAL_STEPS * np.median(steps_s)]))
+    number = np.concatenate([[0.0], np.cumsum(np.maximum(np.rint(steps_s / step_s), 1.0))])
+    for _ in range(_ROUNDS):
+        slope_s, begin_s = np.polyfit(number, stamps_s - stamps_s[0], 1)
+        again = np.rint((stamps_s - stamps_s[0] - begin_s) / slope_s)
+        if np.diff(again).min() < 1:
+            break
+        number = again
+    return number
+
+
+def _rounding_s(stamps_s: np.ndarray) -> float:
+    """Return the decimal of a second that all stamps are rounded to, s; 0 for none."""
+    for rounding_s in _ROUNDINGS_S:
+        steps = stamps_s / rounding_s
+        if np.abs(steps - np.rint(steps)).max() < _ROUNDING_TOLERANCE:
+            return rounding_s
+    return 0.0
+
+
+def _from_bursts(stamps_s: np.ndarray) -> EvenStamps | None:
+    """Return the instants of samples whose stamps come in bursts; None where samples are lost."""
+    time_s, slope_s, largest = _line(stamps_s, np.arange(len(stamps_s)))
+    if largest > _LARGEST_BURST:
+        return None
+    return EvenStamps(time_s, True, f'stamps come in bursts, and {_even_text(slope_s)}')
+
+
+def find_encoder_fault(recording: Recording, sensor: Sensor) -> DataFault | None:
+    """Find an angle with the wrong sign, or in degrees."""
+    angles_rad = recording.stage_angles
+    if angles_rad is None:
+        return None
+    volts = recording.volts(sensor)
+    rows = np.flatnonzero(np.isfinite(angles_rad).all(axis=1) & np.isfinite(volts).all(axis=1))
+    if len(rows) < 2:
+        return None
+    rows = rows[::max(1, len(rows) // _SAMPLES)]
+    angles_rad, volts = angles_rad[rows], volts[rows]
+    measured_g = (volts - sensor.zero_g_v) / sensor.scale_v_per_g
+    variance = float(np.sum(np.var(measured_g, axis=0)))
+    if variance < SMALLEST_MOTION_G ** 2:
+        return None
+
+    def unexplained(factors: tuple[float, float]) -> float:
+        """Return the share of the variance that angles times factors do not explain."""
+        force_g = _force_g(angles_rad * factors, len(sensor.axes))
+        return float(np.sum(np.var(measured_g - force_g, axis=0))) / variance
+
+    recorded = unexplained((1.0, 1.0))
+    if recorded < _WRONG:
+        return None
+    factors = min(_factors(angles_rad), key=unexplained)
+    if unexplained(factors) > min(_RIGHT, recorded / 2):
+        return None
+    correlation = np.sqrt(1 - unexplained(factors))
+    return (_angle_unit_fault(recording, rows, angles_rad, factors, correlation)
+            or _sign_fault(angles_rad, measured_g, sensor, factors, correlation))
+
+
+def _force_g(angles_rad: np.ndarray, axes: int) -> np.ndarray:
+    """Return the specific force at rest, g, (n, m)."""
+    return np.column_stack(specific_force(angles_rad[:, 0], angles_rad[:, 1], 1.0)[:axes])
+
+
+def _factors(angles_rad: np.ndarray) -> Iterator[tuple[float, float]]:
+    """Yield what alpha and beta may have to be multiplied by, the fewest changes first."""
+    in_degrees = np.nanmax(np.abs(angles_rad), axis=0) > _TURN
+    units = product(*([1.0, np.pi / 180] if large else [1.0] for large in in_degrees))
+    for alpha_unit, beta_unit in units:
+        for alpha_sign, beta_sign in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+            yield alpha_sign * alpha_unit, beta_sign * beta_unit
+
+
+def _angle_unit_fault(recording: Recording, rows: np.ndarray, angles_rad: np.ndarray,
+                      factors: tuple[float, float], correlation: float) -> DataFault | None:
+    """Name the columns in degrees."""
+    names = [JOINTS[joint] for joint, factor in zip(('alpha', 'beta'), factors)
+             if abs(factor) != 1]
+    if not names:
+        return None
+    largest = {name: int(np.argmax(np.abs(recording.columns[name][rows]))) for name in names}
+    reached = ' and '.join(
+        f'{name} is {recording.columns[name][rows[i]]:.4g} at {recording.time_s[rows[i]]:.4g} s'
+        for name, i in largest.items())
+    return DataFault('unit', 'bad_data', f'{reached}: degrees in a column of radians (as degrees '
+                     f'it fits the output, correlation {correlation:.2f}); multiply '
+                     f'{" and ".join(names)} by π/180')
+
+
+def _sign_fault(angles_rad: np.ndarray, measured_g: np.ndarray, sensor: Sensor,
+                factors: tuple[float, float], correlation: float) -> DataFault | None:
+    """Name the encoders that count in the opposite direction; None where an axis is simpler."""
+    joints = [JOINTS[joint] for joint, factor in zip(('alpha', 'beta'), factors) if factor < 0]
+    recorded_g, turned_g = (_force_g(angles_rad * f, len(sensor.axes)) for f in (1.0, factors))
+    mirrored = np.flatnonzero(np.std(turned_g - recorded_g, axis=0) > SMALLEST_MOTION_G)
+    if len(mirrored) < len(joints):
+        return None
+    axes = ' and '.join(sensor.axes[d] for d in mirrored)
+    rival = f'the sensor is mounted half a turn about z, with {axes} mirrored'
+    if len(mirrored) == len(joints):
+        d = int(mirrored[0])
+        if _zero_g_is_mirrored(float(np.mean(measured_g[:, d] - turned_g[:, d])), d, sensor):
+            return None
+        rival = f'the axis {axes} is inverted'
+    names = ' and '.join(joints)
+    return DataFault('encoder_sign', 'bad_data', f'{names}: opposite sign of the encoder '
+                     f'(correlation {correlation:.2f} with the sign changed); change the sign of '
+                     f'{names}, unless {rival}')
+
+
+def _zero_g_is_mirrored(offset_g: float, axis: int, sensor: Sensor) -> bool:
+    """Determine whether the zero-g of an axis is mirrored, as that of an inverted axis is."""
+    zero_g = float((sensor.zero_g_v - sensor.nominal_zero_g_v)[axis] / sensor.scale_v_per_g[axis])
+    return abs(zero_g) > _AGED_ZERO_G and abs(offset_g + 2 * zero_g) < abs(offset_g)
 
 
 @dataclass(frozen=True)
@@ -186,22 +466,7 @@ def find_length_fault(comparisons: Sequence[BaselineComparison]) -> DataFault | 
 
 def find_data_fault(comparison: BaselineComparison, search_comparison: BaselineComparison
                     ) -> DataFault | None:
-    """
-    Find what makes a diagnosis of effects meaningless.
-
-    Parameters
-    ----------
-    comparison
-        The recording at its full rate.
-    search_comparison
-        The recording at the rate of the search.
-
-    Returns
-    -------
-    DataFault or None
-        The first fault that was found.
-
-    """
+    """Find what makes a diagnosis of effects meaningless."""
     if len(comparison) < _FEWEST_SAMPLES:
         return DataFault('too_short', 'insufficient', f'{len(comparison)} samples are too few; '
                          f'a recording needs {_FEWEST_SAMPLES}')
@@ -216,9 +481,36 @@ def find_data_fault(comparison: BaselineComparison, search_comparison: BaselineC
     if railed > _LARGEST_MISSING_SHARE:
         return DataFault('saturated', 'bad_data', f'{100 * railed:.0f} % of the samples are at '
                          'the end of the range; check supply, range and wiring')
-    if comparison.reference is Reference.NONE:
-        return _unexplained_motion(comparison, finite)
-    return _axis_fault(search_comparison)
+    return (_constant_fault(comparison, finite)
+            or (_unexplained_motion(comparison, finite) if comparison.reference is Reference.NONE
+                else _axis_fault(search_comparison))
+            or _level_fault(comparison, finite))
+
+
+def _constant_fault(comparison: BaselineComparison, finite: np.ndarray) -> DataFault | None:
+    """Find an axis that does not change as a sensor does."""
+    range_v = np.ptp(comparison.volts[finite], axis=0)
+    expected_v = np.ptp(comparison.simulated_v(comparison.sensor)[finite], axis=0)
+    # At rest, codes may all be the same where their step exceeds the noise.
+    noisy = noise.analog_std_v(comparison.sensor) > comparison.sensor.lsb_v
+    dead = np.where(expected_v > _SMALLEST_RANGE_V, range_v < _DEAD_SHARE * expected_v,
+                    (range_v < _SMALLEST_STEP_V) & ((range_v > 0) | noisy))
+    if not dead.any():
+        return None
+    return DataFault('constant', 'bad_data', f'{comparison.sensor.axes[int(np.argmax(dead))]} '
+                     'does not change with motion or noise; check its wiring')
+
+
+def _level_fault(comparison: BaselineComparison, finite: np.ndarray) -> DataFault | None:
+    """Find an axis that no sensor can output."""
+    sensor = comparison.sensor
+    level_g = np.abs(np.median(comparison.volts[finite], axis=0) - sensor.zero_g_v) \
+        / sensor.scale_v_per_g
+    worst = int(np.argmax(level_g))
+    if level_g[worst] < _LARGEST_LEVEL_G:
+        return None
+    return DataFault('unit', 'bad_data', f'{sensor.axes[worst]} is at {level_g[worst]:.3g} g; '
+                     'correct the unit of its column, or --params')
 
 
 def _unexplained_motion(comparison: BaselineComparison, finite: np.ndarray) -> DataFault | None:
@@ -280,7 +572,7 @@ def _axis_fault(comparison: BaselineComparison) -> DataFault | None:
     simulated_g = (simulated_v - simulated_v.mean(axis=0)) / sensor.scale_v_per_g
     measured_g = (comparison.volts - comparison.volts[finite].mean(axis=0)) \
         / sensor.scale_v_per_g
-    moving = np.flatnonzero(simulated_g.std(axis=0) > _SMALLEST_MOTION_G)
+    moving = np.flatnonzero(simulated_g.std(axis=0) > SMALLEST_MOTION_G)
     if not len(moving):
         return None
     delay = _delay_fault(simulated_g, np.where(finite[:, None], measured_g, 0.0), sensor.rate_hz)
@@ -358,3 +650,9 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
     """Return the correlation of two signals, 0 where one is constant."""
     with np.errstate(all='ignore'):
         return float(np.nan_to_num(np.corrcoef(a, b)[0, 1]))
+
+
+def _without(comparison: BaselineComparison, left_out: Sequence[LeftOut]) -> BaselineComparison:
+    """Return a comparison that does not use some samples."""
+    rows = np.logical_or.reduce([~comparison.used, *(part.rows for part in left_out)])
+    return replace(comparison, used=~rows)

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 from adxl_ros.diagnose.noise_whitening import before_filters, Series, Whitener
@@ -167,6 +168,13 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
     return WhitenedChannel(column_ids, grams, total, counts, log_scales,
                            np.array([f.log_prior for f in filters]),
                            np.array(['' if f.healthy else f.effect for f in filters]))
+
+
+def plain_grams(columns: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Return the products of k columns, (n, k), over used samples, by block, (blocks, k, k)."""
+    kept = np.where(used[:, None], columns, 0.0)
+    edges = block_edges(len(used))
+    return np.array([kept[a:b].T @ kept[a:b] for a, b in pairwise(edges)])
 
 
 def prepared(filters: Sequence[Whitener], columns: np.ndarray, used: np.ndarray) -> Series:
@@ -530,42 +538,6 @@ def conditional_mean(fit: LinearFit, places: np.ndarray, values: np.ndarray) -> 
         fit.covariance[np.ix_(places, places)], values - mean[places])[0]
     mean[places] = values
     return mean
-
-
-def held_out_log_likelihood(channels: Sequence[WhitenedChannel], fit: LinearFit,
-                            blocks: np.ndarray) -> np.ndarray:
-    """
-    Return the log likelihood of blocks that the fit has not seen.
-
-    Parameters
-    ----------
-    channels
-        All axes of all recordings.
-    fit
-        The fit to other blocks.
-    blocks
-        Numbers of the j held-out blocks, (j,).
-
-    Returns
-    -------
-    numpy.ndarray
-        Log likelihood by block, (j,).
-
-    """
-    total = np.zeros(len(blocks))
-    for c, f, v in zip(channels, fit.filter_indices, fit.innovation_variance_v2):
-        squares = _squares_by_block(c, fit, f)[blocks]
-        total += c.log_scales[f][blocks] - 0.5 * (squares / v + c.counts[blocks] * np.log(v))
-    return total
-
-
-def _squares_by_block(channel: WhitenedChannel, fit: LinearFit, filter_index: int) -> np.ndarray:
-    """Return the sum of squares of the residual after a fit, by block, V², (blocks,)."""
-    columns = np.flatnonzero(np.isin(channel.column_ids, fit.column_ids))
-    v = np.zeros(len(channel.column_ids) + 1)
-    v[0] = 1.0
-    v[1 + columns] = -fit.values[np.searchsorted(fit.column_ids, channel.column_ids[columns])]
-    return np.einsum('i,bij,j->b', v, channel.block_grams[filter_index], v)
 
 
 def log_posterior_loss(channels: Sequence[WhitenedChannel], fit: LinearFit, values: np.ndarray,

@@ -28,13 +28,13 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol
 
 from adxl_ros.diagnose import evidence
-from adxl_ros.diagnose.baseline_comparison import at_search_rate, compare
-from adxl_ros.diagnose.decision import Verdict, WeightedHypothesis
+from adxl_ros.diagnose.comparison import at_search_rate, compare
 from adxl_ros.diagnose.evidence import LinearFit
 from adxl_ros.diagnose.information import Belief, expected_information
 from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
 from adxl_ros.diagnose.noise_detectors import UNKNOWN
 from adxl_ros.diagnose.noise_whitening import drifts_among
+from adxl_ros.diagnose.verdict import Verdict, WeightedHypothesis
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.diagnosis_hints import FormDimension
 from adxl_ros.model.effects.base import Coefficient
@@ -52,6 +52,10 @@ _MOST_HYPOTHESES = 40
 """Largest number of hypotheses that lead the choice. Chosen: run time."""
 _UNKNOWN_G = 1e-3
 """Rms of an unknown function, g. Chosen: the middle of those of the diagnosis."""
+
+
+_EVIDENCE_FACTOR = 0.3
+"""Factor of the information, because no model of a sensor is exact (Miller and Dunson 2019)."""
 
 
 class Experiment(Protocol):
@@ -200,14 +204,14 @@ def leading(hypotheses: Sequence[WeightedHypothesis]) -> tuple[WeightedHypothesi
 def unknown_dimensions(verdict: Verdict | None) -> tuple[FormDimension, ...]:
     """Return the dimensions in which something unknown may act, or the usual ones."""
     present = {d.value: d for d in FormDimension}
-    where = tuple(present[d] for d in (verdict.unknown_where if verdict else ()) if d in present)
+    where = tuple(present[d] for d in (verdict.rest_follows if verdict else ()) if d in present)
     return where or (FormDimension.FORCE, FormDimension.DIRECTION, FormDimension.RATE,
                      FormDimension.TIME)
 
 
 def rank_responses(responses: Sequence[PredictedResponse],
                    hypotheses: Sequence[WeightedHypothesis], model: LinearModel | None,
-                   dimensions: Sequence[FormDimension], evidence_factor: float
+                   dimensions: Sequence[FormDimension]
                    ) -> tuple[ManoeuvreWorth, ...]:
     """
     Rank manoeuvres by their expected information per minute.
@@ -222,8 +226,6 @@ def rank_responses(responses: Sequence[PredictedResponse],
         The linear model of the samples so far; None before there are any.
     dimensions
         Dimensions in which something unknown may act.
-    evidence_factor
-        Factor by which the evidence is tempered.
 
     Returns
     -------
@@ -237,7 +239,7 @@ def rank_responses(responses: Sequence[PredictedResponse],
     total = sum(h.probability for h in leaders)
     probabilities = [h.probability / total for h in leaders]
     worth = [ManoeuvreWorth(r.manoeuvre, expected_information(
-        r.gram, probabilities, [_belief(p, r) for p in posteriors], evidence_factor))
+        r.gram, probabilities, [_belief(p, r) for p in posteriors], _EVIDENCE_FACTOR))
         for r in responses]
     return tuple(sorted(worth, key=lambda w: -w.per_minute))
 

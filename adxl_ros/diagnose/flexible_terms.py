@@ -25,8 +25,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import prod
 
-from adxl_ros.diagnose.baseline_comparison import BaselineComparison, Reference
-from adxl_ros.diagnose.motion_history import direction_of_last_move, time_since_move_s
+from adxl_ros.diagnose.comparison import (
+    BaselineComparison,
+    direction_of_last_move,
+    Reference,
+    time_since_move_s,
+)
 from adxl_ros.diagnose.noise_floor import gravity_slopes
 from adxl_ros.model.diagnosis_hints import FormDimension
 from adxl_ros.model.filters import low_pass

@@ -16,14 +16,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
 from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence
-from adxl_ros.diagnose.drift_checks import ResidualChannel, weakest_walk
 from adxl_ros.diagnose.evidence import LinearFit, WhitenedChannel
 from adxl_ros.diagnose.linear_model import (
     calibration_takes_up,
@@ -33,7 +32,7 @@ from adxl_ros.diagnose.linear_model import (
     parts_at_rest,
     rests_by_channel,
 )
-from adxl_ros.diagnose.noise_whitening import drifts_among, fitted_density, Whitener
+from adxl_ros.diagnose.noise_whitening import drifts_among, Whitener
 from adxl_ros.diagnose.sensitivities import limits, PRIOR_WIDTH, sensitivities_at
 from adxl_ros.model.coefficients import fitted_of, get, parameter_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
@@ -44,8 +43,6 @@ import numpy as np
 
 _EVALUATIONS = 8
 """Largest number of simulations of a hypothesis. Chosen: most need five."""
-_BESIDE_DRIFT_EVALUATIONS = 4
-"""The same beside a drift. Chosen: such a fit starts from one without the drift."""
 _HALVINGS = 2
 """How often a step that lowers the log evidence is halved. Chosen: a quarter of a step is
 enough for the library."""
@@ -69,6 +66,8 @@ prior's. Chosen: the samples then determine it hardly better than the prior."""
 _LIMIT_STEP = 0.02
 """Share by which a limit of some blocks may differ from that of all blocks. Chosen: the change of
 the output is linear within a knee, which is that wide."""
+_HEALTHY_STDS = 3.0
+"""Largest departure of a healthy unit, in standard deviations: one unit in 400 exceeds it."""
 _UNDETERMINED_RATIO = 3.0
 """Some blocks do not determine a coefficient if their standard deviation exceeds that of all
 blocks by this factor. Chosen: a quarter of the blocks is held out."""
@@ -116,6 +115,14 @@ class Hypothesis:
     converged: bool = True
 
     @property
+    def undetermined(self) -> np.ndarray:
+        """Coefficients that the recordings narrow hardly more than their prior, (k,) bool."""
+        j = len(self.names)
+        return np.sqrt(np.diag(self.fit.covariance)[:j]) \
+            > _UNDETERMINED_PRIOR_SHARE * np.maximum(self.linearised.prior_std[:j],
+                                                     np.abs(self.values))
+
+    @property
     def whiteners(self) -> list[Whitener]:
         """Whitening filter of each channel."""
         return [filters[i] for filters, i in zip(self.linearised.filters,
@@ -132,11 +139,15 @@ class ChannelColumns(NamedTuple):
         Places of the k coefficients among all, (k,).
     values
         Residual at the prior mean, V, and sensitivities, V per unit, (n, k + 1).
+    plain
+        Products of the same divided by the scale factor and the root of the number of axes, by
+        block, (m/s²)², (blocks, k + 1, k + 1).
 
     """
 
     places: np.ndarray
     values: np.ndarray
+    plain: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -159,6 +170,8 @@ class LinearisedHypothesis:
         Prior mean of the coefficients, (k,).
     prior_std
         Prior standard deviation of the coefficients, (k,).
+    reach
+        Largest departure of the nuisance parameters of a healthy unit, (k − j,).
     values
         Values of the coefficients of the effects, (j,).
     channels
@@ -175,6 +188,7 @@ class LinearisedHypothesis:
     names: tuple[Coefficient, ...]
     prior_mean: np.ndarray
     prior_std: np.ndarray
+    reach: np.ndarray
     values: np.ndarray
     channels: list[WhitenedChannel]
     columns: list[ChannelColumns]
@@ -270,6 +284,10 @@ class LinearisedHypothesis:
         sized = np.array([p.is_size and not limits(effect_named(name.effect))
                           for p, name in zip(parameters, self.effect_names)], bool)
         values = np.where(undetermined & ~sized, self.values, fitted)
+        if full_fit is not None:
+            # Of a size that only the held-out blocks show, the others predict nothing.
+            hidden = undetermined & sized & (2 * std > np.abs(self.values - self.prior_mean[:j]))
+            values = np.where(hidden, self.prior_mean[:j], values)
         shape_range = np.sort([self.values / 2, self.values * 2], axis=0)
         is_shape = [p.role is Role.SHAPE for p in parameters]
         values = np.where(is_shape, np.clip(values, *shape_range), values)
@@ -277,11 +295,20 @@ class LinearisedHypothesis:
         departures = self._given(fit, changed, values)
         if full_fit is None:
             return departures
+        # A healthy unit's zero-g, scale factor, filter and latency stay within their tolerance.
+        outside = np.abs(departures[j:]) > self.reach
+        if outside.any():
+            given = np.flatnonzero(np.concatenate([changed, outside]))
+            within = np.clip(departures[j:], -self.reach, self.reach)
+            departures = evidence.conditional_mean(fit, given, np.concatenate(
+                [values - self.prior_mean[:j], within])[given])
         # A limit may follow another coefficient that keeps its value, so that it is bounded last.
         values = departures[:j] + self.prior_mean[:j]
         limit_range = np.sort(np.outer([1 - _LIMIT_STEP, 1 + _LIMIT_STEP], self.values), axis=0)
         is_limit = np.array([p.role is Role.LIMIT for p in parameters], bool)
         bounded = np.where(is_limit, np.clip(values, *limit_range), values)
+        if np.array_equal(bounded, values):
+            return departures
         return self._given(fit, changed | (bounded != values), bounded)
 
     def _given(self, fit: LinearFit, given: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -309,7 +336,7 @@ def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
     sensor
         A sensor with the effects.
     filters
-        Whitening filters of each channel; None for all.
+        Whitening filters of each channel; None for those of a healthy unit.
 
     Returns
     -------
@@ -317,7 +344,7 @@ def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
         Whitened residuals and columns.
 
     """
-    filters = linear_model.filters if filters is None else filters
+    filters = linear_model.filters_of(()) if filters is None else filters
     start = with_neutral(linear_model.baseline, effects)
     names = _fitted_names(linear_model, effects)
     nuisances = [n for n in dict.fromkeys(chain(*linear_model.nuisance_columns))
@@ -347,16 +374,18 @@ def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
             ids = np.array([*places, *nuisance_columns], int)
             design = np.column_stack([design, *nuisance_columns.values()])
             changes_v.append(change_v[:, d])
-            columns.append(ChannelColumns(
-                ids, np.column_stack([residual_v, design]).astype(np.float32)))
+            stacked = np.column_stack([residual_v, design])
+            scale = float(comparison.scale_v_per_mps2[d]) * len(start.axes) ** 0.5
+            columns.append(ChannelColumns(ids, stacked.astype(np.float32), evidence.plain_grams(
+                stacked / scale, comparison.used)))
             channels.append(evidence.whiten_channel(residual_v, design, ids, comparison.used,
                                                     filters[len(channels)]))
-    nuisance_std = _nuisance_std(linear_model, effects, all_names, nuisances, changes_v)
+    nuisance_std, reach = _nuisance_std(linear_model, effects, all_names, nuisances, changes_v)
     return LinearisedHypothesis(
         effects=tuple(effects), sensor=sensor, names=tuple(all_names),
         prior_mean=np.concatenate([prior_mean, get(start, nuisances)]),
         prior_std=np.array([*prior_std, *nuisance_std]), values=values, channels=channels,
-        columns=columns, filters=filters)
+        reach=np.array(reach), columns=columns, filters=filters)
 
 
 def _output_without_calibrated(linear_model: LinearModel, number: int, sensor: Sensor,
@@ -371,23 +400,24 @@ def _output_without_calibrated(linear_model: LinearModel, number: int, sensor: S
 
 def _nuisance_std(linear_model: LinearModel, effects: Sequence[str], names: list[Coefficient],
                   nuisances: Sequence[Coefficient], changes_v: Sequence[np.ndarray]
-                  ) -> list[float]:
+                  ) -> tuple[list[float], list[float]]:
     """
-    Return prior standard deviations of nuisance parameters in a hypothesis with some effects.
+    Return prior standard deviations of nuisance parameters beside effects, and their reach.
 
-    The square of each is that of a healthy unit's tolerance plus that of what a calibration can
-    take up of the effects. `changes_v` are the outputs of the effects by channel, V, (n,); `names`
-    are all coefficients.
+    The reach is what a healthy unit stays within. The square of each deviation is that of a
+    healthy unit's tolerance plus that of what a calibration can take up of the effects.
+    `changes_v` are the outputs of the effects by channel, V, (n,); `names` are all coefficients.
     """
     lines = [{names.index(n): column for n, column in columns.items() if hints_of(n).straight_line}
              for columns in linear_model.nuisance_columns]
     changes = [[NumberedColumn(0, change_v)] for change_v in changes_v]
     parts = parts_at_rest(lines, changes, 1, rests_by_channel(linear_model.comparisons))
-    drifts, std = drifts_among(effects), []
+    std, reach = [], []
     for name in nuisances:
         part = parts.get(names.index(name), np.zeros(1))
-        std.append(float(np.hypot(linear_model.tolerance(name, drifts), part[0])))
-    return std
+        std.append(float(np.hypot(linear_model.tolerance(name), part[0])))
+        reach.append(float(np.hypot(_HEALTHY_STDS * linear_model.tolerance(name), part[0])))
+    return std, reach
 
 
 def _fitted_names(linear_model: LinearModel, effects: Sequence[str]
@@ -458,11 +488,13 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
     effects = tuple(dict.fromkeys(effects))
     neutral_sensor = with_neutral(linear_model.baseline, effects)
     names = _fitted_names(linear_model, effects)
-    filters = linear_model.filters_of(effects)
+    filters = linear_model.filters_of(())
+    # The iteration has the noise of no gap; only its end is compared for every noise.
+    fixed = [[f[i]] for f, i in zip(filters, linear_model.null_fit.filter_indices)]
 
     def linearised_at(values: np.ndarray) -> _HypothesisIterate:
         linearised = linearise(linear_model, effects,
-                               put(neutral_sensor, names, _within_bounds(names, values)), filters)
+                               put(neutral_sensor, names, _within_bounds(names, values)), fixed)
         fit = linearised.fit()
         j = len(linearised.values)
         step = linearised.departures(fit)[:j] + linearised.prior_mean[:j] - linearised.values
@@ -476,7 +508,7 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
 
     solve = partial(
         gauss_newton, linearised_at, has_converged=has_ended, max_halvings=_HALVINGS,
-        max_evaluations=_BESIDE_DRIFT_EVALUATIONS if drifts_among(effects) else _EVALUATIONS,
+        max_evaluations=_EVALUATIONS,
         cost_tolerance=_EVIDENCE_TOLERANCE)
     first = _first_values(neutral_sensor, names, start, shapes)
     solution = solve(first)
@@ -484,19 +516,20 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
         nearer = _nearer_shape(linearised_at, first, names, shapes, solution.last.log_evidence)
         if nearer is not None:
             solution = min(solution, solve(nearer), key=lambda s: s.last.cost)
-    linearised, fit = solution.last.linearised, solution.last.fit
+    hopeless = solution.last.fit.log_evidence < lowest_log_evidence
+    linearised = linearise(linear_model, effects, solution.last.linearised.sensor, filters)
+    fit = linearised.fit()
     j = len(linearised.values)
     std = np.sqrt(evidence.robust_std(linearised.channels, fit, linearised.prior_std)[:j] ** 2
                   + _encoder_std(linear_model, linearised.effect_names) ** 2
                   + _form_std(linearised, fit) ** 2)
-    log_evidence = solution.last.log_evidence + sparsity_log_bayes_factor(
+    log_evidence = fit.log_evidence - linearised.linear_loss(fit) + sparsity_log_bayes_factor(
         linearised, fit.values, fit.covariance)
-    hypothesis = Hypothesis(
+    return Hypothesis(
         effects, linearised.sensor_at_values(fit), linearised.effect_names,
         linearised.values - linearised.prior_mean[:j], std, log_evidence, fit, linearised,
         linearised.linear_loss(fit),
-        solution.converged and fit.log_evidence >= lowest_log_evidence)
-    return replace(hypothesis, sensor=_with_drift_densities(linear_model, hypothesis))
+        solution.converged and not hopeless)
 
 
 def _nearer_shape(linearised_at: Callable[[np.ndarray], _HypothesisIterate], first: np.ndarray,
@@ -560,22 +593,6 @@ def _has_converged(first: _HypothesisIterate, previous: _HypothesisIterate | Non
         return True
     prior_std = present.linearised.prior_std[:len(present.step)]
     return bool(np.all(np.abs(present.step) < _SMALLEST_STEP * prior_std))
-
-
-def _with_drift_densities(linear_model: LinearModel, hypothesis: Hypothesis) -> Sensor:
-    """Return the sensor with the densities of its drifts in the first recording."""
-    sensor, variance_v2 = hypothesis.sensor, hypothesis.fit.innovation_variance_v2
-    for drift in drifts_among(hypothesis.effects):
-        densities = np.zeros(len(sensor.axes))
-        for d in range(len(densities)):
-            whitener = hypothesis.whiteners[d]
-            if whitener.effect == drift:
-                densities[d] = fitted_density(
-                    whitener, variance_v2[d], linear_model.comparisons[0].dt_s,
-                    linear_model.baseline.scale_v_per_g[d])
-        sensor = replace(sensor, values={**sensor.values, drift: {
-            effect_named(drift).parameters[0].name: densities}})
-    return sensor
 
 
 def _encoder_std(linear_model: LinearModel, names: Sequence[Coefficient]) -> np.ndarray:
@@ -645,32 +662,3 @@ def _within_bounds(names: Sequence[Coefficient], values: np.ndarray) -> np.ndarr
     """Clip values to the bounds of their parameters, (k,)."""
     return np.clip(values, np.array([parameter_of(n).lower for n in names]),
                    np.array([parameter_of(n).upper for n in names]))
-
-
-def residual_channels(linear_model: LinearModel, hypothesis: Hypothesis
-                      ) -> Iterator[ResidualChannel]:
-    """
-    Compute the residual of a hypothesis, channel by channel.
-
-    Parameters
-    ----------
-    linear_model
-        The recordings.
-    hypothesis
-        A fitted hypothesis.
-
-    Yields
-    ------
-    ResidualChannel
-        Residual and noise of one axis of one recording.
-
-    """
-    number = 0
-    for comparison in linear_model.comparisons:
-        residual_v = evidence.bridged(comparison.residual_v(hypothesis.sensor), comparison.used)
-        for axis_v in residual_v.T:
-            yield ResidualChannel(
-                axis_v, comparison.used, comparison.sensor.rate_hz,
-                hypothesis.whiteners[number], weakest_walk(linear_model.filters[number]),
-                float(hypothesis.fit.innovation_variance_v2[number]))
-            number += 1

@@ -34,22 +34,23 @@ from itertools import chain
 from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence, noise_whitening
-from adxl_ros.diagnose.angle_errors import angle_error_filter, AngleErrorFilter
-from adxl_ros.diagnose.baseline_comparison import BaselineComparison, Reference
+from adxl_ros.diagnose.comparison import BaselineComparison, Reference
 from adxl_ros.diagnose.evidence import FlexibleColumns, LinearFit, WhitenedChannel
 from adxl_ros.diagnose.flexible_terms import Basis, flexible_bases
-from adxl_ros.diagnose.lost_motion import lost_motion_filter, LostMotionFilter
 from adxl_ros.diagnose.noise_whitening import drifts_among, Whitener
-from adxl_ros.diagnose.sensitivities import candidates, Variant, variants
+from adxl_ros.diagnose.reference import (
+    angle_error_filter,
+    AngleErrorFilter,
+    lost_motion_filter,
+    LostMotionFilter,
+)
+from adxl_ros.diagnose.sensitivities import candidates, PRIOR_WIDTH, Variant, variants
+from adxl_ros.model.coefficients import parameter_of
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre, StraightLine
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Coefficient, Concern, Effect
 from adxl_ros.model.sensor import Sensor
 import numpy as np
-
-_DRIFTED_STD_G = 0.02
-"""Prior standard deviation of a zero-g that drifts, g. It has also drifted between calibration and
-recording. Tuned by hand on simulated recordings of the working seeds of the blind check."""
 
 _SIMULATED_SHARE = 0.5
 """Share of the run time of a linear model that its simulations take. Measured."""
@@ -167,11 +168,9 @@ class LinearModel:
         return _filters_of(self.filters, (*effects, *self.baseline.effects))
 
     @cached_property
-    def drifting_channels(self) -> list[WhitenedChannel]:
-        """Return the channels with all filters, which hypotheses with a drift need."""
-        if list(map(len, self.filters_of(()))) == list(map(len, self.filters)):
-            return self.channels
-        return _whitened_channels(self.comparisons, self.columns, self.filters, None)
+    def null_fit(self) -> LinearFit:
+        """Fit of the nuisance parameters alone."""
+        return self.fit_variants([])
 
     @cached_property
     def flexible_bases(self) -> list[list[Basis]]:
@@ -179,16 +178,19 @@ class LinearModel:
         return [flexible_bases(c, v) for c, v in zip(self.comparisons, self.baseline_v)]
 
     def nuisance_ids(self) -> list[int]:
-        """Return the numbers of the columns of nuisance parameters."""
-        return [i for variant, ids in zip(self.variants, self.column_ids)
-                if effect_named(variant.effect).diagnosis.nuisance for i in ids]
+        """Return the numbers of the columns of nuisance parameters, each for small departures."""
+        first: dict[str, list[int]] = {}
+        for variant, ids in zip(self.variants, self.column_ids):
+            first.setdefault(variant.effect, ids)
+        return [i for effect, ids in first.items()
+                if effect_named(effect).diagnosis.nuisance for i in ids]
 
     def smallest_angle_rad(self) -> float:
         """Return the standard deviation of an angle by the step of the stage's encoder, rad."""
         return max(c.sensor.stage_resolution_rad if c.reference is Reference.STAGE else 0.0
                    for c in self.comparisons) / 12 ** 0.5
 
-    def prior(self, chosen: Sequence[int], drifts: Sequence[str] = ()) -> np.ndarray:
+    def prior(self, chosen: Sequence[int]) -> np.ndarray:
         """
         Return prior standard deviations of all coefficients.
 
@@ -197,8 +199,6 @@ class LinearModel:
         chosen
             Numbers of the variants of the hypothesis. Only their effects may exceed the tolerance
             of a healthy unit.
-        drifts
-            Effects by which the zero-g drifts.
 
         Returns
         -------
@@ -216,10 +216,10 @@ class LinearModel:
                 continue
             parts = self.parts_at_rest.get(name, np.zeros(len(prior_std)))[columns] \
                 * prior_std[columns]
-            prior_std[i] = np.hypot(self.tolerance(name, drifts), np.sqrt(np.sum(parts ** 2)))
+            prior_std[i] = np.hypot(self.tolerance(name), np.sqrt(np.sum(parts ** 2)))
         return prior_std
 
-    def tolerance(self, name: Coefficient, drifts: Sequence[str] = ()) -> float:
+    def tolerance(self, name: Coefficient) -> float:
         """
         Return the standard deviation of a nuisance parameter in a healthy unit.
 
@@ -229,8 +229,6 @@ class LinearModel:
         ----------
         name
             Name of the coefficient.
-        drifts
-            Effects by which the zero-g drifts.
 
         Returns
         -------
@@ -240,14 +238,16 @@ class LinearModel:
         """
         hints = hints_of(name)
         assert hints.healthy_std is not None
-        if hints.straight_line is None:
-            return hints.healthy_std
         sensor = self.baseline
+        if hints.straight_line is None:
+            return PRIOR_WIDTH * parameter_of(name).scale \
+                if {*hints.stated_by} & {*sensor.measured} else hints.healthy_std
         scale = float(sensor.scale_v_per_g[sensor.axes.index(name.axis)])
         zero_g = hints.straight_line is StraightLine.ZERO_G
         if zero_g and not self.pose_known:
             return scale
-        variance = (_DRIFTED_STD_G * scale) ** 2 if zero_g and drifts else 0.0
+        # Converters round or cut off, which shifts the zero-g by a part of a step.
+        variance = sensor.lsb_v ** 2 / 12 if zero_g else 0.0
         if name in sensor.covariance_names:
             i = sensor.covariance_names.index(name)
             variance += float(sensor.covariance[i, i])
@@ -259,8 +259,7 @@ class LinearModel:
                       if e.diagnosis.straight_line is StraightLine.ZERO_G)
         return self.tolerance(Coefficient(effect.name, effect.parameters[0].name, axis))
 
-    def fit_variants(self, chosen: Sequence[int], start: LinearFit | None = None,
-                     drifts: Sequence[str] = ()) -> LinearFit:
+    def fit_variants(self, chosen: Sequence[int], start: LinearFit | None = None) -> LinearFit:
         """
         Fit a set of variants on the sensitivities at the baseline.
 
@@ -270,8 +269,6 @@ class LinearModel:
             Numbers of the variants.
         start
             A fit whose noise is close to that of this fit.
-        drifts
-            Effects by which the zero-g drifts, beside those of the baseline.
 
         Returns
         -------
@@ -279,11 +276,12 @@ class LinearModel:
             The fit; its log evidence is that with the log-uniform prior over amplitudes.
 
         """
-        channels = self.drifting_channels if drifts else self.channels
-        drifts = (*drifts, *drifts_among(self.baseline.effects))
-        ids = set(self.nuisance_ids()).union(*(self.column_ids[i] for i in chosen))
-        prior_std = self.prior(chosen, drifts)
-        fit = evidence.fit_columns(channels, sorted(ids), prior_std, None, start, drifts)
+        drifts = drifts_among(self.baseline.effects)
+        effects = {self.variants[i].effect for i in chosen}
+        ids = {k for k in self.nuisance_ids() if self.names[k].effect not in effects}.union(
+            *(self.column_ids[i] for i in chosen))
+        prior_std = self.prior(chosen)
+        fit = evidence.fit_columns(self.channels, sorted(ids), prior_std, None, start, drifts)
         gain = 0.0
         for i in chosen:
             places = np.flatnonzero(np.isin(fit.column_ids, self.column_ids[i]))
@@ -391,7 +389,8 @@ def _empty_by_axis(comparison: BaselineComparison) -> list[list[NumberedColumn]]
 def _nuisance_columns(channel: Sequence[NumberedColumn], names: Sequence[Coefficient]
                       ) -> dict[Coefficient, np.ndarray]:
     """Return the columns of nuisance parameters of a channel by coefficient."""
-    return {names[i]: column for i, column in channel if hints_of(names[i]).nuisance}
+    # The first column of an effect is that of its smallest start.
+    return {names[i]: column for i, column in reversed(channel) if hints_of(names[i]).nuisance}
 
 
 def rests_by_channel(comparisons: Sequence[BaselineComparison]) -> list[np.ndarray]:

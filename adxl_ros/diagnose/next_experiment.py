@@ -26,10 +26,10 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from adxl_ros.diagnose.baseline_comparison import Reference
-from adxl_ros.diagnose.decision import Verdict
+from adxl_ros.diagnose.comparison import Reference
 from adxl_ros.diagnose.expectation import leading, predict, rank_responses, unknown_dimensions
 from adxl_ros.diagnose.linear_model import LinearModel
+from adxl_ros.diagnose.verdict import Verdict
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import with_neutral
 from adxl_ros.model.diagnosis_hints import Manoeuvre
@@ -128,8 +128,6 @@ class RecordedEvidence:
         The baseline.
     linear_model
         Linear model of the recordings; None without any.
-    evidence_factor
-        Factor by which their evidence is tempered.
     seed
         Seed of the manoeuvres of the menu.
 
@@ -137,7 +135,6 @@ class RecordedEvidence:
 
     sensor: Sensor
     linear_model: LinearModel | None
-    evidence_factor: float
     seed: int
 
     @property
@@ -254,7 +251,7 @@ def _give_same_samples(group: Sequence[str]) -> bool:
 
 def _separating_experiment(verdict: Verdict, evidence: RecordedEvidence) -> NextExperiment:
     """Rank the whole menu by its expected information; propose the best manoeuvre."""
-    hypotheses = leading(verdict.described)
+    hypotheses = leading(verdict.hypotheses)
     effects = sorted({effect for h in hypotheses for effect in h.effects})
     dimensions = unknown_dimensions(verdict)
     responses = []
@@ -265,7 +262,7 @@ def _separating_experiment(verdict: Verdict, evidence: RecordedEvidence) -> Next
                 planned, _as_mounted(evidence.sensor, planned.manoeuvre), effects, dimensions))
     of_text = {described.text: manoeuvre for manoeuvre, described in MENU.items()}
     ranked = [(worth, of_text[worth.manoeuvre.name]) for worth in rank_responses(
-        responses, hypotheses, evidence.linear_model, dimensions, evidence.evidence_factor)]
+        responses, hypotheses, evidence.linear_model, dimensions)]
     group, has_no_stage = verdict.groups[0], evidence.beside_simulator
     why = f'to separate {", ".join(group[:-1])} and {group[-1]}'
     menu = tuple(MenuWorth(_text(manoeuvre, has_no_stage), float(worth.manoeuvre.minutes),

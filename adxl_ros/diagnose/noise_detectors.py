@@ -42,7 +42,7 @@ _LINE_LOWEST_HZ = 1.0
 _LINE_FEWEST_ORDINATES = 64
 """Fewest ordinates of a periodogram in which a line is looked for. Chosen: their level needs
 some."""
-_LINE_LOG_EXCESS = 14.0
+LINE_LOG_EXCESS = 14.0
 """Log likelihood ratio of a line, above that of the largest ordinate by chance, from which it is a
 line. Chosen: exp(−14) is one in a million."""
 _LOCAL_ORDINATES = 201
@@ -54,7 +54,7 @@ wanders little within it."""
 _LINE_BESIDE = 4.0
 """Distance at which the power beside a line is taken, in inverse parts. Chosen: beyond the main
 lobe of the window."""
-_SPIKE_STDS = 7.0
+SPIKE_STDS = 7.0
 """Deviation of a spike from its neighbours, in robust standard deviations. Chosen: normal noise
 exceeds it once in 4·10¹¹ samples."""
 _SPIKE_FEWEST = 3
@@ -68,9 +68,9 @@ _SPIKE_LOCAL_FEWEST = 9
 """Fewest samples of such a block. Chosen: a median of nine."""
 _SPIKE_LOG_BAYES_FACTOR = 10.0
 """Log Bayes factor of one isolated sample, rough: it only ranks detections."""
-_NOISE_EXCESS = 1.2
+NOISE_EXCESS = 1.2
 """Noise, divided by the stated noise, from which it is excessive. Chosen: units differ by less."""
-_COARSE_STEPS = 1.6
+COARSE_STEPS = 1.6
 """Distance of codes, in stated steps, from which codes are coarse. Chosen: between 1 and 2."""
 _SMALLEST_CODE_STEPS = 0.3
 """Distance of two values, in stated steps, below which they are one code. Chosen: below half a
@@ -172,13 +172,7 @@ def repeated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, se
 
     """
     same = np.concatenate([[False], (np.diff(volts, axis=0) == 0).all(axis=1)])
-    # Neighbours are correlated, so that the root of the independent probability is safe.
-    probability = float(np.sqrt(np.prod([np.mean(np.diff(v) == 0) for v in volts.T])))
-    smallest = _REPEAT_PROBABILITY_MORE_AXES if len(sensor.axes) > 1 \
-        else _REPEAT_PROBABILITY_ONE_AXIS
-    probability = min(max(probability, smallest), _REPEAT_LARGEST_PROBABILITY)
-    by_chance = int(np.ceil(np.log(_REPEAT_CHANCE / len(volts)) / np.log(probability)))
-    shortest = max(_REPEAT_SHORTEST, by_chance)
+    shortest = shortest_repeat(volts, len(sensor.axes))
     repeated = np.zeros(len(volts), bool)
     for begin, end in true_runs(same):
         if end - begin >= shortest:
@@ -193,6 +187,16 @@ def repeated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, se
         'duration_s': np.array(max(duration_s + 1 / sensor.rate_hz, 1 / sensor.rate_hz))},
         _REPEAT_LOG_BAYES_FACTOR * len(repeats),
         f'samples repeat {len(repeats)} times, for {duration_s:.3g} s (median)')]
+
+
+def shortest_repeat(volts: np.ndarray, axes: int) -> int:
+    """Return how many equal samples, (n, m), in a row are too many for chance."""
+    # Neighbours are correlated, so that the root of the independent probability is safe.
+    probability = float(np.sqrt(np.prod([np.mean(np.diff(v) == 0) for v in volts.T])))
+    smallest = _REPEAT_PROBABILITY_MORE_AXES if axes > 1 else _REPEAT_PROBABILITY_ONE_AXIS
+    probability = min(max(probability, smallest), _REPEAT_LARGEST_PROBABILITY)
+    by_chance = int(np.ceil(np.log(_REPEAT_CHANCE / len(volts)) / np.log(probability)))
+    return max(_REPEAT_SHORTEST, by_chance)
 
 
 def isolated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, sensor: Sensor
@@ -263,15 +267,17 @@ def _spikes(volts: np.ndarray, used: np.ndarray, sensor: Sensor
     near = _SPIKE_NEIGHBOUR
     deviation_v = volts - (np.roll(volts, near, 0) + np.roll(volts, -near, 0)) / 2
     isolated, size_v = np.zeros(volts.shape, bool), np.zeros(volts.shape[1])
+    step_v = np.where(code_step_v(volts) < _CONSTANT_V, code_step_v(volts), 0.0)
     # The first samples after repeated or missing ones may step, which is no spike.
     undisturbed = np.convolve(used, np.ones(4 * near + 1), 'same') > 4 * near
     for d, deviation in enumerate(deviation_v.T):
-        std_v = MAD_TO_STD * np.nanmedian(np.abs(deviation[used]))
+        # The rounding of a file makes steps, which are no spikes.
+        std_v = max(MAD_TO_STD * np.nanmedian(np.abs(deviation[used])), step_v[d])
         # Motion also deviates from the line, so that a spike must exceed its surroundings, too.
         local_v = _local_std(np.nan_to_num(deviation),
                              round(max(sensor.rate_hz * _SPIKE_LOCAL_S, _SPIKE_LOCAL_FEWEST)))
         outside = (np.abs(deviation)
-                   > _SPIKE_STDS * np.maximum(local_v, max(std_v, sensor.lsb_v))) & undisturbed
+                   > SPIKE_STDS * np.maximum(local_v, max(std_v, sensor.lsb_v))) & undisturbed
         outside[:near] = outside[-near:] = False
         # The neighbours of a spike deviate by half of it.
         peak = np.abs(deviation) >= np.maximum.reduce([
@@ -322,7 +328,7 @@ def coarse_codes(volts: np.ndarray, sensor: Sensor) -> Detection | None:
     """
     if not sensor.lsb_v:
         return None
-    bits, threshold = np.array([_lost_bits(v, sensor) for v in volts.T]), np.log2(_COARSE_STEPS)
+    bits, threshold = np.array([_lost_bits(v, sensor) for v in volts.T]), np.log2(COARSE_STEPS)
     if not (bits >= threshold).any():
         return None
     common = 0.0
@@ -453,7 +459,7 @@ def _excess(white: np.ndarray, at_rest: np.ndarray, samples: NoiseSamples, senso
     ratio = np.minimum(ratio, _spectral_level(white, sensor.rate_hz)
                        / _spectral_level(simulated, sensor.rate_hz))
     largest = np.max(ratio)
-    if largest <= _NOISE_EXCESS:
+    if largest <= NOISE_EXCESS:
         return None
     return Detection(detected_effect(Detector.NOISE_LEVEL), {'ratio': ratio - 1},
                      (len(white) + 1) * float(np.log(largest) ** 2),
@@ -494,7 +500,7 @@ def _strongest_line(white: np.ndarray, samples: NoiseSamples, sensor: Sensor
     excess = (power / level).sum(axis=1)
     best = int(np.argmax(excess))
     log_excess = float(excess[best]) - np.log(len(frequency_hz)) - len(sensor.axes)
-    if log_excess < _LINE_LOG_EXCESS:
+    if log_excess < LINE_LOG_EXCESS:
         return None
     line_hz = float(frequency_hz[best])
     mains_hz = _mains_frequency_hz(line_hz, sensor.rate_hz)

@@ -16,8 +16,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+from adxl_ros.diagnose.comparison import BaselineComparison, Reference
 from adxl_ros.model import noise
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
@@ -33,8 +35,6 @@ _MOST_PARTS = 100
 """Parts from which an interval is drawn at most. Chosen: 100 parts show their spread to 7 %."""
 _FEWEST_PARTS = 20
 """Fewest parts of an interval. Chosen: 20 parts show their spread to 16 %."""
-_DRAWS = 400
-"""Number of draws of an interval. Chosen: the 5 % quantile has 20 draws below it."""
 FEWEST_SAMPLES = 200
 """Fewest samples of an estimate. Chosen: 5 % of the standard deviation."""
 _REPEAT_SHORTEST_S = 20.0
@@ -45,6 +45,8 @@ with itself."""
 _REPEAT_STEPS = 5.0
 """Largest rms angle between the directions of two repeats, in steps of the encoder. Chosen:
 several times the rounding of both."""
+_RATE_TOLERANCE = 1e-3
+"""Largest relative difference of the sample rates of two repeats. Chosen: 20 ms in 20 s."""
 _SMALLEST_RESOLUTION_RAD = 1e-5
 """Smallest step of the encoder that is assumed for repeats, rad. Chosen: rounding errors of
 stated angles."""
@@ -77,7 +79,7 @@ class NoiseFloor:
     source: str
     parts: np.ndarray
 
-    def draws_mps2(self, seed: int) -> np.ndarray | None:
+    def draws_mps2(self, seed: int, draws: int) -> np.ndarray | None:
         """
         Return the floor from parts drawn with replacement.
 
@@ -85,6 +87,8 @@ class NoiseFloor:
         ----------
         seed
             Seed of the draws.
+        draws
+            Number of draws.
 
         Returns
         -------
@@ -97,7 +101,7 @@ class NoiseFloor:
             return None
         edges = np.linspace(0, count, min(count, _MOST_PARTS) + 1).astype(int)[:-1]
         squares, samples = np.add.reduceat(self.parts, edges, axis=1)
-        drawn = np.random.default_rng(seed).integers(0, len(edges), (_DRAWS, len(edges)))
+        drawn = np.random.default_rng(seed).integers(0, len(edges), (draws, len(edges)))
         return np.sqrt(squares[drawn].sum(axis=1) / samples[drawn].sum(axis=1))
 
 
@@ -117,6 +121,61 @@ class SquareSum:
 
     squares_v2: np.ndarray
     count: int
+
+
+def estimate(comparisons: Sequence[BaselineComparison]) -> NoiseFloor:
+    """
+    Estimate the noise floor from rests, else from repeats, else from the parameter file.
+
+    The noise at rest is that about the mean of each second. The mean square of the encoder's steps
+    is added.
+    """
+    baseline = comparisons[0].sensor
+    sums = [part for c in comparisons for part in squares_at_rest(
+        c.volts, c.at_rest & c.used, c.sensor)]
+    source = 'still'
+    if sum(part.count for part in sums) < FEWEST_SAMPLES:
+        sums, source = _repeat_squares(comparisons), 'repeats'
+    count = sum(part.count for part in sums)
+    if count < FEWEST_SAMPLES:
+        sums, noise_v, source = [], noise.sample_std_v(baseline), 'assumed'
+    else:
+        noise_v = np.sqrt(np.sum([part.squares_v2 for part in sums], axis=0) / count)
+    encoder = float(np.mean([_encoder_mean_square(c) for c in comparisons]))
+    scale_v_per_mps2 = comparisons[0].scale_v_per_mps2
+    parts = np.array([(np.mean(part.squares_v2 / scale_v_per_mps2 ** 2) + part.count * encoder,
+                       part.count) for part in sums]).reshape(-1, 2).T
+    noise_mps2 = noise_v / scale_v_per_mps2
+    return NoiseFloor(noise_v, float(np.sqrt(np.mean(noise_mps2 ** 2) + encoder)), source, parts)
+
+
+def _repeat_squares(comparisons: Sequence[BaselineComparison]) -> list[SquareSum]:
+    """Return the squares of the differences between repeats of a trajectory on the stage."""
+    staged = [c for c in comparisons if c.reference is Reference.STAGE]
+    oriented = [directions(c.motion.alpha(c.time_s), c.motion.beta(c.time_s)) for c in staged]
+    out: list[SquareSum] = []
+    for i, first in enumerate(staged):
+        for j, second in enumerate(staged[i:], i):
+            rate_hz = first.sensor.rate_hz
+            if abs(rate_hz / second.sensor.rate_hz - 1) > _RATE_TOLERANCE:
+                continue
+            repeat = find_repeat(oriented[i], oriented[j], rate_hz,
+                                 first.sensor.stage_resolution_rad, i == j)
+            if repeat is not None:
+                used = first.used[repeat[0]] & second.used[repeat[1]]
+                out += squares_of_difference(
+                    first.residual_v(first.sensor)[repeat[0]][used],
+                    second.residual_v(second.sensor)[repeat[1]][used], rate_hz)
+    return out
+
+
+def _encoder_mean_square(comparison: BaselineComparison) -> float:
+    """Return the mean square that the steps of the encoder make in a recording, (m/s²)²."""
+    if comparison.reference is not Reference.STAGE or not comparison.sensor.stage_resolution_rad:
+        return 0.0
+    motion, time_s, used = comparison.motion, comparison.time_s, comparison.used
+    return encoder_mean_square(motion.alpha(time_s)[used], motion.beta(time_s)[used],
+                               comparison.sensor)
 
 
 def squares_at_rest(volts: np.ndarray, at_rest: np.ndarray, sensor: Sensor) -> list[SquareSum]:

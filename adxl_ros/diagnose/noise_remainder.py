@@ -27,7 +27,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from adxl_ros.diagnose import noise_detectors
-from adxl_ros.diagnose.baseline_comparison import at_search_rate, BaselineComparison
+from adxl_ros.diagnose.comparison import at_search_rate, BaselineComparison
 from adxl_ros.diagnose.evidence import bridged
 from adxl_ros.diagnose.noise_comparison import allan_deviation
 from adxl_ros.diagnose.noise_detectors import Detection
@@ -104,8 +104,8 @@ class _Series:
 
 
 def noise_remainders(comparisons: Sequence[BaselineComparison], mean_sensor: Sensor,
-                     named_sensor: Sensor, detections: Sequence[Detection],
-                     effects: Sequence[str], seed: int) -> list[NoiseRemainder]:
+                     named_sensor: Sensor, detections: Sequence[Detection], seed: int
+                     ) -> list[NoiseRemainder]:
     """
     Compare the noise-like effects of the recordings with those of their simulation.
 
@@ -119,8 +119,6 @@ def noise_remainders(comparisons: Sequence[BaselineComparison], mean_sensor: Sen
         The sensor with the noise-like effects.
     detections
         Noise-like effects that show.
-    effects
-        Effects of the best hypothesis; drifts among them are compared.
     seed
         Seed of the simulated noise.
 
@@ -144,7 +142,7 @@ def noise_remainders(comparisons: Sequence[BaselineComparison], mean_sensor: Sen
                 [(statistic(c, recorded), statistic(c, simulated))
                  for c, recorded, simulated in pairs]))
     averaging_s = min(_LONGEST_ALLAN_S, min(c.span_s for c in comparisons) / _ALLAN_WINDOWS)
-    for drift in drifts_among(effects):
+    for drift in drifts_among(named_sensor.effects):
         remainders.append(_remainder(
             drift, f'Allan deviation at {averaging_s:.2g} s', 'm/s^2', named_sensor.axes,
             [_allan_values(at_search_rate(c), mean_sensor, named_sensor, averaging_s, seed)

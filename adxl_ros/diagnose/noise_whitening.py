@@ -31,8 +31,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from adxl_ros.diagnose.angle_errors import AngleErrorFilter
-from adxl_ros.diagnose.lost_motion import LostMotionFilter
+from adxl_ros.diagnose.reference import AngleErrorFilter, LostMotionFilter
 from adxl_ros.model import noise
 from adxl_ros.model.diagnosis_hints import DriftSpectrum
 from adxl_ros.model.effects import effect_named, library
@@ -40,13 +39,10 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 import scipy
 
-RANDOM_WALKS_G_PER_RTS = (1e-7, 3e-6, 1e-5, 3e-5, 3.8e-5, 5e-5, 8e-5, 1.3e-4, 2.1e-4,
-                          3.5e-4, 6e-4, 1.1e-3, 2e-3)
-"""Grid of densities of a random walk, g/√s. It is densest where a healthy unit ends, because a
-walk between two coarse steps would look like an unknown effect. Tuned by hand on simulated
-recordings of the working seeds of the blind check."""
-FLICKERS_G_PER_RTHZ = (3e-5, 6e-5, 8e-5, 1.2e-4, 2.5e-4, 5e-4, 1e-3, 2e-3, 4e-3)
-"""Grid of densities of 1/f noise at 1 Hz, g/√Hz. Tuned as the grid of random walks."""
+RANDOM_WALKS_G_PER_RTS = (1e-7, 1e-5, 3e-5, 7e-5, 1.5e-4, 4e-4, 1e-3, 3e-3)
+"""Grid of densities of a random walk, g/√s, a factor of two to three apart."""
+FLICKERS_G_PER_RTHZ = (6e-5, 1.5e-4, 5e-4, 1.5e-3, 4e-3)
+"""Grid of densities of 1/f noise at 1 Hz, g/√Hz, a factor of three apart."""
 USUAL_DENSITY = 1e-5
 """Usual density of both drifts, g/√s and g/√Hz. Chosen: 0.1 mg within 100 s."""
 _DENSITY_DECADES = 1.0
@@ -279,36 +275,6 @@ def _whitener(sections: np.ndarray, effect: str, density: float) -> Whitener:
     """Make a filter with its log-normal prior."""
     log_prior = -0.5 * (np.log10(density / USUAL_DENSITY) / _DENSITY_DECADES) ** 2
     return Whitener(sections, log_prior, effect, density)
-
-
-def fitted_density(whitener: Whitener, variance_v2: float, dt_s: float, scale_v_per_g: float
-                   ) -> float:
-    """
-    Return the density of the drift that a filter makes white.
-
-    Parameters
-    ----------
-    whitener
-        The filter.
-    variance_v2
-        Variance of the whitened residual, V².
-    dt_s
-        Time between samples, s.
-    scale_v_per_g
-        Scale factor of the axis, V/g.
-
-    Returns
-    -------
-    float
-        For a random walk the density of the grid, g/√s. For 1/f noise the root of the fitted
-        one-sided density at 1 Hz, g/√Hz.
-
-    """
-    if whitener.spectrum is DriftSpectrum.RANDOM_WALK:
-        return whitener.density
-    _, gain = scipy.signal.sosfreqz(whitener.sections, [2 * np.pi * dt_s])
-    density_v_per_rthz = np.sqrt(2 * dt_s * variance_v2) / np.abs(gain[0])
-    return float(density_v_per_rthz / scale_v_per_g)
 
 
 def expected_drift_g(spectrum: DriftSpectrum, density: float, span_s: float, rate_hz: float

@@ -1,17 +1,5 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
-"""The diagnosis as one HTML page that opens offline."""
+# SPDX-License-Identifier: Apache-2.0
+"""The diagnosis as one HTML page that opens offline, and its figures."""
 
 from __future__ import annotations
 
@@ -20,40 +8,30 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-from adxl_ros.diagnose import page_figures
-from adxl_ros.diagnose.diagnosis import Diagnosis
-from adxl_ros.diagnose.effect_proof import EffectProof, prove
-from adxl_ros.diagnose.report_json import as_json, notes, PROBABLE
-from adxl_ros.diagnose.report_text import badge, named_effects, parameter_label
-from adxl_ros.diagnose.report_wording import (
-    concern_text,
-    gap_rows,
-    headline,
-    is_only_noise,
-    listed,
-    mg,
-    mg_text,
-    NOISE_STAYS,
-    p_text,
-    parameter_text,
-    percent,
-    probability_text,
-    range_text,
-    remainder_rows,
-    tiles,
-)
-from adxl_ros.files import html_page, plotly_figures
+from adxl_ros.diagnose import report as words, residual_map as where
+from adxl_ros.diagnose.comparison import BaselineComparison
+from adxl_ros.diagnose.diagnosis import Diagnosis, Report
+from adxl_ros.diagnose.report import mg, mg_text, percent
+from adxl_ros.diagnose.report_text import axis_scale, named_effects
+from adxl_ros.diagnose.visibility import by_effect
+from adxl_ros.files import html_page, plotly_figures as plots
+from adxl_ros.files.plotly_figures import Figure, figure, line, rounded
+from adxl_ros.model import noise
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Parameter
 from adxl_ros.model.sensor import Sensor
+import numpy as np
 
-_COLOURS = {'explained': 'green', 'no_gap': 'grey', 'inseparable': 'amber',
+_COLOURS = {'explained': 'green', 'partly': 'amber', 'no_gap': 'grey', 'inseparable': 'amber',
             'insufficient': 'amber', 'unknown': 'red', 'bad_data': 'red'}
 """Colour of the badge for each status."""
-_CELL_ROWS = 12
-"""Rows of the table of cells. Chosen: the map above it shows all."""
 _MARGIN = 0.06
 """Margin beside the whiskers of sizes, as a share of their range. Chosen: no dot is cut."""
+_PLOTTED_POINTS = 3000
+"""Largest number of plots.points of a line. Chosen: more than a wide screen has columns."""
+_INK, _EFFECT_COLOUR = '#1f2933', '#5b8fd6'
+_CURVE_COLOURS = {'recorded': _INK, 'stated noise': plots.QUIET_COLOUR} | dict.fromkeys(
+    ('before', 'without the effect'), plots.BEFORE_COLOUR) | dict.fromkeys(
+        ('after', 'with the effect'), plots.AFTER_COLOUR)
 
 
 @dataclass(frozen=True)
@@ -61,19 +39,8 @@ class Run:
     """
     What the page says about the run that made it.
 
-    Attributes
-    ----------
-    subject
-        What is compared with what.
-    parameter_file
-        The parameter file of the simulation.
-    steps : list of tuple
-        What to do next: purpose and command.
-    parameters_text
-        Text of the new parameter file; empty for none.
-    command
-        Command that makes the page; empty for that of this process.
-
+    `steps` are what to do next, purpose and command; `command` makes the page, and is empty for
+    that of this process.
     """
 
     subject: str
@@ -84,119 +51,61 @@ class Run:
 
 
 def page(diagnosis: Diagnosis, run: Run) -> str:
-    """
-    Lay out the page.
-
-    Parameters
-    ----------
-    diagnosis
-        The diagnosis.
-    run
-        The run that made it.
-
-    Returns
-    -------
-    str
-        The page, HTML.
-
-    Raises
-    ------
-    UserError
-        Plotly or jinja2 is not installed.
-
-    """
+    """Lay out the page; raise UserError where Plotly or jinja2 is not installed."""
     html_page.check_libraries()
-    report = as_json(diagnosis)
-    status = report['verdict']['status']
+    objects = words.as_json(diagnosis)
     values: dict[str, Any] = {
-        'title': run.subject,
-        'about': [f'parameter file {run.parameter_file}'],
-        'badge': {'colour': _COLOURS[status], 'word': badge(diagnosis),
-                  'sentence': _sentence(diagnosis, report)},
-        'notes': notes(diagnosis), 'figures': {}, 'has_verdict': False,
+        'title': run.subject, 'about': [f'parameter file {run.parameter_file}'],
+        'badge': {'colour': _COLOURS[objects['verdict']['status']],
+                  'word': words.badge(diagnosis), 'sentence': words.headline(diagnosis)},
+        'notes': words.notes(diagnosis), 'figures': {}, 'has_verdict': False,
         'download': run.parameters_text and html_page.download_url(run.parameters_text)}
     if run.command:
         values['command'] = run.command
-    if diagnosis.data_fault is None and diagnosis.verdict is not None:
-        values |= _contents(diagnosis, report) | {'steps': run.steps}
+    if diagnosis.report is not None:
+        values |= _contents(diagnosis, diagnosis.report, objects) | {'steps': run.steps}
     return html_page.render('adxl_ros.diagnose', 'diagnosis.html', values)
 
 
-def _sentence(diagnosis: Diagnosis, report: dict[str, Any]) -> str:
-    """Return the verdict in one sentence beside its badge."""
-    status = report['verdict']['status']
-    if status == 'no_gap':
-        return 'The recording agrees with its simulation within the noise.'
-    if status != 'explained':
-        return headline(diagnosis)
-    assert diagnosis.gap_closure is not None and diagnosis.verdict is not None
-    closure, effects = diagnosis.gap_closure, listed(report['verdict']['effects'], 'and')
-    if is_only_noise(diagnosis):
-        return f'{effects}. {NOISE_STAYS}'
-    return (f'{effects}: the difference falls from {mg_text(closure.before_mps2)} '
-            f'to {mg_text(closure.after_mps2)} rms.{concern_text(diagnosis.verdict)}')
-
-
-def _contents(diagnosis: Diagnosis, report: dict[str, Any]) -> dict[str, Any]:
+def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> dict[str, Any]:
     """Return what the template shows of a diagnosis with a verdict."""
-    assert diagnosis.verdict is not None
-    named = named_effects(diagnosis, report)
-    candidates = report['candidates']
-    probable = [c for c in candidates if (c['probability'] or 0.0) >= PROBABLE]
-    probable.sort(key=lambda c: named.index(c['effect']) if c['effect'] in named else len(named))
-    refuted = [c for c in candidates if (c['probability'] or 0.0) < PROBABLE]
-    after = diagnosis.verdict.best.sensor
-    proofs = _proofs(diagnosis, probable)
-    figures = {'waterfall': page_figures.waterfall(diagnosis),
-               'signals': page_figures.signals(diagnosis.comparisons[0], after),
-               'spectrum': page_figures.gap_spectrum(diagnosis.full_rate[0], after),
-               'map': page_figures.residual_map(diagnosis.residual_cells)}
-    figures |= {f'proof-{p.effect}': page_figures.proof(p) for p in proofs}
-    noisy = bool(report['noise_remainders'])
+    named, proposal = named_effects(report, objects), objects['next_experiment']
+    shown = [c for c in objects['candidates']
+             if c['effect'] in named or c['probability'] >= words.PROBABLE]
+    shown.sort(key=lambda c: named.index(c['effect']) if c['effect'] in named else len(named))
+    after, full_rate = report.verdict.best.sensor, diagnosis.full_rate[0]
+    proofs = [where.prove(c['effect'], diagnosis.comparisons[0], full_rate, sensor)
+              for c in shown if (sensor := _sensor_with(report, c['effect'])) is not None]
+    rows, scale = words.figure_rows(diagnosis), float(report.baseline.scale_v_per_g.mean())
     return {
         'has_verdict': True,
-        'figures': figures,
-        'tiles': tiles(diagnosis),
-        'effects': [_effect(c, noisy) for c in probable],
-        'refuted': [[c['effect'], p_text(c['probability'] or 0.0), c['cause']] for c in refuted],
+        'figures': {'waterfall': waterfall(report), 'map': residual_map(report.residual_cells),
+                    'signals': signals(diagnosis.comparisons[0], after),
+                    'spectrum': gap_spectrum(full_rate, after),
+                    **{f'proof-{p.effect}': proof(p) for p in proofs}},
+        'tiles': rows[:3] + [r for r in rows[3:] if r.label in (
+            'upper limit', 'explained', 'repeats, not explained')][:4 - len(rows[:3])],
+        'effects': [_effect(c, report) for c in shown],
         'proofs': [{'effect': p.effect, 'text': _proof_text(p)} for p in proofs],
-        'gap_rows': gap_rows(diagnosis),
-        'remainders': remainder_rows(diagnosis),
-        'converged': diagnosis.verdict.best.converged,
-        'groups': [' or '.join(group) for group in report['verdict']['groups']],
-        'hypotheses': [[', '.join(h['effects']) or 'no gap', p_text(h['probability'])]
-                       for h in report['hypotheses'] if h['probability'] >= PROBABLE],
-        'refuted_hypotheses': [
-            [', '.join(h['effects']) or 'no gap', p_text(h['probability'])]
-            for h in report['hypotheses'] if h['probability'] < PROBABLE],
-        'cells': _cell_rows(report),
-        'not_covered': report['not_covered'],
-        'noise': _noise_rows(report),
-        'menu': _menu_rows(report),
-    }
+        'figure_rows': rows, 'remainders': [row[:2] for row in words.remainder_rows(report)],
+        'converged': report.verdict.best.converged,
+        'hypotheses': [[', '.join(h['effects']) or 'no gap', percent(h['probability'])]
+                       for h in objects['hypotheses']],
+        'not_covered': objects['not_covered'], 'noise': _noise_rows(objects),
+        'menu': [[m['manoeuvre'], f'{m["minutes"]:.1f}', f'{m["nats_per_minute"]:.2g}']
+                 for m in proposal['menu']] if proposal else [],
+        'could_show': [(row.shows, *words.shown_row(row, scale))
+                       for row in by_effect(report.could_show).values()]}
 
 
-def _proofs(diagnosis: Diagnosis, candidates: Sequence[dict[str, Any]]) -> list[EffectProof]:
-    """Prove the effects that the page shows, as far as the fitted sensor has them."""
-    assert diagnosis.verdict is not None
-    detected = {d.effect for d in diagnosis.detections}
-    proofs = []
-    for candidate in candidates:
-        effect = candidate['effect']
-        sensor = _sensor_with(diagnosis, effect, effect in detected)
-        if sensor is not None:
-            proofs.append(prove(effect, diagnosis.comparisons[0], diagnosis.full_rate[0], sensor))
-    return proofs
-
-
-def _sensor_with(diagnosis: Diagnosis, effect: str, detected: bool) -> Sensor | None:
+def _sensor_with(report: Report, effect: str) -> Sensor | None:
     """Return the most probable fitted sensor that has an effect; None without one."""
-    if detected and diagnosis.sensor is not None and effect in diagnosis.sensor.effects:
-        return diagnosis.sensor
-    return next((h.sensor for h in diagnosis.hypotheses if effect in h.effects), None)
+    if any(d.effect == effect for d in report.detections) and effect in report.sensor.effects:
+        return report.sensor
+    return next((h.sensor for h in report.hypotheses if effect in h.effects), None)
 
 
-def _proof_text(evidence: EffectProof) -> str:
+def _proof_text(evidence: where.EffectProof) -> str:
     """Explain the proof of an effect in one sentence."""
     if evidence.binned:
         return ('Points: recording minus a simulation with all other effects, with 90 % bars. '
@@ -207,70 +116,171 @@ def _proof_text(evidence: EffectProof) -> str:
         'The effect is there if the spectrum of the difference falls from red to green.'
 
 
-def _effect(candidate: dict[str, Any], noisy: bool) -> dict[str, Any]:
-    """Return the row of an effect."""
-    effect = effect_named(candidate['effect'])
-    stated = {p.name: p for p in effect.parameters}
-    parameters = candidate['parameters']
-    is_single = len({name.partition('.')[0] for name in parameters}) == 1
-    return {
-        'name': effect.name,
-        'sure': probability_text(candidate['probability'] or 0.0),
-        'share': '' if candidate['share'] is None else
-                 f'{percent(candidate["share"], noisy)} % of the gap',
-        'cause': effect.cause,
-        'rivals': candidate['inseparable_from'],
-        'does': (effect.apply.__doc__ or '').strip().split('\n')[0],
-        'meaning': [[p.name, p.unit, p.doc] for p in effect.parameters],
-        'sizes': [_size(parameter_label(name, is_single), parameter,
-                        stated[name.partition('.')[0]], parameters)
-                  for name, parameter in parameters.items()]}
+def _effect(candidate: dict[str, Any], report: Report) -> dict[str, Any]:
+    """Return one effect with its sizes, as dot and plots.whisker where they have an interval."""
+    effect, parameters = effect_named(candidate['effect']), candidate['parameters']
+    stated, sizes = {p.name: p for p in effect.parameters}, []
+    is_single = len({key.partition('.')[0] for key in parameters}) == 1
+    for key, parameter in parameters.items():
+        text = words.parameter_text(parameter, axis_scale(report, key))
+        mark = None
+        if parameter.get('ci'):
+            ends = [v for p in parameters.values() if p.get('ci')
+                    and p['unit'] == parameter['unit'] for v in p['ci']]
+            low, high = min(0.0, *ends), max(0.0, *ends)
+            margin = _MARGIN * (high - low)
+            mark = plots.whisker(parameter['value'], parameter['ci'][0], parameter['ci'][1],
+                                 (low - margin, high + margin), text)
+        sizes.append({'label': words.parameter_label(key, is_single) or 'size', 'text': text,
+                      'doc': stated[key.partition('.')[0]].doc, 'mark': mark})
+    return {'name': effect.name, 'sure': percent(candidate['probability']),
+            'share': '' if candidate['share'] is None else
+            f'{percent(candidate["share"])} of the gap', 'cause': effect.cause,
+            'rivals': candidate['inseparable_from'], 'sizes': sizes}
 
 
-def _size(label: str, parameter: dict[str, Any], stated: Parameter,
-          parameters: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
-    """Return one size of an effect, with its whisker where it has an interval."""
-    text = parameter_text(parameter)
-    size: dict[str, Any] = {'label': label or 'size', 'doc': stated.doc, 'text': text,
-                            'mark': None}
-    if parameter.get('ci'):
-        comparable = [p for p in parameters.values() if p.get('ci') and p['unit'] == stated.unit]
-        low = min(0.0, *(p['ci'][0] for p in comparable))
-        high = max(0.0, *(p['ci'][1] for p in comparable))
-        margin = _MARGIN * (high - low)
-        size['mark'] = plotly_figures.whisker(
-            parameter['value'], parameter['ci'][0], parameter['ci'][1],
-            (low - margin, high + margin), text)
-    return size
-
-
-def _cell_rows(report: dict[str, Any]) -> list[list[str]]:
-    """Return the significant cells with the largest shares."""
-    rows = []
-    for c in report['where'][:_CELL_ROWS]:
-        low, high = c['range']
-        rows.append([c['axis'], c['dimension'], c['statistic'], range_text(low, high),
-                     f'{mg(c["mean"]):+.2f}', f'{c["floor_units"]:+.1f}',
-                     f'{100 * c["share"]:.1f} %', p_text(c['p'])])
-    return rows
-
-
-def _noise_rows(report: dict[str, Any]) -> list[list[str]]:
+def _noise_rows(objects: dict[str, Any]) -> list[list[str]]:
     """Return ratios of recorded and simulated noise, before and after."""
     rows = []
-    for noise in report['gap']['noise']:
-        names = [f'{low:.3g} to {high:.3g} Hz' for low, high in pairwise(noise['bands_hz'])]
-        names += [f'Allan deviation at {t:g} s' for t in noise['allan_s']]
-        before, after = ([*noise[f'power_ratio_{when}'], *noise[f'allan_ratio_{when}']]
+    for ratios in objects['gap']['noise']:
+        names = [f'{low:.3g} to {high:.3g} Hz' for low, high in pairwise(ratios['bands_hz'])]
+        names += [f'Allan deviation at {t:g} s' for t in ratios['allan_s']]
+        before, after = ([*ratios[f'power_ratio_{when}'], *ratios[f'allan_ratio_{when}']]
                          for when in ('before', 'after'))
         rows += [[name, f'{b:.2f}', f'{a:.2f}'] for name, b, a in zip(names, before, after)]
-        rows.append(['gain of log likelihood', '', f'{noise["log_likelihood_gain"]:.0f}'])
     return rows
 
 
-def _menu_rows(report: dict[str, Any]) -> list[list[str]]:
-    """Return the manoeuvres that would separate hypotheses, the best first."""
-    proposal = report['next_experiment']
-    return [] if proposal is None else [
-        [m['manoeuvre'], f'{m["minutes"]:.1f}', f'{m["nats_per_minute"]:.2g}']
-        for m in proposal['menu']]
+def waterfall(report: Report) -> Figure:
+    """Draw the gap, what each effect takes off it, what stays, and the noise floor."""
+    closure = report.closure
+    before, after, floor = (float(mg(v)) for v in (
+        closure.before_mps2, closure.after_mps2, closure.floor_mps2))
+    bars = [('gap', 0.0, before, mg_text(closure.before_mps2), plots.BEFORE_COLOUR)]
+    level = before
+    for name, share in sorted(words.shares_of_gap(report).items(), key=lambda item: -item[1]):
+        if share > 0:
+            lower = max(level ** 2 - share * (before ** 2 - floor ** 2), 0.0) ** 0.5
+            bars.append((name, lower, level - lower, percent(share), _EFFECT_COLOUR))
+            level = lower
+    if len(bars) > 1:
+        bars.append(('what is left', 0.0, after, mg_text(closure.after_mps2), plots.AFTER_COLOUR))
+    bars.append(('noise floor', 0.0, floor, mg_text(closure.floor_mps2), plots.QUIET_COLOUR))
+    labels, base, width, text, colours = zip(*bars)
+    trace = {'type': 'bar', 'width': 0.62, 'orientation': 'h', 'y': labels, 'x': rounded(width),
+             'base': rounded(base), 'text': text, 'textposition': 'outside', 'cliponaxis': False,
+             'marker': {'color': colours}, 'hovertemplate': '%{y}: %{text}<extra></extra>',
+             'showlegend': False}
+    return figure([trace], 60 + 38 * len(labels), xaxis={
+        'title': {'text': 'rms, mg'}, 'range': [0, 1.2 * max(before, after, floor)]},
+        yaxis={'autorange': 'reversed', 'ticks': '', 'type': 'category'})
+
+
+def proof(evidence: where.EffectProof) -> Figure:
+    """Draw means over the variable with the line of the model, or curves."""
+    if not evidence.binned:
+        unit = 'mg/√Hz' if evidence.is_spectrum else 'samples'
+        return _panels(evidence.curves, evidence.variable, unit, evidence.is_spectrum)
+    traces = []
+    for binned in evidence.binned:
+        colour, order = plots.AXIS_COLOURS[binned.axis], np.argsort(binned.variable)
+        traces += [plots.points(binned.variable, binned.residual_mg, binned.half_width_mg,
+                                f'{binned.axis} recorded', colour),
+                   line(binned.variable[order], binned.model_mg[order], f'{binned.axis} model',
+                        colour)]
+    return figure(traces, 300, xaxis={'title': {'text': evidence.variable}},
+                  yaxis={'title': {'text': 'recording minus simulation, mg'}},
+                  margin={'l': 8, 'r': 12, 't': 36, 'b': 8})
+
+
+def _panels(curves: Sequence[where.Curve], title: str, unit: str, is_log: bool) -> Figure:
+    """Draw curves in one panel for each axis, below each other."""
+    axes = list(dict.fromkeys(curve.axis for curve in curves))
+    traces, layout = [], {}
+    for number, axis in enumerate(axes, 1):
+        for curve in (c for c in curves if c.axis == axis):
+            positive = curve.y > 0
+            traces.append(line(curve.x[positive], curve.y[positive], curve.label,
+                               _CURVE_COLOURS[curve.label], xaxis='x',
+                               yaxis=plots.axis_number('y', number), legendgroup=curve.label,
+                               showlegend=number == 1))
+        layout[plots.axis_number('yaxis', number)] = {
+            'title': {'text': f'{axis}, {unit}'}, 'domain': _domain(number, len(axes)),
+            **plots.log_axis(np.concatenate([c.y for c in curves if c.axis == axis]))}
+    return figure(traces, 60 + 190 * len(axes), margin={'l': 8, 'r': 12, 't': 36, 'b': 8},
+                  xaxis={'title': {'text': title}, 'anchor': plots.axis_number('y', len(axes)),
+                         **(plots.log_axis(curves[0].x) if is_log else {})}, **layout)
+
+
+def _domain(number: int, count: int) -> list[float]:
+    """Return the vertical range of a panel, from the top; there is a gap between panels."""
+    height = (1 + 0.08) / count - 0.08
+    top = 1 - (number - 1) * (height + 0.08)
+    return [max(top - height, 0.0), top]
+
+
+def signals(comparison: BaselineComparison, after: Sensor) -> Figure:
+    """Draw recording, simulation and difference, before and after, with linked zoom."""
+    time_s, scale = comparison.time_s - comparison.time_s[0], comparison.scale_v_per_mps2
+    before_mg, after_mg = (mg(comparison.residual_v(s) / scale)
+                           for s in (comparison.sensor, after))
+    recorded_g = mg((comparison.volts - comparison.sensor.zero_g_v) / scale) / 1e3
+    axes, traces, layout = comparison.sensor.axes, [], {}
+    panels: Mapping[str, Sequence[tuple[str, np.ndarray, str]]] = {
+        '{}, g': [('recording', recorded_g, _INK),
+                  ('simulation before', recorded_g - before_mg / 1e3, plots.BEFORE_COLOUR),
+                  ('simulation after', recorded_g - after_mg / 1e3, plots.AFTER_COLOUR)],
+        'difference {}, mg': [('difference before', before_mg, plots.BEFORE_COLOUR),
+                              ('difference after', after_mg, plots.AFTER_COLOUR)]}
+    count = len(panels) * len(axes)
+    for i, (d, label) in enumerate(((d, label) for d in range(len(axes)) for label in panels), 1):
+        for name, values, colour in panels[label]:
+            chosen = plots.extremes(values[:, d], _PLOTTED_POINTS)
+            traces.append(line(time_s[chosen], values[chosen, d], name, colour, xaxis='x',
+                               yaxis=plots.axis_number('y', i), legendgroup=name,
+                               showlegend=d == 0, opacity=0.8))
+        layout[plots.axis_number('yaxis', i)] = {'title': {'text': label.format(axes[d])},
+                                                 'domain': _domain(i, count), 'nticks': 5}
+    return figure(traces, 80 + 150 * count, margin={'l': 8, 'r': 12, 't': 60, 'b': 8}, xaxis={
+        'title': {'text': 'time, s'}, 'anchor': plots.axis_number('y', count)}, **layout)
+
+
+def gap_spectrum(comparison: BaselineComparison, after: Sensor) -> Figure:
+    """Draw the spectrum of the gap before and after, and the stated noise."""
+    curves = [*where.spectra(comparison, comparison.residual_v(comparison.sensor), 'before'),
+              *where.spectra(comparison, comparison.residual_v(after), 'after')]
+    frequency_hz = curves[0].x
+    stated = mg(np.sqrt(noise.density_v2_per_hz(comparison.sensor, frequency_hz))
+                / comparison.scale_v_per_mps2)
+    curves += [where.Curve(axis, 'stated noise', frequency_hz, stated[:, d])
+               for d, axis in enumerate(comparison.sensor.axes)]
+    return _panels(curves, 'frequency, Hz', 'mg/√Hz', True)
+
+
+def residual_map(cells: Sequence[where.ResidualCell]) -> Figure:
+    """Draw the mean residual over ranges of all dimensions; significant cells have a dot."""
+    means = [c for c in cells if c.dimension != 'frequency_hz']
+    labels, values, texts, marks = [], [], [], []
+    for name, axis in sorted({(c.dimension, c.axis) for c in means}):
+        row = sorted((c for c in means if (c.dimension, c.axis) == (name, axis)),
+                     key=lambda c: c.low)
+        in_degrees = 'rad' in name
+        unit = name.rpartition('_')[2] if not in_degrees else '°/s' if 'rate' in name else '°'
+        factor = float(np.degrees(1.0)) if in_degrees else 1.0
+        labels.append(f'{name.split("_rad")[0].replace("_", " ")}: {axis}')
+        pad = [None] * (where.RANGES - len(row))
+        values.append([*rounded([mg(c.mean_mps2) for c in row]), *pad])
+        texts.append([f'{factor * c.low:.4g} to {factor * c.high:.4g} {unit}' for c in row] + pad)
+        marks += [(i, labels[-1]) for i, c in enumerate(row) if c.p < where.SIGNIFICANT_P]
+    largest = float(max((abs(mg(c.mean_mps2)) for c in means), default=1.0))
+    heat = {'type': 'heatmap', 'y': labels, 'x': list(range(where.RANGES)), 'z': values,
+            'text': texts, 'hovertemplate': '%{y}, %{text}<br>mean %{z:.3~g} mg<extra></extra>',
+            'colorscale': 'RdBu', 'zmin': -largest, 'zmax': largest, 'xgap': 2, 'ygap': 2,
+            'colorbar': {'title': {'text': 'mg'}, 'thickness': 12}}
+    dots = {'type': 'scatter', 'mode': 'markers', 'x': [i for i, _ in marks],
+            'y': [label for _, label in marks], 'hoverinfo': 'skip', 'showlegend': False,
+            'marker': {'color': _INK, 'size': 5}}
+    return figure([heat, dots], 80 + 22 * len(labels), xaxis={
+        'showticklabels': False, 'showgrid': False, 'zeroline': False,
+        'title': {'text': 'parts of the range, ascending'}},
+        yaxis={'type': 'category', 'showgrid': False, 'dtick': 1})

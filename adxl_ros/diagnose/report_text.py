@@ -1,341 +1,150 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
-
+# SPDX-License-Identifier: Apache-2.0
 """The diagnosis as a screen of text for a terminal of 80 columns."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from textwrap import wrap
-from typing import Any, NamedTuple
+from typing import Any
 
-from adxl_ros.diagnose.diagnosis import Diagnosis
+from adxl_ros.diagnose import report as words
+from adxl_ros.diagnose.diagnosis import Diagnosis, Report
 from adxl_ros.diagnose.noise_detectors import UNKNOWN
-from adxl_ros.diagnose.report_json import as_json, notes, PROBABLE
-from adxl_ros.diagnose.report_wording import (
-    closed_text,
-    closes,
-    concern,
-    floor_source,
-    headline,
-    is_only_noise,
-    listed,
-    lost_text,
-    mg,
-    mg_text,
-    NOISE_STAYS,
-    parameter_text,
-    pose_is_compared,
-    probability_text,
-    range_text,
-    remainder_rows,
-    Row,
-)
-from adxl_ros.model.effects.base import Concern
-import numpy as np
+from adxl_ros.diagnose.visibility import by_effect
 
 COLUMNS = 79
 """Columns of text. Chosen: a terminal of 80 columns."""
-_BADGE_COLUMNS = 28
-"""Columns of the verdict before the figures of the gap."""
-_VALUE_COLUMNS = 26
-"""Columns of the gap before and after."""
-_LABEL_COLUMNS = 9
-"""Columns of the words before rows of text."""
-_SURE_COLUMNS = 8
-"""Columns of a probability in the table of effects."""
-_SHARE_COLUMNS = 7
-"""Columns of a share of the gap in the table of effects."""
-_MOST_CELLS = 3
-"""Places of the gap that the screen names. Chosen: all of it fits on one screen."""
-_MOST_OTHERS = 3
-"""Further hypotheses on the screen. Chosen: all of it fits on one screen."""
-_UNIT_SUFFIXES = ('m', 's', 'rad', 'v', 'hz', 'f', 'g')
-"""Ends of parameter names that repeat the unit of the value."""
-_DIMENSIONS = {
-    'frequency_hz': '{} Hz', 'temperature_c': '{} °C', 'supply_v': 'supply {} V',
-    'time_s': '{} s from the start', 'since_move_s': '{} s after a move',
-    'alpha_rad': 'alpha {}°', 'beta_rad': 'beta {}°', 'rate_rad_s': '{} °/s'}
-"""Text of a range by dimension; others have their names before it."""
-
-
-class _EffectRow(NamedTuple):
-    """
-    An effect in the table.
-
-    Attributes
-    ----------
-    name
-        Its name.
-    sure
-        Its probability as text.
-    sizes
-        Its parameters, one line each.
-    share
-        Its share of the gap as text.
-
-    """
-
-    name: str
-    sure: str
-    sizes: list[str]
-    share: str
+_BADGE_COLUMNS, _GAP_COLUMNS, _LABEL_COLUMNS = 29, 24, 9
+"""Columns of the verdict, of the gap before and after, and of the words before rows of text."""
+_SURE_COLUMNS, _SHARE_COLUMNS = 8, 7
+"""Columns of the table of effects."""
+_MOST_SHOWN, _MOST_HIDDEN, _MOST_OTHERS = 4, 4, 3
+"""Effects that the screen lists; the page has all of them."""
 
 
 def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
-    """
-    Return the diagnosis as lines: verdict, gap, effects, places and causes.
-
-    Parameters
-    ----------
-    diagnosis
-        The diagnosis.
-    subject
-        What is compared with what, for the first line.
-
-    Returns
-    -------
-    list of str
-        Lines of at most `COLUMNS` columns.
-
-    """
-    lines = [*_wrapped(subject), '']
-    note_lines = [line for note in notes(diagnosis) for line in _row_lines('note', note)]
-    if diagnosis.data_fault is not None:
-        word = badge(diagnosis)
-        return [*lines, *_wrapped(f'{word}  {diagnosis.data_fault.message}', len(word) + 2),
-                *note_lines]
-    report = as_json(diagnosis)
-    lines += _gap_lines(diagnosis)
-    table = _effect_table(diagnosis, report)
-    if table:
-        lines += ['', *table]
-    if diagnosis.noise_remainders or report['where'] or note_lines:
-        lines.append('')
-    for i, row in enumerate(remainder_rows(diagnosis)):
-        lines += _row_lines('' if i else 'noise', f'{row.label}: {row.text}')
-    lines += _where_lines(report['where'])
-    lines += _cause_lines(named_effects(diagnosis, report), report)
+    """Return the diagnosis as lines of at most `COLUMNS` columns; the first one is the subject."""
+    lines, word, report = [*_wrapped(subject), ''], words.badge(diagnosis), diagnosis.report
+    note_lines = [line for note in words.notes(diagnosis) for line in _row_lines('note', note)]
+    if report is None:
+        lines += _wrapped(f'{word}  {words.headline(diagnosis)}', len(word) + 2)
+        return lines + note_lines
+    objects = words.as_json(diagnosis)
+    rows = words.figure_rows(diagnosis)
+    lines += _verdict_lines(diagnosis, report)
+    lines += _effect_table(report, objects)
+    # The gap, with the effects, and the floor stand in the first line.
+    first = 3 if words.closes(report) else 2
+    figures = [f'{row.label} {row.text}' for row in rows[first:]]
+    lines += ['', *_row_lines('figures', '; '.join(figures))]
+    lines += [line for i, row in enumerate(words.remainder_rows(report))
+              for line in _row_lines('' if i else 'noise', f'{row.label}: {row.text}')]
+    lines += _row_lines('shows', shown_text(report))
+    named, causes = named_effects(report, objects), {
+        c['effect']: c['cause'] for c in objects['candidates']}
+    width = max(map(len, named), default=0) + 2
+    lines += [line for i, name in enumerate(named)
+              for line in _row_lines('' if i else 'cause', f'{name:{width}}{causes[name]}',
+                                     _LABEL_COLUMNS + width)]
     return lines + note_lines
 
 
-def _gap_lines(diagnosis: Diagnosis) -> list[str]:
+def _verdict_lines(diagnosis: Diagnosis, report: Report) -> list[str]:
     """Return verdict and gap, and what the verdict means where that is not plain."""
-    assert diagnosis.verdict is not None and diagnosis.gap_closure is not None
-    closure = diagnosis.gap_closure
-    values = f'{mg_text(closure.before_mps2)} rms'
-    further = []
-    if closes(diagnosis):
-        values = f'{mg_text(closure.before_mps2)} -> {mg_text(closure.after_mps2)} rms'
-        further.append(f'{closed_text(diagnosis)} closed on held-out blocks')
-    if diagnosis.lost_motion_mps2:
-        further += wrap(f'the reference lacks {lost_text(diagnosis)}', COLUMNS - _BADGE_COLUMNS)
-    parts = f'zero-g {mg_text(closure.zero_g_mps2)}, drift {mg_text(closure.drift_mps2)}; ' \
-        if pose_is_compared(diagnosis) else 'the pose is unknown, so the mean is not compared; '
-    further += wrap(f'{parts}floor {floor_source(diagnosis)}', COLUMNS - _BADGE_COLUMNS)
-    lines = [f'{badge(diagnosis):{_BADGE_COLUMNS - 1}} {values:{_VALUE_COLUMNS - 1}} '
-             f'noise floor {mg_text(closure.floor_mps2)}',
-             *(f'{"":{_BADGE_COLUMNS}}{line}' for line in further)]
-    concerns = concern(diagnosis.verdict) or ''
-    if diagnosis.verdict.status in ('inseparable', 'unknown', 'insufficient') \
-            or Concern.REFERENCE.value in concerns:
-        lines += _wrapped(headline(diagnosis))
-    if is_only_noise(diagnosis):
-        lines += _wrapped(NOISE_STAYS)
+    closure, verdict = report.closure, report.verdict
+    gap = f'{words.mg_text(closure.before_mps2)} rms'
+    if words.closes(report):
+        gap = f'{words.mg_text(closure.before_mps2)} -> {words.mg_text(closure.after_mps2)} rms'
+    rows = {row.label: row for row in words.figure_rows(diagnosis)}
+    lines = [f'{words.badge(diagnosis):{_BADGE_COLUMNS - 1}} {gap:{_GAP_COLUMNS - 1}} '
+             f'noise floor {words.mg_text(closure.floor_mps2)}']
+    remarks = [rows['with the effects'].note] if words.closes(report) else \
+        [] if 'sim' in rows['gap'].note else [f'gap {rows["gap"].note}']
+    remarks.append(f'noise floor {rows["noise floor"].note}')
+    lines += [f'{"":{_BADGE_COLUMNS}}{line}' for remark in remarks
+              for line in wrap(remark, COLUMNS - _BADGE_COLUMNS)]
+    if verdict.status != 'explained' or 'REFERENCE' in words.badge(diagnosis):
+        lines += _wrapped(words.headline(diagnosis))
+    elif words.is_only_noise(report):
+        lines += _wrapped(words.NOISE_STAYS)
     return lines
 
 
-def badge(diagnosis: Diagnosis) -> str:
-    """Return the verdict in a few words."""
-    if diagnosis.data_fault is not None:
-        return 'BAD DATA' if diagnosis.data_fault.status == 'bad_data' else 'TOO LITTLE DATA'
-    assert diagnosis.verdict is not None
-    verdict = diagnosis.verdict
-    count = len(verdict.effects) + len(verdict.groups)
-    sure = probability_text(verdict.probability)
-    if verdict.status == 'no_gap':
-        return f'NO GAP ({sure} sure)'
-    if verdict.status == 'insufficient':
-        return 'TOO LITTLE DATA'
-    if verdict.status == 'unknown':
-        return f'UNKNOWN CAUSE ({sure})'
-    if verdict.status == 'inseparable':
-        return 'CAUSES NOT SEPARATED'
-    if concern(verdict) == Concern.REFERENCE.value:
-        return 'ERROR OF THE REFERENCE'
-    return f'GAP EXPLAINED by {count} effect{"" if count == 1 else "s"}'
+def shown_text(report: Report) -> str:
+    """Return how many effects would have shown, some of them, and some that could not."""
+    rows = by_effect(report.could_show)
+    scale = float(report.baseline.scale_v_per_g.mean())
+    named = {*report.verdict.effects, *sum(report.verdict.groups, ())}
+    shown = [f'{name} from {words.shown_row(row, scale)[2]}' for name, row in rows.items()
+             if row.shows and name not in named]
+    hidden = [name for name, row in rows.items() if not row.shows]
+    text = f'{sum(r.shows for r in rows.values())} of {len(rows)} effects could show'
+    if shown:
+        text += f': {", ".join(shown[:_MOST_SHOWN])}, ...'
+    if hidden:
+        more = ', ...' if len(hidden) > _MOST_HIDDEN else ''
+        text += f'; could not: {", ".join(hidden[:_MOST_HIDDEN])}{more}'
+    return text
 
 
-def named_effects(diagnosis: Diagnosis, report: dict[str, Any]) -> list[str]:
-    """
-    Return the effects of the verdict, or the nearest ones to something unknown, by share.
-
-    Parameters
-    ----------
-    diagnosis
-        The diagnosis.
-    report
-        Its objects of JSON.
-
-    Returns
-    -------
-    list of str
-        Names of effects.
-
-    """
-    assert diagnosis.verdict is not None
-    verdict = diagnosis.verdict
-    named = [*verdict.effects, *(effect for group in verdict.groups for effect in group)]
-    if verdict.status == 'unknown':
-        named = list(verdict.best.effects)
-    shares = {c['effect']: c['share'] or 0.0 for c in report['candidates']}
+def named_effects(report: Report, objects: dict[str, Any]) -> list[str]:
+    """Return the effects of the verdict by their share of the gap."""
+    named = [*report.verdict.effects, *sum(report.verdict.groups, ())]
+    shares = {c['effect']: c['share'] or 0.0 for c in objects['candidates']}
     return sorted((name for name in dict.fromkeys(named) if name in shares),
                   key=lambda name: -shares[name])
 
 
-def _effect_table(diagnosis: Diagnosis, report: dict[str, Any]) -> list[str]:
+def _effect_table(report: Report, objects: dict[str, Any]) -> list[str]:
     """Lay out the named effects, and the probable ones that are not named."""
-    assert diagnosis.verdict is not None
-    named = named_effects(diagnosis, report)
-    candidates = {c['effect']: c for c in report['candidates']}
-    named_rows = [_effect_row(candidates[name]) for name in named]
-    others = _others(diagnosis, report, named)
-    if not named_rows:
-        return _other_lines(others)
-    width = max(map(len, named)) + 2
-    title = 'nearest effect' if diagnosis.verdict.status == 'unknown' else 'effect'
-    width = max(width, len(title) + 2)
-    size_columns = COLUMNS - 1 - width - _SURE_COLUMNS - _SHARE_COLUMNS
-    head = (f' {title:{width}}{"sure":{_SURE_COLUMNS}}{"size (90 % interval)":{size_columns - 6}}'
-            ' share of gap')
-    lines = [head]
-    for row in named_rows:
-        sizes = [line for size in row.sizes
+    named = named_effects(report, objects)
+    candidates = {c['effect']: c for c in objects['candidates']}
+    others = [(c['probability'], name) for name, c in candidates.items()
+              if name not in named and c['probability'] >= words.PROBABLE]
+    unknown = sum(h['probability'] for h in objects['hypotheses'] if UNKNOWN in h['effects'])
+    if unknown >= words.PROBABLE and report.verdict.status != 'unknown':
+        others.append((unknown, 'something unknown'))
+    lines = []
+    if named:
+        width = max(map(len, ('effect', *named))) + 2
+        size_columns = COLUMNS - 1 - width - _SURE_COLUMNS - _SHARE_COLUMNS
+        lines = ['', f' {"effect":{width}}{"sure":{_SURE_COLUMNS}}'
+                 f'{"size (90 % interval)":{size_columns - 6}} share of gap']
+    for name in named:
+        share, sure = candidates[name]['share'], words.percent(candidates[name]['probability'])
+        sizes = [line for size in size_lines(report, candidates[name])
                  for line in wrap(size, size_columns - 1, subsequent_indent='  ')] or ['']
-        lines.append(f' {row.name:{width}}{row.sure:{_SURE_COLUMNS}}{sizes[0]:{size_columns}}'
-                     f'{row.share:>{_SHARE_COLUMNS}}'.rstrip())
+        lines.append(f' {name:{width}}{sure:{_SURE_COLUMNS}}{sizes[0]:{size_columns}}'
+                     f'{"" if share is None else words.percent(share):>{_SHARE_COLUMNS}}'.rstrip())
         lines += [f'{"":{1 + width + _SURE_COLUMNS}}{size}' for size in sizes[1:]]
-    return lines + _other_lines(others)
-
-
-def _effect_row(candidate: dict[str, Any]) -> _EffectRow:
-    """Return the row of an effect."""
-    share = candidate['share']
-    return _EffectRow(candidate['effect'], probability_text(candidate['probability'] or 0.0),
-                      _sizes(candidate['parameters']),
-                      '' if share is None else f'{100 * share:.0f} %')
-
-
-def _sizes(parameters: dict[str, Any]) -> list[str]:
-    """Return one line for each parameter; those that may be 0 share the last line."""
-    names = {key.partition('.')[0] for key in parameters}
-    lines, zeros = [], []
-    for key, parameter in parameters.items():
-        label = parameter_label(key, len(names) == 1)
-        ci = parameter.get('ci')
-        if ci and ci[0] <= 0 <= ci[1]:
-            zeros.append(label)
-        else:
-            lines.append(f'{label} {parameter_text(parameter)}'.strip())
-    if zeros:
-        label = ', '.join(filter(None, zeros))
-        lines.append(f'{label}: not different from 0' if label else 'not different from 0')
+    if others:
+        texts = [f'{name} ({words.percent(p)})' for p, name in sorted(others, reverse=True)]
+        lines += [] if named else ['']
+        lines += _row_lines('', 'also possible: ' + words.listed(texts[:_MOST_OTHERS], 'and'), 1)
     return lines
 
 
-def parameter_label(key: str, is_single: bool) -> str:
-    """
-    Return the name of a parameter without its unit, or its axis where that is enough.
-
-    Parameters
-    ----------
-    key
-        Name of the parameter, with its axis.
-    is_single
-        Whether the effect has no other parameter.
-
-    Returns
-    -------
-    str
-        The label.
-
-    """
-    name, _, axis = key.partition('.')
-    stem, _, suffix = name.rpartition('_')
-    short = stem if stem and suffix in _UNIT_SUFFIXES else name
-    return axis if axis and is_single else f'{short} {axis}'.rstrip()
+def size_lines(report: Report, candidate: dict[str, Any]) -> list[str]:
+    """Return one line for each parameter; those that may be 0 share the last line."""
+    parameters = candidate['parameters']
+    is_single = len({key.partition('.')[0] for key in parameters}) == 1
+    lines, zeros = [], []
+    for key, parameter in parameters.items():
+        label, ci = words.parameter_label(key, is_single), parameter.get('ci')
+        if ci and ci[0] <= 0 <= ci[1]:
+            zeros.append(label)
+        else:
+            text = words.parameter_text(parameter, axis_scale(report, key))
+            lines.append(f'{label} {text}'.strip())
+    return lines + ([f'{", ".join(zeros)}: not different from 0'.removeprefix(': ')]
+                    if zeros else [])
 
 
-def _others(diagnosis: Diagnosis, report: dict[str, Any], named: Sequence[str]) -> list[Row]:
-    """Return the probabilities of what the verdict does not name, where they are not small."""
-    assert diagnosis.verdict is not None
-    rows = []
-    for candidate in report['candidates']:
-        probability = candidate['probability'] or 0.0
-        if candidate['effect'] not in named and probability >= PROBABLE:
-            rows.append((probability, candidate['effect']))
-    unknown = sum(h['probability'] for h in report['hypotheses'] if UNKNOWN in h['effects'])
-    if unknown >= PROBABLE and diagnosis.verdict.status != 'unknown':
-        rows.append((unknown, 'something unknown'))
-    return [Row(name, probability_text(probability))
-            for probability, name in sorted(rows, reverse=True)[:_MOST_OTHERS]]
-
-
-def _other_lines(others: Sequence[Row]) -> list[str]:
-    """Return what else is possible as one row of text."""
-    if not others:
-        return []
-    return _row_lines('', 'also possible: ' + listed([f'{row.label} ({row.text})'
-                                                      for row in others], 'and'), 1)
-
-
-def _where_lines(cells: Sequence[dict[str, Any]]) -> list[str]:
-    """Return where the gap shows, the largest shares first; one line for each range."""
-    axes_of_place: dict[str, list[str]] = {}
-    statistics: dict[str, str] = {}
-    for cell in cells:
-        place = _place_text(cell)
-        # The variance says little where the mean of the same range shows.
-        if statistics.setdefault(place, cell['statistic']) == cell['statistic']:
-            axes_of_place.setdefault(place, []).append(f'{cell["axis"]} {_size_text(cell)}')
-    places = list(axes_of_place.items())[:_MOST_CELLS]
-    return [line for i, (place, axes) in enumerate(places)
-            for line in _row_lines('' if i else 'where', f'{place}: {", ".join(axes)}')]
-
-
-def _place_text(cell: dict[str, Any]) -> str:
-    """Return the range of a cell with its dimension, angles in degrees."""
-    dimension, (low, high) = cell['dimension'], cell['range']
-    if 'rad' in dimension:
-        low, high = np.degrees([low, high])
-    return _DIMENSIONS.get(dimension, dimension.replace('_', ' ') + ' {}').format(
-        range_text(low, high))
-
-
-def _size_text(cell: dict[str, Any]) -> str:
-    """Return the size of a cell: a mean has a sign, variance and power are rms."""
-    size = float(mg(cell['mean']))
-    return f'{size:+.2f} mg' if cell['statistic'] == 'mean' else f'{size:.2f} mg rms'
-
-
-def _cause_lines(named: Sequence[str], report: dict[str, Any]) -> list[str]:
-    """Return the causes of effects, and what to do about them."""
-    causes = {c['effect']: c['cause'] for c in report['candidates']}
-    width = max(map(len, named), default=0) + 2
-    return [line for i, name in enumerate(named)
-            for line in _row_lines('' if i else 'cause', f'{name:{width}}{causes[name]}',
-                                   _LABEL_COLUMNS + width)]
+def axis_scale(report: Report, key: str) -> float:
+    """Return the scale factor, V/g, of the axis of a parameter; the mean one without an axis."""
+    axis = key.partition('.')[2]
+    scales = dict(zip(report.baseline.axes, report.baseline.scale_v_per_g))
+    return float(scales.get(axis, report.baseline.scale_v_per_g.mean()))
 
 
 def _row_lines(label: str, text: str, indent: int = _LABEL_COLUMNS) -> list[str]:
@@ -347,5 +156,6 @@ def _row_lines(label: str, text: str, indent: int = _LABEL_COLUMNS) -> list[str]
 
 def _wrapped(text: str, indent: int = 0) -> list[str]:
     """Wrap a text between words; further lines have an indent."""
-    return wrap(text, COLUMNS, subsequent_indent=indent * ' ', break_long_words=False,
-                break_on_hyphens=False)
+    texts: Sequence[str] = wrap(text, COLUMNS, subsequent_indent=indent * ' ',
+                                break_long_words=False, break_on_hyphens=False)
+    return list(texts)

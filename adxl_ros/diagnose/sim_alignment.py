@@ -1,17 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
-
+# SPDX-License-Identifier: Apache-2.0
 """
 Time shift between a recording and the specific force of another simulator.
 
@@ -24,8 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from adxl_ros.diagnose.baseline_comparison import compare
-from adxl_ros.diagnose.data_checks import DataFault, SHORTEST_S
+from adxl_ros.diagnose.comparison import compare, DataFault, SHORTEST_S, SMALLEST_MOTION_G
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import Sensor
@@ -48,16 +34,12 @@ motion that repeats fits at several shifts."""
 _LARGEST_ERROR_RATIO = 0.5
 """A shift shows if it reduces 1 − correlation below this share. Chosen: noise that is not shifted
 keeps it."""
-_SMALLEST_MOTION_G = 0.05
-"""Standard deviation of the specific force, g, below which nothing moves. Chosen: ten times the
-noise of an ADXL203."""
 _ROUNDS = 6
 """Gauss-Newton steps of the fine search. Chosen: the shift then changes by less than 1 µs."""
 _BLOCKS = 10
 """Blocks whose shifts show the error of their mean. Chosen: their scatter is known to 24 %."""
 _FINE_SAMPLES = 20_000
 """Largest number of samples of the fine search. Chosen: far below the error of the sensor."""
-
 _FINE_STD_S = 1e-3
 """Standard deviation of a shift, s, below which it is shown to 0.1 ms. Chosen: one digit more than
 the error."""
@@ -114,26 +96,7 @@ class AlignedForce:
 
 def align_force(recording: Recording, sensor: Sensor, sim: Motion, may_shift: bool
                 ) -> AlignedForce | DataFault:
-    """
-    Find the part of a recording that another simulator covers, and check their time.
-
-    Parameters
-    ----------
-    recording
-        The recording.
-    sensor
-        The baseline.
-    sim
-        Motion with the specific force of the simulator.
-    may_shift
-        Whether a shift is corrected (`--align`); otherwise it is a fault.
-
-    Returns
-    -------
-    AlignedForce or DataFault
-        What is compared, or why it cannot be.
-
-    """
+    """Find the part of a recording that another simulator covers, and check their time."""
     assert isinstance(sim.force, ForcePath)
     shift, notes = _find_shift(recording, sensor, sim.force), []
     if shift is not None and may_shift:
@@ -191,7 +154,7 @@ def _rough_shift(time_s: np.ndarray, measured_g: np.ndarray, force: ForcePath) -
     first_s, second_s = (np.arange(t[0], t[-1], step_s) for t in (time_s, sim_s))
     first = np.column_stack([np.interp(first_s, time_s, g) for g in measured_g.T])
     second = np.column_stack(force(second_s))[:, :first.shape[1]] / G0_MPS2
-    if min(first.std(axis=0).max(), second.std(axis=0).max()) < _SMALLEST_MOTION_G:
+    if min(first.std(axis=0).max(), second.std(axis=0).max()) < SMALLEST_MOTION_G:
         return None
     smallest = round(min(SHORTEST_S, np.ptp(time_s) / 2, np.ptp(sim_s) / 2) / step_s)
     lags, overlap, correlation = _correlations(first, second, max(smallest, 2))
@@ -213,23 +176,7 @@ def _rough_shift(time_s: np.ndarray, measured_g: np.ndarray, force: ForcePath) -
 
 def _correlations(first: np.ndarray, second: np.ndarray, smallest: int
                   ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """
-    Correlate two series at all lags, each over the samples that overlap.
-
-    Parameters
-    ----------
-    first, second
-        Series of m axes, (n, m) and (k, m).
-    smallest
-        Fewest samples that must overlap.
-
-    Returns
-    -------
-    tuple of numpy.ndarray
-        Lags in samples by which the second is later in its own series, number of overlapping
-        samples, and correlation: the mean of the axes, weighted by their variances, (lags,) each.
-
-    """
+    """Correlate two series at all lags, each over the samples that overlap."""
     size = 1 << int(np.ceil(np.log2(len(first) + len(second))))
 
     def products(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -251,7 +198,7 @@ def _correlations(first: np.ndarray, second: np.ndarray, smallest: int
         squares[0] += products(a * a, ones_second) - sum_a ** 2 / count
         squares[1] += products(ones_first, b * b) - sum_b ** 2 / count
     long_enough = overlap >= smallest
-    smallest_square = _SMALLEST_MOTION_G ** 2 * count
+    smallest_square = SMALLEST_MOTION_G ** 2 * count
     moves = (squares[0] > smallest_square) & (squares[1] > smallest_square)
     correlation = np.where(long_enough & moves, covariance / np.sqrt(
         np.maximum(squares[0], smallest_square) * np.maximum(squares[1], smallest_square)), -1.0)
@@ -297,23 +244,7 @@ def _fine_shift(recording: Recording, sensor: Sensor, force: ForcePath, late_s: 
 
 def _block_error(volts: np.ndarray, simulated_v: np.ndarray, slope_v: np.ndarray
                  ) -> np.ndarray:
-    """
-    Fit zero-g and scale factor to a block, and sum what determines its shift.
-
-    Parameters
-    ----------
-    volts
-        The recording, V, (n, m).
-    simulated_v, slope_v
-        The simulated output, V, and its derivative, V/s, (n, m).
-
-    Returns
-    -------
-    numpy.ndarray
-        Product of residual and slope, V²/s, square of the slope, V²/s², and squares of residual
-        and recording about their means, V², (4,).
-
-    """
+    """Fit zero-g and scale factor to a block, and sum what determines its shift."""
     sums = np.zeros(4)
     for measured, simulated, slope in zip(volts.T, simulated_v.T, slope_v.T):
         line = np.column_stack([np.ones(len(simulated)), simulated])

@@ -33,10 +33,9 @@ from typing import IO
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.investigate.diagnosis_round import Answer, Question, run_round
+from adxl_ros.investigate.diagnosis_round import Answer, Outcome, Question, run_round
+from adxl_ros.investigate.manoeuvres import Pose, StageLimits
 from adxl_ros.investigate.output_folder import OutputFolder, write_diagnosis
-from adxl_ros.investigate.stage_limits import Pose, StageLimits
-from adxl_ros.investigate.stop_rule import Outcome
 
 _NICENESS = 10
 """Niceness of the process. Chosen: the node that records comes first."""

@@ -15,27 +15,25 @@
 """
 Commands of a stage along a manoeuvre: positions in short steps.
 
-The stage gets positions, never velocities. Where the commands end for any reason, the stage comes
-to rest within one step of its last command.
+Each command is a position some time ahead on the manoeuvre, with the speed at which it is reached
+in this time. A stage that keeps to it moves evenly although commands come late. Where they end for
+any reason, the stage comes to rest at the last one.
 """
 
 from __future__ import annotations
 
-from adxl_ros.investigate.manoeuvres import PlannedManoeuvre
-from adxl_ros.investigate.stage_limits import Pose, StageLimits
+from adxl_ros.investigate.manoeuvres import PlannedManoeuvre, Pose, StageLimits
+from adxl_ros.simulate.trajectories import RUN_UP_S
 import numpy as np
 
 LONGEST_STEP_S = 0.2
 """Longest time of a manoeuvre between two commands, s. Chosen: the stage then comes to rest within
 a fifth of a second at the limit of rate where the commands end."""
-_FIRST_STEP_S = 0.02
-"""Time that a step may have after a shorter one, s. Chosen: that of the node."""
-_GROWTH = 2.0
-"""Largest ratio of the times of two steps. Chosen: a stage that was not commanded for a while then
-starts again within some steps, and not by a jump."""
+_AHEAD_S = LONGEST_STEP_S
+"""Time by which a command is ahead of the stage, s. Chosen: no command is later."""
 LARGEST_LAG_RAD = 0.15
-"""Distance of the stage from its command, rad, at which the command waits. Chosen: a controller
-lags by some tenths of a second."""
+"""Distance of the stage from where it should be, rad, at which the command waits. Chosen: a
+controller lags by some tenths of a second."""
 
 
 class CommandStream:
@@ -46,6 +44,8 @@ class CommandStream:
     ----------
     command
         The newest command.
+    speed
+        Speed of each joint on the way to it, rad/s.
     waited_s
         Time for which the command has waited for the stage, s.
 
@@ -65,11 +65,11 @@ class CommandStream:
             Pose of the stage.
 
         """
-        self.command = limits.nearest(*pose)
+        self.command = self._expected = limits.nearest(*pose)
+        self.speed = Pose(0.0, 0.0)
         self.waited_s = 0.0
         self._limits, self._manoeuvre = limits, manoeuvre
         self._elapsed_s = 0.0
-        self._step_s = _FIRST_STEP_S
 
     @property
     def is_done(self) -> bool:
@@ -85,8 +85,7 @@ class CommandStream:
         """
         Return the next command.
 
-        A late call does not catch up: the manoeuvre then takes longer. The step after it is at
-        most twice as long as the last one, so that the stage does not jump.
+        The manoeuvre takes longer where a call is later than `LONGEST_STEP_S`.
 
         Parameters
         ----------
@@ -102,19 +101,33 @@ class CommandStream:
             rate times the elapsed time at most.
 
         """
+        # Where a stage is that has moved on with its last command.
+        self._expected = _moved(self._expected, self.command, *(
+            speed * max(elapsed_s, 0.0) for speed in self.speed))
         elapsed_s = min(max(elapsed_s, 0.0), LONGEST_STEP_S)
-        lag_rad = max(abs(c - p) for c, p in zip(self.command, pose))
+        lag_rad = max(max(min(e, c) - p, p - max(e, c))
+                      for e, c, p in zip(self._expected, self.command, pose))
         if lag_rad > LARGEST_LAG_RAD:
             self.waited_s += elapsed_s
             return self.command
         self.waited_s = 0.0
-        elapsed_s = min(elapsed_s, _GROWTH * self._step_s)
-        self._step_s = max(elapsed_s, _FIRST_STEP_S)
         self._elapsed_s += elapsed_s
-        time_s = np.array([self._manoeuvre.begin_s + self._elapsed_s])
         motion = self._manoeuvre.motion
-        largest_rad = self._limits.rate_rad_s * elapsed_s
-        goal = self._limits.nearest(float(motion.alpha(time_s)[0]), float(motion.beta(time_s)[0]))
-        self.command = Pose(*(c + min(max(g - c, -largest_rad), largest_rad)
-                              for c, g in zip(self.command, goal)))
+        ahead_s = np.array([self._manoeuvre.begin_s
+                            + min(self._elapsed_s + _AHEAD_S, motion.duration_s)])
+        goal = self._limits.nearest(float(motion.alpha(ahead_s)[0]),
+                                    float(motion.beta(ahead_s)[0]))
+        rate_rad_s = self._limits.rate_rad_s
+        largest_rad = rate_rad_s * elapsed_s
+        self.command = _moved(self.command, goal, largest_rad, largest_rad)
+        # A stage that came to rest for want of commands starts as softly as a manoeuvre.
+        faster = rate_rad_s * elapsed_s / RUN_UP_S
+        self.speed = Pose(*(min(abs(c - e) / _AHEAD_S, speed + faster, rate_rad_s) for c, e, speed
+                            in zip(self.command, self._expected, self.speed)))
         return self.command
+
+
+def _moved(pose: Pose, goal: Pose, alpha_rad: float, beta_rad: float) -> Pose:
+    """Return a pose after a move towards a goal, by a distance of each joint at most."""
+    return Pose(*(p + min(max(g - p, -largest), largest)
+                  for p, g, largest in zip(pose, goal, (alpha_rad, beta_rad))))

@@ -18,17 +18,50 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Enum
 from typing import Any
 
-from adxl_ros.diagnose.decision import WeightedHypothesis
-from adxl_ros.diagnose.diagnosis import Diagnosis
+from adxl_ros.diagnose.diagnosis import diagnose, Diagnosis
+from adxl_ros.diagnose.expectation import (
+    leading,
+    ManoeuvreWorth,
+    predict,
+    rank_responses,
+    unknown_dimensions,
+)
+from adxl_ros.diagnose.noise_detectors import UNKNOWN
+from adxl_ros.diagnose.sensitivities import candidates
+from adxl_ros.diagnose.verdict import normalised, WeightedHypothesis
 from adxl_ros.files.recording_columns import Recording
-from adxl_ros.investigate.assessment import assess, prior
-from adxl_ros.investigate.manoeuvres import plan_all
-from adxl_ros.investigate.ranking import rank
-from adxl_ros.investigate.stage_limits import Pose, StageLimits
-from adxl_ros.investigate.stop_rule import decide, decide_early, Outcome
+from adxl_ros.investigate.manoeuvres import KIND_OF, plan_all, PlannedManoeuvre, Pose, StageLimits
+from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor
+
+CERTAIN = 0.95
+"""Probability of a hypothesis at which an investigation ends. Chosen: one error in 20."""
+_NOTHING = 0.6
+"""Prior probability of no gap; a single effect is as probable. Chosen: most units are healthy."""
+_SMALLEST_PER_MINUTE = 0.01
+"""Expected information per minute, nat/min, below which no manoeuvre separates anything. Chosen:
+ten minutes then change even odds by a tenth."""
+_LARGEST_NAMED = 4
+"""Largest number of hypotheses in a sentence. Chosen: a reader keeps four in mind."""
+
+
+class Outcome(Enum):
+    """
+    Why an investigation goes on or ends.
+
+    GO_ON: another manoeuvre follows. CERTAIN: a hypothesis has 95 %. NO_VISIBLE_GAP, INSEPARABLE:
+    no manoeuvre of this stage changes that there is no gap, or separates what remains. TIME_OVER:
+    the time does not suffice for a manoeuvre.
+    """
+
+    GO_ON = 'go_on'
+    CERTAIN = 'certain'
+    NO_VISIBLE_GAP = 'no_visible_gap'
+    INSEPARABLE = 'inseparable'
+    TIME_OVER = 'time_over'
 
 
 @dataclass(frozen=True)
@@ -46,6 +79,10 @@ class Question:
         Time that remains for manoeuvres, min.
     has_samples
         Whether there are samples to diagnose.
+    recorded
+        Names of the manoeuvres that have been recorded.
+    verdict
+        Verdict of the round before; '' for none.
 
     """
 
@@ -53,6 +90,8 @@ class Question:
     minutes: float
     remaining_minutes: float
     has_samples: bool
+    recorded: tuple[str, ...] = ()
+    verdict: str = ''
 
 
 @dataclass(frozen=True)
@@ -76,6 +115,8 @@ class Answer:
         Fault of the recording that makes a verdict impossible; '' without one.
     hidden
         Effects that this stage cannot show.
+    verdict
+        Status and effects of the diagnosis; '' without a verdict.
 
     """
 
@@ -86,14 +127,12 @@ class Answer:
     information_per_minute: float = 0.0
     fault: str = ''
     hidden: tuple[str, ...] = ()
+    verdict: str = ''
 
     def as_json(self) -> dict[str, Any]:
         """Return the answer as values of JSON."""
-        return {'hypotheses': [[list(h.effects), h.probability] for h in self.hypotheses],
-                'outcome': self.outcome.value, 'sentence': self.sentence,
-                'manoeuvre': self.manoeuvre,
-                'information_per_minute': self.information_per_minute, 'fault': self.fault,
-                'hidden': list(self.hidden)}
+        return {**vars(self), 'outcome': self.outcome.value,
+                'hypotheses': [[list(h.effects), h.probability] for h in self.hypotheses]}
 
     @staticmethod
     def from_json(values: dict[str, Any]) -> Answer:
@@ -102,6 +141,58 @@ class Answer:
                          'hidden': tuple(values['hidden']),
                          'hypotheses': tuple(WeightedHypothesis(tuple(effects), probability)
                                              for effects, probability in values['hypotheses'])})
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """
+    Probabilities of the hypotheses, and the diagnosis that gives them.
+
+    Attributes
+    ----------
+    hypotheses
+        Hypotheses by falling probability, which sums to 1; no effect means no gap.
+    diagnosis
+        The diagnosis; None before there are samples enough.
+
+    """
+
+    hypotheses: tuple[WeightedHypothesis, ...]
+    diagnosis: Diagnosis | None = None
+
+    @property
+    def fault(self) -> str:
+        """Return the fault of the recording that makes a verdict impossible; '' without one."""
+        fault = self.diagnosis.fault if self.diagnosis else None
+        return '' if fault is None or fault.status == 'insufficient' else fault.message
+
+    @property
+    def verdict(self) -> str:
+        """Return status and effects of the diagnosis; '' without a verdict."""
+        report = self.diagnosis.report if self.diagnosis else None
+        verdict = report.verdict if report else None
+        return ' '.join([verdict.status, *verdict.effects]) if verdict else ''
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """
+    The manoeuvres by what they are expected to tell per minute.
+
+    Attributes
+    ----------
+    assessment
+        The assessment, with the effects that only the manoeuvres can show.
+    worth
+        Manoeuvres, the best first.
+    hidden
+        Effects that neither the samples nor a manoeuvre of this stage can show.
+
+    """
+
+    assessment: Assessment
+    worth: tuple[ManoeuvreWorth, ...]
+    hidden: tuple[str, ...]
 
 
 def run_round(question: Question, recordings: Sequence[Recording], sensor: Sensor,
@@ -133,21 +224,153 @@ def run_round(question: Question, recordings: Sequence[Recording], sensor: Senso
         A recording is of another unit, or its reference cannot be followed.
 
     """
-    assessment = assess(recordings, sensor, seed) if recordings else prior()
-    diagnosis = assessment.diagnosis
+    assessment = _assess(recordings, sensor, seed)
+    hypotheses = assessment.hypotheses
     if assessment.fault:
-        return Answer(assessment.hypotheses, Outcome.INSEPARABLE,
-                      fault=assessment.fault), diagnosis
-    decision = decide_early(assessment)
-    if decision is not None:
-        return Answer(assessment.hypotheses, decision.outcome, decision.sentence), diagnosis
+        return Answer(hypotheses, Outcome.INSEPARABLE, fault=assessment.fault), \
+            assessment.diagnosis
+    if hypotheses[0].effects and hypotheses[0].probability >= CERTAIN:
+        # Effects that were not seen so far only take probability from no gap, so that the
+        # manoeuvres need not be simulated.
+        return decide(Ranking(assessment, (), ()), question, True), assessment.diagnosis
     manoeuvres = plan_all(limits, question.pose, 60 * question.minutes)
     in_time = [m for m in manoeuvres if m.minutes <= question.remaining_minutes]
     ranking = rank(assessment, sensor, in_time or manoeuvres)
-    decision = decide(ranking, bool(in_time))
-    hypotheses = ranking.assessment.hypotheses
-    if decision.following is None:
-        return Answer(hypotheses, decision.outcome, decision.sentence,
-                      hidden=ranking.hidden), diagnosis
-    return Answer(hypotheses, decision.outcome, '', decision.following.manoeuvre.name,
-                  decision.following.per_minute, hidden=ranking.hidden), diagnosis
+    return decide(ranking, question, bool(in_time)), assessment.diagnosis
+
+
+def _assess(recordings: Sequence[Recording], sensor: Sensor, seed: int = 0) -> Assessment:
+    """Diagnose the samples; the probabilities are the prior ones where they are too few."""
+    diagnosis = diagnose(recordings, sensor, seed=seed) if recordings else None
+    if diagnosis is not None and diagnosis.report is not None:
+        return Assessment(diagnosis.report.verdict.hypotheses, diagnosis)
+    return Assessment(normalised({(): _NOTHING, (UNKNOWN,): 1 - _NOTHING}), diagnosis)
+
+
+def rank(assessment: Assessment, sensor: Sensor, manoeuvres: Sequence[PlannedManoeuvre]
+         ) -> Ranking:
+    """
+    Rank manoeuvres by their expected information per minute, given the samples so far.
+
+    Parameters
+    ----------
+    assessment
+        What the samples so far say.
+    sensor
+        The baseline.
+    manoeuvres
+        The manoeuvres.
+
+    Returns
+    -------
+    Ranking
+        The manoeuvres, the best first.
+
+    """
+    diagnosis = assessment.diagnosis
+    report = diagnosis.report if diagnosis else None
+    model = report.linear_model if report else None
+    seen = {v.effect for v in model.variants} if model else set()
+    considered = {e for h in leading(assessment.hypotheses) for e in h.effects}
+    needed = sorted(considered | (set(library()) - seen))
+    dimensions = unknown_dimensions(report.verdict if report else None)
+    responses = [predict(m, sensor, needed, dimensions) for m in manoeuvres]
+    excited = {effect for response in responses for effect in response.effects}
+    complete = _with_unseen(assessment, excited - seen, len(excited | seen))
+    worth = rank_responses(responses, complete.hypotheses, model, dimensions)
+    on_the_mean = {e.name for e in candidates()}
+    return Ranking(complete, worth, tuple(sorted(on_the_mean - excited - seen)))
+
+
+def _with_unseen(assessment: Assessment, effects: set[str], library_size: int) -> Assessment:
+    """Add effects that the samples could not show; they keep their prior odds over no gap."""
+    weights = {h.effects: h.probability for h in assessment.hypotheses}
+    odds = 1 / max(library_size, 1)
+    for effect in sorted(effects):
+        weights.setdefault((effect,), weights.get((), 0.0) * odds)
+    return Assessment(normalised(weights), assessment.diagnosis)
+
+
+def decide(ranking: Ranking, question: Question, has_time: bool) -> Answer:
+    """
+    Choose the next manoeuvre, or end.
+
+    A verdict that was the same in the round before is not expected to change by more of the same:
+    only manoeuvres of a kind that is not recorded yet follow it.
+
+    Parameters
+    ----------
+    ranking
+        Probabilities of the hypotheses, and the manoeuvres.
+    question
+        What has been recorded, and the verdict before.
+    has_time
+        Whether there is time for each of the manoeuvres.
+
+    Returns
+    -------
+    Answer
+        The next manoeuvre, or the end.
+
+    """
+    hypotheses, verdict = ranking.assessment.hypotheses, ranking.assessment.verdict
+    best = hypotheses[0]
+    following = [w for w in ranking.worth if w.per_minute > _SMALLEST_PER_MINUTE]
+    if verdict and verdict == question.verdict:
+        kinds = {KIND_OF[name] for name in question.recorded}
+        following = [w for w in following if KIND_OF[w.manoeuvre.name] not in kinds]
+    named = _with_95_percent(hypotheses)
+    if best.probability >= CERTAIN:
+        outcome = Outcome.CERTAIN
+    elif not following and not best.effects:
+        # The samples prefer no gap to each of these effects, so that they do not show it.
+        outcome = Outcome.NO_VISIBLE_GAP
+        named = [h for h in hypotheses if len(h.effects) < 2 and UNKNOWN not in h.effects]
+    elif not following:
+        outcome = Outcome.INSEPARABLE
+    elif not has_time:
+        outcome = Outcome.TIME_OVER
+    else:
+        return Answer(hypotheses, Outcome.GO_ON, '', following[0].manoeuvre.name,
+                      following[0].per_minute, hidden=ranking.hidden, verdict=verdict)
+    return Answer(hypotheses, outcome, _sentence(outcome, named), hidden=ranking.hidden,
+                  verdict=verdict)
+
+
+def _with_95_percent(hypotheses: Sequence[WeightedHypothesis]) -> list[WeightedHypothesis]:
+    """Return the fewest hypotheses that together have 95 %."""
+    total, kept = 0.0, []
+    for hypothesis in hypotheses:
+        kept.append(hypothesis)
+        total += hypothesis.probability
+        if total >= CERTAIN:
+            break
+    return kept
+
+
+def _sentence(outcome: Outcome, named: Sequence[WeightedHypothesis]) -> str:
+    """Return the result in one sentence with one number."""
+    percent = f'{100 * sum(h.probability for h in named):.0f} %'
+    names = _listed([hypothesis_text(h.effects) for h in named])
+    return {
+        Outcome.CERTAIN: f'The recording shows {names}: {percent}.',
+        Outcome.NO_VISIBLE_GAP: f'There is no gap that this stage can show: {percent}.',
+        Outcome.INSEPARABLE: f'This stage cannot separate {names}: together {percent}.',
+        Outcome.TIME_OVER: f'The time is over; the recording shows {names}: together {percent}.',
+    }[outcome]
+
+
+def hypothesis_text(effects: Sequence[str]) -> str:
+    """Return a hypothesis for people."""
+    if not effects:
+        return 'no gap'
+    named = [e for e in effects if e != UNKNOWN]
+    return ' with '.join(named + ['something unknown'] * (UNKNOWN in effects))
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return the first names in a sentence, and how many others there are."""
+    others = len(names) - _LARGEST_NAMED
+    if others > 1:
+        return f'{", ".join(names[:_LARGEST_NAMED])} or {others} other hypotheses'
+    return ', '.join(names[:-1]) + ' or ' * (len(names) > 1) + names[-1]

@@ -32,10 +32,8 @@ from typing import Protocol
 
 from adxl_ros.errors import UserError
 from adxl_ros.investigate.command_stream import CommandStream
-from adxl_ros.investigate.diagnosis_round import Answer, Question
-from adxl_ros.investigate.manoeuvres import description, plan
-from adxl_ros.investigate.stage_limits import Pose, StageLimits
-from adxl_ros.investigate.stop_rule import Outcome
+from adxl_ros.investigate.diagnosis_round import Answer, Outcome, Question
+from adxl_ros.investigate.manoeuvres import description, plan, Pose, StageLimits
 import numpy as np
 
 _FIRST_REST_S = 1.0
@@ -156,6 +154,16 @@ class Investigation:
         return self.state is State.FINISHED and bool(self.answers) \
             and self.answers[-1][1].outcome not in (Outcome.GO_ON, Outcome.TIME_OVER)
 
+    @property
+    def has_moved(self) -> bool:
+        """Return whether it has recorded a part of a manoeuvre."""
+        return self._moved_s > 0
+
+    @property
+    def speed(self) -> Pose | None:
+        """Return the speed on the way to the newest command, rad/s; None at its end."""
+        return None if self._stream is None or self._stream.is_done else self._stream.speed
+
     def status(self) -> Status:
         """Return what it does."""
         texts = {State.RECORDING: 'waiting for samples and stage',
@@ -244,7 +252,9 @@ class Investigation:
         self._flush()
         self._diagnoser.ask(Question(
             self._command or self._limits.nearest(*pose), self._asked_minutes,
-            max(self._longest_s - self._moved_s, 0.0) / 60, bool(self.answers)))
+            max(self._longest_s - self._moved_s, 0.0) / 60, bool(self.answers),
+            tuple(answer.manoeuvre for _, answer in self.answers),
+            self.answers[-1][1].verdict if self.answers else ''))
 
     def _take_answer(self) -> None:
         """Take the answer if there is one, and follow it."""

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The manoeuvres that an investigation can command, one function each.
+The limits of the stage, and the manoeuvres that an investigation can command in them.
 
 A manoeuvre begins in the pose of the stage and keeps the limits of the stage: each pose is moved
 to the nearest one within them, and no joint turns faster than the limit.
@@ -23,8 +23,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
-from adxl_ros.investigate.stage_limits import Pose, StageLimits
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.trajectories import RUN_UP_S, Script
 import numpy as np
@@ -42,6 +42,67 @@ _APPROACH_RAD = np.radians(20.0)
 """Distance from which a pose is approached, rad. Chosen: beyond every backlash."""
 _SWINGS = 4
 """Number of swings forth and back. Chosen: their reversals are averaged."""
+
+
+class Pose(NamedTuple):
+    """
+    Angles of the stage.
+
+    Attributes
+    ----------
+    alpha_rad, beta_rad
+        Angles, rad.
+
+    """
+
+    alpha_rad: float
+    beta_rad: float
+
+
+@dataclass(frozen=True)
+class StageLimits:
+    """
+    Limits of angle and rate.
+
+    Attributes
+    ----------
+    alpha_rad, beta_rad
+        Lowest and highest angle of each joint, rad.
+    rate_rad_s
+        Largest rate of each joint, rad/s.
+
+    """
+
+    alpha_rad: tuple[float, float]
+    beta_rad: tuple[float, float]
+    rate_rad_s: float
+
+    def nearest(self, alpha_rad: float, beta_rad: float) -> Pose:
+        """
+        Return the pose within the limits that is nearest to a pose.
+
+        Parameters
+        ----------
+        alpha_rad, beta_rad
+            Angles, rad.
+
+        Returns
+        -------
+        Pose
+            The pose within the limits.
+
+        """
+        return Pose(_within(alpha_rad, self.alpha_rad), _within(beta_rad, self.beta_rad))
+
+    def excess_rad(self, pose: Pose) -> float:
+        """Return how far the worse angle of a pose is beyond the limits, rad; 0 within them."""
+        nearest = self.nearest(*pose)
+        return max(abs(pose.alpha_rad - nearest.alpha_rad), abs(pose.beta_rad - nearest.beta_rad))
+
+
+def _within(value: float, limits: tuple[float, float]) -> float:
+    """Return the value within limits that is nearest to a value."""
+    return min(max(value, limits[0]), limits[1])
 
 
 class Path:
@@ -257,11 +318,18 @@ def _turn_of_alpha(path: Path, betas_deg: Sequence[float], share: float) -> None
         path.turn('alpha', low_rad, share)
 
 
-CATALOGUE: dict[str, Callable[[Path], None]] = {f.__name__: f for f in (
-    rests_upright, rests_on_sphere, slow_turn_of_beta, fast_turn_of_beta, inclined_turn_of_beta,
-    level_turn_of_beta, slow_turn_of_alpha, fast_turns_of_alpha, two_rates_of_beta,
-    swings_of_beta, swings_of_alpha, poses_from_both_sides, long_rests, rests_on_axes)}
+_KINDS: dict[str, tuple[Callable[[Path], None], ...]] = {
+    'rests': (rests_upright, rests_on_sphere, rests_on_axes),
+    'turns of beta': (slow_turn_of_beta, fast_turn_of_beta, inclined_turn_of_beta,
+                      level_turn_of_beta),
+    'turns of alpha': (slow_turn_of_alpha, fast_turns_of_alpha),
+    'rates': (two_rates_of_beta,),
+    'reversals': (swings_of_beta, swings_of_alpha, poses_from_both_sides),
+    'long rests': (long_rests,)}
+CATALOGUE = {f.__name__: f for functions in _KINDS.values() for f in functions}
 """Manoeuvres by name."""
+KIND_OF = {f.__name__: kind for kind, functions in _KINDS.items() for f in functions}
+"""Kind of each manoeuvre: what it varies."""
 
 
 @dataclass(frozen=True)

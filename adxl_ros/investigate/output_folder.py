@@ -17,18 +17,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain, count
 import json
 from pathlib import Path
 import shlex
+import shutil
 
-from adxl_ros.diagnose import report_html, report_json, report_text
+from adxl_ros.diagnose import report_html, report_text
 from adxl_ros.diagnose.diagnosis import Diagnosis
+from adxl_ros.diagnose.report import as_json
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.investigate.diagnosis_round import Answer
 from adxl_ros.model.sensor import Sensor
+
+_WITHOUT_DIAGNOSIS = {'bag', 'baseline.yaml', 'answer.json'}
+"""Files of an investigation that was stopped before its first diagnosis of samples."""
 
 
 @dataclass(frozen=True)
@@ -70,48 +76,27 @@ class OutputFolder:
         """Return the newest answer, JSON."""
         return self.path / 'answer.json'
 
+    @staticmethod
+    def free(path: Path) -> OutputFolder:
+        """Return the first of `path`, `path_2`, ... that has nothing, or no diagnosis yet."""
+        candidates = chain([path], (path.with_name(f'{path.name}_{n}') for n in count(2)))
+        return next(OutputFolder(p) for p in candidates if not p.exists() or (
+            p.is_dir() and {child.name for child in p.iterdir()} <= _WITHOUT_DIAGNOSIS))
+
+    def make(self, sensor: Sensor) -> None:
+        """Make the folder, and write the baseline; an investigation without diagnosis goes."""
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            if self.bag.exists():
+                shutil.rmtree(self.bag)
+        except OSError as error:
+            raise UserError(f'{self.path}: cannot make the folder: {error.strerror}; set output '
+                            'to another one') from None
+        parameter_file.save(self.baseline, sensor)
+
     def write_answer(self, answer: Answer) -> None:
         """Write the newest answer."""
         write_text(self.answer, json.dumps(answer.as_json(), indent=1, allow_nan=False) + '\n')
-
-
-def new_folder(path: Path, sensor: Sensor) -> OutputFolder:
-    """
-    Make the folder of an investigation, and write the baseline into it.
-
-    Parameters
-    ----------
-    path
-        The folder. Where it exists, the first of `path_2`, `path_3`, ... that does not is made:
-        an earlier investigation stays.
-    sensor
-        The baseline.
-
-    Returns
-    -------
-    OutputFolder
-        The folder.
-
-    Raises
-    ------
-    UserError
-        The folder cannot be made.
-
-    """
-    folder, number = path, 1
-    while True:
-        try:
-            folder.mkdir(parents=True)
-            break
-        except FileExistsError:
-            number += 1
-            folder = path.with_name(f'{path.name}_{number}')
-        except OSError as error:
-            raise UserError(f'{folder}: cannot make the folder: {error.strerror}; set output to '
-                            'another one') from None
-    output = OutputFolder(folder)
-    parameter_file.save(output.baseline, sensor)
-    return output
 
 
 def write_diagnosis(folder: OutputFolder, diagnosis: Diagnosis, recording: Recording,
@@ -140,11 +125,11 @@ def write_diagnosis(folder: OutputFolder, diagnosis: Diagnosis, recording: Recor
                f'{recording.rate_hz:.4g} Hz, {" ".join(recording.axes)})  minus  simulation of '
                f'{folder.baseline.name}')
     write_text(folder.path / 'report.json', json.dumps(
-        report_json.as_json(diagnosis), indent=1, allow_nan=False) + '\n')
+        as_json(diagnosis), indent=1, allow_nan=False) + '\n')
     parameters = ''
-    if diagnosis.sensor is not None:
+    if diagnosis.report is not None:
         lines = report_text.screen_lines(diagnosis, subject)
-        parameters = parameter_file.as_text(diagnosis.sensor, lines)
+        parameters = parameter_file.as_text(diagnosis.report.sensor, lines)
         write_text(folder.parameters, parameters)
     if with_page:
         steps = [('simulate with these parameters', 'ros2 run adxl_ros simulate rich --params '

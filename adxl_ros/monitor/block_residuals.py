@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from adxl_ros.diagnose.baseline_comparison import noiseless
+from adxl_ros.diagnose.comparison import noiseless
 from adxl_ros.model import noise
 from adxl_ros.model.constants import MAD_TO_STD
 from adxl_ros.model.effects import effect_named

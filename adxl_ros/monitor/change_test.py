@@ -18,7 +18,8 @@ A sequential test whether the mean of a series has changed, with a stated rate o
 The mean of the newest blocks is compared with the mean of the blocks before, at many lengths. Such
 a difference is stationary for white noise, for flicker and for a random walk, as the Allan
 deviation is. So each length learns the usual size of its difference from the series itself, and
-correlated samples need no model.
+correlated samples need no model. At rest, this size is at most that of a healthy walk: a ramp from
+the beginning would else be learnt as usual.
 
 The difference over its usual size follows Student's t. Its limit divides the permitted false
 alarms among all comparisons of a day (Bonferroni), so the rate is at most the stated one.
@@ -100,6 +101,9 @@ class ChangeSettings:
     smallest
         Smallest usual size of a difference, in the unit of the series; a series without noise has
         none of its own.
+    walks
+        Random walk of a healthy series, in its unit a root of a second, by series; infinite where
+        every drift is usual.
 
     """
 
@@ -107,6 +111,7 @@ class ChangeSettings:
     false_alarms_per_day: float
     block_s: float = 1.0
     smallest: float = 1e-6
+    walks: tuple[float, ...] = (np.inf,)
 
     @cached_property
     def p(self) -> float:
@@ -167,7 +172,7 @@ class ChangeTest:
         Returns
         -------
         list of Change
-            One change for each series that has changed. The series begins again after it.
+            One change for each series that has changed. It begins and learns again after it.
 
         """
         last = self._count % self._size
@@ -197,16 +202,27 @@ class ChangeTest:
         kind = int(self._moves[now] > self._moves[first])
         valid = self._since <= begin
         self._learn(j, length)
-        weights = self._weights[kind, j]
-        freedom = (weights * _stride(length) / (_INDEPENDENT * length)).astype(int)
-        std = np.maximum(np.sqrt(self._squares[kind, j] / np.maximum(weights, 1.0)),
-                         self.settings.smallest)
-        limit = self.settings.limits[np.minimum(freedom, _MOST)] * std
+        std, factor = self._usual(kind, j)
+        limit = factor * std
+        if not kind:
+            # The variance of the difference of a walk's means is L/3 + 4·L/3 steps.
+            walk = np.array(self.settings.walks) * np.sqrt(
+                (1 + _BEFORE) / 3 * length * self.settings.block_s)
+            shortest_std, shortest_factor = self._usual(kind, 0)
+            limit = np.minimum(limit, shortest_factor * np.hypot(shortest_std, walk))
         changed = np.flatnonzero(valid & (np.abs(difference) > limit))
         usable = valid.copy()
         usable[changed] = False
         self._waiting[j].append((self._count, kind, difference, usable))
         return [(int(channel), float(std[channel])) for channel in changed]
+
+    def _usual(self, kind: int, j: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the usual size of a difference by series, and the limit of Student's t."""
+        weights = self._weights[kind, j]
+        freedom = (weights * _stride(2 ** j) / (_INDEPENDENT * 2 ** j)).astype(int)
+        std = np.sqrt(self._squares[kind, j] / np.maximum(weights, 1.0))
+        return (np.maximum(std, self.settings.smallest),
+                self.settings.limits[np.minimum(freedom, _MOST)])
 
     def _learn(self, j: int, length: int) -> None:
         """Add the differences that are so old that no change can be in them unseen."""
@@ -228,6 +244,8 @@ class ChangeTest:
         change = (sums[-1] - sums[1:-1]) / (total - before) - sums[1:-1] / before
         best = int(np.argmax(change ** 2 * before * (total - before)))
         self._begin_again(np.array([channel]), begin + int(before[best]))
+        # After a change of the gain, the residual of motion has another usual size.
+        self._squares[:, :, channel] = self._weights[:, :, channel] = 0.0
         return Change(channel, total - int(before[best]), float(change[best]), std)
 
     def _begin_again(self, channels: np.ndarray, block: int) -> None:

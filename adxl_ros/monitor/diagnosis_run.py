@@ -202,6 +202,7 @@ def result_of(report: dict, page: str) -> DiagnosisResult:
     likely = tuple(effect for group in verdict.get('groups') or [] for effect in group)
     texts = {
         'explained': f'{names} ({100 * probability:.0f} %)',
+        'partly': f'partly {names} ({100 * probability:.0f} %), and something else',
         'no_gap': 'no gap: the parameters explain the samples',
         'inseparable': f'one of {", ".join(likely)}: these samples cannot choose',
         'unknown': 'a cause that is not in the library',

@@ -24,11 +24,17 @@ from adxl_ros.files.reference_alignment import LONGEST_MOVE_NS, Track
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.monitor.block_residuals import Block, Prediction
 from adxl_ros.monitor.change_test import ChangeSettings, ChangeTest
-from adxl_ros.monitor.reference_stream import AFTER_NS, ReferenceKind, ReferenceStream
-from adxl_ros.monitor.stream_buffer import StreamBuffer
+from adxl_ros.monitor.diagnosis_run import DiagnosisInput
+from adxl_ros.monitor.reference_stream import (
+    AFTER_NS,
+    ReferenceKind,
+    ReferenceStream,
+    StreamBuffer,
+)
 import numpy as np
 import scipy
 
@@ -159,12 +165,15 @@ class GapSettings:
         Largest rate of changes that are none.
     history_s
         Time that is kept for a diagnosis, s.
+    wait_s
+        Time after a change of an axis in which further ones belong to it, s.
 
     """
 
     window_s: float = 60.0
     false_alarms_per_day: float = 1 / 30
     history_s: float = 600.0
+    wait_s: float = 120.0
 
 
 @dataclass(frozen=True)
@@ -236,8 +245,11 @@ class LiveGap:
         self._blocks: deque[Block] = deque(
             maxlen=max(round(settings.window_s * 1e9 / BLOCK_NS), _FEWEST_BLOCKS))
         self._ends_ns: deque[int] = deque(maxlen=_MEMORY)
-        self._test = ChangeTest(ChangeSettings(2 * len(sensor.axes),
-                                               settings.false_alarms_per_day, BLOCK_NS * 1e-9))
+        count = len(sensor.axes)
+        self._test = ChangeTest(ChangeSettings(
+            2 * count, settings.false_alarms_per_day, BLOCK_NS * 1e-9,
+            walks=(_healthy_walk(sensor),) * count + (np.inf,) * count))
+        self._changed_ns: dict[str, int] = {}
         self._prediction = Prediction(sensor, self.reference)
         self._next_ns: int | None = None
         self._compared_ns: int | None = None
@@ -304,47 +316,28 @@ class LiveGap:
             return ()
         return tuple(self._axis_gap(d, axis, blocks) for d, axis in enumerate(self.sensor.axes))
 
-    def recording(self, begin_ns: int = 0) -> Recording:
-        """Return the samples since a stamp, ns, at most those of the history, for a diagnosis."""
+    def diagnosis_input(self, begin_ns: int = 0) -> DiagnosisInput:
+        """Return what there is since a stamp, ns, of at most the history, for a diagnosis."""
         newest_ns = self._samples.newest_ns or 0
         begin_ns = max(begin_ns, newest_ns - round(self._settings.history_s * 1e9))
         stamps_ns, accel_mps2 = self._samples.between(begin_ns, newest_ns + 1)
+        origin_ns = int(stamps_ns[0]) if len(stamps_ns) else 0
         columns = dict(zip(ACCEL, accel_mps2.T))
         around = begin_ns - BLOCK_NS, newest_ns + BLOCK_NS
+        at_ns, readings = self.reference.readings.between(*around)
+        force = None
         if self.reference.kind is ReferenceKind.STAGE:
-            at_ns, readings = self.reference.readings.between(*around)
             for name, values in zip(JOINTS.values(), readings.T):
                 columns[name] = _aligned(at_ns, values, stamps_ns, LONGEST_MOVE_NS)
+        else:
+            force = (at_ns - origin_ns) * 1e-9, readings
         for name, buffer in self.reference.surroundings.items():
             at_ns, readings = buffer.between(*around)
             if len(at_ns) > 1:
                 columns[name] = _aligned(at_ns, readings[:, 0], stamps_ns)
-        origin_ns = int(stamps_ns[0]) if len(stamps_ns) else 0
-        return Recording('the running stream', (stamps_ns - origin_ns) * 1e-9, columns,
-                         sensor_info(self.sensor))
-
-    def force(self, begin_ns: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Return the force of the simulator on the time of `recording`.
-
-        Parameters
-        ----------
-        begin_ns
-            As of `recording`.
-
-        Returns
-        -------
-        tuple
-            Times, s, (k,), and force, m/s², (k, 3).
-
-        """
-        newest_ns = self._samples.newest_ns or 0
-        begin_ns = max(begin_ns, newest_ns - round(self._settings.history_s * 1e9))
-        stamps_ns, _ = self._samples.between(begin_ns, newest_ns + 1)
-        at_ns, force_mps2 = self.reference.readings.between(begin_ns - BLOCK_NS,
-                                                            newest_ns + BLOCK_NS)
-        origin_ns = int(stamps_ns[0]) if len(stamps_ns) else 0
-        return (at_ns - origin_ns) * 1e-9, force_mps2
+        return DiagnosisInput(Recording(
+            'the running stream', (stamps_ns - origin_ns) * 1e-9, columns,
+            sensor_info(self.sensor)), self.sensor, force)
 
     def span_s(self, begin_ns: int = 0) -> float:
         """Return the time of the samples since a stamp, ns, that are kept, s."""
@@ -372,6 +365,7 @@ class LiveGap:
         self._prediction.restart()
         self._test.restart()
         self._blocks.clear()
+        self._changed_ns.clear()
 
     def _begin(self) -> bool:
         """Begin with the first whole second, at the measured rate; return whether it has come."""
@@ -429,13 +423,18 @@ class LiveGap:
         self._blocks.append(block)
         self._ends_ns.append(block.end_ns)
         changes = []
-        for change in self._test.add(np.concatenate([block.mean_mps2, block.log_noise]),
-                                     block.moves):
-            quantity, axis = divmod(change.channel, len(self.sensor.axes))
+        alarms = self._test.add(np.concatenate([block.mean_mps2, block.log_noise]), block.moves)
+        # More noise scatters the mean, too, so that it comes first.
+        for change in sorted(alarms, key=lambda change: -change.channel):
+            quantity, number = divmod(change.channel, len(self.sensor.axes))
+            axis = self.sensor.axes[number]
+            if block.end_ns < self._changed_ns.get(axis, 0):
+                continue
+            self._changed_ns[axis] = block.end_ns + round(self._settings.wait_s * 1e9)
             begun = max(len(self._ends_ns) - 1 - change.blocks, 0)
             changes.append(GapChange(
-                self.sensor.axes[axis], 'noise' if quantity else 'mean', self._ends_ns[begun],
-                block.end_ns, float(np.exp(change.size)) if quantity else change.size / _MG))
+                axis, 'noise' if quantity else 'mean', self._ends_ns[begun], block.end_ns,
+                float(np.exp(change.size)) if quantity else change.size / _MG))
         self.changes = (self.changes + changes)[-_MOST_CHANGES:]
         return changes
 
@@ -458,6 +457,13 @@ class LiveGap:
                 datasheet.value ** 2 - floor.value ** 2), 0.0, 1.0))
         offset_mg = float(np.mean([block.mean_mps2[d] for block in blocks])) / _MG
         return AxisGap(axis, gap, floor, source, offset_mg, explained)
+
+
+def _healthy_walk(sensor: Sensor) -> float:
+    """Return the random walk of a healthy unit, or of its file if that is larger, m/s²/√s."""
+    healthy = effect_named('bias_walk').diagnosis.healthy_density
+    walks = sensor.values.get('bias_walk', {}).get('density_g_per_rts', ())
+    return G0_MPS2 * float(np.max(walks, initial=healthy))
 
 
 def _rms_interval(squares: np.ndarray) -> Interval:

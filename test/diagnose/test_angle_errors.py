@@ -16,8 +16,8 @@
 
 from dataclasses import replace
 
-from adxl_ros.diagnose.angle_errors import angle_error_filter
-from adxl_ros.diagnose.baseline_comparison import compare
+from adxl_ros.diagnose.comparison import compare
+from adxl_ros.diagnose.reference import angle_error_filter
 from adxl_ros.files import parameter_file
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info

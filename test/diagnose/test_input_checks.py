@@ -18,9 +18,8 @@ from dataclasses import replace
 import json
 
 from adxl_ros.diagnose import data_checks
-from adxl_ros.diagnose.baseline_comparison import compare
-from adxl_ros.diagnose.decision import Verdict, WeightedHypothesis, without_fast_effects
-from adxl_ros.diagnose.input_checks import compare_checked
+from adxl_ros.diagnose.comparison import compare
+from adxl_ros.diagnose.data_checks import compare_checked
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import ACCEL, Recording
 from adxl_ros.files.stream_info import sensor_info
@@ -81,15 +80,6 @@ def test_no_verdict_is_exit_status_1(run_tool, tmp_path):
     assert 'run0.csv: no verdict (axis_inverted)' in run.stderr
     assert report['verdict']['status'] == 'bad_data'
     assert 'Exit status' in run_tool('diagnose', '--help').stdout
-
-
-def test_stamps_in_milliseconds_are_named(run_tool, tmp_path):
-    """Ten seconds between samples do not show how the stage moved."""
-    recorded = made(unit())
-    slow = replace(recorded, time_s=recorded.time_s * 1000)
-    report, run = report_of(run_tool, tmp_path, unit(), slow)
-    assert (run.returncode, report['verdict']['data_fault']) == (1, 'unit')
-    assert 'divide stamps in milliseconds by 1000' in report['summary']
 
 
 def test_short_recordings_count_together():
@@ -401,16 +391,6 @@ def test_a_reference_that_is_smoother_than_the_sensor_is_named(tmp_path):
     # A sensor without its filter has more motion than its simulation, too.
     recorded, sim = shaken(tmp_path, None, sensor)
     assert not compare_checked(recorded, unit(), sim, False).reference_fades
-
-
-@pytest.mark.parametrize('effects, status', [
-    (('bandwidth',), 'unknown'), (('misalignment',), 'explained')])
-def test_a_smoother_reference_explains_no_fast_effect(effects, status):
-    """A filter of the reference is not blamed on that of the sensor."""
-    verdict = Verdict('explained', effects, (), 0.9, (
-        WeightedHypothesis(effects, 0.9), WeightedHypothesis((), 0.1)), None)
-    assert without_fast_effects(verdict).status == status
-    assert sum(h.probability for h in without_fast_effects(verdict).hypotheses) == 1
 
 
 def test_rests_alone_have_no_motion(run_tool, tmp_path):

@@ -12,9 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The interval of a noise floor that is measured at rest."""
+"""The noise floor: its interval where it is measured at rest, and the part of rounding."""
+
+from dataclasses import replace
 
 from adxl_ros.diagnose.noise_floor import NoiseFloor, squares_at_rest
+from adxl_ros.model import noise
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -37,12 +40,27 @@ def test_the_interval_contains_the_noise(seconds):
         sums = squares_at_rest(volts, np.ones(count, bool), sensor)
         parts = np.array([(part.squares_v2[0], part.count) for part in sums]).T
         rms = np.sqrt(parts[0].sum() / parts[1].sum())
-        low, high = np.quantile(NoiseFloor(np.array([rms]), rms, 'still', parts).draws_mps2(seed),
-                                [0.05, 0.95])
+        floor = NoiseFloor(np.array([rms]), rms, 'still', parts)
+        low, high = np.quantile(floor.draws_mps2(seed, 200), [0.05, 0.95])
         contained += low < 1.0 < high
     assert (0.8 if seconds < 20 else 0.84) < contained / _TRIALS < 0.95
 
 
 def test_a_few_seconds_have_no_interval():
     parts = np.ones((2, 19))
-    assert NoiseFloor(np.ones(1), 1.0, 'still', parts).draws_mps2(0) is None
+    assert NoiseFloor(np.ones(1), 1.0, 'still', parts).draws_mps2(0, 200) is None
+
+
+@pytest.mark.parametrize('steps', [0.02, 0.1, 0.2, 0.3])
+def test_rounding_is_split_by_the_noise_before_it(steps):
+    """The held part is the error of the mean of many roundings, averaged over a step."""
+    sensor = replace(nominal('x'), adc_bits=8)
+    scale = steps * sensor.lsb_v / noise.analog_std_v(sensor)[0]
+    sensor = replace(sensor, noise_density_g_per_rthz=sensor.noise_density_g_per_rthz * scale)
+    rng = np.random.default_rng(1)
+    places = np.linspace(-0.5, 0.5, 200, endpoint=False)
+    rounded = np.rint(places[:, None] + steps * rng.normal(size=(200, 4000)))
+    held = np.mean((rounded.mean(axis=1) - places) ** 2) * sensor.lsb_v ** 2
+    parts = noise.rounding(sensor, 0)
+    assert parts.held_v2 == pytest.approx(held, rel=0.05, abs=1e-3 * sensor.lsb_v ** 2)
+    assert parts.held_v2 + parts.white_v2 == pytest.approx(sensor.lsb_v ** 2 / 12)

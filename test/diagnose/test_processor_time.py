@@ -72,12 +72,12 @@ def used_by(folder, rate_hz, duration_s, *effects):
     return (used.ru_utime + used.ru_stime) / slower, used.ru_maxrss / 2 ** 20
 
 
-@pytest.mark.parametrize('effects', [
-    (), ('hysteresis',), ('lever_arm', 'temperature_bias'), ('bias_walk', 'nonlinearity')])
-def test_five_minutes_at_250_hz_take_ten_seconds(tmp_path, effects):
-    """Three axes need at most 10 s of processor time, whatever the verdict."""
-    seconds, _ = used_by(tmp_path, 250.0, 300.0, *effects)
-    assert seconds < 10.0
+def test_five_minutes_at_250_hz_take_eight_seconds(tmp_path):
+    """Three axes need 8 s of processor time in the median, and never more than 20 s."""
+    seconds = [used_by(tmp_path, 250.0, 300.0, *effects)[0] for effects in (
+        (), ('hysteresis',), ('lever_arm', 'temperature_bias'), ('bias_walk', 'nonlinearity'))]
+    assert np.median(seconds) < 8.0
+    assert max(seconds) < 20.0
 
 
 def test_ten_minutes_at_1_khz_take_25_s_and_1_gb(tmp_path):

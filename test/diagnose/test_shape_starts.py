@@ -16,7 +16,7 @@
 
 from dataclasses import replace
 
-from adxl_ros.diagnose.baseline_comparison import compare
+from adxl_ros.diagnose.comparison import compare
 from adxl_ros.diagnose.hypothesis_fit import fit_hypothesis
 from adxl_ros.diagnose.linear_model import build_linear_model
 from adxl_ros.diagnose.sensitivities import shapes, variants
@@ -27,7 +27,7 @@ from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Coefficient, Role
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate import simulator
-from adxl_ros.simulate.trajectories import tumble
+from adxl_ros.simulate.trajectories import shaker, tumble
 from adxl_ros.tools.effect_option import with_effects
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def test_starts_belong_to_shapes_and_lie_within_their_bounds(effect):
     """Starts rise, and every combination is tried."""
     tried = shapes(effect)
     for p in effect.parameters:
-        assert not p.starts or p.role is Role.SHAPE or (p.is_size and not p.axes)
+        assert not p.starts or p.role is Role.SHAPE or p.is_size
         assert list(p.starts) == sorted(set(p.starts))
         if p.role is Role.SHAPE and not p.held:
             values = {shape[p.name] for shape in tried}
@@ -104,6 +104,28 @@ def test_a_limit_of_one_axis_starts_without_clipping_the_others():
         assert min(first[names[0]], first[names[1]]) > 1.05
         assert first[Coefficient('saturation', 'knee_g')] > 0
         assert first[Coefficient('saturation', 'offset_g', 'x')] == 0
+
+
+def test_the_linear_model_finds_a_filter_that_is_40_times_slower():
+    """The best start is next to it. A filter that no file states is free in every hypothesis."""
+    sensor = replace(nominal('xyz'), rate_hz=250.0, rc_capacitance_f=5e-9)
+    motion = shaker(np.random.default_rng(4))
+    slower = with_effects(sensor, ['bandwidth:resistance_ratio=39'])
+    columns = simulator.simulate(slower, motion, 1)
+    recording = Recording('drawn', columns.pop('time_s'), columns, sensor_info(sensor))
+    linear_model = build_linear_model([compare(recording, sensor)], only=['bandwidth'])
+    tried = [i for i, v in enumerate(linear_model.variants) if v.effect == 'bandwidth']
+    best = max(tried, key=lambda i: linear_model.fit_variants([i]).log_evidence)
+    name = Coefficient('bandwidth', 'resistance_ratio', 'x')
+    start = linear_model.variants[best]
+    hypothesis = fit_hypothesis(linear_model, ['bandwidth'],
+                                dict.fromkeys(start.names, start.step), {})
+    assert dict(zip(hypothesis.names, hypothesis.linearised.values))[name] \
+        == pytest.approx(39.0, rel=0.05)
+    assert linear_model.tolerance(name) == 0.02
+    unstated = replace(sensor, measured=('rc_resistance_ohm', 'rc_capacitance_f'))
+    linear_model = build_linear_model([compare(recording, unstated)], only=['bandwidth'])
+    assert linear_model.tolerance(name) > 1.0
 
 
 def test_a_fit_reaches_a_period_far_from_its_start():

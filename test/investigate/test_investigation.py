@@ -14,14 +14,15 @@
 
 """The states of an investigation, with answers that the test gives."""
 
-from adxl_ros.diagnose.decision import WeightedHypothesis
+from adxl_ros.diagnose.verdict import WeightedHypothesis
 from adxl_ros.errors import UserError
-from adxl_ros.investigate.diagnosis_round import Answer
+from adxl_ros.investigate.diagnosis_round import Answer, Outcome
 from adxl_ros.investigate.investigation import Investigation, State
-from adxl_ros.investigate.stage_limits import Pose, StageLimits
-from adxl_ros.investigate.stop_rule import Outcome
+from adxl_ros.investigate.manoeuvres import Pose, StageLimits
+from adxl_ros.investigate.output_folder import OutputFolder
 import numpy as np
 import pytest
+from units import nominal
 
 LIMITS = StageLimits((0.0, np.pi), (0.0, 2 * np.pi), 0.5)
 GO_ON = Answer((WeightedHypothesis((), 0.6),), Outcome.GO_ON, manoeuvre='rests_upright')
@@ -145,3 +146,14 @@ def test_a_failed_diagnosis_stops_it(answer):
 def test_an_answer_survives_its_file():
     assert Answer.from_json(GO_ON.as_json()) == GO_ON
     assert Answer.from_json(CERTAIN.as_json()) == CERTAIN
+
+
+def test_a_folder_without_a_diagnosis_is_used_again(tmp_path):
+    first = OutputFolder.free(tmp_path / 'found')
+    first.make(nominal())
+    first.bag.mkdir()
+    assert OutputFolder.free(tmp_path / 'found') == first
+    first.make(nominal())
+    assert not first.bag.exists()
+    (first.path / 'report.json').write_text('{}')
+    assert OutputFolder.free(tmp_path / 'found').path == tmp_path / 'found_2'

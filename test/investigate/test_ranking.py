@@ -14,21 +14,29 @@
 
 """The manoeuvre that is chosen separates what remains."""
 
+from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
-from adxl_ros.diagnose.decision import WeightedHypothesis
-from adxl_ros.investigate.assessment import Assessment
-from adxl_ros.investigate.diagnosis_round import Question, run_round
-from adxl_ros.investigate.manoeuvres import plan, plan_all
-from adxl_ros.investigate.ranking import ManoeuvreWorth, rank, Ranking
-from adxl_ros.investigate.stage_limits import Pose, StageLimits
-from adxl_ros.investigate.stop_rule import decide, Outcome
+from adxl_ros.diagnose.verdict import WeightedHypothesis
+from adxl_ros.investigate.diagnosis_round import (
+    Assessment,
+    decide,
+    ManoeuvreWorth,
+    Outcome,
+    Question,
+    rank,
+    Ranking,
+    run_round,
+)
+from adxl_ros.investigate.manoeuvres import KIND_OF, plan, plan_all, Pose, StageLimits
 import numpy as np
 import pytest
 from units import nominal
 
 LIMITS = StageLimits((0.0, np.pi), (0.0, 2 * np.pi), 0.5)
 SENSOR = nominal(rate_hz=62.5)
+FIRST = Question(Pose(0.0, 0.0), 0.0, 10.0, False)
 
 
 BEYOND = ('saturation',)
@@ -50,7 +58,7 @@ def told_nothing(information=0.0):
 @cache
 def first_round():
     """Return answer and diagnosis of a round of ten minutes without samples."""
-    return run_round(Question(Pose(0.0, 0.0), 0.0, 10.0, False), [], SENSOR, LIMITS)
+    return run_round(FIRST, [], SENSOR, LIMITS)
 
 
 def worth(ranking):
@@ -72,7 +80,7 @@ def test_a_level_turn_of_beta_does_not_show_the_force_along_the_axes():
 
 def test_equal_hypotheses_cannot_be_separated():
     ranking = Ranking(between((), ('saturation',)), (told_nothing(),), ())
-    decision = decide(ranking, True)
+    decision = decide(ranking, FIRST, True)
     assert decision.outcome is Outcome.NO_VISIBLE_GAP
     assert decision.sentence == 'There is no gap that this stage can show: 100 %.'
 
@@ -86,17 +94,34 @@ def test_a_manoeuvre_that_does_not_fit_in_the_time_is_not_chosen():
     answer, _ = run_round(Question(pose, 0.0, minutes[shortest] + 1e-6, False), [], SENSOR, LIMITS)
     assert answer.manoeuvre == shortest
     assert decide(Ranking(between((), ('hysteresis',)), (told_nothing(1.0),), ()),
-                  False).outcome is Outcome.TIME_OVER
+                  FIRST, False).outcome is Outcome.TIME_OVER
 
 
 @pytest.mark.parametrize('probability, outcome', [(0.96, Outcome.CERTAIN), (0.9, Outcome.GO_ON)])
 def test_95_percent_of_a_hypothesis_is_a_verdict(probability, outcome):
     assessment = Assessment((WeightedHypothesis(('hysteresis',), probability),
                              WeightedHypothesis((), 1 - probability)))
-    decision = decide(Ranking(assessment, (told_nothing(1.0),), ()), True)
+    decision = decide(Ranking(assessment, (told_nothing(1.0),), ()), FIRST, True)
     assert decision.outcome is outcome
     if outcome is Outcome.CERTAIN:
         assert decision.sentence == 'The recording shows hysteresis: 96 %.'
+
+
+def test_a_verdict_that_stays_after_every_kind_of_manoeuvre_ends_it():
+    """The manoeuvres still promise much, as where the probability of no gap has a ceiling."""
+    verdict = SimpleNamespace(status='no_gap', effects=())
+    assessment = Assessment((WeightedHypothesis((), 0.8), WeightedHypothesis(('gravity',), 0.2)),
+                            SimpleNamespace(report=SimpleNamespace(verdict=verdict), fault=None))
+    worth = tuple(ManoeuvreWorth(m, 1.0) for m in plan_all(LIMITS, Pose(1.5, 0.0)))
+    question, recorded = FIRST, []
+    while (answer := decide(Ranking(assessment, worth, ()), question, True)).manoeuvre:
+        recorded.append(answer.manoeuvre)
+        question = replace(FIRST, recorded=tuple(recorded), verdict=answer.verdict)
+    assert {KIND_OF[name] for name in recorded} == set(KIND_OF.values())
+    assert len(recorded) == len(set(KIND_OF.values()))
+    assert answer.outcome is Outcome.NO_VISIBLE_GAP
+    changed = decide(Ranking(assessment, worth, ()), replace(question, verdict='unknown'), True)
+    assert changed.outcome is Outcome.GO_ON
 
 
 @pytest.mark.xdist_group('first_round')

@@ -149,6 +149,24 @@ def test_a_change_of_the_mean_and_of_the_noise() -> None:
     assert all(change.size > 2 for change in noise if change.quantity == 'noise')
 
 
+def test_a_change_of_the_gain_in_motion_is_one_change_of_each_axis() -> None:
+    world = World(UNIT, UNIT)
+    assert not world.run(80)
+    changes = world.run(150, lambda a: 1.02 * a)
+    assert sorted(change.axis for change in changes) == ['x', 'y', 'z']
+    assert all((change.since_ns - ORIGIN_NS) * 1e-9 == pytest.approx(80, abs=2)
+               for change in changes)
+
+
+@pytest.mark.parametrize('mg_per_min', [0.02, 10.0])
+def test_a_ramp_from_the_first_second_is_a_change_if_no_healthy_unit_drifts_so(
+        mg_per_min: float) -> None:
+    world = World(UNIT, UNIT, amplitude=0.0)
+    changes = world.run(150, lambda a: a + [
+        0.0, mg_per_min * world.step / RATE_HZ / 60 * 9.80665e-3, 0.0])
+    assert {change.axis for change in changes} == ({'y'} if mg_per_min > 1 else set())
+
+
 def test_faults_of_the_samples_are_counted() -> None:
     world = World(UNIT, UNIT)
     world.run(20)
@@ -203,7 +221,7 @@ def test_memory_is_bounded_and_the_recording_has_the_newest_samples() -> None:
     world = World(UNIT, UNIT)
     world.live = LiveGap(UNIT, ReferenceKind.STAGE, GapSettings(history_s=60.0))
     world.run(200)
-    recording = world.live.recording()
+    recording = world.live.diagnosis_input().recording
     assert recording.time_s[-1] == pytest.approx(60, abs=0.1)
     assert {'ax_mps2', 'alpha_rad', 'beta_rad'} <= set(recording.columns)
     assert np.isfinite(recording.columns['alpha_rad'][100:-100]).all()

@@ -1,21 +1,9 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
-
+# SPDX-License-Identifier: Apache-2.0
 """A recording beside the simulation of its baseline, on the recording's own reference motion."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 
@@ -33,6 +21,12 @@ from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.smoothed_paths import PathErrors, SmoothedPath
 import numpy as np
 
+SHORTEST_S = 30.0
+"""Shortest time, s, that the recordings of a moving sensor last together. Chosen: a few turns of
+the stage."""
+SMALLEST_MOTION_G = 0.05
+"""Standard deviation of the simulated force, g, from which an axis is compared. Chosen: ten times
+the noise of an ADXL203."""
 SEARCH_RATE_HZ = 125.0
 """The search uses samples at about this rate, Hz. Chosen: it shows motion up to 60 Hz. Samples
 are left out, never averaged, so that aliases of faster signals remain."""
@@ -57,10 +51,33 @@ _SMALLEST_SHIFT_M = 1e-6
 _REST_RATE = 1e-3
 """A joint rests below this rate, rad/s, and the shift below this acceleration, m/s². Chosen: the
 specific force then changes by less than the noise within a second."""
-_SETTLING_S = 0.3
+SETTLING_S = 0.3
 """A sample rests if no joint moves within this time before it, s. Where another simulator moves
 from its first sample on, samples of this time are not used. Chosen: an RC filter of 15 Hz has
 settled."""
+_LONGEST_S = 1e3
+"""Time since the last move where there was none, s. Chosen: beyond any creep."""
+
+
+@dataclass(frozen=True)
+class DataFault:
+    """
+    A fault of the recording.
+
+    Attributes
+    ----------
+    name
+        Name in the report: `verdict.data_fault`.
+    status
+        Status of the verdict: 'bad_data' or 'insufficient'.
+    message
+        What is wrong and what to do, one line.
+
+    """
+
+    name: str
+    status: str
+    message: str
 
 
 class Reference(Enum):
@@ -171,22 +188,7 @@ class BaselineComparison:
         return residual_v
 
     def simulated_noise_v(self, sensor: Sensor, seed: int) -> np.ndarray:
-        """
-        Draw a sensor's output about its own mean, V, (n, m).
-
-        Parameters
-        ----------
-        sensor
-            The sensor with its noise and its effects.
-        seed
-            Seed of the noise.
-
-        Returns
-        -------
-        numpy.ndarray
-            Noise, V, (n, m).
-
-        """
+        """Draw a sensor's output about its own mean, V, (n, m)."""
         at_rate = replace(sensor, rate_hz=self.sensor.rate_hz)
         noisy = Response(at_rate, self.motion, seed, float(self.time_s[0]))(self.time_s)
         return noisy - self.simulated_v(at_rate)
@@ -200,22 +202,7 @@ class CachedPath:
         self._values: dict[tuple, np.ndarray] = {}
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
-        """
-        Return the derivative of an order at times.
-
-        Parameters
-        ----------
-        time_s
-            Times, s, (n,).
-        order
-            0, 1 or 2.
-
-        Returns
-        -------
-        numpy.ndarray
-            Values of the path's derivative, (n,).
-
-        """
+        """Return the derivative of an order at times."""
         if not len(time_s):
             return self._path(time_s, order)
         key = (order, len(time_s), float(time_s[0]), float(time_s[-1]),
@@ -256,30 +243,7 @@ def noiseless(sensor: Sensor) -> Sensor:
 
 def compare(recording: Recording, sensor: Sensor, sim: Motion | None = None
             ) -> BaselineComparison:
-    """
-    Put a recording beside the simulator, at the full rate of the recording.
-
-    Parameters
-    ----------
-    recording
-        A recording of `sensor`.
-    sensor
-        The baseline.
-    sim
-        Specific force by another simulator, in place of the stage.
-
-    Returns
-    -------
-    BaselineComparison
-        The comparison. All samples are used but the first ones of another simulator that moves:
-        the filter may still show what was before them.
-
-    Raises
-    ------
-    UserError
-        The stage angles jump as no stage does.
-
-    """
+    """Put a recording beside the simulator, at the full rate of the recording."""
     sensor = replace(sensor, rate_hz=recording.rate_hz)
     volts = recording.volts(sensor)
     motion, reference = _motion(recording, sensor, volts, sim)
@@ -291,7 +255,7 @@ def compare(recording: Recording, sensor: Sensor, sim: Motion | None = None
     at_rest = _at_rest(motion, time_s, reference, volts)
     used = np.ones(len(recording), bool)
     if reference is Reference.SIMULATOR:
-        used = at_rest | (time_s > time_s[0] + _SETTLING_S)
+        used = at_rest | (time_s > time_s[0] + SETTLING_S)
     return BaselineComparison(
         recording.path, time_s, volts, motion, sensor, reference,
         'alpha_rad' in recording.columns, at_rest, used)
@@ -367,4 +331,18 @@ def _at_rest(motion: Motion, time_s: np.ndarray, reference: Reference, volts: np
         moving |= np.abs(joint(time_s, 1)) > _REST_RATE
     moving |= np.abs(motion.shift(time_s, 2)) > _REST_RATE
     last_move_s = np.maximum.accumulate(np.where(moving, time_s, -np.inf))
-    return time_s - last_move_s > _SETTLING_S
+    return time_s - last_move_s > SETTLING_S
+
+
+def direction_of_last_move(rate_rad_s: np.ndarray) -> np.ndarray:
+    """Return the direction of the last move of a joint, −1 or 1, 0 before the first, (n,)."""
+    moving = np.abs(rate_rad_s) > _REST_RATE
+    last = np.maximum.accumulate(np.where(moving, np.arange(len(rate_rad_s)), -1))
+    return np.where(last >= 0, np.sign(rate_rad_s[np.maximum(last, 0)]), 0.0)
+
+
+def time_since_move_s(time_s: np.ndarray, rates_rad_s: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the time since any joint moved."""
+    moving = np.any(np.abs(np.array(rates_rad_s)) > _REST_RATE, axis=0)
+    last_s = np.maximum.accumulate(np.where(moving, time_s, -np.inf))
+    return np.minimum(time_s - last_s, _LONGEST_S)

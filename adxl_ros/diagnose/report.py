@@ -1,0 +1,492 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The diagnosis as `report.json`, and the words that terminal and page share with it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from adxl_ros.diagnose.comparison import Reference
+from adxl_ros.diagnose.diagnosis import Diagnosis, Report
+from adxl_ros.diagnose.hypothesis_fit import Hypothesis
+from adxl_ros.diagnose.next_experiment import MENU, NextExperiment
+from adxl_ros.diagnose.residual_map import SIGNIFICANT_P
+from adxl_ros.diagnose.verdict import Interval, Verdict, WeightedHypothesis
+from adxl_ros.diagnose.visibility import by_effect, CouldShow
+from adxl_ros.model.coefficients import fitted_of, get, parameter_of
+from adxl_ros.model.constants import G0_MPS2, Z_90
+from adxl_ros.model.effects import effect_named, library
+from adxl_ros.model.effects.base import ActsOn, Coefficient, Concern
+import numpy as np
+
+_DIGITS = 6
+"""Significant digits of the report. Chosen: more than any of its numbers has."""
+_MOST_CELLS = 40
+"""Largest number of cells in the report. Chosen: cells of small share say little."""
+PROBABLE = 0.05
+"""Smallest probability of what terminal and page show first. Chosen: that of a rival."""
+_NEARLY_ALL = 0.995
+"""Share from which a percentage would be rounded to 100."""
+_SMALLEST_MG = 0.005
+"""Acceleration, mg, that rounds to 0.00 below this."""
+_WITHOUT_GAP = ('no_gap', 'insufficient')
+"""Verdicts in which there is no gap to close."""
+_CLOSING = ('explained', 'partly', 'inseparable')
+"""Verdicts that name effects."""
+_MATTERS = 0.3
+"""Error of the reference, in material amplitudes, that is shown: it adds 5 % to them."""
+_FLOOR_SOURCES = {'still': 'from rests', 'repeats': 'from repeats of a trajectory',
+                  'assumed': 'assumed from the parameter file'}
+_DIMENSIONS = {
+    'force': 'the force along the axis', 'cross_force': 'the force across the axis',
+    'direction': 'the direction of the last move', 'rate': 'the rate of the joints',
+    'alpha_rad': 'alpha', 'beta_rad': 'beta', 'temperature_c': 'the temperature',
+    'warming': 'the history of the temperature', 'supply_v': 'the supply', 'time_s': 'the time',
+    'since_move_s': 'the time since a move', 'code': 'the code of the ADC',
+    'lag': 'the recent history of the force'}
+"""Dimensions of the reproducible rest, for people."""
+_MOST_DIMENSIONS = 2
+"""Dimensions that a sentence names. Chosen: the strongest ones."""
+_UNIT_SUFFIXES = ('m', 's', 'rad', 'v', 'hz', 'f', 'g')
+"""Ends of parameter names that repeat the unit of the value."""
+NOISE_STAYS = 'The effects are noise, which no simulation repeats sample by sample.'
+"""Why effects on the noise close nothing."""
+
+
+class Row(NamedTuple):
+    """One row of figures: what it is, its figures with their units, and a remark."""
+
+    label: str
+    text: str
+    note: str = ''
+
+
+def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Return the report as the objects of JSON; docs/interfaces.md lists its keys."""
+    fault, report = diagnosis.fault, diagnosis.report
+    if fault is not None:
+        return {'schema': 1, 'verdict': {
+            'status': fault.status, 'effects': [], 'groups': [], 'of': None,
+            'data_fault': fault.name if fault.status == 'bad_data' else None,
+            'probability': 1.0}, 'hypotheses': [], 'gap': None, 'where': [], 'candidates': [],
+            'notes': notes(diagnosis), 'next_experiment': None, 'summary': fault.message}
+    assert report is not None
+    verdict = report.verdict
+    return {
+        'schema': 1,
+        'verdict': {'status': verdict.status, 'effects': list(verdict.effects),
+                    'groups': [list(group) for group in verdict.groups], 'of': concern(verdict),
+                    'data_fault': None, 'probability': _rounded(verdict.probability)},
+        'hypotheses': _hypotheses(verdict.hypotheses),
+        'gap': _gap(diagnosis, report),
+        'explained': _power(verdict.explained), 'rest': _power(verdict.rest),
+        'rest_follows': list(verdict.rest_follows),
+        'material': _rounded(verdict.material_mps2),
+        'lost_without': {e: _power(p) for e, p in verdict.lost_without.items()},
+        'where': [{'axis': c.axis, 'dimension': c.dimension,
+                   'range': [_rounded(c.low), _rounded(c.high)], 'mean': _rounded(c.mean_mps2),
+                   'share': _rounded(c.share), 'p': _rounded(c.p)}
+                  for c in report.residual_cells if c.p < SIGNIFICANT_P][:_MOST_CELLS],
+        'not_covered': list(report.not_covered), 'notes': notes(diagnosis),
+        'could_show': [{'effect': r.effect, 'parameter': r.parameter, 'axis': r.axis or None,
+                        'unit': r.unit, 'smallest': _rounded(r.smallest), 'could_show': r.shows}
+                       for r in report.could_show],
+        'candidates': _candidates(report),
+        'noise_remainders': [
+            {'effect': r.effect, 'quantity': r.quantity, 'unit': r.unit,
+             'axis': r.axes[r.largest] if r.axes else None,
+             'recorded': _rounded(r.recorded[r.largest]),
+             'simulated': _rounded(r.simulated[r.largest]),
+             'left': _rounded(r.remains[r.largest])} for r in report.noise_remainders],
+        'next_experiment': _next_experiment(report.next_experiment),
+        'summary': summary(diagnosis)}
+
+
+def notes(diagnosis: Diagnosis) -> list[str]:
+    """Return what was corrected or left out, with the file where there are several."""
+    several = len(diagnosis.comparisons) > 1
+    return [f'{Path(c.name).name}: {note}' if several else note
+            for c in diagnosis.comparisons for note in c.notes]
+
+
+def _rounded(value: float) -> float | None:
+    """Round to the digits of the report; None for NaN and infinity."""
+    return float(f'{value:.{_DIGITS}g}') if np.isfinite(value) else None
+
+
+def _power(power: Interval) -> dict[str, Any]:
+    """Return a power, (m/s²)², with its interval."""
+    return {'value': _rounded(power.value), 'ci': [_rounded(power.low), _rounded(power.high)],
+            'unit': '(m/s^2)^2'}
+
+
+def _hypotheses(hypotheses: Sequence[WeightedHypothesis]) -> list[dict[str, Any]]:
+    """Round probabilities so that they still sum to 1."""
+    rounded = [round(h.probability, _DIGITS) for h in hypotheses]
+    rounded[0] = round(1 - sum(rounded[1:]), _DIGITS)
+    return [{'effects': list(h.effects), 'probability': p} for h, p in zip(hypotheses, rounded)]
+
+
+def _gap(diagnosis: Diagnosis, report: Report) -> dict[str, Any]:
+    """Return the gap before and after, and the noise recording by recording."""
+    closure, has_gap = report.closure, report.verdict.status not in _WITHOUT_GAP
+    noise = [{'recording': comparison.name,
+              'log_likelihood_gain': _rounded(after.log_likelihood - before.log_likelihood),
+              'bands_hz': list(map(_rounded, after.band_edges_hz)),
+              'power_ratio_before': list(map(_rounded, before.power_ratio)),
+              'power_ratio_after': list(map(_rounded, after.power_ratio)),
+              'allan_s': list(after.averaging_times_s),
+              'allan_ratio_before': list(map(_rounded, before.allan_ratio)),
+              'allan_ratio_after': list(map(_rounded, after.allan_ratio))}
+             for comparison, before, after in zip(diagnosis.comparisons, report.noise_before,
+                                                  report.noise_after)]
+    return {'unit': 'm/s^2', 'before': _rounded(closure.before_mps2),
+            'before_ci': list(map(_rounded, closure.before_ci)),
+            'after': _rounded(closure.after_mps2),
+            'after_ci': list(map(_rounded, closure.after_ci)),
+            'floor': _rounded(closure.floor_mps2),
+            'floor_ci': closure.floor_ci and list(map(_rounded, closure.floor_ci)),
+            'floor_source': report.noise_floor.source,
+            'upper_limit': _rounded(report.verdict.upper_limit_mps2),
+            'reference': _rounded(report.verdict.reference_mps2),
+            'closed': _rounded(closure.closed) if has_gap else None,
+            'closed_ci': list(map(_rounded, closure.closed_ci)),
+            'not_in_reference': _rounded(report.lost_motion_mps2), 'noise': noise}
+
+
+def _next_experiment(proposal: NextExperiment | None) -> dict[str, Any] | None:
+    """Return what to record next."""
+    return None if proposal is None else {
+        'manoeuvre': proposal.manoeuvre, 'why': proposal.why, 'command': proposal.command,
+        'menu': [{'manoeuvre': w.text, 'minutes': _rounded(w.minutes),
+                  'nats_per_minute': _rounded(w.nats_per_minute)} for w in proposal.menu]}
+
+
+def shares_of_gap(report: Report) -> dict[str, float]:
+    """Split the closed share of the squared gap among the effects by what is lost without each."""
+    verdict, closure = report.verdict, report.closure
+    if not set(verdict.best.effects) & {*verdict.effects, *sum(verdict.groups, ())}:
+        return {}
+    lost = {effect: max(power.value, 0.0) for effect, power in verdict.lost_without.items()}
+    total = sum(lost.values())
+    closed = float(np.clip(closure.closed, 0.0, 1.0)) if np.isfinite(closure.closed) else 0.0
+    return {effect: closed * power / total if total else 0.0 for effect, power in lost.items()}
+
+
+def _candidates(report: Report) -> list[dict[str, Any]]:
+    """Return the effects of all hypotheses and detections, the most probable first."""
+    verdict, shown = report.verdict, by_effect(report.could_show)
+    best_with: dict[str, Hypothesis] = {}
+    for h in report.hypotheses:
+        for name in h.effects:
+            best_with.setdefault(name, h)
+    detected, shares = {d.effect: d for d in report.detections}, shares_of_gap(report)
+    out = []
+    for name, effect in library().items():
+        sets = [h for h in verdict.hypotheses if name in h.effects]
+        if not sets and name not in best_with:
+            continue
+        if name in detected:
+            parameters = {p.name: {'value': np.asarray(detected[name].values[p.name]).tolist(),
+                                   'unit': p.unit}
+                          for p in effect.parameters if p.name in detected[name].values}
+        else:
+            parameters = _parameters(report, best_with.get(name), name)
+        closed = _rounded(report.closure.closed) if name in verdict.best.effects else None
+        group = next((g for g in reversed(verdict.groups) if name in g), ())
+        out.append({
+            'effect': name, 'of': effect.concern.value,
+            'probability': _rounded(min(sum(h.probability for h in sets), 1.0)),
+            'closed': closed,
+            'p': float(np.exp(-detected[name].log_bayes_factor)) if name in detected else None,
+            'parameters': parameters,
+            'share': _rounded(shares[name]) if name in shares else None,
+            'visibility': _rounded(shown[name].share) if name in shown else 1.0,
+            'inseparable_from': [other for other in group if other != name],
+            'cause': effect.cause})
+    return sorted(out, key=lambda c: (-c['probability'], c['effect']))
+
+
+def _parameters(report: Report, hypothesis: Hypothesis | None, effect: str) -> dict[str, Any]:
+    """
+    Return the parameters of an effect as the parameter file has them, baseline included.
+
+    A parameter that the recordings do not determine has no value.
+    """
+    drift, sensor = effect_named(effect).diagnosis.drift, report.sensor
+    if drift and effect in sensor.effects:
+        # The density of a drift is chosen with the noise, on a grid.
+        return {_key(name): {'value': _rounded(float(get(sensor, [name])[0])),
+                             'unit': parameter_of(name).unit}
+                for name in fitted_of(effect_named(effect), sensor.axes)}
+    parameters: dict[str, dict[str, Any]] = {}
+    if hypothesis is None:
+        return parameters
+    for name in fitted_of(effect_named(effect), hypothesis.sensor.axes):
+        if name not in hypothesis.names:
+            continue
+        place = hypothesis.names.index(name)
+        value, half = float(get(hypothesis.sensor, [name])[0]), Z_90 * hypothesis.std[place]
+        determined = not hypothesis.undetermined[place]
+        parameters[_key(name)] = {
+            'value': _rounded(value) if determined else None,
+            'ci': [_rounded(value - half), _rounded(value + half)] if determined else None,
+            'unit': parameter_of(name).unit, 'determined': determined}
+    return parameters
+
+
+def _key(name: Coefficient) -> str:
+    """Return the name of a parameter with its axis, as the keys of the report have it."""
+    return f'{name.parameter}.{name.axis}' if name.axis else name.parameter
+
+
+def badge(diagnosis: Diagnosis) -> str:
+    """Return the verdict in a few words."""
+    if diagnosis.fault is not None:
+        return 'BAD DATA' if diagnosis.fault.status == 'bad_data' else 'TOO LITTLE DATA'
+    assert diagnosis.report is not None
+    verdict = diagnosis.report.verdict
+    count = len(verdict.effects)
+    if verdict.status == 'explained' and concern(verdict) == Concern.REFERENCE.value:
+        return 'ERROR OF THE REFERENCE'
+    return {'no_gap': f'NO GAP above {mg_text(verdict.upper_limit_mps2)}',
+            'insufficient': 'TOO LITTLE DATA', 'unknown': 'UNKNOWN CAUSE',
+            'inseparable': 'CAUSES NOT SEPARATED',
+            'partly': f'PARTLY EXPLAINED, {percent(verdict.explained_share)}',
+            'explained': f'GAP EXPLAINED by {count} effect{"" if count == 1 else "s"}',
+            }[verdict.status]
+
+
+def headline(diagnosis: Diagnosis) -> str:
+    """Return the verdict in a sentence or two."""
+    if diagnosis.fault is not None:
+        return diagnosis.fault.message
+    assert diagnosis.report is not None
+    verdict = diagnosis.report.verdict
+    sure = f'({percent(verdict.probability)} sure)'
+    named = listed([*verdict.effects, *(listed(group, 'or') for group in verdict.groups)], 'and')
+    if verdict.status == 'no_gap':
+        return f'No gap {sure}: one above {mg_text(verdict.upper_limit_mps2)} would have shown.'
+    if verdict.status == 'insufficient':
+        return 'No verdict: neither motion nor temperature nor supply changes, so that no ' \
+               'effect can show.'
+    rest = mg_text(_amplitude(verdict.rest.value))
+    if verdict.status == 'unknown':
+        return f'Unknown {sure}: {rest} repeats that no effect of the library explains.' \
+               f'{_follows(verdict)}'
+    if verdict.status == 'partly':
+        share = verdict.explained_share
+        return f'Partly explained {sure}: {percent(share)} of what repeats is {named}; ' \
+               f'{percent(1 - share)} ({rest}) is something else.{_follows(verdict)}' \
+               f'{_of_reference(verdict)}'
+    recordings = 'these recordings do' if len(diagnosis.comparisons) > 1 else 'this recording does'
+    separate = f': {recordings} not separate them' if verdict.groups else ''
+    noise = f' {NOISE_STAYS}' if is_only_noise(diagnosis.report) else ''
+    return f'Explained {sure} by {named}{separate}.{noise}{_of_reference(verdict)}'
+
+
+def _follows(verdict: Verdict) -> str:
+    """Return a sentence on what the reproducible rest follows."""
+    where = [_DIMENSIONS.get(d, d) for d in verdict.rest_follows[:_MOST_DIMENSIONS]]
+    return f' It follows {listed(where, "and")}.' if where else ''
+
+
+def concern(verdict: Verdict) -> str | None:
+    """Return what a verdict is about, joined by 'and', within a group by 'or'; None for none."""
+    parts = [_concerns(group) for group in ([e] for e in verdict.effects)]
+    parts += [_concerns(group) for group in verdict.groups]
+    return ' and '.join(sorted(set(parts))) or None
+
+
+def _concerns(effects: Sequence[str]) -> str:
+    """Return what one of some effects is an error of."""
+    return ' or '.join(sorted({effect_named(e).concern.value for e in effects}))
+
+
+def _of_reference(verdict: Verdict) -> str:
+    """Return a sentence on what is the reference's in a verdict; empty where nothing is."""
+    reference = Concern.REFERENCE.value
+    if concern(verdict) == reference:
+        return f' This is an error of the {reference}, not of the sensor.'
+    certain = [e for e in verdict.effects if effect_named(e).concern is Concern.REFERENCE]
+    undecided = [_concerns(group) for group in verdict.groups if reference in _concerns(group)]
+    sentences = [f' {listed(certain, "and")} is of the {reference}.'] if certain else []
+    return ''.join(sentences + [
+        f' The error is of the {c.replace(" or ", " or of the ")}; both give the same samples.'
+        for c in undecided])
+
+
+def listed(names: Sequence[str], word: str) -> str:
+    """Return names separated by commas, with a word before the last one."""
+    return f' {word} '.join(filter(None, [', '.join(names[:-1]), *names[-1:]]))
+
+
+def summary(diagnosis: Diagnosis) -> str:
+    """Return verdict and figures in a few sentences."""
+    if diagnosis.report is None:
+        return headline(diagnosis)
+    rows = [f'{row.label}: {row.text}.' for row in (*figure_rows(diagnosis),
+                                                    *remainder_rows(diagnosis.report))]
+    return ' '.join([headline(diagnosis), *(row[0].upper() + row[1:] for row in rows)])
+
+
+def figure_rows(diagnosis: Diagnosis) -> list[Row]:
+    """Return the figures from which the verdict follows: the same for terminal, page and JSON."""
+    report = diagnosis.report
+    assert report is not None
+    closure, verdict = report.closure, report.verdict
+    compared = any(c.reference is not Reference.NONE for c in diagnosis.comparisons)
+    rows = [Row('gap', f'{mg_text(closure.before_mps2)} rms', 'recording minus simulation'
+                if compared else 'without its mean, because the pose is unknown')]
+    if closes(report):
+        low, high = (percent(share) for share in closure.closed_ci)
+        ci = '' if low == high else f', 90 % interval {low} to {high}'
+        rows.append(Row('with the effects', f'{mg_text(closure.after_mps2)} rms',
+                        f'{percent(closure.closed)} closed, held out{ci}'))
+    rows.append(Row('noise floor', f'{mg_text(closure.floor_mps2)} rms',
+                    _FLOOR_SOURCES[report.noise_floor.source]))
+    if verdict.status in _WITHOUT_GAP:
+        rows.append(Row('upper limit', mg_text(verdict.upper_limit_mps2),
+                        'a larger gap would have shown'))
+    else:
+        rows.append(Row('explained', _power_text(verdict.explained), 'by ' + listed(
+            verdict.best.effects, 'and') if verdict.best.effects else 'no effect on the mean'))
+    rows.append(Row('repeats, not explained', _power_text(verdict.rest),
+                    'by flexible functions, held out'))
+    text, note = f'from {mg_text(verdict.material_mps2)}', 'smaller is no gap'
+    if verdict.reference_mps2 > _MATTERS * verdict.material_mps2:
+        highest = float(np.hypot(verdict.material_mps2, verdict.reference_mps2))
+        text += f', {mg_text(highest)} if it follows the pose'
+        note += f'; the reference has errors of {mg_text(verdict.reference_mps2)}'
+    rows.append(Row('material', text, note))
+    if report.lost_motion_mps2:
+        lacking_hz = min(c.lacking_hz for c in diagnosis.comparisons)
+        rows.append(Row('not in the reference', f'{mg_text(report.lost_motion_mps2)} rms',
+                        f'motion above {lacking_hz:.2g} Hz'))
+    if len(verdict.lost_without) > 1 and closes(report):
+        rows += [Row(f'lost without {effect}', mg_text(_amplitude(power.value)), ' to '.join(
+            mg_text(_amplitude(p)) for p in (power.low, power.high)))
+            for effect, power in verdict.lost_without.items()]
+    return rows
+
+
+def remainder_rows(report: Report) -> list[Row]:
+    """Return what remains of each noise-like effect."""
+    rows = []
+    for r in report.noise_remainders:
+        values = (_statistic_text(float(v[r.largest]), r.unit)
+                  for v in (r.recorded, r.simulated, r.remains))
+        axis = f' on {r.axes[r.largest]}' if r.axes else ''
+        rows.append(Row(f'{r.effect}, {r.quantity}{axis}',
+                        '{} recorded, {} simulated, {} left'.format(*values)))
+    return rows
+
+
+def _statistic_text(value: float, unit: str) -> str:
+    """Return a statistic of the noise with its unit."""
+    if unit == 'm/s^2':
+        return mg_text(value)
+    return f'{100 * value:.2g} %' if unit == '1' else f'{value:.2g} {unit}'.replace(
+        ' 1/s', ' a second')
+
+
+def is_only_noise(report: Report) -> bool:
+    """Determine whether a verdict has effects, but none that acts on the mean."""
+    return report.verdict.status in _CLOSING and not any(
+        effect_named(e).acts_on is ActsOn.MEAN for e in report.verdict.best.effects)
+
+
+def closes(report: Report) -> bool:
+    """Determine whether there is a gap, and effects that change the mean."""
+    return report.verdict.status in _CLOSING and bool(np.isfinite(report.closure.closed)) \
+        and not is_only_noise(report)
+
+
+def shown_row(row: CouldShow, scale_v_per_g: float) -> list[str]:
+    """Return effect, parameter, smallest and typical size, and the manoeuvre that shows it."""
+    smallest, typical = (parameter_text({'value': v, 'unit': row.unit}, scale_v_per_g, 2)
+                         for v in (row.smallest, row.typical))
+    return [row.effect, parameter_label(row.parameter, False),
+            smallest if row.shows else 'cannot show', typical,
+            MENU[row.revealed_by].text if row.revealed_by else '']
+
+
+def mg(value_mps2: Any) -> Any:
+    """Convert m/s² to mg."""
+    return 1e3 * value_mps2 / G0_MPS2
+
+
+def mg_text(value_mps2: float) -> str:
+    """Return an acceleration, m/s², in mg with three digits at most."""
+    value = float(mg(value_mps2))
+    if abs(value) < _SMALLEST_MG:
+        return '< 0.01 mg'
+    return f'{value:.{2 if abs(value) < 10 else 1 if abs(value) < 100 else 0}f} mg'
+
+
+def _amplitude(power: float) -> float:
+    """Return the root of a power; a negative power counts as 0."""
+    return float(np.sqrt(max(power, 0.0)))
+
+
+def _power_text(power: Interval) -> str:
+    """Return the root of a power with its 90 % interval in mg."""
+    value, low, high = (mg_text(_amplitude(p)) for p in (power.value, power.low, power.high))
+    if value == high:
+        return value
+    return f'{value.removesuffix(" mg")} ({low.removesuffix(" mg")} to {high[:-3]}) mg'
+
+
+def percent(share: float) -> str:
+    """Return a share in per cent; only certainty by definition would be 0 or 100 %."""
+    if share >= _NEARLY_ALL:
+        return '> 99 %'
+    return '< 1 %' if 0 < share < 1 - _NEARLY_ALL else f'{100 * share:.0f} %'
+
+
+def parameter_label(key: str, is_single: bool) -> str:
+    """Return the name of a parameter without its unit, or its axis where that is enough."""
+    name, _, axis = key.partition('.')
+    stem, _, suffix = name.rpartition('_')
+    short = stem if stem and suffix in _UNIT_SUFFIXES else name
+    return axis if axis and is_single else f'{short} {axis}'.rstrip()
+
+
+def parameter_text(parameter: dict[str, Any], scale_v_per_g: float = 1.0, digits: int = 3
+                   ) -> str:
+    """Return a parameter of the report with its interval, in a unit that people use."""
+    if not parameter.get('determined', True):
+        return 'not determined'
+    ci = parameter.get('ci')
+    plain = np.array([*np.atleast_1d(parameter['value']), *(ci or ())], float)
+    values, unit = _for_people(plain, parameter['unit'], scale_v_per_g)
+    if ci:
+        width = max((values[2] - values[1]) / 4, 1e-12)
+        places = int(np.clip(np.ceil(-np.log10(width)), 0, 6))
+        value, low, high = (f'{round(v, places) + 0.0:.{places}f}' for v in values)
+        return f'{value} ({low} to {high}) {unit}'.rstrip()
+    texts = dict.fromkeys(np.format_float_positional(v, digits, fractional=False, trim='-')
+                          if abs(v) < 100 else f'{v:.0f}' for v in values)
+    return f'{", ".join(texts)} {unit}'.rstrip()
+
+
+def _for_people(values: np.ndarray, unit: str, scale_v_per_g: float) -> tuple[np.ndarray, str]:
+    """Return values in a unit with prefix; volts of the output as the acceleration they feign."""
+    if unit in ('V', 'V/g') and np.abs(values).max() < scale_v_per_g:
+        values, unit = values / scale_v_per_g, 'g' if unit == 'V' else '1'
+    if unit == 'm/s^2':
+        values, unit = values / G0_MPS2, 'g'
+    if unit == 'rad':
+        return np.degrees(values), 'deg'
+    base, slash, per = unit.replace('s/s', '1').partition('/')
+    per = per.replace('^2', '²').replace('sqrt(', '√').replace(')', '')
+    largest = float(np.abs(values).max())
+    prefixes = {'g': (1e3, 'mg', 1e6, 'µg'), 'm': (1e3, 'mm', 1e6, 'µm'),
+                's': (1e3, 'ms', 1e6, 'µs'), 'V': (1e3, 'mV', 1e6, 'µV'),
+                '1': (1e2, '%', 1e6, 'ppm')}
+    if base in prefixes and 0 < largest < 0.1:
+        milli, milli_name, micro, micro_name = prefixes[base]
+        factor, base = (milli, milli_name) if largest >= 1e-4 else (micro, micro_name)
+        values = factor * values
+    return values, (base + slash + per).removeprefix('1' if not per else '')
