@@ -21,23 +21,49 @@ Start a calibrated sensor on a robot: the driver and the compensation.
     ros2 launch adxl_ros robot.launch.py params_file:=unit_17.yaml base_frame:=base_link \
         mounting_xyz_m:=0.1,0,0.05 mounting_rpy_rad:=3.14159,0,0
 
-The second line also publishes the static transform from the robot to the case. A node that ends
-is started again. The launch ends with an error when a node refuses to start three times.
+    ros2 launch adxl_ros robot.launch.py params_file:=cam7.yaml imu_topic:=/camera/imu \
+        output_rate_hz:=50
+
+The second line also publishes the static transform from the robot to the case. The third one
+corrects the IMU of another driver, and publishes 50 samples a second. A node that ends is started
+again, unless `respawn` is false. The launch ends with an error when a node refuses to start three
+times, or once without `respawn`.
 """
 
+from adxl_ros.errors import UserError
 from adxl_ros.nodes.support import launch_nodes
+from adxl_ros.nodes.support.launch_nodes import Argument, LINK_TYPE, text
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
+from launch.actions import DeclareLaunchArgument
+
+OUTPUT_RATE = Argument('output_rate_hz', 'output_rate_hz', 'rate of imu/data and tilt, Hz', float)
 
 
 def generate_launch_description() -> LaunchDescription:
-    return launch_nodes.describe(
-        [*launch_nodes.common_arguments(), *launch_nodes.TRANSFORM], make_nodes)
+    return launch_nodes.describe([
+        *launch_nodes.common_arguments(), *launch_nodes.TRANSFORM, OUTPUT_RATE.declared(),
+        DeclareLaunchArgument('imu_topic', default_value='', description='topic of another '
+                              "driver's sensor_msgs/Imu, such as /camera/imu, which is corrected "
+                              'in place of that of our driver; empty: start our driver'),
+        DeclareLaunchArgument('use_sim_time', default_value='false', choices=['true', 'false'],
+                              description='follow /clock'),
+        DeclareLaunchArgument('respawn', default_value='true', choices=['true', 'false'],
+                              description='start a node again that ends')], make_nodes)
 
 
 def make_nodes(context: LaunchContext) -> list[Action]:
     """Return the nodes."""
+    imu_topic, respawn = text(context, 'imu_topic'), text(context, 'respawn') == 'true'
+    if imu_topic and text(context, LINK_TYPE.name):
+        raise UserError(f'imu_topic:={imu_topic} starts no driver; leave link_type out')
+    nodes = {'compensation': launch_nodes.given_parameters(context, [OUTPUT_RATE])}
+    if not imu_topic:
+        nodes = {'driver': {}} | nodes
+    sim_time = {'use_sim_time': True} if text(context, 'use_sim_time') == 'true' else {}
     return [*launch_nodes.static_transform(context), *(
-        launch_nodes.make_node(context, executable, {}, respawn=True, respawn_delay=2.0,
-                               on_exit=launch_nodes.GiveUp())
-        for executable in ('driver', 'compensation'))]
+        launch_nodes.make_node(
+            context, executable, parameters | sim_time, respawn=respawn, respawn_delay=2.0,
+            remappings=[('imu/data_raw', imu_topic)] if imu_topic else [],
+            on_exit=launch_nodes.GiveUp() if respawn else launch_nodes.GiveUp(1))
+        for executable, parameters in nodes.items())]

@@ -148,6 +148,8 @@ class CompensationPolicy:
         File that was taken from the store, '' if none was.
     info
         What the stream states of itself (`sensor_info`), None before it does.
+    mixture
+        That several nodes publish the samples, so that none counts, or ''.
     refusal
         Why the sensor cannot correct the stream, or ''.
 
@@ -161,7 +163,7 @@ class CompensationPolicy:
         self._warnings: set[str] = set()
         self.stored_path = ''
         self.info: StreamInfo | None = None
-        self.refusal = ''
+        self.refusal = self.mixture = ''
 
     @property
     def rate_hz(self) -> float:
@@ -214,7 +216,7 @@ class CompensationPolicy:
 
     def assess(self) -> bool:
         """Update `refusal` by the sensor and the stream; return whether it has changed."""
-        before, self.refusal = self.refusal, ''
+        before, self.refusal = self.refusal, self.mixture
         try:
             self.check(self.sensor)
         except UserError as error:
@@ -360,7 +362,7 @@ class CompensationPolicy:
     def _unit(self) -> str:
         """State whether the stream is of the unit of the calibration."""
         if self.refusal:
-            return 'other'
+            return 'several' if self.refusal == self.mixture else 'other'
         if self.info is None:
             return 'not confirmed'
         # A stream or a file without a serial number goes with every unit.
@@ -373,7 +375,8 @@ class CompensationPolicy:
         if not sensor.effects:
             return 'not calibrated'
         if self.refusal:
-            return f'of another unit: {self.refusal}'
+            return self.refusal if self.refusal == self.mixture else \
+                f'of another unit: {self.refusal}'
         if interval.counts.get('outside'):
             return f'outside: {"; ".join(interval.outside)}'
         if age_days is not None and age_days < -_CLOCK_TOLERANCE_DAYS:

@@ -50,6 +50,7 @@ class _Chain(NamedTuple):
 
     live: LiveEstimator
     delayed: filter_inversion.DelayedInversion
+    stride: int
 
 
 class LiveStream:
@@ -75,6 +76,8 @@ class LiveStream:
     publish_free
         Takes the acceleration without gravity of a sample that states an orientation, m/s², a
         serialized geometry_msgs/Vector3Stamped; None for no such output.
+    output_rate_hz
+        Rate to which samples are thinned out, unfiltered, Hz; 0 for all of them.
 
     Attributes
     ----------
@@ -96,9 +99,11 @@ class LiveStream:
 
     def __init__(self, paper: bool, undo_filter: bool, publish_imu: Callable[[bytes], None],
                  publish_tilt: Callable[[bytes], None], keep_orientation: bool = False,
-                 publish_free: Callable[[bytes], None] | None = None) -> None:
+                 publish_free: Callable[[bytes], None] | None = None,
+                 output_rate_hz: float = 0.0) -> None:
         self._paper, self._undo_filter = paper, undo_filter
         self._keep_orientation, self._publish_free = keep_orientation, publish_free
+        self._output_rate_hz, self._corrected = output_rate_hz, 0
         self._mounting, self._frame_id = Mounting(), ''
         self._sensor: tuple[Sensor, float]
         self._forces: list[Components] | None = None
@@ -137,7 +142,7 @@ class LiveStream:
         live = LiveEstimator(sensor, self._paper, self._undo_filter,
                              self._mounting if self._mounting.turns else None)
         live.set_environment(**self.surroundings)
-        self._chain = _Chain(live, _delayed(sensor, rate_hz))
+        self._chain = _Chain(live, _delayed(sensor, rate_hz), self._stride(rate_hz))
 
     @property
     def sensor(self) -> Sensor:
@@ -174,7 +179,12 @@ class LiveStream:
 
     def restart_filter(self, rate_hz: float) -> None:
         """Forget the samples that wait for their neighbours; the stream has a rate, Hz."""
-        self._chain = self._chain._replace(delayed=_delayed(self._chain.live.sensor, rate_hz))
+        self._chain = self._chain._replace(delayed=_delayed(self._chain.live.sensor, rate_hz),
+                                           stride=self._stride(rate_hz))
+
+    def _stride(self, rate_hz: float) -> int:
+        """Return which part of the samples is published: one of so many."""
+        return max(1, round(rate_hz / self._output_rate_hz)) if self._output_rate_hz else 1
 
     def surround(self, name: str, value: float) -> None:
         """
@@ -218,11 +228,12 @@ class LiveStream:
             self.counts['dropped'] += 1
         elif self._undo_filter:
             for ready in chain.delayed(time_s, volts, raw):
-                self._correct(chain.live, *ready)
+                self._correct(chain, *ready)
         else:
-            self._correct(chain.live, time_s, volts, raw)
+            self._correct(chain, time_s, volts, raw)
 
-    def _correct(self, live: LiveEstimator, time_s: float, volts: list[float], raw: Any) -> None:
+    def _correct(self, chain: _Chain, time_s: float, volts: list[float], raw: Any) -> None:
+        live = chain.live
         estimate = live.from_volts(volts, time_s)
         if estimate is None:
             self.counts['dropped'] += 1
@@ -234,6 +245,9 @@ class LiveStream:
         xx, xy, xz, yy, yz, zz = estimate.covariance
         if self._forces is not None:
             self._forces.append(estimate.force)
+        self._corrected += 1
+        if self._corrected % chain.stride:
+            return
         if live.mounting is not None:
             raw = imu_message.with_frame(imu_message.turned(raw, live.mounting), self._frame_id)
         orientation: Sequence[float] | None = self._orientation(estimate)

@@ -239,7 +239,9 @@ class IioLink:
                                  self._declared, self._settings)
         except (ReadError, UserError) as error:
             self._error = str(error)
-            self._backoff.fail(slow=isinstance(error, UserError))
+            # To look for a USB device, libiio asks all that are on the bus.
+            is_usb = self._settings.uri.startswith('usb:')
+            self._backoff.fail(slow=is_usb or isinstance(error, UserError))
             return
         self._stream, self._error = stream, ''
         self._connections += 1

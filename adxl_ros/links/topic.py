@@ -17,12 +17,13 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import ceil, inf
 import time
 from typing import NamedTuple
 
+from adxl_ros.files.stamp_bursts import is_even, stamped_rate_hz
 from adxl_ros.links.support.base import (
     Event,
     Level,
@@ -44,8 +45,10 @@ _SILENT_S = 3.0
 """Steady time without samples after which the stream counts as silent, s; chosen: as for the
 samples of the calibration node."""
 _FIRST = 50
-"""Samples that determine the rate, before the first one is published; chosen: 0.25 s at 200 Hz,
-where a jitter of 20 % of the period leaves an error of 0.4 %."""
+"""Samples with even stamps that determine the rate, before the first one is published; chosen:
+0.25 s at 200 Hz."""
+_FIRST_UNEVEN = 400
+"""Samples with uneven stamps that do; chosen: a jitter of a whole period leaves 2 %."""
 _FIRST_NS = 1_000_000_000
 """Simulated time after which fewer samples determine the rate, ns; chosen: for slow simulators."""
 _MIN_FIRST = 5
@@ -53,7 +56,11 @@ _MIN_FIRST = 5
 _BLOCK = 100
 """Samples after which the rate is measured again; chosen."""
 _RATE_TOLERANCE = 0.03
-"""Largest relative change of the rate that is no change; chosen: far above the error of a rate."""
+"""Largest relative change of the rate that is no change, beside the part of a block that a long
+step is; chosen: far above the error of a rate."""
+_STEP_SCATTER = 0.45
+"""Largest departure of 99 % of the steps from whole periods, periods, where longer steps show lost
+samples; chosen: from half a period on, jitter looks like loss."""
 _MAX_FILLED_NS = 1_000_000_000
 """Longest gap of the stream through which the chain runs on, ns. Chosen: filter and resonance
 forget the past within it."""
@@ -278,6 +285,7 @@ class EmulatedSensor:
         self._unit = replace(sensor, effects=effects,
                              values={name: sensor.values[name] for name in effects})
         self._publishers: int | None = None
+        self._mixture = ''
         self._heard_s = time.monotonic()
         self._newest_ns: int | None = None
         self._made: list[tuple[_Ideal, np.ndarray]] = []
@@ -291,9 +299,19 @@ class EmulatedSensor:
         if np.isfinite(temperature_c):
             self._temperature_c = temperature_c
 
-    def sense_publishers(self, count: int) -> None:
-        """Take how many nodes publish the ideal samples."""
-        self._publishers = count
+    def sense_publishers(self, count: int, mixture: str = '') -> None:
+        """
+        Take who publishes the ideal samples.
+
+        Parameters
+        ----------
+        count
+            Number of nodes that publish them.
+        mixture
+            That the samples of several nodes mix, in words, or ''.
+
+        """
+        self._publishers, self._mixture = count, mixture
 
     def sense_imu(self, stamp_ns: np.ndarray, fields: Mapping[str, np.ndarray]) -> None:
         """
@@ -340,6 +358,8 @@ class EmulatedSensor:
                   Event(f'{self.imu_topic}: a sample is not a number; check the simulation',
                         counts.not_finite))
         text = self._fault()
+        if self._mixture:
+            return LinkStatus(Level.ERROR, self._mixture, (counts,), events)
         if text:
             return LinkStatus(Level.WARN, text, (counts,), events)
         rate_hz = self.sensor.rate_hz if self.sensor else 0.0
@@ -357,9 +377,6 @@ class EmulatedSensor:
             return f'{self.imu_topic}: no samples; is the simulation paused?' \
                 if self._publishers else \
                 f'{self.imu_topic}: nobody publishes it; start the simulator, or set link.topic'
-        if self._publishers is not None and self._publishers > 1:
-            return f'{self.imu_topic}: {self._publishers} nodes publish it, and their samples ' \
-                'mix; end all but one'
         return '' if self._chain else f'{self.imu_topic}: measuring the rate'
 
     def _restart(self) -> None:
@@ -368,7 +385,8 @@ class EmulatedSensor:
         self._chain = None
         self._held: list[_Ideal] = []
         self._last: _Ideal | None = None
-        self._steps: deque[tuple[int, int]] = deque(maxlen=_BLOCK)
+        self._stamps_ns: deque[int] = deque(maxlen=_BLOCK)
+        self._shows_losses = True
         self._since = 0
 
     def _count(self, name: str) -> None:
@@ -406,8 +424,12 @@ class EmulatedSensor:
         count = len(self._held)
         if count < _FIRST and (span_ns < _FIRST_NS or count < _MIN_FIRST):
             return
-        period_ns = _period_ns(np.array([held.stamp_ns for held in self._held]))
-        self.sensor = replace(self._unit, rate_hz=1e9 / period_ns)
+        time_s = _seconds([held.stamp_ns for held in self._held])
+        if span_ns < _FIRST_NS and count < _FIRST_UNEVEN and not is_even(time_s):
+            return
+        rate_hz = stamped_rate_hz(time_s)
+        self._shows_losses = _show_losses(np.diff(time_s) * rate_hz)
+        self.sensor = replace(self._unit, rate_hz=rate_hz)
         self._chain = _Chain(self.sensor, self._seed)
         self._seed += 1
         held, self._held = self._held, []
@@ -421,7 +443,7 @@ class EmulatedSensor:
         steps = 1
         if self._last is not None:
             step_ns = ideal.stamp_ns - self._last.stamp_ns
-            steps = max(round(step_ns / period_ns), 1)
+            steps = max(round(step_ns / period_ns), 1) if self._shows_losses else 1
             self._missing += steps - 1
             if step_ns > max(_MAX_FILLED_NS, _LATE_PERIODS * period_ns):
                 self._count('gaps')
@@ -431,10 +453,10 @@ class EmulatedSensor:
             for k in range(1, steps):
                 between = self._last.force + k / steps * (ideal.force - self._last.force)
                 self._waiting.append((None, between))
-            self._steps.append((step_ns, steps))
+        self._stamps_ns.append(ideal.stamp_ns)
         self._waiting.append((ideal, ideal.force))
         self._last = ideal
-        self._check_rate(period_ns)
+        self._check_rate(self.sensor.rate_hz)
 
     def _run_chain(self) -> None:
         """Run the chain over the samples that wait for it."""
@@ -444,15 +466,18 @@ class EmulatedSensor:
             self._made += [(ideal, row) for (ideal, _), row in zip(waiting, volts)
                            if ideal is not None]
 
-    def _check_rate(self, period_ns: float) -> None:
+    def _check_rate(self, rate_hz: float) -> None:
         """Measure the rate of a block of samples; start again if the simulator has another one."""
         self._since += 1
-        if self._since < _BLOCK or len(self._steps) < _BLOCK:
+        if self._since < _BLOCK:
             return
         self._since = 0
-        step_ns, steps = np.array(self._steps).T
-        change = step_ns.sum() / steps.sum() / period_ns - 1
-        if abs(change) > _RATE_TOLERANCE or np.median(steps) > 1:
+        time_s = _seconds(self._stamps_ns)
+        steps = np.diff(time_s) * rate_hz
+        self._shows_losses = _show_losses(steps)
+        # A burst at the end of the block may belong to it or not.
+        tolerance = _RATE_TOLERANCE + max(np.quantile(steps, 0.99) - 1, 0) / _BLOCK
+        if abs(rate_hz / stamped_rate_hz(time_s) - 1) > tolerance:
             self._count('rate_changes')
             self._restart()
 
@@ -493,8 +518,11 @@ def _in_case(fields: dict[str, np.ndarray], case: scipy.spatial.transform.Rotati
     return fields
 
 
-def _period_ns(stamps_ns: np.ndarray) -> float:
-    """Return the period of stamps, ns, (n,), some of which may be lost."""
-    steps_ns = np.diff(stamps_ns)
-    periods = np.rint(steps_ns / np.median(steps_ns)).clip(1)
-    return float(steps_ns.sum() / periods.sum())
+def _seconds(stamps_ns: Sequence[int]) -> np.ndarray:
+    """Return stamps, ns, (n,), as times since the first one, s."""
+    return (np.array(stamps_ns) - stamps_ns[0]) * 1e-9
+
+
+def _show_losses(steps: np.ndarray) -> bool:
+    """Return whether steps of stamps, periods, (n,), are whole periods, so that losses show."""
+    return bool(np.quantile(np.abs(steps - np.rint(steps).clip(1)), 0.99) < _STEP_SCATTER)

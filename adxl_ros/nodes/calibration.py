@@ -91,10 +91,11 @@ class Calibration(Node):
             self, 'resume', 'ask', 'go on with an interrupted calibration; ask where there is a '
             'screen, else go on', choices=tuple(choice.value for choice in Resume)))
         settings = declare_settings(self)
+        self._has_stage = settings.mode == 'stage'
         self._captures: list[Future] = []
-        self._announcer = Announcer(self)
-        self._controller = Controller(settings, sensor, resume, Samples(self), self,
-                                      anonymous)
+        self._announcer = Announcer(self, self._has_stage)
+        self._samples = Samples(self)
+        self._controller = Controller(settings, sensor, resume, self._samples, self, anonymous)
         if autostart:
             self._controller.wait_for_sensor()
         self._connect()
@@ -154,8 +155,9 @@ class Calibration(Node):
         """Make diagnostics, subscriptions, services and the timer."""
         self._diagnostics = DiagnosticsReporter(self, {'calibration': self._status})
         create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
-        self._stage = PolledSubscription(self, JointState, 'stage/joint_states', _STAGE_QUEUE)
-        create_subscription(self, JointState, 'stage/command', self._on_command, _QUEUE)
+        if self._has_stage:
+            self._stage = PolledSubscription(self, JointState, 'stage/joint_states', _STAGE_QUEUE)
+            create_subscription(self, JointState, 'stage/command', self._on_command, _QUEUE)
         create_subscription(self, Temperature, 'temperature', self._on_temperature, _QUEUE)
         create_subscription(self, BatteryState, 'supply', self._on_supply, _QUEUE)
         start = self._controller.start
@@ -182,7 +184,7 @@ class Calibration(Node):
             self._exit_when_done()
 
     def _notice(self) -> None:
-        self._diagnostics.notice('calibration', _level(self._controller.status().late))
+        self._diagnostics.notice('calibration', self._level(self._controller.status().late))
 
     def _exit_when_done(self) -> None:
         """End the node after a calibration, when its last report has been received."""
@@ -196,8 +198,13 @@ class Calibration(Node):
 
     def _status(self) -> Status:
         report = self._controller.report()
-        return Status(_level(report.status.late), report.status.text, report.serial,
+        return Status(self._level(report.status.late), report.status.text, report.serial,
                       report.values)
+
+    def _level(self, late: bool) -> Level:
+        if self._samples.is_mixed:
+            return Level.ERROR
+        return Level.WARN if late else Level.OK
 
     def _on_info(self, message: DiagnosticStatus) -> None:
         texts = {pair.key: pair.value for pair in message.values}
@@ -205,7 +212,7 @@ class Calibration(Node):
 
     def _read_stage(self) -> None:
         """Give the angles of the stage that have come to the controller."""
-        for reading in joint_readings(self._stage.take()):
+        for reading in joint_readings(self._stage.take() if self._has_stage else ()):
             alpha_rad, beta_rad = _angles(reading.position)
             if math.isfinite(alpha_rad) and math.isfinite(beta_rad):
                 self._controller.read_stage(reading.stamp_ns, alpha_rad, beta_rad)
@@ -238,10 +245,6 @@ class Calibration(Node):
             answer = await future
         response.success, response.message = answer
         return response
-
-
-def _level(late: bool) -> Level:
-    return Level.WARN if late else Level.OK
 
 
 def _angles(position_rad: dict[str, float]) -> tuple[float, float]:

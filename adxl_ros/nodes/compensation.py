@@ -12,7 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Republish a stream corrected by its parameter file: acceleration, orientation, tilt."""
+"""
+Republish a stream corrected by its parameter file: acceleration, orientation, tilt.
+
+The topic tilt has three angles in a Vector3Stamped, so tf2 must not transform it: use imu/data.
+"""
 
 from __future__ import annotations
 
@@ -49,8 +53,8 @@ from sensor_msgs.msg import BatteryState, Imu, Temperature
 
 _DEPTH = 100
 """Samples that are kept while the node is busy: 0.1 s at 1 kHz."""
-_MEASURE_S = 0.5
-"""Time between two attempts to measure an unknown sensor, s; chosen."""
+_LOOK_S = 0.5
+"""Time between two looks at who publishes and, where it is unknown, at the sensor, s; chosen."""
 _LEVELS = {State.REFUSED: Level.ERROR, State.COMPENSATING: Level.OK}
 """Levels of the states; all others are warnings."""
 _EXAMPLES = {
@@ -96,26 +100,31 @@ class Compensation(Node):
         self._ages = SampleAges()
         self._data = create_publisher(self, Imu, 'imu/data', _DEPTH)
         tilt = create_publisher(self, Vector3Stamped, 'tilt', _DEPTH)
+        output_rate_hz = declare(
+            self, 'output_rate_hz', 0.0, 'rate of imu/data and tilt: one sample of so many is '
+            'published as it is, so that vibration above half of this rate folds into it; 0: '
+            'every sample', 'Hz', 0.0, 1e5)
         publishes_free = declare(
             self, 'free_acceleration', False, 'publish imu/linear_acceleration_free: the '
             'acceleration without gravity of samples that state an orientation')
         free = create_publisher(self, Vector3Stamped, 'imu/linear_acceleration_free', _DEPTH) \
             if publishes_free else None
         self._stream = LiveStream(paper, self._undo_filter, self._publish, tilt.publish,
-                                  keeps_orientation, free.publish if free else None)
+                                  keeps_orientation, free.publish if free else None,
+                                  output_rate_hz)
         self._policy = CompensationPolicy(paper, store, Topics(
             data_raw=self.resolve_topic_name('imu/data_raw'),
             sensor_info=self.resolve_topic_name('sensor_info'),
             temperature=self.resolve_topic_name('temperature'),
             supply=self.resolve_topic_name('supply')))
+        self._samples = ReceiveTurn(self, Imu, 'imu/data_raw', self._stream, _DEPTH)
         self._sensor = ExchangeableSensor(self, self._policy.check, self._use)
         MountingParameters(self, self._stream)
-        self.create_timer(_MEASURE_S, self._measure, clock=self._steady)
+        self.create_timer(_LOOK_S, self._look, clock=self._steady)
         create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
         create_subscription(self, Temperature, 'temperature', self._on_temperature, 1)
         create_subscription(self, BatteryState, 'supply', self._on_supply, 1)
-        self._thread = RepeatingThread(
-            self, ReceiveTurn(self, Imu, 'imu/data_raw', self._stream, _DEPTH), 'imu/data_raw')
+        self._thread = RepeatingThread(self, self._samples, 'imu/data_raw')
 
     def close(self) -> None:
         """End the thread that receives."""
@@ -144,8 +153,10 @@ class Compensation(Node):
             self.get_logger().info(text)
         self._assess()
 
-    def _measure(self) -> None:
-        """Measure the sensor of a stream that states nothing of itself."""
+    def _look(self) -> None:
+        """Refuse samples of several nodes; measure the sensor of a stream that states none."""
+        self._policy.mixture = self._samples.fault()
+        self._assess()
         samples = self._stream.unknown
         if samples is None:
             return
@@ -195,7 +206,7 @@ class Compensation(Node):
         if refusal:
             self.get_logger().error(f'publishing nothing: {refusal}')
         else:
-            self.get_logger().info('publishing again: the parameters are those of the stream')
+            self.get_logger().info('publishing again')
         self._diagnostics.notice('compensation', Level.ERROR if refusal else Level.OK)
 
     def _on_temperature(self, message: Temperature) -> None:

@@ -84,6 +84,7 @@ class Driver(LifecycleNode):
             settings, base.SimulatorSettings) else Clock(clock_type=ClockType.SYSTEM_TIME)
         self._tally = Tally(self._steady.now().nanoseconds)
         self._fault = ''
+        self._refusal: UserError | None = None
         self._announces = not autostart
         self._output: SampleOutput | None = None
         self._reader: LinkReader | None = None
@@ -92,6 +93,8 @@ class Driver(LifecycleNode):
             self._announce('unconfigured')
         elif self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
             self.trigger_activate()
+        if self._refusal is not None:
+            raise self._refusal
         self._announces = True
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -134,10 +137,17 @@ class Driver(LifecycleNode):
         try:
             act()
             result = parent(state)
-        except UserError as error:
-            self._fail(error)
-            return TransitionCallbackReturn.FAILURE
         except Exception as error:
+            if not self.context.ok():
+                # A signal has ended the context, and whatever was being made failed by that.
+                return TransitionCallbackReturn.FAILURE
+            if isinstance(error, UserError):
+                if self._announces:
+                    self._fail(error)
+                else:
+                    # Links wait for a device that is away: only the parameters can be wrong.
+                    self._refusal = error
+                return TransitionCallbackReturn.FAILURE
             self._fault = f'the driver has failed: {one_line(error)}'
             self.get_logger().fatal(traceback.format_exc())
             self._diagnostics.notice('link', Level.ERROR)
@@ -195,6 +205,11 @@ class Driver(LifecycleNode):
             # A simulator may publish no /clock, although the node waits for one.
             sensor_ns = self._stamp_clock.now().nanoseconds or sensor_ns
         values, warning = self._tally.report(self._steady.now().nanoseconds, sensor_ns)
+        topic = self.resolve_topic_name('imu/data_raw')
+        publishers = self.count_publishers(topic)
+        if publishers > 1:
+            several = f'{publishers} nodes publish {topic}; end all but one'
+            warning = f'{several}, {warning}' if warning else several
         level = self._level()
         if warning and level is Level.OK:
             level = Level.WARN

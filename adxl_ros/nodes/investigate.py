@@ -21,8 +21,8 @@ import signal
 
 from adxl_ros.investigate.background import BackgroundDiagnoser
 from adxl_ros.investigate.investigation import Investigation, State
-from adxl_ros.investigate.output_folder import new_folder
-from adxl_ros.investigate.stage_limits import Pose
+from adxl_ros.investigate.manoeuvres import Pose
+from adxl_ros.investigate.output_folder import OutputFolder
 from adxl_ros.links.support.watchdog import Watchdog
 from adxl_ros.nodes.support.bag_recorder import BagRecorder
 from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
@@ -38,6 +38,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.executors import Executor
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 _POLL_S = 0.02
@@ -92,15 +93,15 @@ class Investigate(Node):
         self._request = reason
 
     def begin(self) -> None:
-        """Make the files, and begin to record and to command."""
+        """Wait for sensor and stage; the files are made when both are there."""
         settings = self._settings
-        self._folder = new_folder(settings.output, self._sensor)
+        self._folder = OutputFolder.free(settings.output)
         self._screen = InvestigationScreen(self._folder.path, settings)
-        self._recorder.start(self._folder.bag)
         self._investigation = Investigation(
             settings.limits, settings.minutes,
             BackgroundDiagnoser(self._folder, settings.limits, settings.seed),
             self._screen.show_answer, self._recorder.flush)
+        self._recorder.listen()
         self.create_timer(_POLL_S, self._poll, clock=self._steady)
 
     def stop(self, reason: str) -> None:
@@ -125,7 +126,9 @@ class Investigate(Node):
         now_s = self.get_clock().now().nanoseconds * 1e-9
         command = investigation.step(now_s, self._pose) if now_s else None
         if command is not None:
-            self._commands.publish(JointState(name=['alpha', 'beta'], position=list(command)))
+            self._commands.publish(JointState(
+                header=Header(stamp=self.get_clock().now().to_msg()), name=['alpha', 'beta'],
+                position=list(command), velocity=list(investigation.speed or ())))
         screen.show_status(investigation.status())
         if investigation.has_ended:
             self._end(investigation)
@@ -147,7 +150,12 @@ class Investigate(Node):
         if investigation.state is State.RECORDING:
             if not self._recorder.has_samples:
                 self._pose = None
+            elif self._pose is not None and not self._recorder.is_writing:
+                self._folder.make(self._sensor)
+                self._recorder.start(self._folder.bag)
             return
+        if self._recorder.fault():
+            investigation.stop(f'{self._recorder.fault()}; the stage holds its pose')
         for topic, watchdog in self._watchdogs.items():
             silent_s = watchdog.check()
             if silent_s > _SILENT_S:

@@ -27,7 +27,7 @@ from adxl_ros.files.stream_info import NO_UNIT, StreamInfo
 from adxl_ros.files.stream_unit import check_unit, unit_of
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.monitor import change_record
-from adxl_ros.monitor.diagnosis_run import DiagnosisInput, DiagnosisResult, DiagnosisRun
+from adxl_ros.monitor.diagnosis_run import DiagnosisResult, DiagnosisRun
 from adxl_ros.monitor.live_gap import GapSettings, LiveGap
 from adxl_ros.monitor.reference_stream import ReferenceKind
 from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
@@ -93,14 +93,15 @@ class Monitor(Node):
                 self, 'false_alarms_per_day', round(1 / 30, 4), 'largest rate of reported changes '
                 'that are none', '1/day', 1e-5, 10.0),
             history_s=declare(self, 'history_s', 600.0, 'time that is kept for a diagnosis', 's',
-                              60.0, 3600.0))
+                              60.0, 3600.0),
+            wait_s=declare(self, 'diagnose.wait_s', 120.0, 'time of samples that an automatic '
+                           'diagnosis needs; changes of an axis within it are one', 's',
+                           _SHORTEST_S, 3600.0))
         self._output = Path(declare(
             self, 'output', str(calibration_store.default_folder().with_name('monitor')),
             'folder of the record of changes and of the diagnoses')).expanduser()
         self._automatic = declare(
             self, 'diagnose.automatic', True, 'diagnose a change, or a gap, once enough is seen')
-        self._wait_s = declare(self, 'diagnose.wait_s', 120.0, 'time of samples that an automatic '
-                               'diagnosis needs', 's', _SHORTEST_S, 3600.0)
         self._budget_s = declare(self, 'diagnose.budget_s', 300.0, 'longest time of a diagnosis',
                                  's', 1.0, 3600.0)
         self._live: LiveGap | None = None
@@ -109,7 +110,7 @@ class Monitor(Node):
         self._run: DiagnosisRun | None = None
         self._result: DiagnosisResult | None = None
         self._headers: list[object] = []
-        self._due_ns: int | None = 0
+        self._changed_ns: int | None = None
         self._diagnosed_s = -_PAUSE_S
         self._begun_s = self._sampled_s = self._referenced_s = self._heard_s = 0.0
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -152,7 +153,7 @@ class Monitor(Node):
     def _use(self, sensor: Sensor) -> None:
         """Begin a comparison with a sensor."""
         self._live, self._refusal = LiveGap(sensor, self._kind, self._settings), ''
-        self._due_ns, self._result = 0, None
+        self._changed_ns = self._result = None
         effects = ', '.join(sensor.effects) or 'no effects'
         self.get_logger().info(
             f'comparing {self.resolve_topic_name("imu/data_raw")} of {sensor.serial} ({effects}) '
@@ -190,28 +191,26 @@ class Monitor(Node):
             except (UserError, OSError) as error:
                 self.get_logger().error(f'{self._output}: the change is not on disk: {error}')
         if changes:
-            self._due_ns = min(change.since_ns for change in changes)
+            # The waiting time of a diagnosis does not start again with a further change.
+            self._changed_ns = self._changed_ns or min(change.since_ns for change in changes)
             self._diagnostics.notice('gap', Level.WARN)
-        if self._automatic and self._run is None:
-            self._diagnose_if_due(live)
 
     def _diagnose_if_due(self, live: LiveGap) -> None:
-        """Diagnose a change, or a gap from the start, once there are enough samples."""
-        if self._due_ns is None or time.monotonic() - self._diagnosed_s < _PAUSE_S \
-                or live.span_s(self._due_ns) < self._wait_s:
+        """Diagnose a change, or the first open gap, once there are enough samples."""
+        if not self._automatic or self._run is not None \
+                or time.monotonic() - self._diagnosed_s < _PAUSE_S \
+                or live.span_s(self._changed_ns or 0) < self._settings.wait_s:
             return
-        begin_ns, self._due_ns = self._due_ns, None
-        if live.changes or any(gap.is_open for gap in live.report()):
+        if self._changed_ns or (self._result is None and any(g.is_open for g in live.report())):
+            begin_ns, self._changed_ns = self._changed_ns or 0, None
             self._diagnosed_s = time.monotonic()
             self._begin_diagnosis(live, begin_ns)
 
     def _begin_diagnosis(self, live: LiveGap, begin_ns: int) -> None:
         """Begin a diagnosis of the samples since a stamp, ns."""
-        given = DiagnosisInput(live.recording(begin_ns), live.sensor, live.force(begin_ns)
-                               if self._kind is ReferenceKind.IMU else None)
         name = datetime.now(UTC).strftime('diagnosis_%Y%m%dT%H%M%S_%fZ')
-        self._run = DiagnosisRun(self._output / name, given, [executable('diagnose')],
-                                 self._budget_s)
+        self._run = DiagnosisRun(self._output / name, live.diagnosis_input(begin_ns),
+                                 [executable('diagnose')], self._budget_s)
 
     def _serve(self) -> None:
         """Take requests of ~/diagnose, and answer them when the diagnosis ends."""
@@ -242,8 +241,8 @@ class Monitor(Node):
     def _obstacle(self) -> str:
         """Return why nothing is compared; empty where samples are."""
         now_s = time.monotonic()
-        if self._refusal:
-            return self._refusal
+        if self._refusal or self._streams.fault():
+            return self._refusal or self._streams.fault()
         if now_s - self._sampled_s > _SILENT_S:
             return self._silence('imu/data_raw')
         if self._live is None:
@@ -268,6 +267,8 @@ class Monitor(Node):
 
     def _publish(self) -> None:
         self._publisher.publish(self._state().message())
+        if self._live is not None:
+            self._diagnose_if_due(self._live)
 
     def _status(self) -> Status:
         """Return the state for /diagnostics, with counts."""
@@ -279,7 +280,7 @@ class Monitor(Node):
             values |= vars(self._live.counts)
         values |= {'false_alarms_per_day': self._settings.false_alarms_per_day,
                    'diagnosis_runs': self._run is not None}
-        level = Level.ERROR if self._refusal else state.level
+        level = Level.ERROR if self._refusal or self._streams.fault() else state.level
         return Status(level, state.text(), state.serial, values)
 
 

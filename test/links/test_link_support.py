@@ -124,6 +124,18 @@ def test_a_clock_that_stood_still_is_a_step_and_a_gap():
     assert np.abs(errors).max() < 1.5, 'no stamp lies in the time for which the clock stood still'
 
 
+def test_samples_that_were_read_late_are_no_step_forward():
+    """At the pace of time they look like a clock that stopped, until the next are in time."""
+    frames = DelayedFrames(50, 0.05, 0.5)
+    frames.run(1500)
+    frames.run(30, late_ms=2000)
+    assert frames.map.steps == 1
+    frames.count += 2000
+    frames.run(500)
+    assert frames.map.steps == 1, 'the device stamps show the loss of two seconds'
+    assert np.abs(frames.errors()[-1000:]).max() < 1
+
+
 def test_ros_time_follows_the_system_clock_when_it_is_set(monkeypatch):
     now = {'monotonic': 10 * S, 'time': 1000 * S}
     monkeypatch.setattr(clock_sync.time, 'monotonic_ns', lambda: now['monotonic'])

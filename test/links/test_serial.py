@@ -33,7 +33,6 @@ from adxl_ros.links.support.wire_format import (
     Splitter,
 )
 import numpy as np
-from processes import REPEATED
 import pytest
 from units import nominal
 
@@ -99,6 +98,14 @@ class ConnectedBoard:
     def read_samples(self, count, timeout_s=60.0):
         """Read until so many samples have come, and return the parts."""
         return self.read(timeout_s, lambda parts: sample_count(parts) >= count)
+
+    def wait_for(self, text, send=lambda: None, timeout_s=60.0):
+        """Send, and read the link, until its status has a text."""
+        end_s = time.monotonic() + timeout_s
+        while text not in self.link.status().text:
+            assert time.monotonic() < end_s, self.link.status().text
+            send()
+            self.link.read(0)
 
     def commands(self):
         """Return the latencies of the commands that have come, µs."""
@@ -328,23 +335,14 @@ def test_another_version_of_the_format_is_reported(connect):
     assert board.link.status().text == 'streaming'
 
 
-@REPEATED
 def test_silence_and_bytes_without_a_frame_are_distinguished(connect):
     board = connect()
     board.send_info()
     board.send_frames(3)
-    board.read()
-    time.sleep(0.6)
-    board.read()
-    assert 'silent' in board.link.status().text
-    end_s = time.monotonic() + 1.5
-    while time.monotonic() < end_s:
-        board.send(os.urandom(50).replace(b'\0', b'\1') + b'\0')
-        board.link.read(0)
-    assert 'is link.baud (115200) that of the board?' in board.link.status().text
-    board.send_frames(3)
-    board.read_samples(30)
-    assert board.link.status().text == 'streaming'
+    board.wait_for('silent')
+    board.wait_for('is link.baud (115200) that of the board?',
+                   lambda: board.send(os.urandom(50).replace(b'\0', b'\1') + b'\0'))
+    board.wait_for('streaming', board.send_frames)
 
 
 def test_frames_far_above_the_stated_rate_wait(connect):
@@ -365,7 +363,6 @@ def test_frames_far_above_the_stated_rate_wait(connect):
     assert (np.diff(stamps_of(parts)) > 0).all()
 
 
-@REPEATED
 def test_a_port_comes_back_and_the_count_goes_on(connect):
     board = connect()
     board.send_info()
@@ -373,18 +370,17 @@ def test_a_port_comes_back_and_the_count_goes_on(connect):
     board.read_samples(200)
     board.unplug()
     unplugged_s = time.monotonic()
-    board.read(5.0, lambda parts: board.link.status().level == base.Level.ERROR)
-    assert board.link.status().level == base.Level.ERROR
+    board.wait_for('No such file')
     time.sleep(0.3)
     board.plug()
-    plugged_s = time.monotonic()
+    end_s = time.monotonic() + 60
     board.index += round((time.monotonic() - unplugged_s) * 1000)
     lost = board.index - 200
     parts = []
     while sample_count(parts) < 100:
         board.send_frames(1, 0.01)
         parts += board.read_samples(10, 0.02)
-        assert time.monotonic() < plugged_s + 5
+        assert time.monotonic() < end_s
     assert board.value('connections') == 2
     assert board.value('resets') == 0
     assert missing(parts) >= lost

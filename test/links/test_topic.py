@@ -129,6 +129,37 @@ def test_jitter_and_lost_samples_leave_the_chain_running() -> None:
     assert statistics(link)['rate_changes'] == 0
 
 
+def host_stamps(kind: str, rng: np.random.Generator) -> np.ndarray:
+    """Return 20 s of stamps at 200 Hz as a host gives them on arrival, ns, (n,)."""
+    index = np.arange(4000)
+    due = 5e-3 * index
+    if kind == 'bursts':
+        arrival = 5e-3 * (index // 10 * 10)
+    elif kind == 'uneven bursts':
+        flushed = np.cumsum(rng.uniform(0.01, 0.05, 1000))
+        arrival = flushed[np.searchsorted(flushed, due)]
+    elif kind == 'stalls':
+        arrival = np.where(index % 150 < 20, due[index // 150 * 150] + 0.1, due)
+    else:
+        arrival = due + {'normal': rng.normal(0, 1.5e-3, len(index)),
+                         'delays': rng.exponential(5e-3, len(index))}[kind]
+    # A sample takes 40 µs to be handed on.
+    return START_NS + np.rint(1e9 * (
+        np.maximum.accumulate(arrival - 4e-5 * index) + 4e-5 * index)).astype(np.int64)
+
+
+@pytest.mark.parametrize('kind', ['normal', 'delays', 'bursts', 'uneven bursts', 'stalls'])
+def test_host_stamps_neither_mislead_the_rate_nor_restart_the_sensor(kind: str) -> None:
+    link = topic.open_link(unit(), topic.Settings())
+    stamps = host_stamps(kind, np.random.default_rng(1))
+    parts = [feed(link, part) for part in np.array_split(stamps, 200)]
+    assert link.sensor is not None
+    assert link.sensor.rate_hz == pytest.approx(200, rel=0.05)
+    assert statistics(link)['rate_changes'] == 0
+    assert sum(len(part.stamp_ns) for part in parts) == len(stamps)
+    assert sum(part.missing for part in parts) == 0 or kind == 'stalls'
+
+
 @pytest.mark.parametrize('step_ns', [STEP_NS // 2, STEP_NS * 2, STEP_NS * 11 // 10])
 def test_a_new_rate_is_measured(step_ns: int) -> None:
     link = topic.open_link(unit(), topic.Settings())
@@ -204,6 +235,7 @@ def test_the_status_names_what_is_missing() -> None:
     assert 'measuring the rate' in link.status().text
     feed(link, START_NS + STEP_NS * np.arange(3, 60))
     assert 'at 200 Hz' in link.status().text
-    link.sense_publishers(2)
-    assert '2 nodes publish it' in link.status().text and link.status().level is Level.WARN
+    link.sense_publishers(2, 'imu/ideal: 2 nodes publish it')
+    assert '2 nodes publish it' in link.status().text and link.status().level is Level.ERROR
+    link.sense_publishers(1)
     assert 'lever_arm' in link.status().events[0].message and link.status().events[0].count == 1

@@ -33,12 +33,12 @@ Start = Callable[..., Started]
 
 
 class Camera:
-    """A camera's IMU: three axes, a gyroscope, an orientation, and no sensor_info."""
+    """A camera's IMU: three axes, a gyroscope, an orientation, host stamps, no sensor_info."""
 
     def __init__(self, graph: Graph) -> None:
         self.graph = graph
         self._publisher = graph.node.create_publisher(Imu, TOPIC, 1000)
-        self._rng = np.random.default_rng(5)
+        self._rng, self._jitter = np.random.default_rng(5), np.random.default_rng(6)
         self._count = 0
 
     def connected(self) -> None:
@@ -60,7 +60,8 @@ class Camera:
     def send(self, force_mps2: np.ndarray) -> None:
         """Publish one sample."""
         message = Imu()
-        time_ns = 1_700_000_000_000_000_000 + round(self._count * 1e9 / RATE_HZ)
+        time_ns = 1_700_000_000_000_000_000 + round(
+            (self._count + self._jitter.uniform(0, 0.9)) * 1e9 / RATE_HZ)
         self._count += 1
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(time_ns, 10 ** 9)
         message.header.frame_id = 'camera_imu'
@@ -92,7 +93,7 @@ def test_compensation_takes_any_imu(camera: Camera, start: Start, orientation: s
         graph.spin(0.05)
         return bool(data)
     graph.spin_until(published, 40, 'corrected samples')
-    node.wait_for('measured from the stream: rate: 100 Hz, axes: xyz')
+    node.wait_for('Hz, axes: xyz')
     message = data[-1]
     assert message.header.frame_id == 'camera_imu' and stamp_ns(message) > 0
     np.testing.assert_allclose(accel(message), [0, 0, G], atol=0.2)
@@ -114,7 +115,7 @@ def test_calibration_takes_any_imu(camera: Camera, start: Start, tmp_path) -> No
     def measured() -> bool:
         camera.rest([0.0, 0.0, G], 0.5)
         graph.spin(0.1)
-        return 'measured from the stream: rate: 100 Hz, axes: xyz' in node.output()
+        return 'measured from the stream: rate: ' in node.output()
     graph.spin_until(measured, 40, 'the measured sensor')
     graph.spin_until(lambda: graph.reports('calibration', ''), 20, 'diagnostics')
     rng = np.random.default_rng(8)
@@ -127,9 +128,11 @@ def test_calibration_takes_any_imu(camera: Camera, start: Start, tmp_path) -> No
     camera.turn()
     answer = graph.call(Trigger, 'calibration/finish', Trigger.Request())
     assert answer.success, answer.message
+    assert 'rest in 10 or more directions' in node.output()
+    assert '[ERROR]' not in node.output(), 'jitter of host stamps is no other rate'
     unit = parameter_file.load(tmp_path / 'unit.yaml')
     assert (unit.serial, unit.axes, unit.model) == ('cam7', 'xyz', 'gravity')
-    assert unit.rate_hz == pytest.approx(RATE_HZ)
+    assert unit.rate_hz == pytest.approx(RATE_HZ, rel=0.02)
     assert unit.adc_bits == 0 and unit.rc_s == 0 and unit.range_g >= 2
     noise_mps2 = unit.noise_density_g_per_rthz * G * np.sqrt(RATE_HZ / 2)
     np.testing.assert_allclose(noise_mps2, NOISE_MPS2, rtol=0.2)
@@ -163,6 +166,7 @@ def test_a_mounted_sensor_is_turned_into_the_frame_of_the_robot(camera: Camera, 
     answer = client.call_async(Trigger.Request())
     until(answer.done, 'the answer of ~/level')
     assert answer.result().success, answer.result().message
+    assert "to keep them, start it with -p 'mounting.rpy_rad:=[" in answer.result().message
     until(lambda: abs(tilt[-1].vector.x) < 0.01, 'a level robot')
     # The orientation that the camera states is 2·atan2(0.6, 0.8) about x, whatever it measures.
     quaternion = data[-1].orientation

@@ -21,8 +21,8 @@ import time
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
-from adxl_ros.nodes.support import offline_jobs, rival_driver
-from adxl_ros.nodes.support.benchmark_table import Job, rows_of
+from adxl_ros.nodes.support import live_benchmark, offline_jobs, rival_driver
+from adxl_ros.nodes.support.benchmark_table import Job, print_table, rows_of
 from graph import Graph
 from processes import executable
 import pytest
@@ -50,6 +50,33 @@ def test_rows_state_the_ratio_to_each_rival_and_what_is_not_installed() -> None:
     assert third == '| count | 0.3 (0.3–0.3) | slow | 0.1 (0.1–0.1) | – |'
     assert rows_of(make('alone', lambda: work(2.0), 5.0), 1) == [
         '| alone | 2 (2–2) | – | – | 5 s |']
+
+
+def refuse(*_: object) -> float:
+    raise UserError('no messages for 20 s')
+
+
+def test_a_row_that_fails_is_named_and_the_others_stand(monkeypatch, capsys) -> None:
+    def measure(subject: live_benchmark._Subject, seconds: float) -> live_benchmark._Result:
+        return refuse() if 'iio' in subject.label else live_benchmark._Result(
+            1000.0, 0, 0.5, 1.0, (0.1,))
+
+    labels = 'bare publisher and relay', 'driver, iio, compensation', 'driver, sim, compensation'
+    monkeypatch.setattr(live_benchmark, '_subjects', lambda *_: [
+        live_benchmark._Subject(label, 'imu/data', []) for label in labels])
+    monkeypatch.setattr(live_benchmark, '_measure', measure)
+    monkeypatch.setattr(live_benchmark, '_first_sample_s', refuse)
+    live_benchmark.measure_live(1.0, 3, None)
+    table = capsys.readouterr().out.splitlines()[2:]
+    assert table[1] == f'{labels[1]:27} failed in 3 of 3 rounds: no messages for 20 s'
+    assert [line[:34].split()[-1] for line in table[0:3:2]] == ['1000', '1000']
+    assert f'CPU of {labels[2]} by that of the {labels[0]}: 1.00' in table
+    assert 'First sample of compensation: no messages for 20 s' in table
+
+    failing = Job('apply', refuse)
+    print_table([failing, Job('count', lambda: None)], 1)
+    rows = capsys.readouterr().out.splitlines()
+    assert rows[-2] == '| apply | no messages for 20 s | – | – | – |' and 'count' in rows[-1]
 
 
 @pytest.mark.parametrize('kind', ['csv', 'mcap'])

@@ -327,6 +327,7 @@ def test_rests_before_the_info_of_the_driver_count(start, tmp_path):
               '-p', 'mode:=gravity', '-p', 'autostart:=true', '-p', 'output:=unit.yaml')
         graph.spin_until(lambda: raw.get_subscription_count() and graph.reports(
             'calibration', 'waiting for sensor_info'), 30, 'up')
+        assert not graph.node.count_subscribers('stage/command')
         rests = [np.tile(G0_MPS2 * np.eye(3)[d], (300, 1)) for d in (2, 0)]
         moving = 5 * rng.standard_normal((150, 3))
         samples = np.vstack([rests[0], moving, rests[1], moving])

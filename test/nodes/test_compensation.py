@@ -404,6 +404,24 @@ def test_invalid_samples_are_not_published(robot: Robot, start: Start, tmp_path:
     robot.warned('samples with the ADC at its rail', 1)
 
 
+def test_samples_of_two_drivers_are_not_mixed(robot: Robot, start: Start) -> None:
+    """The samples are withheld while both publish, and come again when one has ended."""
+    graph = robot.graph
+    process = start('compensation')
+    start('driver')
+    graph.spin_until(lambda: robot.data, 30.0, 'corrected samples')
+    second = start('driver', '--ros-args', '-r', '__node:=second')
+    robot.level(DiagnosticStatus.ERROR, 'nodes publish it, and their samples mix')
+    graph.spin_until(lambda: graph.reports('second', 'nodes publish /imu/data_raw'), 10.0,
+                     'the warning of a driver')
+    count = len(robot.data)
+    graph.spin(1.0)
+    assert len(robot.data) == count
+    second.stop()
+    process.wait_for('publishing again')
+    graph.spin_until(lambda: len(robot.data) > count, 10.0, 'corrected samples again')
+
+
 def test_another_unit_is_refused(robot: Robot, start: Start, tmp_path: Path) -> None:
     """The policy of the compensation has tests of every other refusal."""
     sensor = unit()

@@ -90,6 +90,8 @@ def test_a_driver_that_may_mean_a_real_sensor_is_refused(start, parameter, words
 @pytest.mark.parametrize('link, parameter, words', [
     ('sim', 'link.port:=/dev/ttyACM0', 'link sim has no such parameter; link.type serial has it'),
     ('serial', 'link.prot:=/dev/ttyACM0', 'did you mean link.port?'),
+    ('serial', 'link.port:=""', 'names no port; set it to a device path or a pyserial URL'),
+    ('iio', 'link.uri:=nowhere', 'is none of local:, ip:HOST, usb:..., serial:...'),
     ('sim', 'link.sped:=2.0', 'did you mean link.speed?')])
 def test_a_parameter_of_another_link_is_refused(start, link, parameter, words):
     line = refusal(start, 'driver', '-p', f'link.type:={link}', '-p', parameter)
@@ -243,12 +245,8 @@ def test_an_invalid_qos_policy_is_one_line(start):
     line = refusal(start, 'stage', '-p', f'{override}:=relaible')
     assert 'qos_overrides./stage/joint_states.publisher: ' in line
     assert 'relaible' in line
-    driver = start('driver', ROS, '-p', 'qos_overrides./imu/data_raw.publisher.depth:=deep')
-    with Graph() as graph:
-        graph.spin_until(lambda: graph.reports('driver', 'qos_overrides./imu/data_raw'), 20, 'why')
-        assert graph.diagnostics['driver'].level == DiagnosticStatus.ERROR
-    assert driver.stop() == 0
-    assert len(driver.output().splitlines()) == 1, driver.output()
+    line = refusal(start, 'driver', '-p', 'qos_overrides./imu/data_raw.publisher.depth:=deep')
+    assert 'qos_overrides./imu/data_raw' in line
 
 
 def test_an_inactive_driver_is_a_warning_and_each_transition_is_one_line(start):

@@ -23,12 +23,14 @@ import signal
 import subprocess
 
 from adxl_ros.files import parameter_file
-from processes import Started, wait_until
+from graph import Graph
+from processes import NEEDS_ROS2, Started, wait_until
 import pytest
+from rcl_interfaces.srv import GetParameters
 from terminal import Terminal
 from units import NOMINAL, nominal
 
-pytestmark = pytest.mark.skipif(shutil.which('ros2') is None, reason='ros2 is not installed')
+pytestmark = NEEDS_ROS2
 
 
 @pytest.fixture
@@ -59,6 +61,7 @@ def launch(ros_env: dict[str, str], tmp_path: Path) -> Iterator[Callable[..., St
     ('robot', 'link_baud:=fast', 'link_baud:=fast: expected a whole number'),
     ('robot', 'log_level:=loud', '"loud" is not valid'),
     ('calibrate', 'screen:=maybe', '"maybe" is not valid'),
+    ('robot', 'output_rate_hz:=slow', 'output_rate_hz:=slow: expected a number'),
     ('robot', 'mounting_xyz_m:=0.1', 'mounting_xyz_m:=0.1: expected three numbers'),
     ('emulate', 'rpy_rad:=0.1', 'rpy_rad:=0.1: expected three numbers'),
     ('emulate', 'seed:=odd', 'seed:=odd: expected a whole number'),
@@ -90,13 +93,17 @@ def test_a_launch_names_the_nearest_of_a_misspelt_argument(launch, name):
     assert output.count('did you mean') == 1
 
 
-@pytest.mark.parametrize('name', ['robot', 'calibrate'])
-def test_a_driver_that_refuses_to_start_ends_the_launch(launch, tmp_path, name):
+@pytest.mark.parametrize('name, arguments, starts, words', [
+    ('robot', [], 3, 'driver-1 has refused to start 3 times'),
+    ('robot', ['respawn:=false'], 1, 'driver-1 has refused to start;'),
+    ('calibrate', [], 3, 'driver-1 has refused to start 3 times')])
+def test_a_driver_that_refuses_to_start_ends_the_launch(launch, tmp_path, name, arguments, starts,
+                                                        words):
     parameter_file.save(tmp_path / 'unit.yaml', nominal(serial='17'))
-    launched = launch(name, 'params_file:=unit.yaml')
+    launched = launch(name, 'params_file:=unit.yaml', *arguments)
     assert launched.wait(60) == 1
-    assert launched.output().count('driver: unit.yaml: link.type: is not set') == 3
-    assert 'driver-1 has refused to start 3 times' in launched.output()
+    assert launched.output().count('driver: unit.yaml: link.type: is not set') == starts
+    assert words in launched.output()
 
 
 @pytest.mark.parametrize('name', ['robot', 'calibrate'])
@@ -117,6 +124,22 @@ def test_the_arguments_count_before_the_file(launch, tmp_path):
         NOMINAL.read_text() + 'driver:\n  ros__parameters:\n    link.type: serial\n')
     launched = launch('robot', 'params_file:=own.yaml', 'link_type:=sim')
     launched.wait_for('active: link sim, unit nominal')
+
+
+def test_a_robot_takes_the_imu_of_another_driver(launch):
+    launch('robot', 'imu_topic:=/camera/imu', 'output_rate_hz:=25', 'use_sim_time:=true',
+           'enclave:=/adxl_ros')
+    with Graph() as graph:
+        def nodes():
+            return graph.node.get_node_names_and_namespaces_with_enclaves()
+        graph.spin_until(lambda: ('compensation', '/', '/adxl_ros/compensation') in nodes(), 30,
+                         'the node in its enclave')
+        graph.spin_until(lambda: graph.node.count_subscribers('/camera/imu')
+                         and graph.node.count_subscribers('/clock'), 30, 'its topics')
+        assert 'driver' not in graph.node.get_node_names()
+        values = graph.call(GetParameters, '/compensation/get_parameters', GetParameters.Request(
+            names=['output_rate_hz', 'use_sim_time'])).values
+        assert (values[0].double_value, values[1].bool_value) == (25.0, True)
 
 
 def test_a_launch_puts_a_sensor_behind_a_simulator(launch, tmp_path):

@@ -44,7 +44,8 @@ def help_of(name: str) -> subprocess.CompletedProcess:
 
 @pytest.mark.parametrize('name', PROGRAMS)
 def test_version(name: str, ros_env: dict[str, str]) -> None:
-    done = run_executable(name, '--version', env=ros_env)
+    ros_args = () if name in ('demo', 'bench') else ('--ros-args',)
+    done = run_executable(name, *ros_args, '--version', env=ros_env)
     assert (done.returncode, done.stderr) == (0, '')
     assert re.fullmatch(r'adxl_ros \d+\.\d+\.\d+\n', done.stdout)
 

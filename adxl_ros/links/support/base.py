@@ -409,8 +409,18 @@ class ImuLink(Protocol):
     def sense_temperature(self, temperature_c: float) -> None:
         """Use a temperature, °C, from the next sample on."""
 
-    def sense_publishers(self, count: int) -> None:
-        """Take how many nodes publish the ideal samples."""
+    def sense_publishers(self, count: int, mixture: str) -> None:
+        """
+        Take who publishes the ideal samples.
+
+        Parameters
+        ----------
+        count
+            Number of nodes that publish them.
+        mixture
+            That the samples of several nodes mix, in words, or ''.
+
+        """
 
 
 class LinkModule(Protocol):

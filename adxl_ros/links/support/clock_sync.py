@@ -158,6 +158,7 @@ class ClockMap:
         self._opened_ns = self._seen_ns = self._count = 0
         self._first_arrived_ns: int | None = None
         self._late: _LateArrivals | None = None
+        self._former_lag_ns: float | None = None
         # The stamps lie on a line through this point, device time and host time, ns.
         self._line_device_ns = self._line_host_ns = 0
         self._slope = 1.0
@@ -180,11 +181,16 @@ class ClockMap:
 
         """
         lag_ns = arrived_ns - self._delay_ns - device_ns
-        if self._is_early(device_ns, arrived_ns) or self._is_shifted(lag_ns):
-            self.steps += 1
+        is_early = self._is_early(device_ns, arrived_ns)
+        if is_early or self._is_shifted(lag_ns):
+            former_ns = self._former_lag_ns
+            # Samples that a busy host read late have looked like those of a clock that stopped.
+            was_delayed = is_early and former_ns is not None and lag_ns > former_ns - _EARLY_NS
+            self.steps += not was_delayed
             self.restart()
+            self._former_lag_ns = former_ns if was_delayed else None
             self.observe(device_ns, arrived_ns)
-            return True
+            return not was_delayed
         if self.settled and self._is_late(device_ns, arrived_ns, lag_ns):
             return False
         if self._first_arrived_ns is None:
@@ -356,7 +362,11 @@ class ClockMap:
         if taken_ns > _CATCH_UP_RATIO * (late.last_ns - late.first_ns):
             return
         self.steps += 1
+        former_ns = self._former_lag_ns
+        if former_ns is None:
+            former_ns = self._line(late.first_device_ns) - late.first_device_ns
         self.restart()
+        self._former_lag_ns = former_ns
         self._first_arrived_ns = late.first_ns
         self._open = _Window(late.last_device_ns, late.min_lag_ns)
         self._opened_ns, self._count = late.last_device_ns, 1

@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from math import ceil, isfinite
 import os
@@ -291,7 +291,8 @@ def open_stream(uri: str, device_name: str, entries: Sequence[str], sensor: Sens
     iio = import_libiio()
     try:
         _probe(uri)
-        context = iio.Context(uri)
+        with _quiet_stderr():
+            context = iio.Context(uri)
     except (OSError, ValueError) as error:
         raise ReadError(_reason(error)) from None
     try:
@@ -308,6 +309,19 @@ def open_stream(uri: str, device_name: str, entries: Sequence[str], sensor: Sens
                       latency)
     except (OSError, ValueError) as error:
         raise ReadError(f'{device_name}: cannot be read: {_reason(error)}') from None
+
+
+@contextmanager
+def _quiet_stderr() -> Iterator[None]:
+    """Drop what libiio itself writes to stderr: each attempt would write the same line."""
+    original, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nothing, 2)
+        yield
+    finally:
+        os.dup2(original, 2)
+        os.close(original)
+        os.close(nothing)
 
 
 def _probe(uri: str) -> None:

@@ -78,6 +78,15 @@ class BagRecorder:
                                 latched=topic == 'sensor_info', raw=True)
         self._samples = ReceiveTurn(node, Imu, _SAMPLES, self._write_sample, _QUEUE)
 
+    @property
+    def is_writing(self) -> bool:
+        """Return whether there is a bag."""
+        return self._bag is not None
+
+    def listen(self) -> None:
+        """Take samples, so that `has_samples` shows them."""
+        self._thread = RepeatingThread(self._node, self._samples, _SAMPLES)
+
     def start(self, path: Path) -> None:
         """
         Begin to write.
@@ -96,7 +105,10 @@ class BagRecorder:
         self._bag = LiveBag(path)
         for topic, kind, data in self._early:
             self._write(topic, kind, data)
-        self._thread = RepeatingThread(self._node, self._samples, _SAMPLES)
+
+    def fault(self) -> str:
+        """Return that several nodes publish samples, so that none is written, or ''."""
+        return self._samples.fault()
 
     def flush(self) -> None:
         """Write the messages so far to the file."""

@@ -25,6 +25,7 @@ import platform
 import resource
 import time
 
+from adxl_ros.errors import UserError
 import numpy as np
 
 _PACKAGES = ('numpy', 'scipy', 'pyarrow', 'polars', 'orjson', 'rosbags', 'allantools', 'imucal',
@@ -91,8 +92,11 @@ def print_table(jobs: Iterable[Job], rounds: int) -> None:
           'turns\n')
     print('| job | s | beside | ratio | goal |\n|---|---|---|---|---|', flush=True)
     for job in jobs:
-        for row in rows_of(job, min(rounds, job.rounds)):
-            print(row, flush=True)
+        try:
+            rows = rows_of(job, min(rounds, job.rounds))
+        except UserError as error:
+            rows = [f'| {job.name} | {error} | – | – | – |']
+        print(*rows, sep='\n', flush=True)
 
 
 def _version(name: str) -> str:

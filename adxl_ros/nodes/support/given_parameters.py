@@ -40,7 +40,7 @@ OWN_PARAMETERS = {
         'thermal.block_s', 'thermal.range_c'),
     'compensation': (
         'calibration', 'free_acceleration', 'inverse', 'mounting.frame_id', 'mounting.rpy_rad',
-        'orientation', 'store', 'undo_filter'),
+        'orientation', 'output_rate_hz', 'store', 'undo_filter'),
     'investigate': (
         'limits.alpha_deg', 'limits.beta_deg', 'limits.minutes', 'limits.rate_deg_s', 'output',
         'seed'),

@@ -83,8 +83,6 @@ class Samples:
         self._receive()
         batch, self._raw = self._raw, []
         stamps, accel, yaw_rad2 = _decoded(batch)
-        if batch:
-            self.restart_silence()
         accel = accel[:, :len(unit.axes)]
         finite = np.isfinite(accel)
         if batch:
@@ -94,7 +92,15 @@ class Samples:
 
     def _receive(self) -> None:
         """Take the messages that have come since the last call."""
-        self._raw += self._subscription.take()
+        new = self._subscription.take()
+        self._raw += new
+        if new:
+            self.restart_silence()
+
+    @property
+    def is_mixed(self) -> bool:
+        """Return whether several nodes publish the samples, so that none is taken."""
+        return bool(self._subscription.fault())
 
     def _why_compensated(self, yaw_rad2: np.ndarray) -> str:
         """Return that a stream with these variances of yaw is compensated, or ''."""
@@ -104,7 +110,9 @@ class Samples:
             'driver')
 
     def silence(self) -> str:
-        """Return in words for how long no sample has come; '' while samples come."""
+        """Return in words why or for how long no sample has come; '' while samples come."""
+        if self.is_mixed:
+            return self._subscription.fault()
         silent_s = (self._steady.now().nanoseconds - self._heard_ns) * 1e-9
         if silent_s < _SILENT_S:
             return ''

@@ -19,7 +19,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-from adxl_ros.investigate.stage_limits import StageLimits
+from adxl_ros.investigate.manoeuvres import StageLimits
 from adxl_ros.nodes.support.parameters import declare, parameter_error
 import numpy as np
 from rclpy.node import Node
@@ -67,7 +67,7 @@ def declare_settings(node: Node) -> InvestigateSettings:
     """
     output = Path(declare(node, 'output', 'investigation',
                           'folder of bag, report and parameters; a number is added where it '
-                          'exists'))
+                          'has a diagnosis'))
     rate_deg_s = declare(node, 'limits.rate_deg_s', _RATE_DEG_S, 'largest rate of each joint',
                          'deg/s', 0.1, 180.0)
     minutes = declare(node, 'limits.minutes', 15.0, 'largest time of all manoeuvres together',

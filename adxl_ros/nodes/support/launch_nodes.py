@@ -185,6 +185,9 @@ def common_arguments(link: Sequence[Argument] = LINK, frame_id: str = 'imu_link'
                               + ("; '': that of the ideal samples" if not frame_id else '')),
         DeclareLaunchArgument('log_level', default_value='info', choices=_LOG_LEVELS,
                               description='log level'),
+        DeclareLaunchArgument('enclave', default_value='', description='folder of the enclaves of '
+                              'SROS 2, such as /adxl_ros; each node has one of its name there; '
+                              'empty: none'),
         *(argument.declared() for argument in link)]
 
 
@@ -268,9 +271,18 @@ def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, A
     rules = [part for key, value in given.items() for part in (
         '-p', f'{node}{key}:={json.dumps(value, ensure_ascii=False)}')]
     options.setdefault('output', 'screen')
+    # The nominal sensor is what a node without a file has; a file would name it for any stream.
+    is_named &= path != str(parameter_file.nominal_path())
     return Node(package='adxl_ros', executable=executable, namespace=namespace,
-                ros_arguments=['--log-level', text(context, 'log_level'),
+                ros_arguments=[*_enclave(context, executable),
+                               '--log-level', text(context, 'log_level'),
                                *(['--params-file', path] if is_named else []), *rules], **options)
+
+
+def _enclave(context: LaunchContext, executable: str) -> list[str]:
+    """Return the ROS arguments that put a node into its enclave of SROS 2."""
+    folder = text(context, 'enclave')
+    return ['--enclave', f'{folder.rstrip("/")}/{executable}'] if folder else []
 
 
 def static_transform(context: LaunchContext) -> list[Action]:
@@ -294,7 +306,9 @@ def static_transform(context: LaunchContext) -> list[Action]:
     values = [*three_numbers(context, 'mounting_xyz_m'),
               *three_numbers(context, 'mounting_rpy_rad')]
     options = zip(('x', 'y', 'z', 'roll', 'pitch', 'yaw'), values)
-    return [Node(package='tf2_ros', executable='static_transform_publisher', arguments=[
+    executable = 'static_transform_publisher'
+    return [Node(package='tf2_ros', executable=executable, ros_arguments=_enclave(
+        context, executable), arguments=[
         *(part for name, value in options for part in (f'--{name}', repr(value))),
         '--frame-id', base_frame, '--child-frame-id', text(context, 'frame_id')])]
 
@@ -442,7 +456,8 @@ def simulated_link(context: LaunchContext, speed: Mapping[str, Any]) -> dict[str
 class GiveUp:
     """Ends a launch with an error when a node refuses to start again and again."""
 
-    def __init__(self) -> None:
+    def __init__(self, most_refusals: int = _MOST_REFUSALS) -> None:
+        self._most_refusals = most_refusals
         self._refusals_s: list[float] = []
 
     def __call__(self, event: ProcessExited, context: LaunchContext) -> None:
@@ -466,9 +481,10 @@ class GiveUp:
             return
         now_s = time.monotonic()
         self._refusals_s = [s for s in self._refusals_s if now_s - s < _REFUSALS_S] + [now_s]
-        if len(self._refusals_s) >= _MOST_REFUSALS:
-            raise UserError(f'{event.process_name} has refused to start {_MOST_REFUSALS} times; '
-                            'its own line above says why')
+        if len(self._refusals_s) >= self._most_refusals:
+            times = f' {self._most_refusals} times' if self._most_refusals > 1 else ''
+            raise UserError(f'{event.process_name} has refused to start{times}; its own line '
+                            'above says why')
 
 
 def end_with(success: str, failure: str) -> Callable[[ProcessExited, LaunchContext], list[Action]]:

@@ -183,15 +183,12 @@ class _Subject(NamedTuple):
         Topic of its last node; '' for a process that publishes nothing.
     commands
         Commands of its processes.
-    may_fail
-        Whether a measurement without messages is left out, and not an error.
 
     """
 
     label: str
     topic: str
     commands: Sequence[Sequence[str]]
-    may_fail: bool = False
 
 
 @dataclass(frozen=True)
@@ -228,14 +225,10 @@ def measure_live(seconds: float, rounds: int, iiod: str | None) -> None:
     seconds
         Duration of one measurement, s.
     rounds
-        Measurements of each subject, which take turns. A row has their medians.
+        Measurements of each subject, which take turns. A row has the medians of those that
+        succeeded, and says why others failed.
     iiod
         Path of the tests' IIOD, a Python file that prints its port; None for no row of it.
-
-    Raises
-    ------
-    UserError
-        A subject does not publish.
 
     """
     print(f'{RATE_HZ:g} Hz, {rounds} x {seconds:g} s: medians (range). '
@@ -244,27 +237,31 @@ def measure_live(seconds: float, rounds: int, iiod: str | None) -> None:
     with ExitStack() as stack:
         subjects = _subjects(stack, iiod)
         results: dict[str, list[_Result]] = {subject.label: [] for subject in subjects}
+        failures: dict[str, list[str]] = {subject.label: [] for subject in subjects}
         for _ in range(rounds):
             for subject in subjects:
                 try:
                     results[subject.label].append(_measure(subject, seconds))
                 except UserError as error:
-                    if not subject.may_fail:
-                        raise
-                    print(f'{error}; left out', flush=True)
+                    failures[subject.label].append(str(error))
     for label, measured in results.items():
         if measured:
             print(_row(label, measured))
-    bare = np.median([sum(result.loads) for result in results[_RELAY]])
+        if failed := failures[label]:
+            print(f'{label:27} failed in {len(failed)} of {rounds} rounds: {failed[-1]}')
+    bare = np.median([sum(result.loads) for result in results[_RELAY]] or [np.nan])
     for label, measured in results.items():
-        if 'compensation' in label:
+        if 'compensation' in label and measured:
             load = np.median([sum(result.loads) for result in measured])
             print(f'CPU of {label} by that of the {_RELAY}: {load / bare:.2f}')
     driver, compensation = [executable('driver')], [executable('compensation')]
     for label, topic, command, before in (('driver, sim', 'imu/data_raw', driver, []),
                                           ('compensation', 'imu/data', compensation, [driver])):
-        firsts_s = [_first_sample_s(topic, command, before) for _ in range(rounds)]
-        print(f'First sample of {label}: {_spread(firsts_s)} s after its start')
+        try:
+            firsts_s = [_first_sample_s(topic, command, before) for _ in range(rounds)]
+            print(f'First sample of {label}: {_spread(firsts_s)} s after its start')
+        except UserError as error:
+            print(f'First sample of {label}: {error}')
     print(f'Load of the machine after: {os.getloadavg()[0]:.1f}', flush=True)
 
 
@@ -284,7 +281,7 @@ def _subjects(stack: ExitStack, iiod: str | None) -> list[_Subject]:
         bench = [sys.executable, sys.argv[0]]
         rival_port = stack.enter_context(_emulated_board([*bench, '--rival-board']))
         rivals.append(_Subject('driver of another project', rival_driver.TOPIC,
-                               [[*bench, '--rival-driver', rival_port]], may_fail=True))
+                               [[*bench, '--rival-driver', rival_port]]))
     return [
         _Subject('bare publisher', 'bare', bare[:1]), _Subject(_RELAY, 'relayed', bare),
         _Subject('bare reader of the port', '',
@@ -344,7 +341,9 @@ def _measure(subject: _Subject, seconds: float) -> _Result:
                 duration_s = time.monotonic() - began_s
                 loads = (cpu_times_s() - before_s) / duration_s
         except UserError as error:
-            raise UserError(f'{subject.label}: {error}') from None
+            ended = [f'{process.args!r} ended with status {process.returncode}'
+                     for process in processes if process.poll() is not None]
+            raise UserError(', '.join([*ended, str(error)])) from None
     stamps_ns = np.concatenate([table.stamp_ns() for table in cdr.tables(listener.raw, cdr.imu)])
     age_ms = (np.array(listener.arrived_ns) - stamps_ns) * 1e-6
     periods = np.rint(np.diff(np.sort(stamps_ns)) * 1e-9 * RATE_HZ)

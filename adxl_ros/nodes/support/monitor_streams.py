@@ -58,6 +58,10 @@ class MonitorStreams:
         """Return the samples that wait: stamps, ns, (n,), and acceleration, m/s², (n, 3)."""
         return _imu(self._samples)
 
+    def fault(self) -> str:
+        """Return that several nodes publish samples or reference, so that none count, or ''."""
+        return self._samples.fault() or self._reference.fault()
+
     def take_others(self, live: LiveGap) -> int:
         """Give reference and surroundings that wait to a comparison; return how many came."""
         reference = live.reference

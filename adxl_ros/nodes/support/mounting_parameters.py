@@ -101,8 +101,12 @@ class MountingParameters:
         self._node.set_parameters([Parameter(_RPY, value=rpy_rad)])
         degrees = ', '.join(f'{np.degrees(angle):.2f}' for angle in rpy_rad)
         response.success = True
-        response.message = (f'level: roll, pitch, yaw of the case are {degrees} deg; to keep '
-                            f'them, write {_RPY}: {rpy_rad} into the parameter file')
+        yaml = f'[{", ".join(f"{angle:.6f}" for angle in rpy_rad)}]'
+        response.message = (
+            f'level: roll, pitch, yaw of the case are {degrees} deg, until this node ends; to '
+            f"keep them, start it with -p '{_RPY}:={yaml}', or write '/**: {{ros__parameters: "
+            f"{{{_RPY}: {yaml}}}}}' into a file and start it with --params-file")
+        self._node.get_logger().info(response.message)
         return response
 
     def _waiting_ends(self) -> None:

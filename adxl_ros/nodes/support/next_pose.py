@@ -24,6 +24,7 @@ from adxl_ros.nodes.support.topics import create_publisher
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from rclpy.time import Time
 from sensor_msgs.msg import JointState
 
 _REPEAT_NS = 500_000_000
@@ -44,12 +45,15 @@ class Announcer:
     ----------
     node
         The node that publishes.
+    has_stage
+        Whether there is a stage, which may turn itself.
 
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, has_stage: bool) -> None:
         self._node = node
-        self._command = create_publisher(node, JointState, 'stage/command', _COMMAND_QUEUE)
+        self._command = create_publisher(node, JointState, 'stage/command', _COMMAND_QUEUE) \
+            if has_stage else None
         self._next = create_publisher(node, DiagnosticStatus, '~/next_pose', 1, latched=True)
         self._clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._announced = ''
@@ -62,11 +66,13 @@ class Announcer:
             self._publish(pose.text, pose.values)
         self._announced = pose.text
         now_ns = self._clock.now().nanoseconds
-        if pose.command_rad is not None and (
+        if self._command and pose.command_rad is not None and (
                 pose.text != self._commanded or now_ns - self._commanded_ns >= _REPEAT_NS):
             self._commanded, self._commanded_ns = pose.text, now_ns
             command = JointState(name=['alpha', 'beta'], position=list(pose.command_rad))
-            command.header.stamp = self._node.get_clock().now().to_msg()
+            # The clock of a simulation may lag behind samples that have come.
+            stamp_ns = max(self._node.get_clock().now().nanoseconds, pose.newest_ns)
+            command.header.stamp = Time(nanoseconds=stamp_ns).to_msg()
             self._command.publish(command)
 
     def withdraw(self, reason: str) -> None:

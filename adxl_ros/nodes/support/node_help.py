@@ -84,7 +84,7 @@ def print_if_asked(arguments: Sequence[str], make_node: Callable[[], Node], node
     Parameters
     ----------
     arguments
-        Arguments of the command line without those of ROS.
+        Arguments of the command line.
     make_node
         Creates the node.
     node_help

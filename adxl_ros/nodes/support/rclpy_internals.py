@@ -59,7 +59,8 @@ class NotForExecutors(CallbackGroup):
         """Do nothing: nothing was executed."""
 
 
-def take_messages(subscription: Subscription, kind: Any, raw: bool, limit: int) -> Iterator[Any]:
+def take_messages(subscription: Subscription, kind: Any, raw: bool, limit: int,
+                  accept: Callable[[int | None], bool] = lambda _: True) -> Iterator[Any]:
     """
     Take the messages that wait in a subscription, without a turn of an executor.
 
@@ -76,6 +77,8 @@ def take_messages(subscription: Subscription, kind: Any, raw: bool, limit: int) 
         Whether to return serialized messages.
     limit
         The largest number of messages.
+    accept
+        Gets the sequence number of each message; returns whether to yield it.
 
     Yields
     ------
@@ -88,7 +91,8 @@ def take_messages(subscription: Subscription, kind: Any, raw: bool, limit: int) 
             message_and_info = subscription.handle.take_message(kind, raw)
             if message_and_info is None:
                 return
-            yield message_and_info[0]
+            if accept(message_and_info[1]['publication_sequence_number']):
+                yield message_and_info[0]
 
 
 def take_request(service: Service, kind: Any) -> tuple[Any, Any] | None:
@@ -128,7 +132,8 @@ class MessageWait:
         self._subscription, self._context = subscription, node.context
         self._wait_set: Any = None
 
-    def __call__(self, kind: Any, callback: Callable[[bytes], None], limit: int) -> None:
+    def __call__(self, kind: Any, callback: Callable[[bytes], None], limit: int,
+                 accept: Callable[[int | None], bool] = lambda _: True) -> None:
         """
         Wait for a message for up to 0.1 s, and give all that have come to a function.
 
@@ -140,6 +145,8 @@ class MessageWait:
             Takes the bytes of one message.
         limit
             The largest number of messages.
+        accept
+            As for `take_messages`.
 
         """
         handle, context = self._subscription.handle, self._context.handle
@@ -154,7 +161,8 @@ class MessageWait:
                 message_and_info = handle.take_message(kind, True)
                 if message_and_info is None:
                     break
-                callback(message_and_info[0])
+                if accept(message_and_info[1]['publication_sequence_number']):
+                    callback(message_and_info[0])
 
 
 def store_empty(node: Node, name: str, kind: Parameter.Type, number: float) -> None:

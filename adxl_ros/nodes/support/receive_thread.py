@@ -26,7 +26,7 @@ import threading
 from typing import Any
 
 from adxl_ros.nodes.support.rclpy_internals import MessageWait, NotForExecutors
-from adxl_ros.nodes.support.topics import create_subscription
+from adxl_ros.nodes.support.topics import create_subscription, OnePublisher
 from rclpy.node import Node
 
 
@@ -72,9 +72,10 @@ class RepeatingThread:
 
 class ReceiveTurn:
     """
-    A turn of a thread: waits for the messages of one topic, and gives each to a callback.
+    A turn of a thread: waits for the samples of one topic, and gives each to a callback.
 
-    Subscribes best effort, so that both kinds of publisher connect.
+    Subscribes best effort, so that both kinds of publisher connect. Samples of several publishers
+    are withheld.
 
     Parameters
     ----------
@@ -98,10 +99,15 @@ class ReceiveTurn:
                                                  group=NotForExecutors())
         self._wait = MessageWait(self._subscription, node)
         self._kind, self._callback, self._depth = kind, callback, depth
+        self._publishers = OnePublisher(node, topic)
 
     def __call__(self) -> None:
         """Wait for a message, and take all that have come."""
-        self._wait(self._kind, self._callback, self._depth)
+        self._wait(self._kind, self._callback, self._depth, self._publishers)
+
+    def fault(self) -> str:
+        """Return that several nodes publish on the topic, so that nothing is taken, or ''."""
+        return self._publishers.fault()
 
     def destroy(self) -> None:
         """Remove the subscription; the thread must have ended."""

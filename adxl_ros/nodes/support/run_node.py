@@ -81,10 +81,10 @@ def run(make_node: Callable[[], Node], node_help: NodeHelp,
     try:
         # It names a fault of a file by its place; rclpy does not.
         check_params_files()
-        arguments = remove_ros_args(sys.argv)[1:]
-        if print_if_asked(arguments, make_node, node_help):
+        # People ask for help behind --ros-args, too.
+        if print_if_asked(sys.argv[1:], make_node, node_help):
             return 0
-        argparse.ArgumentParser(prog=name, usage=_USAGE).parse_args(arguments)
+        argparse.ArgumentParser(prog=name, usage=_USAGE).parse_args(remove_ros_args(sys.argv)[1:])
         # rclpy's own handler ends the context; Python's would raise in the middle of a statement.
         signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))
         _wake_in_time()

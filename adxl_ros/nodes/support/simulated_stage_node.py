@@ -41,6 +41,8 @@ _RESOLUTION_RAD = float(5 / 60 * np.pi / 180)
 """Default resolution of the encoders, rad: 5 minutes of arc, as on the paper's stage."""
 _START = (('alpha_rad', 'rad', 100.0), ('beta_rad', 'rad', 100.0), ('shift_m', 'm', 10.0))
 """Parameters of the joints' start: name, unit, largest position either way."""
+_LIMITS = ('slew_rate_rad_s', 'slew_rate_m_s', 'settling_time_s', 'stage.resolution_rad')
+"""Parameters that the log states at the start."""
 
 
 class SimulatedStageNode:
@@ -70,6 +72,7 @@ class SimulatedStageNode:
         self._unshown: deque[tuple[int, bytes]] = deque()
         self._writer = JointStateWriter(JOINTS)
         self._simulated_ns = 0
+        self._is_commanded = False
         self._refusal_count = 0
         self._refusal = ''
         self._encoders = create_publisher(node, JointState, 'stage/joint_states', _QUEUE)
@@ -77,6 +80,11 @@ class SimulatedStageNode:
         self._diagnostics = DiagnosticsReporter(node, {'stage': self._status})
         create_subscription(node, JointState, 'stage/command', self._on_command,
                             _COMMAND_QUEUE)
+        limits = (f'{name} {node.get_parameter(name).value:g}' for name in _LIMITS)
+        pose = ', '.join(f'{name} {p:.4g}' for name, p in zip(JOINTS, self._stage.encoder()))
+        node.get_logger().info(
+            f'simulated stage at {pose} (rad, rad, m): {", ".join(limits)}; waiting for '
+            f'{node.resolve_topic_name("stage/command")}')
         # The timer runs on ROS time: each message of a faster clock wakes the node.
         node.create_timer(_STEP_NS * 1e-9, self._tick)
 
@@ -85,7 +93,11 @@ class SimulatedStageNode:
             if len(message.name) != len(message.position):
                 raise UserError(f'{len(message.name)} names, but {len(message.position)} '
                                 'positions')
-            self._stage.command(dict(zip(message.name, message.position)))
+            positions = dict(zip(message.name, message.position))
+            self._stage.command(positions, dict(zip(message.name, message.velocity)))
+            if not self._is_commanded:
+                self._is_commanded = True
+                self._node.get_logger().info(f'first command: {positions}')
         except UserError as error:
             self._refusal_count += 1
             self._refusal = f'{self._node.resolve_topic_name("stage/command")}: {error}'

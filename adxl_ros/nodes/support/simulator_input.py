@@ -91,7 +91,7 @@ class SimulatorInput:
         self._raw.clear()
         if not raws or self._due_s > self._counted_s + _COUNT_S:
             topic = self._node.resolve_topic_name(self._link.imu_topic)
-            self._link.sense_publishers(self._node.count_publishers(topic))
+            self._link.sense_publishers(self._node.count_publishers(topic), self._turn.fault())
             self._counted_s = self._due_s
         if not raws:
             return

@@ -151,6 +151,12 @@ class StageBridge:
                             _COMMAND_QUEUE)
         create_subscription(node, JointState, self._states_topic, self._on_states,
                             _STATES_QUEUE)
+        joints = ', '.join(f'{name} is {joint.name}' for name, joint in self._joints.items())
+        speed = f' at most {self._speed_rad_s:g} rad/s' if kind == 'trajectory' else ''
+        node.get_logger().info(
+            f'bridge ({kind}){speed}: {joints}; commands go to {self._commands.topic_name}, '
+            f'positions come from {node.resolve_topic_name(self._states_topic)}; waiting for '
+            f'{node.resolve_topic_name("stage/command")}')
 
     def _on_command(self, message: JointState) -> None:
         positions = dict(zip(message.name, message.position))
@@ -169,6 +175,8 @@ class StageBridge:
         # The calibration repeats its command: a controller would begin its trajectory each time.
         if goal == self._goal and (self._arrived() or now_ns < self._resend_ns):
             return
+        if not self._goal:
+            self._node.get_logger().info(f'first command: {positions}')
         duration_s = self._duration_s(goal)
         self._resend_ns = now_ns + round(duration_s * 1e9) + _GRACE_NS
         if goal != self._goal:

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+import time
 from typing import Any
 
 from adxl_ros.errors import one_line, UserError
@@ -34,6 +35,9 @@ from rclpy.subscription import Subscription
 _OVERRIDING = QoSOverridingOptions((QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH,
                                     QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY))
 """Policies that parameters can override."""
+_MIXED_S = 3.0
+"""Time within which sequence numbers step back twice where two publishers mix, s; chosen: longer
+than the period of slow samples, shorter than two starts of a driver."""
 
 
 def create_publisher(node: Node, kind: Any, topic: str, depth: int, latched: bool = False
@@ -113,6 +117,39 @@ def create_subscription(node: Node, kind: Any, topic: str, callback: Callable[[A
             kind, topic, take_all, qos, raw=raw, callback_group=group,
             qos_overriding_options=_OVERRIDING)
     return subscription
+
+
+class OnePublisher:
+    """
+    Withholds messages while several nodes send them on one topic, because a mixture is no signal.
+
+    Each publisher numbers its messages. The number steps back once where a publisher was started
+    again, and over and over where two send by turns.
+    """
+
+    def __init__(self, node: Node, topic: str) -> None:
+        self._node, self._topic = node, node.resolve_topic_name(topic)
+        self._number = 0
+        self._back_s = self._until_s = -_MIXED_S
+
+    def __call__(self, number: int | None) -> bool:
+        """Return whether to take a message of a sequence number; None where the RMW has none."""
+        if number is None:
+            return True
+        if number <= self._number:
+            now_s = time.monotonic()
+            if now_s - self._back_s < _MIXED_S:
+                self._until_s = now_s + _MIXED_S
+            self._back_s = now_s
+        self._number = number
+        return self._until_s <= 0 or time.monotonic() > self._until_s
+
+    def fault(self) -> str:
+        """Return how many nodes publish on the topic while messages are withheld, or ''."""
+        if self._until_s <= 0 or time.monotonic() > self._until_s:
+            return ''
+        count = max(self._node.count_publishers(self._topic), 2)
+        return f'{self._topic}: {count} nodes publish it, and their samples mix; end all but one'
 
 
 @contextmanager

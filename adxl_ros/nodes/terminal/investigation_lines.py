@@ -18,16 +18,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+import shlex
 import sys
 from textwrap import wrap
 from typing import Any, Protocol
 
-from adxl_ros.investigate.diagnosis_round import Answer
+from adxl_ros.investigate.diagnosis_round import Answer, hypothesis_text, Outcome
 from adxl_ros.investigate.investigation import Investigation, State, Status
-from adxl_ros.investigate.manoeuvres import description
+from adxl_ros.investigate.manoeuvres import description, StageLimits
 from adxl_ros.investigate.output_folder import OutputFolder
-from adxl_ros.investigate.stage_limits import StageLimits
-from adxl_ros.investigate.stop_rule import hypothesis_text, Outcome
 from adxl_ros.nodes.terminal.steps import drawable
 import numpy as np
 
@@ -193,18 +192,19 @@ def closing_lines(investigation: Investigation, folder: OutputFolder) -> list[st
         The lines.
 
     """
-    diagnose = ['ros2 run adxl_ros diagnose', str(folder.bag), f'--params {folder.baseline}',
-                f'-o {folder.path / "gap"}']
+    bag, baseline, gap, parameters = (shlex.quote(str(path)) for path in (
+        folder.bag, folder.baseline, folder.path / 'gap', folder.parameters))
+    diagnose = ['ros2 run adxl_ros diagnose', bag, f'--params {baseline}', f'-o {gap}']
     files = [('Report', folder.report), ('Parameters', folder.parameters), ('Bag', folder.bag)]
     named = [f' {name:11} {path}' for name, path in files if path.exists()]
     if investigation.state is State.STOPPED:
         return ['', *wrap(f'Stopped without a verdict: {investigation.reason}', _COLUMNS), '',
-                *named, *_command(diagnose)]
+                *named, *(_command(diagnose) if investigation.has_moved else [])]
     answer = investigation.answers[-1][1]
     lines = ['', *wrap(answer.sentence, _COLUMNS)]
     if answer.hidden:
         lines += wrap(f'It cannot show {_listed(answer.hidden)}.', _COLUMNS)
-    simulate = ['ros2 run adxl_ros simulate rich', f'--params {folder.parameters}', '-o sim.csv']
+    simulate = ['ros2 run adxl_ros simulate rich', f'--params {parameters}', '-o sim.csv']
     return [*lines, '', *named, *_command(simulate)]
 
 
