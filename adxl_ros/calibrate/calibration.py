@@ -268,7 +268,8 @@ def _calibrated(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str 
     if sensor.axes != AXES:
         raise UserError(f'{source}: no stage angles and only the axes {sensor.axes}: the '
                         'magnitude of gravity needs x, y and z; record alpha_rad and beta_rad')
-    return _against_gravity(sensor, poses, source, data_sha256, population)
+    span_s = sum(float(np.ptp(recording.poses.time_s)) for recording in recordings)
+    return _against_gravity(sensor, poses, source, span_s, data_sha256, population)
 
 
 def _without_angles_lines(poses: Poses) -> list[str]:
@@ -465,12 +466,12 @@ def _rms_residual_mg(fitted: Sensor, poses: Poses) -> float:
     return float(np.sqrt(np.mean(residual ** 2)))
 
 
-def _against_gravity(sensor: Sensor, poses: Poses, source: str, data_sha256: str,
+def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, data_sha256: str,
                      population: Population | None) -> CalibrationResult:
     fit = gravity.fit_gravity(poses.volts, poses.std_v, sensor)
     kept = np.setdiff1d(np.arange(len(poses)), fit.outliers)
-    before, after, leave_one_out = (_rms_mg(values[kept]) for values in (
-        fit.before_mps2, fit.residual_mps2, fit.leave_one_out_mps2))
+    before, after, held_out = (_rms_mg(values[kept]) for values in (
+        fit.before_mps2, fit.residual_mps2, fit.held_out_mps2))
     fitted = replace(
         sensor, model='gravity', effects=('bias', 'scale_factor', 'misalignment'),
         values=fit.values, covariance=fit.covariance, covariance_names=gravity.NAMES)
@@ -485,12 +486,13 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, data_sha256: str
                                                float(np.sqrt(budgets.accel.model))))
     fitted = with_provenance(fitted, source, poses, data_sha256, {
         'reference': 'gravity', **_prior_entry(population), 'residual_mg': f'{after:.4f}',
-        'leave_one_out_mg': f'{leave_one_out:.4f}', 'converged': _yes_or_no(fit.converged),
+        'held_out_mg': f'{held_out:.4f}', 'span_s': f'{span_s:.1f}',
+        'converged': _yes_or_no(fit.converged),
         **acceptance.provenance_entries(assessment, ())})
     lines = [f'magnitude of gravity over {len(kept)} rests, rms in mg: nominal {before:.2f}, '
-             f'nine parameters {after:.3f}, leave-one-out {leave_one_out:.3f}',
+             f'nine parameters {after:.3f}, held out {held_out:.3f}',
              *_gravity_fit_lines(fit, poses),
-             acceptance.gravity_line(assessment, fit.leave_one_out_mps2[kept]),
+             acceptance.gravity_line(assessment, fit.held_out_mps2[kept]),
              *acceptance.explanation(assessment, fitted), *acceptance.unit_line(fitted),
              *prior_lines]
     return CalibrationResult(

@@ -38,8 +38,8 @@ from __future__ import annotations
 from collections import deque
 from itertools import islice, pairwise, takewhile
 
-from adxl_ros.calibrate.poses import SAME_ANGLE_RAD
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.signals.rest_detection import SAME_ANGLE_RAD
 import numpy as np
 
 ENCODER_STEPS = 1.5

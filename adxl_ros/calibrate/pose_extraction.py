@@ -19,14 +19,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from adxl_ros.calibrate import joint_settings
-from adxl_ros.calibrate.poses import Poses, SAME_ANGLE_RAD
+from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import COMMANDS, JOINTS, Recording
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals import filter_time_constant
 from adxl_ros.signals.noise_limits import datasheet_noise
-from adxl_ros.signals.rest_detection import find_rests, Rest, rest_means
+from adxl_ros.signals.rest_detection import recording_finder, Rest, rest_means
 import numpy as np
 
 _MAX_PERIODS = 1.5
@@ -100,9 +100,9 @@ def extract_poses(recording: Recording, sensor: Sensor,
     volts, angles = recording.volts(sensor), recording.stage_angles
     noise = datasheet_noise(sensor)
     if records is None:
-        tolerance = max(sensor.stage_resolution_rad, SAME_ANGLE_RAD)
-        rests = find_rests(recording.time_s, volts, sensor.rate_hz, angles, noise, learn=True,
-                           angle_tolerance_rad=None if angles is None else tolerance)
+        finder = recording_finder(sensor, angles is not None)
+        finder.feed(recording.time_s, volts, angles)
+        rests = finder.rests()
     else:
         rests = named_rests(recording, records)
     if not rests:

@@ -26,11 +26,8 @@ from adxl_ros.model.effects.base import Components, Environment, NOMINAL_ENVIRON
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.axis_polarity import CERTAIN_CORRELATION, find_polarity_fault
+from adxl_ros.signals.rest_detection import SAME_ANGLE_RAD
 import numpy as np
-
-SAME_ANGLE_RAD = 1e-5
-"""Angles that differ by less are equal, rad. Chosen: above the rounding of angles in a file, and
-far below the step of an encoder."""
 
 
 @dataclass(frozen=True)

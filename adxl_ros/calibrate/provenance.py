@@ -63,6 +63,7 @@ def with_provenance(fitted: Sensor, source: str, poses: Poses, data_sha256: str,
 
     """
     entries = {
+        **{key: text for key, text in fitted.provenance.items() if key.endswith('_from')},
         # A text of YAML, where +00:00 makes a date, which ros2 param cannot set.
         'date': f'{datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%S}+0000',
         'package_version': package_version(), 'source': source,

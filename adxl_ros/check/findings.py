@@ -23,7 +23,7 @@ from adxl_ros.calibrate.value_text import counted, duration
 from adxl_ros.diagnose.data_checks import SHORTEST_S as SHORTEST_MOTION_S
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.signals.recording_contents import RecordingContents
-from adxl_ros.signals.still_stretch import SHORTEST_S as SHORTEST_REST_S
+from adxl_ros.signals.still_stretch import shortest_rest_s
 import numpy as np
 
 _LARGEST_MISSING = 0.01
@@ -146,7 +146,8 @@ def _stamp_faults(contents: RecordingContents) -> list[str]:
                       f'{1e3 * _LARGEST_JITTER * period_s:.3g} ms at most; --rate HZ stamps by '
                       'index')
     delay = contents.delay
-    if delay is not None and delay.spread_s > _LARGEST_SPREAD_S:
+    if delay is not None and delay.spread_s > _LARGEST_SPREAD_S \
+            and not delay.is_simulated:
         faults.append(f'log time minus header time varies by {delay.spread_s:.3g} s, expected '
                       f'{_LARGEST_SPREAD_S:g} s at most; a clock was set, or messages came late')
     if contents.cut:
@@ -244,7 +245,7 @@ def _diagnose(contents: RecordingContents) -> Ability:
 
 def _noise(contents: RecordingContents) -> Ability:
     """Return whether `noise` can measure the noise."""
-    longest_s = contents.longest_rest_s
-    return Ability('noise', longest_s >= SHORTEST_REST_S,
-                   f'longest rest {duration(longest_s)}' if longest_s >= SHORTEST_REST_S else
-                   f'rests for {longest_s:.3g} s, needs {SHORTEST_REST_S:g} s')
+    longest_s, shortest_s = contents.longest_rest_s, shortest_rest_s(contents.rate_hz)
+    return Ability('noise', longest_s >= shortest_s,
+                   f'longest rest {duration(longest_s)}' if longest_s >= shortest_s else
+                   f'rests for {longest_s:.4g} s, needs {shortest_s:.3g} s')

@@ -29,7 +29,6 @@ from adxl_ros.files.stream_unit import uncalibrated
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.recorded_sensor import load_sensor
 from adxl_ros.signals.recording_contents import examine, log_delay
-import numpy as np
 
 BLOCK_ROWS = 65536
 """Samples that are read at a time (chosen: some MB)."""
@@ -61,9 +60,13 @@ def check_recording(path: str, params: str | None, reading: ReadingOptions,
         delay = None
         if has_log_times(path) and reading.rate_hz is None:
             delay = log_delay(log_times(path, reading.topic))
-        source = _Source(params)
+
+        def unit_of(block: Recording) -> Sensor:
+            sensor = load_sensor(params, block)
+            return uncalibrated(sensor, block.stream_info, block.axes, sensor.rate_hz)
+
         blocks = recording.blocks(path, BLOCK_ROWS, reading)
-        contents = examine(_shown(blocks, show), source.accel_mps2, delay)
+        contents = examine(_shown(blocks, show), unit_of, delay)
     except UserError as error:
         reason = one_line(error).removeprefix(f'{path}: ')
         return Findings(path, None, (reason,), paste=error.paste)
@@ -75,18 +78,3 @@ def _shown(blocks: Iterator[Recording], show: Callable[[float], None]) -> Iterat
     for block in blocks:
         yield block
         show(block.done)
-
-
-class _Source:
-    """Converts the samples of a recording by the nominal values of its sensor."""
-
-    def __init__(self, params: str | None) -> None:
-        self._params = params
-        self._unit: Sensor | None = None
-
-    def accel_mps2(self, block: Recording) -> np.ndarray:
-        """Return the specific force of a block, m/s², (n, m)."""
-        if self._unit is None:
-            sensor = load_sensor(self._params, block)
-            self._unit = uncalibrated(sensor, block.stream_info, block.axes, sensor.rate_hz)
-        return block.accel_mps2(self._unit)

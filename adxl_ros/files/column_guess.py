@@ -23,11 +23,19 @@ import re
 import shlex
 
 from adxl_ros.files.column_mapping import ColumnMapping, Source
-from adxl_ros.files.column_units import LSB, Quantity, ROLES, unit_in_name, UNITS
+from adxl_ros.files.column_units import (
+    LSB,
+    Quantity,
+    ROLES,
+    signed,
+    unit_in_name,
+    UNITS,
+    UNSIGNED,
+)
 from adxl_ros.files.mapped_recording import likely_unit, listed
-from adxl_ros.files.stamp_bursts import burst_rate_hz, burst_samples
+from adxl_ros.files.stamp_bursts import burst_samples, stamped_rate_hz
 from adxl_ros.files.tables.base import Table
-from adxl_ros.model.constants import AXES
+from adxl_ros.model.constants import AXES, G0_MPS2
 import numpy as np
 
 _TIME_NAMES = re.compile(
@@ -40,8 +48,9 @@ _INDEX_NAMES = re.compile(r'(?i)index|sample|frame|count|seq|^(n|i|id|no)$|#')
 """Names of a count."""
 
 _OTHER_SENSORS = re.compile(
-    r'(?i)gyr|mag(?!nit)|angular|omega|rate|\bw[xyz]\b|g[xyz]r|rot|orient|quat|'
-    r'pressure|baro|gps|vel|\bg[xyz]\b|abs|total|norm|std|cov|user|gravity|without|'
+    r'(?i)gyr|mag(?!nit)|\bm[xyz]\b|compass|(?<![a-z])(pos|dist|height|alt|lat|lon|hum)|'
+    r'angular|omega|rate|\bw[xyz]\b|g[xyz]r|rot|orient|quat|'
+    r'press|baro|gps|vel|\bg[xyz]\b|abs|total|norm|std|cov|user|gravity|without|'
     r'\brad\b|dps|(deg|°)\s?/\s?s|angle')
 """Names of columns of other sensors."""
 
@@ -55,6 +64,12 @@ _ACCEL_NAMES = (
     re.compile(r'(?i)[xyz]'),
 )
 """Names of acceleration, the surest first."""
+
+_COUNT_NAMES = re.compile(r'(?i)acc|^(a|f|g_?f|ad)_?[xyz]|adc|raw|counts?|lsb|^a\d')
+"""Names of an accelerometer's counts."""
+
+_VOLT_NAMES = re.compile(r'(?i)volt|adc|analog|^a\d|(?<![a-z])m?v(?![a-z])|^v_?[xyz]|[xyz]_?v$')
+"""Names of volts."""
 
 _AXIS_WORD = re.compile(
     r'(?i)(a|acc|accel|g_?f|f|ad|gf|v)([xyz])|([xyz])(acc|accel|adc|v)')
@@ -79,12 +94,21 @@ _EPOCHS = ((1e9, 'ns'), (1e6, 'us'), (1e3, 'ms'), (1.0, 's'))
 _EPOCH_S = (9e8, 4e9)
 """Bounds of times since 1970, s: 1998 to 2096."""
 
-_STEPS = ((1e6, 'ns'), (1e3, 'us'), (1.0, 'ms'), (0.0, 's'))
-"""Smallest step of each unit, between samples of 1 Hz to 1 kHz."""
+_SHORTEST_STEP_S = 5e-5
+"""Shortest step of stamps, s. Chosen: twice the rate of the fastest sensor."""
+
+_LONGEST_STEP_S = 1.05
+"""Longest step of stamps, s. Chosen: 1 Hz, the slowest rate of the package, with jitter."""
 
 _CONSTANT = 0.3
 """Largest relative scatter of a length that is that of gravity (chosen: a hand that turns a
 sensor makes less)."""
+
+_LENGTHS_G = (0.5, 2.0)
+"""Bounds of the length of readings at rest in a unit that the name states, g."""
+
+_REST_ROWS = 16
+"""Rows of a window; the quietest quarter of them is at rest (chosen: short in every log)."""
 
 _LARGEST = 1e30
 """Larger magnitudes are no readings and no stamps."""
@@ -103,6 +127,9 @@ _NOMINAL_V = 2.5
 
 _NEAR_NOMINAL = 0.1
 """Largest relative difference from it (chosen: units of one kind differ by less)."""
+
+_NEAR_COUNTS = 0.1
+"""Largest logarithm of the ratio of a length to usual counts of 1 g (chosen: tolerances are)."""
 
 _COUNTS = (64, 100, 128, 256, 512, 1000, 1024, 1365, 2048, 4096, 8192, 16384, 32768)
 """Usual counts of 1 g."""
@@ -137,13 +164,54 @@ class Proposal:
 
     def options(self) -> str:
         """Return the options, quoted for a shell."""
-        text = f'--columns {_shell_quoted(str(self.mapping))}'
+        text = f'--columns {shell_quoted(str(self.mapping))}'
         text += f' {self.stamps}' if self.stamps else ''
         text += f' --lsb-per-g {self.lsb_per_g:.0f}' if self.lsb_per_g else ''
         return text + (f' --lsb-at-0g {self.lsb_at_0g:.0f}' if self.lsb_at_0g else '')
 
 
-def _shell_quoted(text: str) -> str:
+def is_sensor_step(step_s: float, is_whole: bool) -> bool:
+    """
+    Return whether samples come at such steps; at whole seconds they hardly do.
+
+    Parameters
+    ----------
+    step_s
+        Step of stamps, s.
+    is_whole
+        Whether the stamps are whole numbers.
+
+    Returns
+    -------
+    bool
+        Whether a sensor may have this rate.
+
+    """
+    return _SHORTEST_STEP_S <= step_s <= _LONGEST_STEP_S and not (is_whole and step_s >= 1)
+
+
+def time_unit_of_step(step: float, is_whole: bool) -> str:
+    """
+    Return the likely unit of stamps.
+
+    Parameters
+    ----------
+    step
+        Step of the stamps, in their unit.
+    is_whole
+        Whether the stamps are whole numbers.
+
+    Returns
+    -------
+    str
+        The largest unit in which samples come at such steps; s where there is none.
+
+    """
+    return next((unit for unit in ('s', 'ms', 'us', 'ns') if is_sensor_step(
+        step / UNITS[Quantity.TIME][unit].divisor, is_whole)), 's')
+
+
+def shell_quoted(text: str) -> str:
     """Return a word for a shell, in quotes even where it needs none."""
     quoted = shlex.quote(text)
     return quoted if quoted != text else f"'{text}'"
@@ -165,18 +233,25 @@ def propose(table: Table) -> Proposal | None:
         unit, reason = _time_unit(table, time, values[time])
         sources['time'] = Source(time, unit)
         reasons.append(reason)
-    zero, length = _zero_and_length(readings)
     stated = table.units.get(outputs[0]) or unit_in_name(outputs[0], Quantity.OUTPUT)
-    unit = stated or ('' if zero else likely_unit(length)) or _count_or_volts(zero or length)
+    names = outputs if table.has_names else []
+    is_unsigned = stated in (None, LSB) and _has_lost_sign(readings)
+    zero, length = _zero_and_length(signed(readings) if is_unsigned else readings)
+    unit = UNSIGNED if is_unsigned else stated or ('' if zero else likely_unit(length)) or \
+        _count_or_volts(zero or length, readings, names)
+    if not unit or (len(outputs) == len(AXES)
+                    and not _is_gravity(readings, unit, zero, length)):
+        return None
     sources |= {axis: Source(name, unit) for axis, name in zip(AXES, outputs)}
     about = f' about {zero:.4g}' * (zero != 0)
     reasons.append(f'the readings have a length of {length:.4g}{about}'
                    + f', so {unit}' * (not stated))
     sources |= _references(table, values, {*outputs, time or ''})
-    per_g = (round(length) if zero else _counts(length)) if unit == LSB else 0.0
+    is_count = unit in (LSB, UNSIGNED)
+    per_g = (round(length) if zero else _counts(length)) if is_count else 0.0
     note = _note(time is not None, unit, zero)
     stamps = _stamp_options(values[time], sources['time']) if time else '--rate HZ'
-    return Proposal(ColumnMapping(sources), per_g, zero if unit == LSB else 0.0, reasons, stamps,
+    return Proposal(ColumnMapping(sources), per_g, zero if is_count else 0.0, reasons, stamps,
                     note)
 
 
@@ -197,7 +272,7 @@ def _stamp_options(values: np.ndarray, source: Source) -> str:
     if (steps > 0).all():
         return ''
     if burst_samples(time_s) > 1:
-        return f'--rate {burst_rate_hz(time_s):.4g}'
+        return f'--rate {stamped_rate_hz(time_s):.4g}'
     return '--drop-bad-stamps'
 
 
@@ -260,12 +335,15 @@ def _time_unit(table: Table, name: str, values: np.ndarray) -> tuple[str, str]:
     step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
     stated = table.units.get(name) or (unit_in_name(name, Quantity.TIME) if table.has_names
                                        else None)
-    if stated:
+    is_whole = bool((finite == np.rint(finite)).all())
+    # A unit in the name counts unless no sensor has samples at such steps.
+    if stated and is_sensor_step(step / UNITS[Quantity.TIME][stated].divisor, False):
         return stated, f'{name} has steps of {step:.4g} {stated}'
     for second, unit in _EPOCHS:
-        if _EPOCH_S[0] < finite[0] / second < _EPOCH_S[1]:
+        if _EPOCH_S[0] < finite[0] / second < _EPOCH_S[1] and \
+                is_sensor_step(step / second, False):
             return ('epoch' if unit == 's' else unit), f'{name} counts from 1970'
-    unit = next(unit for smallest, unit in _STEPS if step >= smallest)
+    unit = time_unit_of_step(step, is_whole)
     return unit, f'{name} has steps of {step:.4g}, so {unit}'
 
 
@@ -280,7 +358,9 @@ def _outputs(table: Table, values: Mapping[str, np.ndarray]) -> list[str]:
         outputs = next(filter(None, map(_by_axis, groups)), None)
         if outputs:
             return outputs
-    return _by_length(values)
+    others = [_OTHER_SENSORS, *_REFERENCES.values()] if table.has_names else []
+    return _by_length({name: column for name, column in values.items()
+                       if not any(pattern.search(name) for pattern in others)})
 
 
 def _by_axis(names: Sequence[str]) -> list[str]:
@@ -331,7 +411,7 @@ def _zero_and_length(readings: np.ndarray) -> tuple[float, float]:
 
     The zero is 0 where an axis reads on both sides of it, or where the readings do not turn.
     """
-    length = float(np.median(np.linalg.norm(readings, axis=1)))
+    length = float(np.median(np.linalg.norm(_at_rest(readings), axis=1)))
     spread = np.ptp(readings, axis=0)
     if len(readings) < _SPHERE_ROWS or (readings.min(axis=0) < 0).any() or \
             spread.min() < _TURNED * spread.max():
@@ -348,8 +428,44 @@ def _zero_and_length(readings: np.ndarray) -> tuple[float, float]:
     return (centre, radius) if is_sphere else (0.0, length)
 
 
-def _count_or_volts(length: float) -> str:
-    return LSB if length > 40 else 'v' if length < 9 else 'mps2'
+def _at_rest(readings: np.ndarray) -> np.ndarray:
+    """Return the means of the quietest quarter of the windows, (k, m)."""
+    count = len(readings) // _REST_ROWS
+    if count < 4:
+        return readings
+    windows = readings[:count * _REST_ROWS].reshape(count, _REST_ROWS, -1)
+    variance = windows.var(axis=1).sum(axis=1)
+    return np.asarray(windows.mean(axis=1)[variance <= np.quantile(variance, 0.25)])
+
+
+def _is_gravity(readings: np.ndarray, unit: str, zero: float, length: float) -> bool:
+    """Return whether readings have the constant length of gravity at rest."""
+    values = signed(readings) if unit == UNSIGNED else readings
+    lengths = np.linalg.norm(_at_rest(values) - zero, axis=1)
+    if np.median(np.abs(lengths - length)) > _CONSTANT * length:
+        return False
+    if unit not in _ACCEL_UNITS:
+        return True
+    length_g = float(UNITS[Quantity.OUTPUT][unit].convert(np.array(length))) / G0_MPS2
+    return _LENGTHS_G[0] < length_g < _LENGTHS_G[1]
+
+
+def _has_lost_sign(readings: np.ndarray) -> bool:
+    """Return whether readings are counts of 16 bits that have lost their sign."""
+    if not (readings.min() >= 0 and 1 << 15 <= readings.max() < 1 << 16 and
+            (readings == np.rint(readings)).all()):
+        return False
+    length = float(np.median(np.linalg.norm(_at_rest(signed(readings)), axis=1)))
+    return abs(np.log(length / _counts(length))) < _NEAR_COUNTS and \
+        _is_gravity(readings, UNSIGNED, 0.0, length)
+
+
+def _count_or_volts(length: float, readings: np.ndarray, names: Sequence[str]) -> str:
+    """Return counts or volts where values and names allow them; empty where they do not."""
+    if length > 40:
+        is_whole = bool((readings == np.rint(readings)).all())
+        return LSB if not names or is_whole or all(map(_COUNT_NAMES.search, names)) else ''
+    return 'v' if length < 9 and names and all(map(_VOLT_NAMES.search, names)) else ''
 
 
 def _counts(length: float) -> float:

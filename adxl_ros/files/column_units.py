@@ -53,6 +53,14 @@ ROLES: Mapping[str, Quantity] = {
 LSB = 'lsb'
 """Unit of counts, which need the counts of 1 g."""
 
+UNSIGNED = 'u16'
+"""Unit of counts of 16 bits whose sign was lost: 65535 is −1."""
+
+
+def signed(values: np.ndarray) -> np.ndarray:
+    """Return counts of 16 bits with their sign, (n,)."""
+    return np.where(values >= 1 << 15, values - (1 << 16), values)
+
 
 @dataclass(frozen=True)
 class Unit:
@@ -95,6 +103,7 @@ UNITS: Mapping[Quantity, Mapping[str, Unit]] = {
         'mg': Unit(Quantity.OUTPUT, 1e3, G0_MPS2),
         'mps2': Unit(Quantity.OUTPUT),
         LSB: Unit(Quantity.OUTPUT, factor=G0_MPS2),
+        UNSIGNED: Unit(Quantity.OUTPUT, factor=G0_MPS2),
         'v': Unit(Quantity.OUTPUT, is_volts=True),
         'mv': Unit(Quantity.OUTPUT, 1e3, is_volts=True),
     },

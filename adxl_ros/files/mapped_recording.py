@@ -21,7 +21,15 @@ from dataclasses import dataclass, field
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.column_mapping import ColumnMapping, Source
-from adxl_ros.files.column_units import LSB, ROLES, Unit, unit_in_name, UNITS
+from adxl_ros.files.column_units import (
+    LSB,
+    ROLES,
+    signed,
+    Unit,
+    unit_in_name,
+    UNITS,
+    UNSIGNED,
+)
 from adxl_ros.files.csv_file import epoch_ns, TIME_LIMIT_S
 from adxl_ros.files.reading_options import ReadingOptions
 from adxl_ros.files.recording_columns import (
@@ -161,7 +169,7 @@ def _resolved(table: Table, mapping: ColumnMapping, reading: ReadingOptions
     if len({column.unit.is_volts for column in outputs}) > 1:
         raise UserError(f'{mapping.where}: some axes are in volts and others are not; state one '
                         'kind')
-    lsb = [column.unit_name == LSB for column in outputs]
+    lsb = [column.unit_name in (LSB, UNSIGNED) for column in outputs]
     for option, values in (('--lsb-per-g', reading.lsb_per_g), ('--lsb-at-0g', reading.lsb_at_0g)):
         if values and len(values) not in (1, len(outputs)):
             raise UserError(f'{option}: has {len(values)} values for {len(outputs)} axes; write '
@@ -285,7 +293,9 @@ class _Converter:
         for index, axis in enumerate(axes):
             column = self.columns[axis]
             values = block.columns[column.name]
-            if column.unit_name == LSB:
+            if column.unit_name == UNSIGNED:
+                values = signed(values)
+            if column.unit_name in (LSB, UNSIGNED):
                 values = (values - zero[index]) / per_g[index]
             outputs.append(column.unit.convert(values))
         return np.column_stack(outputs)

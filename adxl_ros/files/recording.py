@@ -29,13 +29,14 @@ from pathlib import Path
 from adxl_ros.errors import UserError
 from adxl_ros.files import bag_reader, csv_file, mapped_recording
 from adxl_ros.files.bag_writer import BagWriter
-from adxl_ros.files.column_guess import describe
-from adxl_ros.files.column_mapping import ColumnMapping, parse_mapping
+from adxl_ros.files.column_guess import describe, is_sensor_step, shell_quoted, time_unit_of_step
+from adxl_ros.files.column_mapping import ColumnMapping, parse_mapping, Source
+from adxl_ros.files.column_units import Quantity, unit_in_name, UNITS
 from adxl_ros.files.csv_header import HeaderError
 from adxl_ros.files.csv_writer import CsvWriter, recording_columns, recording_info
 from adxl_ros.files.mounted_axes import mounted
 from adxl_ros.files.reading_options import AS_IT_IS, ReadingOptions
-from adxl_ros.files.recording_columns import ACCEL, concatenate, Recording
+from adxl_ros.files.recording_columns import ACCEL, concatenate, Recording, TIME
 from adxl_ros.files.tables import is_text, open_table
 from adxl_ros.files.tables.base import Table
 from adxl_ros.model.sensor import Sensor
@@ -43,6 +44,15 @@ import numpy as np
 
 _BLOCK_ROWS = 65536
 """Samples that are read at a time (chosen: some MB)."""
+
+_FEWEST_STAMPS = 8
+"""Stamps whose steps show their unit. Chosen: a lost sample hides no median."""
+
+_WHOLE = 1e-3
+"""Largest distance of a stamp from a whole number by rounding, in its unit."""
+
+_SAME_RATE = 0.1
+"""Largest relative difference of a stated sample rate from that of the stamps. Chosen."""
 
 _MAGIC_BYTES = 16
 """Bytes at the beginning of a file that show its format."""
@@ -120,13 +130,46 @@ def _blocks(path: str | os.PathLike, rows: int, reading: ReadingOptions
     if _is_bag(path):
         return bag_reader.blocks(path, rows, reading=reading)
     if is_text(path) and not reading.changes_columns and not reading.topic:
-        return _native_blocks(path, rows)
+        return _with_sound_rate(_native_blocks(path, rows), None)
     table = open_table(path, reading.topic)
     mapping = reading.mapping or _mapping_of(table)
     if mapping is None:
         text, options = describe(table)
         raise UserError(f'{path}: {text}', options)
-    return mapped_recording.blocks(table, mapping, reading, rows)
+    read_blocks = mapped_recording.blocks(table, mapping, reading, rows)
+    return read_blocks if reading.rate_hz else _with_sound_rate(read_blocks, mapping)
+
+
+def _with_sound_rate(read_blocks: Iterator[Recording], mapping: ColumnMapping | None
+                     ) -> Generator[Recording, None, None]:
+    """Yield the blocks of a table; refuse stamps that are in another unit, by their steps."""
+    is_first = True
+    for block in read_blocks:
+        if is_first and len(block) > _FEWEST_STAMPS:
+            _check_step(block, mapping or mapped_recording.native_mapping(
+                (TIME, *block.columns), block.path))
+            is_first = False
+        yield block
+
+
+def _check_step(block: Recording, mapping: ColumnMapping | None) -> None:
+    """Refuse stamps whose steps no sensor has, unless the file states their rate."""
+    step_s, stated_hz = 1 / block.rate_hz, block.stream_info.rate_hz
+    if mapping is None or (stated_hz and abs(step_s * stated_hz - 1) < _SAME_RATE):
+        return
+    source = mapping.sources['time']
+    read_as = source.unit or unit_in_name(source.column, Quantity.TIME) or 's'
+    divisor = UNITS[Quantity.TIME][read_as].divisor
+    raw = block.time_s * divisor
+    is_whole = bool((np.abs(raw - np.rint(raw)) < _WHOLE).all())
+    if is_sensor_step(step_s, is_whole):
+        return
+    unit = time_unit_of_step(step_s * divisor, is_whole)
+    fitting = {**mapping.sources, 'time': Source(source.column, unit)}
+    raise UserError(
+        f'{block.path}: {source.column} has steps of {step_s * divisor:.4g}, which as {read_as} '
+        f'are {block.rate_hz:.3g} Hz; if that is right, give --rate {block.rate_hz:.3g}, and if '
+        f'they are {unit}:', f'--columns {shell_quoted(str(ColumnMapping(fitting)))}')
 
 
 def _mapping_of(table: Table) -> ColumnMapping | None:
@@ -180,7 +223,7 @@ def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> tuple[np.ndarray, 
 
     """
     parts = (bag_reader.blocks(path, _BLOCK_ROWS, ideal=True) if _is_bag(path)
-             else csv_file.blocks(path, _BLOCK_ROWS, needed=ACCEL))
+             else _with_sound_rate(csv_file.blocks(path, _BLOCK_ROWS, needed=ACCEL), None))
     ideal = concatenate(parts)
     time_s = ideal.time_s + (ideal.epoch_ns - epoch_ns) / 1e9
     return time_s, np.column_stack([ideal.columns[name] for name in ACCEL])

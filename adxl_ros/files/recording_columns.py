@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.stamp_bursts import rate_lag
+from adxl_ros.files.stamp_bursts import stamped_rate_hz
 from adxl_ros.files.stream_info import StreamInfo
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2, to_volts
@@ -241,12 +241,6 @@ class Recording:
             name: values[:len(sensor.axes)]
             for name, values in self.stream_info.nominal_values(self.axes).items()}
         return replace(sensor, **stated)
-
-
-def stamped_rate_hz(time_s: np.ndarray) -> float:
-    """Return the sample rate of stamps, s, (n,), from their median step, Hz, to 1e-6 Hz."""
-    lag = rate_lag(time_s)
-    return round(float(lag / np.median(time_s[lag:] - time_s[:-lag])), 6)
 
 
 def _has_same_nominal_values(first: Sensor, second: Sensor) -> bool:

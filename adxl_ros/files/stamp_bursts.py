@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Stamps that come in bursts, as of samples that a USB packet or a buffer hands on together."""
+"""The rate of stamps, also of those that jitter or come in bursts (a USB packet, a buffer)."""
 
 from __future__ import annotations
 
@@ -28,45 +28,59 @@ _SHORT_SHARE = 0.45
 """Smallest share of such steps among all (chosen: bursts of two samples have 0.5)."""
 _EVEN = 0.25
 """A median step from this share of the mean step shows stamps without bursts."""
-_LAG_BURSTS = 16
-"""Bursts over which the rate is taken (chosen: their stamps scatter by a part of one)."""
+_EVEN_STEPS = 0.02
+"""Largest median deviation of even steps from their median, as a share of it (chosen: the median
+of 50 steps then is right to 0.5 %)."""
+_LAG = 64
+"""Most samples, or bursts, over which the rate of uneven stamps is taken (chosen: a jitter of a
+whole period then is 2 % of a step)."""
+
+
+def burst_ends(time_s: np.ndarray) -> np.ndarray:
+    """Return the samples, (k,), that end a burst of stamps, s, (n,): all where none is seen."""
+    steps_s = np.diff(time_s)
+    every = np.arange(len(time_s))
+    if len(steps_s) < 8 or np.median(steps_s) >= _EVEN * steps_s.mean():
+        return every
+    long_s = np.quantile(steps_s, _LONG_QUANTILE)
+    is_short = steps_s < _SHORT * long_s
+    if is_short.mean() < _SHORT_SHARE or long_s <= 0:
+        return every
+    return every[:-1][~is_short]
 
 
 def burst_samples(time_s: np.ndarray) -> int:
-    """
-    Return how many samples a burst of stamps has; 1 where there are no bursts.
+    """Return the mean number of samples of a burst of stamps, s, (n,); 1 where there is none."""
+    return round((len(time_s) - 1) / max(len(burst_ends(time_s)), 1))
 
-    Parameters
-    ----------
-    time_s
-        Stamps, s, (n,), in the order of the samples.
 
-    Returns
-    -------
-    int
-        Mean number of samples of a burst.
-
-    """
+def is_even(time_s: np.ndarray) -> bool:
+    """Return whether most steps of stamps, s, (n,), are one period."""
     steps_s = np.diff(time_s)
-    if len(steps_s) < 8 or np.median(steps_s) >= _EVEN * steps_s.mean():
-        return 1
-    long_s = np.quantile(steps_s, _LONG_QUANTILE)
-    short = float(np.mean(steps_s < _SHORT * long_s))
-    if short < _SHORT_SHARE or long_s <= 0:
-        return 1
-    return round(1 / max(1 - short, 1 / len(steps_s)))
+    step_s = np.median(steps_s)
+    return bool(np.median(np.abs(steps_s - step_s)) <= _EVEN_STEPS * step_s)
 
 
-def rate_lag(time_s: np.ndarray) -> int:
-    """Return over how many samples a step shows the rate: 1, and more for bursts of stamps."""
-    size = burst_samples(time_s)
-    return 1 if size == 1 else max(1, min(_LAG_BURSTS * size, len(time_s) // 2))
+def period_s(time_s: np.ndarray) -> float:
+    """
+    Return the period of two or more stamps, s, (n,); 0 where they stand.
+
+    It is the median of many steps: over one sample, or over a quarter of few stamps where they
+    jitter or come in bursts. So gaps and lost samples do not change it.
+    """
+    last = burst_ends(time_s)
+    if len(last) < 2:
+        last = np.array([0, len(time_s) - 1])
+    is_single = len(last) == len(time_s) and is_even(time_s)
+    lag = 1 if is_single else max(min(_LAG, len(last) // 4), 1)
+    return float(np.median((time_s[last[lag:]] - time_s[last[:-lag]])
+                           / (last[lag:] - last[:-lag])))
 
 
-def burst_rate_hz(time_s: np.ndarray) -> float:
-    """Return the mean rate of stamps in bursts, Hz."""
-    lag = rate_lag(time_s)
-    return float(lag / np.median(time_s[lag:] - time_s[:-lag]))
+def stamped_rate_hz(time_s: np.ndarray) -> float:
+    """Return the sample rate of two or more stamps, s, (n,), Hz, to 1e-6; NaN where they stand."""
+    step_s = period_s(time_s)
+    return round(1 / step_s, 6) if step_s > 0 else float('nan')
 
 
 def describe_bursts(time_s: np.ndarray) -> str:
@@ -75,4 +89,4 @@ def describe_bursts(time_s: np.ndarray) -> str:
     if size == 1:
         return ''
     return f'; stamps come in bursts of about {size} samples (USB, or a buffer), at a mean of ' \
-           f'{burst_rate_hz(time_s):.4g} Hz'
+           f'{stamped_rate_hz(time_s):.4g} Hz'

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from adxl_ros.errors import UserError
@@ -96,8 +97,9 @@ def uncalibrated(sensor: Sensor, info: StreamInfo, axes: str, rate_hz: float) ->
         A nominal value cannot be read, or those of further axes are unknown.
 
     """
+    measured = {key: text for key, text in sensor.provenance.items() if key == 'noise_from'}
     bare = with_axes(replace(sensor.without_covariance(), model='nominal', effects=(), values={},
-                             provenance={}), axes)
+                             provenance=measured), axes)
     stated: dict[str, Any] = dict(info.nominal_values(axes))
     return replace(bare, serial=info.texts.get('serial', sensor.serial), rate_hz=rate_hz, **stated)
 
@@ -159,4 +161,5 @@ def recorded_unit(sensor: Sensor, recording: Recording) -> Sensor:
         recording states something unreadable.
 
     """
-    return unit_of(sensor, recording.stream_info, recording.axes, recording.rate_hz)
+    unit = unit_of(sensor, recording.stream_info, recording.axes, recording.rate_hz)
+    return replace(unit, provenance={**unit.provenance, 'rate_from': Path(recording.path).name})

@@ -56,11 +56,10 @@ import numpy as np
 
 if TYPE_CHECKING:
     from adxl_ros.diagnose.diagnosis import Diagnosis
-    from adxl_ros.diagnose.gap_closure import GapClosure
 
 _BOOTSTRAP_DRAWS = 400
 """Number of draws of an interval. Chosen: the 5 % quantile has 20 draws below it."""
-_PAGES = ('explained', 'inseparable', 'unknown')
+_PAGES = ('explained', 'partly', 'inseparable', 'unknown')
 """Statuses of a diagnosis that get a page. Chosen: it has 2 MB, and without a gap shows little."""
 _RESET_PEAK = '5'
 """Command of Linux that sets the largest memory of a process to the present one."""
@@ -362,19 +361,20 @@ class _Job:
         def blocks() -> Iterator[Recording]:
             return recording.blocks(path, BLOCK_ROWS, self.recipe.reading)
 
-        def accel_mps2(block: Recording) -> np.ndarray:
+        def sensor_of(block: Recording) -> Sensor:
             if not units:
                 units.append(unit_of(load_sensor(self._params(), block), block.stream_info,
                                      block.axes))
-            return block.accel_mps2(units[0])
+            return units[0]
 
-        rest = longest_rest(blocks, accel_mps2)
+        rest = longest_rest(blocks, sensor_of)
         result = recording_noise(str(path), rest, units[0].axes, lambda done: None)
         for noise in result.axes:
             for letter, unit, estimate in zip('nbk', ('mps2_per_rthz', 'mps2', 'mps2_per_rts'),
                                               noise.estimates):
                 self.row |= {
-                    f'noise_{letter}_{noise.axis}_{unit}': finite(estimate.value),
+                    f'noise_{letter}_{noise.axis}_{unit}':
+                        finite(estimate.value) if estimate.is_seen else None,
                     f'noise_{letter}_low_{noise.axis}_{unit}': finite(estimate.low),
                     f'noise_{letter}_high_{noise.axis}_{unit}': finite(estimate.high)}
 
@@ -406,16 +406,17 @@ class _Job:
 
     def _diagnose(self) -> None:
         """Compare the recording with its simulation."""
-        from adxl_ros.diagnose import report_html, report_json
+        from adxl_ros.diagnose import report_html
         from adxl_ros.diagnose.diagnosis import diagnose
+        from adxl_ros.diagnose.report import as_json
         read = self._recording()
         sensor, _ = measure_unstated(load_sensor(self._params(), read), read)
         diagnosis = diagnose([read], sensor)
-        report = report_json.as_json(diagnosis)
+        report = as_json(diagnosis)
         _put_verdict(self.row, diagnosis, report)
         self.files['report.json'] = json.dumps(report, indent=1, allow_nan=False).encode()
-        parameters = '' if diagnosis.sensor is None else \
-            parameter_file.as_text(diagnosis.sensor, [report['summary']])
+        parameters = '' if diagnosis.report is None else \
+            parameter_file.as_text(diagnosis.report.sensor, [report['summary']])
         if parameters:
             self.files['params.yaml'] = parameters.encode('utf-8')
         if report['verdict']['status'] in _PAGES:
@@ -478,9 +479,9 @@ def _put_verdict(row: Row, diagnosis: Diagnosis, report: dict[str, Any]) -> None
     row |= {'status': verdict['status'], 'effects': verdict['effects'],
             'groups': verdict['groups'], 'data_fault': verdict['data_fault'],
             'probability': finite(verdict['probability'])}
-    if gap is None or diagnosis.gap_closure is None or diagnosis.verdict is None:
+    if gap is None or diagnosis.report is None:
         return
-    before, after = _intervals(diagnosis.gap_closure)
+    before, after = gap['before_ci'], gap['after_ci']
     row |= {'gap_before_mps2': gap['before'], 'gap_before_low_mps2': finite(before[0]),
             'gap_before_high_mps2': finite(before[1]), 'gap_after_mps2': gap['after'],
             'gap_after_low_mps2': finite(after[0]), 'gap_after_high_mps2': finite(after[1]),
@@ -491,22 +492,12 @@ def _put_verdict(row: Row, diagnosis: Diagnosis, report: dict[str, Any]) -> None
                 'gap_floor_high_mps2': gap['floor_ci'][1]}
     if gap['closed'] is not None:
         row |= {'gap_closed_low': gap['closed_ci'][0], 'gap_closed_high': gap['closed_ci'][1]}
-    best = diagnosis.verdict.best
+    best = diagnosis.report.verdict.best
     values = get(best.sensor, best.names)
     row['coefficients'] += [
         _coefficient(name, value, std, 'diagnose')
-        for name, value, std in zip(best.names, values, best.std)
-        if name not in diagnosis.not_determined]
-
-
-def _intervals(closure: GapClosure) -> np.ndarray:
-    """Return the 90 % intervals of the gap before and after by a bootstrap of blocks, (2, 2)."""
-    before, after, samples = closure.blocks
-    draws = np.random.default_rng(0).integers(0, len(samples), (_BOOTSTRAP_DRAWS, len(samples)))
-    count = samples[draws].sum(axis=1)
-    rms = np.sqrt(np.stack([before[draws].sum(axis=1), after[draws].sum(axis=1)])
-                  / np.maximum(count, 1))
-    return np.quantile(rms, [0.05, 0.95], axis=1).T
+        for name, value, std, is_open in zip(best.names, values, best.std, best.undetermined)
+        if not is_open]
 
 
 def _reset_peak() -> None:

@@ -145,6 +145,9 @@ class DiagnosisHints:
         covariance of the parameter file. The unit is that of the parameter, but g for the zero-g
         and 1 for the scale factor. An effect with this value is a nuisance parameter of every
         hypothesis.
+    stated_by : tuple of str
+        Nominal values of `Sensor` that state the effect's. Where a file leaves one out, a healthy
+        unit may have any, and the nuisance parameter is free.
     imitated
         Whether zero-g and scale factor together imitate the effect completely.
     time_constant
@@ -177,6 +180,7 @@ class DiagnosisHints:
 
     straight_line: StraightLine | None = None
     healthy_std: float | None = None
+    stated_by: tuple[str, ...] = ()
     imitated: bool = False
     time_constant: str = ''
     drift: DriftSpectrum | None = None

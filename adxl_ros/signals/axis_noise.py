@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.noise_drift import Drift, find_drift
 from adxl_ros.signals.noise_parameters import (
@@ -39,6 +40,11 @@ TERMS = ('white', 'instability', 'walk')
 _UNFILTERED = 0.8
 """Variance of a sample, divided by that of unfiltered white noise, from which there is no filter.
 Chosen: a filter at a third of the sample rate."""
+_DITHERED_STEPS = 0.6
+"""Noise from which rounding adds step²/12, steps. Chosen: exact within 0.4 % by the first harmonic
+of the rounding error (Widrow and Kollár 2008, section 4.4)."""
+_DENSITY = 'noise_density_g_per_rthz'
+"""Field of a sensor that holds its white noise."""
 _FILTER_OHM = 1.0e4
 """Resistance of the filter that stands for an unknown one, Ω. Chosen: only the product with the
 capacitor matters."""
@@ -61,6 +67,8 @@ class AxisNoise:
         Standard deviation of a sample, m/s².
     resolution
         Smallest change of a sample, m/s².
+    rounding
+        N of the rounding to this resolution, m/s²/√Hz, which `fit` does not contain.
     lowest_s, lowest
         Time, s, and value, m/s², of the lowest point of the Allan deviation.
     needed_s
@@ -74,6 +82,7 @@ class AxisNoise:
     drift: Drift | None
     sample_std: float
     resolution: float
+    rounding: float
     lowest_s: float
     lowest: float
     needed_s: dict[str, float]
@@ -82,6 +91,16 @@ class AxisNoise:
     def estimates(self) -> tuple[Estimate, Estimate, Estimate]:
         """N in m/s²/√Hz, B in m/s², and K in m/s²/√s."""
         return self.fit.white, self.fit.instability, self.fit.walk
+
+    @property
+    def is_coarse(self) -> bool:
+        """Whether rounding hides the noise."""
+        return _is_coarse(self.sample_std, self.resolution)
+
+    @property
+    def sample_white(self) -> float:
+        """N of the samples with their rounding, or its upper limit, m/s²/√Hz."""
+        return float(np.hypot(_likely(self.fit.white), self.rounding))
 
 
 @dataclass(frozen=True)
@@ -137,20 +156,62 @@ def recording_noise(path: str, rest: StillStretch, axes: str, show: Callable[[fl
                     if not getattr(fit, name).is_seen}
         deviation = rest.allan.deviation[:, i]
         lowest = int(np.argmin(deviation))
-        noises.append(AxisNoise(axis, fit, drift, float(rest.sample_std[i]),
-                                float(rest.resolution[i]), float(rest.allan.tau_s[lowest]),
+        std, resolution = float(rest.sample_std[i]), float(rest.resolution[i])
+        rounding = resolution / float(np.sqrt(12 * rest.rate_hz))
+        noises.append(AxisNoise(axis, without_rounding(fit, std, resolution, rounding), drift, std,
+                                resolution, rounding, float(rest.allan.tau_s[lowest]),
                                 float(deviation[lowest]), needed_s))
         show((i + 1) / len(axes))
     return RecordingNoise(path, rest, noises)
 
 
-def density_g_per_rthz(noise: AxisNoise) -> float:
+def without_rounding(fit: NoiseFit, std: float, resolution: float, rounding: float) -> NoiseFit:
     """
-    Return the density of white noise as datasheets state it, g/√Hz.
+    Return the noise before the rounding of the samples to a resolution.
 
-    Theirs is over positive frequencies alone, so its square is twice N².
+    Above 0.6 steps of noise, rounding adds independent noise of the variance step²/12. Less noise
+    is hidden: it may be anything up to that, and codes that do not change show less.
+
+    Parameters
+    ----------
+    fit
+        The noise of the samples.
+    std
+        Standard deviation of a sample within some seconds, m/s².
+    resolution
+        Smallest change of a sample, m/s².
+    rounding
+        N of the rounding, m/s²/√Hz.
+
+    Returns
+    -------
+    NoiseFit
+        The fit without it; upper limits where it hides the noise.
+
     """
-    return float(np.sqrt(2)) * noise.fit.white.value / G0_MPS2
+    if not _is_coarse(std, resolution):
+        return replace(fit, white=Estimate(*(float(np.sqrt(max(value ** 2 - rounding ** 2, 0.0)))
+                                             for value in fit.white)))
+    widest = max(_DITHERED_STEPS * resolution / std, 1.0)
+    white, instability, walk = (Estimate(term.value, 0.0, term.high * widest)
+                                for term in (fit.white, fit.instability, fit.walk))
+    return replace(fit, white=white, instability=instability, walk=walk)
+
+
+def _is_coarse(std: float, resolution: float) -> bool:
+    """Whether samples with rounding have less noise than makes rounding independent of them."""
+    return std ** 2 < resolution ** 2 * (_DITHERED_STEPS ** 2 + 1 / 12)
+
+
+def density_g_per_rthz(noise: AxisNoise) -> float | None:
+    """Return the density of white noise as datasheets state it, g/√Hz; None if it is not seen."""
+    white = noise.fit.white
+    return ONE_SIDED * white.value / G0_MPS2 if white.is_seen else None
+
+
+def _likely(estimate: Estimate) -> float:
+    """Return an estimate, or its upper limit where it is not seen."""
+    return estimate.value if estimate.is_seen else estimate.high
 
 
 def with_noise(sensor: Sensor, noises: list[AxisNoise]) -> Sensor:
@@ -159,7 +220,8 @@ def with_noise(sensor: Sensor, noises: list[AxisNoise]) -> Sensor:
 
     White noise is its density. Bias instability is the effect `flicker`, whose density over
     positive frequencies is B²/(π·f), and random walk is `bias_walk`. A term that is not seen on
-    an axis is 0 there.
+    an axis keeps the value of `sensor` up to its upper limit. White noise that neither shows stays
+    unstated, so that nobody takes it for 0. It has the rounding where `sensor` has no ADC.
 
     Where the filter is not stated, it is the first-order one that gives a sample the measured
     noise: white noise of the density 2·N² over positive frequencies has the variance N²/(2·RC)
@@ -179,26 +241,46 @@ def with_noise(sensor: Sensor, noises: list[AxisNoise]) -> Sensor:
         The sensor with its other values as they were.
 
     """
-    values = {name: value for name, value in sensor.values.items()
-              if name not in ('noise_excess', 'flicker', 'bias_walk')}
-    flicker, walk = (np.array([noise.estimates[term].value * noise.estimates[term].is_seen
-                               for noise in noises]) / G0_MPS2 for term in (1, 2))
-    if flicker.any():
-        values['flicker'] = {'density_g_per_rthz': flicker / np.sqrt(np.pi)}
-    if walk.any():
-        values['bias_walk'] = {'density_g_per_rts': walk}
+    values = {name: value for name, value in sensor.values.items() if name != 'noise_excess'}
+    to_g = np.array([ONE_SIDED, 1 / np.sqrt(np.pi), 1.0])[:, None] / G0_MPS2
+    # By field of an estimate, term and axis.
+    value, low, high = (np.array([noise.estimates for noise in noises]) * to_g).T
+
+    def merged(term: int, before: np.ndarray | float) -> np.ndarray:
+        return np.where(low[term] > 0, value[term], np.minimum(before, high[term]))
+
+    for term, (effect, name) in enumerate((('flicker', 'density_g_per_rthz'),
+                                           ('bias_walk', 'density_g_per_rts')), 1):
+        sizes = merged(term, sensor.values.get(effect, {}).get(name, 0.0))
+        values.pop(effect, None)
+        if sizes.any():
+            values[effect] = {name: sizes}
+    if 'bias_walk' in values:
+        values['bias_walk']['return_per_s'] = np.array(
+            [1 / noise.fit.correlation.value if noise.fit.correlation else 0.0
+             for noise in noises])
     kept = [name for name in sensor.effects if name in values]
     changed: dict[str, Any] = {
         'effects': (*kept, *(name for name in values if name not in kept)), 'values': values,
-        'noise_density_g_per_rthz': np.array(list(map(density_g_per_rthz, noises)))}
+        'unstated': (_DENSITY,)}
+    if _DENSITY not in sensor.unstated or (low[0] > 0).all():
+        before = sensor.noise_density_g_per_rthz
+        density = merged(0, np.where(before > 0, before, np.inf))
+        if not sensor.adc_bits:
+            rounding = [ONE_SIDED * noise.rounding / G0_MPS2 for noise in noises]
+            density = np.where(low[0] > 0, np.hypot(density, rounding), density)
+        changed |= {_DENSITY: density, 'unstated': ()}
     if 'rc_capacitance_f' in sensor.unstated:
         changed |= {'rc_resistance_ohm': _FILTER_OHM,
                     'rc_capacitance_f': _filter_s(noises, sensor.rate_hz) / _FILTER_OHM}
-    return replace(sensor, unstated=(), **changed)
+    return replace(sensor, **changed)
 
 
 def _filter_s(noises: list[AxisNoise], rate_hz: float) -> float:
     """Return the time constant that the noise of a sample shows, s; 0 for no filter."""
-    white = float(np.mean([noise.fit.white.value ** 2 for noise in noises]))
-    variance = float(np.mean([noise.sample_std ** 2 for noise in noises]))
+    seen = [noise for noise in noises if noise.fit.white.is_seen]
+    if not seen:
+        return 0.0
+    white = float(np.mean([noise.sample_white ** 2 for noise in seen]))
+    variance = float(np.mean([noise.sample_std ** 2 for noise in seen]))
     return white / (2 * variance) if variance < _UNFILTERED * white * rate_hz else 0.0

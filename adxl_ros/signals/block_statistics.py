@@ -22,12 +22,17 @@ import numpy as np
 
 BLOCK_S = 0.05
 """Length of a block, s. Chosen: well below a rest, and above the sample period of most sensors."""
-GAP_S = 0.1
-"""Smallest time without a sample that ends a block and a rest, s. Chosen: two blocks."""
+_GAP_S = 0.1
+"""Smallest time without a sample that ends a block, s. Chosen: two blocks."""
 _GAP_PERIODS = 5
 """Smallest gap in sample periods. Chosen: at low rates a few lost samples are no gap."""
 _CHUNK = 1 << 13
 """Rows processed at once. Chosen: they fit into the cache, whatever the length of a recording."""
+
+
+def gap_s(rate_hz: float) -> float:
+    """Return the smallest time without a sample that is a gap, s."""
+    return max(_GAP_S, _GAP_PERIODS / rate_hz)
 
 
 def block_samples(rate_hz: float) -> int:
@@ -105,7 +110,7 @@ class BlockCutter:
     def __init__(self, rate_hz: float, axes: int, angles: int = 0):
         self.size = block_samples(rate_hz)
         self._axes = axes
-        self._gap_s = max(GAP_S, _GAP_PERIODS / rate_hz)
+        self._gap_s = gap_s(rate_hz)
         self._leftover = np.empty((1 + axes + angles, 0))
         self._mean = np.zeros((axes, 1))
         self._row = 0

@@ -21,6 +21,7 @@ from math import ceil, log2
 from typing import NamedTuple
 
 from adxl_ros.errors import UserError
+from adxl_ros.files.stamp_bursts import stamped_rate_hz
 from adxl_ros.model.constants import AXES, MEASURED_AXES
 from adxl_ros.model.sensor import Sensor, to_volts, with_axes
 from adxl_ros.signals.block_statistics import block_samples, BlockCutter, Blocks
@@ -196,13 +197,14 @@ def unit_of_stream(sensor: Sensor, stamps_ns: np.ndarray, accel_mps2: np.ndarray
     if steps_s.sum() < SHORTEST_S:
         raise UserError(f'{len(stamps_ns)} samples in {max(steps_s.sum(), 0):.1f} s; '
                         f'{SHORTEST_S:g} s show rate and noise')
-    if np.median(steps_s) <= 0:
+    rate_hz = stamped_rate_hz((stamps_ns - stamps_ns[0]) * 1e-9)
+    if not rate_hz > 0:
         raise UserError(f'the stamps of {len(stamps_ns)} samples do not advance; the driver must '
                         'stamp each sample')
     present = ''.join(axis for axis, values in zip(AXES, accel_mps2.T) if values.any())
     axes = present if present in MEASURED_AXES else AXES
     unit = sensor if sensor.effects else with_axes(sensor, axes)
-    unit = replace(unit, rate_hz=round(float(1 / np.median(steps_s)), 3))
+    unit = replace(unit, rate_hz=round(rate_hz, 3))
     volts = to_volts(accel_mps2[:, :len(unit.axes)], unit)
     values = measure((stamps_ns - stamps_ns[0]) * 1e-9, volts, unit)
     unit, lines = with_measured_values(unit, values), describe(unit, values)

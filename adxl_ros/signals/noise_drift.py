@@ -124,7 +124,7 @@ def _without(means: np.ndarray, shape: np.ndarray, step_s: float, variances: np.
     for _ in range(_FIT_ROUNDS):
         weight = expected / (variances[:fit.highest] @ fit.squares)
         size = float(weight @ measured / (weight @ expected))
-        fit = fit_noise(means - size * shape, step_s, variances, fit.highest)
+        fit = fit_noise(means - size * shape, step_s, variances, fit)
     return size, fit
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from adxl_ros.files.exports import kalibr
 from adxl_ros.signals.axis_noise import AxisNoise
 import numpy as np
 
@@ -70,7 +71,7 @@ def settings(noises: list[AxisNoise], rate_hz: float) -> dict[str, list[Setting]
     kalibr takes N and K as they are. VINS-Fusion and PX4 add the variance of a value times the
     square of the time step, so they take N·√rate and K·√rate, at the rate of their filter.
     robot_localization takes the variance of a sample from the message. Programs that have one
-    value for all axes get the largest one. Where a random walk is not seen, it is its upper limit.
+    value for all axes get the largest one. A term that is not seen is its upper limit.
 
     Parameters
     ----------
@@ -85,7 +86,9 @@ def settings(noises: list[AxisNoise], rate_hz: float) -> dict[str, list[Setting]
         Settings by program.
 
     """
-    white = max(noise.fit.white.value for noise in noises)
+    loudest = max(noises, key=lambda noise: noise.sample_white)
+    white = loudest.sample_white
+    white_limit = '' if loudest.fit.white.is_seen else ', an upper limit'
     walk = max((noise.fit.walk for noise in noises), key=lambda walk: walk.value)
     limit = ''
     if not walk.is_seen:
@@ -96,15 +99,15 @@ def settings(noises: list[AxisNoise], rate_hz: float) -> dict[str, list[Setting]
     matrix = np.diag((variances + [1e6] * 3)[:3]).ravel()
     return {
         'kalibr, imu.yaml': [
-            Setting('accelerometer_noise_density', (white,), 'm/s^2/sqrt(Hz)'),
-            Setting('accelerometer_random_walk', (k,), f'm/s^3/sqrt(Hz){limit}'),
-            Setting('update_rate', (rate_hz,), 'Hz')],
+            Setting(name, (value,), unit + note) for (name, value, unit), note
+            in zip(kalibr.settings(white, k, rate_hz), (white_limit, limit, ''))],
         f'VINS-Fusion, at {rate_hz:.4g} Hz': [
-            Setting('acc_n', (white * np.sqrt(rate_hz),), 'm/s^2'),
+            Setting('acc_n', (white * np.sqrt(rate_hz),), f'm/s^2{white_limit}'),
             Setting('acc_w', (k * np.sqrt(rate_hz),), f'm/s^3{limit}')],
         'robot_localization, in sensor_msgs/Imu of the driver': [
             Setting('linear_acceleration_covariance', tuple(matrix.tolist()), '(m/s^2)^2')],
         'PX4, its filter at 100 Hz; vibration in flight needs more': [
-            Setting('EKF2_ACC_NOISE', (white * np.sqrt(_PX4_HZ),), 'm/s^2, at least 0.01'),
+            Setting('EKF2_ACC_NOISE', (white * np.sqrt(_PX4_HZ),),
+                    f'm/s^2, at least 0.01{white_limit}'),
             Setting('EKF2_ACC_B_NOISE', (k * np.sqrt(_PX4_HZ),), f'm/s^3{limit}')],
     }

@@ -19,11 +19,13 @@ The points of an Allan deviation are correlated, so a line through them has no s
 The fit therefore takes the cosine transform of the means of short cells. There a random walk and
 white noise have independent coefficients of known variance, and 1/f noise nearly so. The fit
 maximises the likelihood of the coefficients. The intervals are those of the profile likelihood.
+Lines of a fan or of mains are left out first, and a walk that ends in bounds is a Gauss-Markov
+process (IEEE Std 952, annex B).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import NamedTuple
 
@@ -45,8 +47,18 @@ _SMALLEST = 1e-4
 """Square of a term, by the square at which it would dominate, from which an upper limit is
 searched. Chosen: it changes the likelihood of no recording."""
 _OCTAVE_PROBABILITY = 1e-3
-"""Probability by chance, below which an octave contradicts the three terms. Chosen: with ten
-octaves one healthy recording in a hundred."""
+"""Probability by chance, below which an octave contradicts the three terms, or a group exceeds its
+neighbours. Chosen: with ten octaves one healthy recording in a hundred."""
+_BOUND_PROBABILITY = 1e-2
+"""Probability by chance, below which a walk has bounds. Chosen: one healthy recording in a
+hundred; where bounds are missed, the interval of K is too low."""
+_FEWEST_NEIGHBOURS = 8
+"""Fewest groups within an octave on both sides that show the level beside a line. Chosen."""
+_BOUND_STEP = 2 ** 0.5
+"""Ratio of correlation times that are tried. Chosen: the likelihood changes little between."""
+_SHORTEST_BOUND = 10.0
+"""Shortest correlation time, by that of the highest frequency. Chosen: a shorter one is taken for
+a filter of white noise."""
 _MARGIN_OCTAVES = 2
 """Octaves below a filter's effect that are left out. Chosen: the effect falls by 16 in power."""
 _FEWEST = 32
@@ -120,11 +132,16 @@ class NoiseFit:
     instability
         Bias instability B, u: the density is B²/(2π·f).
     walk
-        Random walk K, u/√s: the density is K²/(2π·f)².
+        Random walk K, u/√s: the density is K²/(2π·f)², or K²/((2π·f)² + 1/T²) with bounds.
+    correlation
+        Correlation time T of a bounded walk (first-order Gauss-Markov), s, whose standard
+        deviation is K·√(T/2); None where no bounds show.
     highest
         Number of cosine coefficients of the fit, from the lowest.
     highest_hz
         Frequency of the last one, Hz.
+    kept
+        Groups of coefficients without lines, bool.
     octaves
         Octaves that contradict the fit. Above `highest_hz` only those with too much power.
     log_likelihood
@@ -135,8 +152,10 @@ class NoiseFit:
     white: Estimate
     instability: Estimate
     walk: Estimate
+    correlation: Estimate | None
     highest: int
     highest_hz: float
+    kept: np.ndarray
     octaves: tuple[Octave, ...]
     log_likelihood: float
 
@@ -151,9 +170,16 @@ class NoiseFit:
 
     def lines(self, tau_s: np.ndarray) -> np.ndarray:
         """Return the Allan deviations of N, B and K at times, s, (k,), in u, (3, k)."""
+        walk = np.sqrt(tau_s / 3)
+        if self.correlation is not None:
+            # IEEE Std 952, equation C.19; for short times its terms cancel.
+            time_s = self.correlation.value
+            x = tau_s / time_s
+            terms = 1 - (3 - 4 * np.exp(-x) + np.exp(-2 * x)) / (2 * x)
+            walk = np.where(x > 1e-3, time_s * np.sqrt(np.abs(terms) / tau_s), walk)
         return np.stack([self.white.value / np.sqrt(tau_s),
                          np.full(len(tau_s), FLOOR * self.instability.value),
-                         self.walk.value * np.sqrt(tau_s / 3)])
+                         self.walk.value * walk])
 
 
 @dataclass(frozen=True)
@@ -179,10 +205,43 @@ class _Groups:
     shapes: np.ndarray
     first: np.ndarray
 
+    def where(self, kept: np.ndarray) -> _Groups:
+        """Return the groups that are marked, (g,) bool."""
+        return _Groups(self.power[kept], self.count[kept], self.shapes[kept], self.first[kept])
+
     def below(self, stop: int) -> _Groups:
         """Return the groups that end before coefficient number `stop`."""
-        kept = self.first + self.count <= stop
-        return _Groups(self.power[kept], self.count[kept], self.shapes[kept], self.first[kept])
+        return self.where(self.first + self.count <= stop)
+
+    def without_lines(self) -> np.ndarray:
+        """
+        Return which groups, and neighbours, do not exceed those of an octave on both sides, bool.
+
+        The fitted terms make the spectrum flat first; the median of the octaves is its level. A
+        strong line has a broad foot, which shows after its peak is left out.
+        """
+        kept = np.ones(len(self.first), bool)
+        spans = np.searchsorted(self.first, np.outer(self.first, (0.5, 2.0)), 'right')
+        for _ in range(_ROUNDS):
+            ratio = self.power / (self.shapes @ _fit(self.where(kept))[0])
+            of_median = np.where(kept, ratio / (1 - 2 / (9 * self.count)) ** 3, np.nan)
+            level = np.full(len(ratio), np.inf)
+            for i in np.flatnonzero(kept):
+                begin, end = spans[i]
+                if np.count_nonzero(kept[begin:end]) >= _FEWEST_NEIGHBOURS:
+                    level[i] = np.nanmedian(of_median[begin:end])
+            line = kept & (scipy.stats.chi2.sf(self.count * ratio / level, self.count)
+                           < _OCTAVE_PROBABILITY)
+            if not line.any():
+                break
+            kept &= ~(line | np.append(line[1:], False) | np.append(False, line[:-1]))
+        return kept
+
+    def bounded(self, correlation_s: float, span_s: float) -> _Groups:
+        """Return the groups with a bounded walk, in recordings of `span_s`."""
+        cycle = np.pi * correlation_s / span_s * (self.first + (self.count - 1) / 2)
+        return replace(self, shapes=self.shapes * np.column_stack(
+            [np.ones((len(cycle), 2)), 1 / (1 + cycle ** -2.0)]))
 
 
 def coefficients(means: np.ndarray) -> np.ndarray:
@@ -229,7 +288,7 @@ def coefficient_variances(count: int, step_s: float) -> np.ndarray:
 
 
 def fit_noise(means: np.ndarray, step_s: float, variances: np.ndarray | None = None,
-              highest: int | None = None) -> NoiseFit:
+              like: NoiseFit | None = None) -> NoiseFit:
     """
     Fit white noise, bias instability and random walk to the means of cells.
 
@@ -241,9 +300,8 @@ def fit_noise(means: np.ndarray, step_s: float, variances: np.ndarray | None = N
         Length of a cell, s.
     variances
         Those of `coefficient_variances`, which axes of one recording share.
-    highest
-        Number of coefficients to use, from the lowest; None leaves out the frequencies at which
-        a filter or vibration shows.
+    like
+        Fit whose coefficients to use; None leaves out those at which a filter or vibration shows.
 
     Returns
     -------
@@ -253,15 +311,45 @@ def fit_noise(means: np.ndarray, step_s: float, variances: np.ndarray | None = N
     """
     if variances is None:
         variances = coefficient_variances(len(means), step_s)
-    groups = _grouped(np.square(coefficients(means)), variances)
-    if highest is None:
-        highest = _highest(groups, len(means))
+    everything = _grouped(np.square(coefficients(means)), variances)
+    kept = everything.without_lines() if like is None else like.kept
+    groups = everything.where(kept)
+    span_s = len(means) * step_s
+    highest = _highest(groups, len(means), span_s) if like is None else like.highest
     used = groups.below(highest)
-    theta, likelihood = _fit(used)
-    white, instability, walk = (_interval(used, theta, likelihood, term) for term in range(3))
-    span_s = 2 * len(means) * step_s
-    return NoiseFit(white, instability, walk, highest, highest / span_s,
-                    _contradictions(groups, theta, highest, span_s), likelihood)
+    models, correlation = _walks(used, span_s, highest)
+    theta, likelihood = _best(models)
+    white, instability, walk = (_interval(models, theta, likelihood, term) for term in range(3))
+    if correlation is not None:
+        everything = everything.bounded(correlation.value, span_s)
+    return NoiseFit(white, instability, walk, correlation, highest, highest / (2 * span_s), kept,
+                    _contradictions(everything, theta, highest, 2 * span_s), likelihood)
+
+
+def _walks(groups: _Groups, span_s: float, highest: int
+           ) -> tuple[list[_Groups], Estimate | None]:
+    """
+    Return the groups with the walks that the interval of its correlation time holds.
+
+    A walk without bounds is one of its own, which bounds must contradict.
+    """
+    count = int(np.log(highest / _SHORTEST_BOUND) / np.log(_BOUND_STEP))
+    times_s = span_s * _BOUND_STEP ** np.arange(-count, 5.0)
+    models = [groups.bounded(time_s, span_s) for time_s in times_s]
+    likelihoods = np.array([_fit(model)[1] for model in models])
+    free = _fit(groups)[1]
+    if 2 * (likelihoods.max() - free) < scipy.stats.chi2.isf(_BOUND_PROBABILITY, 1):
+        return [groups], None
+    inside = np.flatnonzero(2 * (likelihoods.max() - likelihoods) < _drop())
+    low, high = max(inside[0] - 1, 0), min(inside[-1] + 1, len(times_s) - 1)
+    return models[low:high + 1], Estimate(float(times_s[likelihoods.argmax()]),
+                                          float(times_s[low]), float(times_s[high]))
+
+
+def _best(models: list[_Groups], fixed: int | None = None, value: float = 0.0
+          ) -> tuple[np.ndarray, float]:
+    """Return the most likely fit of several models; see `_fit`."""
+    return max((_fit(model, fixed, value) for model in models), key=lambda fit: fit[1])
 
 
 def needed_time_s(fit: NoiseFit, term: int, span_s: float) -> float:
@@ -380,17 +468,17 @@ def _fit(groups: _Groups, fixed: int | None = None, value: float = 0.0
     return theta, likelihood
 
 
-def _interval(groups: _Groups, theta: np.ndarray, likelihood: float, term: int) -> Estimate:
-    """Return a term with the ends of its interval by the profile likelihood."""
+def _interval(models: list[_Groups], theta: np.ndarray, likelihood: float, term: int) -> Estimate:
+    """Return a term with the ends of its interval by the profile likelihood over models."""
     def excess(logarithm: float) -> float:
         """Return twice the drop of the profile likelihood, minus its limit."""
-        return 2 * (likelihood - _fit(groups, term, np.exp(logarithm))[1]) - _drop()
+        return 2 * (likelihood - _best(models, term, np.exp(logarithm))[1]) - _drop()
 
-    scale = float(np.min(groups.shapes @ theta / groups.shapes[:, term]))
+    scale = float(np.min(models[0].shapes @ theta / models[0].shapes[:, term]))
     best = float(theta[term])
     low = 0.0
     begin = np.log(best if best > 0 else scale * _SMALLEST)
-    if best > 0 and 2 * (likelihood - _fit(groups, term, 0.0)[1]) > _drop():
+    if best > 0 and 2 * (likelihood - _best(models, term, 0.0)[1]) > _drop():
         bottom = begin - 1.0
         while excess(bottom) < 0:
             bottom -= 1.0
@@ -402,24 +490,38 @@ def _interval(groups: _Groups, theta: np.ndarray, likelihood: float, term: int) 
     return Estimate(*(float(np.sqrt(square)) for square in (best, low, high)))
 
 
-def _highest(groups: _Groups, count: int) -> int:
+def _highest(groups: _Groups, count: int, span_s: float) -> int:
     """Return the number of the coefficient at which the fit stops: where a filter shows."""
     stop = count
     while stop > 2 * _FEWEST:
         lower = groups.below(max(stop // 2, _FEWEST))
-        theta, _ = _fit(lower)
-        if _octave_probability(groups.below(stop), theta, stop // 2) > _OCTAVE_PROBABILITY:
+        octave = groups.where((groups.first >= stop // 2) & (groups.first + groups.count <= stop))
+        _, correlation = _walks(lower, span_s, stop // 2)
+        if correlation is not None:
+            lower, octave = (part.bounded(correlation.value, span_s) for part in (lower, octave))
+        if _is_expected(octave, lower, _fit(lower)[0]):
             break
         stop //= 2
     return max(stop >> _MARGIN_OCTAVES, min(count, _FEWEST))
+
+
+def _is_expected(octave: _Groups, lower: _Groups, theta: np.ndarray) -> bool:
+    """Whether an octave has the power that a fit of the lower groups predicts."""
+    if not len(octave.count):
+        return False
+    parts, design = ((g.shapes * theta)[:, theta > 0] / (g.shapes @ theta)[:, None]
+                     for g in (octave, lower))
+    share = octave.count / octave.count.sum()
+    predicted = share @ parts @ np.linalg.pinv(design * np.sqrt(lower.count / 2)[:, None])
+    excess = float(share @ (octave.power / (octave.shapes @ theta))) - 1
+    variance = 2 / octave.count.sum() + float(predicted @ predicted)
+    return bool(scipy.stats.chi2.sf(excess ** 2 / variance, 1) > _OCTAVE_PROBABILITY)
 
 
 def _octave_probability(groups: _Groups, theta: np.ndarray, first: int) -> float:
     """Return the two-sided probability of the power from coefficient `first` on."""
     kept = groups.first >= first
     freedom = int(groups.count[kept].sum())
-    if not freedom:
-        return 1.0
     total = float(groups.count[kept] @ (groups.power[kept] / (groups.shapes[kept] @ theta)))
     tails = scipy.stats.chi2.cdf(total, freedom), scipy.stats.chi2.sf(total, freedom)
     return 2 * float(min(tails))

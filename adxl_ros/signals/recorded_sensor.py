@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 from adxl_ros.files import parameter_file
 from adxl_ros.files.recording_columns import Recording, VOLTS
@@ -58,7 +59,7 @@ def load_sensor(params: str | None, read: Recording) -> Sensor:
 
 def measure_unstated(sensor: Sensor, read: Recording) -> tuple[Sensor, list[str]]:
     """
-    Measure from a recording what the parameter file of its sensor leaves out.
+    Measure from a recording its sample rate, and what the parameter file of its sensor leaves out.
 
     Parameters
     ----------
@@ -78,10 +79,15 @@ def measure_unstated(sensor: Sensor, read: Recording) -> tuple[Sensor, list[str]
         The samples are too few to show the noise.
 
     """
+    name = Path(read.path).name
+    if len(read) > 1:
+        sensor = replace(sensor, rate_hz=round(read.rate_hz, 6),
+                         provenance={**sensor.provenance, 'rate_from': name})
     if not sensor.unstated:
         return sensor, []
     unit = sensor if sensor.effects else with_axes(sensor, read.axes)
-    unit = replace(unit, rate_hz=read.rate_hz)
+    if 'noise_density_g_per_rthz' in sensor.unstated:
+        unit = replace(unit, provenance={**unit.provenance, 'noise_from': name})
     values = measured_values.measure(read.time_s, read.volts(unit), unit)
     return (measured_values.with_measured_values(unit, values),
             measured_values.describe(unit, values))

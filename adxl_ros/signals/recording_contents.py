@@ -16,14 +16,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import BadStamps, Recording, REFERENCES
-from adxl_ros.files.stamp_bursts import burst_samples, rate_lag
-from adxl_ros.model.constants import G0_MPS2
-from adxl_ros.signals.rest_detection import Rest, RestFinder
+from adxl_ros.files.stamp_bursts import burst_samples, period_s
+from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.sensor import Sensor, to_nominal_mps2
+from adxl_ros.signals.rest_detection import RecordedRests
 from adxl_ros.signals.runs import true_runs
 import numpy as np
 
@@ -38,8 +39,6 @@ _SHORTEST_GAP = 1.5
 """Shortest gap, periods. Chosen: halfway to two."""
 _OUTLYING_STEP = 5.0
 """Steps beyond this number of medians are not part of the mean step."""
-_REST_PART_S = 3600.0
-"""Time after which the search for rests begins again, s. Chosen: it bounds the memory."""
 _SAME_POSE_G = 0.1
 """Distance of the means of two rests of one orientation, g. Chosen: 6° of tilt."""
 _MOST_POSES = 200
@@ -62,6 +61,11 @@ _HELD_SAMPLES = 20
 """Fewest samples of such a time. Chosen: a slow sensor repeats a few."""
 _CHANGING = 0.5
 """Share of samples that usually change. Chosen: a coarse sensor at rest changes less."""
+_PIECES = 20
+"""Pieces of a bag whose median drift tells simulated time from a clock that was set. Chosen: a
+step is in one of them."""
+_LARGEST_CLOCK_DRIFT = 0.01
+"""Largest drift of a clock. Chosen: a bad quartz has a hundredth of it."""
 
 
 @dataclass(frozen=True)
@@ -105,12 +109,16 @@ class LogDelay:
         Time from the 1st to the 99th percentile without drift, s.
     drift_ppm
         Its drift by log time, 10⁻⁶.
+    is_simulated
+        Whether it drifts by more than any clock does, and not in one step: header time is
+        simulated, and its pace varies.
 
     """
 
     median_s: float
     spread_s: float
     drift_ppm: float
+    is_simulated: bool
 
 
 @dataclass(frozen=True)
@@ -191,7 +199,7 @@ class RecordingContents:
     cut: str
 
 
-def examine(blocks: Iterable[Recording], accel_mps2: Callable[[Recording], np.ndarray],
+def examine(blocks: Iterable[Recording], unit_of: Callable[[Recording], Sensor],
             delay: LogDelay | None) -> RecordingContents:
     """
     Find what a recording holds.
@@ -200,8 +208,8 @@ def examine(blocks: Iterable[Recording], accel_mps2: Callable[[Recording], np.nd
     ----------
     blocks
         Its blocks, without samples whose stamp does not increase.
-    accel_mps2
-        Returns the specific force of a block, m/s², (n, m).
+    unit_of
+        Returns the nominal sensor of the recording from its first block.
     delay
         Its log times; None where there is no bag.
 
@@ -216,30 +224,34 @@ def examine(blocks: Iterable[Recording], accel_mps2: Callable[[Recording], np.nd
         The recording cannot be read, or has fewer than two samples.
 
     """
-    stamps = values = rests = block = None
+    stamps = values = rests = block = unit = None
     references: dict[str, _Reference] = {}
     for block in blocks:
         if not len(block):
             continue
-        accel = accel_mps2(block)
-        if stamps is None or values is None or rests is None:
+        if stamps is None or values is None or rests is None or unit is None:
             stamps = _Stamps(block)
             values = _Values(block.sensor_columns, stamps.period_s)
-            rests = _Rests(accel.shape[1], 1 / stamps.period_s)
+            unit = unit_of(block)
+            rests = RecordedRests(unit, block)
         stamps.feed(block.time_s)
-        values.feed(accel)
-        rests.feed(block.time_s, accel)
+        values.feed(block.accel_mps2(unit))
+        rests.feed(block)
         _add_references(references, block)
-    if block is None or stamps is None or values is None or rests is None:
+    if block is None or stamps is None or values is None or rests is None or unit is None:
         raise UserError('the recording holds no samples')
-    rests.close()
+    rests.take()
+    spans_s = [rest.span_s for rest, _ in rests.detected]
+    means_mps2 = [to_nominal_mps2(mean_v, unit) for _, mean_v in rests.detected]
+    lengths_g = np.linalg.norm(means_mps2, axis=-1) / G0_MPS2
     span_s = stamps.last_s - stamps.first_s
     return RecordingContents(
         block.path, stamps.count, span_s, round(1 / stamps.period_s, 6), stamps.jitter_s,
         stamps.burst, stamps.missing, stamps.gaps, stamps.longest_gap_s, block.bad_stamps,
         values.axes(), values.held_s,
-        min(sum(rests.spans_s) / span_s, 1.0), max(rests.spans_s, default=0.0),
-        len(rests.spans_s), len(rests.poses_mps2), rests.length_g,
+        min(sum(spans_s) / span_s, 1.0), max(spans_s, default=0.0), len(spans_s),
+        _count_poses(means_mps2),
+        float(np.median(lengths_g)) if spans_s and len(unit.axes) == len(AXES) else None,
         {name: (reference.low, reference.high) for name, reference in references.items()},
         {name: reference.total / reference.count for name, reference in references.items()}, delay,
         block.remarks, block.cut)
@@ -256,7 +268,10 @@ def log_delay(times_ns: Iterable[np.ndarray]) -> LogDelay | None:
     time_s = (times[:, 1] - times[0, 1]) * 1e-9
     line = np.polyfit(time_s, delay_s, 1) if np.ptp(time_s) > 0 else np.zeros(2)
     low_s, high_s = np.quantile(delay_s - np.polyval(line, time_s), [0.01, 0.99])
-    return LogDelay(float(np.median(delay_s)), float(high_s - low_s), 1e6 * float(line[0]))
+    places = np.linspace(0, len(time_s) - 1, _PIECES + 1).astype(int)
+    drifts = np.diff(delay_s[places]) / np.maximum(np.diff(time_s[places]), 1e-9)
+    return LogDelay(float(np.median(delay_s)), float(high_s - low_s), 1e6 * float(line[0]),
+                    bool(abs(np.median(drifts)) > _LARGEST_CLOCK_DRIFT))
 
 
 class _Stamps:
@@ -266,9 +281,9 @@ class _Stamps:
         if len(first) < 2:
             raise UserError(f'{first.path}: {len(first)} sample with a usable stamp; at least 2 '
                             f'are needed{_stamp_hint(first)}')
-        time_s, lag = first.time_s, rate_lag(first.time_s)
+        time_s = first.time_s
         self.burst = burst_samples(time_s)
-        self.period_s = float(np.median(time_s[lag:] - time_s[:-lag])) / lag
+        self.period_s = period_s(time_s)
         self.first_s = float(time_s[0])
         self.last_s = np.nan
         self.count = self.missing = self.gaps = 0
@@ -412,48 +427,14 @@ def _lowest_beside(values: np.ndarray, first: int, stop: int, count: int) -> flo
     return float(neighbours.min(initial=values[first]))
 
 
-class _Rests:
-    """Rests of a recording of any length, and their orientations."""
-
-    def __init__(self, axes: int, rate_hz: float) -> None:
-        self._axes, self._rate_hz = axes, rate_hz
-        self._finder = RestFinder(rate_hz, axes)
-        self._begin_s = -np.inf
-        self.spans_s: list[float] = []
-        self.poses_mps2: list[np.ndarray] = []
-        self._lengths: list[float] = []
-
-    def feed(self, time_s: np.ndarray, accel: np.ndarray) -> None:
-        """Add further samples, m/s², (n, m)."""
-        if time_s[0] - self._begin_s > _REST_PART_S:
-            self.close()
-            self._finder, self._begin_s = RestFinder(self._rate_hz, self._axes), float(time_s[0])
-        self._finder.feed(time_s, accel)
-
-    def close(self) -> None:
-        """Take the rests of the part that ends."""
-        rests = self._finder.rests() if len(self._finder.blocks()) else []
-        if not rests:
-            return
-        means, _ = self._finder.means(rests)
-        for rest, mean in zip(rests, means):
-            self._add(rest, mean)
-
-    def _add(self, rest: Rest, mean_mps2: np.ndarray) -> None:
-        """Add a rest with its mean, m/s², (m,)."""
-        self.spans_s.append(rest.time_stop_s - rest.time_start_s)
-        self._lengths.append(float(np.linalg.norm(mean_mps2)))
-        is_new = all(np.linalg.norm(mean_mps2 - pose) > _SAME_POSE_G * G0_MPS2
-                     for pose in self.poses_mps2)
-        if is_new and len(self.poses_mps2) < _MOST_POSES:
-            self.poses_mps2.append(mean_mps2)
-
-    @property
-    def length_g(self) -> float | None:
-        """Median length of the specific force at rest, g."""
-        if self._axes < 3 or not self._lengths:
-            return None
-        return float(np.median(self._lengths)) / G0_MPS2
+def _count_poses(means_mps2: Sequence[np.ndarray]) -> int:
+    """Return the number of different orientations among the means of rests, m/s², (m,) each."""
+    poses: list[np.ndarray] = []
+    for mean in means_mps2:
+        is_new = all(np.linalg.norm(mean - pose) > _SAME_POSE_G * G0_MPS2 for pose in poses)
+        if is_new and len(poses) < _MOST_POSES:
+            poses.append(mean)
+    return len(poses)
 
 
 @dataclass

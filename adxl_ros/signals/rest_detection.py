@@ -22,13 +22,16 @@ mean is compared over 0.5 s to 4 s anywhere in it, and at its ends, where a filt
 settles. A knock that does not change the mean does not end a rest, and is left out of the mean. On
 a live stage, which uses the datasheet noise only, a knock begins the dwell again. The noise is
 that of the datasheet, learned from the quietest parts of the stream, or the larger of both.
+`recording_finder` and `RecordedRests` are the rests of a recording, for all tools.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 from adxl_ros.errors import UserError
+from adxl_ros.files.recording_columns import JOINTS, Recording
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.noise import effective_samples
 from adxl_ros.model.sensor import Sensor
@@ -36,6 +39,7 @@ from adxl_ros.signals.block_statistics import angle_bounds, BlockCutter, Blocks
 from adxl_ros.signals.noise_limits import (
     adc_step,
     batch_scatter,
+    datasheet_noise,
     differing_start,
     DRIFT_OCTAVES,
     END_SIGMAS,
@@ -53,13 +57,19 @@ from adxl_ros.signals.noise_limits import (
 from adxl_ros.signals.runs import true_runs
 import numpy as np
 
+SAME_ANGLE_RAD = 1e-5
+"""Angles that differ by less are equal, rad. Chosen: above the rounding of angles in a file, and
+far below the step of an encoder."""
+
 _HAND_HELD_S = 1.4
 """Shortest rest of a hand-held sensor, s, without its margins of 0.3 s. Chosen: shorter rests are
 pauses of the hand."""
 _STAGE_S = 0.6
 """Shortest rest on a stage, s, without its margins of 0.3 s. Chosen: stages dwell for longer."""
 _KNOCK_S = 1.0
-"""Longest disturbance within a rest, s. Chosen: a knock decays within a second."""
+"""Longest disturbance or gap within a rest, s. Chosen: a knock decays within a second."""
+_PART_S = 3600.0
+"""Time after which only the newest blocks of a recording are kept, s. It bounds the memory."""
 _BATCHES = 20
 """Largest number of batches of a rest whose scatter shows the error of its mean. Chosen: the usual
 number of batch means."""
@@ -70,6 +80,8 @@ _DRIFT_SIGMAS = 5.0
 _SETTLE_TAUS = 8.0
 """Settling time after a motion, in time constants of the filter. Chosen: the remainder of a step,
 0.03 %, is below the noise of a rest's mean."""
+_ANGLES = (JOINTS['alpha'], JOINTS['beta'])
+"""Columns of the encoder angles."""
 _ROUNDING = 1e-9
 """Relative excess over the angle tolerance that rounding explains."""
 
@@ -85,6 +97,8 @@ class Rest:
         First row of the rest and the row after its last.
     time_start_s, time_stop_s
         Times of the first and the last row, s.
+    disturbed_s
+        Times between which it was disturbed, or has no samples, s.
 
     """
 
@@ -92,6 +106,12 @@ class Rest:
     stop: int
     time_start_s: float
     time_stop_s: float
+    disturbed_s: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def span_s(self) -> float:
+        """Return the time of the rest, s."""
+        return self.time_stop_s - self.time_start_s
 
 
 @dataclass(frozen=True)
@@ -216,6 +236,10 @@ class RestFinder:
         """Return the rests so far; the last rest may not have ended yet."""
         return list(self._detect()[1])
 
+    def forget(self) -> None:
+        """Keep the newest blocks only, in which a drift may begin."""
+        self._parts, self._result = [self.blocks()[-self._spans.longest:]], None
+
     def means(self, rests: list[Rest]) -> tuple[np.ndarray, np.ndarray]:
         """Return the mean of each rest and its standard deviation, (k, m) each."""
         blocks = self.blocks()
@@ -268,11 +292,16 @@ class RestFinder:
                 first, stop = self._without_ends(blocks.mean, first + self._settle, stop, limits)
                 if stop - first >= self._spans.window:
                     parts.append((first, stop))
+        groups = [[part] for part in parts]
         if self.learn:
-            parts = self._join_across_knocks(blocks, bounds, parts, limits)
-        return [Rest(int(blocks.start[first]), int(blocks.start[stop - 1]) + self._spans.size,
-                     float(blocks.time_s[first, 0]), float(blocks.time_s[stop - 1, 1]))
-                for first, stop in parts if stop - first >= self._min_blocks]
+            groups = self._join_across_knocks(blocks, bounds, parts, limits, quiet)
+        first_s, last_s = blocks.time_s.T.tolist()
+        return [Rest(int(blocks.start[group[0][0]]),
+                     int(blocks.start[group[-1][1] - 1]) + self._spans.size,
+                     first_s[group[0][0]], last_s[group[-1][1] - 1],
+                     tuple((last_s[end - 1], first_s[first])
+                           for (_, end), (first, _) in pairwise(group)))
+                for group in groups if group[-1][1] - group[0][0] >= self._min_blocks]
 
     def _drifting(self, blocks: Blocks, quiet: np.ndarray, limits: NoiseLimits) -> np.ndarray:
         """
@@ -329,24 +358,32 @@ class RestFinder:
         return not (bounds.sum(axis=0) > allowed).any()
 
     def _join_across_knocks(self, blocks: Blocks, bounds: np.ndarray | None,
-                            parts: list[tuple[int, int]], limits: NoiseLimits
-                            ) -> list[tuple[int, int]]:
-        """Join parts if the disturbance between them has not changed mean and angles."""
-        joined: list[tuple[int, int]] = []
+                            parts: list[tuple[int, int]], limits: NoiseLimits, quiet: np.ndarray
+                            ) -> list[list[tuple[int, int]]]:
+        """
+        Group parts if the disturbance or gap between them has not changed mean and angles.
+
+        A drift without motion that returns to the same mean is noise, and part of the rest.
+        """
+        groups: list[list[tuple[int, int]]] = []
         for first, stop in parts:
-            begin, end = joined[-1] if joined else (0, 0)
-            if (joined and self._is_soon_after(blocks, end, first)
+            begin, end = (groups[-1][0][0], groups[-1][-1][1]) if groups else (0, 0)
+            has_drifted = first - end <= self._spans.longest and quiet[end:first].all() and \
+                bool(groups) and blocks.run[end - 1] == blocks.run[first]
+            if (groups and (has_drifted or self._is_soon_after(blocks, end, first))
                     and (bounds is None or self._is_one_pose(np.fmax.reduce(bounds[begin:stop])))
                     and not self._mean_changed(blocks.mean, (begin, end), (first, stop), limits)):
-                joined[-1] = begin, stop
+                start = groups[-1].pop()[0] if has_drifted else first
+                groups[-1].append((start, stop))
             else:
-                joined.append((first, stop))
-        return joined
+                groups.append([(first, stop)])
+        return groups
 
     def _is_soon_after(self, blocks: Blocks, end: int, first: int) -> bool:
         """Return whether block `first` follows the part before block `end` within a knock."""
-        longest = max(_KNOCK_S / self._spans.block_s, self._spans.window)
-        return first - end <= longest and bool(blocks.run[end - 1] == blocks.run[first])
+        longest = max(_KNOCK_S / self._spans.block_s, self._spans.window) + 1
+        between_s = float(blocks.time_s[first, 0] - blocks.time_s[end - 1, 1])
+        return 0 <= between_s <= longest * self._spans.block_s
 
     def _mean_changed(self, means: np.ndarray, before: tuple[int, int], after: tuple[int, int],
                       limits: NoiseLimits) -> bool:
@@ -355,6 +392,70 @@ class RestFinder:
         return limits.differ(means[max(before[0], before[1] - reach):before[1]],
                              means[after[0]:min(after[1], after[0] + reach)],
                              self._spans, END_SIGMAS)
+
+
+def recording_finder(unit: Sensor, has_angles: bool) -> RestFinder:
+    """
+    Return the finder of rests in a recording that all tools use.
+
+    Parameters
+    ----------
+    unit
+        The sensor of the recording, with its sample rate; samples are in volts.
+    has_angles
+        Whether the recording has stage angles.
+
+    Returns
+    -------
+    RestFinder
+        A finder that learns the noise, which is at least that of the unit's file.
+
+    """
+    noise = None if 'noise_density_g_per_rthz' in unit.unstated else datasheet_noise(unit)
+    tolerance_rad = max(unit.stage_resolution_rad, SAME_ANGLE_RAD) if has_angles else None
+    return RestFinder(unit.rate_hz, len(unit.axes), noise, True, tolerance_rad)
+
+
+class RecordedRests:
+    """
+    Finds the rests of a recording of any length; the memory is that of an hour.
+
+    Attributes
+    ----------
+    detected
+        Rests of all blocks up to the last `take`, each with its mean, V.
+
+    """
+
+    def __init__(self, unit: Sensor, first: Recording) -> None:
+        self._unit = replace(unit, rate_hz=first.rate_hz)
+        self._has_angles = set(_ANGLES) <= set(first.columns)
+        self._finder = recording_finder(self._unit, self._has_angles)
+        self._taken_s = float(first.time_s[0])
+        self.detected: list[tuple[Rest, np.ndarray]] = []
+
+    def feed(self, block: Recording) -> None:
+        """Add a block of the recording."""
+        angles_rad = np.column_stack([block.columns[name] for name in _ANGLES]) \
+            if self._has_angles else None
+        self._finder.feed(block.time_s, block.volts(self._unit), angles_rad)
+        if block.time_s[-1] - self._taken_s > _PART_S:
+            self.take()
+            self._finder.forget()
+            self._taken_s = float(block.time_s[-1])
+
+    def take(self) -> None:
+        """Add the newest rests to `detected`; what was found twice is one rest."""
+        rests = self._finder.rests()
+        for rest, mean_v in zip(rests, self._finder.means(rests)[0]):
+            last, last_mean_v = self.detected[-1] if self.detected else (None, mean_v)
+            if last is None or rest.time_start_s > last.time_stop_s:
+                self.detected.append((rest, mean_v))
+                continue
+            later = [span for span in rest.disturbed_s if span[0] >= last.time_stop_s]
+            joined = replace(last, stop=rest.stop, time_stop_s=rest.time_stop_s,
+                             disturbed_s=(*last.disturbed_s, *later))
+            self.detected[-1] = joined, last_mean_v
 
 
 def find_rests(time_s: np.ndarray, samples: np.ndarray, rate_hz: float,

@@ -18,29 +18,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from itertools import pairwise
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
+from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.allan_deviation import AllanDeviation, AllanStream, CellMeans
-from adxl_ros.signals.block_statistics import GAP_S
-from adxl_ros.signals.runs import true_runs
+from adxl_ros.signals.block_statistics import gap_s
+from adxl_ros.signals.rest_detection import RecordedRests, Rest
 import numpy as np
 
-_GAP_PERIODS = 5
-"""Smallest gap in sample periods. Chosen: stamps of a slow sensor scatter."""
-_LONGEST_FILLED_S = 1.0
-"""Longest gap that is filled by a straight line, s. Chosen: it changes no average of minutes."""
-_BURSTS = 0.5
-"""Median step of stamps in bursts, divided by the mean step, is below this."""
 _WINDOW_S = 2.0
-"""Shortest window in which a motion is looked for, s. Chosen: a knock stays visible in it."""
-_WINDOW_SAMPLES = 32
-"""Fewest samples of a window. Chosen: the variance of white noise is then known within 25 %."""
-_QUIET_QUANTILE = 0.25
-"""Quantile of the windows' variances that is the noise. Chosen: up to three quarters may move."""
-_LARGEST_VARIANCE = 5.0
-"""Variance of a window at rest, divided by that quantile. Chosen: never reached by white noise."""
+"""Window of the standard deviation of a sample, s. Chosen: noise at low frequency is slower."""
+_LARGEST_END_S = 0.2
+"""Longest time before the first rest or after the last that is no motion, s. Chosen: rests are
+found in blocks of 0.05 s, of which one is left out."""
+_FILLED_GAPS = 20
+"""Longest gap that is filled by a straight line, in smallest gaps. Chosen: no rest has longer
+ones, and a line of days would fill the memory."""
 _FEWEST_SAMPLES = 512
 """Fewest samples at rest. Chosen: fewer do not show white noise within 10 %."""
 SHORTEST_S = 10.0
@@ -101,8 +95,13 @@ class StillStretch:
         return self.count / self.rate_hz
 
 
-def longest_rest(read: Callable[[], Iterable[Recording]],
-                 accel_mps2: Callable[[Recording], np.ndarray]) -> StillStretch:
+def shortest_rest_s(rate_hz: float) -> float:
+    """Return the shortest rest that shows noise, from its first to its last sample, s."""
+    return max(SHORTEST_S, _FEWEST_SAMPLES / rate_hz) - 1 / rate_hz
+
+
+def longest_rest(read: Callable[[], Iterable[Recording]], unit_of: Callable[[Recording], Sensor]
+                 ) -> StillStretch:
     """
     Find the longest rest of a recording.
 
@@ -113,8 +112,8 @@ def longest_rest(read: Callable[[], Iterable[Recording]],
     ----------
     read
         Opens the recording and returns its blocks.
-    accel_mps2
-        Returns the specific force of a block, m/s², (n, m).
+    unit_of
+        Returns the nominal sensor of the recording by a block.
 
     Returns
     -------
@@ -127,31 +126,27 @@ def longest_rest(read: Callable[[], Iterable[Recording]],
         The recording cannot be read, does not rest, or an axis does not change.
 
     """
-    survey = _read(read, accel_mps2, -np.inf, np.inf)
-    _check_axes(survey)
-    moving, window = _moving(survey.longest)
-    breaks = list(survey.breaks)
-    if not moving.any():
-        return _stretch(survey, survey, breaks)
-    start, stop = max(true_runs(~moving, np.zeros(len(moving))), key=lambda run: run[1] - run[0],
-                      default=(0, 0))
-    # A motion may begin or end within the window before and after.
-    start, stop = start + int(start > 0), stop - int(stop < len(moving))
-    begin_s, length_s = survey.longest.start_s, window / survey.longest.rate_hz
-    breaks += [(begin_s + first * length_s, begin_s + last * length_s)
-               for first, last in true_runs(moving, np.zeros(len(moving)))]
-    if (stop - start) * length_s < SHORTEST_S:
-        raise UserError(f'{survey.path}: rests for {max(stop - start, 0) * length_s:.3g} s at '
-                        f'most, expected {SHORTEST_S:g} s at least; record a sensor that nobody '
-                        'touches')
-    end_s = np.inf if stop == len(moving) else begin_s + stop * length_s
-    rest = _read(read, accel_mps2, begin_s + start * length_s, end_s)
-    _check_axes(rest, f' from {rest.longest.start_s:.4g} s to {rest.longest.stop_s:.4g} s')
-    return _stretch(survey, rest, sorted(breaks))
+    survey = _read(read, unit_of, None)
+    rests = [rest for rest, _ in survey.rests.detected]
+    rest = max(rests, key=lambda rest: rest.span_s, default=Rest(0, 0, 0.0, 0.0))
+    shortest_s = shortest_rest_s(survey.segment.nominal_hz)
+    if rest.span_s < shortest_s:
+        raise UserError(f'{survey.path}: rests for {rest.span_s:.4g} s at most, expected '
+                        f'{shortest_s:.3g} s at least; record longer, and do not touch the sensor')
+    edges_s = np.array([survey.start_s, *(time_s for each in rests for time_s in
+                                          (each.time_start_s, each.time_stop_s)), survey.stop_s])
+    motion_s = [(start_s, stop_s) for start_s, stop_s in edges_s.reshape(-1, 2).tolist()
+                if stop_s - start_s > _LARGEST_END_S]
+    if not motion_s and not rest.disturbed_s:
+        _check_axes(survey)
+        return _stretch(survey, survey, motion_s)
+    rest_only = _read(read, unit_of, rest)
+    _check_axes(rest_only, f' from {rest.time_start_s:.4g} s to {rest.time_stop_s:.4g} s')
+    return _stretch(survey, rest_only, motion_s)
 
 
 class _Segment:
-    """Samples without a long gap, as far as they have been read."""
+    """Samples of a rest, as far as they have been read; gaps are filled by straight lines."""
 
     def __init__(self, columns: int, rate_hz: float) -> None:
         self.nominal_hz = rate_hz
@@ -160,6 +155,7 @@ class _Segment:
         self.resolution = np.full(columns - 1, np.inf)
         self.filled = 0
         self.start_s = self.stop_s = np.nan
+        self.is_whole = True
         self._last: np.ndarray | None = None
 
     @property
@@ -174,7 +170,10 @@ class _Segment:
 
     def feed(self, time_s: np.ndarray, rows: np.ndarray) -> None:
         """Add rows, (n, c), whose gaps are to be filled; the last column is the temperature."""
-        if not len(rows):
+        # Nothing is added after a gap that is too long to be filled.
+        steps_s = np.diff(time_s, prepend=time_s[0] if self._last is None else self.stop_s)
+        self.is_whole &= bool((steps_s <= _FILLED_GAPS * gap_s(self.nominal_hz)).all())
+        if not self.is_whole:
             return
         is_first = self._last is None
         if self._last is None:
@@ -192,7 +191,7 @@ class _Segment:
     def _evenly(self, time_s: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Return the rows with gaps filled."""
         steps_s = np.diff(time_s)
-        gaps = steps_s > _gap_s(self.nominal_hz)
+        gaps = steps_s > gap_s(self.nominal_hz)
         if not gaps.any():
             return rows
         advance = np.where(gaps, np.maximum(np.rint(steps_s * self.nominal_hz), 1), 1)
@@ -204,68 +203,51 @@ class _Segment:
 
 @dataclass
 class _Survey:
-    """What a pass over a recording has found."""
+    """What a pass over a recording, or over one of its rests, has found."""
 
     path: str
     names: tuple[str, ...]
     start_s: float
     stop_s: float
-    longest: _Segment
-    breaks: list[tuple[float, float]]
+    segment: _Segment
+    rests: RecordedRests
 
 
-def _gap_s(rate_hz: float) -> float:
-    """Return the smallest gap of a stream, s."""
-    return max(GAP_S, _GAP_PERIODS / rate_hz)
-
-
-def _read(read: Callable[[], Iterable[Recording]], accel_mps2: Callable[[Recording], np.ndarray],
-          start_s: float, stop_s: float) -> _Survey:
-    """Read the samples between two stamps, and keep the longest part without a long gap."""
+def _read(read: Callable[[], Iterable[Recording]], unit_of: Callable[[Recording], Sensor],
+          rest: Rest | None) -> _Survey:
+    """Read the undisturbed samples of a rest; those of the whole recording where it is None."""
     survey: _Survey | None = None
-    segment: _Segment | None = None
     held = np.nan
     for block in read():
-        inside = (block.time_s >= start_s) & (block.time_s <= stop_s)
-        time_s = block.time_s[inside]
+        inside = np.ones(len(block), bool) if rest is None else _is_inside(block.time_s, rest)
         temperature, held = _held(block, held)
-        rows = np.column_stack([accel_mps2(block), temperature])[inside]
+        unit = unit_of(block)
+        rows = np.column_stack([block.accel_mps2(unit), temperature])[inside]
         if not len(rows):
             continue
-        if survey is None or segment is None:
-            segment = _Segment(rows.shape[1], _rate_hz(block, time_s))
-            survey = _Survey(block.path, block.sensor_columns, float(time_s[0]), 0.0, segment, [])
-        before_s = segment.stop_s if segment.count else time_s[0]
-        steps_s = np.diff(time_s, prepend=before_s)
-        longest_s = max(_LONGEST_FILLED_S, _gap_s(segment.nominal_hz))
-        edges = [0, *(1 + np.flatnonzero(steps_s[1:] > longest_s)).tolist(), len(rows)]
-        for first, last in pairwise(edges):
-            if first or steps_s[0] > longest_s:
-                stamp_s = float(time_s[first])
-                survey.breaks.append((stamp_s - float(steps_s[first]), stamp_s))
-                segment = _Segment(rows.shape[1], segment.nominal_hz)
-            segment.feed(time_s[first:last], rows[first:last])
-            if segment.count > survey.longest.count:
-                survey.longest = segment
+        time_s = block.time_s[inside]
+        if survey is None:
+            if len(block) < 2:
+                raise UserError(f'{block.path}: {len(block)} samples; record longer')
+            survey = _Survey(block.path, block.sensor_columns, float(time_s[0]), 0.0,
+                             _Segment(rows.shape[1], block.rate_hz), RecordedRests(unit, block))
+        survey.segment.feed(time_s, rows)
+        if rest is None:
+            survey.rests.feed(block)
         survey.stop_s = float(time_s[-1])
     if survey is None:
         raise UserError('the recording holds no samples')
-    if survey.longest.count < _FEWEST_SAMPLES or \
-            survey.longest.stop_s - survey.longest.start_s < SHORTEST_S:
-        segment = survey.longest
-        raise UserError(f'{survey.path}: {segment.count} samples in '
-                        f'{segment.stop_s - segment.start_s:.3g} s without a gap, expected '
-                        f'{_FEWEST_SAMPLES} in {SHORTEST_S:g} s at least; record longer')
+    if rest is None:
+        survey.rests.take()
     return survey
 
 
-def _rate_hz(block: Recording, time_s: np.ndarray) -> float:
-    """Return the rate of the first samples, Hz, also where their stamps come in bursts."""
-    steps_s = np.diff(time_s)
-    if len(steps_s) < 1 or not (steps_s > 0).all():
-        raise UserError(f'{block.path}: {len(time_s)} samples; record longer')
-    median_s, mean_s = float(np.median(steps_s)), float(steps_s.mean())
-    return 1 / (mean_s if median_s < _BURSTS * mean_s else median_s)
+def _is_inside(time_s: np.ndarray, rest: Rest) -> np.ndarray:
+    """Return which samples belong to a rest and are not disturbed, (n,) bool."""
+    inside = (time_s >= rest.time_start_s) & (time_s <= rest.time_stop_s)
+    for start_s, stop_s in rest.disturbed_s:
+        inside &= (time_s <= start_s) | (time_s >= stop_s)
+    return inside
 
 
 def _held(block: Recording, last: float) -> tuple[np.ndarray, float]:
@@ -283,26 +265,10 @@ def _held(block: Recording, last: float) -> tuple[np.ndarray, float]:
 
 def _check_axes(survey: _Survey, span: str = '') -> None:
     """Refuse an axis that never changes; `span` names the part of the recording."""
-    for name, resolution in zip(survey.names, survey.longest.resolution):
+    for name, resolution in zip(survey.names, survey.segment.resolution):
         if not np.isfinite(resolution):
             raise UserError(f'{survey.path}: {name} never changes{span}; the axis is stuck, or '
                             'not connected')
-
-
-def _moving(segment: _Segment) -> tuple[np.ndarray, int]:
-    """Return which windows move, (w,) bool, and the samples of a window."""
-    cells = segment.cells
-    shortest = max(_WINDOW_S * segment.nominal_hz, _WINDOW_SAMPLES)
-    width = min(max(int(np.ceil(shortest / cells.size)), 1), cells.count)
-    variance = _window_variance(cells, width)
-    noise = np.quantile(variance, _QUIET_QUANTILE, axis=0)
-    # Where the noise is below the resolution, most windows do not change at all.
-    limit = np.where(noise > 0, _LARGEST_VARIANCE * noise, np.inf)
-    moving = np.asarray((variance > limit).any(axis=1))
-    if (_window_variance(cells, width, cells.count - width) > limit).any():
-        # The motion is in the cells after the last window.
-        moving = np.append(moving, True)
-    return moving, width * cells.size
 
 
 def _window_variance(cells: CellMeans, width: int, first: int = 0) -> np.ndarray:
@@ -315,9 +281,10 @@ def _window_variance(cells: CellMeans, width: int, first: int = 0) -> np.ndarray
     return (squares + between) / max(width * cells.size - 1, 1)
 
 
-def _stretch(survey: _Survey, rest: _Survey, breaks: list[tuple[float, float]]) -> StillStretch:
+def _stretch(survey: _Survey, rest: _Survey, motion_s: list[tuple[float, float]]
+             ) -> StillStretch:
     """Return the rest that a pass has read."""
-    segment = rest.longest
+    segment = rest.segment
     cells, rate_hz = segment.cells, segment.rate_hz
     width = max(int(np.ceil(_WINDOW_S * rate_hz / cells.size)), 1)
     temperature = cells.means[:, -1]
@@ -326,4 +293,4 @@ def _stretch(survey: _Survey, rest: _Survey, breaks: list[tuple[float, float]]) 
         segment.allan.result(rate_hz, cells), cells.size / rate_hz, cells.means[:, :-1],
         temperature if np.isfinite(temperature).all() else None,
         np.sqrt(_window_variance(cells, min(width, cells.count)).mean(axis=0)),
-        segment.resolution, survey.stop_s - survey.start_s, breaks)
+        segment.resolution, survey.stop_s - survey.start_s, motion_s)

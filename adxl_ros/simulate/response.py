@@ -95,7 +95,7 @@ class Response:
         Raises
         ------
         UserError
-            An effect needs the stage, the filter, the ADC or the noise, which is missing.
+            An effect needs the stage, the ADC or the noise, which is missing.
 
         """
         check_needs(sensor, motion)
@@ -429,9 +429,6 @@ def check_needs(sensor: Sensor, motion: Motion) -> None:
     missing = {}
     if motion.force is not None:
         missing[Need.STAGE] = 'this manoeuvre has none, only specific force'
-    if not sensor.rc_s > 0:
-        missing[Need.FILTER] = \
-            'the sensor has none: sensor.rc_capacitance_f or rc_resistance_ohm is 0'
     if not sensor.adc_bits > 0:
         missing[Need.ADC] = 'the sensor has none: sensor.adc_bits is 0'
     if not np.any(sensor.noise_density_g_per_rthz):

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from math import exp
+from types import MappingProxyType
 
 from adxl_ros.errors import UserError
 from adxl_ros.simulate.simulator import encoder_reading
@@ -72,6 +73,7 @@ class SimulatedStage:
 
         """
         self._slew = slew
+        self._speed = np.array(slew, float)
         self._omega = _SETTLED / settling_s
         self._resolution = resolution
         self._rng = np.random.default_rng(seed)
@@ -81,7 +83,8 @@ class SimulatedStage:
         self.position = self._goal.copy()
         self.velocity = np.zeros(3)
 
-    def command(self, positions: Mapping[str, float]) -> None:
+    def command(self, positions: Mapping[str, float],
+                speeds: Mapping[str, float] = MappingProxyType({})) -> None:
         """
         Command joints to positions; a joint whose command does not change goes on.
 
@@ -89,6 +92,8 @@ class SimulatedStage:
         ----------
         positions
             Position by joint, rad or m.
+        speeds
+            Largest speed on the way by joint, rad/s or m/s; 0 or absent: that of the stage.
 
         Raises
         ------
@@ -108,10 +113,13 @@ class SimulatedStage:
         if is_new.any():
             self._goal = np.where(is_new, self._reachable(target), self._goal)
             self._commanded = target
+        for name in positions:
+            joint = JOINTS.index(name)
+            self._speed[joint] = min(self._slew[joint], abs(speeds.get(name, 0.0)) or np.inf)
 
     def step(self, dt_s: float) -> None:
         """Advance by a time step, s."""
-        max_move = self._slew * dt_s
+        max_move = self._speed * dt_s
         reference = self._reference + np.clip(self._goal - self._reference, -max_move, max_move)
         rate = (reference - self._reference) / dt_s
         # x'' = w² (r - x) - 2 w x' behind a ramp r: x = r - 2 r'/w + (c + d t) exp(-w t).

@@ -19,7 +19,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 import itertools
 from pathlib import Path
 
@@ -136,9 +135,7 @@ def _sensor(params: str | None, first: Recording | None) -> tuple[Sensor, list[s
     if first is None:
         return parameter_file.load(params or parameter_file.nominal_path()), []
     sensor, measured = measure_unstated(load_sensor(params, first), first)
-    sensor = _of_unit(first, sensor)
-    rate_hz = first.rate_hz if len(first) > 1 else sensor.rate_hz
-    return replace(sensor, rate_hz=rate_hz), measured
+    return _of_unit(first, sensor), measured
 
 
 def _print_end(options: argparse.Namespace, sensor: Sensor, rows: int, measured: list[str]

@@ -36,9 +36,10 @@ _STEP_COLUMNS = _LABEL_COLUMNS + 3
 """Columns before the purpose of one of several steps."""
 _GREEN, _RED, _YELLOW = '\x1b[32m', '\x1b[31m', '\x1b[33m'
 """Codes of xterm: good, bad, and not decided."""
-_COLOURS = {'GAP EXPLAINED': _GREEN, 'NO GAP': _GREEN, 'CAUSES NOT SEPARATED': _YELLOW,
-            'UNKNOWN CAUSE': _RED, 'TOO LITTLE DATA': _YELLOW, 'BAD DATA': _RED,
-            'NOT SHOWN': _YELLOW, 'PASS': _GREEN, 'FAIL': _RED, 'NO': _RED,
+_COLOURS = {'GAP EXPLAINED': _GREEN, 'PARTLY EXPLAINED': _YELLOW, 'NO GAP': _GREEN,
+            'CAUSES NOT SEPARATED': _YELLOW, 'UNKNOWN CAUSE': _RED,
+            'TOO LITTLE DATA': _YELLOW, 'BAD DATA': _RED, 'NOT SHOWN': _YELLOW,
+            'PASS': _GREEN, 'FAIL': _RED, 'NO': _RED,
             'not refuted': _YELLOW, 'too few': _YELLOW}
 """Colours of outcomes in a terminal, those of several words first."""
 _NO_COLOUR = '\x1b[0m'

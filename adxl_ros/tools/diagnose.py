@@ -22,8 +22,11 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from adxl_ros.diagnose import report_html, report_json, report_text
+from adxl_ros.diagnose import report_html, report_text
 from adxl_ros.diagnose.diagnosis import diagnose as diagnose_recordings, Diagnosis
+from adxl_ros.diagnose.report import as_json
+from adxl_ros.diagnose.self_check import self_check
+from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.errors import UserError
 from adxl_ros.files import html_page, parameter_file, population_file, recording
 from adxl_ros.files.atomic_write import write_text
@@ -71,6 +74,11 @@ def parser() -> argparse.ArgumentParser:
                        help='ideal specific force of the same manoeuvre by another simulator')
     parse.add_argument('--align', action='store_true',
                        help='shift --sim in time where its motion is late or early')
+    parse.add_argument('--material', type=float, default=MATERIAL_MG, metavar='MG',
+                       help='amplitude that matters, mg rms (default 0.1, at least a tenth of the '
+                            'noise); smaller effects are no gap')
+    parse.add_argument('--self-check', type=int, default=0, metavar='N',
+                       help='simulate N recordings from the verdict, and say how often it returns')
     parse.add_argument('--seed', type=int, default=0, help='seed of the bootstraps (default 0)')
     parse.add_argument('--json', action='store_true', help='print the report as JSON')
     parse.add_argument('-o', dest='output', metavar='DIR', required=True,
@@ -91,6 +99,10 @@ def diagnose(options: argparse.Namespace) -> int:
     begin_s = monotonic()
     if options.seed < 0:
         raise UserError(f'--seed {options.seed}: must not be negative')
+    if not 0 < options.material < float('inf'):
+        raise UserError(f'--material {options.material:g}: must be positive')
+    if options.self_check < 0:
+        raise UserError(f'--self-check {options.self_check}: must not be negative')
     if options.sim and len(options.recording) > 1:
         raise UserError(f'--sim {options.sim}: goes with one recording, but '
                         f'{len(options.recording)} are given')
@@ -109,9 +121,14 @@ def diagnose(options: argparse.Namespace) -> int:
             sensor, line, _ = posterior(sensor, population)
             prior_lines = ['', f' prior: {line}']
         diagnosis = diagnose_recordings(recordings, sensor, sim, options.seed,
-                                        lambda stage, done: show(done, stage), options.align)
+                                        lambda stage, done: show(done, stage), options.align,
+                                        options.material)
         subject = _subject(recordings, sensor, options.sim)
         lines = [*report_text.screen_lines(diagnosis, subject), *prior_lines]
+        if options.self_check and diagnosis.report is not None:
+            lines += ['', ' ' + self_check(diagnosis, recordings, sim, options.self_check,
+                                           options.seed, lambda done: show(
+                                               done, 'self-check')).text]
         report = _write(options, diagnosis, subject, lines)
     if options.json:
         print(json.dumps(report, indent=1, allow_nan=False))
@@ -138,10 +155,10 @@ def _write(options: argparse.Namespace, diagnosis: Diagnosis, subject: str, line
     """Write the files of a diagnosis; return its report."""
     folder = Path(options.output)
     make_folder(folder)
-    report = report_json.as_json(diagnosis)
+    report = as_json(diagnosis)
     write_text(folder / 'report.json', json.dumps(report, indent=1, allow_nan=False) + '\n')
-    parameters = '' if diagnosis.sensor is None else \
-        parameter_file.as_text(diagnosis.sensor, lines)
+    parameters = '' if diagnosis.report is None else \
+        parameter_file.as_text(diagnosis.report.sensor, lines)
     if parameters:
         write_text(folder / 'params.yaml', parameters)
     steps = _next_steps(options, diagnosis)
@@ -166,14 +183,14 @@ def _subject(recordings: list[Recording], sensor: Sensor, sim: str | None) -> st
 
 def _next_steps(options: argparse.Namespace, diagnosis: Diagnosis) -> str | list[NextStep]:
     """Return what to record, how to diagnose that, and how to simulate what was found."""
-    verdict = diagnosis.verdict
-    if verdict is None:
+    if diagnosis.report is None:
         return ''
+    verdict = diagnosis.report.verdict
     params = quoted(Path(options.output) / 'params.yaml')
     simulate = command('simulate', f'rich --params {params} -o sim.csv')
-    if diagnosis.next_experiment is None:
+    if diagnosis.report.next_experiment is None:
         return simulate
-    proposal = diagnosis.next_experiment
+    proposal = diagnosis.report.next_experiment
     if proposal.concerns_reference:
         return [NextStep(f'record next.csv: {proposal.manoeuvre}, {proposal.why}',
                          proposal.command),
@@ -183,7 +200,7 @@ def _next_steps(options: argparse.Namespace, diagnosis: Diagnosis) -> str | list
     if proposal.beside_simulator:
         steps, then = [], (f'record next.csv, and next_simulated.csv in the simulator: '
                            f'{proposal.manoeuvre}, {proposal.why}; then ')
-    if verdict.status == 'explained':
+    if verdict.status in ('explained', 'partly'):
         steps += [NextStep(f'{then}diagnose the recording: the effects should close its gap, too',
                            _diagnose_command(options, params, [])),
                   NextStep('simulate with the effects', simulate)]

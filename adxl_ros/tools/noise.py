@@ -40,7 +40,6 @@ from adxl_ros.tools.recording_options import (
     reading_text,
     RECORDING_HELP,
 )
-import numpy as np
 
 _BLOCK_ROWS = 65536
 """Samples that are read at a time (chosen: some MB)."""
@@ -76,7 +75,7 @@ def noise(options: argparse.Namespace) -> int:
         html_page.check_libraries()
     source = _Source(options)
     with progress('noise') as show:
-        rest = longest_rest(lambda: source.blocks(show), source.accel_mps2)
+        rest = longest_rest(lambda: source.blocks(show), source.unit)
         result = recording_noise(options.recording, rest, source.axes,
                                  lambda done: show(done, 'fit'))
     report_reading('noise', source.last)
@@ -86,7 +85,8 @@ def noise(options: argparse.Namespace) -> int:
         files += noise_page.write(Path(options.report), result)
     if options.output:
         fresh = with_noise(source.sensor(rest.rate_hz), result.axes)
-        provenance = {**fresh.provenance, 'noise_from': Path(options.recording).name}
+        name = Path(options.recording).name
+        provenance = {**fresh.provenance, 'noise_from': name, 'rate_from': name}
         parameter_file.save(options.output, replace(fresh, provenance=provenance),
                             noise_text.comments(result))
         files.insert(0, Path(options.output))
@@ -125,13 +125,13 @@ class _Source:
             yield block
             show(block.done, 'read')
 
-    def accel_mps2(self, block: Recording) -> np.ndarray:
-        """Return the specific force of a block by the nominal values, m/s², (n, m)."""
+    def unit(self, block: Recording) -> Sensor:
+        """Return the nominal sensor of the recording by its first block."""
         if self._unit is None:
             self.axes = block.axes
             self._sensor = load_sensor(self._params, block)
             self._unit = unit_of(self._sensor, block.stream_info, block.axes)
-        return block.accel_mps2(self._unit)
+        return self._unit
 
     def sensor(self, rate_hz: float) -> Sensor:
         """Return the sensor of the parameter file, with the axes and rate of the recording."""

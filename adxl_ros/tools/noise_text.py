@@ -20,6 +20,7 @@ from typing import Any
 
 from adxl_ros.calibrate.value_text import duration
 from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.signals.axis_noise import AxisNoise, density_g_per_rthz, RecordingNoise, TERMS
 from adxl_ros.signals.noise_drift import Drift, DriftKind
 from adxl_ros.signals.noise_names import settings
@@ -61,6 +62,7 @@ def tables(result: RecordingNoise) -> list[str]:
     for noise in result.axes:
         cells = [interval(estimate.scaled(MICRO_G)) for estimate in noise.estimates]
         rows.append(f' {noise.axis:5}' + ''.join(f'{cell:25}' for cell in cells).rstrip())
+    rows += _walk_lines(result)
     rows += ['', f' {"":5}{"N":12}{"B":12}{"K":12}{"N by sample":13}{"K by sample":13}'
              'datasheet',
              f' {"axis":5}{"m/s²/√Hz":12}{"m/s²":12}{"m/s²/√s":12}{"m/s²":13}{"m/s²":13}µg/√Hz']
@@ -68,10 +70,26 @@ def tables(result: RecordingNoise) -> list[str]:
     for noise in result.axes:
         white, instability, walk = noise.estimates
         cells = [value(white), value(instability), value(walk), value(white.scaled(rate)),
-                 value(walk.scaled(1 / rate)), f'{1e6 * density_g_per_rthz(noise):.3g}']
+                 value(walk.scaled(1 / rate)),
+                 value(white.scaled(1e6 * ONE_SIDED / G0_MPS2))]
         widths = (12, 12, 12, 13, 13, 0)
         rows.append(f' {noise.axis:5}' + ''.join(f'{cell:{width}}' for cell, width
                                                  in zip(cells, widths)).rstrip())
+    return rows
+
+
+def _walk_lines(result: RecordingNoise) -> list[str]:
+    """Return the bounds of the walks, and for which times K holds."""
+    rows = []
+    for noise in result.axes:
+        time_s, walk = noise.fit.correlation, noise.fit.walk
+        if time_s is not None:
+            std = MICRO_G * walk.value * np.sqrt(time_s.value / 2)
+            rows.append(f' {noise.axis}: the walk has bounds, {std:.3g} µg rms; correlation time '
+                        f'{interval(time_s)} s')
+    if any(noise.fit.walk.is_seen for noise in result.axes):
+        rows.append(f' K holds for times up to {duration(result.rest.span_s)}, those of the '
+                    'recording.')
     return rows
 
 
@@ -119,10 +137,13 @@ def warnings(result: RecordingNoise) -> list[str]:
             texts.append(_drift_text(rest, noise, noise.drift))
         else:
             texts += _unexplained(noise)
-        if noise.sample_std < noise.resolution / 2:
+        if noise.is_coarse:
             texts.append(f'{noise.axis}: samples change in steps of '
-                         f'{noise.resolution * MICRO_G:.3g} µg, which exceed the noise. N, B and '
-                         'K are those of the rounding.')
+                         f'{noise.resolution * MICRO_G:.3g} µg, which hide the noise. N, B and K '
+                         'are upper limits. Choose a smaller range.')
+        if not noise.fit.white.is_seen:
+            texts.append(f'{noise.axis}: N is not determined. A parameter file keeps the figure '
+                         'of --params, or states no white noise.')
         if noise.sample_std > _LARGEST_STD_MPS2:
             texts.append(f'{noise.axis}: one sample has a noise of {noise.sample_std:.2g} m/s², '
                          f'expected less than {_LARGEST_STD_MPS2:g}. The sensor seems to '
@@ -226,7 +247,10 @@ def _axis_json(noise: AxisNoise) -> dict[str, Any]:
     terms = {name: {'value': estimate.value if estimate.is_seen else None,
                     'ci': [estimate.low, estimate.high], 'unit': _UNITS[name]}
              for name, estimate in zip(TERMS, noise.estimates)}
-    return {**terms, 'density_g_per_rthz': density_g_per_rthz(noise),
+    time_s = noise.fit.correlation
+    return {**terms, 'correlation_s': time_s and {'value': time_s.value,
+                                                  'ci': [time_s.low, time_s.high]},
+            'rounding': noise.rounding, 'density_g_per_rthz': density_g_per_rthz(noise),
             'sample_std_mps2': noise.sample_std, 'resolution_mps2': noise.resolution,
             'lowest': {'tau_s': noise.lowest_s, 'deviation_mps2': noise.lowest},
             'fitted_below_hz': noise.fit.highest_hz}

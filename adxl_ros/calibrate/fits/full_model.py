@@ -410,16 +410,17 @@ def _result(state: _State, problem: _Problem, converged: bool) -> FullFit:
     """Return the fit of the last state, with the covariance of the sensor's coefficients."""
     about = problem.linearised(state.unit, state.poses, state.kept)
     covariance = about.covariance(state.stage)
-    _, information = about.solve(covariance)
+    over_levels = about.covariance_over_levels(state.stage, problem.stated.total_rad)
     of_sensor = [i for i, name in enumerate(problem.names) if not belongs_to_stage(name)]
     fitted = replace(
         _without_stage(state.unit), model='full',
-        covariance=np.linalg.inv(information)[np.ix_(of_sensor, of_sensor)],
+        covariance=over_levels[np.ix_(of_sensor, of_sensor)],
         covariance_names=tuple(problem.names[i] for i in of_sensor))
     return FullFit(
         fitted=fitted, unit=state.unit, names=problem.names, stage=state.stage,
         stated_std_rad=problem.stated.total_rad,
-        outliers=tuple(np.flatnonzero(~state.kept).tolist()), information=information,
+        outliers=tuple(np.flatnonzero(~state.kept).tolist()),
+        information=np.linalg.inv(over_levels),
         squared_distances=covariance.predicted_errors(about.residual).squared_distances,
         linear_poses=state.poses, deviance=about.deviance(state.stage), converged=converged)
 

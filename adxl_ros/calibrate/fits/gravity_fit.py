@@ -63,6 +63,8 @@ _NEARBY_STEPS = 8
 suffice."""
 _NEARBY_STEP = 1e-10
 """Largest component of a last step, after which the next one is below rounding."""
+STRETCHES = 5
+"""Stretches of time that are held out in turn. Chosen: the usual number of folds."""
 _MAX_ROUNDS = 20
 """Largest count of rounds of parameters and excess variance."""
 _EXCESS_TOLERANCE = 1e-6
@@ -105,9 +107,9 @@ class GravityFit:
         Parameters of effects by axis, as `Sensor.values` has them.
     covariance
         Covariance of the coefficients NAMES, in their units, (9, 9).
-    before_mps2, residual_mps2, leave_one_out_mps2
+    before_mps2, residual_mps2, held_out_mps2
         Magnitude minus local gravity, m/s², (k,): by nominal values, by the fit, and by the fit to
-        all other rests.
+        the rests outside of the rest's own stretch of time.
     expected_mps2
         Standard deviation of a rest's magnitude, m/s², (k,): noise of the mean and excess.
     excess_mps2
@@ -123,7 +125,7 @@ class GravityFit:
     covariance: np.ndarray
     before_mps2: np.ndarray
     residual_mps2: np.ndarray
-    leave_one_out_mps2: np.ndarray
+    held_out_mps2: np.ndarray
     expected_mps2: np.ndarray
     excess_mps2: float
     outliers: tuple[int, ...]
@@ -150,7 +152,8 @@ class _Estimate(NamedTuple):
     converged: bool
 
 
-def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor) -> GravityFit:
+def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor,
+                stretches: int = STRETCHES) -> GravityFit:
     """
     Fit the nine parameters by maximum likelihood of the magnitudes.
 
@@ -161,9 +164,12 @@ def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor) -> Gravit
     Parameters
     ----------
     mean_v, std_v
-        Mean of each rest and its standard deviation, V, (k, 3).
+        Mean of each rest and its standard deviation, V, (k, 3), in the order of time.
     sensor
         Nominal values and local gravity of a three-axis sensor.
+    stretches
+        Groups of successive rests that are held out together: neighbours share temperature and
+        time, so that a rest that is held out alone shows no drift.
 
     Returns
     -------
@@ -194,7 +200,7 @@ def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor) -> Gravit
         covariance=covariance * np.outer(effects.units, effects.units),
         before_mps2=G0_MPS2 * (np.linalg.norm(rests.mean, axis=1) - rests.gravity_g),
         residual_mps2=G0_MPS2 * residual,
-        leave_one_out_mps2=G0_MPS2 * _leave_one_out(rests, kept, parameters, variance, residual),
+        held_out_mps2=G0_MPS2 * _held_out(rests, kept, parameters, variance, residual, stretches),
         expected_mps2=G0_MPS2 * np.sqrt(variance),
         excess_mps2=G0_MPS2 * float(np.sqrt(excess_g2)),
         outliers=tuple(int(i) for i in np.flatnonzero(~kept)),
@@ -348,17 +354,19 @@ def _studentised(rests: NominalRests, kept: np.ndarray, estimate: _Estimate) -> 
     return np.where(kept, inside, distance / np.sqrt(1 + leverage))
 
 
-def _leave_one_out(rests: NominalRests, kept: np.ndarray, parameters: np.ndarray,
-                   variance: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """Return magnitude minus gravity by the fit to all other rests, g, (k,)."""
+def _held_out(rests: NominalRests, kept: np.ndarray, parameters: np.ndarray,
+              variance: np.ndarray, residual: np.ndarray, stretches: int) -> np.ndarray:
+    """Return magnitude minus gravity by the fit to the other stretches of rests, g, (k,)."""
     errors, used = residual.copy(), rests[kept]
     count = len(used.mean)
-    weights = (1 - np.eye(count)) / variance[kept]
-    without, converged = _nearby(used, np.tile(parameters, (count, 1)), weights)
+    stretches = min(stretches, count)
+    stretch = np.arange(count) * stretches // count
+    others = stretch != np.arange(stretches)[:, None]
+    without, converged = _nearby(used, np.tile(parameters, (stretches, 1)),
+                                 others / variance[kept])
     for i in np.flatnonzero(~converged):
-        others = np.arange(count) != i
-        without[i], _ = _solve(used[others], parameters, variance[kept][others])
-    errors[kept] = _residual(used, without).diagonal()
+        without[i], _ = _solve(used[others[i]], parameters, variance[kept][others[i]])
+    errors[kept] = _residual(used, without)[stretch, np.arange(count)]
     return errors
 
 
@@ -414,7 +422,7 @@ def _nearby(rests: NominalRests, starts: np.ndarray, weights: np.ndarray
             steps = np.linalg.solve(weighted @ rows,
                                     weighted @ (rests.gravity_g - length)[..., None])[..., 0]
         except np.linalg.LinAlgError:
-            break  # without a rest, the others do not determine the parameters
+            break  # without a stretch, the others do not determine the parameters
         parameters = parameters + steps
         converged = np.abs(steps).max(axis=1) < _NEARBY_STEP
         if converged.all():

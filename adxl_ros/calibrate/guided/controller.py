@@ -26,8 +26,10 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from adxl_ros.calibrate.calibration import CalibrationResult
+from adxl_ros.calibrate.fits.gravity_fit import MIN_RESTS
 from adxl_ros.calibrate.guided.capture_settings import Phase, Status
 from adxl_ros.calibrate.guided.guide import NextPose
+from adxl_ros.calibrate.guided.hand_guide import ENOUGH_RESTS
 from adxl_ros.calibrate.guided.live_window import NewestSamples, Readings, STALE_NS
 from adxl_ros.calibrate.guided.session import Session
 from adxl_ros.calibrate.guided.session_settings import SessionSettings
@@ -275,7 +277,7 @@ class Controller:
         if self.state is ControllerState.ASKING:
             return Answer(False, self.question)
         if self.state is ControllerState.WAITING_FOR_SENSOR:
-            return Answer(True, 'starts when sensor_info arrives')
+            return Answer(True, 'starts when sensor_info comes, or samples show the sensor')
         return Answer(self.session is not None, self._last_line)
 
     def capture(self) -> Answer:
@@ -429,8 +431,10 @@ class Controller:
         if self.state is ControllerState.WAITING_FOR_SENSOR:
             if self._sensor_fault:
                 return Status(Phase.REFUSED, self._sensor_fault, True)
-            advice = '; is the driver running?' if self._samples.silence() else ''
-            return Status(Phase.INFO, f'waiting for sensor_info{advice}', True)
+            silence = self._samples.silence()
+            obstacle = f'{silence}; is the driver running?' if silence else \
+                'without it, 2 s of samples show the sensor'
+            return Status(Phase.INFO, f'waiting for sensor_info; {obstacle}', True)
         if self.session is None:
             idle = f'{IDLE_TEXT}; {self._outlook}' if self._outlook else IDLE_TEXT
             return Status(Phase.IDLE, self._last_line or idle, False)
@@ -483,7 +487,8 @@ class Controller:
         self.session = session = Session(unit, self.settings, self._starts_over, self._sensor)
         self.state, self.outcome = ControllerState.RUNNING, ()
         self._samples.restart_silence()
-        task = self._outlook or 'rest in 24 or more directions, then call ~/finish'
+        task = self._outlook or f'rest in {MIN_RESTS} or more directions (at best in ' \
+            f'{ENOUGH_RESTS}), then call ~/finish'
         if not session.resumed:
             self.say(f'calibrating {unit.serial}: {task}')
             return

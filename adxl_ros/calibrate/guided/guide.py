@@ -39,12 +39,15 @@ class NextPose(NamedTuple):
         Values for programs, by key.
     command_rad
         Angles alpha and beta for a stage that turns itself, rad; None for others.
+    newest_ns
+        Stamp of the newest sample, ns: a command is given after it.
 
     """
 
     text: str
     values: Mapping[str, str | float]
     command_rad: tuple[float, float] | None
+    newest_ns: int = 0
 
 
 class Guide(Protocol):

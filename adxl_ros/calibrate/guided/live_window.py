@@ -19,6 +19,7 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from collections import deque
 
+from adxl_ros.files.stamp_bursts import stamped_rate_hz
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.signals.noise_limits import datasheet_noise
 from adxl_ros.signals.rest_detection import RestFinder, Stillness
@@ -29,7 +30,7 @@ _REST_WINDOW_S = 1.2
 _SHOWN_S = 0.5
 """Newest samples whose mean is shown, s; chosen: steady to read and still quick."""
 _FEWEST_SAMPLES = 20
-"""Samples that stay at the lowest rates; chosen: a median of 19 periods gives the rate."""
+"""Samples that stay at the lowest rates; chosen: they give the rate."""
 _BACK_NS = 1_000_000_000
 """A stamp that is earlier than the one before by more is of another clock, ns.
 
@@ -124,8 +125,7 @@ class NewestSamples:
         """Return the rate of the stamps, Hz; NaN while there are too few of them."""
         if len(self.stamps_ns) < _FEWEST_SAMPLES:
             return float('nan')
-        period_ns = float(np.median(np.diff(self.stamps_ns)))
-        return 1e9 / period_ns if period_ns > 0 else float('nan')
+        return stamped_rate_hz((self.stamps_ns - self.stamps_ns[0]) * 1e-9)
 
     def _shown(self) -> np.ndarray:
         return to_nominal_mps2(self.volts[-self._show:], self._sensor)

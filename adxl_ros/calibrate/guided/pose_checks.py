@@ -147,16 +147,16 @@ def temperature_fault(first_c: float, now_c: float, span_c: float) -> str:
             'is back, or finish with the poses so far')
 
 
-def rate_fault(measured_hz: float, stated_hz: float) -> str:
+def rate_fault(measured_hz: float, unit: Sensor) -> str:
     """
-    Refuse samples whose rate differs from the stated one.
+    Refuse samples whose rate is not that of the unit.
 
     Parameters
     ----------
     measured_hz
         Rate by the stamps, Hz; NaN where it is unknown.
-    stated_hz
-        Rate that `sensor_info` states, Hz.
+    unit
+        The unit, whose rate `sensor_info` states or its first samples show.
 
     Returns
     -------
@@ -164,10 +164,12 @@ def rate_fault(measured_hz: float, stated_hz: float) -> str:
         Both rates, or ''.
 
     """
-    if not abs(measured_hz / stated_hz - 1) > _RATE_ERROR:
+    if not abs(measured_hz / unit.rate_hz - 1) > _RATE_ERROR:
         return ''
-    return (f'samples are {measured_hz:.4g} a second by their stamps, but sensor_info states '
-            f'rate_hz {stated_hz:.4g}; correct the rate of the driver')
+    expected = f'were {unit.rate_hz:.4g} at the start; keep the rate of the sensor' \
+        if 'rate_hz' in unit.measured else \
+        f'sensor_info states rate_hz {unit.rate_hz:.4g}; correct the rate of the driver'
+    return f'samples are {measured_hz:.4g} a second by their stamps, but {expected}'
 
 
 def clock_fault(stage_ahead_s: float) -> str:

@@ -131,7 +131,7 @@ class Session:
 
         """
         self.newest.feed(stamps_ns, volts)
-        fault = pose_checks.rate_fault(self.newest.rate_hz(), self.unit.rate_hz)
+        fault = pose_checks.rate_fault(self.newest.rate_hz(), self.unit)
         if not fault:
             self.guide.feed(stamps_ns, volts)
         return fault

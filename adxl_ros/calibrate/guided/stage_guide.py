@@ -369,7 +369,7 @@ class StageGuide:
         number = f'pose {self.pose_number} of {len(self.targets)}'
         if self.moves_itself:
             return NextPose(f'{number}: {self.destination()}', values,
-                            (target.alpha_rad, target.beta_rad))
+                            (target.alpha_rad, target.beta_rad), self.newest_ns or 0)
         return NextPose(f'{number}: turn the stage to {self.destination()}, then capture', values,
                         None)
 

@@ -365,7 +365,7 @@ def _cell(statistic: ErrorStatistic, datasheet: str, noise: str) -> str:
     return f'{cell:>14} {datasheet:9} {noise:9}'
 
 
-def gravity_line(assessment: Assessment, leave_one_out_mps2: np.ndarray) -> str:
+def gravity_line(assessment: Assessment, held_out_mps2: np.ndarray) -> str:
     """
     State errors and outcomes of a calibration against gravity in one line.
 
@@ -373,8 +373,9 @@ def gravity_line(assessment: Assessment, leave_one_out_mps2: np.ndarray) -> str:
     ----------
     assessment
         Assessment of that calibration.
-    leave_one_out_mps2
-        Error of the magnitude of gravity at each rest by the fit to all others, m/s², (k,).
+    held_out_mps2
+        Error of the magnitude of gravity at each rest by the fit to the other stretches of time,
+        m/s², (k,).
 
     Returns
     -------
@@ -382,9 +383,10 @@ def gravity_line(assessment: Assessment, leave_one_out_mps2: np.ndarray) -> str:
         The line.
 
     """
-    mg = leave_one_out_mps2 / G0_MPS2 * 1e3
+    mg = held_out_mps2 / G0_MPS2 * 1e3
     low, high = rms_interval(mg)
-    return (f'held-out rests: {np.sqrt(np.mean(mg ** 2)):.3f} ({low:.3f} to {high:.3f}) mg rms, '
+    return (f'held-out stretches of time: {np.sqrt(np.mean(mg ** 2)):.3f} ({low:.3f} to '
+            f'{high:.3f}) mg rms, '
             f'{np.abs(mg).max():.3f} max; datasheet {assessment.accel_datasheet or "-"}, noise '
             f'{assessment.accel_noise}; limited by the {assessment.limited_by}')
 

@@ -362,7 +362,7 @@ def _scatter(sensor: Sensor, poses: Poses) -> _Scatter | None:
 def gravity_error_budgets(fit: GravityFit, fitted: Sensor, force: np.ndarray, kept: np.ndarray
                           ) -> ErrorBudgets:
     """
-    Split the leave-one-out errors of the magnitude of gravity; there is no stage part.
+    Split the held-out errors of the magnitude of gravity; there is no stage part.
 
     The part of the coefficients is that of the force by their covariance. It includes directions
     that a magnitude does not show.
@@ -382,7 +382,7 @@ def gravity_error_budgets(fit: GravityFit, fitted: Sensor, force: np.ndarray, ke
         Of acceleration and of tilt.
 
     """
-    errors = fit.leave_one_out_mps2[kept]
+    errors = fit.held_out_mps2[kept]
     excess = fit.excess_mps2 ** 2
     by_noise = float(np.mean(fit.expected_mps2[kept] ** 2)) - excess
     covariance = force_covariance(fitted, list(force[kept].T), np.zeros(len(fitted.axes)))

@@ -93,7 +93,7 @@ def gravity_errors(fit: GravityFit) -> Figure:
     """Draw the error of the magnitude of gravity at each rest, and its expected 90 % bars."""
     used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
     scale = 1e3 / G0_MPS2
-    traces = [points(used + 1, scale * fit.leave_one_out_mps2[used],
+    traces = [points(used + 1, scale * fit.held_out_mps2[used],
                      Z_90 * scale * fit.expected_mps2[used], 'held out', AXIS_COLOURS['x'])]
     return figure(traces, 320, margin=_ROOM, xaxis={'title': {'text': 'rest'}},
                   yaxis={'title': {'text': 'magnitude minus gravity, mg'}})

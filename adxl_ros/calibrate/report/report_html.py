@@ -218,7 +218,7 @@ def _tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dic
         fit = result.gravity_fit
         used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
         before, after = (1e3 * float(np.sqrt(np.mean(v[used] ** 2))) / G0_MPS2
-                         for v in (fit.before_mps2, fit.leave_one_out_mps2))
+                         for v in (fit.before_mps2, fit.held_out_mps2))
         tiles = [{'label': 'error of the magnitude of gravity',
                   'text': f'{_digits(before)} → {_digits(after)} mg',
                   'note': f'rms over {len(used)} rests, held out'}]

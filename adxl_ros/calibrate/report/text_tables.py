@@ -23,7 +23,7 @@ from adxl_ros.calibrate.report import acceptance
 from adxl_ros.calibrate.report.against_truth import Comparison
 from adxl_ros.calibrate.report.cross_validation import HeldOutErrors
 from adxl_ros.calibrate.report.error_budget import sample_noise_mps2
-from adxl_ros.calibrate.value_text import decimals
+from adxl_ros.calibrate.value_text import decimals, duration
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -109,6 +109,8 @@ def acceptance_lines(fitted: Sensor) -> list[str]:
     The limit is that of the datasheet, or the noise of one sample where no datasheet states one.
     """
     provenance = fitted.provenance
+    span = [f'       By rests within {duration(float(provenance["span_s"]))}; a longer drift is '
+            'not in this figure.'] if 'span_s' in provenance else []
     if 'own_accel_mg' not in provenance:
         return [f' {acceptance.NOT_SHOWN}  no pose was kept out of the fit to assess it']
     error_mg = float(provenance['own_accel_mg'])
@@ -129,11 +131,12 @@ def acceptance_lines(fitted: Sensor) -> list[str]:
             advice = 'One axis does not see the force across it: align it, or accept this error.'
         elif kind == 'datasheet':
             advice = 'The sensor is worse than its datasheet states: do not use this file.'
-        return [f' {acceptance.FAIL}  {result}', f'       {advice}']
+        return [f' {acceptance.FAIL}  {result}', f'       {advice}', *span]
     if acceptance.NOT_SHOWN in (accel, tilt):
         return [f' {acceptance.NOT_SHOWN}  {result}',
-                '            The check poses are too few to show that the error is within it.']
-    return [f' {acceptance.PASS}  {result}']
+                '            The check poses are too few to show that the error is within it.',
+                *span]
+    return [f' {acceptance.PASS}  {result}', *span]
 
 
 def added_effect_lines(effects: Sequence[str]) -> list[str]:
@@ -147,11 +150,11 @@ def gravity_lines(fit: GravityFit) -> list[str]:
     used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
     before, after, held_out = (
         _three_digits(1e3 * float(np.sqrt(np.mean(values[used] ** 2))) / G0_MPS2)
-        for values in (fit.before_mps2, fit.residual_mps2, fit.leave_one_out_mps2))
+        for values in (fit.before_mps2, fit.residual_mps2, fit.held_out_mps2))
     lines = [f' error of the magnitude of gravity, rms over {len(used)} rests',
              f' {"datasheet values":22} {before:>9} mg',
-             f' {"gravity calibration":22} {after:>9} mg   '
-             f'(on held-out rests {held_out.strip()} mg)    <- saved']
+             f' {"gravity calibration":22} {after:>9} mg    <- saved',
+             f' {"a fifth of time held out":22}{held_out:>8} mg']
     if fit.outliers:
         count = len(fit.outliers)
         lines.append(f' {count} {"outlier was" if count == 1 else "outliers were"} left out')

@@ -106,9 +106,11 @@ class Axis:
     sample_variance
         Variance of one sample with the rounding of the ADC, (m/s²)².
     noise_density
-        Density of the white noise, m/s²/√Hz.
+        Density of the white noise over positive frequencies, m/s²/√Hz.
     walk_density
         Density of the random walk of the zero-g, m/s²/√s; 0 without `bias_walk`.
+    walk_return_per_s
+        Inverse correlation time of a walk that has bounds, 1/s; 0 without them.
     step_mps2
         Step of the ADC, m/s²; 0 for none.
 
@@ -120,6 +122,7 @@ class Axis:
     sample_variance: float
     noise_density: float
     walk_density: float
+    walk_return_per_s: float
     step_mps2: float
 
 
@@ -133,10 +136,11 @@ def axes(sensor: Sensor) -> list[Axis]:
     step = sensor.lsb_v * 2.0 ** lost_bits * mps2_per_v
     std = noise.analog_std_v(sensor) * mps2_per_v
     density = (noise.electronics(sensor).noise_ratio * sensor.noise_density_g_per_rthz * G0_MPS2)
-    walk = np.broadcast_to(sensor.values.get('bias_walk', {}).get('density_g_per_rts', 0.0),
-                           len(sensor.axes)) * G0_MPS2
+    walk, returns = (np.broadcast_to(sensor.values.get('bias_walk', {}).get(name, 0.0),
+                                     len(sensor.axes))
+                     for name in ('density_g_per_rts', 'return_per_s'))
     return [Axis(name, *(float(values[d]) for values in (
-        zero_g, std, std ** 2 + step ** 2 / 12, density, walk, step)))
+        zero_g, std, std ** 2 + step ** 2 / 12, density, walk * G0_MPS2, returns, step)))
         for d, name in enumerate(sensor.axes)]
 
 
@@ -186,10 +190,37 @@ def head(export: Export, format_name: str, holds: Mapping[str, str]) -> list[str
     if stage:
         lines += ['', *wrap('Left out, as errors of the stage or of another reference: '
                             f'{", ".join(stage)}.', COLUMNS)]
+    lines += ['', *wrap(origin_text(sensor), COLUMNS)]
     return [*lines, '', 'Sizes: change of the output in the manoeuvre rich (7 minutes of turns,',
             'shaking, warming and a step of the supply), by simulation.',
             'All that is not held, but for noise and steps: '
             f'{size_text(export.remaining_mg)} mg rms.']
+
+
+def origin_text(sensor: Sensor) -> str:
+    """Return whose figures the white noise and the sample rate are."""
+    noise_from, rate_from = map(sensor.provenance.get, ('noise_from', 'rate_from'))
+    stated = sensor.datasheet_name or 'the parameter file'
+    return (f'White noise: measured in {noise_from}. ' if noise_from else
+            f'White noise: the figure of {stated}; nobody measured it. ') + (
+            f'Rate: that of {rate_from}.' if rate_from else
+            'Rate: as the parameter file states it.')
+
+
+def flat_noise_lines(sensor: Sensor) -> list[str]:
+    """
+    Return how much quieter white noise is than filtered noise of the same rms at low frequency.
+
+    Filtered noise is an AR(1) sequence with a = exp(−dt/RC). At low frequency its density is
+    √((1 + a)/(1 − a)) times that of white noise of the same variance.
+    """
+    rc_s = float(noise.electronics(sensor).rc_s.max())
+    if not rc_s:
+        return []
+    ratio = np.tanh(0.5 / (sensor.rate_hz * rc_s)) ** -0.5
+    return wrap('White noise is not filtered here: its spectrum is flat up to half the rate. Its '
+                f'density is {ratio:.3g} times too small below the corner of the filter, '
+                f'{0.5 / (np.pi * rc_s):.3g} Hz.', COLUMNS)
 
 
 def stage_effects(sensor: Sensor) -> list[str]:

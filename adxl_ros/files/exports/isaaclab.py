@@ -16,7 +16,14 @@
 
 from __future__ import annotations
 
-from adxl_ros.files.exports.base import arm_m, axes, Export, head, WHITE_NOISE
+from adxl_ros.files.exports.base import (
+    arm_m,
+    axes,
+    Export,
+    flat_noise_lines,
+    head,
+    WHITE_NOISE,
+)
 from adxl_ros.model.constants import AXES
 
 HOLDS = {WHITE_NOISE: 'std', 'noise_excess': 'std', 'bias': 'mean', 'lever_arm': 'pos'}
@@ -29,7 +36,7 @@ def text(export: Export) -> str:
     mean, std = ([getattr(by_name[name], field) if name in by_name else 0.0 for name in AXES]
                  for field in ('zero_g_mps2', 'noise_std_mps2'))
     comment = [*head(export, 'Isaac Lab', HOLDS), '',
-               'White noise is not filtered here: its spectrum is flat up to half the rate.',
+               *flat_noise_lines(sensor),
                'The whole chain for all environments, in each step:',
                '  from adxl_ros.simulate.sensor_model import SensorModel',
                f'  sensor = SensorModel({export.source!r})',

@@ -21,9 +21,33 @@ from adxl_ros.files.exports.base import axes, Export, head, WHITE_NOISE
 from adxl_ros.files.parameter_file import float_text
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
+from adxl_ros.model.noise import ONE_SIDED
 
 HOLDS = {WHITE_NOISE: 'accelerometer_noise_density',
          'noise_excess': 'accelerometer_noise_density', 'bias_walk': 'accelerometer_random_walk'}
+
+
+def settings(white: float, walk: float, rate_hz: float) -> list[tuple[str, float, str]]:
+    """
+    Return the settings of Kalibr, which are densities over both signs of the frequency.
+
+    Parameters
+    ----------
+    white
+        White noise N, m/s²/√Hz.
+    walk
+        Random walk K, m/s²/√s.
+    rate_hz
+        Sample rate, Hz.
+
+    Returns
+    -------
+    list
+        Names, values and units.
+
+    """
+    return [('accelerometer_noise_density', white, 'm/s^2/sqrt(Hz)'),
+            ('accelerometer_random_walk', walk, 'm/s^3/sqrt(Hz)'), ('update_rate', rate_hz, 'Hz')]
 
 
 def text(export: Export) -> str:
@@ -39,8 +63,8 @@ def text(export: Export) -> str:
 
     """
     values = axes(export.sensor)
-    density = max(axis.noise_density for axis in values)
-    if not density:
+    white = max(axis.noise_density for axis in values) / ONE_SIDED
+    if not white:
         raise UserError(f'{export.source}: sensor.noise_density_g_per_rthz is 0, which Kalibr '
                         'refuses; measure it: ros2 run adxl_ros noise RECORDING -o FILE.yaml')
     walk = max(axis.walk_density for axis in values)
@@ -52,6 +76,5 @@ def text(export: Export) -> str:
                 'gyroscope_noise_density, gyroscope_random_walk']
     return '\n'.join([
         *(f'# {line}'.rstrip() for line in comment), 'rostopic: /imu/data_raw',
-        f'update_rate: {float_text(export.sensor.rate_hz)}  # Hz',
-        f'accelerometer_noise_density: {float_text(density)}  # m/s^2/sqrt(Hz)',
-        f'accelerometer_random_walk: {float_text(walk)}  # m/s^3/sqrt(Hz)', ''])
+        *(f'{name}: {float_text(value)}  # {unit}'
+          for name, value, unit in settings(white, walk, export.sensor.rate_hz)), ''])

@@ -18,15 +18,23 @@ from __future__ import annotations
 
 from xml.sax.saxutils import quoteattr
 
-from adxl_ros.files.exports.base import arm_m, axes, Axis, Export, head, STEPS, WHITE_NOISE
+from adxl_ros.files.exports.base import (
+    arm_m,
+    axes,
+    Axis,
+    Export,
+    flat_noise_lines,
+    head,
+    STEPS,
+    WHITE_NOISE,
+)
 
 HOLDS = {WHITE_NOISE: '<stddev>', 'noise_excess': '<stddev>', 'bias': '<mean>',
          'bias_walk': '<dynamic_bias_stddev>', 'lever_arm': '<pose>', STEPS: '<precision>',
          'quantisation': '<precision>'}
 
 _WALK_S = 1e9
-"""Correlation time of the bias of gz-sensors, s; chosen: far longer than any simulation, so that
-the bias is a random walk."""
+"""Correlation time of a walk without bounds, s; chosen: far longer than any simulation."""
 
 
 def text(export: Export) -> str:
@@ -39,7 +47,7 @@ def text(export: Export) -> str:
     sensor = export.sensor
     comment = [*head(export, 'SDFormat', HOLDS), '',
                'The zero-g is in mean, because gz-sensors draws the sign of bias_mean.',
-               'White noise is not filtered here: its spectrum is flat up to half the rate.']
+               *flat_noise_lines(sensor)]
     lines = ['<?xml version="1.0"?>', '<!--',
              *(f'  {line}'.rstrip().replace('--', '- -') for line in comment), '-->',
              '<sdf version="1.9">', '  <model name="imu">', '    <link name="imu_link">',
@@ -60,7 +68,7 @@ def _axis_lines(axis: Axis) -> list[str]:
               'bias_stddev': 0.0}
     if axis.walk_density:
         values |= {'dynamic_bias_stddev': axis.walk_density,
-                   'dynamic_bias_correlation_time': _WALK_S}
+                   'dynamic_bias_correlation_time': 1 / (axis.walk_return_per_s or 1 / _WALK_S)}
     if axis.step_mps2:
         values['precision'] = axis.step_mps2
     kind = 'gaussian_quantized' if axis.step_mps2 else 'gaussian'

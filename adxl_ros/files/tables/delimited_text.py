@@ -42,11 +42,21 @@ NAME = 'delimited_text'
 _HEAD_LINES = 200
 """Lines that show the form of a file (chosen: more than any preamble seen)."""
 
+_FEWEST_NUMBERS = 2
+"""Fewest numbers of a line of samples with text (chosen: `rate, 100` is in a preamble)."""
+
 _DELIMITERS = {'\t': 'tabs', ';': 'semicolons', ',': 'commas', ' ': 'blanks'}
 """Names of delimiters; the first that fits is taken."""
 
 _NUMBER = re.compile(r'[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan|inf)', re.IGNORECASE)
 """A number with a decimal point or comma."""
+
+_DATE = re.compile(rb'"?(\d{4})[-/](\d\d)[-/](\d\d)[T ](\d\d:\d\d:\d\d(?:[.,]\d{1,9})?)'
+                   rb'(?:Z|([-+]\d\d):?(\d\d))?"?')
+"""A date and time by ISO 8601; without an offset it counts as UTC."""
+
+_LABEL = re.compile(rb'"?[A-Za-z_][\w ]*"?\s*[:=]\s*(?=[-+.]?\d)')
+"""A label before a number, as in `x: 0.1` and `"x": 0.1`."""
 
 _COMMENT = re.compile(r'\s*(#|//|%)')
 """Begin of a comment."""
@@ -69,6 +79,8 @@ class Form:
         Whether there is a header.
     first_line
         Number of the first line with samples, from 1.
+    is_worded
+        Whether lines have dates, labels or quotes, which `_plain` removes.
 
     """
 
@@ -77,6 +89,7 @@ class Form:
     names: tuple[str, ...]
     has_header: bool
     first_line: int
+    is_worded: bool = False
 
     def describe(self) -> str:
         """Return the form for messages; empty for commas with a header."""
@@ -207,32 +220,46 @@ def find_form(lines: Sequence[str]) -> Form | None:
     """
     Return the form of a table by its first lines; None where they hold no row of numbers.
 
-    The samples begin with the first of two lines that have the same number of numbers. The header
-    is the line with text and as many fields that is nearest before them.
+    The samples are the lines with as many fields as hold most of the numbers. Of two such forms
+    the one with fewer fields counts, as with labels and quotes left out and dates as numbers. The
+    header is the line with text and as many fields that is nearest before them.
     """
-    for index, line in enumerate(lines):
-        if not line.strip() or _COMMENT.match(line):
-            continue
-        following = next((text for text in lines[index + 1:] if text.strip()), line)
+    plain = [_plain(line.encode()).decode() for line in lines]
+    best, form = (0, 0), None
+    for rows in (lines, plain) if plain != list(lines) else (lines,):
         for delimiter in _DELIMITERS:
-            count = _numbers(line, delimiter)
-            # A second line may have empty cells, but no more numbers than fields.
-            if count and len(_fields(line, delimiter)) == len(_fields(following, delimiter)) and \
-                    _numbers(following, delimiter):
-                return _form(lines, index, delimiter)
-    return None
+            numbers: dict[int, int] = {}
+            first: dict[int, int] = {}
+            for index, line in enumerate(rows):
+                count = 0 if _COMMENT.match(line) else _numbers(line, delimiter)
+                fields = _fields(line, delimiter)
+                # One number with empty cells is a row, one with a text may be a preamble.
+                if count >= _FEWEST_NUMBERS or (count and count == sum(map(bool, fields))):
+                    size = len(fields)
+                    numbers[size] = numbers.get(size, 0) + count
+                    first.setdefault(size, index)
+            size = max(numbers, key=lambda size: numbers[size], default=0)
+            if size and (numbers[size], -size) > best:
+                best = numbers[size], -size
+                form = _form(lines, rows, first[size], delimiter)
+    return form
 
 
-def _form(lines: Sequence[str], index: int, delimiter: str) -> Form:
-    """Return the form of a table whose samples begin at a line."""
-    fields = _fields(lines[index], delimiter)
-    header = _header(lines[:index], delimiter, len(fields))
+def _form(lines: Sequence[str], rows: Sequence[str], index: int, delimiter: str) -> Form:
+    """Return the form of a table whose samples begin at a line, by its lines and plain lines."""
+    fields = _fields(rows[index], delimiter)
+    header = _header([_unquoted(line) for line in lines[:index]], delimiter, len(fields))
+    labels = [label.decode().strip('":= ') for label in _LABEL.findall(_DATE.sub(
+        b'0', lines[index].encode()))] if rows is not lines else []
+    if header is None and len(labels) == len(fields):
+        header = labels
     names = _distinct(header or [''] * len(fields))
-    sample = [line for line in lines[index:] if not _COMMENT.match(line)]
+    sample = [line for line in rows[index:] if not _COMMENT.match(line)]
     decimal_comma = delimiter != ',' and any(
         re.fullmatch(r'[-+]?\d*,\d+([eE][-+]?\d+)?', field)
         for line in sample for field in _fields(line, delimiter))
-    return Form(delimiter, decimal_comma, names, header is not None, index + 1)
+    return Form(delimiter, decimal_comma, names, header is not None, index + 1,
+                rows is not lines)
 
 
 def _header(lines: Sequence[str], delimiter: str, count: int) -> list[str] | None:
@@ -302,8 +329,36 @@ def _samples(path: str, file: BinaryIO, info: dict[str, str], form: Form) -> Ite
             yield lines
 
 
+def _unquoted(line: str) -> str:
+    """Return a line without quotes around the whole of it."""
+    return re.sub(r'^"([^"]*)"\s*$', r'\1', line)
+
+
+def _plain(data: bytes) -> bytes:
+    """Return lines without labels and quotes, and with seconds since 1970 in place of dates."""
+    data = _DATE.sub(_since_1970, data)
+    data = _LABEL.sub(b'', data)
+    data = re.sub(rb'(?m)^\s*"([^"\n]*)"[ \t\r]*$', rb'\1', data)
+    return re.sub(rb'(?m)^[ \t]*\{|\}[,\s]*?$', b'', data)
+
+
+def _since_1970(date: re.Match[bytes]) -> bytes:
+    """Return the seconds since 1970 of a date and time, in nanoseconds."""
+    year, month, day, time, hours, minutes = (part.decode() if part else '0'
+                                              for part in date.groups())
+    try:
+        stamp = np.datetime64(f'{year}-{month}-{day}T{time.replace(",", ".")}', 'ns')
+    except ValueError:
+        return date[0]
+    offset_s = 3600 * int(hours) + (-60 if hours.startswith('-') else 60) * int(minutes)
+    seconds, nanoseconds = divmod(int(stamp.astype(np.int64)), 1_000_000_000)
+    return b'%d.%09d' % (seconds - offset_s, nanoseconds)
+
+
 def _rewritten(data: bytes, form: Form) -> bytes:
     """Return lines with commas between fields, and decimal points."""
+    if form.is_worded:
+        data = _plain(data)
     if form.delimiter == ',':
         return data
     # A comma in a text would look like a delimiter.

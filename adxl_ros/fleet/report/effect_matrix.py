@@ -25,20 +25,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from adxl_ros.fleet.report.batches import by_prefix, CHANCE, MIN_GROUP
 from adxl_ros.fleet.report.fleet_table import FleetTable
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Place
 import numpy as np
 import scipy
 
-_VERDICTS = ('no_gap', 'explained', 'inseparable', 'unknown')
+_VERDICTS = ('no_gap', 'explained', 'partly', 'inseparable', 'unknown')
 """Statuses of recordings whose effects are judged."""
 _COMMON_SHARE = 0.5
 """Share of all units with an effect that is common to the fleet. Chosen: the majority."""
-_MIN_GROUP = 5
-"""Fewest units of a group. Chosen: fewer have nothing in common that a test could show."""
-_CHANCE = 0.01
-"""Probability of a false group among all groups and effects. Chosen."""
 _MANY_EFFECTS = 3
 """Count of effects of one unit from which the unit itself is suspected. Chosen."""
 
@@ -90,7 +87,7 @@ def effect_matrix(table: FleetTable) -> EffectMatrix:
     np.add.at(named, place, has)
     by_unit = named > judged[:, None] / 2
     serials = [table.serials[unit] for unit in units]
-    is_common = (by_unit.sum(axis=0) > _COMMON_SHARE * len(units)) & (len(units) >= _MIN_GROUP)
+    is_common = (by_unit.sum(axis=0) > _COMMON_SHARE * len(units)) & (len(units) >= MIN_GROUP)
     folders = [_folder(url) for url in table['url'][rows]]
     findings = [*_common(effects, by_unit, is_common), *_batches(effects, by_unit, serials),
                 *_places(effects, has, place, folders),
@@ -127,12 +124,10 @@ def _of_stage(name: str) -> bool:
 
 def _batches(effects: Sequence[str], by_unit: np.ndarray, serials: Sequence[str]) -> list[str]:
     """Name the effects of units whose serial numbers begin alike."""
-    prefixes = {serial[:length] for serial in serials for length in range(1, len(serial))}
-    groups = {prefix: np.array([serial.startswith(prefix) for serial in serials])
-              for prefix in sorted(prefixes)}
     return [f'{inside} of {size} units with a serial number {prefix}… have {name}, and '
             f'{outside} of the {rest} others: a bad batch.'
-            for prefix, name, inside, size, outside, rest in _frequent(groups, effects, by_unit)]
+            for prefix, name, inside, size, outside, rest in _frequent(
+                by_prefix(serials), effects, by_unit)]
 
 
 def _places(effects: Sequence[str], has: np.ndarray, unit: np.ndarray, folders: Sequence[str]
@@ -174,7 +169,7 @@ def _frequent(groups: dict[str, np.ndarray], effects: Sequence[str], has: np.nda
 
     """
     groups = {name: members for name, members in groups.items()
-              if _MIN_GROUP <= members.sum() <= len(members) - 1}
+              if MIN_GROUP <= members.sum() <= len(members) - 1}
     result = []
     for number, effect in enumerate(effects):
         tested = []
@@ -183,7 +178,7 @@ def _frequent(groups: dict[str, np.ndarray], effects: Sequence[str], has: np.nda
             outside, rest = int(has[~members, number].sum()), len(members) - size
             log_chance = _log_fisher(inside, size, outside, rest)
             tested.append((log_chance, -size, (name, effect, inside, size, outside, rest)))
-        if tested and min(tested)[0] < np.log(_CHANCE / (len(groups) * len(effects))):
+        if tested and min(tested)[0] < np.log(CHANCE / (len(groups) * len(effects))):
             best = min(tested)[2]
             if best[2] > _COMMON_SHARE * best[3]:
                 result.append(best)

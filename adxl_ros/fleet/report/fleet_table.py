@@ -37,6 +37,8 @@ _NUMBERS = ('duration_s', 'size_bytes', 'calibration_age_days', 'gap_before_mps2
 """Columns of numbers that the page uses, beside those of the quantities."""
 _YEAR = np.timedelta64(31_557_600_000_000, 'us')
 """A year of 365.25 days."""
+TOLERANCE_MG = 3.5
+"""Largest gap of a unit that is in order, mg. Chosen: an error of 0.2° in tilt."""
 MG = 1e3 / G0_MPS2
 """Milli-g in 1 m/s²."""
 

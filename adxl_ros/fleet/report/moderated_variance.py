@@ -55,7 +55,9 @@ def moderated(variance: np.ndarray, freedom: np.ndarray) -> tuple[np.ndarray, np
     common, common_freedom = _common(variance[determined], freedom[determined])
     squares = np.where(determined, freedom * np.nan_to_num(variance), 0.0)
     total = common_freedom + freedom
-    return (common_freedom * common + squares) / total, total
+    # What all units share is no better known than from all of their recordings (limma).
+    largest = float(freedom[determined].sum())
+    return (common_freedom * common + squares) / total, np.minimum(total, largest or np.inf)
 
 
 def _common(variance: np.ndarray, freedom: np.ndarray) -> tuple[float, float]:

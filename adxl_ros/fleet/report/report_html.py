@@ -27,11 +27,11 @@ from adxl_ros.files import html_page, population_file
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.fleet.report import page_figures
 from adxl_ros.fleet.report.effect_matrix import effect_matrix
-from adxl_ros.fleet.report.fleet_table import FleetTable, MG, read
+from adxl_ros.fleet.report.fleet_table import FleetTable, MG, read, TOLERANCE_MG
 from adxl_ros.fleet.report.page_figures import date_text
 from adxl_ros.fleet.report.trends import FALSE_DISCOVERY_RATE, Scatter
 from adxl_ros.fleet.report.unit_results import analyse, far_out, population_of, QuantityResult
-from adxl_ros.fleet.report.urgency import number, rank, State, TOLERANCE_MG, UnitState
+from adxl_ros.fleet.report.urgency import number, rank, State, UnitState
 from adxl_ros.fleet.row import PAGE, POPULATION, reason_kind, TABLE, UNITS
 from adxl_ros.model.constants import AXES
 import numpy as np
@@ -151,7 +151,7 @@ def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> 
         'without_unit': _rows_without_unit(table, folder),
         'without_unit_count': int((table.unit < 0).sum()),
         'trends': [_trend_caption(i, unit, result) for i, (unit, result) in enumerate(plotted)],
-        'findings': effects.findings, 'has_effects': bool(effects.effects),
+        'findings': [*_batches(results), *effects.findings], 'has_effects': bool(effects.effects),
         'judged': len(effects.units), 'populations': _population_rows(results),
         'far_out': _far_out_rows(distant, results),
         'outliers': _outlier_rows(table, results, folder),
@@ -159,6 +159,17 @@ def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> 
         'refusals': _refusal_rows(table), 'most_rows': _MOST_ROWS,
         'tolerance': number(TOLERANCE_MG), 'false_discovery': f'{FALSE_DISCOVERY_RATE:.0%}',
         'drifts': sum(int(result.is_claimed.sum()) for result in results)})
+
+
+def _batches(results: Sequence[QuantityResult]) -> list[str]:
+    """Name the batches whose coefficient is not that of the other units."""
+    return [f'{batch.members.sum()} units with a serial number {batch.prefix}… have a '
+            f'{result.quantity.label} that differs by {number(factor * batch.difference, True)} '
+            f'({number(factor * batch.low, True)} to {number(factor * batch.high, True)}) '
+            f'{result.quantity.shown_unit} from that of the {(~batch.members).sum()} others: a '
+            'bad batch.'
+            for result in results if (batch := result.batch) is not None
+            for factor in [result.quantity.factor]]
 
 
 def _about(table: FleetTable) -> list[str]:

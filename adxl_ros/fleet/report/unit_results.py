@@ -20,7 +20,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from adxl_ros.fleet.report import outliers
-from adxl_ros.fleet.report.fleet_table import FleetTable, quantities, Quantity
+from adxl_ros.fleet.report.batches import bad_batch, BadBatch
+from adxl_ros.fleet.report.fleet_table import FleetTable, quantities, Quantity, TOLERANCE_MG
 from adxl_ros.fleet.report.random_effects import MIN_UNITS, random_effects, RandomEffects
 from adxl_ros.fleet.report.trends import (
     claimed,
@@ -61,6 +62,8 @@ class QuantityResult:
         Half of the interval of each slope, (k,).
     population
         Mean and spread over the units; None where they are too few.
+    batch
+        Units of one batch that are not of this population; None for none.
 
     """
 
@@ -74,6 +77,7 @@ class QuantityResult:
     is_claimed: np.ndarray
     half_width: np.ndarray
     population: RandomEffects | None
+    batch: BadBatch | None = None
 
     def place_of(self, unit: int) -> int | None:
         """Return where a unit stands among those of the quantity; None if it is not there."""
@@ -94,12 +98,27 @@ def analyse(table: FleetTable) -> list[QuantityResult]:
         is_outlier = outliers.are_outliers(distance, freedom, values)
         kept = recordings[~is_outlier]
         trends, units = fit_trends(kept), np.unique(table.unit[rows[~is_outlier]])
-        population = random_effects(trends.level, trends.level_std, coefficients) \
-            if quantity.is_coefficient and len(units) >= MIN_UNITS else None
+        population, batch = None, None
+        if quantity.is_coefficient and len(units) >= MIN_UNITS:
+            batch = bad_batch([table.serials[unit] for unit in units], trends.level,
+                              TOLERANCE_MG / quantity.factor, len(measured)) \
+                if quantity.is_force else None
+            population = _population(trends, batch, coefficients)
         none = np.zeros(len(units), bool)
         results.append(QuantityResult(quantity, rows, recordings, distance, is_outlier, units,
-                                      trends, none, np.zeros(len(units)), population))
+                                      trends, none, np.zeros(len(units)), population, batch))
     return _with_claims(results)
+
+
+def _population(trends: Trends, batch: BadBatch | None, tests: int) -> RandomEffects:
+    """Return the population of the units without those of a bad batch, which are far out."""
+    if batch is None:
+        return random_effects(trends.level, trends.level_std, tests)
+    others = ~batch.members
+    of_others = random_effects(trends.level[others], trends.level_std[others], tests)
+    is_far_out = batch.members.copy()
+    is_far_out[others] = of_others.is_far_out
+    return RandomEffects(of_others.pooled, trends.level, trends.level_std, is_far_out)
 
 
 def _with_claims(results: Sequence[QuantityResult]) -> list[QuantityResult]:

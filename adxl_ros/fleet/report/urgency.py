@@ -32,12 +32,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
-from adxl_ros.fleet.report.fleet_table import FleetTable, MG
+from adxl_ros.fleet.report.fleet_table import FleetTable, MG, TOLERANCE_MG
 from adxl_ros.fleet.report.unit_results import QuantityResult
 import numpy as np
 
-TOLERANCE_MG = 3.5
-"""Largest gap of a unit that is in order, mg. Chosen: an error of 0.2° in tilt."""
 RECENT = 5
 """Number of recordings whose median is the gap of a unit now. Chosen: one odd one is no gap."""
 MAX_AGE_DAYS = 365.0
