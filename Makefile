@@ -16,11 +16,11 @@
 # make nulls    recordings without any effect through diagnose: docs/nulls.md, 90 minutes
 # make fleet    10 000 recordings while workers, scheduler and client are killed: docs/fleet.md
 # make blind    the blind check of diagnose, 600 trials, into blind_output/ (make blind ARGS='--seed 1')
-# make working  working cases of diagnose, drawn, diagnosed and scored, into working_output/
+# make working  working cases of diagnose, one line each, then the scores (make working ARGS='--count 20 --seed 3')
 # make lint     the linters alone
 # make clean    remove what these made
 
-.PHONY: build help demo check test perf bench gallery screenshots reproduction coverage faults soak fuzz noise nulls investigate blind working lint clean \
+.PHONY: build developed help demo check test perf bench gallery screenshots reproduction coverage faults soak fuzz noise nulls investigate blind working lint clean \
     FORCE
 .DEFAULT_GOAL := build
 
@@ -37,11 +37,11 @@ endif
 ifdef ros_python
 mode := ros
 base_python = $(ros_python)
-requirements := $(patsubst %,requirements/%.txt,build core extras blind test)
+requirements := $(patsubst %,requirements/%.txt,build core extras)
 else
 mode := wheels
 base_python = $(call first_python,$(fits))
-requirements := $(patsubst %,requirements/%.txt,ros build core extras blind test)
+requirements := $(patsubst %,requirements/%.txt,ros build core extras)
 ifdef ROS_DISTRO
 # Another ROS that is sourced must not mix with the wheels.
 unexport ROS_DISTRO PYTHONPATH LD_LIBRARY_PATH AMENT_PREFIX_PATH
@@ -66,20 +66,32 @@ make_venv = python='$(base_python)'; \
         > .venv/constraints.txt
 endif
 
+# pip compiles on one core. Some packages have templates of Python that do not compile.
+install = echo 'installing into .venv: $(1)'; \
+    .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-compile \
+    --constraint .venv/constraints.txt $(1:%=--requirement %) && \
+    { .venv/bin/python -m compileall -qq -j 0 .venv/lib || :; }
+
 # The constraints keep the versions that an installed ROS was built with.
 .venv/.ready: $(requirements)
 	@$(make_venv)
 	@rm -f $@
-	@echo 'installing into .venv: $(requirements)'
-	@.venv/bin/python -m pip install --quiet --disable-pip-version-check \
-	    --constraint .venv/constraints.txt $(requirements:%=--requirement %)
+	@$(call install,$(requirements))
 	@echo '$(made_for)' > $@
+
+# What only tests and development need, so that the demonstration need not wait for it.
+development := requirements/test.txt
+.venv/.developed: .venv/.ready $(development)
+	@$(call install,$(development))
+	@touch $@
 
 # Directories count, too: their time changes when a file in them is removed.
 sources := package.xml setup.py setup.cfg \
-    $(shell find adxl_ros launch params resource security -name __pycache__ -prune -o -print)
+    $(shell find adxl_ros adxl_ros_validation launch params resource security -name __pycache__ -prune -o -print)
 
 build: install/.built
+
+developed: build .venv/.developed
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -103,18 +115,18 @@ demo: build
 # In test/, so that Python imports the installed package and not the sources beside it.
 pytest = cd test && OPENBLAS_NUM_THREADS=1 ../run --exec python -m pytest -q
 
-check: build
+check: developed
 	$(pytest) -n 2 --dist loadgroup -m 'not (live or long or perf)' $(ARGS)
 
 # A test of live nodes waits for half of its time: three share two cores.
-test: build
+test: developed
 	$(pytest) -n 3 --dist loadgroup -m 'not perf' $(ARGS)
 
-perf: build
+perf: developed
 	$(pytest) -m perf $(ARGS)
 
-lint: build
-	$(pytest) project/test_linters.py project/test_layering.py project/test_language.py
+lint: developed
+	$(pytest) project/test_linters.py project/test_layering.py
 
 # Rivals that do not install are left out of the table.
 bench: build
@@ -125,26 +137,26 @@ bench: build
 # Each of the next takes long: its table goes into docs/links.md, docs/guided.md or docs/recordings.md.
 python_in_test = cd test && ../run --exec sh -c 'PYTHONPATH="support:$$PYTHONPATH" exec python "$$@"' -
 
-faults: build
+faults: developed
 	$(python_in_test) support/faults.py $(ARGS)
 
-soak: build
+soak: developed
 	$(python_in_test) long/soak.py $(ARGS)
 
 # With atheris where it installs; else by mutations of its own.
-fuzz: build
+fuzz: developed
 	-.venv/bin/python -m pip install --quiet --disable-pip-version-check \
 	    --requirement requirements/fuzz.txt
 	$(python_in_test) long/fuzz_links.py $(ARGS)
 
-noise: build
+noise: developed
 	$(python_in_test) long/noise_coverage.py $(ARGS)
 
 gallery: build
 	./run --exec python docs/gallery.py docs
 
 # One of them: make screenshots ARGS=diagnose. Pages need Chromium: apt install chromium.
-screenshots: build
+screenshots: developed
 	OPENBLAS_NUM_THREADS=1 ./run --exec python docs/screenshots.py docs $(ARGS)
 
 reproduction: build
@@ -154,26 +166,26 @@ coverage: build
 	OPENBLAS_NUM_THREADS=1 ./run reproduce --units 0 --draws 300 -o coverage_output $(ARGS)
 
 # Goes on where it was cut short.
-investigate: build
+investigate: developed
 	OPENBLAS_NUM_THREADS=1; export OPENBLAS_NUM_THREADS; \
 	$(python_in_test) long/investigate_units.py -o ../investigate_units.jsonl $(ARGS)
 
 # Goes on where it was cut short.
-nulls: build
+nulls: developed
 	OPENBLAS_NUM_THREADS=1; export OPENBLAS_NUM_THREADS; \
 	$(python_in_test) long/nulls.py ../docs/nulls.md $(ARGS)
 
-fleet: build
+fleet: developed
 	OPENBLAS_NUM_THREADS=1; export OPENBLAS_NUM_THREADS; \
 	$(python_in_test) long/fleet_kills.py $(ARGS)
 
 # Goes on where it was cut short; with a seed of its own in ARGS, into another folder.
 blind: build
-	./run blind -o blind_output --forest $(ARGS)
+	./run blind -o blind_output $(ARGS)
 
 working: build
-	OPENBLAS_NUM_THREADS=1 ./run working working_output $(ARGS)
+	OPENBLAS_NUM_THREADS=1 ./run --exec python -m adxl_ros_validation.working_cases $(ARGS)
 
 clean:
 	rm -rf .venv build install log demo_output blind_output working_output coverage_output .*_cache .hypothesis
-	find adxl_ros launch test -name __pycache__ -prune -exec rm -rf {} +
+	find adxl_ros adxl_ros_validation launch test -name __pycache__ -prune -exec rm -rf {} +

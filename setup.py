@@ -38,7 +38,8 @@ setup(
     name=PACKAGE,
     version='0.1.0',
     # The parameter files are part of the package, too: a cluster node has no ROS to locate them.
-    packages=[*find_packages(include=[PACKAGE, f'{PACKAGE}.*']), f'{PACKAGE}.params'],
+    packages=[*find_packages(include=[PACKAGE, f'{PACKAGE}.*', f'{PACKAGE}_validation*']),
+              f'{PACKAGE}.params'],
     package_dir={f'{PACKAGE}.params': 'params'},
     package_data={PACKAGE: ['calibrate/report/*.html', 'calibrate/report/*.js', 'diagnose/*.html',
                             'files/page_templates/*', 'fleet/report/*.html', 'tools/*.html'],
@@ -52,7 +53,7 @@ setup(
     ],
     python_requires='>=3.10',
     install_requires=['setuptools', *requirements('core')],
-    extras_require={name: requirements(name) for name in ('extras', 'blind', 'fleet', 'test')},
+    extras_require={name: requirements(name) for name in ('extras', 'fleet', 'test')},
     zip_safe=True,
     maintainer='the adxl_ros authors',
     maintainer_email='maintainers@example.org',
@@ -64,7 +65,9 @@ setup(
                                'investigate', 'monitor', 'demo')),
             f'bench = {PACKAGE}.nodes.benchmark:main',
             *scripts('tools', ('simulate', 'fit', 'apply', 'noise', 'check', 'diagnose', 'export',
-                               'fleet', 'blind', 'working', 'reproduce')),
+                               'fleet')),
+            *(f'{name} = {PACKAGE}_validation.{name}_command:main'
+              for name in ('blind', 'reproduce')),
         ],
     },
 )

@@ -55,26 +55,17 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """
-    Mark tests of a graph; keep the shared results of a module in one worker of xdist.
-
-    A test of a graph that fails is repeated once: a busy machine may hold up one of its processes
-    for seconds. The summary names it.
-    """
+    """Mark tests of a graph; keep the shared results of a module in one worker of xdist."""
     for item in items:
         fixtures = set(getattr(item, 'fixturenames', ()))
         if 'ros_env' in fixtures:
             item.add_marker(pytest.mark.live)
-            item.add_marker(pytest.mark.flaky(reruns=1))
         if {'committed_check', 'evaluations', 'report_folder'} & fixtures:
             item.add_marker(pytest.mark.xdist_group(item.path.stem))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """End with the tests that passed when repeated, and the reasons of skipped ones."""
-    for report in terminalreporter.stats.get('rerun', ()):
-        first = str(report.longrepr.reprcrash.message).partition('\n')[0]
-        terminalreporter.write_line(f'repeated {report.nodeid}: {first}')
+    """End with the reasons of skipped tests."""
     reasons = Counter(report.longrepr[2].removeprefix('Skipped: ')
                       for report in terminalreporter.stats.get('skipped', ()))
     if reasons:

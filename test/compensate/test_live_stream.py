@@ -36,11 +36,12 @@ G = 9.80665
 class Stream(LiveStream):
     """A stream that keeps its results."""
 
-    def __init__(self, sensor: Sensor, undo_filter: bool = False, period_ns: int = 2 * 10 ** 9
-                 ) -> None:
+    def __init__(self, sensor: Sensor, undo_filter: bool = False, period_ns: int = 2 * 10 ** 9,
+                 output_rate_hz: float = 0.0) -> None:
         self.data: list[bytes] = []
         self.tilt: list[bytes] = []
-        super().__init__(False, undo_filter, self.data.append, self.tilt.append)
+        super().__init__(False, undo_filter, self.data.append, self.tilt.append,
+                         output_rate_hz=output_rate_hz)
         self.use(sensor, 1000.0)
         self.period_ns, self.time_ns = period_ns, 0
 
@@ -74,6 +75,15 @@ def test_samples_are_corrected_and_counted() -> None:
     assert tilt.header == deserialize_message(stream.data[-1], Imu).header
     assert tilt.vector.z == pytest.approx(0.7, abs=1e-7)
     assert (stream.counts['received'], stream.counts['published']) == (1, 1)
+
+
+def test_an_output_rate_leaves_samples_out_and_changes_none() -> None:
+    every, few = Stream(unit()), Stream(unit(), output_rate_hz=240.0)  # 1000 Hz: every fourth
+    for i in range(12):
+        every.send(unit(), 0.7, 0.1 * i)
+        few.send(unit(), 0.7, 0.1 * i)
+    assert few.data == every.data[3::4] and few.tilt == every.tilt[3::4]
+    assert (few.counts['received'], few.counts['published']) == (12, 3)
 
 
 def test_samples_of_a_refused_stream_are_only_counted() -> None:

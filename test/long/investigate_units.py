@@ -26,6 +26,7 @@ limits, diagnosis and stop rule; they differ only in what is recorded next.
 from __future__ import annotations
 
 import argparse
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
 import json
@@ -35,17 +36,14 @@ import time
 from adxl_ros.diagnose.noise_detectors import UNKNOWN
 from adxl_ros.files import parameter_file
 from adxl_ros.files.recording_columns import Recording
-from adxl_ros.investigate.diagnosis_round import Question, run_round
-from adxl_ros.investigate.manoeuvres import plan, plan_all
-from adxl_ros.investigate.stage_limits import Pose, StageLimits
-from adxl_ros.investigate.stop_rule import Outcome
+from adxl_ros.investigate.diagnosis_round import Outcome, Question, run_round
+from adxl_ros.investigate.manoeuvres import plan, plan_all, Pose, StageLimits
 from adxl_ros.model.coefficients import fitted_of, parameter_of, put, with_neutral
-from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects import effect_named, library
+from adxl_ros.model.effects.base import Effect, Place
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.simulator import simulate
 from adxl_ros.simulate.trajectories import rich
-from adxl_ros.working import unlisted_faults
-from adxl_ros.working.fault import Fault, in_library
 import numpy as np
 
 LIMITS = StageLimits((-np.radians(120), np.pi), (0.0, 2 * np.pi), np.radians(60))
@@ -67,8 +65,12 @@ EFFECTS = ('backlash', 'base_tilt', 'bias', 'clock_skew', 'cross_axis', 'gravity
 """Effects that a stage at rest or in motion excites."""
 COUNTS = (0.15, 0.6, 0.25)
 """Probabilities of no, one and two effects."""
-UNLISTED = tuple(kind for kind in unlisted_faults.KINDS if kind.needs in ('', 'fast'))
-"""Faults that the library does not have, without those that need another temperature."""
+UNLISTED = (
+    lambda signals, d: np.sin(2 * np.pi * signals.environment.time_s / 15.0),
+    lambda signals, d: np.sin(2 * np.pi * signals.sensed[d] / 0.3),
+    lambda signals, d: np.tanh(5 * np.hypot(signals.alpha.velocity, signals.beta.velocity)),
+    lambda signals, d: np.sin(3 * np.asarray(signals.beta.position) + 1.0))
+"""Laws of each axis that the library does not have."""
 UNLISTED_G = (2e-3, 1e-2)
 """Range of their sizes, g; they are log-uniform."""
 SIZES = (2.0, 10.0)
@@ -106,10 +108,9 @@ def drawn_unit(seed, base, is_beyond=False):
     rng = np.random.default_rng([seed, 1])
     count = rng.choice(len(COUNTS), p=COUNTS)
     if is_beyond:
-        kind = UNLISTED[rng.integers(len(UNLISTED))]
-        fault = Fault(kind, float(np.exp(rng.uniform(*np.log(UNLISTED_G)))),
-                      kind.draw(rng, len(base.axes)))
-        return Unit(seed, (UNKNOWN,), base, (fault,))
+        law = UNLISTED[rng.integers(len(UNLISTED))]
+        sizes = np.exp(rng.uniform(*np.log(UNLISTED_G), len(base.axes)))
+        return Unit(seed, (UNKNOWN,), base, ((law, sizes),))
     effects = tuple(sorted(map(str, rng.choice(EFFECTS, count, replace=False))))
     sensor = with_neutral(base, effects)
     for effect in effects:
@@ -149,6 +150,24 @@ class Bench:
             Joined(begins_s, [m.motion.beta for m in self._manoeuvres])))
 
 
+@contextmanager
+def in_library(faults):
+    """Add faults to the library of this process for a while, so that the simulator runs them."""
+    def effect(name, law, sizes):
+        def act(signals, parameters):
+            for d, size in enumerate(sizes):
+                signals.output[d] = signals.output[d] + size * law(signals, d)
+        return Effect(name, Place.ELEMENT, (), act, '')
+
+    added = {f'fault_{i}': effect(f'fault_{i}', *fault) for i, fault in enumerate(faults)}
+    library().update(added)
+    try:
+        yield tuple(added)
+    finally:
+        for name in added:
+            del library()[name]
+
+
 def sampled(unit, motion):
     """Return the recording of a unit."""
     with in_library(unit.faults) as names:
@@ -172,10 +191,10 @@ def nominal_sensor():
 def investigated(unit, base, is_random):
     """Return the last answer, and the minutes that were recorded."""
     bench, rng = Bench(unit, base), np.random.default_rng([unit.seed, 2])
-    moved_s, has_samples = 0.0, False
+    moved_s, has_samples, recorded, verdict = 0.0, False, (), ''
     while True:
         question = Question(bench.pose, bench.now_s / 60, LONGEST_MINUTES - moved_s / 60,
-                            has_samples)
+                            has_samples, recorded, verdict)
         answer = run_round(question, [bench.recording()], base, LIMITS)[0] if has_samples \
             else first_answer()
         if answer.outcome is not Outcome.GO_ON:
@@ -188,7 +207,7 @@ def investigated(unit, base, is_random):
         manoeuvre = plan(name, LIMITS, bench.pose, bench.now_s)
         moved_s += manoeuvre.motion.duration_s
         bench.record(manoeuvre, ROUND_S)
-        has_samples = True
+        has_samples, recorded, verdict = True, (*recorded, name), answer.verdict
 
 
 def recorded_richly(unit, base):

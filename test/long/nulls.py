@@ -94,11 +94,11 @@ def answer(case, seed):
 
 def in_words(diagnosis):
     """Return the verdict in a few words."""
-    if diagnosis.data_fault:
-        return f'fault: {diagnosis.data_fault.name}'
-    verdict = diagnosis.verdict
+    if diagnosis.report is None:
+        return f'fault: {diagnosis.fault.name}'
+    verdict = diagnosis.report.verdict
     if verdict.status == 'unknown':
-        return ' '.join(['unknown', *verdict.unknown_where[:1]])
+        return ' '.join(['unknown', *verdict.rest_follows[:1]])
     named = [*verdict.effects, *(' or '.join(group) for group in verdict.groups)]
     return ' and '.join(named) or verdict.status.replace('_', ' ')
 

@@ -352,6 +352,15 @@ def test_bias_walks_with_the_root_of_time():
     assert np.std(final_v) == pytest.approx(2e-5 * np.sqrt(50), rel=0.1)
 
 
+def test_a_walk_that_returns_ends_in_bounds():
+    """Its rms is k/√(2·r), and its steps are those of the walk without bounds."""
+    sensor = put(with_effect('bias_walk', nominal('xyz', **CLEAN, rate_hz=10.0)),
+                 [Coefficient('bias_walk', 'return_per_s')], [0.1])
+    out_v = volts(sensor, Motion(10000.0, internal_rate_hz=10.0))[1000:] - [2.5, 2.5, 3.5]
+    assert np.std(out_v, axis=0) == pytest.approx(np.full(3, 2e-5 / np.sqrt(0.2)), rel=0.1)
+    assert np.std(np.diff(out_v, axis=0)) == pytest.approx(2e-5 * np.sqrt(0.1), rel=0.02)
+
+
 def test_time_offset_and_clock_skew_shift_the_samples():
     """With a positive offset and skew, a sample was taken before its stamp."""
     ramp = Motion(20.0, Held(np.pi / 2), Knots([0, 1, 19, 20], [0, .05, 1.85, 1.9],
@@ -387,12 +396,11 @@ def test_local_gravity_is_used_by_equation_5():
 
 
 @pytest.mark.parametrize('name, changes, motion', [
-    ('bandwidth', {'rc_capacitance_f': 0.0}, MOTION),
     ('quantisation', {'adc_bits': 0}, MOTION),
     ('noise_excess', {'noise_density_g_per_rthz': np.zeros(3)}, MOTION),
     ('backlash', {}, Motion(1.0, force=lambda at_s: [0 * at_s] * 3))])
 def test_an_effect_without_its_stage_of_the_chain_is_refused(name, changes, motion):
-    """The message names the effect if the sensor has no filter, ADC, noise or stage."""
+    """The message names the effect if the sensor has no ADC, noise or stage."""
     with pytest.raises(UserError, match=f'^{name} acts on the '):
         Response(replace(with_effect(name, nominal('xyz')), **changes), motion, 0)
 

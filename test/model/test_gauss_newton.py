@@ -43,7 +43,8 @@ def is_short(_: Iterate, __: Iterate | None, present: Iterate) -> bool:
 
 def solve(linearise: Callable[[np.ndarray], Iterate], start: list[float], evaluations: int,
           halvings: int = 0) -> Solution[Iterate]:
-    return gauss_newton(linearise, np.array(start), is_short, evaluations, halvings)
+    # At the end the cost changes by rounding errors only, and may rise by these.
+    return gauss_newton(linearise, np.array(start), is_short, evaluations, halvings, 1e-12)
 
 
 @pytest.mark.parametrize('start', MISRA_STARTS)

@@ -21,7 +21,7 @@ import subprocess
 
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
 from ament_index_python.resources import get_resource
-from processes import executable, REPO
+from processes import executable, NEEDS_ROS2, REPO
 import pytest
 
 SCRIPTS = [entry for entry in distribution('adxl_ros').entry_points
@@ -74,9 +74,9 @@ def test_run_passes_arguments_and_status(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (7, "['a b', '*']\n", '')
 
 
+@NEEDS_ROS2
 @pytest.mark.parametrize('name', LAUNCH_FILES)
 def test_launch_file_loads(name: str) -> None:
-    pytest.importorskip('launch_ros', reason='launch_ros is not installed: source a ROS 2 Jazzy')
     from launch import LaunchContext
     from launch.launch_description_sources import PythonLaunchDescriptionSource
     path = Path(get_package_share_directory('adxl_ros')) / 'launch' / name

@@ -84,3 +84,16 @@ def test_the_table_of_sensors_has_their_values() -> None:
     files = [path for path in sorted((REPO / 'params').glob('*.yaml'))
              if not parameter_file.load(path, may_measure=True).unstated]
     assert rows == [sensor_row(path) for path in files]
+
+
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page: Path) -> None:
+    """Links to files and to headings of pages."""
+    for target, anchor in re.findall(r'\]\((?!https?:)([^)#\s]*)(#[^)\s]*)?\)',
+                                     page.read_text('utf-8')):
+        linked = page.parent / target if target else page
+        assert linked.exists(), f'{page.name} links to {target}'
+        if anchor and linked.suffix == '.md':
+            headings = re.findall(r'^#+ (.*)$', linked.read_text('utf-8'), re.MULTILINE)
+            assert anchor in {'#' + re.sub(r'[^\w\- ]', '', heading).lower().replace(' ', '-')
+                              for heading in headings}, f'{page.name} links to {target}{anchor}'

@@ -16,7 +16,6 @@
 
 import ast
 from pathlib import Path
-import re
 import sys
 
 from processes import REPO
@@ -60,16 +59,3 @@ def test_extras_are_imported_where_they_are_used(path: Path) -> None:
     if 'nodes' in path.parts:
         allowed |= ROS
     assert imported_at_once(path) <= allowed
-
-
-def test_the_architecture_lists_each_file_of_each_folder() -> None:
-    page = (REPO / 'docs' / 'architecture.md').read_text(encoding='utf-8')
-    table = page[page.index('## Folders'):page.index('## Import order')]
-    listed = {folder: set(files.split(', ')) for folder, files
-              in re.findall(r'^\| `([\w/]+)` \| .* \| ([\w, ]+) \|$', table, re.MULTILINE)}
-    actual: dict[str, set[str]] = {}
-    for path in PACKAGE.rglob('*.py'):
-        if not path.stem.startswith('__'):
-            folder = path.parent.relative_to(PACKAGE).as_posix()
-            actual.setdefault(folder.replace('.', 'adxl_ros'), set()).add(path.stem)
-    assert listed == actual

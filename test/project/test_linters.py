@@ -22,7 +22,7 @@ import sys
 from processes import REPO
 import pytest
 
-PYTHON_SOURCES = ('adxl_ros', 'launch', 'test', 'setup.py')
+PYTHON_SOURCES = ('adxl_ros', 'adxl_ros_validation', 'launch', 'test', 'setup.py')
 
 
 def run_module(name: str, *args: str) -> None:
@@ -37,7 +37,6 @@ def run_module(name: str, *args: str) -> None:
 
 
 @pytest.mark.parametrize(('linter', 'paths'), [
-    ('ament_copyright', (*PYTHON_SOURCES, 'LICENSE')),
     ('ament_flake8', PYTHON_SOURCES),
     ('ament_pep257', PYTHON_SOURCES),
     ('ament_xmllint', ('package.xml',)),

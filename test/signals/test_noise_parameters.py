@@ -25,6 +25,7 @@ from adxl_ros.signals.noise_parameters import (
 import numpy as np
 import pytest
 from scipy.linalg import toeplitz
+from scipy.signal import lfilter
 from still_noise import flicker, still_samples
 
 N, B, K = 1e-3, 2e-4, 1e-5
@@ -95,6 +96,35 @@ def test_a_tone_is_named() -> None:
     octaves = fit_noise(means, STEP_S).octaves
     assert any(octave.low_hz <= 0.01 <= octave.high_hz and octave.ratio > 1.2
                for octave in octaves)
+
+
+def test_lines_do_not_change_white_noise() -> None:
+    """A line of a fan beside the band of a filter, and in the band of white noise."""
+    rng, time_s = np.random.default_rng(9), np.arange(30000) / 50.0
+    inside = 0
+    for _ in range(10):
+        white = rng.standard_normal(30000) * N * np.sqrt(50.0)
+        line = 5e-3 * np.sin(2 * np.pi * 0.55 * time_s + rng.uniform(0, 6))
+        fit = fit_noise(white + line, 1 / 50.0)
+        inside += fit.white.low <= N <= fit.white.high
+        assert fit.white.high < 1.05 * N
+    assert inside >= 7
+
+
+def test_a_walk_with_bounds() -> None:
+    """Its density is known, where a walk without bounds would fall short of it."""
+    rng, k, bound_s = np.random.default_rng(10), 1e-4, 100.0
+    decay = np.exp(-STEP_S / bound_s)
+    fits = []
+    for _ in range(10):
+        walk = lfilter([1.0], [1.0, -decay], rng.standard_normal(8000))[800:]
+        walk *= k * np.sqrt(bound_s / 2 * (1 - decay ** 2))
+        fits.append(fit_noise(walk + rng.standard_normal(7200) * N, STEP_S))
+    assert all(fit.correlation is not None for fit in fits)
+    assert sum(fit.walk.low <= k <= fit.walk.high for fit in fits) >= 7
+    assert sum(fit.correlation.low <= bound_s <= fit.correlation.high for fit in fits) >= 7
+    flat = fits[0].lines(np.array([1000.0, 10000.0]))[2]
+    assert flat[0] / flat[1] > 2
 
 
 def test_variances_of_the_coefficients() -> None:

@@ -237,12 +237,13 @@ def test_a_flicker_of_noise_does_not_cut_a_long_rest():
     assert len(rests) <= 2
 
 
-def test_gaps_end_rests_and_nan_does_not():
+def test_long_gaps_end_rests_and_lost_samples_do_not():
     rng = np.random.default_rng(11)
     samples = np.tile([0.0, 0.0, G0_MPS2], (3000, 1)) + SIGMA * rng.normal(size=(3000, 3))
     samples[::7, 1] = np.nan
     time_s = np.arange(3000) / 100
-    time_s[1000:] += 0.5
+    time_s[500:] += 0.5
+    time_s[1000:] += 1.5
     time_s[2000:] -= 5.0
     rests = find_rests(time_s, samples, 100.0)
     assert [(r.start // 100, -(-r.stop // 100)) for r in rests] == [(0, 10), (10, 20), (20, 30)]

@@ -163,10 +163,38 @@ def _repeated(log: Turned) -> str:
     return ''.join([*rows[:200], rows[199], *rows[200:300], *rows[290:293], *rows[300:]])
 
 
+def _preamble(log: Turned) -> str:
+    return 'Device,A\nSample rate,100\nRange,2\n\nTime (s),X (g),Y (g),Z (g)\n' + lines(
+        [log.time_s, *log.output_g.T], ['%.3f'] + ['%.4f'] * 3)
+
+
+def _labels(log: Turned) -> str:
+    return ''.join(f'X: {x:.4f} Y: {y:.4f} Z: {z:.4f}\n' for x, y, z in log.output_g)
+
+
+def _quoted(log: Turned) -> str:
+    rows = lines([log.time_s, *log.output_g.T], ['%.3f'] + ['%.4f'] * 3).splitlines()
+    return ''.join(f'"{row}"\n' for row in ['time,ax,ay,az', *rows])
+
+
+def _unsigned(log: Turned) -> str:
+    counts = np.rint(16384 * log.output_g) % 65536
+    return 'ms,x,y,z\n' + lines([1e3 * log.time_s, *counts.T], ['%.0f'] * 4)
+
+
+def _dates(log: Turned) -> str:
+    dates = np.datetime64('2026-01-02T03:04:05', 'us') + np.rint(1e6 * log.time_s).astype(int)
+    rows = lines([*log.output_g.T], ['%.4f'] * 3, ';', ',').splitlines()
+    return 'date;x;y;z\n' + ''.join(f'{str(date).replace("T", " ")}+01:00;{row}\n'
+                                    for date, row in zip(dates, rows))
+
+
 FORMS = {'arduino.csv': _arduino, 'german.csv': _german, 'phyphox.csv': _phyphox,
          'counts.txt': _counts, 'tabs.tsv': _tabs, 'epoch.csv': _epoch, 'app.csv': _app,
          'ros_text.csv': _ros_text, 'units_row.dat': _units_row, 'euroc.csv': _euroc,
-         'usb.csv': _usb, 'repeated.csv': _repeated}
+         'usb.csv': _usb, 'repeated.csv': _repeated, 'preamble.csv': _preamble,
+         'labels.txt': _labels, 'quoted.csv': _quoted, 'unsigned.csv': _unsigned,
+         'dates.csv': _dates}
 """Text of a log by the name of its file."""
 
 

@@ -37,6 +37,8 @@ class MadeUpFleet:
         Recordings of each unit, spread over a year.
     batch
         Number of units whose serial numbers begin with B and that have temperature_bias.
+    batch_scale
+        Scale factor of these units over that of the others.
     drifting_mg
         Drift of the zero-g of unit A-0003, mg per year.
     refused
@@ -49,6 +51,7 @@ class MadeUpFleet:
     units: int = 20
     per_unit: int = 10
     batch: int = 0
+    batch_scale: float = 1.0
     drifting_mg: float = 0.0
     refused: float = 0.0
     stage_fault: bool = False
@@ -87,6 +90,7 @@ class MadeUpFleet:
             columns[f'zero_g_{axis}_v'] = zero_g + std * rng.normal(size=n)
             columns[f'zero_g_std_{axis}_v'] = std
             scale = (SCALE_V_PER_G + rng.normal(0, 0.01, m))[unit] + rng.normal(0, 2e-4, n)
+            scale *= np.where(in_batch, self.batch_scale, 1.0)
             columns[f'scale_{axis}_v_per_g'] = scale + 1e-4 * rng.normal(size=n)
             columns[f'scale_std_{axis}_v_per_g'] = np.full(n, 1e-4)
             noise = 1.08e-3 * (1 + rng.normal(0, 0.05, m))[unit] * (1 + rng.normal(0, 0.02, n))

@@ -21,6 +21,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 import os
 from pathlib import Path
+import shutil
 import signal
 import subprocess
 import time
@@ -30,11 +31,10 @@ import pytest
 
 REPO = Path(__file__).resolve().parents[2]
 """The root of the repository."""
+NEEDS_ROS2 = pytest.mark.skipif(shutil.which('ros2') is None, reason='no ros2 and launch: they '
+                                'have no wheels; source a ROS 2 Jazzy')
 PATIENCE = 5
 """How many times longer than on a quiet machine any action may take on a busy one."""
-
-REPEATED = pytest.mark.flaky(reruns=2)
-"""For a test in real time that a busy machine may hold up: it may fail twice."""
 
 
 def wait_until(condition: Callable[[], object], timeout_s: float, purpose: str) -> None:

@@ -42,8 +42,10 @@ def by_rests(read, unit, entries):
     """Find the rests without a journal; return the settings of the poses of a journal."""
     poses = pose_extraction.extract_poses(read, unit)
     begin, end = (read.epoch_ns + np.rint(poses.time_s * 1e9).astype(np.int64)).T
-    middle = [(e.start_ns + e.stop_ns) // 2 for e in entries]
-    rest = [int(np.flatnonzero((begin <= m) & (m <= end))[0]) for m in middle]
+    # Without the journal a rest may begin later, and end with the next move.
+    overlap_ns = [np.minimum(end, e.stop_ns) - np.maximum(begin, e.start_ns) for e in entries]
+    assert min(map(max, overlap_ns)) > 0
+    rest = [int(both.argmax()) for both in overlap_ns]
     return poses.alpha_setting[rest], poses.beta_setting[rest]
 
 

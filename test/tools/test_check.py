@@ -215,6 +215,11 @@ def test_log_time_against_header_time(tmp_path: Path) -> None:
     result = checked(tmp_path, 'simulated')
     assert result['sound']
     assert any('header time runs 0.2 times as fast' in text for text in result['remarks'])
+    paces = np.cumsum(np.where(np.arange(1000) < 300, 4 * 10 ** 7, 10 ** 7))
+    varying = [replace(item, log_ns=item.stamp_ns + int(late_ns))
+               for item, late_ns in zip(sent, paces)]
+    bag_of(tmp_path / 'varying', varying)
+    assert checked(tmp_path, 'varying')['sound'], 'a simulator that runs at a varying pace'
     jumped = [replace(item, log_ns=item.stamp_ns + (5 * 10 ** 9 if i > 500 else 0))
               for i, item in enumerate(sent)]
     bag_of(tmp_path / 'jumped', jumped)

@@ -21,7 +21,7 @@ import sys
 from processes import executable, run_executable
 import pytest
 
-TOOLS = ('apply', 'blind', 'check', 'diagnose', 'fit', 'noise', 'reproduce', 'simulate', 'working')
+TOOLS = ('apply', 'blind', 'check', 'diagnose', 'fit', 'noise', 'reproduce', 'simulate')
 
 
 @pytest.mark.parametrize('name', TOOLS)

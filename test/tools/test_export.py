@@ -27,7 +27,7 @@ from adxl_ros.files.exports import format_names
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 import numpy as np
-from processes import run_executable
+from processes import REPO, run_executable
 import pytest
 from units import nominal
 import yaml
@@ -87,6 +87,29 @@ def test_the_head_says_what_the_format_cannot_hold(exported, name):
     assert (places['bias'] == 'not held') == (name not in ('sdf', 'isaaclab'))
     assert 'no z' in exported[name].text
     assert max(map(len, exported[name].screen.splitlines())) <= COLUMNS
+
+
+@pytest.mark.parametrize('name', ['isaaclab', 'sdf'])
+def test_the_head_says_how_much_too_quiet_flat_noise_is(exported, name):
+    frequency_hz = np.linspace(0, unit().rate_hz / 2, 20001)
+    density = noise.density_v2_per_hz(replace(unit(), adc_bits=0), frequency_hz)[:, 0]
+    text = ' '.join(line.strip('# ') for line in exported[name].text.splitlines())
+    ratio = float(text.split('Its density is ')[1].split()[0])
+    assert ratio == pytest.approx(np.sqrt(density[0] / density.mean()), rel=0.01)
+
+
+def test_the_head_says_whose_figures_noise_and_rate_are(tmp_path):
+    """The rate of a diagnosed unit is that of its recording; its noise nobody measured."""
+    samples = np.random.default_rng(1).normal([0, 0, G0_MPS2], 0.01, (5000, 3))
+    np.savetxt(tmp_path / 'run.csv', np.column_stack([np.arange(5000) / 250, samples]),
+               fmt='%.6f', delimiter=',', header='time_s,ax_mps2,ay_mps2,az_mps2', comments='')
+    for arguments in (('diagnose', 'run.csv', '--params', str(REPO / 'params' / 'adxl355.yaml'),
+                       '-o', 'gap'),
+                      ('export', 'gap/params.yaml', '--to', 'kalibr', '-o', 'imu.yaml')):
+        run_executable(*arguments, cwd=tmp_path)
+    text = (tmp_path / 'imu.yaml').read_text().replace('\n# ', ' ')
+    assert '\nupdate_rate: 250.0' in text
+    assert 'nobody measured it. Rate: that of run.csv.' in text
 
 
 def test_sdf(exported):
@@ -204,12 +227,17 @@ def test_isaaclab(exported, monkeypatch):
 
 
 def test_kalibr(exported):
-    """Kalibr reads these keys with PyYAML, and refuses values that are not positive floats."""
+    """
+    Kalibr reads these keys with PyYAML, and refuses values that are not positive floats.
+
+    A sample of its noise has the variance N²·rate (ethz-asl/kalibr, wiki/IMU-Noise-Model), and
+    white noise of the density d of a datasheet has d²·rate/2.
+    """
     values = yaml.safe_load(exported['kalibr'].text)
     assert values == {
         'rostopic': '/imu/data_raw', 'update_rate': unit().rate_hz,
         'accelerometer_noise_density': pytest.approx(
-            unit().noise_density_g_per_rthz.max() * G0_MPS2),
+            unit().noise_density_g_per_rthz.max() * G0_MPS2 / np.sqrt(2)),
         'accelerometer_random_walk': pytest.approx(3e-5 * G0_MPS2)}
 
 
@@ -232,7 +260,8 @@ def test_json(exported, tmp_path):
     c, s = np.cos(MISALIGNED_RAD), np.sin(MISALIGNED_RAD)
     assert np.array(content['gain']) == pytest.approx(np.array([[c, s, 0], [-s, c, 0]]), abs=1e-6)
     assert content['position_m'] == list(ARM_M)
-    assert content['parameter_file'] == parameter_file.to_flat(unit())
+    # Optional parameters that the unit does not state are neutral.
+    assert content['parameter_file'].items() >= parameter_file.to_flat(unit()).items()
     assert {part['name'] for part in content['parts']} >= set(unit().effects)
     # The linear response and the filter hold all of this unit but its second-order terms.
     assert content['not_held_mg'] < 0.01

@@ -277,6 +277,65 @@ def test_a_documented_mounting(run_tool, tmp_path) -> None:
     check_errors(tmp_path / 'u.yaml')
 
 
+@pytest.mark.parametrize('counts', [1e3, 1e6])
+@pytest.mark.parametrize('tool', ['check', 'fit', 'noise', 'diagnose'])
+def test_every_tool_refuses_stamps_in_another_unit(run_tool, tmp_path, tool, counts) -> None:
+    """A column that says s and counts ms or us: one line, and its options read the log."""
+    written(tmp_path, 'log.csv', 'time_s,ax_mps2,ay_mps2,az_mps2\n' + lines(
+        [counts * LOG.time_s, *G0_MPS2 * LOG.output_g.T], ['%.0f'] + ['%.4f'] * 3))
+    output = [] if tool in ('check', 'noise') else ['-o', 'out.yaml']
+    done = run_tool(tool, 'log.csv', *output)
+    text = ' '.join((done.stdout + done.stderr).split())
+    assert done.returncode == 1
+    assert f'time_s has steps of {0.01 * counts:.4g}, which as s are' in text
+    unit = 'ms' if counts == 1e3 else 'us'
+    assert f"--columns 'time=time_s:{unit},x=ax_mps2:mps2" in text
+    options = shlex.split(text[text.index('--columns'):])[:2]
+    assert run_tool('check', 'log.csv', *options).returncode == 0
+
+
+def test_a_slow_log_is_read_by_its_rate(run_tool, tmp_path) -> None:
+    """A step of 10 s may be right; then the rate says so."""
+    written(tmp_path, 'log.csv', plain_text([1e3 * LOG.time_s, *LOG.output_g.T]))
+    assert run_tool('check', 'log.csv', '--columns', XYZ_G).returncode == 1
+    done = run_tool('check', 'log.csv', '--columns', XYZ_G, '--rate', '0.1')
+    assert done.returncode == 0 and ' 0.1 Hz ' in done.stdout
+
+
+def test_milliseconds_since_the_start_are_no_epoch(run_tool, tmp_path) -> None:
+    """After two weeks, milliseconds have as many digits as seconds since 1970."""
+    written(tmp_path, 'log.csv', 'timestamp,ax,ay,az\n' + lines(
+        [1.2e9 + 1e3 * LOG.time_s, *LOG.output_g.T], ['%.0f'] + ['%.4f'] * 3))
+    assert proposed(run_tool('fit', 'log.csv', '-o', 'u.yaml').stderr) == [
+        '--columns', 'time=timestamp:ms,x=ax:g,y=ay:g,z=az:g']
+
+
+def without_gravity() -> np.ndarray:
+    """Return acceleration without gravity: noise at rest, and more of it in motion."""
+    rng, moves = np.random.default_rng(4), np.isnan(LOG.angles_rad[:, :1])
+    return rng.normal(0, 0.02 + 2 * moves, LOG.output_g.shape)
+
+
+PRESSURE = np.array([101325.0, 24.0, 40.0])
+
+
+@pytest.mark.parametrize(('names', 'values'), [
+    ('mx,my,mz', 48 * LOG.output_g), ('x,y,z', 48.03 * LOG.output_g),
+    ('pressure,temp,humidity', PRESSURE + 0.1 * without_gravity()),
+    ('pos_x,pos_y,pos_z', LOG.output_g), ('x,y,z', 0.5 + np.cumsum(without_gravity(), axis=0)),
+    ('ax,ay,az', without_gravity()),
+    ('x (m/s^2),y (m/s^2),z (m/s^2)', without_gravity()),
+    ('x,y,z', 1.65 + 0.33 * LOG.output_g)],
+    ids=['magnetometer', 'microtesla', 'pressure', 'positions', 'path', 'linear', 'linear in m/s²',
+         'volts without a name'])
+def test_what_contradicts_gravity_is_no_guess(run_tool, tmp_path, names, values) -> None:
+    written(tmp_path, 'log.csv', f'time,{names}\n' + lines(
+        [LOG.time_s, *values.T], ['%.3f'] + ['%.4f'] * 3))
+    done = run_tool('fit', 'log.csv', '-o', 'unit.yaml')
+    assert 'none looks like an accelerometer: name the columns' in done.stderr
+    assert 'best guess' not in done.stderr and done.stderr.count('\n') == 1
+
+
 def test_numbered_columns_and_a_mapping_file(run_tool, tmp_path) -> None:
     """A header may be missing, and a file may hold the mapping; `apply` reads both alike."""
     text = lines([1e3 * LOG.time_s, *1e3 * LOG.output_g.T], ['%.0f'] + ['%.1f'] * 3, ';', ',')

@@ -25,7 +25,7 @@ import pytest
 from terminal import Terminal
 
 TOOLS = ('apply', 'blind', 'check', 'diagnose', 'export', 'fit', 'fleet', 'noise', 'reproduce',
-         'simulate', 'working')
+         'simulate')
 COLUMNS = 79
 COLOUR = '\x1b['
 
@@ -121,7 +121,7 @@ def test_diagnose_in_a_terminal_of_80_columns(tmp_path: Path) -> None:
     assert re.search(r'^(NO GAP|GAP EXPLAINED|UNKNOWN CAUSE).* mg rms +noise floor ', screen,
                      re.MULTILINE)
     assert re.search(r'\x1b\[3\dm(NO GAP|GAP EXPLAINED|UNKNOWN CAUSE)\x1b\[0m', raw)
-    assert '1/6 checks' in raw and '2/6 library of effects' in raw
+    assert '1/5 checks' in raw and '2/5 library of effects' in raw
     assert re.search(r'^ wrote +gap/report\.html +gap/params\.yaml +gap/report\.json', screen,
                      re.MULTILINE)
 

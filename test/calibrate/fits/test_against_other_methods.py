@@ -33,10 +33,10 @@ def rests(request, shared_dir):
     stream = recording.read(shared_dir / 'real' / f'{request.param}.csv')
     unit = recorded_unit(parameter_file.load(NOMINAL), stream)
     poses = pose_extraction.extract_poses(stream, unit)
-    fit = gravity_fit.fit_gravity(poses.volts, poses.std_v, unit)
+    fit = gravity_fit.fit_gravity(poses.volts, poses.std_v, unit, len(poses))
     kept = np.setdiff1d(np.arange(len(poses)), fit.outliers)
     accel = (poses.volts - unit.nominal_zero_g_v) / unit.nominal_scale_v_per_g * G0_MPS2
-    return fit.residual_mps2[kept], fit.leave_one_out_mps2[kept], accel[kept], \
+    return fit.residual_mps2[kept], fit.held_out_mps2[kept], accel[kept], \
         unit.local_gravity_mps2
 
 

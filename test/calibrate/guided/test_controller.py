@@ -152,11 +152,13 @@ def test_a_sweep_goes_from_the_wait_for_its_sensor_to_its_file(rig, tmp_path):
     """The states are idle, waiting, running, idle, with their log, announcements and values."""
     bench = rig()
     controller = bench.controller
-    assert controller.start() == (True, 'starts when sensor_info arrives')
+    assert controller.start() == (
+        True, 'starts when sensor_info comes, or samples show the sensor')
     assert controller.state is ControllerState.WAITING_FOR_SENSOR
-    assert controller.status().text == 'waiting for sensor_info'
+    assert controller.status().text == (
+        'waiting for sensor_info; without it, 2 s of samples show the sensor')
     bench.silence_text = 'nothing on imu/data_raw'
-    assert controller.status().text.endswith('; is the driver running?')
+    assert controller.status().text.endswith('nothing on imu/data_raw; is the driver running?')
     bench.turn()
     assert controller.state is ControllerState.WAITING_FOR_SENSOR
     bench.say_info()

@@ -209,10 +209,12 @@ def test_a_stage_on_another_clock_is_reported(ahead_s, words):
 
 def test_a_wrong_sample_rate_is_refused():
     """Samples at another rate than that of sensor_info are refused."""
-    assert pose_checks.rate_fault(999.0, 1000.0) == ''
-    assert pose_checks.rate_fault(float('nan'), 1000.0) == ''
+    unit = nominal()
+    assert pose_checks.rate_fault(999.0, unit) == ''
+    assert pose_checks.rate_fault(float('nan'), unit) == ''
     assert 'samples are 500 a second by their stamps, but sensor_info states rate_hz 1000' in \
-        pose_checks.rate_fault(500.0, 1000.0)
+        pose_checks.rate_fault(500.0, unit)
+    assert 'sensor_info' not in pose_checks.rate_fault(500.0, replace(unit, measured=('rate_hz',)))
 
 
 def test_a_step_back_in_time_restarts_the_pose():

@@ -194,6 +194,21 @@ def test_a_year_of_200_units(opened, tmp_path):
     assert page.locator('#all-units tbody tr').count() == 200 and messages == []
 
 
+@pytest.mark.parametrize('batch', [6, 10])
+def test_a_bad_batch_shows_without_a_diagnosis(tmp_path, batch):
+    """The page names it, its units are far out in units.csv, and the others are the population."""
+    fleet = MadeUpFleet(units=24, per_unit=3, batch=batch, batch_scale=1.05)
+    text = page_without('effects', fleet, tmp_path)
+    assert f'{batch} units with a serial number B… have a scale factor x that differs by +' in text
+    assert f'from that of the {24 - batch} others: a bad batch.' in text
+    with open(tmp_path / 'units.csv', encoding='utf-8') as file:
+        strange = [row['serial'] for row in csv.DictReader(file)
+                   if row['coefficient'] == 'scale_x_v_per_g' and row['is_far_out'] == 'true']
+    assert len(strange) == batch and all(serial.startswith('B') for serial in strange)
+    pooled = population_file.read(tmp_path / 'population.yaml').coefficients['scale_x_v_per_g']
+    assert pooled.units == 24 - batch
+
+
 def test_a_file_that_is_no_table(tmp_path):
     for contents in (b'', b'not parquet'):
         (tmp_path / 'fleet.parquet').write_bytes(contents)
