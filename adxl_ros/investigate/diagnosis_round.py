@@ -37,8 +37,8 @@ from adxl_ros.investigate.manoeuvres import KIND_OF, plan_all, PlannedManoeuvre,
 from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor
 
-CERTAIN = 0.95
-"""Probability of a hypothesis at which an investigation ends. Chosen: one error in 20."""
+CERTAIN = 0.9
+"""Probability of a hypothesis at which an investigation ends. Chosen: one error in ten."""
 _NOTHING = 0.6
 """Prior probability of no gap; a single effect is as probable. Chosen: most units are healthy."""
 _SMALLEST_PER_MINUTE = 0.01
@@ -52,7 +52,7 @@ class Outcome(Enum):
     """
     Why an investigation goes on or ends.
 
-    GO_ON: another manoeuvre follows. CERTAIN: a hypothesis has 95 %. NO_VISIBLE_GAP, INSEPARABLE:
+    GO_ON: another manoeuvre follows. CERTAIN: a hypothesis has 90 %. NO_VISIBLE_GAP, INSEPARABLE:
     no manoeuvre of this stage changes that there is no gap, or separates what remains. TIME_OVER:
     the time does not suffice for a manoeuvre.
     """
@@ -319,8 +319,8 @@ def decide(ranking: Ranking, question: Question, has_time: bool) -> Answer:
     if verdict and verdict == question.verdict:
         kinds = {KIND_OF[name] for name in question.recorded}
         following = [w for w in following if KIND_OF[w.manoeuvre.name] not in kinds]
-    named = _with_95_percent(hypotheses)
-    if best.probability >= CERTAIN:
+    named = _with_90_percent(hypotheses)
+    if best.effects and best.probability >= CERTAIN:
         outcome = Outcome.CERTAIN
     elif not following and not best.effects:
         # The samples prefer no gap to each of these effects, so that they do not show it.
@@ -337,8 +337,8 @@ def decide(ranking: Ranking, question: Question, has_time: bool) -> Answer:
                   verdict=verdict)
 
 
-def _with_95_percent(hypotheses: Sequence[WeightedHypothesis]) -> list[WeightedHypothesis]:
-    """Return the fewest hypotheses that together have 95 %."""
+def _with_90_percent(hypotheses: Sequence[WeightedHypothesis]) -> list[WeightedHypothesis]:
+    """Return the fewest hypotheses that together have 90 %."""
     total, kept = 0.0, []
     for hypothesis in hypotheses:
         kept.append(hypothesis)

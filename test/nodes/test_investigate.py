@@ -212,7 +212,7 @@ def test_a_terminal_shows_what_the_stage_does_until_ctrl_c(laboratory, ros_env, 
         [executable('investigate'), '--ros-args', '--params-file', 'nominal.yaml', *SIM, *FAST,
          *LONG], ros_env, tmp_path, columns=80)
     try:
-        terminal.wait_for('no gap 35 %', 'next: ', timeout_s=90)
+        terminal.wait_for('0.0 min  no gap ', 'next: ', timeout_s=90)
         laboratory.wait_for_motion()
         terminal.wait_for(' s left')
         terminal.press('\x03')
