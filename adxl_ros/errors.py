@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The one exception that reaches a user, and words that its messages share."""
 
@@ -24,27 +12,12 @@ class UserError(Exception):
 
     The message names the file, line and column, or the topic, the wrong value, and what to do.
     Tools print it and exit with status 1. Nodes log it and show it in diagnostics.
-
-    Attributes
-    ----------
-    paste
-        End of the message that is for a command line, quoted for a shell; empty for none.
-
     """
 
     def __init__(self, message: str = '', paste: str = '') -> None:
-        """
-        Take the message.
-
-        Parameters
-        ----------
-        message
-            What is wrong, and what to do.
-        paste
-            What follows it, for a command line.
-
-        """
+        """Take the message."""
         super().__init__(f'{message} {paste}' if paste else message)
+        # End of the message that is for a command line, quoted for a shell; empty for none
         self.paste = paste
 
 

@@ -23,17 +23,7 @@ _SHOWN_S = (2.0, 2.5)
 
 
 def draw_misalignment(path: str | os.PathLike, search: DirectionSearch) -> None:
-    """
-    Draw the search for β_x of (18) and the results of its three methods, as figure 9.
-
-    Parameters
-    ----------
-    path
-        The PNG file.
-    search
-        The search for the direction.
-
-    """
+    """Draw the search for β_x of (18) and the results of its three methods, as figure 9."""
     figure, axis = pyplot().subplots(figsize=(7, 4.5), layout='constrained')
     turned = np.degrees(search.turned_rad)
     axis.plot(turned, 1e3 * (search.output_g - search.output_g.max()), 'o', ms=4,
@@ -51,17 +41,7 @@ def draw_misalignment(path: str | os.PathLike, search: DirectionSearch) -> None:
 
 
 def draw_tilt(path: str | os.PathLike, unit: Unit) -> None:
-    """
-    Draw figure 10: errors of alpha and beta in the three tilt experiments.
-
-    Parameters
-    ----------
-    path
-        The PNG file.
-    unit
-        One unit with its errors by model.
-
-    """
+    """Draw figure 10: errors of alpha and beta in the three tilt experiments."""
     figure, grid = pyplot().subplots(2, 3, figsize=(16, 8), layout='constrained', sharex=True)
     for column, (run, asked_deg) in enumerate(RUNS.items()):
         turned = asked_deg[:, 1 if run == 'beta' else 0]
@@ -91,15 +71,7 @@ def draw_motion(path: str | os.PathLike, fitted: dict[str, Sensor],
     """
     Draw figure 12: the acceleration of the shaken sensor and of the interferometer.
 
-    Parameters
-    ----------
-    path
-        The PNG file.
-    fitted
-        The calibrated unit by model.
-    shaken
-        Stamps, s, (n,); volts, (n, m); acceleration along x, m/s², (n,).
-
+    shaken: stamps, s, (n,); volts, (n, m); acceleration along x, m/s², (n,).
     """
     figure, row = pyplot().subplots(1, len(fitted), figsize=(16, 4.5), layout='constrained',
                                     sharey=True)
@@ -118,17 +90,7 @@ def draw_motion(path: str | os.PathLike, fitted: dict[str, Sensor],
 
 def draw_components(path: str | os.PathLike, truth: Sensor, fitted: Sensor,
                     linear: Sensor) -> None:
-    """
-    Draw figure 13: what each part of the model does to the response at alpha 45°, beta 90°.
-
-    Parameters
-    ----------
-    path
-        The PNG file.
-    truth, fitted, linear
-        The unit: true, by the physical model, and by the linear model.
-
-    """
+    """Draw figure 13: what each part of the model does to the response at alpha 45°, beta 90°."""
     reach = np.linspace(-0.4, 0.4, 81)
     pose = [reach * G0_MPS2, np.full(81, -np.sqrt(0.5) * truth.local_gravity_mps2),
             np.full(81, np.sqrt(0.5) * truth.local_gravity_mps2)]
@@ -197,26 +159,7 @@ NOTES = """\
 
 
 def page(results: dict[str, list[Unit]], bound_mmps2: float, made: str, coverage: str = '') -> str:
-    """
-    Lay out the page, Markdown.
-
-    Parameters
-    ----------
-    results
-        Units by stage.
-    bound_mmps2
-        Noise floor of the motion experiment, mm/s².
-    made
-        Version, date and seed.
-    coverage
-        The section of `coverage.page`; empty for none.
-
-    Returns
-    -------
-    str
-        Markdown.
-
-    """
+    """Lay out the page, Markdown."""
     parts = ["# The paper's experiments, on simulated units", made,
              'W. T. Ang, P. K. Khosla, C. N. Riviere, "Nonlinear Regression Model of a Low-g MEMS '
              'Accelerometer", IEEE Sensors Journal, 2007, doi 10.1109/JSEN.2006.886995. In '
@@ -231,22 +174,7 @@ def page(results: dict[str, list[Unit]], bound_mmps2: float, made: str, coverage
 
 
 def screen_lines(results: dict[str, list[Unit]], bound_mmps2: float) -> list[str]:
-    """
-    Return Table I and the motion experiment as lines for a terminal.
-
-    Parameters
-    ----------
-    results
-        Units by stage.
-    bound_mmps2
-        Noise floor of the motion experiment, mm/s².
-
-    Returns
-    -------
-    list of str
-        Lines of at most 79 columns.
-
-    """
+    """Return Table I and the motion experiment as lines for a terminal."""
     lines = [f' {"Table I, rms error of":28}{"paper":>15}'
              + ''.join(f'{name:>9}' for name in MODELS) + f'{"bound":>8}']
     for stage, units in results.items():

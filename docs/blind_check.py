@@ -22,19 +22,7 @@ def main() -> None:
 
 
 def replace(path: Path, mark: str, text: str) -> None:
-    """
-    Replace the text between two marks of a page.
-
-    Parameters
-    ----------
-    path
-        The page.
-    mark
-        Name of the marks.
-    text
-        What stands between them afterwards.
-
-    """
+    """Replace the text between two marks of a page."""
     page = path.read_text(encoding='utf-8')
     page, count = re.subn(f'<!-- {mark} -->.*<!-- /{mark} -->',
                           lambda match: f'<!-- {mark} -->\n{text}\n<!-- /{mark} -->',

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Write docs/effects.md: each effect of the library with a plot of what it does."""
 
@@ -44,52 +32,23 @@ TURN = 2 * np.pi
 
 @dataclass(frozen=True)
 class Scene:
-    """
-    A manoeuvre and how its output is drawn.
+    """A manoeuvre and how its output is drawn."""
 
-    Attributes
-    ----------
-    motion
-        The manoeuvre.
-    across
-        Column of the horizontal axis.
-    label
-        Label of the horizontal axis.
-    unit
-        Factor from the column to the horizontal axis.
-    noisy
-        Whether noise and ADC are simulated.
-    axes
-        Axes that are drawn.
-    kind
-        Kind of the plot: lines, spectrum or codes.
-
-    """
-
-    motion: Motion
-    across: str = 'time_s'
-    label: str = 'time, s'
-    unit: float = 1.0
-    noisy: bool = False
-    axes: str = 'xy'
-    kind: str = 'lines'
+    motion: Motion  # The manoeuvre
+    across: str = 'time_s'  # Column of the horizontal axis
+    label: str = 'time, s'  # Label of the horizontal axis
+    unit: float = 1.0  # Factor from the column to the horizontal axis
+    noisy: bool = False  # Whether noise and ADC are simulated
+    axes: str = 'xy'  # Axes that are drawn
+    kind: str = 'lines'  # Kind of the plot: lines, spectrum or codes
 
 
 @dataclass(frozen=True)
 class Pair:
-    """
-    Recordings of one manoeuvre without and with an effect.
+    """Recordings of one manoeuvre without and with an effect."""
 
-    Attributes
-    ----------
-    sensor
-        The unit without the effect.
-    clean, changed
-        Columns without and with the effect.
-
-    """
-
-    sensor: Sensor
+    sensor: Sensor  # The unit without the effect
+    # clean, changed: Columns without and with the effect
     clean: Columns
     changed: Columns
 
@@ -98,18 +57,7 @@ def turning(alpha_deg: float, seconds: float = 36.0) -> Motion:
     """
     Turn beta forth and back at constant velocity in one plane.
 
-    Parameters
-    ----------
-    alpha_deg
-        Alpha of the plane, degrees.
-    seconds
-        Duration, s.
-
-    Returns
-    -------
-    Motion
-        The manoeuvre.
-
+    seconds: duration, s.
     """
     half, rate = seconds / 2, TURN / (seconds / 2 - 1)
     return Motion(seconds, Held(np.radians(alpha_deg)), Knots(
@@ -119,22 +67,7 @@ def turning(alpha_deg: float, seconds: float = 36.0) -> Motion:
 
 
 def plane(alpha_deg: float, axes: str = 'xy') -> Scene:
-    """
-    Draw the output over beta in one plane.
-
-    Parameters
-    ----------
-    alpha_deg
-        Alpha of the plane, degrees.
-    axes
-        Axes that are drawn.
-
-    Returns
-    -------
-    Scene
-        The scene.
-
-    """
+    """Draw the output over beta in one plane."""
     return Scene(turning(alpha_deg), 'beta_rad', f'beta at alpha = {alpha_deg:g}°, deg',
                  180 / np.pi, axes=axes)
 
@@ -205,22 +138,7 @@ TITLES = {Place.REFERENCE: 'Reference', Place.STAGE: 'Stage',
 
 
 def section(effect: Effect, caption: str) -> list[str]:
-    """
-    Return the section of an effect.
-
-    Parameters
-    ----------
-    effect
-        The effect.
-    caption
-        Caption of its plot.
-
-    Returns
-    -------
-    list
-        Lines of Markdown.
-
-    """
+    """Return the section of an effect."""
     facts = [f'Acts on the {effect.acts_on.value}',
              'smooth in its parameters' if effect.smooth else 'not smooth in its parameters',
              'undone by the inverse' if effect.invertible else 'not undone by the inverse']
@@ -235,24 +153,7 @@ def section(effect: Effect, caption: str) -> list[str]:
 
 
 def draw(nominal: Sensor, effect: Effect, path: Path) -> str:
-    """
-    Draw one effect.
-
-    Parameters
-    ----------
-    nominal
-        The nominal sensor.
-    effect
-        The effect.
-    path
-        File of the plot.
-
-    Returns
-    -------
-    str
-        Caption of the plot.
-
-    """
+    """Draw one effect."""
     scene = SCENES.get(effect.name, plane(90))
     sensor = nominal if scene.noisy else replace(
         nominal, noise_density_g_per_rthz=np.zeros(3),
@@ -274,19 +175,7 @@ def draw(nominal: Sensor, effect: Effect, path: Path) -> str:
 
 
 def draw_lines(above: plt.Axes, below: plt.Axes, scene: Scene, pair: Pair) -> None:
-    """
-    Draw output and difference over time or an angle, in the direction of travel.
-
-    Parameters
-    ----------
-    above, below
-        Axes of the output and of the difference.
-    scene
-        How it is drawn.
-    pair
-        The recordings.
-
-    """
+    """Draw output and difference over time or an angle, in the direction of travel."""
     across = pair.clean[scene.across] * scene.unit
     forth = np.ones(len(across), bool)
     if np.ptp(np.sign(np.diff(across))) == 2:
@@ -315,19 +204,7 @@ def draw_lines(above: plt.Axes, below: plt.Axes, scene: Scene, pair: Pair) -> No
 
 
 def draw_spectrum(above: plt.Axes, below: plt.Axes, _: Scene, pair: Pair) -> None:
-    """
-    Draw a part of the output, and the noise densities.
-
-    Parameters
-    ----------
-    above, below
-        Axes of the output and of the densities.
-    _
-        Not used.
-    pair
-        The recordings.
-
-    """
+    """Draw a part of the output, and the noise densities."""
     part = slice(0, 1000)
     for columns, colour, width, label in ((pair.clean, '0.7', 3, 'clean'),
                                           (pair.changed, COLOURS['x'], 1, 'with it')):
@@ -345,19 +222,7 @@ def draw_spectrum(above: plt.Axes, below: plt.Axes, _: Scene, pair: Pair) -> Non
 
 
 def draw_codes(above: plt.Axes, below: plt.Axes, _: Scene, pair: Pair) -> None:
-    """
-    Draw a part of the output, and the share of each code.
-
-    Parameters
-    ----------
-    above, below
-        Axes of the output and of the codes.
-    _
-        Not used.
-    pair
-        The recordings.
-
-    """
+    """Draw a part of the output, and the share of each code."""
     part = slice(0, 150)
     for columns, colour, width, label in ((pair.clean, '0.7', 3, 'clean'),
                                           (pair.changed, COLOURS['x'], 1.2, 'with it')):

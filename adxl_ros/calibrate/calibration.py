@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Calibration of a unit from poses: fit, assessment, provenance, and its report."""
 
@@ -67,62 +55,32 @@ _SAME_FIT_TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class RecordedPoses:
-    """
-    Poses of one recording.
+    """Poses of one recording."""
 
-    Attributes
-    ----------
-    source
-        Name of the recording, for messages and the provenance.
-    poses
-        Its poses, with angles or without.
-    filters
-        Estimate of the output filter of each axis; empty where there is none.
-
-    """
-
-    source: str
-    poses: Poses
+    source: str  # Name of the recording, for messages and the provenance
+    poses: Poses  # Its poses, with angles or without
+    # Estimate of the output filter of each axis; empty where there is none
     filters: Sequence[FilterNoise | None] = ()
 
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """
-    A calibrated unit with its assessment.
+    """A calibrated unit with its assessment."""
 
-    Attributes
-    ----------
-    nominal, fitted
-        The unit before and after the fit.
-    report_lines
-        Errors, acceptance and fit as text: the head of the parameter file.
-    summary_lines
-        The same for a terminal of 80 columns, the most important lines first.
-    poses
-        k poses, check poses among them.
-    assessments
-        Acceptance of each model; the last one is that of `fitted`.
-    held_out
-        Errors of the models on held-out poses, the nominal sensor first.
-    gravity_fit
-        The fit of a calibration against gravity.
-    outliers
-        Indices of the outliers, which the fit leaves out.
-    warnings
-        What is wrong with the poses or the fit, and why no richer model was fitted.
-
-    """
-
+    # nominal, fitted: The unit before and after the fit
     nominal: Sensor
     fitted: Sensor
-    report_lines: list[str]
+    report_lines: list[str]  # Errors, acceptance and fit as text: the head of the parameter file
+    # The same for a terminal of 80 columns, the most important lines first
     summary_lines: list[str]
-    poses: Poses
+    poses: Poses  # k poses, check poses among them
+    # Acceptance of each model; the last one is that of `fitted`
     assessments: tuple[Assessment, ...] = ()
+    # Errors of the models on held-out poses, the nominal sensor first
     held_out: tuple[HeldOutErrors, ...] = ()
-    gravity_fit: gravity.GravityFit | None = None
-    outliers: tuple[int, ...] = ()
+    gravity_fit: gravity.GravityFit | None = None  # The fit of a calibration against gravity
+    outliers: tuple[int, ...] = ()  # Indices of the outliers, which the fit leaves out
+    # What is wrong with the poses or the fit, and why no richer model was fitted
     warnings: tuple[str, ...] = ()
 
     def comments(self) -> list[str]:
@@ -284,32 +242,15 @@ def _without_angles_lines(poses: Poses) -> list[str]:
 
 @dataclass(frozen=True)
 class _StageFit:
-    """
-    A fit against the stage.
+    """A fit against the stage."""
 
-    Attributes
-    ----------
-    fitted
-        The fitted unit.
-    refit
-        Function that makes the same fit to other poses, for cross-validation.
-    report_lines
-        Report of a full fit.
-    refusals
-        Reasons why richer models are not fitted.
-    warnings
-        What is wrong with the poses or a full fit.
-    full
-        The full fit; None for other models.
-
-    """
-
-    fitted: Sensor
+    fitted: Sensor  # The fitted unit
+    # Function that makes the same fit to other poses, for cross-validation
     refit: cross_validation.Fit
-    report_lines: Sequence[str] = ()
-    refusals: Sequence[str] = ()
-    warnings: Sequence[str] = ()
-    full: FullFit | None = None
+    report_lines: Sequence[str] = ()  # Report of a full fit
+    refusals: Sequence[str] = ()  # Reasons why richer models are not fitted
+    warnings: Sequence[str] = ()  # What is wrong with the poses or a full fit
+    full: FullFit | None = None  # The full fit; None for other models
 
 
 def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None,

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Settings of a joint: the poses between which the stage has not moved it.
@@ -58,46 +46,12 @@ def angle_tolerance_rad(sensor: Sensor) -> float:
 
 def encoder_moved(low_rad: np.ndarray, high_rad: np.ndarray, mean_rad: np.ndarray,
                   tolerance_rad: float) -> np.ndarray:
-    """
-    Return whether the encoder has moved between poses; False without readings.
-
-    Parameters
-    ----------
-    low_rad, high_rad
-        Least and greatest reading between an earlier and a later pose, the mean of the later one
-        among them, rad; NaN where there is none.
-    mean_rad
-        Mean reading of the earlier pose, rad, of the same shape.
-    tolerance_rad
-        From `angle_tolerance_rad`.
-
-    Returns
-    -------
-    ndarray
-        True where the joint has moved, of the same shape.
-
-    """
+    """Return whether the encoder has moved between poses; False without readings."""
     return np.fmax(high_rad - mean_rad, mean_rad - low_rad) > tolerance_rad
 
 
 def command_moved(low_rad: np.ndarray, high_rad: np.ndarray, held_rad: np.ndarray) -> np.ndarray:
-    """
-    Return whether the command has moved between poses.
-
-    Parameters
-    ----------
-    low_rad, high_rad
-        Least and greatest command given between an earlier and a later pose, rad; NaN where none
-        was given.
-    held_rad
-        Command in force at the earlier pose, rad, of the same shape; NaN before the first one.
-
-    Returns
-    -------
-    ndarray
-        True where the command has moved, of the same shape.
-
-    """
+    """Return whether the command has moved between poses."""
     changed = np.fmax(high_rad - held_rad, held_rad - low_rad) > COMMAND_RAD
     return changed | (np.isnan(held_rad) & np.isfinite(high_rad))
 
@@ -107,21 +61,10 @@ def recorded_settings(rests: np.ndarray, readings_rad: np.ndarray | None,
     """
     Return the number of the setting of one joint in each rest of a recording, (k,) int.
 
-    Parameters
-    ----------
-    rests
-        First row and row after the last of each rest, (k, 2), in any order.
-    readings_rad, commands_rad
-        Encoder and command at each sample, rad, (n,); NaN where there is none. None for a joint
-        without them. A command stays in force until the next one.
-    tolerance_rad
-        From `angle_tolerance_rad`.
-
-    Returns
-    -------
-    ndarray
-        Numbers from 0 in the order of time, (k,) int.
-
+    rests: first row and row after the last of each rest, (k, 2), in any order; readings_rad,
+    commands_rad: encoder and command at each sample, rad, (n,); NaN where there is none. None for
+    a joint without them. A command stays in force until the next one.; returns: numbers from 0 in
+    the order of time, (k,) int.
     """
     order = np.argsort(rests[:, 0], kind='stable')
     start, stop = rests[order].T
@@ -171,15 +114,6 @@ class SettingTracker:
 
     Memory is bounded: since the last pose, readings older than the newest 20 000 are reduced to
     their extremes.
-
-    Parameters
-    ----------
-    tolerance_rad
-        From `angle_tolerance_rad`.
-    highest
-        Highest numbers that a sweep had given before it was interrupted. The first pose after an
-        interruption has new settings: power may have been cycled, and the stage may have moved.
-
     """
 
     def __init__(self, tolerance_rad: float, highest: tuple[int, int] = (-1, -1)) -> None:
@@ -190,31 +124,11 @@ class SettingTracker:
         self._unseen = True
 
     def read(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
-        """
-        Add an encoder reading.
-
-        Parameters
-        ----------
-        stamp_ns
-            Its stamp, ns.
-        alpha_rad, beta_rad
-            Angles, rad.
-
-        """
+        """Add an encoder reading."""
         self._readings.add(stamp_ns, (alpha_rad, beta_rad))
 
     def command(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
-        """
-        Add a command, which is in force from its stamp on.
-
-        Parameters
-        ----------
-        stamp_ns
-            Its stamp, ns.
-        alpha_rad, beta_rad
-            Angles, rad; NaN for a joint that is not commanded.
-
-        """
+        """Add a command, which is in force from its stamp on."""
         before = self._commands.newest
         new = tuple(a if np.isfinite(a) else b for a, b in zip((alpha_rad, beta_rad), before))
         if new != before:
@@ -232,22 +146,7 @@ class SettingTracker:
 
     def settings(self, start_ns: int, stop_ns: int, alpha_rad: float, beta_rad: float
                  ) -> tuple[int, int]:
-        """
-        Return the numbers of the settings of alpha and beta in the next pose.
-
-        Parameters
-        ----------
-        start_ns, stop_ns
-            Stamps of the first and the last sample of its rest, ns.
-        alpha_rad, beta_rad
-            Its mean angles, rad.
-
-        Returns
-        -------
-        tuple
-            Numbers of the settings of alpha and beta.
-
-        """
+        """Return the numbers of the settings of alpha and beta in the next pose."""
         middle_ns, mean = (start_ns + stop_ns) // 2, np.array([alpha_rad, beta_rad])
         low, high = self._readings.extremes(middle_ns)
         moved = encoder_moved(np.fmin(low, mean), np.fmax(high, mean), self._mean_rad,
@@ -258,15 +157,7 @@ class SettingTracker:
         return int(alpha), int(beta)
 
     def take(self, start_ns: int, stop_ns: int, alpha_rad: float, beta_rad: float) -> None:
-        """
-        Make a pose the newest one.
-
-        Parameters
-        ----------
-        start_ns, stop_ns, alpha_rad, beta_rad
-            As for `settings`.
-
-        """
+        """Make a pose the newest one."""
         self._settings = np.array(self.settings(start_ns, stop_ns, alpha_rad, beta_rad))
         mean = np.array([alpha_rad, beta_rad])
         self._mean_rad = np.where(np.isfinite(mean), mean, self._mean_rad)
@@ -276,21 +167,12 @@ class SettingTracker:
 
 
 class _Window:
-    """
-    Angles of two joints since the last pose.
-
-    Attributes
-    ----------
-    before
-        The last angles up to that pose, rad; NaN without any.
-    newest
-        The newest angles, rad.
-
-    """
+    """Angles of two joints since the last pose."""
 
     def __init__(self) -> None:
+        # The last angles up to that pose, rad; NaN without any
         self.before: tuple[float, ...] = (float('nan'), float('nan'))
-        self.newest: tuple[float, ...] = self.before
+        self.newest: tuple[float, ...] = self.before  # The newest angles, rad
         self._recent: deque[tuple[int, tuple[float, ...]]] = deque()
         self._older = np.full((2, 2), np.nan)
 
@@ -298,13 +180,7 @@ class _Window:
         """
         Append angles.
 
-        Parameters
-        ----------
-        stamp_ns
-            Their stamp, ns.
-        angles_rad
-            Angles of both joints, rad, (2,).
-
+        angles_rad: angles of both joints, rad, (2,).
         """
         self.newest = angles_rad
         self._recent.append((stamp_ns, angles_rad))

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Poses from recordings: rests, their means, angles and settings."""
 
@@ -36,27 +24,7 @@ _MIN_SAMPLES = 0.9
 
 
 def named_rests(recording: Recording, records: Sequence[PoseRecord]) -> list[Rest]:
-    """
-    Find the rows of the rests that a journal names by their first and last stamp.
-
-    Parameters
-    ----------
-    recording
-        The recording of the run.
-    records
-        Poses of the journal of the run.
-
-    Returns
-    -------
-    list
-        One rest for each pose.
-
-    Raises
-    ------
-    UserError
-        The recording lacks more than a tenth of the samples of a pose.
-
-    """
+    """Find the rows of the rests that a journal names by their first and last stamp."""
     stamps = recording.stamp_ns
     rests = []
     for number, record in enumerate(records, 1):
@@ -73,30 +41,7 @@ def named_rests(recording: Recording, records: Sequence[PoseRecord]) -> list[Res
 
 def extract_poses(recording: Recording, sensor: Sensor,
                   records: Sequence[PoseRecord] | None = None) -> Poses:
-    """
-    Find the rests of a recording, or take those of a journal, and average each.
-
-    Parameters
-    ----------
-    recording
-        A whole recording.
-    sensor
-        The unit of the recording, from `stream_unit.recorded_unit`.
-    records
-        Poses of the journal of the run. They name the rests, the angles, the settings of the
-        joints and the check poses.
-
-    Returns
-    -------
-    Poses
-        One pose for each rest.
-
-    Raises
-    ------
-    UserError
-        There is no rest, or the journal is of another recording.
-
-    """
+    """Find the rests of a recording, or take those of a journal, and average each."""
     volts, angles = recording.volts(sensor), recording.stage_angles
     noise = datasheet_noise(sensor)
     if records is None:
@@ -160,24 +105,7 @@ def _rest_means(values: np.ndarray | None, rests: Sequence[Rest]) -> np.ndarray:
 
 def estimate_filters(recording: Recording, sensor: Sensor, poses: Poses
                      ) -> list[filter_time_constant.FilterNoise | None]:
-    """
-    Estimate the output filter of each axis from the noise of the poses.
-
-    Parameters
-    ----------
-    recording
-        The recording of the poses.
-    sensor
-        The unit of the recording.
-    poses
-        Poses from `extract_poses`.
-
-    Returns
-    -------
-    list
-        Estimate of each axis; None where the noise does not show the filter.
-
-    """
+    """Estimate the output filter of each axis from the noise of the poses."""
     volts = recording.volts(sensor)
     first, last = np.searchsorted(recording.time_s, poses.time_s.T)
     gapless = []

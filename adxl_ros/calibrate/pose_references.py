@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Poses whose angles a table states, and poses without angles."""
 
@@ -27,29 +15,7 @@ noted by hand is not exact)."""
 
 
 def with_table_angles(poses: Poses, table: PoseTable, epoch_ns: int) -> Poses:
-    """
-    Give rests the angles of a table.
-
-    Parameters
-    ----------
-    poses
-        k rests of a recording.
-    table
-        The angles.
-    epoch_ns
-        Origin of the recording's times, ns.
-
-    Returns
-    -------
-    Poses
-        The rests; the angles of a rest that the table does not name are NaN.
-
-    Raises
-    ------
-    UserError
-        The table has another number of poses than there are rests, or none of them is named.
-
-    """
+    """Give rests the angles of a table."""
     if table.span_s is None:
         if len(table.angles_rad) != len(poses):
             raise UserError(

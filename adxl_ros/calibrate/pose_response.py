@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Predicted volts of poses on a stage, and their Jacobians."""
 
@@ -47,20 +35,7 @@ def predicted_volts(unit: Sensor, poses: Poses, shift_rad: tuple[float, float] =
     """
     Predict the mean output of a unit in poses.
 
-    Parameters
-    ----------
-    unit
-        A sensor with its effects, those of the stage among them.
-    poses
-        k poses with angles, temperature and supply.
-    shift_rad
-        Angles that are added to alpha and beta of all poses, rad.
-
-    Returns
-    -------
-    ndarray
-        Volts, (k, m).
-
+    returns: volts, (k, m).
     """
     force = stage_force(unit, poses.alpha_rad + shift_rad[0], poses.beta_rad + shift_rad[1])
     return np.column_stack(signal_chain.static_response(unit)(force, poses.environment))
@@ -70,18 +45,8 @@ def stage_force(unit: Sensor, alpha_rad: np.ndarray, beta_rad: np.ndarray) -> Co
     """
     Return the specific force at rest on a stage with the stage effects of a unit.
 
-    Parameters
-    ----------
-    unit
-        A sensor with its local gravity and with effects of the stage.
-    alpha_rad, beta_rad
-        Angles of the encoder, rad, (k,).
-
-    Returns
-    -------
-    list
-        Three components in the case frame, m/s², (k,).
-
+    alpha_rad, beta_rad: angles of the encoder, rad, (k,); returns: three components in the case
+    frame, m/s², (k,).
     """
     signals = Signals(NOMINAL_ENVIRONMENT, alpha=Joint(alpha_rad), beta=Joint(beta_rad),
                       up=list(UPRIGHT), gravity_mps2=unit.local_gravity_mps2)
@@ -95,16 +60,7 @@ def angle_jacobian(unit: Sensor, poses: Poses) -> np.ndarray:
     """
     Differentiate the predicted volts by alpha and beta.
 
-    Parameters
-    ----------
-    unit, poses
-        As for `predicted_volts`.
-
-    Returns
-    -------
-    ndarray
-        Jacobian, V/rad, (k, m, 2).
-
+    returns: jacobian, V/rad, (k, m, 2).
     """
     def slope(alpha_rad: float, beta_rad: float) -> np.ndarray:
         above = predicted_volts(unit, poses, (alpha_rad, beta_rad))
@@ -118,18 +74,7 @@ def coefficient_jacobian(unit: Sensor, poses: Poses, names: Sequence[Coefficient
     """
     Differentiate the predicted volts by coefficients.
 
-    Parameters
-    ----------
-    unit, poses
-        As for `predicted_volts`.
-    names
-        Coefficients, (p,).
-
-    Returns
-    -------
-    ndarray
-        Jacobian, V per unit of the coefficient, (k, m, p).
-
+    names: coefficients, (p,); returns: jacobian, V per unit of the coefficient, (k, m, p).
     """
     def slope(name: Coefficient) -> np.ndarray:
         value, step = get(unit, [name]), _COEFFICIENT_STEP * parameter_of(name).scale
@@ -145,21 +90,6 @@ def volts_covariance(unit: Sensor, poses: Poses, error: StageError,
     """
     Return the covariance of the volts of all poses about the model.
 
-    Parameters
-    ----------
-    unit
-        Sensor at whose coefficients the volts are differentiated by the angles.
-    poses
-        Noise of the means, angles and settings of k poses.
-    error
-        Standard deviations of the stage's error.
-    kept
-        Poses that count, (k,) bool; None for all.
-
-    Returns
-    -------
-    PoseCovariance
-        Covariance of k·m volts.
-
+    kept: poses that count, (k,) bool; None for all.
     """
     return PoseCovariance(angle_jacobian(unit, poses), poses, shared_settings(poses), error, kept)

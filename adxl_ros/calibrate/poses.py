@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Poses: mean output at rest with the angles of the stage's encoder."""
 
@@ -32,36 +20,24 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Poses:
-    """
-    k poses of one unit with m measured axes.
+    """k poses of one unit with m measured axes."""
 
-    Attributes
-    ----------
-    volts, std_v
-        Mean output of each measured axis and the standard deviation of that mean, V, (k, m).
-    alpha_rad, beta_rad
-        Angles of the stage's encoder, unwrapped, (k,); NaN without a stage.
-    time_s
-        Beginning and end of each rest, s, (k, 2).
-    check
-        True for a pose that the fit does not use, so that it can show the error, (k,).
-    temperature_c, supply_v
-        Means over each rest, (k,); NaN where they were not measured.
-    alpha_setting, beta_setting
-        Number of the setting of each joint, (k,) int. Poses of one setting share the error of the
-        joint; see `joint_settings`. By default each change of the angle from one pose to the next
-        in time begins a setting.
-
-    """
-
+    # volts, std_v: Mean output of each measured axis and the standard deviation of that mean, V,
+    # (k, m)
     volts: np.ndarray
     std_v: np.ndarray
+    # alpha_rad, beta_rad: Angles of the stage's encoder, unwrapped, (k,); NaN without a stage
     alpha_rad: np.ndarray
     beta_rad: np.ndarray
-    time_s: np.ndarray
+    time_s: np.ndarray  # Beginning and end of each rest, s, (k, 2)
+    # True for a pose that the fit does not use, so that it can show the error, (k,)
     check: np.ndarray
+    # temperature_c, supply_v: Means over each rest, (k,); NaN where they were not measured
     temperature_c: np.ndarray = None  # type: ignore[assignment]
     supply_v: np.ndarray = None  # type: ignore[assignment]
+    # alpha_setting, beta_setting: Number of the setting of each joint, (k,) int. Poses of one
+    # setting share the error of the joint; see `joint_settings`. By default each change of the
+    # angle from one pose to the next in time begins a setting.
     alpha_setting: np.ndarray = None  # type: ignore[assignment]
     beta_setting: np.ndarray = None  # type: ignore[assignment]
 
@@ -85,21 +61,9 @@ class Poses:
         """
         Make poses that have not been measured: their volts and times are 0.
 
-        Parameters
-        ----------
-        alpha_rad, beta_rad
-            Joint angles, (k,).
-        std_v
-            Noise of the mean of a pose, V, (m,), or of each pose, (k, m).
-        setting
-            Number of the setting of both joints, (k,) int. By default each change of an angle
-            begins a setting.
-
-        Returns
-        -------
-        Poses
-            k poses, which may be none.
-
+        alpha_rad, beta_rad: joint angles, (k,); std_v: noise of the mean of a pose, V, (m,), or of
+        each pose, (k, m); setting: number of the setting of both joints, (k,) int. By default each
+        change of an angle begins a setting.
         """
         count = len(alpha_rad)
         noise_v = np.broadcast_to(std_v, (count, np.shape(std_v)[-1])).copy()
@@ -176,39 +140,13 @@ def reference_force(poses: Poses, gravity_mps2: float) -> Components:
     """
     Return the specific force at the angles of the encoder, on a stage without errors.
 
-    Parameters
-    ----------
-    poses
-        k poses with angles.
-    gravity_mps2
-        Local gravity, m/s².
-
-    Returns
-    -------
-    list
-        Three components in the case frame, m/s², (k,).
-
+    returns: three components in the case frame, m/s², (k,).
     """
     return specific_force(poses.alpha_rad, poses.beta_rad, gravity_mps2)
 
 
 def check_polarity(sensor: Sensor, poses: Poses) -> None:
-    """
-    Refuse a unit with an inverted axis or with swapped axes.
-
-    Parameters
-    ----------
-    sensor
-        Axes and local gravity of the unit.
-    poses
-        Poses on the stage. Fewer than two poses are not checked.
-
-    Raises
-    ------
-    UserError
-        An axis moves against its reference, or follows the reference of another axis.
-
-    """
+    """Refuse a unit with an inverted axis or with swapped axes."""
     if len(poses) < 2:
         return
     reference = reference_force(poses, sensor.local_gravity_mps2)

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Provenance of a calibration and its validity range, as the parameter file has them."""
 
@@ -40,28 +28,7 @@ _MAX_PLANES_LISTED = 12
 
 def with_provenance(fitted: Sensor, source: str, poses: Poses, data_sha256: str,
                     results: Mapping[str, str]) -> Sensor:
-    """
-    Add date, sources, sweep, data hash, results and id to a fitted unit.
-
-    Parameters
-    ----------
-    fitted
-        The fitted unit.
-    source
-        Names of the recordings.
-    poses
-        All poses, check poses among them.
-    data_sha256
-        Hash of the recordings' files; empty takes the hash of the poses.
-    results
-        Further entries.
-
-    Returns
-    -------
-    Sensor
-        The unit with its provenance.
-
-    """
+    """Add date, sources, sweep, data hash, results and id to a fitted unit."""
     entries = {
         **{key: text for key, text in fitted.provenance.items() if key.endswith('_from')},
         # A text of YAML, where +00:00 makes a date, which ros2 param cannot set.
@@ -113,22 +80,7 @@ def envelope(fitted: Sensor, force: np.ndarray, poses: Poses, misfit_mps2: float
     """
     Return the validity range of a calibration.
 
-    Parameters
-    ----------
-    fitted
-        The fitted unit with its covariance.
-    force
-        Specific force of k poses, check poses among them, m/s², (k, 3).
-    poses
-        The poses with their temperatures.
-    misfit_mps2
-        Rms error of the model on these poses beyond noise and stage, m/s².
-
-    Returns
-    -------
-    Envelope
-        Ranges of temperature and force, and how the error grows beyond them.
-
+    force: specific force of k poses, check poses among them, m/s², (k, 3).
     """
     finite_c = poses.temperature_c[np.isfinite(poses.temperature_c)]
     rest_leverage = leverage(fitted)

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Check that several recordings are of one unit in one mounting."""
 
@@ -46,21 +34,6 @@ def require_one_mounting(full: FullFit, parts: Sequence[Poses], names: Sequence[
 
     A turn of the case and a shift of the zero-g of each axis are fitted by least squares to the
     residuals of each recording about the common fit.
-
-    Parameters
-    ----------
-    full
-        The fit of all recordings.
-    parts
-        Poses of each recording.
-    names
-        Name of each recording.
-
-    Raises
-    ------
-    UserError
-        The message names the recording, and the turn or shift with its standard deviations.
-
     """
     axes = full.unit.axes
     limits = np.repeat([_MAX_TURN_RAD, _MAX_ZERO_G_SHIFT_G], [3, len(axes)])

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The error of the stage's angles: one part for each setting of a joint, one part for each pose.
@@ -44,22 +32,12 @@ _MIN_VARIANCE_RAD2 = 1e-24
 
 @dataclass(frozen=True)
 class StageError:
-    """
-    Standard deviations of the error of a joint.
+    """Standard deviations of the error of a joint."""
 
-    Attributes
-    ----------
-    setting_rad
-        Standard deviation of the part that the poses of one setting share, σ_s, rad.
-    pose_rad
-        Standard deviation of the part that is new with each pose, σ_p, rad.
-    ratio
-        Standard deviation of alpha over the geometric mean of those of alpha and beta, r.
-
-    """
-
+    # Standard deviation of the part that the poses of one setting share, σ_s, rad
     setting_rad: float
-    pose_rad: float = 0.0
+    pose_rad: float = 0.0  # Standard deviation of the part that is new with each pose, σ_p, rad
+    # Standard deviation of alpha over the geometric mean of those of alpha and beta, r
     ratio: float = 1.0
 
     @property
@@ -74,56 +52,26 @@ class StageError:
 
 
 class SharedSettings(NamedTuple):
-    """
-    Settings that several poses share.
+    """Settings that several poses share."""
 
-    Attributes
-    ----------
-    number
-        Column of the setting of each joint, (k, 2); −1 where no other pose shares it.
-    columns
-        Number of shared settings, q.
-
-    """
-
+    # Column of the setting of each joint, (k, 2); −1 where no other pose shares it
     number: np.ndarray
-    columns: int
+    columns: int  # Number of shared settings, q
 
 
 class NormalEquations(NamedTuple):
-    """
-    Normal equations of a generalised least-squares problem.
+    """Normal equations of a generalised least-squares problem."""
 
-    Attributes
-    ----------
-    information
-        XᵀS⁻¹X of the design X, (p, p).
-    gradient
-        XᵀS⁻¹r of the residuals r, (p,).
-
-    """
-
-    information: np.ndarray
-    gradient: np.ndarray
+    information: np.ndarray  # XᵀS⁻¹X of the design X, (p, p)
+    gradient: np.ndarray  # XᵀS⁻¹r of the residuals r, (p,)
 
 
 class PoseCovariance:
     """
     The covariance S of the volts of k poses with m axes about the model, as an operator.
 
-    Parameters
-    ----------
-    jacobian
-        Derivatives of the volts by alpha and beta, V/rad, (k, m, 2).
-    poses
-        The poses; `std_v` is used.
-    shared
-        From `shared_settings` of the poses.
-    error
-        Standard deviations of the stage's error.
-    kept
-        Poses that count, (k,) bool; the others have no weight.
-
+    jacobian: derivatives of the volts by alpha and beta, V/rad, (k, m, 2); kept: poses that count,
+    (k,) bool; the others have no weight.
     """
 
     def __init__(self, jacobian: np.ndarray, poses: Poses, shared: SharedSettings,
@@ -180,18 +128,8 @@ class PoseCovariance:
         """
         Return the normal equations of a linear model of the volts.
 
-        Parameters
-        ----------
-        design
-            Derivatives of the volts, (k, m, p).
-        residual
-            Measured volts minus predicted volts, V, (k, m).
-
-        Returns
-        -------
-        NormalEquations
-            Information and gradient of p parameters.
-
+        design: derivatives of the volts, (k, m, p); residual: measured volts minus predicted
+        volts, V, (k, m).
         """
         products = self.products(np.concatenate([design, residual[:, :, None]], axis=2))
         return NormalEquations(products[:-1, :-1], products[:-1, -1])
@@ -218,16 +156,7 @@ class PoseCovariance:
         """
         Predict the angle errors from the residuals (best linear unbiased prediction).
 
-        Parameters
-        ----------
-        residual
-            Measured volts minus the predicted volts at the encoder's angles, V, (k, m).
-
-        Returns
-        -------
-        AngleErrors
-            Errors of both joints in each pose, ε = σ²·Jᵀ·B⁻¹·(residual − settings).
-
+        residual: measured volts minus the predicted volts at the encoder's angles, V, (k, m).
         """
         by_setting = self._solve_settings(
             self._white_settings.T @ self.whiten_by_pose(residual[:, :, None]))
@@ -244,24 +173,14 @@ class PoseCovariance:
 
 @dataclass(frozen=True)
 class AngleErrors:
-    """
-    Predicted errors of alpha and beta in k poses.
+    """Predicted errors of alpha and beta in k poses."""
 
-    Attributes
-    ----------
-    setting_rad, pose_rad
-        Parts of the error by setting and by pose, rad, (k, 2).
-    squared_distances
-        Squared Mahalanobis distance of each pose from the model, given its settings, (k,).
-    setting_penalty
-        Sum of the squared errors of the settings over σ_s².
-
-    """
-
+    # setting_rad, pose_rad: Parts of the error by setting and by pose, rad, (k, 2)
     setting_rad: np.ndarray
     pose_rad: np.ndarray
+    # Squared Mahalanobis distance of each pose from the model, given its settings, (k,)
     squared_distances: np.ndarray
-    setting_penalty: float
+    setting_penalty: float  # Sum of the squared errors of the settings over σ_s²
 
     @classmethod
     def zeros(cls, count: int) -> AngleErrors:
@@ -274,22 +193,7 @@ class AngleErrors:
         return self.setting_rad + self.pose_rad
 
     def interpolated(self, other: AngleErrors, share: float) -> AngleErrors:
-        """
-        Return errors between these and others.
-
-        Parameters
-        ----------
-        other
-            Errors in the same poses.
-        share
-            0 gives these errors, 1 the others.
-
-        Returns
-        -------
-        AngleErrors
-            Interpolated errors, with the distances of the others.
-
-        """
+        """Return errors between these and others."""
         return replace(
             other,
             setting_rad=self.setting_rad + share * (other.setting_rad - self.setting_rad),

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Calibration over temperature: blocks of a resting sensor in, its parameter file out."""
 
@@ -50,23 +38,7 @@ Chosen: neither form is exact."""
 
 
 def rest_blocks(recording: Recording, unit: Sensor) -> Poses | None:
-    """
-    Cut a recording of a resting sensor into blocks with a temperature.
-
-    Parameters
-    ----------
-    recording
-        A whole recording.
-    unit
-        The nominal sensor of the recording.
-
-    Returns
-    -------
-    Poses or None
-        One pose for each block at rest; None where there is no temperature, or more than one
-        orientation.
-
-    """
+    """Cut a recording of a resting sensor into blocks with a temperature."""
     temperature_c = recording.columns.get('temperature_c')
     if temperature_c is None or not np.isfinite(temperature_c).any():
         return None
@@ -111,33 +83,7 @@ def calibrated_temperature_c(base: Sensor) -> float:
 
 def calibrate(base: Sensor, poses: Poses, source: str, data_sha256: str = '',
               range_c: tuple[float, float] | None = None) -> CalibrationResult:
-    """
-    Fit zero-g over temperature, and the slope of the scale factor where orientations allow.
-
-    Parameters
-    ----------
-    base
-        The unit as it is calibrated at one temperature.
-    poses
-        Blocks at rest with a temperature.
-    source
-        Name of the recording.
-    data_sha256
-        Hash of the recording's file. Empty takes the hash of the poses.
-    range_c
-        Wanted range of temperature, °C; None for that of the blocks.
-
-    Returns
-    -------
-    CalibrationResult
-        The unit with the effects of temperature added to its parameter file.
-
-    Raises
-    ------
-    UserError
-        The blocks are too few, or the temperature hardly changes.
-
-    """
+    """Fit zero-g over temperature, and the slope of the scale factor where orientations allow."""
     blocks = blocks_of(poses)
     fit = thermal_fit.fit(base, blocks)
     calibrated_c = calibrated_temperature_c(base)

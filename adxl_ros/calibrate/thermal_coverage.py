@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Which parts of a wanted range the temperature has passed, and the error to expect there."""
 
@@ -34,24 +22,13 @@ thermometer."""
 
 @dataclass(frozen=True)
 class Passed:
-    """
-    Parts of the wanted range that the temperature has passed.
+    """Parts of the wanted range that the temperature has passed."""
 
-    Attributes
-    ----------
-    middles_c
-        Middle of each part, °C, (parts,).
-    warming, cooling
-        Whether the temperature has passed it in that direction, (parts,) bool.
-    rises
-        Whether the temperature rose last.
-
-    """
-
-    middles_c: np.ndarray
+    middles_c: np.ndarray  # Middle of each part, °C, (parts,)
+    # warming, cooling: Whether the temperature has passed it in that direction, (parts,) bool
     warming: np.ndarray
     cooling: np.ndarray
-    rises: bool
+    rises: bool  # Whether the temperature rose last
 
     @property
     def complete(self) -> bool:
@@ -79,18 +56,7 @@ def passed(temperatures_c: np.ndarray, range_c: tuple[float, float]) -> Passed:
     """
     Return which parts of a range the temperature has passed.
 
-    Parameters
-    ----------
-    temperatures_c
-        Temperatures in the order of time, °C, (k,).
-    range_c
-        The wanted range, °C.
-
-    Returns
-    -------
-    Passed
-        Parts by direction.
-
+    temperatures_c: temperatures in the order of time, °C, (k,).
     """
     low_c, high_c = range_c
     middles_c = low_c + (high_c - low_c) * (np.arange(PARTS) + 0.5) / PARTS
@@ -109,21 +75,6 @@ def expected_error_mg(fit: ThermalFit, covered: Passed, calibrated_c: float) -> 
     Return the expected error of the zero-g of the worst axis at the worst part of a range.
 
     A part that is not passed in both directions may have a loop of typical width.
-
-    Parameters
-    ----------
-    fit
-        Zero-g over temperature.
-    covered
-        What is passed of the range.
-    calibrated_c
-        Temperature at which the zero-g is calibrated, °C.
-
-    Returns
-    -------
-    float
-        Standard deviation, mg.
-
     """
     typical_g = parameter_of(Coefficient('thermal_hysteresis', 'half_width_g', 'x')).scale
     unseen_g = np.where(covered.warming & covered.cooling, 0.0, typical_g)

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Coefficients as text, with the digits that their intervals allow."""
 
 _MOST_DECIMALS = 7
@@ -28,43 +16,13 @@ def decimals(half_width: float) -> int:
 
 
 def with_half_width(value: float, half_width: float) -> str:
-    """
-    Write a value and half of its interval, without an exponent.
-
-    Parameters
-    ----------
-    value
-        The value.
-    half_width
-        Half of its interval, in the same unit.
-
-    Returns
-    -------
-    str
-        Both with two digits of the interval.
-
-    """
+    """Write a value and half of its interval, without an exponent."""
     places = decimals(half_width)
     return f'{round(value, places) + 0.0:.{places}f} +- {half_width:.{places}f}'
 
 
 def counted(number: int, noun: str) -> str:
-    """
-    Return a number of things.
-
-    Parameters
-    ----------
-    number
-        The number.
-    noun
-        Its noun, whose plural ends in s.
-
-    Returns
-    -------
-    str
-        Both.
-
-    """
+    """Return a number of things."""
     return f'{number} {noun}{"" if number == 1 else "s"}'
 
 

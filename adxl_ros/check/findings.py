@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The findings of `check`: faults of a recording, remarks, and what other tools can do with it."""
 
@@ -54,53 +42,23 @@ _FEWEST_STAGE_POSES = 4
 
 @dataclass(frozen=True)
 class Ability:
-    """
-    What a tool can do with a recording.
+    """What a tool can do with a recording."""
 
-    Attributes
-    ----------
-    tool
-        Name of the tool.
-    is_able
-        Whether it can do its task.
-    reason
-        What it uses, or what is missing, for people.
-
-    """
-
-    tool: str
-    is_able: bool
-    reason: str
+    tool: str  # Name of the tool
+    is_able: bool  # Whether it can do its task
+    reason: str  # What it uses, or what is missing, for people
 
 
 @dataclass(frozen=True)
 class Findings:
-    """
-    The check of a recording.
+    """The check of a recording."""
 
-    Attributes
-    ----------
-    path
-        The recording.
-    contents
-        What it holds; None where it cannot be read.
-    faults
-        Why it is not sound, one line each.
-    remarks
-        What else is noteworthy, one line each.
-    abilities
-        What the tools can do with it.
-    paste
-        End of the last fault that is for a command line; empty for none.
-
-    """
-
-    path: str
-    contents: RecordingContents | None
-    faults: tuple[str, ...]
-    remarks: tuple[str, ...] = ()
-    abilities: tuple[Ability, ...] = ()
-    paste: str = ''
+    path: str  # The recording
+    contents: RecordingContents | None  # What it holds; None where it cannot be read
+    faults: tuple[str, ...]  # Why it is not sound, one line each
+    remarks: tuple[str, ...] = ()  # What else is noteworthy, one line each
+    abilities: tuple[Ability, ...] = ()  # What the tools can do with it
+    paste: str = ''  # End of the last fault that is for a command line; empty for none
 
     @property
     def is_sound(self) -> bool:

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The check of one recording, read in blocks."""
 
@@ -36,26 +24,7 @@ BLOCK_ROWS = 65536
 
 def check_recording(path: str, params: str | None, reading: ReadingOptions,
                     show: Callable[[float], None] = lambda done: None) -> Findings:
-    """
-    Return the findings of a recording; one that cannot be read is not sound.
-
-    Parameters
-    ----------
-    path
-        The recording.
-    params
-        The parameter file of its sensor; None takes the nominal sensor.
-    reading
-        How it is to be read. Samples whose stamp does not increase must be left out.
-    show
-        Receives the fraction that has been read.
-
-    Returns
-    -------
-    Findings
-        Contents, faults, and what the tools can do with it.
-
-    """
+    """Return the findings of a recording; one that cannot be read is not sound."""
     try:
         delay = None
         if has_log_times(path) and reading.rate_hz is None:

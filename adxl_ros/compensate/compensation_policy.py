@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The decisions of a live compensation: which calibration applies, to whose stream, and where."""
 
@@ -59,33 +47,16 @@ class State(Enum):
 
 
 class Status(NamedTuple):
-    """
-    State of a compensated stream.
+    """State of a compensated stream."""
 
-    Attributes
-    ----------
-    state
-        The state.
-    text
-        The state in one line for people, with its reason.
-
-    """
-
-    state: State
-    text: str
+    state: State  # The state
+    text: str  # The state in one line for people, with its reason
 
 
 class Topics(NamedTuple):
-    """
-    Full names of the topics, for messages.
+    """Full names of the topics, for messages."""
 
-    Attributes
-    ----------
-    data_raw, sensor_info, temperature, supply
-        Name of the topic.
-
-    """
-
+    # data_raw, sensor_info, temperature, supply: Name of the topic
     data_raw: str
     sensor_info: str
     temperature: str
@@ -94,32 +65,16 @@ class Topics(NamedTuple):
 
 @dataclass(frozen=True)
 class Interval:
-    """
-    What a stream has shown since the last report.
+    """What a stream has shown since the last report."""
 
-    Attributes
-    ----------
-    duration_s
-        Length of the interval, s.
-    counts
-        Samples in the interval, by the names of `live_stream.COUNTS`.
-    outside
-        What the newest sample outside of the calibrated range exceeds, in words.
-    surroundings
-        Temperature, °C, and supply, V, that the inverse uses, by name.
-    ages_s
-        Time since each of them was heard, s, by name.
-    obstacle
-        Why the sensor of the samples is still unknown, or ''.
-
-    """
-
-    duration_s: float
-    counts: Mapping[str, int]
+    duration_s: float  # Length of the interval, s
+    counts: Mapping[str, int]  # Samples in the interval, by the names of `live_stream.COUNTS`
+    # What the newest sample outside of the calibrated range exceeds, in words
     outside: tuple[str, ...]
+    # Temperature, °C, and supply, V, that the inverse uses, by name
     surroundings: Mapping[str, float]
-    ages_s: Mapping[str, float]
-    obstacle: str = ''
+    ages_s: Mapping[str, float]  # Time since each of them was heard, s, by name
+    obstacle: str = ''  # Why the sensor of the samples is still unknown, or ''
 
 
 class CompensationPolicy:
@@ -129,39 +84,18 @@ class CompensationPolicy:
     A calibration that is named stands. Otherwise the newest one of the unit in the store applies,
     as soon as the stream states its serial number.
 
-    Parameters
-    ----------
-    paper
-        Whether the paper's inverse is used, which needs the axes x and y.
-    store
-        Folder of calibrations; empty for none.
-    topics
-        Names of the topics.
-
-    Attributes
-    ----------
-    sensor
-        The sensor whose coefficients are used.
-    source
-        Where the coefficients come from.
-    stored_path
-        File that was taken from the store, '' if none was.
-    info
-        What the stream states of itself (`sensor_info`), None before it does.
-    mixture
-        That several nodes publish the samples, so that none counts, or ''.
-    refusal
-        Why the sensor cannot correct the stream, or ''.
-
+    mixture: that several nodes publish the samples, so that none counts, or ''; refusal: why the
+    sensor cannot correct the stream, or ''.
     """
 
-    sensor: Sensor
-    source: str
+    sensor: Sensor  # The sensor whose coefficients are used
+    source: str  # Where the coefficients come from
 
     def __init__(self, paper: bool, store: str, topics: Topics) -> None:
         self._paper, self._store, self._topics = paper, store, topics
         self._warnings: set[str] = set()
-        self.stored_path = ''
+        self.stored_path = ''  # File that was taken from the store, '' if none was
+        # What the stream states of itself (`sensor_info`), None before it does
         self.info: StreamInfo | None = None
         self.refusal = self.mixture = ''
 
@@ -176,16 +110,7 @@ class CompensationPolicy:
         return stated_hz or self.sensor.rate_hz
 
     def check(self, sensor: Sensor) -> None:
-        """
-        Refuse a sensor that cannot correct the stream.
-
-        Raises
-        ------
-        UserError
-            The sensor lacks an axis of the paper's inverse, belongs to another unit than the
-            stream, or the stream states no sample rate.
-
-        """
+        """Refuse a sensor that cannot correct the stream."""
         if self._paper and sensor.axes == 'x':
             raise UserError("inverse: the paper's needs the axes x and y, the sensor has x")
         if self.info is not None:
@@ -193,22 +118,7 @@ class CompensationPolicy:
             _ = self.info.rate_hz  # raises where it is no rate
 
     def use(self, sensor: Sensor, source: str) -> str:
-        """
-        Apply a sensor from now on.
-
-        Parameters
-        ----------
-        sensor
-            The sensor, with its coefficients.
-        source
-            Where they come from.
-
-        Returns
-        -------
-        str
-            What is used, in one line.
-
-        """
+        """Apply a sensor from now on."""
         self.sensor, self.source = sensor, source
         model = f'{sensor.serial}, model {sensor.model}' if sensor.effects else \
             f'{sensor.serial}, which is not calibrated'
@@ -228,20 +138,7 @@ class CompensationPolicy:
         return calibration != self.stored_path if calibration else bool(self.sensor.effects)
 
     def choose(self, calibration: str) -> tuple[str, list[str]]:
-        """
-        Choose the newest calibration of the stream's unit, unless one was named.
-
-        Parameters
-        ----------
-        calibration
-            Value of the parameter `calibration`.
-
-        Returns
-        -------
-        tuple
-            The file that is to be used, '' if nothing changes; and new warnings about the store.
-
-        """
+        """Choose the newest calibration of the stream's unit, unless one was named."""
         serial = self.info.serial if self.info else NO_UNIT
         if not self._store or serial == NO_UNIT or self.is_named(calibration):
             return '', []
@@ -266,24 +163,7 @@ class CompensationPolicy:
         return calibration_store.newer(self._store, sensor)
 
     def status(self, interval: Interval, newer: Path | None, calibration: str) -> Status:
-        """
-        Return the state of the stream.
-
-        Parameters
-        ----------
-        interval
-            What the stream has shown since the last report.
-        newer
-            A newer calibration in the store, as `newer` returns it.
-        calibration
-            Value of the parameter `calibration`.
-
-        Returns
-        -------
-        Status
-            The first state that holds.
-
-        """
+        """Return the state of the stream."""
         counts = interval.counts
         if self.refusal:
             return Status(State.REFUSED, f'publishing nothing: {self.refusal}')
@@ -333,22 +213,7 @@ class CompensationPolicy:
         return ''
 
     def values(self, interval: Interval, newer: Path | None) -> dict[str, Any]:
-        """
-        Return what diagnostics report of the calibration in use.
-
-        Parameters
-        ----------
-        interval
-            What the stream has shown since the last report.
-        newer
-            A newer calibration in the store, as `newer` returns it.
-
-        Returns
-        -------
-        dict
-            Values by key.
-
-        """
+        """Return what diagnostics report of the calibration in use."""
         sensor = self.sensor
         age_days = _age_days(sensor) if sensor.effects else None
         return {

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Inversion of the RC filter: u = v + RC·dv/dt, in amplitude and phase.
@@ -57,22 +45,8 @@ def undo(volts: np.ndarray, time_s: np.ndarray, rc_s: np.ndarray, rate_hz: float
     Near the ends of the series, and near gaps, the difference uses as many neighbours as both
     sides have. A sample without a neighbour on one side stays as it is.
 
-    Parameters
-    ----------
-    volts
-        Volts behind the filter, V, (n, m).
-    time_s
-        Stamps, s, (n,).
-    rc_s
-        Time constants of the filter by axis, s, (m,).
-    rate_hz
-        Sample rate, Hz.
-
-    Returns
-    -------
-    ndarray
-        Volts before the filter, V, (n, m).
-
+    volts: volts behind the filter, V, (n, m); time_s: stamps, s, (n,); rc_s: time constants of the
+    filter by axis, s, (m,); returns: volts before the filter, V, (n, m).
     """
     distance = np.diff(time_s) * rate_hz
     breaks = np.concatenate([[0], np.flatnonzero(~((distance > 0) & (distance < MAX_GAP))) + 1,
@@ -94,20 +68,9 @@ def undo_blocks(blocks: Iterable[tuple[Token, np.ndarray, np.ndarray]], rc_s: np
     """
     Undo the filter block by block, with the result of `undo` for the whole.
 
-    Parameters
-    ----------
-    blocks
-        For each block: a token, stamps, s, (n,), and volts behind the filter, V, (n, m).
-    rc_s
-        Time constants of the filter by axis, s, (m,).
-    rate_hz
-        Sample rate, Hz.
-
-    Yields
-    ------
-    tuple
-        For each block: its token, and volts before the filter, V, (n, m).
-
+    blocks: for each block: a token, stamps, s, (n,), and volts behind the filter, V, (n, m); rc_s:
+    time constants of the filter by axis, s, (m,); yields: for each block: its token, and volts
+    before the filter, V, (n, m).
     """
     previous_s, previous_v = np.empty(0), np.empty((0, len(rc_s)))
     current = None
@@ -150,13 +113,7 @@ class DelayedInversion:
         """
         Prepare for a stream.
 
-        Parameters
-        ----------
-        rc_s
-            Time constants of the filter by axis, s, (m,).
-        rate_hz
-            Sample rate, Hz.
-
+        rc_s: time constants of the filter by axis, s, (m,).
         """
         self._rate_hz = rate_hz
         self._near: deque[tuple[float, list[float], object]] = deque()
@@ -170,20 +127,8 @@ class DelayedInversion:
         """
         Take a sample. At a gap, all samples before it become ready.
 
-        Parameters
-        ----------
-        time_s
-            Stamp of the sample, s.
-        volts
-            Volts behind the filter by axis, V.
-        token
-            Anything that belongs to the sample.
-
-        Yields
-        ------
-        tuple
-            Each sample that is ready: its stamp, s, volts before the filter, V, and its token.
-
+        volts: volts behind the filter by axis, V; yields: each sample that is ready: its stamp, s,
+        volts before the filter, V, and its token.
         """
         near = self._near
         if near and not 0 < (time_s - near[-1][0]) * self._rate_hz < MAX_GAP:

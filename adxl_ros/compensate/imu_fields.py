@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Estimates of a recording as fields of messages, in which no number is NaN or infinite."""
 
@@ -40,18 +28,8 @@ class ImuFields:
         """
         Return the fields of sensor_msgs/Imu and the tilt of the samples that have a solution.
 
-        Parameters
-        ----------
-        estimates
-            Estimates of the next samples, of which n have a solution.
-
-        Returns
-        -------
-        imu_fields : dict
-            Fields by name, (n, k) each. The yaw of the orientation is 0 and unknown.
-        tilt_rad : ndarray
-            Roll, pitch and inclination, rad, (n, 3).
-
+        returns: fields by name, (n, k) each. The yaw of the orientation is 0 and unknown. Roll,
+        pitch and inclination, rad, (n, 3).
         """
         unsolved = estimates.unsolved
         solved = ~unsolved if unsolved.any() else slice(None)  # a slice copies nothing
@@ -92,20 +70,8 @@ def _orientation_covariance(force: np.ndarray, covariance: np.ndarray, roll_rad2
     """
     Return the elements of the covariance of roll, pitch and yaw, row after row.
 
-    Parameters
-    ----------
-    force
-        Specific force, m/s², (3, n).
-    covariance
-        Its covariance, (m/s²)², (3, 3, n).
-    roll_rad2, pitch_rad2
-        Variances, rad², (n,).
-
-    Returns
-    -------
-    ndarray
-        The covariance, rad², (9, n).
-
+    force: specific force, m/s², (3, n); covariance: its covariance, (m/s²)², (3, 3, n); roll_rad2,
+    pitch_rad2: variances, rad², (n,); returns: the covariance, rad², (9, n).
     """
     components = tuple(covariance[i, j] for i in range(3) for j in range(i, 3))
     both = roll_pitch_covariance(list(force), components, ARRAYS)

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A live stream of serialized messages: samples come in, corrected samples and tilt go out."""
 
@@ -60,41 +48,10 @@ class LiveStream:
     One thread calls it with samples; another one may replace the sensor and the surroundings
     meanwhile. A sample has the coefficients before or after a replacement, never some of both.
 
-    Parameters
-    ----------
-    paper
-        Whether the paper's approximate inverse is used instead of the exact one.
-    undo_filter
-        Whether the RC filter is undone; a sample then comes out `filter_inversion.HALF` samples
-        later.
-    publish_imu
-        Takes a corrected sample, a serialized sensor_msgs/Imu.
-    publish_tilt
-        Takes roll, pitch and inclination, rad, a serialized geometry_msgs/Vector3Stamped.
-    keep_orientation
-        Whether a sample that states an orientation keeps it.
-    publish_free
-        Takes the acceleration without gravity of a sample that states an orientation, m/s², a
-        serialized geometry_msgs/Vector3Stamped; None for no such output.
-    output_rate_hz
-        Rate to which samples are thinned out, unfiltered, Hz; 0 for all of them.
-
-    Attributes
-    ----------
-    counts
-        Samples since the start, by the names of `COUNTS`.
-    outside
-        What the newest sample outside of the calibrated range exceeds, in words.
-    surroundings
-        Temperature, °C, and supply, V, that the inverse uses, by name; those that are known.
-    refused
-        Whether the stream belongs to another unit; then its samples are counted only.
-    may_be_foreign
-        Whether nobody has named the sensor. The stream is then held as soon as it has a value on
-        an axis that the sensor lacks.
-    unknown
-        Newest samples of a stream that is held; None where it is not.
-
+    publish_tilt: takes roll, pitch and inclination, rad, a serialized
+    geometry_msgs/Vector3Stamped; publish_free: takes the acceleration without gravity of a sample
+    that states an orientation, m/s², a serialized geometry_msgs/Vector3Stamped; None for no such
+    output.
     """
 
     def __init__(self, paper: bool, undo_filter: bool, publish_imu: Callable[[bytes], None],
@@ -111,11 +68,17 @@ class LiveStream:
         self._chain: _Chain
         self._angles_rad = [0.0, 0.0, 0.0]
         self._new_surroundings: dict[str, float] = {}
-        self.counts: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter()  # Samples since the start, by the names of `COUNTS`
+        # What the newest sample outside of the calibrated range exceeds, in words
         self.outside: tuple[str, ...] = ()
+        # Temperature, °C, and supply, V, that the inverse uses, by name; those that are known
         self.surroundings: dict[str, float] = {}
+        # Whether the stream belongs to another unit; then its samples are counted only
         self.refused = False
+        # Whether nobody has named the sensor. The stream is then held as soon as it has a value on
+        # an axis that the sensor lacks.
         self.may_be_foreign = False
+        # Newest samples of a stream that is held; None where it is not
         self.unknown: deque[bytes] | None = None
 
     def hold(self) -> None:
@@ -127,17 +90,7 @@ class LiveStream:
         self.unknown, self.may_be_foreign = None, False
 
     def use(self, sensor: Sensor, rate_hz: float) -> None:
-        """
-        Correct by a sensor from the next sample on.
-
-        Parameters
-        ----------
-        sensor
-            The unit, with its coefficients.
-        rate_hz
-            Sample rate of the stream, Hz.
-
-        """
+        """Correct by a sensor from the next sample on."""
         self._sensor = sensor, rate_hz
         live = LiveEstimator(sensor, self._paper, self._undo_filter,
                              self._mounting if self._mounting.turns else None)
@@ -150,17 +103,7 @@ class LiveStream:
         return self._sensor[0]
 
     def mount(self, mounting: Mounting, frame_id: str) -> None:
-        """
-        Turn the samples that follow into the frame of the robot.
-
-        Parameters
-        ----------
-        mounting
-            The case in the frame of the robot.
-        frame_id
-            Name of that frame.
-
-        """
+        """Turn the samples that follow into the frame of the robot."""
         self._mounting, self._frame_id = mounting, frame_id
         self.use(*self._sensor)
 
@@ -187,17 +130,7 @@ class LiveStream:
         return max(1, round(rate_hz / self._output_rate_hz)) if self._output_rate_hz else 1
 
     def surround(self, name: str, value: float) -> None:
-        """
-        Take a temperature or supply into account, from the next sample on.
-
-        Parameters
-        ----------
-        name
-            `temperature_c` or `supply_v`.
-        value
-            Its value, °C or V, finite.
-
-        """
+        """Take a temperature or supply into account, from the next sample on."""
         self._new_surroundings = {**self._new_surroundings, name: value}
 
     def __call__(self, raw: bytes) -> None:
@@ -284,24 +217,7 @@ class LiveStream:
 
 def free_acceleration(force_mps2: Components, quaternion: Sequence[float], gravity_mps2: float
                       ) -> list[float]:
-    """
-    Return the acceleration without gravity, m/s², three floats.
-
-    Parameters
-    ----------
-    force_mps2
-        Specific force in a frame, m/s².
-    quaternion
-        Orientation of this frame in the world, whose z is up: x, y, z, w.
-    gravity_mps2
-        Local gravity, m/s².
-
-    Returns
-    -------
-    list
-        The force less the vertical g, in the same frame.
-
-    """
+    """Return the acceleration without gravity, m/s², three floats."""
     x, y, z, w = quaternion
     vertical = (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
     return [f - gravity_mps2 * v for f, v in zip(force_mps2, vertical)]

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The paper's compensation, equations 14 to 21, which ignores the errors of the other axes.
@@ -50,21 +38,9 @@ def inverse(sensor: Sensor, z_sign: np.ndarray | None = None, maths: Maths = ARR
     bias by the other axes is subtracted, and the result is divided by the scale factor at those
     inputs (14, 16). Finally the misalignment is removed, one axis after the other (20, 21).
 
-    Parameters
-    ----------
-    sensor
-        The unit with the effects to undo; it measures x and y at least.
-    z_sign
-        Sign of z by sample, (n,), where it is known better than by `sensor.z_sign`.
-    maths
-        Functions for arrays or for floats.
-
-    Returns
-    -------
-    callable
-        Maps the volts of each axis, and an `Environment` (the nominal one unless given), to
-        three components of specific force, m/s².
-
+    z_sign: sign of z by sample, (n,), where it is known better than by `sensor.z_sign`; returns:
+    maps the volts of each axis, and an `Environment` (the nominal one unless given), to three
+    components of specific force, m/s².
     """
     measured = [AXES.index(axis) for axis in sensor.axes]
     gravity_g = signal_chain.gravity_mps2(sensor) / G0_MPS2

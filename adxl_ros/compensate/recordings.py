@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Specific force and tilt of whole recordings, with standard deviations, block by block."""
 
@@ -44,33 +32,16 @@ class Estimates:
     Estimates of the samples of one block.
 
     A quantity that a sample does not determine is NaN and has an infinite standard deviation.
-
-    Attributes
-    ----------
-    force_mps2
-        Specific force in the case frame, m/s², (3, n).
-    force_std_mps2
-        Standard deviations of the force, m/s², (3, n).
-    covariance
-        Covariance of the force, (m/s²)², (3, 3, n); very large for an axis that is not measured.
-    tilt
-        Angles of the samples with their standard deviations, rad, (n,) each.
-    at_rail
-        Whether the ADC was at a rail, (n,).
-    outside
-        Whether temperature or force lie outside of the validity range, (n,).
-    volts
-        Volts of the ADC, V, (n, m).
-
     """
 
-    force_mps2: np.ndarray
-    force_std_mps2: np.ndarray
+    force_mps2: np.ndarray  # Specific force in the case frame, m/s², (3, n)
+    force_std_mps2: np.ndarray  # Standard deviations of the force, m/s², (3, n)
+    # Covariance of the force, (m/s²)², (3, 3, n); very large for an axis that is not measured
     covariance: np.ndarray
-    tilt: Tilt
-    at_rail: np.ndarray
-    outside: np.ndarray
-    volts: np.ndarray
+    tilt: Tilt  # Angles of the samples with their standard deviations, rad, (n,) each
+    at_rail: np.ndarray  # Whether the ADC was at a rail, (n,)
+    outside: np.ndarray  # Whether temperature or force lie outside of the validity range, (n,)
+    volts: np.ndarray  # Volts of the ADC, V, (n, m)
 
     @property
     def unsolved(self) -> np.ndarray:
@@ -83,27 +54,7 @@ class RecordingEstimator:
 
     def __init__(self, sensor: Sensor, first: Recording, paper: bool = False,
                  undo_filter: bool = False) -> None:
-        """
-        Prepare for a recording.
-
-        Parameters
-        ----------
-        sensor
-            The unit by its calibration, at the sample rate of the recording.
-        first
-            First block of the recording. It begins the time since power-on, and has the columns
-            of all blocks.
-        paper
-            Whether the paper's approximate inverse applies instead of the exact one.
-        undo_filter
-            Whether the RC filter is undone. The noise then is that before the filter.
-
-        Raises
-        ------
-        UserError
-            The sensor lacks axes that the paper's inverse needs.
-
-        """
+        """Prepare for a recording."""
         if paper and sensor.axes == 'x':
             raise UserError('--inverse paper: needs the axes x and y, the sensor has x; leave it '
                             'out')
@@ -162,22 +113,7 @@ class RecordingEstimator:
 
 
 def effects_left(sensor: Sensor, undo_filter: bool) -> list[Effect]:
-    """
-    Return the effects of a unit that act on single samples and that no inverse undoes.
-
-    Parameters
-    ----------
-    sensor
-        The unit by its calibration.
-    undo_filter
-        Whether the RC filter is undone, which undoes the effects of the filter.
-
-    Returns
-    -------
-    list
-        Effects on the mean of the output, without those of stage and clock.
-
-    """
+    """Return the effects of a unit that act on single samples and that no inverse undoes."""
     effects = [effect_named(name) for name in sensor.effects]
     return [effect for effect in effects
             if effect.acts_on is ActsOn.MEAN and not effect.invertible

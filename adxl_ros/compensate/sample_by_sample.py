@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Inverse, covariance and tilt of a live stream, sample by sample."""
 
@@ -67,56 +55,31 @@ samples hardly exceeds it by chance."""
 
 
 class Estimate(NamedTuple):
-    """
-    Estimate from one sample.
+    """Estimate from one sample."""
 
-    Attributes
-    ----------
-    force
-        Specific force in the frame of the case, or of the robot where there is a mounting, m/s²,
-        three floats.
-    covariance
-        Covariance of the force: xx, xy, xz, yy, yz, zz, (m/s²)².
-    roll, pitch, inclination
-        Angle, rad, and its variance, rad². The variance of an angle that is not shown exceeds
-        `tilt.UNOBSERVABLE_RAD2`.
-    roll_pitch
-        Covariance of roll and pitch, rad².
-    saturated
-        Whether the ADC is at a rail; the variances are then those of an unmeasured axis.
-    outside
-        Texts on how the sample lies outside of the validity range; the variances include it.
-
-    """
-
+    # Specific force in the frame of the case, or of the robot where there is a mounting, m/s²,
+    # three floats
     force: Components
-    covariance: tuple[float, ...]
+    covariance: tuple[float, ...]  # Covariance of the force: xx, xy, xz, yy, yz, zz, (m/s²)²
+    # roll, pitch, inclination: Angle, rad, and its variance, rad². The variance of an angle that
+    # is not shown exceeds `tilt.UNOBSERVABLE_RAD2`.
     roll: tuple[float, float]
     pitch: tuple[float, float]
     inclination: tuple[float, float]
-    roll_pitch: float
+    roll_pitch: float  # Covariance of roll and pitch, rad²
+    # Whether the ADC is at a rail; the variances are then those of an unmeasured axis
     saturated: bool
+    # Texts on how the sample lies outside of the validity range; the variances include it
     outside: tuple[str, ...]
 
 
 class _Cell(NamedTuple):
-    """
-    What the forces of one cell of the grid share.
+    """What the forces of one cell of the grid share."""
 
-    Attributes
-    ----------
-    tangent
-        Tangent of the inverse at the middle of the cell.
-    covariance
-        Covariance by noise and coefficients: xx, xy, xz, yy, yz, zz, (m/s²)².
-    outside
-        Texts on how the cell lies outside of the validity range.
-
-    """
-
-    tangent: signal_chain.Tangent
+    tangent: signal_chain.Tangent  # Tangent of the inverse at the middle of the cell
+    # Covariance by noise and coefficients: xx, xy, xz, yy, yz, zz, (m/s²)²
     covariance: tuple[float, ...]
-    outside: tuple[str, ...]
+    outside: tuple[str, ...]  # Texts on how the cell lies outside of the validity range
 
 
 class LiveEstimator:
@@ -135,22 +98,7 @@ class LiveEstimator:
 
     def __init__(self, sensor: Sensor, paper: bool = False, undo_filter: bool = False,
                  mounting: Mounting | None = None) -> None:
-        """
-        Prepare for a unit.
-
-        Parameters
-        ----------
-        sensor
-            The unit by its calibration, at the sample rate of the stream.
-        paper
-            Whether the paper's approximate inverse applies instead of the exact one.
-        undo_filter
-            Whether the samples come from `filter_inversion.DelayedInversion`. Their noise then
-            is that before the filter.
-        mounting
-            The case in the frame of the robot, in which the estimates are; None for the case's.
-
-        """
+        """Prepare for a unit."""
         self.sensor, self.mounting = sensor, mounting
         self._paper_inverse = paper_inverse.inverse(sensor, maths=FLOATS) if paper else None
         self._variance_v2 = filter_inversion.noise_variance_v2(sensor) if undo_filter \
@@ -175,22 +123,7 @@ class LiveEstimator:
         self._time_s = float('-inf')
 
     def __call__(self, accel_mps2: Components, time_s: float) -> Estimate | None:
-        """
-        Estimate from one sample.
-
-        Parameters
-        ----------
-        accel_mps2
-            Nominally converted specific force, m/s², three floats; only measured axes count.
-        time_s
-            Stamp of the sample, s.
-
-        Returns
-        -------
-        Estimate or None
-            The estimate; None if no force explains the sample.
-
-        """
+        """Estimate from one sample."""
         volts = self.volts(accel_mps2)
         return self.from_volts(volts, time_s) if volts else None
 
@@ -204,18 +137,7 @@ class LiveEstimator:
         """
         Estimate from the volts of one sample.
 
-        Parameters
-        ----------
-        volts
-            Volts of each measured axis, V.
-        time_s
-            Stamp of the sample, s.
-
-        Returns
-        -------
-        Estimate or None
-            The estimate; None if no force explains the sample.
-
+        volts: volts of each measured axis, V.
         """
         force = self._inverse(volts)
         if force is None:
@@ -239,17 +161,7 @@ class LiveEstimator:
 
     def set_environment(self, temperature_c: float | None = None, supply_v: float | None = None
                         ) -> None:
-        """
-        Set the surroundings of the samples that follow.
-
-        Parameters
-        ----------
-        temperature_c
-            Temperature of the sensor, °C; None leaves it.
-        supply_v
-            Supply voltage of the sensor, V; None leaves it.
-
-        """
+        """Set the surroundings of the samples that follow."""
         if temperature_c is not None:
             if not self._knows_temperature:
                 self._use(self.sensor)

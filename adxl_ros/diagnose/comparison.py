@@ -61,23 +61,11 @@ _LONGEST_S = 1e3
 
 @dataclass(frozen=True)
 class DataFault:
-    """
-    A fault of the recording.
+    """A fault of the recording."""
 
-    Attributes
-    ----------
-    name
-        Name in the report: `verdict.data_fault`.
-    status
-        Status of the verdict: 'bad_data' or 'insufficient'.
-    message
-        What is wrong and what to do, one line.
-
-    """
-
-    name: str
-    status: str
-    message: str
+    name: str  # Name in the report: `verdict.data_fault`
+    status: str  # Status of the verdict: 'bad_data' or 'insufficient'
+    message: str  # What is wrong and what to do, one line
 
 
 class Reference(Enum):
@@ -95,51 +83,26 @@ class Reference(Enum):
 
 @dataclass(frozen=True)
 class BaselineComparison:
-    """
-    Samples of one recording, n of m axes, and what the simulator needs to follow the recording.
+    """Samples of one recording, n of m axes, and what the simulator needs to follow it."""
 
-    Attributes
-    ----------
-    name
-        Path of the recording, for people.
-    time_s
-        Stamps, s, (n,).
-    volts
-        Output of the sensor, V, (n, m).
-    motion
-        Motion of the reference.
-    sensor
-        The baseline: datasheet values and effects of the parameter file, at this sample rate.
-    reference
-        What determines the motion.
-    has_stage_angles
-        Whether the recording holds stage angles, even if they never change.
-    at_rest
-        Samples at which nothing moves, (n,) bool.
-    used
-        Samples that are used, (n,) bool; the others are missing, repeated or outliers, or their
-        reference is not known.
-    notes : tuple of str
-        What was corrected or left out before the comparison, one line each, for people.
-    fading_hz
-        Frequency above which the reference lacks half of the motion's power, Hz; None where it
-        does not.
-    memo
-        Signals that simulations of this recording share.
-
-    """
-
-    name: str
-    time_s: np.ndarray
-    volts: np.ndarray
-    motion: Motion
+    name: str  # Path of the recording, for people
+    time_s: np.ndarray  # Stamps, s, (n,)
+    volts: np.ndarray  # Output of the sensor, V, (n, m)
+    motion: Motion  # Motion of the reference
+    # The baseline: datasheet values and effects of the parameter file, at this sample rate
     sensor: Sensor
-    reference: Reference
-    has_stage_angles: bool
-    at_rest: np.ndarray
+    reference: Reference  # What determines the motion
+    has_stage_angles: bool  # Whether the recording holds stage angles, even if they never change
+    at_rest: np.ndarray  # Samples at which nothing moves, (n,) bool
+    # Samples that are used, (n,) bool; the others are missing, repeated or outliers, or their
+    # reference is not known
     used: np.ndarray
+    # What was corrected or left out before the comparison, one line each, for people
     notes: tuple[str, ...] = ()
+    # Frequency above which the reference lacks half of the motion's power, Hz; None where it does
+    # not
     fading_hz: float | None = None
+    # Signals that simulations of this recording share
     memo: ChainMemo = field(default_factory=ChainMemo, compare=False, repr=False)
 
     def __len__(self) -> int:

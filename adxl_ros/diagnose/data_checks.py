@@ -222,24 +222,13 @@ def _too_slow(recording: Recording) -> DataFault | None:
 
 @dataclass(frozen=True)
 class EvenStamps:
-    """
-    The instants of samples that were taken evenly.
+    """The instants of samples that were taken evenly."""
 
-    Attributes
-    ----------
-    time_s
-        The instants, s, (n,).
-    certain
-        Whether rounding or bursts explain all deviations; otherwise the samples themselves may
-        have been taken unevenly.
-    note
-        What was changed, for people; empty where it does not matter.
-
-    """
-
-    time_s: np.ndarray
+    time_s: np.ndarray  # The instants, s, (n,)
+    # Whether rounding or bursts explain all deviations; otherwise the samples themselves may have
+    # been taken unevenly
     certain: bool
-    note: str
+    note: str  # What was changed, for people; empty where it does not matter
 
 
 def even_stamps(stamps_s: np.ndarray) -> EvenStamps | None:
@@ -397,25 +386,12 @@ def _zero_g_is_mirrored(offset_g: float, axis: int, sensor: Sensor) -> bool:
 
 @dataclass(frozen=True)
 class CheckedRecording:
-    """
-    A recording that can be diagnosed.
+    """A recording that can be diagnosed."""
 
-    Attributes
-    ----------
-    comparison
-        The recording beside the baseline at its full rate.
-    search_comparison
-        The same at the rate of the search.
-    detections
-        Noise-like effects that the samples themselves show.
-    possible_spikes
-        Isolated samples; the residual of the best hypothesis must show them, too.
-
-    """
-
-    comparison: BaselineComparison
-    search_comparison: BaselineComparison
-    detections: tuple[Detection, ...]
+    comparison: BaselineComparison  # The recording beside the baseline at its full rate
+    search_comparison: BaselineComparison  # The same at the rate of the search
+    detections: tuple[Detection, ...]  # Noise-like effects that the samples themselves show
+    # Isolated samples; the residual of the best hypothesis must show them, too
     possible_spikes: Detection | None
 
 

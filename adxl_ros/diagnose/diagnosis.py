@@ -76,114 +76,57 @@ _SMALLEST_RANGES = {'temperature_c': 0.5, 'supply_v': 0.02}
 
 
 class GapClosure(NamedTuple):
-    """
-    The gap before and after the effects of the verdict, held out, and the noise floor.
+    """The gap before and after the effects of the verdict, held out, and the noise floor."""
 
-    Attributes
-    ----------
-    before_mps2, after_mps2
-        Rms of recording minus simulation over samples and axes, m/s².
-    before_ci, after_ci
-        Their 90 % intervals.
-    floor_mps2
-        Noise floor, m/s².
-    floor_ci
-        Its 90 % interval; None where it is not measured.
-    closed
-        (before² − after²)/(before² − floor²); NaN without a gap.
-    closed_ci
-        Its 90 % interval.
-
-    """
-
+    # before_mps2, after_mps2: Rms of recording minus simulation over samples and axes, m/s²
     before_mps2: float
+    # before_ci, after_ci: Their 90 % intervals
     before_ci: tuple[float, float]
     after_mps2: float
     after_ci: tuple[float, float]
-    floor_mps2: float
-    floor_ci: tuple[float, float] | None
-    closed: float
-    closed_ci: tuple[float, float]
+    floor_mps2: float  # Noise floor, m/s²
+    floor_ci: tuple[float, float] | None  # Its 90 % interval; None where it is not measured
+    closed: float  # (before² − after²)/(before² − floor²); NaN without a gap
+    closed_ci: tuple[float, float]  # Its 90 % interval
 
 
 @dataclass(frozen=True)
 class Report:
-    """
-    A verdict with what a reader needs to believe and to use it.
+    """A verdict with what a reader needs to believe and to use it."""
 
-    Attributes
-    ----------
-    verdict
-        The verdict with its figures.
-    closure
-        The gap before and after the effects of the verdict.
-    noise_floor
-        The noise floor with its source.
-    hypotheses
-        Fitted sets of effects, those that explain most first.
-    detections, noise_remainders
-        Effects that show in the noise, and what remains after they are added.
-    noise_before, noise_after
-        Recorded noise relative to simulated noise by recording, before and with what was found.
-    residual_cells
-        Map of the residual of the first recording.
-    not_covered
-        What the recordings do not cover, for people.
-    could_show
-        Smallest size of each effect that these recordings would have shown.
-    next_experiment
-        What to record next.
-    lost_motion_mps2
-        Rms of motion that a smooth reference lacks, m/s².
-    baseline
-        The baseline.
-    sensor
-        The baseline with the effects whose closing is stated, ready for `simulate`.
-    linear_model
-        The linear model of the recordings.
-
-    """
-
-    verdict: Verdict
-    closure: GapClosure
-    noise_floor: NoiseFloor
-    hypotheses: tuple[Hypothesis, ...]
+    verdict: Verdict  # The verdict with its figures
+    closure: GapClosure  # The gap before and after the effects of the verdict
+    noise_floor: NoiseFloor  # The noise floor with its source
+    hypotheses: tuple[Hypothesis, ...]  # Fitted sets of effects, those that explain most first
+    # detections, noise_remainders: Effects that show in the noise, and what remains after they are
+    # added
     detections: tuple[Detection, ...]
     noise_remainders: tuple[NoiseRemainder, ...]
+    # noise_before, noise_after: Recorded noise relative to simulated noise by recording, before
+    # and with what was found
     noise_before: tuple[NoiseComparison, ...]
     noise_after: tuple[NoiseComparison, ...]
-    residual_cells: tuple[ResidualCell, ...]
-    not_covered: tuple[str, ...]
+    residual_cells: tuple[ResidualCell, ...]  # Map of the residual of the first recording
+    not_covered: tuple[str, ...]  # What the recordings do not cover, for people
+    # Smallest size of each effect that these recordings would have shown
     could_show: tuple[CouldShow, ...]
-    next_experiment: NextExperiment | None
-    lost_motion_mps2: float
-    baseline: Sensor
-    sensor: Sensor
-    linear_model: LinearModel
+    next_experiment: NextExperiment | None  # What to record next
+    lost_motion_mps2: float  # Rms of motion that a smooth reference lacks, m/s²
+    baseline: Sensor  # The baseline
+    sensor: Sensor  # The baseline with the effects whose closing is stated, ready for `simulate`
+    linear_model: LinearModel  # The linear model of the recordings
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """
-    What a diagnosis found: a report, or the fault of a recording that makes one impossible.
+    """What a diagnosis found: a report, or the fault of a recording that makes one impossible."""
 
-    Attributes
-    ----------
-    comparisons
-        The recordings beside the baseline, at the rate of the search.
-    full_rate
-        The same at their full rate; empty after a fault.
-    fault
-        Fault of a recording.
-    report
-        The report where there is no fault.
-
-    """
-
+    # The recordings beside the baseline, at the rate of the search
     comparisons: tuple[BaselineComparison, ...]
+    # The same at their full rate; empty after a fault
     full_rate: tuple[BaselineComparison, ...] = ()
-    fault: DataFault | None = None
-    report: Report | None = None
+    fault: DataFault | None = None  # Fault of a recording
+    report: Report | None = None  # The report where there is no fault
 
 
 def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = None,

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Log evidence of hypotheses: Bayesian comparison of linear models on whitened columns.
@@ -50,53 +38,27 @@ _RIDGE = 1e-12
 
 @dataclass(frozen=True)
 class WhitenedChannel:
-    """
-    One axis of one recording: products of whitened columns, by filter and block.
+    """One axis of one recording: products of whitened columns, by filter and block."""
 
-    Attributes
-    ----------
-    column_ids
-        Numbers of the k columns that the axis follows, (k,).
-    block_grams
-        Products of the residual (first) and the columns, V², (filters, blocks, k + 1, k + 1);
-        no block where they are not kept.
-    total_grams
-        Their sums over all blocks, V², (filters, k + 1, k + 1).
-    counts
-        Samples by block, (blocks,).
-    log_scales
-        What the filter for errors of angles adds to the log likelihood, (filters, blocks).
-    log_priors
-        Log prior probability of each filter, (filters,).
-    drift_effects
-        Effect that the noise of each filter needs, '' for a healthy unit, (filters,).
-
-    """
-
-    column_ids: np.ndarray
+    column_ids: np.ndarray  # Numbers of the k columns that the axis follows, (k,)
+    # Products of the residual (first) and the columns, V², (filters, blocks, k + 1, k + 1); no
+    # block where they are not kept
     block_grams: np.ndarray
-    total_grams: np.ndarray
-    counts: np.ndarray
+    total_grams: np.ndarray  # Their sums over all blocks, V², (filters, k + 1, k + 1)
+    counts: np.ndarray  # Samples by block, (blocks,)
+    # What the filter for errors of angles adds to the log likelihood, (filters, blocks)
     log_scales: np.ndarray
-    log_priors: np.ndarray
+    log_priors: np.ndarray  # Log prior probability of each filter, (filters,)
+    # Effect that the noise of each filter needs, '' for a healthy unit, (filters,)
     drift_effects: np.ndarray
 
 
 class FlexibleColumns(NamedTuple):
-    """
-    Functions that are integrated out of a channel.
+    """Functions that are integrated out of a channel."""
 
-    Attributes
-    ----------
-    values
-        Functions times the prior standard deviations of their coefficients, V, (n, m).
-    variance_v2
-        Variance of the whitened noise, V².
-
-    """
-
+    # Functions times the prior standard deviations of their coefficients, V, (n, m)
     values: np.ndarray
-    variance_v2: float
+    variance_v2: float  # Variance of the whitened noise, V²
 
 
 def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.ndarray,
@@ -106,28 +68,9 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
     """
     Whiten one axis of one recording.
 
-    Parameters
-    ----------
-    residual_v
-        Residual, V, (n,).
-    columns
-        Columns, V per unit of their coefficients, (n, k).
-    column_ids
-        Numbers of the columns, (k,).
-    used
-        Samples that are used, (n,) bool; the others are bridged by straight lines.
-    filters
-        Whitening filters to choose from.
-    flexible
-        Functions that are integrated out of the total products.
-    by_block
-        Whether the products of each block are kept, too.
-
-    Returns
-    -------
-    WhitenedChannel
-        Products of the whitened columns.
-
+    residual_v: residual, V, (n,); columns: columns, V per unit of their coefficients, (n, k);
+    column_ids: numbers of the columns, (k,); used: samples that are used, (n,) bool; the others
+    are bridged by straight lines.
     """
     parts = [residual_v[:, None], columns, *([] if flexible is None else [flexible.values])]
     data = np.empty((sum(values.shape[1] for values in parts), len(used)))
@@ -181,20 +124,8 @@ def prepared(filters: Sequence[Whitener], columns: np.ndarray, used: np.ndarray)
     """
     Prepare columns for each whitening filter of a channel.
 
-    Parameters
-    ----------
-    filters
-        Filters of the channel.
-    columns
-        Columns, (n, k).
-    used
-        Samples that are used, (n,) bool; the others are bridged by straight lines.
-
-    Returns
-    -------
-    dict
-        Series for `whitened`, (k, n) each.
-
+    columns: columns, (n, k); used: samples that are used, (n,) bool; the others are bridged by
+    straight lines; returns: series for `whitened`, (k, n) each.
     """
     return before_filters(filters, np.ascontiguousarray(bridged(columns, used).T))
 
@@ -203,20 +134,8 @@ def whitened(whitener: Whitener, series: Series, used: np.ndarray) -> np.ndarray
     """
     Whiten columns.
 
-    Parameters
-    ----------
-    whitener
-        The filter.
-    series
-        Columns that are `prepared`, (k, n) each.
-    used
-        Samples that are used, (n,) bool.
-
-    Returns
-    -------
-    numpy.ndarray
-        Whitened columns, (k, n), zero where samples are not used.
-
+    series: columns that are `prepared`, (k, n) each; used: samples that are used, (n,) bool;
+    returns: whitened columns, (k, n), zero where samples are not used.
     """
     values = series[whitener.corrects_angles]
     white = np.empty_like(values, float)
@@ -240,18 +159,8 @@ def bridged(data: np.ndarray, used: np.ndarray) -> np.ndarray:
     """
     Replace rows that are not used by straight lines between those that are.
 
-    Parameters
-    ----------
-    data
-        Series, (n, k).
-    used
-        Rows that are used, (n,) bool.
-
-    Returns
-    -------
-    numpy.ndarray
-        Series without gaps, (n, k).
-
+    data: series, (n, k); used: rows that are used, (n,) bool; returns: series without gaps, (n,
+    k).
     """
     if used.all() or not used.any() or not data.shape[1]:
         return data
@@ -266,32 +175,14 @@ def bridged(data: np.ndarray, used: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class LinearFit:
-    """
-    A linear model after the fit of k coefficients.
+    """A linear model after the fit of k coefficients."""
 
-    Attributes
-    ----------
-    column_ids
-        Numbers of the columns, (k,).
-    values
-        Posterior mean of the coefficients, (k,).
-    covariance
-        Posterior covariance, (k, k).
-    log_evidence
-        Log evidence of the samples.
-    filter_indices
-        Number of the whitening filter of each channel.
-    innovation_variance_v2
-        Variance of the whitened residual of each channel, V².
-
-    """
-
-    column_ids: np.ndarray
-    values: np.ndarray
-    covariance: np.ndarray
-    log_evidence: float
-    filter_indices: tuple[int, ...]
-    innovation_variance_v2: np.ndarray
+    column_ids: np.ndarray  # Numbers of the columns, (k,)
+    values: np.ndarray  # Posterior mean of the coefficients, (k,)
+    covariance: np.ndarray  # Posterior covariance, (k, k)
+    log_evidence: float  # Log evidence of the samples
+    filter_indices: tuple[int, ...]  # Number of the whitening filter of each channel
+    innovation_variance_v2: np.ndarray  # Variance of the whitened residual of each channel, V²
 
 
 def fit_columns(channels: Sequence[WhitenedChannel], column_ids: Sequence[int],
@@ -300,26 +191,7 @@ def fit_columns(channels: Sequence[WhitenedChannel], column_ids: Sequence[int],
     """
     Fit the coefficients of some columns, and the noise.
 
-    Parameters
-    ----------
-    channels
-        All axes of all recordings.
-    column_ids
-        Numbers of the columns of the hypothesis, nuisance parameters included.
-    prior_std
-        Prior standard deviation of every column's coefficient, by number.
-    blocks
-        Blocks that are used, (blocks,) bool; None for all.
-    start
-        A fit whose noise is close to that of this fit.
-    drifts
-        Effects by which the zero-g may drift more than that of a healthy unit.
-
-    Returns
-    -------
-    LinearFit
-        Coefficients, noise and log evidence.
-
+    blocks: blocks that are used, (blocks,) bool; None for all.
     """
     ids = np.array(sorted(column_ids), int)
     selected = [_selected(channel, ids, blocks) for channel in channels]
@@ -399,20 +271,8 @@ def amplitude_log_bayes_factor(mean: np.ndarray, covariance: np.ndarray, prior_s
     """
     Return what the log evidence gains by the log-uniform prior over `AMPLITUDES`.
 
-    Parameters
-    ----------
-    mean
-        Posterior mean of the effect's k coefficients with the given prior, (k,).
-    covariance
-        Posterior covariance, (k, k).
-    prior_std
-        Standard deviations of the given prior, (k,).
-
-    Returns
-    -------
-    float
-        Log Bayes factor of the log-uniform prior over the given prior.
-
+    mean: posterior mean of the effect's k coefficients with the given prior, (k,); covariance:
+    posterior covariance, (k, k); prior_std: standard deviations of the given prior, (k,).
     """
     gains = log_bayes_factor_by_amplitude(mean, covariance, prior_std)
     return float(np.logaddexp.reduce(gains) - np.log(len(gains)))
@@ -425,20 +285,9 @@ def log_bayes_factor_by_amplitude(mean: np.ndarray, covariance: np.ndarray,
 
     It is the logarithm of the posterior mean of the ratio of both priors, in closed form.
 
-    Parameters
-    ----------
-    mean
-        Posterior mean of k coefficients with the given prior, (k,).
-    covariance
-        Posterior covariance, (k, k).
-    prior_std
-        Standard deviations of the given prior, (k,).
-
-    Returns
-    -------
-    numpy.ndarray
-        Log Bayes factors, (amplitudes,).
-
+    mean: posterior mean of k coefficients with the given prior, (k,); covariance: posterior
+    covariance, (k, k); prior_std: standard deviations of the given prior, (k,); returns: log Bayes
+    factors, (amplitudes,).
     """
     # Divided by their prior deviations, coefficients in V and in rad have similar sizes.
     precision = np.linalg.inv(covariance / prior_std[:, None] / prior_std)
@@ -486,20 +335,7 @@ def robust_std(channels: Sequence[WhitenedChannel], fit: LinearFit, prior_std: n
     Econometrica 50). The sandwich sums gradients of the log likelihood over blocks, because
     samples may be correlated.
 
-    Parameters
-    ----------
-    channels
-        All axes of all recordings.
-    fit
-        The fit of k coefficients.
-    prior_std
-        Prior standard deviation of every column's coefficient, by number.
-
-    Returns
-    -------
-    numpy.ndarray
-        Standard deviations of the coefficients, (k,).
-
+    returns: standard deviations of the coefficients, (k,).
     """
     gradients = np.zeros((BLOCKS, len(fit.column_ids)))
     for c, f, v in zip(channels, fit.filter_indices, fit.innovation_variance_v2):
@@ -517,20 +353,8 @@ def conditional_mean(fit: LinearFit, places: np.ndarray, values: np.ndarray) -> 
     """
     Return the posterior mean of all coefficients where some have given values.
 
-    Parameters
-    ----------
-    fit
-        The fit of k coefficients.
-    places
-        Places of the j coefficients with given values, (j,).
-    values
-        Their values, (j,).
-
-    Returns
-    -------
-    numpy.ndarray
-        Mean of the coefficients, (k,).
-
+    places: places of the j coefficients with given values, (j,); values: their values, (j,);
+    returns: mean of the coefficients, (k,).
     """
     mean = fit.values.copy()
     others = np.setdiff1d(np.arange(len(mean)), places)
@@ -547,22 +371,7 @@ def log_posterior_loss(channels: Sequence[WhitenedChannel], fit: LinearFit, valu
 
     The other coefficients are at their conditional maximum.
 
-    Parameters
-    ----------
-    channels
-        All axes of all recordings.
-    fit
-        The fit of all columns to all blocks.
-    values
-        Values of the first j coefficients, (j,).
-    prior_std
-        Prior standard deviation of every column's coefficient, by number.
-
-    Returns
-    -------
-    float
-        Difference of log posteriors, not negative.
-
+    values: values of the first j coefficients, (j,).
     """
     count = len(values)
     deviation = values - fit.values[:count]

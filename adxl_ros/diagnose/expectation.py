@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 What each manoeuvre is expected to tell, given the samples so far.
@@ -79,38 +67,18 @@ class Experiment(Protocol):
 
 
 class ColumnKey(NamedTuple):
-    """
-    A coefficient of one variant of an effect, or of a flexible function.
+    """A coefficient of one variant of an effect, or of a flexible function."""
 
-    Attributes
-    ----------
-    variant
-        Effect, shape and step; dimension, channel and number of a flexible function.
-    name
-        The coefficient; None of a flexible function.
-
-    """
-
-    variant: tuple
-    name: Coefficient | None
+    variant: tuple  # Effect, shape and step; dimension, channel and number of a flexible function
+    name: Coefficient | None  # The coefficient; None of a flexible function
 
 
 @dataclass(frozen=True)
 class ManoeuvreWorth:
-    """
-    What a manoeuvre is expected to tell.
+    """What a manoeuvre is expected to tell."""
 
-    Attributes
-    ----------
-    manoeuvre
-        The manoeuvre.
-    information
-        Expected decrease of the entropy of the hypotheses, nat.
-
-    """
-
-    manoeuvre: Experiment
-    information: float
+    manoeuvre: Experiment  # The manoeuvre
+    information: float  # Expected decrease of the entropy of the hypotheses, nat
 
     @property
     def per_minute(self) -> float:
@@ -120,26 +88,12 @@ class ManoeuvreWorth:
 
 @dataclass(frozen=True)
 class PredictedResponse:
-    """
-    Products of the sensitivities of one manoeuvre.
+    """Products of the sensitivities of one manoeuvre."""
 
-    Attributes
-    ----------
-    manoeuvre
-        The manoeuvre.
-    linear_model
-        Its linear model.
-    places
-        Place of each column.
-    gram
-        Products, in units of the noise, (k, k).
-
-    """
-
-    manoeuvre: Experiment
-    linear_model: LinearModel
-    places: dict[ColumnKey, int]
-    gram: np.ndarray
+    manoeuvre: Experiment  # The manoeuvre
+    linear_model: LinearModel  # Its linear model
+    places: dict[ColumnKey, int]  # Place of each column
+    gram: np.ndarray  # Products, in units of the noise, (k, k)
 
     @property
     def effects(self) -> set[str]:
@@ -149,29 +103,13 @@ class PredictedResponse:
 
 @dataclass(frozen=True)
 class _Posterior:
-    """
-    What a hypothesis knows after the samples so far.
+    """What a hypothesis knows after the samples so far."""
 
-    Attributes
-    ----------
-    keys
-        Columns of its k coefficients.
-    mean
-        Their means, (k,).
-    covariance
-        Their covariance, (k, k).
-    unseen
-        Effects of the hypothesis about which only the prior is known.
-    dimensions
-        Dimensions in which it has an unknown function.
-
-    """
-
-    keys: tuple[ColumnKey, ...]
-    mean: np.ndarray
-    covariance: np.ndarray
-    unseen: tuple[str, ...] = ()
-    dimensions: tuple[FormDimension, ...] = ()
+    keys: tuple[ColumnKey, ...]  # Columns of its k coefficients
+    mean: np.ndarray  # Their means, (k,)
+    covariance: np.ndarray  # Their covariance, (k, k)
+    unseen: tuple[str, ...] = ()  # Effects of the hypothesis about which only the prior is known
+    dimensions: tuple[FormDimension, ...] = ()  # Dimensions in which it has an unknown function
 
 
 @dataclass
@@ -213,26 +151,7 @@ def rank_responses(responses: Sequence[PredictedResponse],
                    hypotheses: Sequence[WeightedHypothesis], model: LinearModel | None,
                    dimensions: Sequence[FormDimension]
                    ) -> tuple[ManoeuvreWorth, ...]:
-    """
-    Rank manoeuvres by their expected information per minute.
-
-    Parameters
-    ----------
-    responses
-        What each manoeuvre is predicted to show.
-    hypotheses
-        Hypotheses by falling probability.
-    model
-        The linear model of the samples so far; None before there are any.
-    dimensions
-        Dimensions in which something unknown may act.
-
-    Returns
-    -------
-    tuple of ManoeuvreWorth
-        The manoeuvres, the best first.
-
-    """
+    """Rank manoeuvres by their expected information per minute."""
     samples = _Samples(model, model.fit_variants([])) if model else None
     leaders = leading(hypotheses)
     posteriors = [_posterior_of(h, samples, leaders, dimensions) for h in leaders]
@@ -246,31 +165,7 @@ def rank_responses(responses: Sequence[PredictedResponse],
 
 def predict(manoeuvre: Experiment, sensor: Sensor, effects: Sequence[str],
             dimensions: Sequence[FormDimension]) -> PredictedResponse:
-    """
-    Simulate a manoeuvre with the baseline, and multiply its whitened sensitivities.
-
-    Parameters
-    ----------
-    manoeuvre
-        The manoeuvre.
-    sensor
-        The baseline.
-    effects
-        Effects whose sensitivities are needed.
-    dimensions
-        Dimensions in which something unknown may act.
-
-    Returns
-    -------
-    PredictedResponse
-        The products.
-
-    Raises
-    ------
-    UserError
-        The baseline cannot be simulated in this manoeuvre.
-
-    """
+    """Simulate a manoeuvre with the baseline, and multiply its whitened sensitivities."""
     at_rate = replace(sensor, rate_hz=min(sensor.rate_hz, _RATE_HZ))
     parts = list(simulate_blocks(at_rate, manoeuvre.motion, 0, manoeuvre.begin_s))
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

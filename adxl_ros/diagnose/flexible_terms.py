@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Flexible functions of the quantities that an error of a sensor may follow.
@@ -91,18 +79,7 @@ def flexible_bases(comparison: BaselineComparison, baseline_v: np.ndarray) -> li
     """
     Compute the flexible functions of a recording.
 
-    Parameters
-    ----------
-    comparison
-        The recording.
-    baseline_v
-        Simulated output of its baseline, V, (n, m).
-
-    Returns
-    -------
-    list of dict
-        Functions by dimension, for each axis.
-
+    baseline_v: simulated output of its baseline, V, (n, m).
     """
     force_g = ((baseline_v - comparison.sensor.zero_g_v) / comparison.sensor.scale_v_per_g).T
     common, used = _common(comparison), comparison.used

@@ -60,59 +60,32 @@ def block_weights(seed: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """
-    What a set of effects leaves of blocks that it was not fitted to.
+    """What a set of effects leaves of blocks that it was not fitted to."""
 
-    Attributes
-    ----------
-    squares
-        Squares of recording minus simulation, mean over axes, sum over samples, by block,
-        (m/s²)², (blocks,).
-    log_likelihood
-        Log likelihood by block, (blocks,).
-
-    """
-
+    # Squares of recording minus simulation, mean over axes, sum over samples, by block, (m/s²)²,
+    # (blocks,)
     squares: np.ndarray
-    log_likelihood: np.ndarray
+    log_likelihood: np.ndarray  # Log likelihood by block, (blocks,)
 
 
 @dataclass(frozen=True)
 class Rest:
-    """
-    What flexible functions predict of held-out blocks beyond a set of effects.
+    """What flexible functions predict of held-out blocks beyond a set of effects."""
 
-    Attributes
-    ----------
-    squares
-        Decrease of the squares by all functions together, by block, (m/s²)², (blocks,).
-    steady_log_likelihood
-        Increase of the log likelihood by all functions but those of time, by block, (blocks,).
-    by_dimension
-        Decrease of the squares by the functions of one dimension alone, by block.
-
-    """
-
+    # Decrease of the squares by all functions together, by block, (m/s²)², (blocks,)
     squares: np.ndarray
+    # Increase of the log likelihood by all functions but those of time, by block, (blocks,)
     steady_log_likelihood: np.ndarray
+    # Decrease of the squares by the functions of one dimension alone, by block
     by_dimension: dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
 class HeldOutFits:
-    """
-    The fits of a linearised set of effects to all blocks but those held out.
+    """The fits of a linearised set of effects to all blocks but those held out."""
 
-    Attributes
-    ----------
-    linearised
-        The set of effects, linearised at its fit to all blocks.
-    drifts
-        Effects by which the zero-g may drift more than that of a healthy unit.
-
-    """
-
-    linearised: LinearisedHypothesis
+    linearised: LinearisedHypothesis  # The set of effects, linearised at its fit to all blocks
+    # Effects by which the zero-g may drift more than that of a healthy unit
     drifts: tuple[str, ...] = ()
 
     @cached_property

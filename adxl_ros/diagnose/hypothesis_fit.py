@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The fit of a hypothesis: linearised at its coefficients, fitted, and simulated again."""
 
@@ -75,44 +63,19 @@ blocks by this factor. Chosen: a quarter of the blocks is held out."""
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """
-    A set of effects after its fit.
+    """A set of effects after its fit."""
 
-    Attributes
-    ----------
-    effects
-        Names of the effects; none for no gap.
-    sensor
-        The baseline with the effects and the nuisance parameters, as fitted.
-    names
-        Names of the k fitted coefficients of the effects, (k,).
-    values
-        Their values, as departures from the baseline, (k,).
-    std
-        Their standard deviations, (k,).
-    log_evidence
-        Log evidence.
-    fit
-        The last linear fit.
-    linearised
-        The hypothesis linearised at its values.
-    linear_loss
-        How far the log posterior at the values is below the maximum of the linear model.
-    converged
-        Whether the Gauss-Newton iteration has converged.
-
-    """
-
-    effects: tuple[str, ...]
-    sensor: Sensor
-    names: tuple[Coefficient, ...]
-    values: np.ndarray
-    std: np.ndarray
-    log_evidence: float
-    fit: LinearFit
-    linearised: LinearisedHypothesis
+    effects: tuple[str, ...]  # Names of the effects; none for no gap
+    sensor: Sensor  # The baseline with the effects and the nuisance parameters, as fitted
+    names: tuple[Coefficient, ...]  # Names of the k fitted coefficients of the effects, (k,)
+    values: np.ndarray  # Their values, as departures from the baseline, (k,)
+    std: np.ndarray  # Their standard deviations, (k,)
+    log_evidence: float  # Log evidence
+    fit: LinearFit  # The last linear fit
+    linearised: LinearisedHypothesis  # The hypothesis linearised at its values
+    # How far the log posterior at the values is below the maximum of the linear model
     linear_loss: float
-    converged: bool = True
+    converged: bool = True  # Whether the Gauss-Newton iteration has converged
 
     @property
     def undetermined(self) -> np.ndarray:
@@ -130,23 +93,12 @@ class Hypothesis:
 
 
 class ChannelColumns(NamedTuple):
-    """
-    The linear model of a hypothesis in one channel.
+    """The linear model of a hypothesis in one channel."""
 
-    Attributes
-    ----------
-    places
-        Places of the k coefficients among all, (k,).
-    values
-        Residual at the prior mean, V, and sensitivities, V per unit, (n, k + 1).
-    plain
-        Products of the same divided by the scale factor and the root of the number of axes, by
-        block, (m/s²)², (blocks, k + 1, k + 1).
-
-    """
-
-    places: np.ndarray
-    values: np.ndarray
+    places: np.ndarray  # Places of the k coefficients among all, (k,)
+    values: np.ndarray  # Residual at the prior mean, V, and sensitivities, V per unit, (n, k + 1)
+    # Products of the same divided by the scale factor and the root of the number of axes, by
+    # block, (m/s²)², (blocks, k + 1, k + 1)
     plain: np.ndarray
 
 
@@ -157,42 +109,19 @@ class LinearisedHypothesis:
 
     The first j coefficients are those of the effects. The others are nuisance parameters, which
     stay near the baseline and are linearised there.
-
-    Attributes
-    ----------
-    effects
-        Names of the effects.
-    sensor
-        The sensor at the values.
-    names
-        Coefficients, those of the effects first, (k,).
-    prior_mean
-        Prior mean of the coefficients, (k,).
-    prior_std
-        Prior standard deviation of the coefficients, (k,).
-    reach
-        Largest departure of the nuisance parameters of a healthy unit, (k − j,).
-    values
-        Values of the coefficients of the effects, (j,).
-    channels
-        Whitened columns, and whitened residuals at the prior mean by the linear model.
-    columns
-        The same before whitening.
-    filters
-        Whitening filters of each channel.
-
     """
 
-    effects: tuple[str, ...]
-    sensor: Sensor
-    names: tuple[Coefficient, ...]
-    prior_mean: np.ndarray
-    prior_std: np.ndarray
-    reach: np.ndarray
-    values: np.ndarray
+    effects: tuple[str, ...]  # Names of the effects
+    sensor: Sensor  # The sensor at the values
+    names: tuple[Coefficient, ...]  # Coefficients, those of the effects first, (k,)
+    prior_mean: np.ndarray  # Prior mean of the coefficients, (k,)
+    prior_std: np.ndarray  # Prior standard deviation of the coefficients, (k,)
+    reach: np.ndarray  # Largest departure of the nuisance parameters of a healthy unit, (k − j,)
+    values: np.ndarray  # Values of the coefficients of the effects, (j,)
+    # Whitened columns, and whitened residuals at the prior mean by the linear model
     channels: list[WhitenedChannel]
-    columns: list[ChannelColumns]
-    filters: Sequence[Sequence[Whitener]]
+    columns: list[ChannelColumns]  # The same before whitening
+    filters: Sequence[Sequence[Whitener]]  # Whitening filters of each channel
 
     @property
     def effect_names(self) -> tuple[Coefficient, ...]:
@@ -203,18 +132,7 @@ class LinearisedHypothesis:
         """
         Fit all coefficients.
 
-        Parameters
-        ----------
-        blocks
-            Blocks that are used, (blocks,) bool; None for all.
-        drifts
-            Effects by which the zero-g drifts, beside those of the sensor.
-
-        Returns
-        -------
-        LinearFit
-            Departures from the prior mean.
-
+        blocks: blocks that are used, (blocks,) bool; None for all.
         """
         return evidence.fit_columns(self.channels, range(len(self.names)), self.prior_std, blocks,
                                     drifts=(*drifts, *drifts_among(self.sensor.effects)))
@@ -233,22 +151,7 @@ class LinearisedHypothesis:
                    _within_bounds(self.names, self.prior_mean + departures))
 
     def refitted_sensor(self, fit: LinearFit, full_fit: LinearFit) -> Sensor:
-        """
-        Return the sensor after a fit to some blocks.
-
-        Parameters
-        ----------
-        fit
-            The fit to some blocks.
-        full_fit
-            The fit to all blocks.
-
-        Returns
-        -------
-        Sensor
-            All coefficients as fitted, within their bounds.
-
-        """
+        """Return the sensor after a fit to some blocks."""
         return put(self.sensor, self.names, _within_bounds(
             self.names, self.prior_mean + self.departures(fit, full_fit)))
 
@@ -261,18 +164,7 @@ class LinearisedHypothesis:
         blocks determine it. A shape changes by a factor of two at most, and a limit that is fitted
         to some blocks by a small share.
 
-        Parameters
-        ----------
-        fit
-            The fit.
-        full_fit
-            The fit to all blocks, where `fit` is to some.
-
-        Returns
-        -------
-        numpy.ndarray
-            Departures, (k,).
-
+        returns: departures, (k,).
         """
         j = len(self.values)
         parameters = [parameter_of(name) for name in self.effect_names]
@@ -324,26 +216,7 @@ class LinearisedHypothesis:
 
 def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
               filters: Sequence[Sequence[Whitener]] | None = None) -> LinearisedHypothesis:
-    """
-    Linearise a hypothesis at the coefficients of a sensor.
-
-    Parameters
-    ----------
-    linear_model
-        The recordings.
-    effects
-        Names of the effects.
-    sensor
-        A sensor with the effects.
-    filters
-        Whitening filters of each channel; None for those of a healthy unit.
-
-    Returns
-    -------
-    LinearisedHypothesis
-        Whitened residuals and columns.
-
-    """
+    """Linearise a hypothesis at the coefficients of a sensor."""
     filters = linear_model.filters_of(()) if filters is None else filters
     start = with_neutral(linear_model.baseline, effects)
     names = _fitted_names(linear_model, effects)
@@ -460,30 +333,6 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
     Each Gauss-Newton step simulates, differentiates, whitens and fits at the present values. The
     iteration ends where the log evidence no longer gains, or where even the maximum of the linear
     model is hopelessly low.
-
-    Parameters
-    ----------
-    linear_model
-        The recordings.
-    effects
-        Names of the effects.
-    start
-        First departures from the baseline by coefficient.
-    shapes
-        First values of shape parameters, by coefficient without axis.
-    lowest_log_evidence
-        Log evidence below which the hypothesis is hopeless; its values are then not refined.
-
-    Returns
-    -------
-    Hypothesis
-        The fitted hypothesis, converged or not.
-
-    Raises
-    ------
-    UserError
-        An effect has nothing to act on.
-
     """
     effects = tuple(dict.fromkeys(effects))
     neutral_sensor = with_neutral(linear_model.baseline, effects)
@@ -620,20 +469,8 @@ def sparsity_log_bayes_factor(linearised: LinearisedHypothesis, mean: np.ndarray
     prior densities at zero (Dickey 1971). Coefficients are omitted one by one while the evidence
     gains; at least one coefficient of each effect stays.
 
-    Parameters
-    ----------
-    linearised
-        The hypothesis.
-    mean
-        Posterior mean of its coefficients, as departures from the prior mean, (k,).
-    covariance
-        Their posterior covariance, (k, k).
-
-    Returns
-    -------
-    float
-        The gain.
-
+    mean: posterior mean of its coefficients, as departures from the prior mean, (k,); covariance:
+    their posterior covariance, (k, k).
     """
     gain = 0.0
     for effect in linearised.effects:

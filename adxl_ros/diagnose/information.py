@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 What an experiment is expected to tell between hypotheses with Gaussian predictions.
@@ -33,38 +21,18 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Belief:
-    """
-    What a hypothesis knows of k coefficients.
+    """What a hypothesis knows of k coefficients."""
 
-    Attributes
-    ----------
-    mean
-        Mean, (k,).
-    root
-        Square root of the covariance, S = root·rootᵀ, (k, r).
-
-    """
-
-    mean: np.ndarray
-    root: np.ndarray
+    mean: np.ndarray  # Mean, (k,)
+    root: np.ndarray  # Square root of the covariance, S = root·rootᵀ, (k, r)
 
 
 def bhattacharyya(gram: np.ndarray, first: Belief, second: Belief) -> float:
     """
     Return the Bhattacharyya distance between the predictions of two hypotheses.
 
-    Parameters
-    ----------
-    gram
-        Products of the sensitivities, in units of the noise, (k, k).
-    first, second
-        What the hypotheses know.
-
-    Returns
-    -------
-    float
-        Distance, nat; 0 for equal predictions.
-
+    gram: products of the sensitivities, in units of the noise, (k, k); returns: distance, nat; 0
+    for equal predictions.
     """
     return _distance(gram, first, second) - 0.25 * (
         _log_det_of(gram, first) + _log_det_of(gram, second))
@@ -97,22 +65,7 @@ def expected_information(gram: np.ndarray, probabilities: Sequence[float],
     """
     Return a lower bound of the information that an experiment gives on the hypothesis.
 
-    Parameters
-    ----------
-    gram
-        Products of the sensitivities, in units of the noise, (k, k).
-    probabilities
-        Probabilities of n hypotheses, which sum to 1.
-    beliefs
-        What each of them knows.
-    factor
-        Factor of the distances where the evidence is tempered.
-
-    Returns
-    -------
-    float
-        Expected decrease of the entropy, nat: from 0 to the entropy of the probabilities.
-
+    gram: products of the sensitivities, in units of the noise, (k, k).
     """
     weights = np.asarray(probabilities, float)
     count = len(weights)

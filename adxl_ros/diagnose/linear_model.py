@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The linear model of all recordings about the baseline: sensitivities to the whole library.
@@ -66,20 +54,10 @@ a straight line itself. Chosen: a tenth of an effect is material."""
 
 
 class NumberedColumn(NamedTuple):
-    """
-    One column of the linear model on one channel.
+    """One column of the linear model on one channel."""
 
-    Attributes
-    ----------
-    number
-        Number of the column.
-    values
-        Sensitivity of the samples to the coefficient, V per unit, (n,).
-
-    """
-
-    number: int
-    values: np.ndarray
+    number: int  # Number of the column
+    values: np.ndarray  # Sensitivity of the samples to the coefficient, V per unit, (n,)
 
 
 def hints_of(name: Coefficient) -> DiagnosisHints:
@@ -93,46 +71,23 @@ class LinearModel:
     Recordings of one unit, and the sensitivities at their baseline.
 
     A channel is one axis of one recording.
-
-    Attributes
-    ----------
-    comparisons
-        The recordings at the rate of the search.
-    baseline_v
-        Simulated output of the baseline in each recording, V, (n, m).
-    variants
-        Variants of the effects of the library.
-    column_ids
-        Numbers of the columns of each variant.
-    names
-        Coefficient of each column.
-    prior_std
-        Prior standard deviation of each coefficient, (columns,).
-    channels
-        Whitened residuals and columns at the baseline, by the filters for healthy units and for
-        the drifts of the baseline.
-    filters
-        Whitening filters of each channel.
-    columns
-        By channel: sensitivities to the library.
-    nuisance_columns
-        By channel: nuisance parameters and their sensitivities, V per unit, (n,).
-    parts_at_rest
-        For each coefficient of zero-g and scale factor: how much of it a calibration can take up
-        of one unit of each column, (columns,).
-
     """
 
-    comparisons: list[BaselineComparison]
-    baseline_v: list[np.ndarray]
-    variants: list[Variant]
-    column_ids: list[list[int]]
-    names: list[Coefficient]
-    prior_std: np.ndarray
+    comparisons: list[BaselineComparison]  # The recordings at the rate of the search
+    baseline_v: list[np.ndarray]  # Simulated output of the baseline in each recording, V, (n, m)
+    variants: list[Variant]  # Variants of the effects of the library
+    column_ids: list[list[int]]  # Numbers of the columns of each variant
+    names: list[Coefficient]  # Coefficient of each column
+    prior_std: np.ndarray  # Prior standard deviation of each coefficient, (columns,)
+    # Whitened residuals and columns at the baseline, by the filters for healthy units and for the
+    # drifts of the baseline
     channels: list[WhitenedChannel]
-    filters: list[list[Whitener]]
-    columns: list[list[NumberedColumn]]
+    filters: list[list[Whitener]]  # Whitening filters of each channel
+    columns: list[list[NumberedColumn]]  # By channel: sensitivities to the library
+    # By channel: nuisance parameters and their sensitivities, V per unit, (n,)
     nuisance_columns: list[dict[Coefficient, np.ndarray]]
+    # For each coefficient of zero-g and scale factor: how much of it a calibration can take up of
+    # one unit of each column, (columns,)
     parts_at_rest: dict[Coefficient, np.ndarray]
 
     @property
@@ -194,17 +149,7 @@ class LinearModel:
         """
         Return prior standard deviations of all coefficients.
 
-        Parameters
-        ----------
-        chosen
-            Numbers of the variants of the hypothesis. Only their effects may exceed the tolerance
-            of a healthy unit.
-
-        Returns
-        -------
-        numpy.ndarray
-            Standard deviations, (columns,).
-
+        returns: standard deviations, (columns,).
         """
         prior_std = self.prior_std.copy()
         effects = {self.variants[i].effect for i in chosen}
@@ -224,17 +169,6 @@ class LinearModel:
         Return the standard deviation of a nuisance parameter in a healthy unit.
 
         Without a known pose the zero-g is free, because only its changes show.
-
-        Parameters
-        ----------
-        name
-            Name of the coefficient.
-
-        Returns
-        -------
-        float
-            Standard deviation about the value of the parameter file, in the parameter's unit.
-
         """
         hints = hints_of(name)
         assert hints.healthy_std is not None
@@ -260,22 +194,7 @@ class LinearModel:
         return self.tolerance(Coefficient(effect.name, effect.parameters[0].name, axis))
 
     def fit_variants(self, chosen: Sequence[int], start: LinearFit | None = None) -> LinearFit:
-        """
-        Fit a set of variants on the sensitivities at the baseline.
-
-        Parameters
-        ----------
-        chosen
-            Numbers of the variants.
-        start
-            A fit whose noise is close to that of this fit.
-
-        Returns
-        -------
-        LinearFit
-            The fit; its log evidence is that with the log-uniform prior over amplitudes.
-
-        """
+        """Fit a set of variants on the sensitivities at the baseline."""
         drifts = drifts_among(self.baseline.effects)
         effects = {self.variants[i].effect for i in chosen}
         ids = {k for k in self.nuisance_ids() if self.names[k].effect not in effects}.union(
@@ -314,28 +233,7 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
                        filters: Sequence[list[Whitener]] | None = None,
                        only: Sequence[str] | None = None,
                        flexible: Sequence[FlexibleColumns] | None = None) -> LinearModel:
-    """
-    Differentiate the baseline by the whole library in all recordings.
-
-    Parameters
-    ----------
-    comparisons
-        Recordings of one unit, with one baseline.
-    show_progress
-        Called with the fraction that is done, 0 to 1.
-    filters
-        Whitening filters of each channel; None for all.
-    only
-        Names of the effects beside the nuisance parameters; None for the whole library.
-    flexible
-        For each channel: functions of any size below their prior, which are integrated out.
-
-    Returns
-    -------
-    LinearModel
-        The linear model.
-
-    """
+    """Differentiate the baseline by the whole library in all recordings."""
     baseline_v = [c.simulated_v(c.sensor) for c in comparisons]
     names: list[Coefficient] = []
     prior_std: list[float] = []
@@ -461,23 +359,11 @@ def parts_at_rest(lines: Sequence[dict[int, np.ndarray]],
     of the calibration differ from those of the recording, so that a share of the whole effect is
     added.
 
-    Parameters
-    ----------
-    lines
-        For each channel: columns of zero-g and scale factor by number, V per unit, (n,).
-    columns
-        For each channel: the other columns, V per unit, (n,), with their numbers below `count`.
-    count
-        Number of the other columns.
-    at_rest
-        For each channel: samples at rest, (n,) bool; where none rests, all samples count.
-
-    Returns
-    -------
-    dict
-        By number of a column of zero-g or scale factor: the standard deviation of its part in one
-        unit of each other column, in its own unit, (count,).
-
+    lines: for each channel: columns of zero-g and scale factor by number, V per unit, (n,);
+    columns: for each channel: the other columns, V per unit, (n,), with their numbers below
+    `count`; at_rest: for each channel: samples at rest, (n,) bool; where none rests, all samples
+    count; returns: by number of a column of zero-g or scale factor: the standard deviation of its
+    part in one unit of each other column, in its own unit, (count,).
     """
     parts: dict[int, np.ndarray] = {}
     for line, channel_columns, resting in zip(lines, columns, at_rest):

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The next experiment: the manoeuvre that separates effects that the recordings cannot separate.
@@ -45,26 +33,12 @@ _OTHER_REFERENCE = 'ros2 run adxl_ros diagnose next.csv --sim next_simulated.csv
 
 
 class ManoeuvreDescription(NamedTuple):
-    """
-    How a manoeuvre is made.
+    """How a manoeuvre is made."""
 
-    Attributes
-    ----------
-    text
-        What to do, for people.
-    trajectory
-        Name of the trajectory of `simulate`.
-    robot_text
-        What to do without a stage, for people.
-    remounted
-        Whether the sensor is remounted, turned by 180° about z.
-
-    """
-
-    text: str
-    trajectory: str
-    robot_text: str
-    remounted: bool = False
+    text: str  # What to do, for people
+    trajectory: str  # Name of the trajectory of `simulate`
+    robot_text: str  # What to do without a stage, for people
+    remounted: bool = False  # Whether the sensor is remounted, turned by 180° about z
 
 
 MENU = {
@@ -88,23 +62,11 @@ MENU = {
 
 @dataclass(frozen=True)
 class MenuManoeuvre:
-    """
-    A manoeuvre of the menu.
+    """A manoeuvre of the menu."""
 
-    Attributes
-    ----------
-    manoeuvre
-        Its place in the menu.
-    motion
-        Its motion, which begins at 0 s.
-    begin_s
-        Time at which it begins, s.
-
-    """
-
-    manoeuvre: Manoeuvre
-    motion: Motion
-    begin_s: float = 0.0
+    manoeuvre: Manoeuvre  # Its place in the menu
+    motion: Motion  # Its motion, which begins at 0 s
+    begin_s: float = 0.0  # Time at which it begins, s
 
     @property
     def name(self) -> str:
@@ -119,23 +81,11 @@ class MenuManoeuvre:
 
 @dataclass(frozen=True)
 class RecordedEvidence:
-    """
-    What recordings are compared with, and what they show.
+    """What recordings are compared with, and what they show."""
 
-    Attributes
-    ----------
-    sensor
-        The baseline.
-    linear_model
-        Linear model of the recordings; None without any.
-    seed
-        Seed of the manoeuvres of the menu.
-
-    """
-
-    sensor: Sensor
-    linear_model: LinearModel | None
-    seed: int
+    sensor: Sensor  # The baseline
+    linear_model: LinearModel | None  # Linear model of the recordings; None without any
+    seed: int  # Seed of the manoeuvres of the menu
 
     @property
     def beside_simulator(self) -> bool:
@@ -145,79 +95,32 @@ class RecordedEvidence:
 
 
 class MenuWorth(NamedTuple):
-    """
-    What a manoeuvre of the menu is expected to tell.
+    """What a manoeuvre of the menu is expected to tell."""
 
-    Attributes
-    ----------
-    text
-        What to do, for people.
-    minutes
-        Duration, min.
-    nats_per_minute
-        Expected information on the hypotheses, nat/min.
-
-    """
-
-    text: str
-    minutes: float
-    nats_per_minute: float
+    text: str  # What to do, for people
+    minutes: float  # Duration, min
+    nats_per_minute: float  # Expected information on the hypotheses, nat/min
 
 
 @dataclass(frozen=True)
 class NextExperiment:
-    """
-    What to record next.
+    """What to record next."""
 
-    Attributes
-    ----------
-    manoeuvre
-        What to do, for people.
-    why
-        The reason, for people.
-    command
-        Command that simulates the manoeuvre, or that diagnoses its recording.
-    nats_per_minute
-        What it is expected to tell; None where nothing has to be separated.
-    menu
-        All manoeuvres that can be simulated, the best first; empty where nothing has to be
-        separated.
-    concerns_reference
-        Whether the reference has to change, so that nothing can be simulated.
-    beside_simulator
-        Whether another simulator makes its motion.
-
-    """
-
-    manoeuvre: str
-    why: str
-    command: str
+    manoeuvre: str  # What to do, for people
+    why: str  # The reason, for people
+    command: str  # Command that simulates the manoeuvre, or that diagnoses its recording
+    # What it is expected to tell; None where nothing has to be separated
     nats_per_minute: float | None = None
+    # All manoeuvres that can be simulated, the best first; empty where nothing has to be separated
     menu: tuple[MenuWorth, ...] = ()
+    # Whether the reference has to change, so that nothing can be simulated
     concerns_reference: bool = False
-    beside_simulator: bool = False
+    beside_simulator: bool = False  # Whether another simulator makes its motion
 
 
 def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str],
                             evidence: RecordedEvidence) -> NextExperiment | None:
-    """
-    Propose the manoeuvre that separates most of what is not separated.
-
-    Parameters
-    ----------
-    verdict
-        The verdict with its groups.
-    not_covered
-        What the recordings do not cover, for people.
-    evidence
-        What the recordings are compared with, and what they show.
-
-    Returns
-    -------
-    NextExperiment or None
-        None where nothing more is needed.
-
-    """
+    """Propose the manoeuvre that separates most of what is not separated."""
     same = next((group for group in verdict.groups if _give_same_samples(group)), None)
     if same is not None:
         return NextExperiment(

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Recorded noise compared with simulated noise: power by band, Allan deviation, likelihood.
@@ -43,32 +31,16 @@ errors."""
 
 @dataclass(frozen=True)
 class NoiseComparison:
-    """
-    Recorded noise relative to simulated noise, all axes together.
+    """Recorded noise relative to simulated noise, all axes together."""
 
-    Attributes
-    ----------
-    band_edges_hz
-        Edges of the k bands of frequency, Hz, (k + 1,).
-    power_ratio
-        Recorded power divided by simulated power, for each band, (k,).
-    averaging_times_s
-        Averaging times of the Allan deviation, s, (j,).
-    allan_ratio
-        Recorded Allan deviation divided by the simulated one, (j,).
-    log_likelihood
-        Log likelihood of the recorded spectrum under the simulated one (Whittle 1953).
-    simulated_std_mps2
-        Rms of the simulated noise over samples and axes, m/s².
-
-    """
-
-    band_edges_hz: tuple[float, ...]
+    band_edges_hz: tuple[float, ...]  # Edges of the k bands of frequency, Hz, (k + 1,)
+    # Recorded power divided by simulated power, for each band, (k,)
     power_ratio: tuple[float, ...]
-    averaging_times_s: tuple[float, ...]
-    allan_ratio: tuple[float, ...]
+    averaging_times_s: tuple[float, ...]  # Averaging times of the Allan deviation, s, (j,)
+    allan_ratio: tuple[float, ...]  # Recorded Allan deviation divided by the simulated one, (j,)
+    # Log likelihood of the recorded spectrum under the simulated one (Whittle 1953)
     log_likelihood: float
-    simulated_std_mps2: float
+    simulated_std_mps2: float  # Rms of the simulated noise over samples and axes, m/s²
 
 
 def compare_noise(residual_v: np.ndarray, simulated_v: np.ndarray, rate_hz: float,
@@ -76,22 +48,8 @@ def compare_noise(residual_v: np.ndarray, simulated_v: np.ndarray, rate_hz: floa
     """
     Compare a residual with drawn noise.
 
-    Parameters
-    ----------
-    residual_v
-        Residual, bridged over samples that are not used, V, (n, m).
-    simulated_v
-        Drawn noise, V, (n, m).
-    rate_hz
-        Sample rate, Hz.
-    scale_v_per_mps2
-        Scale factor by axis, V/(m/s²), (m,).
-
-    Returns
-    -------
-    NoiseComparison
-        Ratios and likelihood.
-
+    residual_v: residual, bridged over samples that are not used, V, (n, m); simulated_v: drawn
+    noise, V, (n, m); scale_v_per_mps2: scale factor by axis, V/(m/s²), (m,).
     """
     recorded = (residual_v - residual_v.mean(axis=0)) / scale_v_per_mps2
     simulated = (simulated_v - simulated_v.mean(axis=0)) / scale_v_per_mps2
@@ -128,18 +86,8 @@ def allan_deviation(values: np.ndarray, count: int) -> np.ndarray:
     """
     Compute the overlapping Allan deviation of means of `count` samples (IEEE 1554).
 
-    Parameters
-    ----------
-    values
-        Series of m axes, (n, m).
-    count
-        Samples in a mean, less than n/2.
-
-    Returns
-    -------
-    numpy.ndarray
-        Allan deviation by axis, in the unit of the values, (m,).
-
+    values: series of m axes, (n, m); returns: allan deviation by axis, in the unit of the values,
+    (m,).
     """
     total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
     second_difference = total[2 * count:] - 2 * total[count:-count] + total[:-2 * count]

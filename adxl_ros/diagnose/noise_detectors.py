@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Effects that show in the statistics of the noise and not in the mean, each with its detector.
@@ -122,26 +110,12 @@ _REPEAT_LOG_BAYES_FACTOR = 5.0
 
 @dataclass(frozen=True)
 class Detection:
-    """
-    One noise-like effect that shows.
+    """One noise-like effect that shows."""
 
-    Attributes
-    ----------
-    effect
-        Name of the effect; 'unknown' for a line that is no mains frequency.
-    values
-        Parameters of the effect by name, (m,) or () each.
-    log_bayes_factor
-        Approximate log Bayes factor of the effect.
-    message
-        What was found, for people.
-
-    """
-
-    effect: str
-    values: dict[str, np.ndarray]
-    log_bayes_factor: float
-    message: str
+    effect: str  # Name of the effect; 'unknown' for a line that is no mains frequency
+    values: dict[str, np.ndarray]  # Parameters of the effect by name, (m,) or () each
+    log_bayes_factor: float  # Approximate log Bayes factor of the effect
+    message: str  # What was found, for people
 
 
 def detected_effect(detector: Detector) -> str:
@@ -154,22 +128,8 @@ def repeated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, se
     """
     Find samples that repeat the one before in all axes, in runs too long for chance.
 
-    Parameters
-    ----------
-    volts
-        As recorded, V, (n, m).
-    time_s
-        Stamps, s, (n,).
-    used
-        Samples that are used so far, (n,) bool.
-    sensor
-        The baseline.
-
-    Returns
-    -------
-    tuple
-        The samples that are used, (n,) bool, and the detection or none.
-
+    volts: as recorded, V, (n, m); time_s: stamps, s, (n,); used: samples that are used so far,
+    (n,) bool; returns: the samples that are used, (n,) bool, and the detection or none.
     """
     same = np.concatenate([[False], (np.diff(volts, axis=0) == 0).all(axis=1)])
     shortest = shortest_repeat(volts, len(sensor.axes))
@@ -204,22 +164,8 @@ def isolated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, se
     """
     Find single samples that deviate from the straight line between their neighbours.
 
-    Parameters
-    ----------
-    volts
-        As recorded, V, (n, m).
-    time_s
-        Stamps, s, (n,).
-    used
-        Samples that are used so far, (n,) bool.
-    sensor
-        The baseline.
-
-    Returns
-    -------
-    tuple
-        The samples that are used, (n,) bool, and the detection or None.
-
+    volts: as recorded, V, (n, m); time_s: stamps, s, (n,); used: samples that are used so far,
+    (n,) bool; returns: the samples that are used, (n,) bool, and the detection or None.
     """
     spikes, size_v = _spikes(volts, used, sensor)
     if not spikes.any() or _at_few_levels(volts, spikes):
@@ -239,22 +185,8 @@ def residual_shows_spikes(spikes: Detection, residual_v: np.ndarray, used: np.nd
 
     Without this check, motion of the sensor may look like spikes.
 
-    Parameters
-    ----------
-    spikes
-        Detection in the recording.
-    residual_v
-        Residual, V, (n, m).
-    used
-        Samples that are used, (n,) bool; spikes are not among them.
-    sensor
-        Sensor of the hypothesis, at the rate of the recording.
-
-    Returns
-    -------
-    bool
-        Whether more than half of the spikes show.
-
+    residual_v: residual, V, (n, m); used: samples that are used, (n,) bool; spikes are not among
+    them.
     """
     isolated, _ = _spikes(residual_v, np.isfinite(residual_v).all(axis=1), sensor)
     expected = float(spikes.values['rate_hz']) * len(sensor.axes) * len(used) / sensor.rate_hz
@@ -313,18 +245,7 @@ def coarse_codes(volts: np.ndarray, sensor: Sensor) -> Detection | None:
     """
     Find an ADC whose codes are coarser than stated, on all axes or on some.
 
-    Parameters
-    ----------
-    volts
-        As recorded, V, (n, m).
-    sensor
-        The baseline, with its stated ADC.
-
-    Returns
-    -------
-    Detection or None
-        None where the codes are as stated.
-
+    volts: as recorded, V, (n, m).
     """
     if not sensor.lsb_v:
         return None
@@ -347,16 +268,8 @@ def code_step_v(volts: np.ndarray) -> np.ndarray:
     """
     Return the smallest change of the output on each axis.
 
-    Parameters
-    ----------
-    volts
-        As recorded, V, (n, m).
-
-    Returns
-    -------
-    numpy.ndarray
-        Changes, V, (m,); 1000 V for an axis that never changes.
-
+    volts: as recorded, V, (n, m); returns: changes, V, (m,); 1000 V for an axis that never
+    changes.
     """
     changes_v = np.abs(np.diff(volts, axis=0))
     return np.min(changes_v, axis=0, initial=_CONSTANT_V, where=changes_v > 0)
@@ -380,48 +293,17 @@ def _lost_bits(volts: np.ndarray, sensor: Sensor) -> float:
 
 @dataclass(frozen=True)
 class NoiseSamples:
-    """
-    The residual of the best hypothesis beside drawn noise, n samples of m axes.
+    """The residual of the best hypothesis beside drawn noise, n samples of m axes."""
 
-    Attributes
-    ----------
-    time_s
-        Stamps, s, (n,).
-    residual_v
-        Residual, bridged over samples that are not used, V, (n, m).
-    simulated_v
-        Noise that the simulator draws, V, (n, m).
-    at_rest
-        Samples that rest and are used, (n,) bool.
-    used
-        Samples that are used, (n,) bool.
-
-    """
-
-    time_s: np.ndarray
-    residual_v: np.ndarray
-    simulated_v: np.ndarray
-    at_rest: np.ndarray
-    used: np.ndarray
+    time_s: np.ndarray  # Stamps, s, (n,)
+    residual_v: np.ndarray  # Residual, bridged over samples that are not used, V, (n, m)
+    simulated_v: np.ndarray  # Noise that the simulator draws, V, (n, m)
+    at_rest: np.ndarray  # Samples that rest and are used, (n,) bool
+    used: np.ndarray  # Samples that are used, (n,) bool
 
 
 def residual_detections(samples: NoiseSamples, sensor: Sensor) -> list[Detection]:
-    """
-    Find lines and excess noise in the residual of the best hypothesis.
-
-    Parameters
-    ----------
-    samples
-        The residual and drawn noise.
-    sensor
-        Sensor of the hypothesis, at the rate of the samples.
-
-    Returns
-    -------
-    list of Detection
-        A line, a level of noise, both or none.
-
-    """
+    """Find lines and excess noise in the residual of the best hypothesis."""
     # First differences remove a zero-g that drifts.
     white = np.diff(_before_filter(samples.residual_v, sensor), axis=0)
     at_rest = samples.at_rest[2:]
@@ -521,20 +403,8 @@ def line_amplitude_v(values_v: np.ndarray, time_s: np.ndarray, line_hz: float) -
 
     It is the rms of the amplitudes of short parts. The power beside the line is subtracted.
 
-    Parameters
-    ----------
-    values_v
-        Series with the line, without gaps, V, (n, m).
-    time_s
-        Stamps, s, (n,).
-    line_hz
-        Frequency of the line, Hz. It may be above half of the sample rate.
-
-    Returns
-    -------
-    numpy.ndarray
-        Amplitude by axis, V, (m,).
-
+    values_v: series with the line, without gaps, V, (n, m); time_s: stamps, s, (n,); returns:
+    amplitude by axis, V, (m,).
     """
     length = int(np.searchsorted(time_s, time_s[0] + _LINE_PART_S))
     parts = max(len(values_v) // max(length, 1), 1)
@@ -558,18 +428,8 @@ def white_noise_v(noise_v: np.ndarray, sensor: Sensor) -> np.ndarray:
     The median over the upper half of the frequencies ignores lines, drift and motion. That over
     the samples ignores spikes. The smaller one counts.
 
-    Parameters
-    ----------
-    noise_v
-        Noise about the mean output, V, (n, m).
-    sensor
-        The sensor at the rate of the samples.
-
-    Returns
-    -------
-    numpy.ndarray
-        Standard deviation of the samples by axis, V, (m,).
-
+    noise_v: noise about the mean output, V, (n, m); returns: standard deviation of the samples by
+    axis, V, (m,).
     """
     innovations = _before_filter(noise_v, sensor)
     frequency_hz, power = scipy.signal.periodogram(innovations, sensor.rate_hz, 'hann', axis=0)

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Estimators of the noise floor: noise at rest, differences of repeats, steps of the encoder."""
 
@@ -57,44 +45,21 @@ changes of a rest."""
 
 @dataclass(frozen=True)
 class NoiseFloor:
-    """
-    Rms of what no model can predict, over samples and measured axes.
+    """Rms of what no model can predict, over samples and measured axes."""
 
-    Attributes
-    ----------
-    noise_v
-        Standard deviation of the samples about their mean, V, (m,).
-    rms_mps2
-        Noise and the steps of the stage's encoder, m/s².
-    source
-        'still' for rests, 'repeats' of a trajectory, or 'assumed' from the parameter file.
-    parts
-        Sum of the squares of noise and steps, mean over axes, (m/s²)², and number of samples, by
-        part of the recordings, (2, k). Without columns where the floor is assumed.
-
-    """
-
-    noise_v: np.ndarray
-    rms_mps2: float
+    noise_v: np.ndarray  # Standard deviation of the samples about their mean, V, (m,)
+    rms_mps2: float  # Noise and the steps of the stage's encoder, m/s²
+    # 'still' for rests, 'repeats' of a trajectory, or 'assumed' from the parameter file
     source: str
+    # Sum of the squares of noise and steps, mean over axes, (m/s²)², and number of samples, by
+    # part of the recordings, (2, k). Without columns where the floor is assumed.
     parts: np.ndarray
 
     def draws_mps2(self, seed: int, draws: int) -> np.ndarray | None:
         """
         Return the floor from parts drawn with replacement.
 
-        Parameters
-        ----------
-        seed
-            Seed of the draws.
-        draws
-            Number of draws.
-
-        Returns
-        -------
-        numpy.ndarray or None
-            Rms, m/s², (n,); None where the floor is assumed, or from a few parts.
-
+        returns: rms, m/s², (n,); None where the floor is assumed, or from a few parts.
         """
         count = self.parts.shape[1]
         if count < _FEWEST_PARTS:
@@ -107,20 +72,10 @@ class NoiseFloor:
 
 @dataclass(frozen=True)
 class SquareSum:
-    """
-    A sum of squares and its number of samples.
+    """A sum of squares and its number of samples."""
 
-    Attributes
-    ----------
-    squares_v2
-        Sum over samples by axis, V², (m,).
-    count
-        Number of samples.
-
-    """
-
-    squares_v2: np.ndarray
-    count: int
+    squares_v2: np.ndarray  # Sum over samples by axis, V², (m,)
+    count: int  # Number of samples
 
 
 def estimate(comparisons: Sequence[BaselineComparison]) -> NoiseFloor:
@@ -182,20 +137,7 @@ def squares_at_rest(volts: np.ndarray, at_rest: np.ndarray, sensor: Sensor) -> l
     """
     Sum the squares about the mean of each second at rest.
 
-    Parameters
-    ----------
-    volts
-        Output, V, (n, m).
-    at_rest
-        Samples that rest and are used, (n,) bool.
-    sensor
-        The baseline at the rate of the samples.
-
-    Returns
-    -------
-    list of SquareSum
-        Squares by part of a second, corrected for the degree of freedom of its mean.
-
+    volts: output, V, (n, m); at_rest: samples that rest and are used, (n,) bool.
     """
     length = max(round(_REST_S * sensor.rate_hz), 4)
     # The mean of correlated samples takes more out of their variance than one sample.
@@ -216,18 +158,7 @@ def squares_of_difference(first_v: np.ndarray, second_v: np.ndarray, rate_hz: fl
     """
     Sum half of the squares of the difference between two repeats.
 
-    Parameters
-    ----------
-    first_v, second_v
-        Residuals of the same trajectory, V, (n, m).
-    rate_hz
-        Sample rate, Hz.
-
-    Returns
-    -------
-    list of SquareSum
-        Squares about the mean difference, of one repeat, by second.
-
+    first_v, second_v: residuals of the same trajectory, V, (n, m).
     """
     difference_v = second_v - first_v
     squares_v2 = (difference_v - difference_v.mean(axis=0)) ** 2 / 2
@@ -241,22 +172,7 @@ def find_repeat(first: np.ndarray, second: np.ndarray, rate_hz: float, resolutio
     """
     Find the shift by which the directions of gravity in two recordings agree best.
 
-    Parameters
-    ----------
-    first, second
-        Direction of gravity in the sensor's frame, unit vectors, (3, n) and (3, n').
-    rate_hz
-        Sample rate of both, Hz.
-    resolution_rad
-        Step of the encoder, rad.
-    same_recording
-        Whether both are one recording, which agrees with itself without a shift.
-
-    Returns
-    -------
-    tuple of slice or None
-        Samples of the first and of the second; None without a repeat.
-
+    first, second: direction of gravity in the sensor's frame, unit vectors, (3, n) and (3, n').
     """
     shortest = round(_REPEAT_SHORTEST_S * rate_hz)
     smallest_lag = round(_REPEAT_DELAY_S * rate_hz) if same_recording else 0
@@ -283,16 +199,7 @@ def directions(alpha_rad: np.ndarray, beta_rad: np.ndarray) -> np.ndarray:
     """
     Return the direction of gravity in the sensor's frame.
 
-    Parameters
-    ----------
-    alpha_rad, beta_rad
-        Angles of the stage, rad, (n,).
-
-    Returns
-    -------
-    numpy.ndarray
-        Unit vectors, (3, n).
-
+    alpha_rad, beta_rad: angles of the stage, rad, (n,); returns: unit vectors, (3, n).
     """
     return np.array(specific_force(alpha_rad, beta_rad, 1.0))
 
@@ -301,18 +208,8 @@ def encoder_mean_square(alpha_rad: np.ndarray, beta_rad: np.ndarray, sensor: Sen
     """
     Return the mean square that the steps of the encoder make, over samples and axes.
 
-    Parameters
-    ----------
-    alpha_rad, beta_rad
-        Angles of the stage, rad, (n,).
-    sensor
-        The baseline, with the resolution of its stage.
-
-    Returns
-    -------
-    float
-        step²/12 times the squared slope of gravity, (m/s²)².
-
+    alpha_rad, beta_rad: angles of the stage, rad, (n,); returns: step²/12 times the squared slope
+    of gravity, (m/s²)².
     """
     slopes = gravity_slopes(alpha_rad, beta_rad)[:, :len(sensor.axes)]
     return float(sensor.local_gravity_mps2 ** 2 * sensor.stage_std_rad ** 2
@@ -323,16 +220,8 @@ def gravity_slopes(alpha_rad: np.ndarray, beta_rad: np.ndarray) -> np.ndarray:
     """
     Return the derivatives of the direction of gravity by the angles of the stage.
 
-    Parameters
-    ----------
-    alpha_rad, beta_rad
-        Angles of the stage, rad, (n,).
-
-    Returns
-    -------
-    numpy.ndarray
-        By angle and component in the sensor's frame, 1/rad, (2, 3, n).
-
+    alpha_rad, beta_rad: angles of the stage, rad, (n,); returns: by angle and component in the
+    sensor's frame, 1/rad, (2, 3, n).
     """
     sin_alpha, cos_alpha = np.sin(alpha_rad), np.cos(alpha_rad)
     sin_beta, cos_beta = np.sin(beta_rad), np.cos(beta_rad)

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 What remains of noise-like effects after they are added to the simulation.
@@ -57,32 +45,14 @@ _ALLAN_WINDOWS = 10
 
 @dataclass(frozen=True)
 class NoiseRemainder:
-    """
-    One statistic of a noise-like effect, in the recordings and in their simulation.
+    """One statistic of a noise-like effect, in the recordings and in their simulation."""
 
-    Attributes
-    ----------
-    effect
-        Name of the effect.
-    quantity
-        What is compared, for people.
-    unit
-        Unit of the values: 'm/s^2', '1/s' or '1'.
-    axes
-        Measured axes, or empty where all have the same value.
-    recorded
-        Value in the recordings by axis, (m,) or (1,).
-    simulated
-        The same in the simulation with the effect.
-
-    """
-
-    effect: str
-    quantity: str
-    unit: str
-    axes: str
-    recorded: np.ndarray
-    simulated: np.ndarray
+    effect: str  # Name of the effect
+    quantity: str  # What is compared, for people
+    unit: str  # Unit of the values: 'm/s^2', '1/s' or '1'
+    axes: str  # Measured axes, or empty where all have the same value
+    recorded: np.ndarray  # Value in the recordings by axis, (m,) or (1,)
+    simulated: np.ndarray  # The same in the simulation with the effect
 
     @property
     def largest(self) -> int:
@@ -106,28 +76,7 @@ class _Series:
 def noise_remainders(comparisons: Sequence[BaselineComparison], mean_sensor: Sensor,
                      named_sensor: Sensor, detections: Sequence[Detection], seed: int
                      ) -> list[NoiseRemainder]:
-    """
-    Compare the noise-like effects of the recordings with those of their simulation.
-
-    Parameters
-    ----------
-    comparisons
-        The recordings at their full rate.
-    mean_sensor
-        The sensor whose mean output is subtracted from the recordings.
-    named_sensor
-        The sensor with the noise-like effects.
-    detections
-        Noise-like effects that show.
-    seed
-        Seed of the simulated noise.
-
-    Returns
-    -------
-    list of NoiseRemainder
-        Statistics of all recordings together, by effect.
-
-    """
+    """Compare the noise-like effects of the recordings with those of their simulation."""
     named = [d for d in detections if d.effect != noise_detectors.UNKNOWN]
     remainders: list[NoiseRemainder] = []
     pairs = [(c, _recorded(c, mean_sensor), _simulated(c, named_sensor, seed))
@@ -275,20 +224,7 @@ def floor_without(floor_mps2: float, remainders: Sequence[NoiseRemainder], state
 
     Both are effects that a model can have, so that they are a part of the gap.
 
-    Parameters
-    ----------
-    floor_mps2
-        Noise floor as measured, m/s².
-    remainders
-        Noise-like effects of the recordings.
-    stated_mps2
-        Rms of the stated noise over axes, m/s².
-
-    Returns
-    -------
-    float
-        Noise floor, m/s².
-
+    returns: noise floor, m/s².
     """
     square = floor_mps2 ** 2
     for r in remainders:

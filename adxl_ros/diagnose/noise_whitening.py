@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Whitening filters for noise that can drift.
@@ -78,30 +66,14 @@ Series = dict[bool, np.ndarray]
 
 @dataclass(frozen=True)
 class Whitener:
-    """
-    A filter that makes noise white.
+    """A filter that makes noise white."""
 
-    Attributes
-    ----------
-    sections
-        Second-order sections, (s, 6).
-    log_prior
-        Log prior probability of such noise, up to a constant.
-    effect
-        Name of the drift effect that the filter is for.
-    density
-        Density of the drift, in the unit of the effect's parameter.
-    angle_errors
-        Filter for the errors of the reference, which comes first; None where the reference
-        is exact, or where the drift within a second exceeds these errors: they would take up a
-        part of it.
-
-    """
-
-    sections: np.ndarray
-    log_prior: float
-    effect: str
-    density: float
+    sections: np.ndarray  # Second-order sections, (s, 6)
+    log_prior: float  # Log prior probability of such noise, up to a constant
+    effect: str  # Name of the drift effect that the filter is for
+    density: float  # Density of the drift, in the unit of the effect's parameter
+    # Filter for the errors of the reference, which comes first; None where the reference is exact,
+    # or where the drift within a second exceeds these errors: they would take up a part of it
     angle_errors: AngleErrorFilter | LostMotionFilter | None = None
 
     @property
@@ -140,18 +112,8 @@ class Whitener:
         """
         Filter the next part of k series after `before_filters`.
 
-        Parameters
-        ----------
-        values
-            The part, (k, n).
-        state
-            State before it, (sections, k, 2).
-
-        Returns
-        -------
-        tuple of numpy.ndarray
-            Filtered part, (k, n), and the state after it.
-
+        values: the part, (k, n); state: state before it, (sections, k, 2); returns: filtered part,
+        (k, n), and the state after it.
         """
         if len(self.sections) > 1:
             return scipy.signal.sosfilt(self.sections, values, zi=state)
@@ -165,18 +127,8 @@ def before_filters(filters: Sequence[Whitener], values: np.ndarray) -> Series:
     """
     Apply what whitening filters of a channel have in common.
 
-    Parameters
-    ----------
-    filters
-        Filters of the channel.
-    values
-        The k series, (k, n).
-
-    Returns
-    -------
-    dict
-        Series, (k, n), for filters that correct errors of angles and for the others.
-
+    values: the k series, (k, n); returns: series, (k, n), for filters that correct errors of
+    angles and for the others.
     """
     angle_errors = {f.corrects_angles: f.angle_errors for f in filters}
     return {corrects: values if errors is None else errors(values)
@@ -186,28 +138,7 @@ def before_filters(filters: Sequence[Whitener], values: np.ndarray) -> Series:
 def whiteners(sensor: Sensor, axis: int, dt_s: float, span_s: float,
               angle_errors: AngleErrorFilter | LostMotionFilter | None = None
               ) -> list[Whitener]:
-    """
-    Return the filters that are tried for the noise of one axis of a recording.
-
-    Parameters
-    ----------
-    sensor
-        The baseline.
-    axis
-        Index of the measured axis.
-    dt_s
-        Time between samples, s.
-    span_s
-        Length of the recording, s.
-    angle_errors
-        Filter for the errors of the reference.
-
-    Returns
-    -------
-    list of Whitener
-        Random walks first, ascending, then 1/f noise.
-
-    """
+    """Return the filters that are tried for the noise of one axis of a recording."""
     rc_s = float(noise.electronics(sensor).rc_s[axis])
     a = float(np.exp(-dt_s / rc_s)) if rc_s else 0.0
     std_v = max(float(noise.analog_std_v(sensor)[axis]), _LOWEST_NOISE_V)
@@ -279,26 +210,7 @@ def _whitener(sections: np.ndarray, effect: str, density: float) -> Whitener:
 
 def expected_drift_g(spectrum: DriftSpectrum, density: float, span_s: float, rate_hz: float
                      ) -> float:
-    """
-    Return the expected rms of a drift about its mean over a recording.
-
-    Parameters
-    ----------
-    spectrum
-        Spectrum of the drift.
-    density
-        Its density w, g/√s or g/√Hz.
-    span_s
-        Length T of the recording, s.
-    rate_hz
-        Sample rate, Hz.
-
-    Returns
-    -------
-    float
-        Of a random walk w·√(T/6), of 1/f noise w·√(ln(T·rate/2)), g.
-
-    """
+    """Return the expected rms of a drift about its mean over a recording."""
     if spectrum is DriftSpectrum.RANDOM_WALK:
         return float(density * np.sqrt(span_s / 6))
     return float(density * np.sqrt(np.log(rate_hz / 2 * span_s)))

@@ -151,20 +151,10 @@ _RIDGE = 1e-9
 
 @dataclass(frozen=True)
 class LeftOut:
-    """
-    Samples that are not used, and why.
+    """Samples that are not used, and why."""
 
-    Attributes
-    ----------
-    rows
-        The samples, (n,) bool.
-    reason
-        Reason, for people.
-
-    """
-
-    rows: np.ndarray
-    reason: str
+    rows: np.ndarray  # The samples, (n,) bool
+    reason: str  # Reason, for people
 
     def text(self, time_s: np.ndarray) -> str:
         """Return the reason with the times, s, of the samples; `time_s` are those of all."""
@@ -426,32 +416,14 @@ def _bands(values: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class AngleErrorFilter:
-    """
-    A filter that gives noise with errors of angles the spectrum of noise without them.
+    """A filter that gives noise with errors of angles the spectrum of noise without them."""
 
-    Attributes
-    ----------
-    rms_v
-        Rms of the errors, V.
-    pole
-        Pole a of the noise.
-    transition
-        Factor of the estimate of u from sample to sample, (n,).
-    gain
-        Gain of the estimate of u, 1/V, (n,).
-    weight
-        Change of the predicted sample by the estimate of u, V, (n,).
-    scale
-        Standard deviation of the noise divided by that of the innovation, (n,).
-
-    """
-
-    rms_v: float
-    pole: float
-    transition: np.ndarray
-    gain: np.ndarray
-    weight: np.ndarray
-    scale: np.ndarray
+    rms_v: float  # Rms of the errors, V
+    pole: float  # Pole a of the noise
+    transition: np.ndarray  # Factor of the estimate of u from sample to sample, (n,)
+    gain: np.ndarray  # Gain of the estimate of u, 1/V, (n,)
+    weight: np.ndarray  # Change of the predicted sample by the estimate of u, V, (n,)
+    scale: np.ndarray  # Standard deviation of the noise divided by that of the innovation, (n,)
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
         """Filter k series, (k, n)."""
@@ -548,25 +520,12 @@ def _filter(std_v: np.ndarray, memory: np.ndarray, pole: float, noise_v2: float
 
 @dataclass(frozen=True)
 class LostMotionFilter:
-    """
-    A filter that gives noise with lost motion the spectrum of noise without it.
+    """A filter that gives noise with lost motion the spectrum of noise without it."""
 
-    Attributes
-    ----------
-    moves
-        Samples in motion, (n,) bool; at rest nothing is lost.
-    taps
-        Impulse response of the filter, (k,).
-    lost_rms_v
-        Rms of the lost motion over all samples, V.
-    before
-        Filter for errors of angles and rounding, which comes first; None without any.
-
-    """
-
-    moves: np.ndarray
-    taps: np.ndarray
-    lost_rms_v: float
+    moves: np.ndarray  # Samples in motion, (n,) bool; at rest nothing is lost
+    taps: np.ndarray  # Impulse response of the filter, (k,)
+    lost_rms_v: float  # Rms of the lost motion over all samples, V
+    # Filter for errors of angles and rounding, which comes first; None without any
     before: AngleErrorFilter | None = None
 
     @property

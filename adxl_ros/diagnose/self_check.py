@@ -23,22 +23,11 @@ import numpy as np
 
 @dataclass(frozen=True)
 class SelfCheck:
-    """
-    What diagnoses of simulated recordings said.
+    """What diagnoses of simulated recordings said."""
 
-    Attributes
-    ----------
-    count
-        Number of the recordings.
-    same
-        How many had the same verdict: the same effects and groups, or none.
-    held, sizes
-        How many 90 % intervals of sizes held the simulated size, of how many.
-
-    """
-
-    count: int
-    same: int
+    count: int  # Number of the recordings
+    same: int  # How many had the same verdict: the same effects and groups, or none
+    # held, sizes: How many 90 % intervals of sizes held the simulated size, of how many
     held: int
     sizes: int
 
@@ -53,25 +42,7 @@ class SelfCheck:
 
 def self_check(diagnosis: Diagnosis, recordings: list[Recording], sim: Motion | None, count: int,
                seed: int, show: Callable[[float], None] = lambda done: None) -> SelfCheck:
-    """
-    Simulate recordings from a verdict, and diagnose them.
-
-    Parameters
-    ----------
-    diagnosis
-        A diagnosis with a report.
-    recordings
-        Its recordings, whose stamps and references the simulated ones have.
-    sim
-        Specific force by another simulator, in place of the stage.
-    count
-        Number of diagnoses.
-    seed
-        Seed of the noise.
-    show
-        Called with the fraction that is done.
-
-    """
+    """Simulate recordings from a verdict, and diagnose them."""
     report = diagnosis.report
     assert report is not None
     same = held = sizes = 0

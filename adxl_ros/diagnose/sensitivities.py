@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Sensitivities: how the simulated output changes with each parameter of the library."""
 
@@ -61,73 +49,30 @@ Simulate = Callable[[Sensor], np.ndarray]
 
 
 class AxisColumns(NamedTuple):
-    """
-    Sensitivities of one axis to the k coefficients that it follows.
+    """Sensitivities of one axis to the k coefficients that it follows."""
 
-    Attributes
-    ----------
-    numbers
-        Numbers of the coefficients in their variant, (k,).
-    values
-        Sensitivities, V per unit of the coefficient, (n, k).
-
-    """
-
-    numbers: np.ndarray
-    values: np.ndarray
+    numbers: np.ndarray  # Numbers of the coefficients in their variant, (k,)
+    values: np.ndarray  # Sensitivities, V per unit of the coefficient, (n, k)
 
 
 @dataclass(frozen=True)
 class Variant:
-    """
-    An effect with fixed shape parameters, and the sensitivities to its p coefficients.
+    """An effect with fixed shape parameters, and the sensitivities to its p coefficients."""
 
-    Attributes
-    ----------
-    effect
-        Name of the effect.
-    shape
-        Values of the shape parameters.
-    step
-        Step of the derivative, in typical sizes; for a limit the number of its level.
-    names
-        Names of the coefficients, (p,).
-    prior_std
-        Their prior standard deviations, (p,).
-    columns
-        Sensitivities of each axis.
-    limit_start
-        Only for an effect with a limit: first values of its fit, by coefficient. The columns are
-        then the change of the output by these values, V.
-    limit_beyond
-        The same for limits that clip no sample.
-
-    """
-
-    effect: str
-    shape: dict[str, float]
-    step: float
-    names: tuple[Coefficient, ...]
-    prior_std: np.ndarray
-    columns: tuple[AxisColumns, ...]
+    effect: str  # Name of the effect
+    shape: dict[str, float]  # Values of the shape parameters
+    step: float  # Step of the derivative, in typical sizes; for a limit the number of its level
+    names: tuple[Coefficient, ...]  # Names of the coefficients, (p,)
+    prior_std: np.ndarray  # Their prior standard deviations, (p,)
+    columns: tuple[AxisColumns, ...]  # Sensitivities of each axis
+    # Only for an effect with a limit: first values of its fit, by coefficient. The columns are
+    # then the change of the output by these values, V.
     limit_start: dict[Coefficient, float] = field(default_factory=dict)
+    # The same for limits that clip no sample
     limit_beyond: dict[Coefficient, float] = field(default_factory=dict)
 
     def first_limits(self, amounts: Mapping[Coefficient, float]) -> dict[Coefficient, float]:
-        """
-        Return first values of a fit of limits; those that hardly clip begin beyond all samples.
-
-        Parameters
-        ----------
-        amounts
-            Share of the change by each limit that the linear model takes, by coefficient.
-
-        Returns
-        -------
-        dict
-            Values by coefficient; none for an effect without a limit.
-
-        """
+        """Return first values of a fit of limits; those that hardly clip begin beyond all."""
         return self.limit_start | {name: value for name, value in self.limit_beyond.items()
                                    if amounts.get(name, 0.0) < _CLIPPING_AMOUNT}
 
@@ -147,24 +92,7 @@ def variants(simulate: Simulate, sensor: Sensor, effect: Effect, baseline_v: np.
     """
     Differentiate the simulated output by the parameters of an effect, for each shape.
 
-    Parameters
-    ----------
-    simulate
-        Simulates a sensor in the recording.
-    sensor
-        The baseline.
-    effect
-        The effect.
-    baseline_v
-        Simulated output of the baseline, V, (n, m).
-    pose_known
-        Whether the recording has a reference. Without one, only changes of the output count.
-
-    Yields
-    ------
-    Variant
-        One shape of the effect; none where the effect has nothing to act on.
-
+    baseline_v: simulated output of the baseline, V, (n, m).
     """
     modelled = effect.name in sensor.effects
     if limits(effect):
@@ -318,24 +246,8 @@ def sensitivities_at(simulate: Simulate, sensor: Sensor, names: Sequence[Coeffic
 
     Coefficients of one parameter change together, because each axis only follows its own one.
 
-    Parameters
-    ----------
-    simulate
-        Simulates a sensor in the recording.
-    sensor
-        Sensor with the coefficients at their values.
-    names
-        Names of the coefficients, (p,).
-    values
-        Their values, (p,).
-    output_v
-        Simulated output of the sensor, V, (n, m).
-
-    Returns
-    -------
-    numpy.ndarray
-        Sensitivities, V per unit, (n, m, p).
-
+    names: names of the coefficients, (p,); values: their values, (p,); output_v: simulated output
+    of the sensor, V, (n, m); returns: sensitivities, V per unit, (n, m, p).
     """
     out = np.zeros((*output_v.shape, len(names)))
     groups: dict[Coefficient, list[int]] = {}

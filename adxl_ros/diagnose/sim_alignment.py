@@ -47,23 +47,11 @@ the error."""
 
 @dataclass(frozen=True)
 class Shift:
-    """
-    How much later the motion of a simulator is stamped than that of a recording.
+    """How much later the motion of a simulator is stamped than that of a recording."""
 
-    Attributes
-    ----------
-    late_s
-        The shift, s; negative where the simulator is early.
-    std_s
-        Its standard deviation, s.
-    correlation
-        Correlation of the two motions without the shift.
-
-    """
-
-    late_s: float
-    std_s: float
-    correlation: float
+    late_s: float  # The shift, s; negative where the simulator is early
+    std_s: float  # Its standard deviation, s
+    correlation: float  # Correlation of the two motions without the shift
 
     @property
     def text(self) -> str:
@@ -75,23 +63,11 @@ class Shift:
 
 @dataclass(frozen=True)
 class AlignedForce:
-    """
-    A recording and the specific force of another simulator that belongs to it.
+    """A recording and the specific force of another simulator that belongs to it."""
 
-    Attributes
-    ----------
-    recording
-        The samples that the simulator covers.
-    sim
-        The simulator, shifted where it was asked for.
-    notes : tuple of str
-        What was shifted or left out, one line each.
-
-    """
-
-    recording: Recording
-    sim: Motion
-    notes: tuple[str, ...]
+    recording: Recording  # The samples that the simulator covers
+    sim: Motion  # The simulator, shifted where it was asked for
+    notes: tuple[str, ...]  # What was shifted or left out, one line each
 
 
 def align_force(recording: Recording, sensor: Sensor, sim: Motion, may_shift: bool

@@ -59,25 +59,13 @@ def normalised(weights: Mapping[tuple[str, ...], float]) -> tuple[WeightedHypoth
 
 @dataclass(frozen=True)
 class Candidate:
-    """
-    A fitted set of effects.
+    """A fitted set of effects."""
 
-    Attributes
-    ----------
-    hypothesis
-        The fitted effects.
-    figures
-        Held-out figures by the drift that the noise may have; '' is that of a healthy unit.
-    drift_mps2
-        Expected rms of the fitted drift, m/s², by the same.
-    pose_shares
-        Share of what each effect does that a function of the pose also does.
-
-    """
-
-    hypothesis: Hypothesis
+    hypothesis: Hypothesis  # The fitted effects
+    # Held-out figures by the drift that the noise may have; '' is that of a healthy unit
     figures: Mapping[str, HeldOut]
-    drift_mps2: Mapping[str, float]
+    drift_mps2: Mapping[str, float]  # Expected rms of the fitted drift, m/s², by the same
+    # Share of what each effect does that a function of the pose also does
     pose_shares: Mapping[str, float]
 
 
@@ -92,55 +80,25 @@ class Interval:
 
 @dataclass(frozen=True)
 class Verdict:
-    """
-    The result of a diagnosis; powers are mean squares over samples and axes, (m/s²)².
+    """The result of a diagnosis; powers are mean squares over samples and axes, (m/s²)²."""
 
-    Attributes
-    ----------
-    status
-        'no_gap', 'explained', 'partly', 'inseparable', 'unknown' or 'insufficient'.
-    effects
-        Effects that are named for certain.
-    groups
-        Sets of inseparable effects, one of which acts.
-    probability
-        How often such a verdict is right.
-    hypotheses
-        Sets of effects by falling probability, which sums to 1.
-    best
-        The set whose closing the report states.
-    material_mps2
-        Material amplitude, m/s².
-    reference_mps2
-        Rms error of the reference, m/s², that what follows the pose must exceed, too.
-    explained
-        Explained power of the best set.
-    rest
-        Reproducible rest beside it.
-    left
-        Power that it leaves above the noise floor, repeating or not.
-    upper_limit_mps2
-        Amplitude above which a gap of any kind would have shown.
-    lost_without
-        Explained power that is lost without each effect of the best set.
-    rest_follows
-        Dimensions that the reproducible rest follows, the strongest first.
-
-    """
-
-    status: str
-    effects: tuple[str, ...]
-    groups: tuple[tuple[str, ...], ...]
-    probability: float
+    status: str  # 'no_gap', 'explained', 'partly', 'inseparable', 'unknown' or 'insufficient'
+    effects: tuple[str, ...]  # Effects that are named for certain
+    groups: tuple[tuple[str, ...], ...]  # Sets of inseparable effects, one of which acts
+    probability: float  # How often such a verdict is right
+    # Sets of effects by falling probability, which sums to 1
     hypotheses: tuple[WeightedHypothesis, ...]
-    best: Hypothesis
-    material_mps2: float
+    best: Hypothesis  # The set whose closing the report states
+    material_mps2: float  # Material amplitude, m/s²
+    # Rms error of the reference, m/s², that what follows the pose must exceed, too
     reference_mps2: float
-    explained: Interval
-    rest: Interval
-    left: Interval
-    upper_limit_mps2: float
+    explained: Interval  # Explained power of the best set
+    rest: Interval  # Reproducible rest beside it
+    left: Interval  # Power that it leaves above the noise floor, repeating or not
+    upper_limit_mps2: float  # Amplitude above which a gap of any kind would have shown
+    # Explained power that is lost without each effect of the best set
     lost_without: Mapping[str, Interval] = field(default_factory=dict)
+    # Dimensions that the reproducible rest follows, the strongest first
     rest_follows: tuple[str, ...] = ()
 
     @property
@@ -157,35 +115,18 @@ _Modelled = tuple[frozenset[str], str]
 
 @dataclass(frozen=True)
 class Evidence:
-    """
-    What the rule weighs.
+    """What the rule weighs."""
 
-    Attributes
-    ----------
-    candidates
-        Sets of effects by name; the empty one is among them.
-    counts
-        Samples by block, (blocks,).
-    weights
-        How often each block is drawn, (draws, blocks); once each in the first row.
-    material_mps2
-        Material amplitude, m/s².
-    reference_mps2
-        Rms error of the reference, m/s²: its steps return with each pose, as an effect would.
-    lost_mps2
-        Rms of the motion that a smooth reference lacks, m/s².
-    floor_mps2
-        Noise floor, m/s²; infinite where it is assumed.
-
-    """
-
+    # Sets of effects by name; the empty one is among them
     candidates: Mapping[frozenset[str], Candidate]
-    counts: np.ndarray
+    counts: np.ndarray  # Samples by block, (blocks,)
+    # How often each block is drawn, (draws, blocks); once each in the first row
     weights: np.ndarray
-    material_mps2: float
+    material_mps2: float  # Material amplitude, m/s²
+    # Rms error of the reference, m/s²: its steps return with each pose, as an effect would
     reference_mps2: float
-    lost_mps2: float
-    floor_mps2: float
+    lost_mps2: float  # Rms of the motion that a smooth reference lacks, m/s²
+    floor_mps2: float  # Noise floor, m/s²; infinite where it is assumed
 
     def left(self, effects: frozenset[str], rows: slice) -> np.ndarray:
         """Return the power above the noise floor that a set leaves, by draw."""
@@ -394,21 +335,7 @@ def _group(effect: str, best: frozenset[str], others: Sequence[frozenset[str]]) 
 
 def decide(evidence: Evidence, rest_of: Callable[[frozenset[str], str], Rest],
            detected: Sequence[str], reliability: Callable[[float], float]) -> Verdict:
-    """
-    Apply the rule to the figures, and to draws of their blocks.
-
-    Parameters
-    ----------
-    evidence
-        Held-out figures of the sets of effects.
-    rest_of
-        Computes the reproducible rest beside a set with the drift of its noise.
-    detected
-        Effects that show in the noise.
-    reliability
-        How often verdicts are right that so large a share of the draws repeats.
-
-    """
+    """Apply the rule to the figures, and to draws of their blocks."""
     everything, noise_effects = slice(None), frozenset(detected)
     best = minimal_sets(evidence, everything)[0]
     rest = rest_of(best, HEALTHY)

@@ -30,37 +30,19 @@ _SHOWN_STDS = 4.0
 
 @dataclass(frozen=True)
 class CouldShow:
-    """
-    Smallest size of one parameter of an effect that recordings would have shown.
+    """Smallest size of one parameter of an effect that recordings would have shown."""
 
-    Attributes
-    ----------
-    effect, parameter, axis
-        The coefficient; `axis` is '' where it has none.
-    unit
-        Unit of the size.
-    smallest
-        The size; infinite where nothing of the effect reaches the output.
-    typical
-        Typical size.
-    shows
-        Whether the smallest size is one that the parameter can have.
-    share
-        Share of the effect's signal that zero-g, scale factor and latency cannot imitate.
-    revealed_by
-        Manoeuvre that shows the effect best.
-
-    """
-
+    # effect, parameter, axis: The coefficient; `axis` is '' where it has none
     effect: str
     parameter: str
     axis: str
-    unit: str
-    smallest: float
-    typical: float
-    shows: bool
+    unit: str  # Unit of the size
+    smallest: float  # The size; infinite where nothing of the effect reaches the output
+    typical: float  # Typical size
+    shows: bool  # Whether the smallest size is one that the parameter can have
+    # Share of the effect's signal that zero-g, scale factor and latency cannot imitate
     share: float
-    revealed_by: Manoeuvre | None
+    revealed_by: Manoeuvre | None  # Manoeuvre that shows the effect best
 
 
 def could_show(model: LinearModel, material_mps2: float) -> list[CouldShow]:

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Files and directories that appear as a whole under their name, or not at all."""
 
@@ -38,12 +26,6 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
 
     The new file or directory is synced to disk before the exchange, so that a power cut leaves
     the old or the new one. It is removed when the block fails.
-
-    Raises
-    ------
-    UserError
-        The directory does not exist or cannot be written.
-
     """
     target = Path(path)
     folder = ''
@@ -68,22 +50,7 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
 
 
 def write_text(path: str | os.PathLike, text: str) -> None:
-    """
-    Write a text file, UTF-8, as a whole or not at all.
-
-    Parameters
-    ----------
-    path
-        The file, replaced if it exists.
-    text
-        Its content.
-
-    Raises
-    ------
-    UserError
-        The file cannot be written.
-
-    """
+    """Write a text file, UTF-8, as a whole or not at all."""
     with atomic_path(path) as fresh:
         fresh.write_text(text, encoding='utf-8')
 
@@ -93,14 +60,6 @@ def remove_unfinished(folder: str | os.PathLike, name: str) -> None:
     Remove the unfinished files of writers that were killed.
 
     A file that another process is writing is locked, and stays.
-
-    Parameters
-    ----------
-    folder
-        The directory of the files.
-    name
-        Beginning of their names.
-
     """
     for unfinished in Path(folder).glob(f'.{escape(name)}*{_SUFFIX}'):
         with suppress(OSError), _locked(unfinished):
@@ -119,15 +78,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def keep_previous(path: str | os.PathLike) -> None:
-    """
-    Copy the file `path`, if it exists, to `path`.previous before it is replaced.
-
-    Raises
-    ------
-    UserError
-        The copy cannot be written.
-
-    """
+    """Copy the file `path`, if it exists, to `path`.previous before it is replaced."""
     if Path(path).is_file():
         with atomic_path(f'{path}.previous') as fresh:
             shutil.copyfile(path, fresh)

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The messages of a rosbag2 recording, in any storage and compression.
@@ -47,20 +35,10 @@ _ENDINGS = ('.mcap', '.db3', '.mcap.zstd', '.db3.zstd')
 
 
 class Part(Protocol):
-    """
-    One file of a recording.
+    """One file of a recording."""
 
-    Attributes
-    ----------
-    done
-        Fraction of the file that has been read.
-    types
-        Topics that hold messages, each with its type.
-
-    """
-
-    done: float
-    types: set[tuple[str, str]]
+    done: float  # Fraction of the file that has been read
+    types: set[tuple[str, str]]  # Topics that hold messages, each with its type
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, bytes, int]]:
         """Yield topic, bytes and log time, ns, of each message, in the order of recording."""
@@ -70,36 +48,13 @@ class Part(Protocol):
 
 
 class Bag:
-    """
-    An open recording.
-
-    Attributes
-    ----------
-    path
-        The file or directory, for messages.
-    types
-        Topics that hold messages, each with its type.
-    cut
-        Where damaged files end; empty if all are whole.
-
-    """
+    """An open recording."""
 
     def __init__(self, path: str, parts: list[Part], cut: str) -> None:
-        """
-        Take the files of a recording.
-
-        Parameters
-        ----------
-        path
-            The file or directory, for messages.
-        parts
-            Its files in the order of time.
-        cut
-            Where damaged files end.
-
-        """
-        self.path = path
-        self.cut = cut
+        """Take the files of a recording."""
+        self.path = path  # The file or directory, for messages
+        self.cut = cut  # Where damaged files end; empty if all are whole
+        # Topics that hold messages, each with its type
         self.types: set[tuple[str, str]] = set().union(*(part.types for part in parts))
         self._parts = parts
         self._read = 0
@@ -112,28 +67,12 @@ class Bag:
         return (self._read + self._parts[self._read].done) / len(self._parts)
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, bytes]]:
-        """
-        Yield topic and CDR of each message of some topics, in the order of recording.
-
-        Raises
-        ------
-        UserError
-            A file or a message is damaged.
-
-        """
+        """Yield topic and CDR of each message of some topics, in the order of recording."""
         for topic, raw, _ in self.logged_messages(topics):
             yield topic, raw
 
     def logged_messages(self, topics: Collection[str]) -> Iterator[tuple[str, bytes, int]]:
-        """
-        Yield topic, CDR and log time, ns, of each message, in the order of recording.
-
-        Raises
-        ------
-        UserError
-            A file or a message is damaged.
-
-        """
+        """Yield topic, CDR and log time, ns, of each message, in the order of recording."""
         self._read = 0
         for part in self._parts:
             for topic, raw, log_ns in part.messages(topics):
@@ -143,15 +82,7 @@ class Bag:
             self._read += 1
 
     def pieces(self, topics: Collection[str]) -> Iterator[Piece]:
-        """
-        Yield the messages of some topics in pieces, in the order of recording.
-
-        Raises
-        ------
-        UserError
-            A file or a message is damaged.
-
-        """
+        """Yield the messages of some topics in pieces, in the order of recording."""
         self._read = 0
         for part in self._parts:
             for piece in part.pieces(topics):
@@ -229,15 +160,7 @@ def _unreadable(path: Path, error: Exception) -> UserError:
 
 
 def import_rosbags() -> Any:
-    """
-    Return the module rosbags.rosbag2.
-
-    Raises
-    ------
-    UserError
-        The library is not installed.
-
-    """
+    """Return the module rosbags.rosbag2."""
     try:
         import rosbags.rosbag2
     except ImportError:
@@ -248,15 +171,7 @@ def import_rosbags() -> Any:
 
 @contextmanager
 def open_bag(path: str | os.PathLike) -> Iterator[Bag]:
-    """
-    Open a rosbag2 directory, or one .mcap or .db3 file.
-
-    Raises
-    ------
-    UserError
-        There is no recording, or it cannot be read.
-
-    """
+    """Open a rosbag2 directory, or one .mcap or .db3 file."""
     bag_path = Path(path)
     rosbag2 = import_rosbags()
     with ExitStack() as stack:

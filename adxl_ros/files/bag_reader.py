@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Bags, read in blocks: the sensor's samples with references aligned with their stamps."""
 
@@ -51,31 +39,7 @@ _EXACT_NS = 1 << 53
 
 def blocks(path: str | os.PathLike, rows: int, ideal: bool = False,
            reading: ReadingOptions = AS_IT_IS) -> Generator[Recording, None, None]:
-    """
-    Read a bag in blocks of at most `rows` samples.
-
-    Parameters
-    ----------
-    path
-        A rosbag2 directory, or one .mcap or .db3 file.
-    rows
-        Largest number of samples of a block.
-    ideal
-        Whether it is another simulator's specific force: any sensor_msgs/Imu, all three axes.
-    reading
-        Topic of the samples, sample rate, and what becomes of bad stamps.
-
-    Yields
-    ------
-    Recording
-        The blocks in the order of time.
-
-    Raises
-    ------
-    UserError
-        The bag cannot be read, or a value is wrong. The message names the topic.
-
-    """
+    """Read a bag in blocks of at most `rows` samples."""
     with open_bag(path) as bag:
         _refuse_mapping(bag, reading)
         topics = find_ideal(bag) if ideal else find_topics(bag, reading.topic)
@@ -110,25 +74,15 @@ def _refuse_mapping(bag: Bag, reading: ReadingOptions) -> None:
 
 
 class _Batch:
-    """
-    Messages in the order of recording.
-
-    Attributes
-    ----------
-    messages
-        Their bytes by topic, in parts.
-    samples_before
-        How many samples of the batch precede each command, (k,).
-    count
-        Samples of the batch.
-
-    """
+    """Messages in the order of recording."""
 
     def __init__(self, topics: Topics) -> None:
         self._topics = topics
+        # Their bytes by topic, in parts
         self.messages: dict[str, list[Raws]] = {name: [] for name in topics.sampled()}
+        # How many samples of the batch precede each command, (k,)
         self.samples_before: list[int] = []
-        self.count = 0
+        self.count = 0  # Samples of the batch
 
     def add(self, piece: Piece) -> None:
         """Append messages."""
@@ -156,38 +110,20 @@ def _batches(bag: Bag, topics: Topics, rows: int) -> Iterator[tuple[_Batch, bool
 
 
 class _Samples:
-    """
-    The sensor's samples that have been read but not yet handed on.
-
-    Attributes
-    ----------
-    where
-        File and topic, for messages.
-    axes
-        Measured axes; None before the first sample, if sensor_info does not state them.
-    epoch_ns
-        Origin of the times, ns.
-    count
-        Samples so far.
-    stamp_ns
-        Stamps of the waiting samples, ns, (n,).
-    accel
-        Their specific force, m/s², (n, 3).
-    arrived_ns
-        Stamps of the newest batch after the stamp of the sample before it, ns; 0 is none.
-
-    """
+    """The sensor's samples that have been read but not yet handed on."""
 
     def __init__(self, where: str, axes: str | None, reading: ReadingOptions) -> None:
-        self.where = where
+        self.where = where  # File and topic, for messages
         self._reading = reading
         self._first_ns = 0
         self.bad_stamps = BadStamps(0, 0)
+        # Measured axes; None before the first sample, if sensor_info does not state them
         self.axes = axes
-        self.epoch_ns = 0
-        self.count = 0
-        self.stamp_ns = np.zeros(0, np.int64)
-        self.accel = np.zeros((0, 3))
+        self.epoch_ns = 0  # Origin of the times, ns
+        self.count = 0  # Samples so far
+        self.stamp_ns = np.zeros(0, np.int64)  # Stamps of the waiting samples, ns, (n,)
+        self.accel = np.zeros((0, 3))  # Their specific force, m/s², (n, 3)
+        # Stamps of the newest batch after the stamp of the sample before it, ns; 0 is none
         self.arrived_ns = np.zeros(1, np.int64)
         self._last_ns: int | None = None
         self._frame: str | None = None

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The topics of a bag that hold the sensor and its references, and what it states of itself."""
 
@@ -44,30 +32,15 @@ _IDENTITY = ('serial', 'axes', 'nominal_zero_g_v', 'nominal_scale_v_per_g')
 
 @dataclass(frozen=True)
 class Topics:
-    """
-    Full names of the topics in a bag; None where the bag does not hold it.
+    """Full names of the topics in a bag; None where the bag does not hold it."""
 
-    Attributes
-    ----------
-    imu
-        The sensor's output.
-    joints
-        Positions of the stage.
-    info
-        What the sensor states of itself.
-    temperature, supply
-        References of these quantities.
-    command
-        Commands of the stage.
-
-    """
-
-    imu: str
-    joints: str | None = None
-    info: str | None = None
+    imu: str  # The sensor's output
+    joints: str | None = None  # Positions of the stage
+    info: str | None = None  # What the sensor states of itself
+    # temperature, supply: References of these quantities
     temperature: str | None = None
     supply: str | None = None
-    command: str | None = None
+    command: str | None = None  # Commands of the stage
 
     def sampled(self) -> list[str]:
         """Return the topics to read sample by sample."""
@@ -76,27 +49,7 @@ class Topics:
 
 
 def find_topics(bag: Bag, topic: str = '') -> Topics:
-    """
-    Find the topics by their names, in any namespace, and their types.
-
-    Parameters
-    ----------
-    bag
-        The recording.
-    topic
-        Name of the sensor's output; empty for `imu/data_raw`, or the only sensor_msgs/Imu.
-
-    Returns
-    -------
-    Topics
-        The topics that belong together.
-
-    Raises
-    ------
-    UserError
-        There is no such topic, or there are several sensors, or a topic is of another type.
-
-    """
+    """Find the topics by their names, in any namespace, and their types."""
     imu = _chosen(bag, topic) if topic else _only(bag, 'imu/data_raw', IMU) or _only_imu(bag)
     space = imu.removesuffix('imu/data_raw')
     if space == imu:
@@ -154,15 +107,7 @@ def _info(bag: Bag, imu: str, space: str) -> str | None:
 
 
 def find_ideal(bag: Bag) -> Topics:
-    """
-    Find another simulator's specific force: the only topic of type sensor_msgs/Imu.
-
-    Raises
-    ------
-    UserError
-        There is none, or there are several and none of them is `imu/data_raw`.
-
-    """
+    """Find another simulator's specific force: the only topic of type sensor_msgs/Imu."""
     candidates = sorted(topic for topic, kind in bag.types if kind == IMU)
     if len(candidates) == 1:
         return Topics(candidates[0])
@@ -211,27 +156,7 @@ def typestore() -> Any:
 
 
 def read_info(bag: Bag, topic: str | None) -> dict[str, str]:
-    """
-    Return what the sensor states in the last message of `sensor_info`.
-
-    Parameters
-    ----------
-    bag
-        The recording.
-    topic
-        Full name of the topic; None if there is none.
-
-    Returns
-    -------
-    dict
-        Values by key; empty without a topic.
-
-    Raises
-    ------
-    UserError
-        A message is damaged, the sensor changes within the recording, or its axes are unknown.
-
-    """
+    """Return what the sensor states in the last message of `sensor_info`."""
     info: dict[str, str] = {}
     if topic is None:
         return info

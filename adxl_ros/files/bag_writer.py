@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Bags, written block by block, whole or not at all."""
 
@@ -72,15 +60,7 @@ class OpenBag:
     """
 
     def __init__(self, path: str | os.PathLike) -> None:
-        """
-        Prepare to write to `path`, which is replaced if it exists.
-
-        Raises
-        ------
-        UserError
-            The library rosbags is not installed.
-
-        """
+        """Prepare to write to `path`, which is replaced if it exists."""
         self._path = Path(path)
         self._rosbag2 = import_rosbags()
         self.types = typestore()
@@ -106,24 +86,7 @@ class OpenBag:
         self._stack.__exit__(kind, error, trace)
 
     def connection(self, topic: str, kind: str, is_latched: bool = False) -> Any:
-        """
-        Return the connection of a topic.
-
-        Parameters
-        ----------
-        topic
-            Its full name.
-        kind
-            Its type.
-        is_latched
-            Whether late subscribers get its last message.
-
-        Returns
-        -------
-        Connection
-            What rosbags writes messages to.
-
-        """
+        """Return the connection of a topic."""
         if topic not in self._connections:
             self._connections[topic] = self._writer.add_connection(
                 topic, kind, typestore=self.types, offered_qos_profiles=[_qos(is_latched)])
@@ -140,13 +103,7 @@ class OpenBag:
         """
         Append the messages of samples.
 
-        Parameters
-        ----------
-        stamp_ns
-            Stamps of the samples, ns, (n,), rising.
-        batches
-            Messages of the samples, in their order within a sample.
-
+        stamp_ns: stamps of the samples, ns, (n,), rising.
         """
         write_messages(self._writer, stamp_ns, batches)
         release_written(self._writer.storage.bio)
@@ -163,36 +120,13 @@ class BagWriter(OpenBag):
     """
 
     def __init__(self, path: str | os.PathLike, sensor: Sensor) -> None:
-        """
-        Prepare to write to `path`.
-
-        Parameters
-        ----------
-        path
-            The bag, replaced if it exists.
-        sensor
-            The unit whose nominal conversion `imu/data_raw` holds.
-
-        Raises
-        ------
-        UserError
-            The library rosbags is not installed.
-
-        """
+        """Prepare to write to `path`."""
         super().__init__(path)
         self._sensor = sensor
         self._imu = imu_template(self.types, _noise_covariance(sensor))
 
     def write(self, recording: Recording) -> None:
-        """
-        Append samples.
-
-        Raises
-        ------
-        UserError
-            An axis of the sensor is missing, or a time cannot be a stamp.
-
-        """
+        """Append samples."""
         stamp_ns = recording.stamp_ns
         self.check_stamps(stamp_ns)
         if '/sensor_info' not in self._connections:
@@ -272,30 +206,15 @@ def _changes(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 class _Scalar(NamedTuple):
-    """
-    A reference with a topic of its own.
+    """A reference with a topic of its own."""
 
-    Attributes
-    ----------
-    column
-        Its column in a recording.
-    topic, kind
-        The topic and its type.
-    field
-        The message's field with the value.
-    template
-        Makes a message, from the message types.
-    layout
-        Finds the fields of a message.
-
-    """
-
-    column: str
+    column: str  # Its column in a recording
+    # topic, kind: The topic and its type
     topic: str
     kind: str
-    field: str
-    template: Callable[[Any], bytes]
-    layout: Callable[[bytes], cdr.Layout]
+    field: str  # The message's field with the value
+    template: Callable[[Any], bytes]  # Makes a message, from the message types
+    layout: Callable[[bytes], cdr.Layout]  # Finds the fields of a message
 
 
 def _keep_file(file: Path, target: Path) -> None:
@@ -321,22 +240,7 @@ def _qos(is_latched: bool) -> Any:
 
 
 def message_header(types: Any, frame: str) -> Any:
-    """
-    Return a header with the stamp 0.
-
-    Parameters
-    ----------
-    types
-        Message types of rosbags.
-    frame
-        Name of the frame.
-
-    Returns
-    -------
-    Header
-        The header.
-
-    """
+    """Return a header with the stamp 0."""
     time = types.types['builtin_interfaces/msg/Time'](sec=0, nanosec=0)
     return types.types['std_msgs/msg/Header'](stamp=time, frame_id=frame)
 
@@ -353,18 +257,7 @@ def imu_template(types: Any, covariance: np.ndarray) -> bytes:
     """
     Return an Imu without orientation and angular velocity, at the stamp 0.
 
-    Parameters
-    ----------
-    types
-        Message types of rosbags.
-    covariance
-        That of the acceleration by rows, (m/s²)², (9,).
-
-    Returns
-    -------
-    bytes
-        The message, serialized.
-
+    covariance: that of the acceleration by rows, (m/s²)², (9,).
     """
     absent = np.zeros(9)
     absent[0] = -1.0

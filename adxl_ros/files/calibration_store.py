@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The calibration store: a folder with one folder for each unit, and in it one file by id.
@@ -55,54 +43,24 @@ _CACHED_DATES = 256
 
 
 class StoredCalibration(NamedTuple):
-    """
-    One calibration of a unit.
+    """One calibration of a unit."""
 
-    Attributes
-    ----------
-    path
-        Its file.
-    sensor
-        The fitted sensor.
-
-    """
-
-    path: Path
-    sensor: Sensor
+    path: Path  # Its file
+    sensor: Sensor  # The fitted sensor
 
 
 class UnitHistory(NamedTuple):
-    """
-    All calibrations of a unit.
+    """All calibrations of a unit."""
 
-    Attributes
-    ----------
-    calibrations
-        Oldest first; those without a date come before them.
-    refused
-        Why further files cannot be used.
-
-    """
-
-    calibrations: list[StoredCalibration]
-    refused: list[str]
+    calibrations: list[StoredCalibration]  # Oldest first; those without a date come before them
+    refused: list[str]  # Why further files cannot be used
 
 
 class Choice(NamedTuple):
-    """
-    The calibration to use.
+    """The calibration to use."""
 
-    Attributes
-    ----------
-    path
-        Its file; None if there is none.
-    refused
-        Why newer or unreadable files are not used.
-
-    """
-
-    path: Path | None
-    refused: list[str]
+    path: Path | None  # Its file; None if there is none
+    refused: list[str]  # Why newer or unreadable files are not used
 
 
 def default_folder() -> Path:
@@ -139,22 +97,7 @@ def date_in(text: str) -> datetime | None:
 
 
 def unit_folder(folder: str | os.PathLike, serial: str) -> Path:
-    """
-    Return the folder of a unit.
-
-    Parameters
-    ----------
-    folder
-        The store.
-    serial
-        Serial number.
-
-    Returns
-    -------
-    Path
-        The folder, which may not exist.
-
-    """
+    """Return the folder of a unit."""
     return Path(folder) / _name(serial)
 
 
@@ -169,29 +112,7 @@ def _name(serial: str) -> str:
 
 
 def put(folder: str | os.PathLike, sensor: Sensor, comments: Iterable[str] = ()) -> Path | None:
-    """
-    Store a calibration.
-
-    Parameters
-    ----------
-    folder
-        The store, created if it does not exist.
-    sensor
-        A fitted unit with provenance.
-    comments
-        Lines for people, before the parameters.
-
-    Returns
-    -------
-    Path
-        The file; None for the serial number `nominal`, which is no particular unit.
-
-    Raises
-    ------
-    UserError
-        The store cannot be written.
-
-    """
+    """Store a calibration."""
     if sensor.serial == NO_UNIT:
         return None
     folder_of_unit = unit_folder(folder, sensor.serial)
@@ -206,22 +127,7 @@ def put(folder: str | os.PathLike, sensor: Sensor, comments: Iterable[str] = ())
 
 
 def history(folder: str | os.PathLike, serial: str) -> UnitHistory:
-    """
-    Return the calibrations of a unit by date.
-
-    Parameters
-    ----------
-    folder
-        The store.
-    serial
-        Serial number.
-
-    Returns
-    -------
-    UnitHistory
-        The calibrations, and why files cannot be used.
-
-    """
+    """Return the calibrations of a unit by date."""
     calibrations, refused = [], []
     for path in sorted(unit_folder(folder, serial).glob('*.yaml')):
         try:
@@ -237,24 +143,7 @@ def history(folder: str | os.PathLike, serial: str) -> UnitHistory:
 
 
 def newest(folder: str | os.PathLike, serial: str, check: Callable[[Sensor], None]) -> Choice:
-    """
-    Return the newest calibration of a unit that can be used.
-
-    Parameters
-    ----------
-    folder
-        The store.
-    serial
-        Serial number.
-    check
-        Raises `UserError` for a calibration that cannot be used.
-
-    Returns
-    -------
-    Choice
-        Its file, and why other files are not used.
-
-    """
+    """Return the newest calibration of a unit that can be used."""
     calibrations, refused = history(folder, serial)
     for path, sensor in reversed(calibrations):
         try:
@@ -271,19 +160,6 @@ def newer(folder: str | os.PathLike, sensor: Sensor) -> Path | None:
     Return the newest file of a unit if its date is later than that of a calibration.
 
     This is quick: file names of the store hold the date, and other files are read once.
-
-    Parameters
-    ----------
-    folder
-        The store.
-    sensor
-        The calibration.
-
-    Returns
-    -------
-    Path or None
-        The newest file, if it is newer.
-
     """
     dated = {path: _dated(path, sensor.serial)
              for path in unit_folder(folder, sensor.serial).glob('*.yaml')}

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 ROS messages in CDR, the wire format of DDS (OMG DDSI-RTPS, section 10), as arrays.
@@ -41,72 +29,30 @@ class CdrError(ValueError):
 
 @dataclass(frozen=True)
 class NumberField:
-    """
-    Numbers within a message.
+    """Numbers within a message."""
 
-    Attributes
-    ----------
-    offset
-        Offset of the first one, bytes.
-    code
-        Their numpy type without byte order, such as f8.
-    count
-        How many there are.
-
-    """
-
-    offset: int
-    code: str
-    count: int
+    offset: int  # Offset of the first one, bytes
+    code: str  # Their numpy type without byte order, such as f8
+    count: int  # How many there are
 
 
 class Layout:
-    """
-    Offsets of the fields of one message, found from its beginning to its end.
-
-    Attributes
-    ----------
-    order
-        Byte order, < or >.
-    fields
-        The number fields by name.
-    texts
-        Strings by name, in the order of the message.
-    fixed
-        Offsets of the bytes that all messages of this layout share: lengths and strings.
-
-    """
+    """Offsets of the fields of one message, found from its beginning to its end."""
 
     def __init__(self, raw: bytes) -> None:
         """Start after the encapsulation header of `raw`."""
         self._raw = raw
         if raw[:2] not in _ORDERS:
             raise CdrError(f'encapsulation 0x{raw[:2].hex()} is not plain CDR')
-        self.order = _ORDERS[raw[:2]]
-        self.fields: dict[str, NumberField] = {}
-        self.texts: dict[str, str] = {}
+        self.order = _ORDERS[raw[:2]]  # Byte order, < or >
+        self.fields: dict[str, NumberField] = {}  # The number fields by name
+        self.texts: dict[str, str] = {}  # Strings by name, in the order of the message
+        # Offsets of the bytes that all messages of this layout share: lengths and strings
         self.fixed: list[int] = [0, 1]
         self._offset = _BODY_OFFSET
 
     def numbers(self, name: str, code: str, count: int = 1) -> None:
-        """
-        Pass over numbers.
-
-        Parameters
-        ----------
-        name
-            Their name in `fields`.
-        code
-            Their numpy type, such as f8.
-        count
-            How many there are.
-
-        Raises
-        ------
-        CdrError
-            The message ends before them.
-
-        """
+        """Pass over numbers."""
         if not count:
             return
         size = int(code[1:])
@@ -191,23 +137,11 @@ def battery_state(raw: bytes) -> Layout:
 
 @dataclass(frozen=True)
 class Table:
-    """
-    Messages of one layout.
+    """Messages of one layout."""
 
-    Attributes
-    ----------
-    rows
-        Their indices among the messages that were given, (n,).
-    data
-        Their bytes, (n, size).
-    layout
-        Where their fields are.
-
-    """
-
-    rows: np.ndarray
-    data: np.ndarray
-    layout: Layout
+    rows: np.ndarray  # Their indices among the messages that were given, (n,)
+    data: np.ndarray  # Their bytes, (n, size)
+    layout: Layout  # Where their fields are
 
     def numbers(self, name: str) -> np.ndarray:
         """Return a field of all messages as float64, (n, count)."""
@@ -227,27 +161,7 @@ Raws = Sequence[bytes] | np.ndarray
 
 
 def tables(raws: Raws, find: Callable[[bytes], Layout]) -> Iterator[Table]:
-    """
-    Group messages by layout.
-
-    Parameters
-    ----------
-    raws
-        The messages of one type.
-    find
-        Finds the layout of a message of that type, such as `imu`.
-
-    Yields
-    ------
-    Table
-        The messages of one layout.
-
-    Raises
-    ------
-    CdrError
-        A message is too short or in another encoding.
-
-    """
+    """Group messages by layout."""
     if isinstance(raws, np.ndarray):
         yield from _tables_of_rows(np.arange(len(raws)), raws, find)
         return
@@ -272,27 +186,7 @@ def _tables_of_rows(rows: np.ndarray, data: np.ndarray, find: Callable[[bytes], 
 
 
 def joined_tables(parts: Sequence[Raws], find: Callable[[bytes], Layout]) -> Iterator[Table]:
-    """
-    Group messages by layout, part by part.
-
-    Parameters
-    ----------
-    parts
-        The messages of one type, in parts.
-    find
-        Finds the layout of a message of that type, such as `imu`.
-
-    Yields
-    ------
-    Table
-        Messages of one layout; their indices count over all parts.
-
-    Raises
-    ------
-    CdrError
-        A message is too short or in another encoding.
-
-    """
+    """Group messages by layout, part by part."""
     begin = 0
     for raws in parts:
         for table in tables(raws, find):
@@ -305,22 +199,8 @@ def fill(template: bytes, layout: Layout, stamp_ns: np.ndarray,
     """
     Return one message for each stamp.
 
-    Parameters
-    ----------
-    template
-        A message with the strings and lengths, and with the values of all other fields.
-    layout
-        Where its fields are.
-    stamp_ns
-        Stamps, ns, (n,).
-    fields
-        Values by field, (n, count).
-
-    Returns
-    -------
-    ndarray
-        The bytes of the messages, (n, size), each as long as the template.
-
+    stamp_ns: stamps, ns, (n,); fields: values by field, (n, count); returns: the bytes of the
+    messages, (n, size), each as long as the template.
     """
     sec, nanosec = np.divmod(stamp_ns, 1_000_000_000)
     values = {'sec': sec, 'nanosec': nanosec, **fields}

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The mapping that a table most likely needs, from the names and values of its columns."""
 
@@ -137,30 +125,15 @@ _COUNTS = (64, 100, 128, 256, 512, 1000, 1024, 1365, 2048, 4096, 8192, 16384, 32
 
 @dataclass(frozen=True)
 class Proposal:
-    """
-    A mapping that is proposed.
+    """A mapping that is proposed."""
 
-    Attributes
-    ----------
-    mapping
-        Columns and units by role.
-    lsb_per_g, lsb_at_0g
-        Counts of 1 g, and at 0 g; 0 where no column is in LSB.
-    reasons
-        What it follows from.
-    stamps
-        Options without which the stamps are refused; empty where they are sound.
-    note
-        What the user has to add, in brackets; empty for nothing.
-
-    """
-
-    mapping: ColumnMapping
+    mapping: ColumnMapping  # Columns and units by role
+    # lsb_per_g, lsb_at_0g: Counts of 1 g, and at 0 g; 0 where no column is in LSB
     lsb_per_g: float
     lsb_at_0g: float
-    reasons: Sequence[str]
-    stamps: str = ''
-    note: str = ''
+    reasons: Sequence[str]  # What it follows from
+    stamps: str = ''  # Options without which the stamps are refused; empty where they are sound
+    note: str = ''  # What the user has to add, in brackets; empty for nothing
 
     def options(self) -> str:
         """Return the options, quoted for a shell."""
@@ -171,42 +144,12 @@ class Proposal:
 
 
 def is_sensor_step(step_s: float, is_whole: bool) -> bool:
-    """
-    Return whether samples come at such steps; at whole seconds they hardly do.
-
-    Parameters
-    ----------
-    step_s
-        Step of stamps, s.
-    is_whole
-        Whether the stamps are whole numbers.
-
-    Returns
-    -------
-    bool
-        Whether a sensor may have this rate.
-
-    """
+    """Return whether samples come at such steps; at whole seconds they hardly do."""
     return _SHORTEST_STEP_S <= step_s <= _LONGEST_STEP_S and not (is_whole and step_s >= 1)
 
 
 def time_unit_of_step(step: float, is_whole: bool) -> str:
-    """
-    Return the likely unit of stamps.
-
-    Parameters
-    ----------
-    step
-        Step of the stamps, in their unit.
-    is_whole
-        Whether the stamps are whole numbers.
-
-    Returns
-    -------
-    str
-        The largest unit in which samples come at such steps; s where there is none.
-
-    """
+    """Return the likely unit of stamps."""
     return next((unit for unit in ('s', 'ms', 'us', 'ns') if is_sensor_step(
         step / UNITS[Quantity.TIME][unit].divisor, is_whole)), 's')
 
@@ -277,24 +220,7 @@ def _stamp_options(values: np.ndarray, source: Source) -> str:
 
 
 def describe(table: Table, is_listed: bool = False) -> tuple[str, str]:
-    """
-    Describe the columns of a table, and the options that most likely read it.
-
-    Parameters
-    ----------
-    table
-        The table.
-    is_listed
-        Whether the columns are named before.
-
-    Returns
-    -------
-    text : str
-        Clauses for a message.
-    options : str
-        What follows them, quoted for a shell.
-
-    """
+    """Describe the columns of a table, and the options that most likely read it."""
     form = f' ({table.form})' if table.form else ''
     seen = '' if is_listed and not form else f'the columns are {listed(table.names)}{form}; '
     proposal = propose(table)

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Which column of a foreign file holds which quantity in which unit, and the mounting."""
 
@@ -35,38 +23,18 @@ _ENTRY = re.compile(r"""\s*([^=,\s]+)\s*=\s*((?:"[^"]*"|'[^']*'|[^,"'])+?)\s*(?:
 
 @dataclass(frozen=True)
 class Source:
-    """
-    Where a quantity comes from.
+    """Where a quantity comes from."""
 
-    Attributes
-    ----------
-    column
-        Name of the column, or its number from 1.
-    unit
-        Name of its unit; empty where none is stated.
-
-    """
-
-    column: str
-    unit: str = ''
+    column: str  # Name of the column, or its number from 1
+    unit: str = ''  # Name of its unit; empty where none is stated
 
 
 @dataclass(frozen=True)
 class ColumnMapping:
-    """
-    Which columns of a file hold a recording.
+    """Which columns of a file hold a recording."""
 
-    Attributes
-    ----------
-    sources
-        Column and unit by role, a key of `column_units.ROLES`.
-    where
-        What states the mapping, for messages.
-
-    """
-
-    sources: Mapping[str, Source]
-    where: str = '--columns'
+    sources: Mapping[str, Source]  # Column and unit by role, a key of `column_units.ROLES`
+    where: str = '--columns'  # What states the mapping, for messages
 
     def __str__(self) -> str:
         """Return the text that states the mapping."""
@@ -82,27 +50,7 @@ def _quoted(column: str) -> str:
 
 
 def parse_mapping(text: str) -> ColumnMapping:
-    """
-    Parse a mapping, or the file that holds it.
-
-    Parameters
-    ----------
-    text
-        `role=column:unit` with commas between; a column is a name or a number from 1, and stands
-        in quotes where its name has a comma or a colon. Text without `=` names a file, in which
-        a line end is a comma and `#` begins a comment.
-
-    Returns
-    -------
-    ColumnMapping
-        The mapping.
-
-    Raises
-    ------
-    UserError
-        The file cannot be read, or an entry, role or unit is wrong.
-
-    """
+    """Parse a mapping, or the file that holds it."""
     where = '--columns'
     if '=' not in text:
         where, text = f'--columns {text}', _content(text)
@@ -177,20 +125,10 @@ def _check_roles(where: str, sources: Mapping[str, Source]) -> None:
 
 @dataclass(frozen=True)
 class Mounting:
-    """
-    How the axes of a file are the axes of the sensor frame.
+    """How the axes of a file are the axes of the sensor frame."""
 
-    Attributes
-    ----------
-    columns
-        For each axis of the frame, the index of the axis in the file.
-    signs
-        For each axis of the frame, 1 or −1.
-
-    """
-
-    columns: tuple[int, ...]
-    signs: tuple[int, ...]
+    columns: tuple[int, ...]  # For each axis of the frame, the index of the axis in the file
+    signs: tuple[int, ...]  # For each axis of the frame, 1 or −1
 
     def turn(self, values: np.ndarray) -> np.ndarray:
         """Return outputs about zero, (n, m), along the axes of the frame."""
@@ -198,15 +136,7 @@ class Mounting:
 
 
 def parse_mounting(text: str) -> Mounting:
-    """
-    Parse a documented mounting, as in `x=-y,y=x,z=z`: x of the frame is −y of the file.
-
-    Raises
-    ------
-    UserError
-        An entry is wrong, or an axis is used twice.
-
-    """
+    """Parse a documented mounting, as in `x=-y,y=x,z=z`: x of the frame is −y of the file."""
     entries: dict[str, tuple[int, int]] = {}
     for entry in text.split(','):
         match = re.fullmatch(r'\s*([xyz])\s*=\s*([-+]?)\s*([xyz])\s*', entry)

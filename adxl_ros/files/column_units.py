@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Units of the columns of foreign files, and their conversion to the units of the package."""
 
@@ -64,25 +52,15 @@ def signed(values: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Unit:
-    """
-    A unit: value in the unit of the package = value · factor / divisor + offset.
+    """A unit: value in the unit of the package = value · factor / divisor + offset."""
 
-    Attributes
-    ----------
-    quantity
-        What it measures.
-    divisor, factor, offset
-        The conversion. A division by a power of ten is exact where a product is not.
-    is_volts
-        Whether the output of a sensor stays in volts.
-
-    """
-
-    quantity: Quantity
+    quantity: Quantity  # What it measures
+    # divisor, factor, offset: The conversion. A division by a power of ten is exact where a
+    # product is not.
     divisor: float = 1.0
     factor: float = 1.0
     offset: float = 0.0
-    is_volts: bool = False
+    is_volts: bool = False  # Whether the output of a sensor stays in volts
 
     def convert(self, values: np.ndarray) -> np.ndarray:
         """Return values in the unit of the package."""
@@ -152,44 +130,14 @@ _WORD_ENDS = re.compile(r'[_\s.]+|\[\d+\]|[(\[{].*[)\]}]|(?<=[a-z])(?=[A-Z])')
 
 
 def unit_name(text: str, quantity: Quantity) -> str | None:
-    """
-    Return the name of a unit that is written in any way.
-
-    Parameters
-    ----------
-    text
-        The unit as people write it.
-    quantity
-        What it measures.
-
-    Returns
-    -------
-    str or None
-        A key of `UNITS[quantity]`; None where it is no unit of the quantity.
-
-    """
+    """Return the name of a unit that is written in any way."""
     word = text.strip().lower()
     name = _ALIASES.get(word, word)
     return name if name in UNITS[quantity] else None
 
 
 def unit_in_name(column: str, quantity: Quantity) -> str | None:
-    """
-    Return the unit that the name of a column states: in brackets, or as one of its words.
-
-    Parameters
-    ----------
-    column
-        Name of the column.
-    quantity
-        What it measures.
-
-    Returns
-    -------
-    str or None
-        Name of the unit; None where the name states none.
-
-    """
+    """Return the unit that the name of a column states: in brackets, or as one of its words."""
     parts = [part for part in _WORD_ENDS.split(column.strip()) if part]
     # The first word names the quantity: a column `g` or `C` may be anything.
     words = [*_BRACKETS.findall(column), '_'.join(parts[-2:]), *reversed(parts[1:])]

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """CSV recordings in the columns and units of the package, read in blocks."""
 
@@ -35,60 +23,19 @@ TIME_LIMIT_S = 9e9
 
 @dataclass
 class _State:
-    """
-    What earlier blocks leave behind.
+    """What earlier blocks leave behind."""
 
-    Attributes
-    ----------
-    path
-        The file, for messages.
-    header
-        Its columns.
-    layout
-        Which of them hold numbers so far.
-    epoch_ns
-        Origin of the times, ns.
-    last_time_s
-        Time of the newest sample, s.
-    last_line
-        Number of its line.
-
-    """
-
-    path: str
-    header: Header
-    layout: Layout
-    epoch_ns: int
-    last_time_s: float = -np.inf
-    last_line: int = 0
+    path: str  # The file, for messages
+    header: Header  # Its columns
+    layout: Layout  # Which of them hold numbers so far
+    epoch_ns: int  # Origin of the times, ns
+    last_time_s: float = -np.inf  # Time of the newest sample, s
+    last_line: int = 0  # Number of its line
 
 
 def blocks(path: str | os.PathLike, rows: int,
            needed: tuple[str, ...] | None = None) -> Generator[Recording, None, None]:
-    """
-    Read a CSV recording in blocks of at most `rows` samples.
-
-    Parameters
-    ----------
-    path
-        The file.
-    rows
-        Largest number of samples of a block.
-    needed
-        Columns besides `time_s` that must have a number in every row; None is the sensor's output
-        in any form.
-
-    Yields
-    ------
-    Recording
-        The blocks in the order of time.
-
-    Raises
-    ------
-    UserError
-        The file cannot be read, or a field is wrong. The message names file, line and column.
-
-    """
+    """Read a CSV recording in blocks of at most `rows` samples."""
     path = str(path)
     try:
         with open(path, 'rb') as file:
@@ -137,27 +84,7 @@ def _begin(path: str, lines: Lines, info: dict[str, str],
 
 
 def epoch_ns(path: str, info: dict[str, str]) -> int:
-    """
-    Return the origin of the times that comments state, ns; else 0.
-
-    Parameters
-    ----------
-    path
-        The file, for messages.
-    info
-        Keys and values of the comments.
-
-    Returns
-    -------
-    int
-        The origin, ns.
-
-    Raises
-    ------
-    UserError
-        It is no whole number of nanoseconds.
-
-    """
+    """Return the origin of the times that comments state, ns; else 0."""
     text = info.get('epoch_ns', '0')
     if not re.fullmatch(r'-?\d{1,19}', text) or abs(int(text)) >= 1 << 63:
         raise UserError(f'{path}: epoch_ns is {text!r}, expected whole nanoseconds')

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The header of a CSV recording: its columns and their units."""
 
@@ -43,20 +31,10 @@ class HeaderError(UserError):
 
 @dataclass(frozen=True)
 class Header:
-    """
-    The columns of a CSV file.
+    """The columns of a CSV file."""
 
-    Attributes
-    ----------
-    names
-        All columns, in order; an empty name is a column that is not read.
-    sensor
-        The columns with the sensor's output.
-
-    """
-
-    names: tuple[str, ...]
-    sensor: tuple[str, ...]
+    names: tuple[str, ...]  # All columns, in order; an empty name is a column that is not read
+    sensor: tuple[str, ...]  # The columns with the sensor's output
 
     def index(self, name: str) -> int:
         """Return the index of a column, from 0."""
@@ -78,29 +56,7 @@ class Header:
 
 
 def parse_header(where: str, fields: list[str], needed: tuple[str, ...] | None) -> Header:
-    """
-    Check the names of the columns.
-
-    Parameters
-    ----------
-    where
-        file:line, for messages.
-    fields
-        The header's fields.
-    needed
-        The columns that must be there; None is any form of the sensor's output.
-
-    Returns
-    -------
-    Header
-        The checked columns.
-
-    Raises
-    ------
-    HeaderError
-        A needed column is missing, a column stands twice, or one is in another unit.
-
-    """
+    """Check the names of the columns."""
     names = tuple(name.strip() for name in fields)
     _refuse_delimiter(where, names)
     _refuse_duplicates(where, names)

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The lines of a text file of samples, read in blocks, with their numbers for messages."""
 
@@ -40,63 +28,19 @@ _INFO = re.compile(r'#+\s*([A-Za-z_][\w.]*)\s*:(?:\s+(.*))?$')
 
 @dataclass
 class Lines:
-    """
-    Lines of samples.
+    """Lines of samples."""
 
-    Attributes
-    ----------
-    data
-        The lines, each with a newline.
-    numbers
-        Their numbers in the file, from 1.
-    done
-        Fraction of the file that has been read at their end.
-    is_open_ended
-        Whether the last one has no newline in the file.
-
-    """
-
-    data: bytes
-    numbers: Sequence[int]
-    done: float
-    is_open_ended: bool
+    data: bytes  # The lines, each with a newline
+    numbers: Sequence[int]  # Their numbers in the file, from 1
+    done: float  # Fraction of the file that has been read at their end
+    is_open_ended: bool  # Whether the last one has no newline in the file
 
     def where(self, path: str, row: int, column: int) -> str:
-        """
-        Return the place of a field for messages.
-
-        Parameters
-        ----------
-        path
-            The file.
-        row, column
-            Row among the lines and column of the field, from 0.
-
-        Returns
-        -------
-        str
-            File, line and column.
-
-        """
+        """Return the place of a field for messages."""
         return f'{path}:{self.numbers[row]}:{column + 1}'
 
     def fields(self, path: str, row: int) -> list[str]:
-        """
-        Split one line.
-
-        Parameters
-        ----------
-        path
-            The file, for messages.
-        row
-            Row among the lines, from 0.
-
-        Returns
-        -------
-        list
-            Its fields.
-
-        """
+        """Split one line."""
         return _split(path, self.data.split(b'\n', row + 1)[row], self.numbers[row])
 
     def rows(self, path: str) -> list[list[str]]:
@@ -124,33 +68,7 @@ def _decode(path: str, line: bytes, number: int) -> str:
 
 def chunks(path: str, file: BinaryIO, info: dict[str, str], skip: int = 0,
            recode: Callable[[bytes], bytes] | None = None) -> Iterator[Lines]:
-    """
-    Yield the lines of samples; comments are added to `info`, empty lines are dropped.
-
-    Parameters
-    ----------
-    path
-        The file, for messages.
-    file
-        The open file.
-    info
-        Gets the keys and values of the comments.
-    skip
-        Number of lines at the begin of the file to leave out; comments among them count.
-    recode
-        Returns text of another encoding as UTF-8.
-
-    Yields
-    ------
-    Lines
-        Lines in the order of the file.
-
-    Raises
-    ------
-    UserError
-        A line is too long, or the file is UTF-16.
-
-    """
+    """Yield the lines of samples; comments are added to `info`, empty lines are dropped."""
     size = os.fstat(file.fileno()).st_size
     number = 1
     for data in whole_lines(path, file):
@@ -176,27 +94,7 @@ def chunks(path: str, file: BinaryIO, info: dict[str, str], skip: int = 0,
 
 
 def whole_lines(path: str, file: BinaryIO) -> Iterator[bytes]:
-    """
-    Yield the bytes of a file in parts that end with a line.
-
-    Parameters
-    ----------
-    path
-        The file, for messages.
-    file
-        The open file.
-
-    Yields
-    ------
-    bytes
-        One or more lines.
-
-    Raises
-    ------
-    UserError
-        A line is too long.
-
-    """
+    """Yield the bytes of a file in parts that end with a line."""
     rest = b''
     while data := file.read(_CHUNK_BYTES):
         data = rest + data
@@ -212,27 +110,7 @@ def whole_lines(path: str, file: BinaryIO) -> Iterator[bytes]:
 
 
 def without_byte_order_mark(path: str, data: bytes) -> bytes:
-    """
-    Return the first bytes of a file without the mark of UTF-8.
-
-    Parameters
-    ----------
-    path
-        The file, for messages.
-    data
-        Its first bytes.
-
-    Returns
-    -------
-    bytes
-        The bytes of the text.
-
-    Raises
-    ------
-    UserError
-        The file is UTF-16.
-
-    """
+    """Return the first bytes of a file without the mark of UTF-8."""
     if data[:2] in (b'\xff\xfe', b'\xfe\xff'):
         raise UserError(f'{path}:1:1: is UTF-16; save the file as UTF-8')
     return data.removeprefix(b'\xef\xbb\xbf')

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The numbers of a block of lines of a CSV file.
@@ -52,52 +40,22 @@ _LONGEST_CELL = 24
 
 @dataclass
 class Layout:
-    """
-    The columns of the lines.
+    """The columns of the lines."""
 
-    Attributes
-    ----------
-    path
-        The file, for messages.
-    names
-        All columns, in order, each once; an empty name is a column that is not read.
-    used
-        Columns that hold numbers so far.
-    required
-        Columns in which text is an error; any other column with text is left out.
-    source
-        What states the number of columns, for messages.
-
-    """
-
-    path: str
+    path: str  # The file, for messages
+    # All columns, in order, each once; an empty name is a column that is not read
     names: tuple[str, ...]
-    used: list[str]
+    used: list[str]  # Columns that hold numbers so far
+    # Columns in which text is an error; any other column with text is left out
     required: frozenset[str]
-    source: str = 'the header'
+    source: str = 'the header'  # What states the number of columns, for messages
 
 
 def parse_numbers(layout: Layout, lines: Lines) -> dict[str, np.ndarray]:
     """
     Parse lines.
 
-    Parameters
-    ----------
-    layout
-        Their columns. A column that turns out to hold text is removed from those that are used.
-    lines
-        The n lines.
-
-    Returns
-    -------
-    dict
-        Arrays (n,) by column name; an empty field is NaN.
-
-    Raises
-    ------
-    UserError
-        A line has another number of fields, or a required field is no number.
-
+    returns: arrays (n,) by column name; an empty field is NaN.
     """
     columns = _by_arrow(layout, lines)
     if columns is not None:

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Rows of numbers as text.
@@ -58,18 +46,7 @@ def rounded_rows(columns: Sequence[np.ndarray], digits: int) -> bytes:
     """
     Return rows with all digits of the first column, and some digits of the others.
 
-    Parameters
-    ----------
-    columns
-        Two or more columns, (n,) each; NaN is empty.
-    digits
-        Significant digits.
-
-    Returns
-    -------
-    bytes
-        A line for each row.
-
+    columns: two or more columns, (n,) each; NaN is empty.
     """
     values = np.array(columns, float)
     dumps = _dumps()
@@ -137,24 +114,8 @@ def _joined(dumps: Callable[[np.ndarray], bytes], plain: np.ndarray, values: np.
     """
     Return rows of text.
 
-    Parameters
-    ----------
-    dumps
-        Makes the text of plain numbers.
-    plain
-        What it formats, by column, (m, n); numbers that are not plain are overwritten.
-    values
-        The numbers before they were rounded, (m, n).
-    is_plain
-        Which of them are plain, (m, n).
-    other
-        Makes the text of another number in a column.
-
-    Returns
-    -------
-    bytes
-        A line for each row.
-
+    plain: what it formats, by column, (m, n); numbers that are not plain are overwritten; values:
+    the numbers before they were rounded, (m, n); is_plain: which of them are plain, (m, n).
     """
     others = []
     places = np.flatnonzero(~is_plain)

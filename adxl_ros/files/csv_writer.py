@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """CSV recordings, written block by block, whole or not at all."""
 
@@ -41,17 +29,7 @@ class CsvWriter:
     """
 
     def __init__(self, path: str | os.PathLike, digits: int | None = None) -> None:
-        """
-        Prepare to write.
-
-        Parameters
-        ----------
-        path
-            The file, replaced if it exists.
-        digits
-            Significant digits of all columns but the first; None keeps every bit.
-
-        """
+        """Prepare to write."""
         self._path = path
         self._digits = digits
         self._names: list[str] = []
@@ -74,13 +52,7 @@ class CsvWriter:
         """
         Append rows.
 
-        Parameters
-        ----------
-        columns
-            Arrays (n,) by column name, in the order of the file; the same names every time.
-        info
-            Lines `# key: value` above the header, from the first call.
-
+        columns: arrays (n,) by column name, in the order of the file; the same names every time.
         """
         if not self._names:
             self._names = list(columns)

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """
 HTML pages of one file that open offline and can be printed.
 
@@ -41,15 +29,7 @@ _GZIP_LEVEL = 6
 
 
 def check_libraries() -> None:
-    """
-    Import what pages need.
-
-    Raises
-    ------
-    UserError
-        Plotly or jinja2 is not installed.
-
-    """
+    """Import what pages need."""
     try:
         import jinja2  # noqa: F401
         from plotly.offline import get_plotlyjs  # noqa: F401
@@ -59,29 +39,7 @@ def check_libraries() -> None:
 
 
 def render(package: str, template: str, values: Mapping[str, Any]) -> str:
-    """
-    Return a whole page.
-
-    Parameters
-    ----------
-    package
-        The package whose folder holds the template.
-    template
-        Name of the template file, which extends `base.html`.
-    values
-        Values of the template by name.
-
-    Returns
-    -------
-    str
-        HTML.
-
-    Raises
-    ------
-    UserError
-        Plotly or jinja2 is not installed.
-
-    """
+    """Return a whole page."""
     check_libraries()
     from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
     from plotly.offline import get_plotlyjs

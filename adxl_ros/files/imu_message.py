@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Serialized sensor_msgs/Imu messages, read and corrected one by one.
@@ -49,36 +37,17 @@ _MAX_LAYOUTS = 64
 
 
 class _Layout(NamedTuple):
-    """
-    Where the numbers of an Imu are, and how they are packed.
+    """Where the numbers of an Imu are, and how they are packed."""
 
-    Attributes
-    ----------
-    order
-        Byte order, < or >.
-    stamp
-        Two integers: s, ns.
-    vector
-        Three float64: x, y, z.
-    orientation
-        Thirteen float64: quaternion and covariance.
-    acceleration
-        Twelve float64: x, y, z and covariance.
-    orientation_offset, acceleration_offset
-        Offsets in the message, bytes.
-    size
-        Length of the message, bytes.
-
-    """
-
-    order: str
-    stamp: struct.Struct
-    vector: struct.Struct
-    orientation: struct.Struct
-    acceleration: struct.Struct
+    order: str  # Byte order, < or >
+    stamp: struct.Struct  # Two integers: s, ns
+    vector: struct.Struct  # Three float64: x, y, z
+    orientation: struct.Struct  # Thirteen float64: quaternion and covariance
+    acceleration: struct.Struct  # Twelve float64: x, y, z and covariance
+    # orientation_offset, acceleration_offset: Offsets in the message, bytes
     orientation_offset: int
     acceleration_offset: int
-    size: int
+    size: int  # Length of the message, bytes
 
 
 _layouts: dict[bytes, _Layout] = {}
@@ -86,15 +55,7 @@ _layouts: dict[bytes, _Layout] = {}
 
 
 def read(raw: bytes) -> tuple[float, Sequence[float]]:
-    """
-    Return the stamp, s, and the linear acceleration, m/s², of a sensor_msgs/Imu.
-
-    Raises
-    ------
-    CdrError
-        The message is too short or in another encoding.
-
-    """
+    """Return the stamp, s, and the linear acceleration, m/s², of a sensor_msgs/Imu."""
     layout = _layout(raw)
     sec, nanosec = layout.stamp.unpack_from(raw, _STAMP_OFFSET)
     return sec + nanosec * 1e-9, layout.vector.unpack_from(raw, layout.acceleration_offset)
@@ -113,22 +74,7 @@ def has_orientation(raw: bytes) -> bool:
 
 
 def with_frame(raw: bytes, frame_id: str) -> bytes:
-    """
-    Return an Imu with another frame in its header.
-
-    Parameters
-    ----------
-    raw
-        The message, serialized, that `read` accepted.
-    frame_id
-        Name of the frame.
-
-    Returns
-    -------
-    bytes
-        The new message, serialized.
-
-    """
+    """Return an Imu with another frame in its header."""
     layout = _layout(raw)
     name = frame_id.encode() + b'\0'
     length = struct.pack(layout.order + 'I', len(name))
@@ -143,19 +89,6 @@ def turned(raw: bytes, mounting: Mounting) -> bytes:
     Return an Imu with angular velocity and orientation in the frame of the robot.
 
     A part that is not there (its first covariance is -1) stays as it is.
-
-    Parameters
-    ----------
-    raw
-        The message, serialized, that `read` accepted.
-    mounting
-        The case in the frame of the robot.
-
-    Returns
-    -------
-    bytes
-        The new message, serialized.
-
     """
     layout = _layout(raw)
     message = bytearray(raw)
@@ -185,20 +118,8 @@ def corrected(raw: bytes, orientation: Sequence[float] | None, acceleration: Seq
     """
     Return an Imu with another orientation and acceleration.
 
-    Parameters
-    ----------
-    raw
-        The message, serialized, that `read` accepted.
-    orientation
-        Quaternion x, y, z, w and the covariance by rows, rad², (13,); None keeps that of `raw`.
-    acceleration
-        x, y, z, m/s², and the covariance by rows, (m/s²)², (12,).
-
-    Returns
-    -------
-    bytes
-        The new message, serialized.
-
+    orientation: quaternion x, y, z, w and the covariance by rows, rad², (13,); None keeps that of
+    `raw`; acceleration: x, y, z, m/s², and the covariance by rows, (m/s²)², (12,).
     """
     layout = _layout(raw)
     message = bytearray(raw)
@@ -212,18 +133,7 @@ def vector3_stamped(raw: bytes, vector: Sequence[float]) -> bytes:
     """
     Return a geometry_msgs/Vector3Stamped with the header of an Imu.
 
-    Parameters
-    ----------
-    raw
-        The Imu, serialized.
-    vector
-        x, y, z, (3,).
-
-    Returns
-    -------
-    bytes
-        The message, serialized.
-
+    vector: x, y, z, (3,).
     """
     layout = _layout(raw)
     # In both messages, numbers of eight bytes follow the header.

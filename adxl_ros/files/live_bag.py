@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A bag that is written while its messages come, and is whole up to the last second."""
 
@@ -36,20 +24,7 @@ class LiveBag:
     """
 
     def __init__(self, path: Path) -> None:
-        """
-        Open a new bag.
-
-        Parameters
-        ----------
-        path
-            The directory; it does not exist yet.
-
-        Raises
-        ------
-        UserError
-            The library rosbags is not installed.
-
-        """
+        """Open a new bag."""
         rosbag2 = import_rosbags()
         self._types = typestore()
         self._writer = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
@@ -60,21 +35,7 @@ class LiveBag:
         self._is_open = True
 
     def write(self, topic: str, kind: str, data: bytes, time_ns: int) -> None:
-        """
-        Append a message; one that comes after the end is left out.
-
-        Parameters
-        ----------
-        topic
-            Its topic.
-        kind
-            Its type, such as sensor_msgs/msg/Imu.
-        data
-            Its CDR.
-        time_ns
-            Time at which it came, ns.
-
-        """
+        """Append a message; one that comes after the end is left out."""
         with self._lock:
             if not self._is_open:
                 return

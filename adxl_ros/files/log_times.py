@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Times of the samples of a bag by their header and by the recorder."""
 
@@ -45,23 +33,7 @@ def log_times(path: str | os.PathLike, topic: str) -> Iterator[np.ndarray]:
     """
     Read header stamp and log time of the samples of a bag in blocks.
 
-    Parameters
-    ----------
-    path
-        The bag.
-    topic
-        Topic of the samples; empty for the only one.
-
-    Yields
-    ------
-    ndarray
-        Header stamp and log time by message, ns, (k, 2).
-
-    Raises
-    ------
-    UserError
-        The bag cannot be read.
-
+    yields: header stamp and log time by message, ns, (k, 2).
     """
     with open_bag(path) as bag:
         imu = find_topics(bag, topic).imu

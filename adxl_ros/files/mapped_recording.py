@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Recordings from the columns of a table: units, stamps and references become the package's."""
 
@@ -72,45 +60,17 @@ _NATIVE = {TIME: ('time', 's'), 'alpha_rad': ('alpha', 'rad'), 'beta_rad': ('bet
 
 @dataclass(frozen=True)
 class _Column:
-    """
-    A column that is read.
+    """A column that is read."""
 
-    Attributes
-    ----------
-    name
-        Its name in the table.
-    unit
-        Its unit.
-    unit_name
-        Name of the unit.
-    is_stated
-        Whether mapping, name or format state the unit; else it is that of the package.
-
-    """
-
-    name: str
-    unit: Unit
-    unit_name: str
+    name: str  # Its name in the table
+    unit: Unit  # Its unit
+    unit_name: str  # Name of the unit
+    # Whether mapping, name or format state the unit; else it is that of the package
     is_stated: bool
 
 
 def native_mapping(names: tuple[str, ...], where: str) -> ColumnMapping | None:
-    """
-    Return the mapping of a table that has the columns of the package; None where it has not.
-
-    Parameters
-    ----------
-    names
-        Columns of the table.
-    where
-        The file, for messages.
-
-    Returns
-    -------
-    ColumnMapping or None
-        The mapping.
-
-    """
+    """Return the mapping of a table that has the columns of the package; None where it has not."""
     sources = {role: Source(name, unit) for name, (role, unit) in _NATIVE.items()
                if name in names}
     for columns, unit in ((VOLTS, 'v'), (ACCEL, 'mps2')):
@@ -122,31 +82,7 @@ def native_mapping(names: tuple[str, ...], where: str) -> ColumnMapping | None:
 
 def blocks(table: Table, mapping: ColumnMapping, reading: ReadingOptions, rows: int
            ) -> Generator[Recording, None, None]:
-    """
-    Read a table as a recording in blocks of at most `rows` samples.
-
-    Parameters
-    ----------
-    table
-        The table.
-    mapping
-        Its columns.
-    reading
-        Counts of 1 g, sample rate, and what becomes of bad stamps.
-    rows
-        Largest number of samples of a block.
-
-    Yields
-    ------
-    Recording
-        The blocks in the order of time.
-
-    Raises
-    ------
-    UserError
-        Mapping and table do not fit, or a value is wrong. The message names file, line and column.
-
-    """
+    """Read a table as a recording in blocks of at most `rows` samples."""
     converter = _Converter(table, _resolved(table, mapping, reading), mapping, reading)
     count = 0
     for block in table.blocks(converter.names):
@@ -212,26 +148,12 @@ def likely_unit(length: float) -> str:
 
 @dataclass
 class _Converter:
-    """
-    Converts the blocks of one table.
+    """Converts the blocks of one table."""
 
-    Attributes
-    ----------
-    table
-        The table.
-    columns
-        Its columns by role.
-    mapping
-        What states them.
-    reading
-        See `ReadingOptions`.
-
-    """
-
-    table: Table
-    columns: Mapping[str, _Column]
-    mapping: ColumnMapping
-    reading: ReadingOptions
+    table: Table  # The table
+    columns: Mapping[str, _Column]  # Its columns by role
+    mapping: ColumnMapping  # What states them
+    reading: ReadingOptions  # See `ReadingOptions`
     _remarks: list[str] = field(default_factory=list)
     _epoch_ns: int | None = None
     _begin: float = 0.0

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The messages of MCAP files, chunk by chunk.
@@ -87,43 +75,15 @@ class IndexFault(ValueError):
 
 
 class _Found(NamedTuple):
-    """
-    Messages of one channel in a chunk.
+    """Messages of one channel in a chunk."""
 
-    Attributes
-    ----------
-    raws
-        The messages.
-    log_ns
-        Their log times, ns, (n,).
-    offset
-        Where their records begin in the chunk, (n,).
-
-    """
-
-    raws: Raws
-    log_ns: np.ndarray
-    offset: np.ndarray
+    raws: Raws  # The messages
+    log_ns: np.ndarray  # Their log times, ns, (n,)
+    offset: np.ndarray  # Where their records begin in the chunk, (n,)
 
 
 def in_order(storage: Any, topics: Mapping[int, str]) -> list[Any]:
-    """
-    Return the chunks that hold messages of some topics.
-
-    Parameters
-    ----------
-    storage
-        The storage of rosbags.
-    topics
-        Names of the topics by channel number.
-
-    Returns
-    -------
-    list
-        The entries of the chunks in the index of the file; empty where it is no MCAP file, or
-        where the log times of chunks overlap.
-
-    """
+    """Return the chunks that hold messages of some topics."""
     chunks = [chunk for chunk in getattr(storage, 'chunks', ())
               if any(chunk.channel_count.get(channel, 0) for channel in topics)]
     chunks.sort(key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))
@@ -138,21 +98,6 @@ def read_chunk(file: Any, chunk: Any, topics: Mapping[int, str]) -> Piece:
     Read the messages of a chunk.
 
     Where its message index does not describe it, its records are read one by one.
-
-    Parameters
-    ----------
-    file
-        The open file.
-    chunk
-        The entry of the chunk in the index of the file, as rosbags reads it.
-    topics
-        Names of the topics to read, by channel number.
-
-    Returns
-    -------
-    Piece
-        The messages, in the order of their log times.
-
     """
     from rosbags.rosbag2.storage_mcap import decompress, msgsrc
     try:
@@ -208,25 +153,7 @@ def _messages(data: np.ndarray, channel: int, entries: np.ndarray) -> _Found:
     """
     Take the messages of a channel out of a chunk.
 
-    Parameters
-    ----------
-    data
-        The bytes of the chunk.
-    channel
-        Number of the channel.
-    entries
-        Its message index, (n,).
-
-    Returns
-    -------
-    _Found
-        Its messages.
-
-    Raises
-    ------
-    IndexFault
-        There are other records at the places of the index.
-
+    entries: its message index, (n,).
     """
     offset = entries['offset'].astype(np.int64)
     head_bytes = _MESSAGE_HEAD.itemsize
@@ -268,38 +195,18 @@ def _even(begin: np.ndarray) -> slice | np.ndarray:
 
 
 class Batch(NamedTuple):
-    """
-    Messages of one topic and one length.
+    """Messages of one topic and one length."""
 
-    Attributes
-    ----------
-    connection
-        Their topic, as rosbags states it.
-    rows
-        Samples that they belong to, rising, (n,).
-    data
-        Their bytes, (n, size).
-
-    """
-
-    connection: Any
-    rows: np.ndarray
-    data: np.ndarray
+    connection: Any  # Their topic, as rosbags states it
+    rows: np.ndarray  # Samples that they belong to, rising, (n,)
+    data: np.ndarray  # Their bytes, (n, size)
 
 
 def write_messages(writer: Any, stamp_ns: np.ndarray, batches: Sequence[Batch]) -> None:
     """
     Append messages to an MCAP file, sample by sample, in chunks of their own.
 
-    Parameters
-    ----------
-    writer
-        The writer of rosbags, without compression.
-    stamp_ns
-        Stamps of the samples, ns, (n,), rising.
-    batches
-        Messages of the samples, in their order within a sample.
-
+    stamp_ns: stamps of the samples, ns, (n,), rising.
     """
     if writer.storage.chunk.msgs:
         writer.storage.close_chunk()
@@ -357,18 +264,8 @@ def _entries(stamp_ns: np.ndarray, messages: list[tuple[np.ndarray, np.ndarray]]
     """
     Make the message index of a channel.
 
-    Parameters
-    ----------
-    stamp_ns
-        Stamps of the samples, ns, (n,).
-    messages
-        Samples and places in the chunk of its messages, (k,) each, by batch.
-
-    Returns
-    -------
-    ndarray
-        The entries of all batches, in the order of their places.
-
+    stamp_ns: stamps of the samples, ns, (n,); messages: samples and places in the chunk of its
+    messages, (k,) each, by batch.
     """
     rows, offset = map(np.concatenate, zip(*messages))
     order = np.argsort(offset, kind='stable')  # fast where the places rise
@@ -394,22 +291,8 @@ def _records(stamp_ns: np.ndarray, batches: list[Batch], begin: int
     """
     Make the message records of a chunk, sample by sample.
 
-    Parameters
-    ----------
-    stamp_ns
-        Stamps of the samples, ns, (n,).
-    batches
-        The messages.
-    begin
-        Where the records begin in the chunk.
-
-    Returns
-    -------
-    records : ndarray
-        Their bytes, (size,).
-    offsets : list of ndarray
-        Where the records of each batch begin in the chunk.
-
+    stamp_ns: stamps of the samples, ns, (n,); returns: their bytes, (size,). Where the records of
+    each batch begin in the chunk.
     """
     lengths = [batch.data.shape[1] + _MESSAGE_HEAD.itemsize for batch in batches]
     counts = [len(batch.rows) for batch in batches]

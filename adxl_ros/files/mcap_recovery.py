@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 MCAP files without an index, read from the front.
@@ -78,22 +66,11 @@ _SMALLEST_BYTES = {_SCHEMA: 6, _CHANNEL: 8, _MESSAGE: _MESSAGE_HEAD_BYTES}
 
 
 class Record(NamedTuple):
-    """
-    One whole record.
+    """One whole record."""
 
-    Attributes
-    ----------
-    code
-        Operation code.
-    data
-        Bytes that hold the record.
-    start, stop
-        Where its content begins and ends in them.
-
-    """
-
-    code: int
-    data: bytes
+    code: int  # Operation code
+    data: bytes  # Bytes that hold the record
+    # start, stop: Where its content begins and ends in them
     start: int
     stop: int
 
@@ -114,27 +91,7 @@ def _has_end(file: BinaryIO) -> bool:
 
 
 def unpack(compression: str, data: bytes) -> bytes:
-    """
-    Decompress data up to its cut, if it has one.
-
-    Parameters
-    ----------
-    compression
-        Name of the compression in MCAP: zstd, lz4, or empty for none.
-    data
-        The compressed bytes.
-
-    Returns
-    -------
-    bytes
-        The data.
-
-    Raises
-    ------
-    ValueError
-        The data is damaged, or the compression is unknown.
-
-    """
+    """Decompress data up to its cut, if it has one."""
     from backports import zstd
     from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
     openers = {'': bytes,
@@ -150,15 +107,7 @@ def unpack(compression: str, data: bytes) -> bytes:
 
 @contextmanager
 def open_scan(path: Path) -> Iterator[ScannedMcap]:
-    """
-    Open an MCAP file that may have no end.
-
-    Raises
-    ------
-    UserError
-        The file is empty or no MCAP file.
-
-    """
+    """Open an MCAP file that may have no end."""
     with open(path, 'rb') as file:
         magic = file.read(len(_MAGIC))
         if not magic:
@@ -169,24 +118,12 @@ def open_scan(path: Path) -> Iterator[ScannedMcap]:
 
 
 class ScannedMcap:
-    """
-    An MCAP file that is read from the front.
-
-    Attributes
-    ----------
-    types
-        Topics that hold messages, each with its type.
-    cut
-        Where the file is cut off or damaged; empty if it is whole.
-    done
-        Fraction of the file that has been read.
-
-    """
+    """An MCAP file that is read from the front."""
 
     def __init__(self, file: BinaryIO) -> None:
         """Read the whole file once for its channels and the cut."""
-        self.done = 0.0
-        self.types: set[tuple[str, str]] = set()
+        self.done = 0.0  # Fraction of the file that has been read
+        self.types: set[tuple[str, str]] = set()  # Topics that hold messages, each with its type
         self._file = file
         self._size = os.fstat(file.fileno()).st_size
         self._offset = 0
@@ -201,7 +138,7 @@ class ScannedMcap:
             elif record.code == _CHANNEL:
                 kind = schemas.get(_u16(data, start + 2), '')
                 self._channels[_u16(data, start)] = (_text(data, start + 4), kind)
-        self.cut = ''
+        self.cut = ''  # Where the file is cut off or damaged; empty if it is whole
         if self._offset != self._size - len(_MAGIC) or not _has_end(file):
             self.cut = (f'cut off or damaged in the record that begins at byte {self._offset} '
                         f'of {self._size}')

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Messages of a bag in pieces, which are handled as arrays."""
 
@@ -29,38 +17,14 @@ _PIECE_MESSAGES = 4096
 
 @dataclass(frozen=True)
 class Piece:
-    """
-    Consecutive messages of some topics.
+    """Consecutive messages of some topics."""
 
-    Attributes
-    ----------
-    messages
-        The messages by topic, in the order of recording.
-    places
-        Where each of them stands in the order of all, by topic, (n,), ascending.
-
-    """
-
-    messages: Mapping[str, Raws]
+    messages: Mapping[str, Raws]  # The messages by topic, in the order of recording
+    # Where each of them stands in the order of all, by topic, (n,), ascending
     places: Mapping[str, np.ndarray]
 
     def split(self, topic: str, count: int) -> tuple[Piece, Piece]:
-        """
-        Split behind a message.
-
-        Parameters
-        ----------
-        topic
-            A topic with at least `count` messages.
-        count
-            Number of messages of the topic up to the split.
-
-        Returns
-        -------
-        tuple
-            The messages before and after the split.
-
-        """
+        """Split behind a message."""
         last = self.places[topic][count - 1]
         cuts = {name: int(np.searchsorted(places, last, 'right'))
                 for name, places in self.places.items()}

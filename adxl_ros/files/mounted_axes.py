@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Recordings along the axes of the sensor frame, by a documented mounting."""
 
@@ -27,27 +15,7 @@ import numpy as np
 
 
 def mounted(blocks: Iterable[Recording], mounting: Mounting) -> Generator[Recording, None, None]:
-    """
-    Turn the blocks of a recording.
-
-    Parameters
-    ----------
-    blocks
-        The blocks along the axes of the file.
-    mounting
-        How these are the axes of the frame.
-
-    Yields
-    ------
-    Recording
-        The blocks along the axes of the sensor frame.
-
-    Raises
-    ------
-    UserError
-        The mounting names other axes than the recording has, or turns volts about an unknown zero.
-
-    """
+    """Turn the blocks of a recording."""
     for block in blocks:
         names = block.sensor_columns
         if len(names) != len(mounting.signs):

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What a large file leaves in the page cache of the system."""
 
@@ -26,15 +14,7 @@ _LARGE_BYTES = 2 << 30
 
 
 def release_read(file: BinaryIO) -> None:
-    """
-    Give back the page cache of what was read of a large file, up to the present place.
-
-    Parameters
-    ----------
-    file
-        A file on a disk, open for reading.
-
-    """
+    """Give back the page cache of what was read of a large file, up to the present place."""
     if os.fstat(file.fileno()).st_size > _LARGE_BYTES:
         # From its begin on, because the system keeps a large page that is only partly within.
         os.posix_fadvise(file.fileno(), 0, file.tell(), os.POSIX_FADV_DONTNEED)
@@ -47,12 +27,6 @@ def release_written(file: BinaryIO) -> None:
     The system writes it to the disk and uses the same memory for what follows. Without this, a
     file of 13 GB pushes out what other programs have in the cache. Where memory is virtual, its
     first use takes most of the time of writing.
-
-    Parameters
-    ----------
-    file
-        A file on a disk, open for writing.
-
     """
     end = file.tell() - _KEPT_BYTES
     if end > 0:

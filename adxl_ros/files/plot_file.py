@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Plots as PNG files, drawn without a display."""
 
@@ -27,15 +15,7 @@ _DPI = 80
 
 
 def pyplot() -> Any:
-    """
-    Return matplotlib's drawing functions, without a display.
-
-    Raises
-    ------
-    UserError
-        Matplotlib is not installed.
-
-    """
+    """Return matplotlib's drawing functions, without a display."""
     try:
         import matplotlib
     except ImportError:
@@ -46,22 +26,7 @@ def pyplot() -> Any:
 
 
 def write_plot(figure: Any, path: str | os.PathLike) -> None:
-    """
-    Write a matplotlib figure as a PNG file, whole or not at all, and close it.
-
-    Parameters
-    ----------
-    figure
-        The figure.
-    path
-        The file, replaced if it exists.
-
-    Raises
-    ------
-    UserError
-        The file cannot be written.
-
-    """
+    """Write a matplotlib figure as a PNG file, whole or not at all, and close it."""
     with atomic_path(path) as fresh:
         figure.savefig(fresh, dpi=_DPI, format='png')
     pyplot().close(figure)

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """
 Figures of plotly.js as plain objects, which `html_page` puts into pages.
 
@@ -45,24 +33,7 @@ _GRID = {'gridcolor': '#e4e7eb', 'zerolinecolor': '#9aa5b1', 'linecolor': '#9aa5
 
 
 def figure(traces: Iterable[Figure], height: int, **layout: Any) -> Figure:
-    """
-    Make a figure.
-
-    Parameters
-    ----------
-    traces
-        The traces.
-    height
-        Height, pixels.
-    **layout
-        Further properties of the layout; those of `xaxis...` and `yaxis...` have a grid.
-
-    Returns
-    -------
-    dict
-        The figure.
-
-    """
+    """Make a figure."""
     axes = {name: _GRID | value for name, value in layout.items()
             if name.startswith(('xaxis', 'yaxis'))}
     return {'data': list(traces), 'layout': {
@@ -74,74 +45,21 @@ def figure(traces: Iterable[Figure], height: int, **layout: Any) -> Figure:
 
 def line(x: Iterable[float], y: Iterable[float], name: str, colour: str, **properties: Any
          ) -> Figure:
-    """
-    Make a line.
-
-    Parameters
-    ----------
-    x, y
-        Its points.
-    name
-        Name in the legend.
-    colour
-        Its colour.
-    **properties
-        Further properties of the trace.
-
-    Returns
-    -------
-    dict
-        The trace.
-
-    """
+    """Make a line."""
     return {'type': 'scatter', 'mode': 'lines', 'x': rounded(x), 'y': rounded(y), 'name': name,
             'line': {'color': colour, 'width': 1.2}} | properties
 
 
 def points(x: Iterable[float], y: Iterable[float], half_width: Iterable[float], name: str,
            colour: str) -> Figure:
-    """
-    Make points with error bars.
-
-    Parameters
-    ----------
-    x, y
-        The points.
-    half_width
-        Half of the error bars.
-    name
-        Name in the legend.
-    colour
-        Their colour.
-
-    Returns
-    -------
-    dict
-        The trace.
-
-    """
+    """Make points with error bars."""
     return {'type': 'scatter', 'mode': 'markers', 'x': rounded(x), 'y': rounded(y), 'name': name,
             'error_y': {'type': 'data', 'array': rounded(half_width), 'thickness': 1.2,
                         'width': 3}, 'marker': {'color': colour, 'size': 6}}
 
 
 def axis_number(name: str, number: int) -> str:
-    """
-    Return plotly's name of the i-th axis of a figure.
-
-    Parameters
-    ----------
-    name
-        'x', 'y', 'xaxis' or 'yaxis'.
-    number
-        Its number from 1.
-
-    Returns
-    -------
-    str
-        The name, whose number is absent for the first one.
-
-    """
+    """Return plotly's name of the i-th axis of a figure."""
     return name if number == 1 else f'{name}{number}'
 
 
@@ -166,18 +84,7 @@ def extremes(values: np.ndarray, count: int) -> np.ndarray:
     """
     Choose samples of a signal so that its plot looks as that of all samples.
 
-    Parameters
-    ----------
-    values
-        The signal, (n,).
-    count
-        Number of samples that are wanted.
-
-    Returns
-    -------
-    numpy.ndarray
-        Rising indices: the smallest and the largest sample of each of `count / 2` blocks.
-
+    values: the signal, (n,).
     """
     if len(values) <= count:
         return np.arange(len(values))
@@ -191,28 +98,7 @@ def extremes(values: np.ndarray, count: int) -> np.ndarray:
 
 def whisker(value: float, low: float, high: float, bounds: tuple[float, float], text: str,
             typical: float = 0.0, beyond: bool = False) -> Mapping[str, Any]:
-    """
-    Place a value with its interval between bounds, in percent of their distance.
-
-    Parameters
-    ----------
-    value, low, high
-        The value and its interval.
-    bounds
-        Both ends of the drawn range.
-    text
-        The value in words.
-    typical
-        Half of a range about 0 that is shaded; 0 for none.
-    beyond
-        Whether the value exceeds its limit.
-
-    Returns
-    -------
-    mapping
-        What the macro `whisker` of `parts.html` draws.
-
-    """
+    """Place a value with its interval between bounds, in percent of their distance."""
     begin, end = bounds
 
     def place(position: float) -> float:

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The file of a population: YAML with mean and spread of each coefficient over the units of a fleet.
@@ -48,24 +36,7 @@ _HEAD = """\
 
 def write(path: str | os.PathLike, population: Population, far_out: Sequence[Mapping[str, Any]]
           ) -> None:
-    """
-    Write a population.
-
-    Parameters
-    ----------
-    path
-        The file.
-    population
-        The population.
-    far_out
-        Units that are not of it: serial, coefficient, value and distance.
-
-    Raises
-    ------
-    UserError
-        The file cannot be written.
-
-    """
+    """Write a population."""
     contents = {
         'format': FORMAT, 'version': package_version(),
         'coefficients': {name: {key: _rounded(value) for key, value in asdict(pooled).items()}
@@ -80,25 +51,7 @@ def _rounded(value: Any) -> Any:
 
 
 def read(path: str | os.PathLike) -> Population:
-    """
-    Read and check a population.
-
-    Parameters
-    ----------
-    path
-        The file.
-
-    Returns
-    -------
-    Population
-        The population.
-
-    Raises
-    ------
-    UserError
-        The file cannot be read, is not YAML, or a value is missing or wrong.
-
-    """
+    """Read and check a population."""
     try:
         text = Path(path).read_text(encoding='utf-8')
         contents = yaml.safe_load(text)

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A table of poses: the angles of each rest of a recording, as a person notes them."""
 
@@ -35,23 +23,12 @@ _LEVEL_RAD = 1e-9
 
 @dataclass(frozen=True)
 class PoseTable:
-    """
-    Angles of k poses.
+    """Angles of k poses."""
 
-    Attributes
-    ----------
-    path
-        The file, for messages.
-    angles_rad
-        Stage angles alpha and beta, rad, (k, 2); NaN where a pose has none.
-    span_s
-        First and last time of each pose, s by the clock of the recording, (k, 2); None where the
-        rows are the rests in their order.
-
-    """
-
-    path: str
-    angles_rad: np.ndarray
+    path: str  # The file, for messages
+    angles_rad: np.ndarray  # Stage angles alpha and beta, rad, (k, 2); NaN where a pose has none
+    # First and last time of each pose, s by the clock of the recording, (k, 2); None where the
+    # rows are the rests in their order
     span_s: np.ndarray | None
 
 
@@ -61,12 +38,6 @@ def read_pose_table(path: str | os.PathLike) -> PoseTable:
 
     Its columns are `alpha` and `beta`, or `roll` and `pitch`, each with its unit (`alpha_deg`),
     and `start_s` and `stop_s`, or `time_s`, where the rows are not the rests in their order.
-
-    Raises
-    ------
-    UserError
-        The file cannot be read, or a column is missing or has no unit.
-
     """
     table = open_table(path)
     columns = {role: name for role in _ANGLES for name in table.names

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What a recording holds: samples by named column, with references and what was stated."""
 
@@ -51,83 +39,44 @@ every sensor, stage and reference of the package)."""
 
 
 class Alignment(NamedTuple):
-    """
-    How well a reference was aligned with the stamps of the samples.
+    """How well a reference was aligned with the stamps of the samples."""
 
-    Attributes
-    ----------
-    residual
-        Rms difference between a message and the line between its neighbours, in the unit of the
-        reference. 0 where no sample needed an interpolation.
-    gap_s
-        Largest time between a sample and the message nearest to it, s.
-
-    """
-
+    # Rms difference between a message and the line between its neighbours, in the unit of the
+    # reference. 0 where no sample needed an interpolation.
     residual: float
-    gap_s: float
+    gap_s: float  # Largest time between a sample and the message nearest to it, s
 
 
 class BadStamps(NamedTuple):
-    """
-    Samples whose stamp does not increase.
+    """Samples whose stamp does not increase."""
 
-    Attributes
-    ----------
-    duplicates
-        Samples with the stamp of the sample before.
-    backward
-        Samples whose stamp is earlier.
-
-    """
-
-    duplicates: int
-    backward: int
+    duplicates: int  # Samples with the stamp of the sample before
+    backward: int  # Samples whose stamp is earlier
 
 
 @dataclass
 class Recording:
-    """
-    Samples of one sensor, with references.
+    """Samples of one sensor, with references."""
 
-    Attributes
-    ----------
-    path
-        The file that it was read from, for messages.
-    time_s
-        Stamps of the samples, s since `epoch_ns`, (n,), strictly increasing. Missing samples are
-        gaps in it.
-    columns
-        Arrays (n,) by column name. The sensor's output is `x_v ...`, V, or `ax_mps2 ...`, m/s²;
-        where a file has both, it is the volts. References are NaN where they were not sampled,
-        commands before the first one. A CSV file may have further columns of numbers.
-    info
-        The keys and values of `sensor_info`, and other `# key: value` lines.
-    alignments
-        How well each reference was aligned, by column.
-    cut
-        Where a damaged recording ends; empty if it is whole.
-    epoch_ns
-        Origin of `time_s`, ns. Whole seconds near the first stamp where the stamps of a bag
-        count from 1970, because float64 seconds since then resolve only 0.2 µs; else 0.
-    done
-        Fraction of the file that has been read at the end of these samples.
-    remarks
-        What was assumed or left out so far, one line each, for people.
-    bad_stamps
-        Samples that were left out so far because their stamp does not increase.
-
-    """
-
-    path: str
+    path: str  # The file that it was read from, for messages
+    # Stamps of the samples, s since `epoch_ns`, (n,), strictly increasing. Missing samples are
+    # gaps in it.
     time_s: np.ndarray
+    # Arrays (n,) by column name. The sensor's output is `x_v ...`, V, or `ax_mps2 ...`, m/s²;
+    # where a file has both, it is the volts. References are NaN where they were not sampled,
+    # commands before the first one. A CSV file may have further columns of numbers.
     columns: dict[str, np.ndarray]
+    # The keys and values of `sensor_info`, and other `# key: value` lines
     info: dict[str, str] = field(default_factory=dict)
+    # How well each reference was aligned, by column
     alignments: dict[str, Alignment] = field(default_factory=dict)
-    cut: str = ''
+    cut: str = ''  # Where a damaged recording ends; empty if it is whole
+    # Origin of `time_s`, ns. Whole seconds near the first stamp where the stamps of a bag count
+    # from 1970, because float64 seconds since then resolve only 0.2 µs; else 0.
     epoch_ns: int = 0
-    done: float = 1.0
-    remarks: tuple[str, ...] = ()
+    done: float = 1.0  # Fraction of the file that has been read at the end of these samples
+    remarks: tuple[str, ...] = ()  # What was assumed or left out so far, one line each, for people
+    # Samples that were left out so far because their stamp does not increase
     bad_stamps: BadStamps = BadStamps(0, 0)
 
     def __len__(self) -> int:
@@ -135,20 +84,7 @@ class Recording:
         return len(self.time_s)
 
     def rows(self, start: int, stop: int) -> Recording:
-        """
-        Return a part of the samples.
-
-        Parameters
-        ----------
-        start, stop
-            First row, and the row after the last.
-
-        Returns
-        -------
-        Recording
-            The part, with all that the recording states.
-
-        """
+        """Return a part of the samples."""
         part = slice(start, stop)
         return replace(self, time_s=self.time_s[part],
                        columns={name: values[part] for name, values in self.columns.items()})
@@ -175,15 +111,7 @@ class Recording:
 
     @property
     def rate_hz(self) -> float:
-        """
-        Sample rate by the stamps, Hz. Gaps and bursts of stamps do not change it.
-
-        Raises
-        ------
-        UserError
-            There are fewer than two samples.
-
-        """
+        """Sample rate by the stamps, Hz. Gaps and bursts of stamps do not change it."""
         if len(self) < 2:
             raise UserError(f'{self.path}: {len(self)} samples; at least 2 are needed')
         return stamped_rate_hz(self.time_s)
@@ -203,26 +131,12 @@ class Recording:
 
         Specific force is converted back by the nominal values that the recording states, and by
         those of `sensor` where it states none.
-
-        Raises
-        ------
-        UserError
-            An axis is missing, or a nominal value of the recording cannot be read.
-
         """
         names, data = self._output(sensor)
         return data if names[0] in VOLTS else to_volts(data, self._nominal(sensor))
 
     def accel_mps2(self, sensor: Sensor) -> np.ndarray:
-        """
-        Return the specific force by the nominal values of `sensor`, m/s², (n, m).
-
-        Raises
-        ------
-        UserError
-            An axis is missing, or a nominal value of the recording cannot be read.
-
-        """
+        """Return the specific force by the nominal values of `sensor`, m/s², (n, m)."""
         names, data = self._output(sensor)
         if names[0] in ACCEL and _has_same_nominal_values(self._nominal(sensor), sensor):
             return data
@@ -249,27 +163,7 @@ def _has_same_nominal_values(first: Sensor, second: Sensor) -> bool:
 
 
 def sensor_columns(names: Iterable[str], where: str) -> tuple[str, ...]:
-    """
-    Return which columns are the sensor's output: volts where there are any, else m/s².
-
-    Parameters
-    ----------
-    names
-        All columns.
-    where
-        The file or topic, for messages.
-
-    Returns
-    -------
-    tuple
-        The names in the order of the axes.
-
-    Raises
-    ------
-    UserError
-        There is none, or an axis before the last one is missing.
-
-    """
+    """Return which columns are the sensor's output: volts where there are any, else m/s²."""
     names = tuple(names)
     kind = VOLTS if any(name in names for name in VOLTS) else ACCEL
     present = tuple(name for name in kind if name in names)

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """References and commands with stamps of their own, aligned with the stamps of the samples."""
 
@@ -44,28 +32,12 @@ class Track:
     wrapped. Before the first and after the last message their value is held for one period of the
     reference; beyond that the reference is NaN. So it is in a long gap over which it has changed:
     nobody knows how.
-
-    Attributes
-    ----------
-    known_until_ns
-        Stamp of the newest message, with or without a number, ns. The reference is known up to
-        there. -1 before the second message, which shows the period.
-
     """
 
     def __init__(self, where: str, longest_ns: float = np.inf) -> None:
-        """
-        Start with no message.
-
-        Parameters
-        ----------
-        where
-            Names the topic in error messages.
-        longest_ns
-            Longest gap between two messages that is bridged although the value changes, ns. Three
-            usual ones are bridged in any case.
-
-        """
+        """Start with no message."""
+        # Stamp of the newest message, with or without a number, ns. The reference is known up to
+        # there. -1 before the second message, which shows the period.
         self.known_until_ns = -1
         self._where, self._longest_ns = where, longest_ns
         self._steps_ns = np.zeros(0, np.int64)
@@ -81,18 +53,8 @@ class Track:
         """
         Append messages.
 
-        Parameters
-        ----------
-        stamp_ns
-            Stamps, ns, (k,). Of messages with the same stamp the last one counts.
-        value
-            Values of the reference, in its unit, (k,); NaN where it was not sampled.
-
-        Raises
-        ------
-        UserError
-            The stamps run backwards.
-
+        stamp_ns: stamps, ns, (k,). Of messages with the same stamp the last one counts.; value:
+        values of the reference, in its unit, (k,); NaN where it was not sampled.
         """
         if not len(stamp_ns):
             return
@@ -197,13 +159,9 @@ class Command:
         """
         Append messages.
 
-        Parameters
-        ----------
-        stamp_ns
-            Stamps, ns, (k,), in any order. Of messages with the same stamp the last one counts.
-        value
-            Commanded positions, rad, (k,); NaN in a message without a position of this joint.
-
+        stamp_ns: stamps, ns, (k,), in any order. Of messages with the same stamp the last one
+        counts.; value: commanded positions, rad, (k,); NaN in a message without a position of this
+        joint.
         """
         is_given = ~np.isnan(value)
         stamps = np.concatenate([self._stamp_ns, stamp_ns[is_given]])

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What a stream states about its sensor: topic `sensor_info`, or the head of a CSV file."""
 
@@ -43,18 +31,10 @@ class StreamInfo:
     What a stream or recording states about its sensor. Every key may be missing.
 
     Values are checked when they are asked for: a wrong one matters only where it is needed.
-
-    Attributes
-    ----------
-    texts
-        Values by key, as text.
-    where
-        The file or topic, for messages.
-
     """
 
-    texts: Mapping[str, str]
-    where: str
+    texts: Mapping[str, str]  # Values by key, as text
+    where: str  # The file or topic, for messages
 
     @property
     def format_version(self) -> str:
@@ -73,15 +53,7 @@ class StreamInfo:
 
     @property
     def rate_hz(self) -> float | None:
-        """
-        Sample rate, Hz; None where it is not stated.
-
-        Raises
-        ------
-        UserError
-            The text is no sample rate.
-
-        """
+        """Sample rate, Hz; None where it is not stated."""
         if 'rate_hz' not in self.texts:
             return None
         text = self.texts['rate_hz']
@@ -97,21 +69,7 @@ class StreamInfo:
         """
         Return the nominal zero-g, V, and scale factor, V/g, as far as they are stated.
 
-        Parameters
-        ----------
-        axes
-            The m axes that need a value each.
-
-        Returns
-        -------
-        dict
-            Arrays (m,) by the name of the field of `Sensor`.
-
-        Raises
-        ------
-        UserError
-            A value is no number, or an axis has none.
-
+        returns: arrays (m,) by the name of the field of `Sensor`.
         """
         values = {}
         for key in _NOMINAL_KEYS:
@@ -150,21 +108,6 @@ def _listed(values: np.ndarray) -> str:
 
 
 def converted_info(texts: Mapping[str, str], sensor: Sensor) -> dict[str, str]:
-    """
-    Return what a recording states after a conversion by the nominal values of `sensor`.
-
-    Parameters
-    ----------
-    texts
-        What it states before. Its serial number, rate and further keys stay.
-    sensor
-        Gives nominal zero-g, scale factor and axes.
-
-    Returns
-    -------
-    dict
-        Values by key.
-
-    """
+    """Return what a recording states after a conversion by the nominal values of `sensor`."""
     unchanged = {key: texts[key] for key in ('serial', 'rate_hz') if key in texts}
     return {**texts, **sensor_info(sensor), **unchanged}

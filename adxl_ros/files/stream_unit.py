@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Which unit a recording or stream is of, and whether given parameters are of the same unit."""
 
@@ -32,21 +20,6 @@ def check_unit(info: StreamInfo, axes: str, sensor: Sensor) -> None:
     Refuse samples of another unit than the one that `sensor` describes.
 
     What `info` does not state is not checked.
-
-    Parameters
-    ----------
-    info
-        What the stream states.
-    axes
-        Its measured axes.
-    sensor
-        The unit of the parameters.
-
-    Raises
-    ------
-    UserError
-        The format version is unknown, or the serial number, the axes or a nominal value differs.
-
     """
     if info.format_version != FORMAT:
         raise UserError(f'{info.where}: format version {info.format_version}, but this package '
@@ -71,32 +44,7 @@ def _check_serial(info: StreamInfo, sensor: Sensor) -> None:
 
 
 def uncalibrated(sensor: Sensor, info: StreamInfo, axes: str, rate_hz: float) -> Sensor:
-    """
-    Return the nominal sensor that a stream states, without a fitted coefficient.
-
-    Parameters
-    ----------
-    sensor
-        Gives what the stream does not state: filter, ADC, noise, stage.
-    info
-        Gives the serial number, and the nominal values where they are stated.
-    axes
-        Measured axes.
-    rate_hz
-        Sample rate, Hz.
-
-    Returns
-    -------
-    Sensor
-        A sensor of model `nominal`. Its serial number is that of `sensor` where the stream
-        states none.
-
-    Raises
-    ------
-    UserError
-        A nominal value cannot be read, or those of further axes are unknown.
-
-    """
+    """Return the nominal sensor that a stream states, without a fitted coefficient."""
     measured = {key: text for key, text in sensor.provenance.items() if key == 'noise_from'}
     bare = with_axes(replace(sensor.without_covariance(), model='nominal', effects=(), values={},
                              provenance=measured), axes)
@@ -106,32 +54,7 @@ def uncalibrated(sensor: Sensor, info: StreamInfo, axes: str, rate_hz: float) ->
 
 def unit_of(sensor: Sensor, info: StreamInfo, axes: str | None = None,
             rate_hz: float | None = None) -> Sensor:
-    """
-    Return the nominal sensor of a stream, whose serial number must not contradict `sensor`.
-
-    Parameters
-    ----------
-    sensor
-        Gives what the stream does not state: filter, ADC, noise, stage.
-    info
-        What the stream states.
-    axes
-        Measured axes; None takes those that the stream states.
-    rate_hz
-        Sample rate, Hz; None takes the stated one.
-
-    Returns
-    -------
-    Sensor
-        A sensor of model `nominal`; where one of both serial numbers is no unit, it has the
-        other.
-
-    Raises
-    ------
-    UserError
-        Stream and `sensor` are of different units, or the stream states something unreadable.
-
-    """
+    """Return the nominal sensor of a stream, whose serial number must not contradict `sensor`."""
     _check_serial(info, sensor)
     axes = axes or info.axes or sensor.axes
     unit = uncalibrated(sensor, info, axes, rate_hz or info.rate_hz or sensor.rate_hz)
@@ -139,27 +62,6 @@ def unit_of(sensor: Sensor, info: StreamInfo, axes: str | None = None,
 
 
 def recorded_unit(sensor: Sensor, recording: Recording) -> Sensor:
-    """
-    Return the nominal sensor of a recording, with the sample rate of its stamps.
-
-    Parameters
-    ----------
-    sensor
-        Gives what the recording does not state: filter, ADC, noise, stage.
-    recording
-        The samples.
-
-    Returns
-    -------
-    Sensor
-        See `unit_of`.
-
-    Raises
-    ------
-    UserError
-        Recording and `sensor` are of different units, there are fewer than two samples, or the
-        recording states something unreadable.
-
-    """
+    """Return the nominal sensor of a recording, with the sample rate of its stamps."""
     unit = unit_of(sensor, recording.stream_info, recording.axes, recording.rate_hz)
     return replace(unit, provenance={**unit.provenance, 'rate_from': Path(recording.path).name})

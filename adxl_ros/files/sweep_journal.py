@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The journal of a calibration: records of its poses, on disk before they are acknowledged."""
 
@@ -39,41 +27,25 @@ _LONGEST_VALUE = 60
 
 @dataclass(frozen=True, kw_only=True)
 class PoseRecord:
-    """
-    One accepted pose: the mean output at rest and the joint angles.
+    """One accepted pose: the mean output at rest and the joint angles."""
 
-    Attributes
-    ----------
-    pose
-        Number of the pose in the pose plan, or of the rest of a hand-held sensor, from 0.
-    alpha_rad, beta_rad
-        Joint angles, rad; NaN without a stage.
-    alpha_setting, beta_setting
-        Numbers of the settings of the joints; None without a stage and in earlier journals.
-    check
-        Whether the pose is kept out of the fit.
-    start_ns, stop_ns
-        Stamps of the first and the last sample, ns.
-    samples
-        Number of samples.
-    mean_v, std_v
-        Mean output of each axis and the standard deviation of that mean, V, (m,).
-    temperature_c, supply_v
-        Means over the rest, °C and V; NaN where there are no readings.
-
-    """
-
-    pose: int
+    pose: int  # Number of the pose in the pose plan, or of the rest of a hand-held sensor, from 0
+    # alpha_rad, beta_rad: Joint angles, rad; NaN without a stage
     alpha_rad: float = math.nan
     beta_rad: float = math.nan
+    # alpha_setting, beta_setting: Numbers of the settings of the joints; None without a stage and
+    # in earlier journals
     alpha_setting: int | None = None
     beta_setting: int | None = None
-    check: bool = False
+    check: bool = False  # Whether the pose is kept out of the fit
+    # start_ns, stop_ns: Stamps of the first and the last sample, ns
     start_ns: int
     stop_ns: int
-    samples: int
+    samples: int  # Number of samples
+    # mean_v, std_v: Mean output of each axis and the standard deviation of that mean, V, (m,)
     mean_v: tuple[float, ...]
     std_v: tuple[float, ...]
+    # temperature_c, supply_v: Means over the rest, °C and V; NaN where there are no readings
     temperature_c: float = math.nan
     supply_v: float = math.nan
 
@@ -87,15 +59,7 @@ class PoseRecord:
 
     @classmethod
     def from_json(cls, line: Mapping[str, Any]) -> PoseRecord:
-        """
-        Read the record of a line; unknown keys are left out.
-
-        Raises
-        ------
-        ValueError
-            The line lacks a key.
-
-        """
+        """Read the record of a line; unknown keys are left out."""
         missing = [f.name for f in fields(cls) if f.default is MISSING and f.name not in line]
         if missing:
             raise ValueError(f'the pose has no {", ".join(missing)}')
@@ -107,17 +71,9 @@ class PoseRecord:
 
 @dataclass(frozen=True)
 class PoseDropped:
-    """
-    A pose that does not count any more, because it is taken again.
+    """A pose that does not count any more, because it is taken again."""
 
-    Attributes
-    ----------
-    pose
-        Number of the pose.
-
-    """
-
-    pose: int
+    pose: int  # Number of the pose
 
     def to_json(self) -> dict[str, Any]:
         """Return the keys and values of the line."""
@@ -126,17 +82,9 @@ class PoseDropped:
 
 @dataclass(frozen=True)
 class PoseSkipped:
-    """
-    A pose that the operator leaves out.
+    """A pose that the operator leaves out."""
 
-    Attributes
-    ----------
-    pose
-        Number of the pose.
-
-    """
-
-    pose: int
+    pose: int  # Number of the pose
 
     def to_json(self) -> dict[str, Any]:
         """Return the keys and values of the line."""
@@ -154,20 +102,10 @@ class MountingUnchecked:
 
 @dataclass(frozen=True)
 class Fitted:
-    """
-    A note that a fit is written.
+    """A note that a fit is written."""
 
-    Attributes
-    ----------
-    rests
-        Poses of the fit; None in journals of earlier versions.
-    done
-        Whether no pose was open, so that the calibration is over.
-
-    """
-
-    rests: tuple[PoseRecord, ...] | None
-    done: bool
+    rests: tuple[PoseRecord, ...] | None  # Poses of the fit; None in journals of earlier versions
+    done: bool  # Whether no pose was open, so that the calibration is over
 
     def to_json(self) -> dict[str, Any]:
         """Return the keys and values of the line."""
@@ -180,55 +118,22 @@ JournalEntry: TypeAlias = PoseRecord | PoseDropped | PoseSkipped | MountingUnche
 
 
 class JournalContents(NamedTuple):
-    """
-    What a journal holds.
+    """What a journal holds."""
 
-    Attributes
-    ----------
-    head
-        What must be the same for poses to belong together, by key.
-    entries
-        All entries, in the order in which they were written.
-
-    """
-
-    head: dict[str, Any]
-    entries: list[JournalEntry]
+    head: dict[str, Any]  # What must be the same for poses to belong together, by key
+    entries: list[JournalEntry]  # All entries, in the order in which they were written
 
 
 class Unfinished(NamedTuple):
-    """
-    An interrupted calibration.
+    """An interrupted calibration."""
 
-    Attributes
-    ----------
-    poses
-        Number of its accepted poses.
-    obstacle
-        Why it cannot be resumed: how its head differs, or which line is damaged; '' if it can.
-
-    """
-
-    poses: int
+    poses: int  # Number of its accepted poses
+    # Why it cannot be resumed: how its head differs, or which line is damaged; '' if it can
     obstacle: str
 
 
 class NotJournalError(UserError):
-    """
-    A line does not belong to a journal.
-
-    Parameters
-    ----------
-    path
-        The file.
-    line_number
-        Number of the line, from 1.
-    reason
-        What is wrong with the line.
-    entries
-        Entries of the lines before.
-
-    """
+    """A line does not belong to a journal."""
 
     def __init__(self, path: Path, line_number: int, reason: object,
                  entries: list[JournalEntry]) -> None:
@@ -242,27 +147,6 @@ class Journal:
     An append-only file of JSON lines: a head that says what is calibrated, then entries.
 
     The file is locked while it is open, so that two calibrations cannot share it.
-
-    Parameters
-    ----------
-    path
-        The file; made if it does not exist.
-    head
-        What must be the same for entries to belong together: unit, mode, pose plan.
-    start_over
-        Begin a new journal although an interrupted one exists, which is kept under its time.
-
-    Attributes
-    ----------
-    entries
-        Entries of an interrupted calibration with the same head, in order.
-
-    Raises
-    ------
-    UserError
-        The file is locked by another calibration, has another head, is not a journal, or cannot
-        be written.
-
     """
 
     def __init__(self, path: str | os.PathLike, head: Mapping[str, Any],
@@ -280,21 +164,14 @@ class Journal:
             raise UserError(f'{path}: another calibration is writing this journal; finish or '
                             'abort it, or choose another journal') from None
         try:
+            # Entries of an interrupted calibration with the same head, in order
             self.entries = self._resume(_as_read(head), start_over)
         except UserError:
             self._file.close()
             raise
 
     def append(self, entry: JournalEntry) -> None:
-        """
-        Write one entry and wait until it is on the disk.
-
-        Raises
-        ------
-        UserError
-            The disk does not take the entry; the journal stays as it was.
-
-        """
+        """Write one entry and wait until it is on the disk."""
         self._append_line(entry.to_json())
 
     def close(self) -> None:
@@ -351,15 +228,7 @@ class Journal:
 
 
 def read(path: str | os.PathLike) -> JournalContents:
-    """
-    Read the head and the entries of a journal.
-
-    Raises
-    ------
-    UserError
-        The file cannot be read or is not a journal.
-
-    """
+    """Read the head and the entries of a journal."""
     try:
         contents, _ = _parse(Path(path))
     except OSError as error:
@@ -370,27 +239,7 @@ def read(path: str | os.PathLike) -> JournalContents:
 
 
 def unfinished(path: str | os.PathLike, head: Mapping[str, Any]) -> Unfinished | None:
-    """
-    Look for an interrupted calibration, without a lock.
-
-    Parameters
-    ----------
-    path
-        The journal, which need not exist.
-    head
-        Head of the calibration that is to begin.
-
-    Returns
-    -------
-    Unfinished or None
-        The interrupted calibration, if there is one.
-
-    Raises
-    ------
-    UserError
-        The file cannot be read.
-
-    """
+    """Look for an interrupted calibration, without a lock."""
     if not Path(path).exists():
         return None
     try:
@@ -408,20 +257,7 @@ def unfinished(path: str | os.PathLike, head: Mapping[str, Any]) -> Unfinished |
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
-    """
-    Return in which keys two heads differ.
-
-    Parameters
-    ----------
-    old, new
-        Heads by key; the keys of the new head come first.
-
-    Returns
-    -------
-    str
-        Each key with its old and new value; '' where the heads are equal.
-
-    """
+    """Return in which keys two heads differ."""
     return ', '.join(f'{key} was {_short(old.get(key))}, is {_short(new.get(key))}'
                      for key in {**new, **old} if old.get(key) != new.get(key))
 

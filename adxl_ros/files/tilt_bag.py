@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Bags of corrected samples: `imu/data` and `tilt`, as the node `compensation` publishes them."""
 
@@ -33,15 +21,7 @@ class TiltBag(OpenBag):
     """Writes corrected samples block by block: a message of `imu/data` and `tilt` for each."""
 
     def __init__(self, path: str | os.PathLike) -> None:
-        """
-        Prepare to write to `path`, which is replaced if it exists.
-
-        Raises
-        ------
-        UserError
-            The library rosbags is not installed.
-
-        """
+        """Prepare to write to `path`, which is replaced if it exists."""
         super().__init__(path)
         self._imu = imu_template(self.types, np.zeros(9))
         kinds = self.types.types
@@ -54,20 +34,8 @@ class TiltBag(OpenBag):
         """
         Append samples.
 
-        Parameters
-        ----------
-        stamp_ns
-            Stamps, ns, (n,), rising.
-        imu_fields
-            Fields of sensor_msgs/Imu by name, (n, k) each.
-        tilt_rad
-            Roll, pitch and inclination, rad, (n, 3).
-
-        Raises
-        ------
-        UserError
-            A time cannot be a stamp.
-
+        stamp_ns: stamps, ns, (n,), rising; imu_fields: fields of sensor_msgs/Imu by name, (n, k)
+        each; tilt_rad: roll, pitch and inclination, rad, (n, 3).
         """
         data, tilt = self.connection('/imu/data', IMU), self.connection('/tilt', _VECTOR)
         if not len(stamp_ns):

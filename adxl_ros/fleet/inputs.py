@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The recordings of a fleet: files, folders, globs, URLs of fsspec, and manifests.
@@ -80,65 +68,25 @@ class Unreachable(UserError):
 
 @dataclass(frozen=True)
 class Source:
-    """
-    One recording, as it was found.
+    """One recording, as it was found."""
 
-    Attributes
-    ----------
-    url
-        Its address; an absolute path for a file of this machine.
-    size_bytes
-        Its size; None if unknown.
-    stamp
-        A text that changes with the content; empty if the server states nothing.
-    modified
-        Time of the last change, ISO 8601, UTC; empty if unknown.
-    serial, params, date
-        What a manifest states: serial number, parameter file, and begin of the recording, ISO
-        8601; empty for nothing.
-    fault
-        Why it cannot be read; empty if it was found.
-    secret
-        What its address leaves out: the password of its server, or the whole address of a web
-        server; empty for nothing.
-
-    """
-
-    url: str
-    size_bytes: int | None = None
-    stamp: str = ''
-    modified: str = ''
+    url: str  # Its address; an absolute path for a file of this machine
+    size_bytes: int | None = None  # Its size; None if unknown
+    stamp: str = ''  # A text that changes with the content; empty if the server states nothing
+    modified: str = ''  # Time of the last change, ISO 8601, UTC; empty if unknown
+    # serial, params, date: What a manifest states: serial number, parameter file, and begin of the
+    # recording, ISO 8601; empty for nothing
     serial: str = ''
     params: str = ''
     date: str = ''
-    fault: str = ''
+    fault: str = ''  # Why it cannot be read; empty if it was found
+    # What its address leaves out: the password of its server, or the whole address of a web
+    # server; empty for nothing
     secret: str = field(default='', repr=False)
 
 
 def file_system(url: str, secret: str = '') -> tuple[Any, str]:
-    """
-    Return the file system of a URL, and the path in it.
-
-    Parameters
-    ----------
-    url
-        The address.
-    secret
-        See `Source.secret`.
-
-    Returns
-    -------
-    tuple
-        A file system of fsspec, and a path.
-
-    Raises
-    ------
-    UserError
-        The library for such URLs is not installed.
-    Unreachable
-        The server does not answer, or refuses.
-
-    """
+    """Return the file system of a URL, and the path in it."""
     try:
         from fsspec.core import url_to_fs
         from fsspec.implementations.local import LocalFileSystem
@@ -181,22 +129,6 @@ def find_sources(inputs: Iterable[str]) -> list[Source]:
     Find the recordings of a command line.
 
     The files of a fleet's results, which lie beside its table, are no recordings.
-
-    Parameters
-    ----------
-    inputs
-        Files, folders, globs, URLs and manifests.
-
-    Returns
-    -------
-    list
-        Each recording once, by URL. Those that cannot be read have a `fault`.
-
-    Raises
-    ------
-    UserError
-        A folder or a glob has no recording, or a manifest is wrong.
-
     """
     try:
         sources = {source.url: source for text in inputs for source in _of_input(text)}
@@ -326,24 +258,7 @@ def _folders(name: str) -> Iterator[str]:
 
 
 def look_up(fs: Any, path: str, url: str) -> Source:
-    """
-    Look up one recording.
-
-    Parameters
-    ----------
-    fs
-        The file system.
-    path
-        The path in it.
-    url
-        The address for messages.
-
-    Returns
-    -------
-    Source
-        The recording; with a fault where it cannot be read.
-
-    """
+    """Look up one recording."""
     try:
         info = fs.info(path)
         if info['type'] == 'directory':
@@ -565,20 +480,10 @@ def is_manifest(path: Path) -> bool:
 
 
 class Stated(NamedTuple):
-    """
-    What a recording states of itself at its begin; empty for nothing.
+    """What a recording states of itself at its begin; empty for nothing."""
 
-    Attributes
-    ----------
-    serial
-        Serial number of its unit.
-    date
-        Its begin, ISO 8601, UTC.
-
-    """
-
-    serial: str = ''
-    date: str = ''
+    serial: str = ''  # Serial number of its unit
+    date: str = ''  # Its begin, ISO 8601, UTC
 
 
 def stated_by(sources: Iterable[Source]) -> list[Stated]:

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 What all tasks of a run share, and the calibration and key of each recording.
@@ -51,26 +39,12 @@ _SECONDS_PER_DAY = 86400.0
 
 
 class ParameterText(NamedTuple):
-    """
-    A parameter file by its content.
+    """A parameter file by its content."""
 
-    Attributes
-    ----------
-    name
-        Its name, for messages.
-    text
-        Its content; empty for the nominal sensor.
-    calibration_id
-        Id of the calibration; empty for none.
-    date
-        Date of the calibration, ISO 8601, UTC; empty if unknown.
-
-    """
-
-    name: str
-    text: str
-    calibration_id: str = ''
-    date: str = ''
+    name: str  # Its name, for messages
+    text: str  # Its content; empty for the nominal sensor
+    calibration_id: str = ''  # Id of the calibration; empty for none
+    date: str = ''  # Date of the calibration, ISO 8601, UTC; empty if unknown
 
 
 _NOMINAL = ParameterText('the nominal sensor', '')
@@ -79,32 +53,16 @@ _NOMINAL = ParameterText('the nominal sensor', '')
 
 @dataclass(frozen=True)
 class Recipe:
-    """
-    What all tasks of a run share.
+    """What all tasks of a run share."""
 
-    Attributes
-    ----------
-    tasks
-        Names of the tasks.
-    code
-        SHA-256 of the code.
-    params
-        Parameter file of all recordings; None takes the calibration of each.
-    stated
-        Parameter files that a manifest names, by their names there.
-    store
-        Names and texts of the calibrations, by the folder of the unit in the store.
-    reading
-        How recordings are to be read.
-
-    """
-
-    tasks: tuple[str, ...]
-    code: str
+    tasks: tuple[str, ...]  # Names of the tasks
+    code: str  # SHA-256 of the code
+    # Parameter file of all recordings; None takes the calibration of each
     params: ParameterText | None
-    stated: dict[str, ParameterText]
+    stated: dict[str, ParameterText]  # Parameter files that a manifest names, by their names there
+    # Names and texts of the calibrations, by the folder of the unit in the store
     store: dict[str, tuple[tuple[str, str], ...]]
-    reading: ReadingOptions = AS_IT_IS
+    reading: ReadingOptions = AS_IT_IS  # How recordings are to be read
 
     def parameters_of(self, serial: str, date: str, stated: str) -> ParameterText:
         """
@@ -112,21 +70,6 @@ class Recipe:
 
         It is that of the manifest, else that of the command line, else the newest calibration of
         the unit that is not younger than the recording, else the nominal sensor.
-
-        Parameters
-        ----------
-        serial
-            Serial number of the unit; empty if unknown.
-        date
-            Begin of the recording, ISO 8601, UTC; empty if unknown.
-        stated
-            Parameter file that a manifest names; empty for none.
-
-        Returns
-        -------
-        ParameterText
-            The parameter file.
-
         """
         if stated:
             return self.stated[stated]
@@ -142,42 +85,12 @@ class Recipe:
         return max(valid, key=lambda parameters: parameters.date, default=_NOMINAL)
 
     def digest(self, chosen: ParameterText, serial: str) -> str:
-        """
-        Return the SHA-256 of all that a row follows from, beside the content.
-
-        Parameters
-        ----------
-        chosen
-            The parameter file.
-        serial
-            Serial number that a manifest states; empty for none.
-
-        Returns
-        -------
-        str
-            Hexadecimal.
-
-        """
+        """Return the SHA-256 of all that a row follows from, beside the content."""
         return _sha256([chosen.text, serial, self.tasks, repr(self.reading), self.code])
 
 
 def key_of(content: str, digest: str) -> str:
-    """
-    Return the key of a row.
-
-    Parameters
-    ----------
-    content
-        SHA-256 of the recording; where it could not be read, its address and stamp.
-    digest
-        See `Recipe.digest`.
-
-    Returns
-    -------
-    str
-        SHA-256, hexadecimal.
-
-    """
+    """Return the key of a row."""
     return _sha256([content, digest])
 
 
@@ -187,22 +100,7 @@ def _sha256(values: Iterable[object]) -> str:
 
 
 def age_days(chosen: ParameterText, date: str) -> float | None:
-    """
-    Return the age of a calibration at a date, days.
-
-    Parameters
-    ----------
-    chosen
-        The calibration.
-    date
-        ISO 8601, UTC; empty if unknown.
-
-    Returns
-    -------
-    float or None
-        Days; None where one of both dates is unknown.
-
-    """
+    """Return the age of a calibration at a date, days."""
     if not (chosen.date and date):
         return None
     seconds = (datetime.fromisoformat(date) - datetime.fromisoformat(chosen.date)
@@ -221,33 +119,7 @@ def task_names(text: str) -> tuple[str, ...]:
 
 def make_recipe(tasks: Iterable[str], params: str | None, stated: Iterable[str],
                 store: str | None, reading: ReadingOptions) -> Recipe:
-    """
-    Read all parameter files of a run.
-
-    Parameters
-    ----------
-    tasks
-        Names of the tasks.
-    params
-        Parameter file of all recordings; None for none.
-    stated
-        Parameter files that a manifest names.
-    store
-        Folder of the calibration store; None for none.
-    reading
-        How recordings are to be read.
-
-    Returns
-    -------
-    Recipe
-        What all tasks share.
-
-    Raises
-    ------
-    UserError
-        A parameter file is wrong.
-
-    """
+    """Read all parameter files of a run."""
     return Recipe(tuple(tasks), code_version(),
                   _read(params) if params else None,
                   {name: _read(name) for name in set(stated) if name},

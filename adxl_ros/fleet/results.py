@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The rows of a fleet on disk, and the table that is made of them.
@@ -51,66 +39,29 @@ _NAME_DIGITS = 16
 
 
 class Entry(NamedTuple):
-    """
-    What the client keeps in memory of a row.
+    """What the client keeps in memory of a row."""
 
-    Attributes
-    ----------
-    name
-        Name of the row's file.
-    written
-        When it was written, ISO 8601, UTC.
-    stamp
-        Stamp of the recording.
-    digest
-        See `Recipe.digest`.
-    key
-        Key of the row.
-    outcome
-        One of `row.OUTCOMES`.
-    serial, date
-        Unit and begin of the recording; empty if unknown.
-    date_source
-        Where the date is from; empty if unknown.
-    size_bytes
-        Size of the recording, byte.
-    seconds
-        Run time of its tasks, s.
-    tasks
-        Its tasks.
-
-    """
-
-    name: str
-    written: str
-    stamp: str
-    digest: str
-    key: str
-    outcome: str
+    name: str  # Name of the row's file
+    written: str  # When it was written, ISO 8601, UTC
+    stamp: str  # Stamp of the recording
+    digest: str  # See `Recipe.digest`
+    key: str  # Key of the row
+    outcome: str  # One of `row.OUTCOMES`
+    # serial, date: Unit and begin of the recording; empty if unknown
     serial: str
     date: str
-    date_source: str
-    size_bytes: int
-    seconds: float
-    tasks: tuple[str, ...]
+    date_source: str  # Where the date is from; empty if unknown
+    size_bytes: int  # Size of the recording, byte
+    seconds: float  # Run time of its tasks, s
+    tasks: tuple[str, ...]  # Its tasks
 
 
 class Results:
-    """
-    The folder of a fleet.
-
-    Attributes
-    ----------
-    folder
-        The folder.
-    newest
-        The newest row of each recording, by URL.
-
-    """
+    """The folder of a fleet."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.newest: dict[str, Entry] = {}
+        self.folder = folder  # The folder
+        self.newest: dict[str, Entry] = {}  # The newest row of each recording, by URL
         self._names: set[str] = set()
         self._looked_s = -_LOOK_S
         self._by_size: dict[int, set[str]] = {}
@@ -149,22 +100,7 @@ class Results:
         return frozenset(key for size in sizes for key in self._by_size.get(size, ()))
 
     def row_with_key(self, key: str, url: str) -> Row | None:
-        """
-        Return a row with a key.
-
-        Parameters
-        ----------
-        key
-            The key.
-        url
-            Address of the recording whose row comes first.
-
-        Returns
-        -------
-        dict or None
-            The row; None where its file is gone.
-
-        """
+        """Return a row with a key."""
         of_url = _row_name(key, url)
         for path in sorted((self.folder / _ROWS).glob(f'{key}-*.json'),
                            key=lambda path: (path.name != of_url, path.name)):
@@ -174,27 +110,7 @@ class Results:
         return None
 
     def put(self, result: Result, attempts: int) -> Row:
-        """
-        Write what a task left: its files, then its row.
-
-        Parameters
-        ----------
-        result
-            What the task left.
-        attempts
-            Number of attempts.
-
-        Returns
-        -------
-        Row
-            The row, complete.
-
-        Raises
-        ------
-        UserError
-            The folder cannot be written.
-
-        """
+        """Write what a task left: its files, then its row."""
         row = {**result.row, 'attempts': attempts,
                'written': datetime.now(timezone.utc).isoformat()}
         if result.files:
@@ -218,20 +134,7 @@ class Results:
                 yield content['row']
 
     def write_table(self) -> Path:
-        """
-        Write the table.
-
-        Returns
-        -------
-        Path
-            The file.
-
-        Raises
-        ------
-        UserError
-            It cannot be written.
-
-        """
+        """Write the table."""
         from pyarrow import ArrowException, parquet
         self._looked_s = -_LOOK_S
         self.look()

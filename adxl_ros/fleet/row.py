@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The columns of a fleet's table: name, kind, unit and meaning, and the file that holds them.
@@ -56,29 +44,15 @@ COEFFICIENT_FIELDS = {'name': 'text', 'unit': 'text', 'value': 'float', 'std': '
 
 @dataclass(frozen=True)
 class Column:
-    """
-    One column of the table.
+    """One column of the table."""
 
-    Attributes
-    ----------
-    name
-        Its name, which ends in the unit where there is one.
-    kind
-        `text`, `float`, `integer`, `flag`, `time` (UTC), `texts`, `groups` (lists of texts) or
-        `coefficients` (see `COEFFICIENT_FIELDS`).
-    meaning
-        What it holds, for people.
-    unit
-        Its unit; empty for none.
-    is_timing
-        Whether it depends on where and when the task ran, and not on the recording.
-
-    """
-
-    name: str
+    name: str  # Its name, which ends in the unit where there is one
+    # `text`, `float`, `integer`, `flag`, `time` (UTC), `texts`, `groups` (lists of texts) or
+    # `coefficients` (see `COEFFICIENT_FIELDS`)
     kind: str
-    meaning: str
-    unit: str = ''
+    meaning: str  # What it holds, for people
+    unit: str = ''  # Its unit; empty for none
+    # Whether it depends on where and when the task ran, and not on the recording
     is_timing: bool = False
 
 

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A fleet from end to end: which recordings are to be worked on, the work, and what it costs."""
 
@@ -45,76 +33,28 @@ cost of its tasks, by which a further run is estimated."""
 
 @dataclass(frozen=True)
 class Plan:
-    """
-    What a run has to do.
+    """What a run has to do."""
 
-    Attributes
-    ----------
-    todo
-        Recordings to work on.
-    done
-        Number of recordings that have their row.
-    outside
-        Number of recordings that --since, --limit or --only-failed leave out.
-    serials
-        Serial numbers of the recordings to work on as far as they are known before; else empty.
-    size_bytes
-        Size of the recordings to work on.
-    core_hours
-        Expected run time on one core, h.
-
-    """
-
-    todo: tuple[Source, ...]
-    done: int
-    outside: int
+    todo: tuple[Source, ...]  # Recordings to work on
+    done: int  # Number of recordings that have their row
+    outside: int  # Number of recordings that --since, --limit or --only-failed leave out
+    # Serial numbers of the recordings to work on as far as they are known before; else empty
     serials: tuple[str, ...]
-    size_bytes: int
-    core_hours: float
+    size_bytes: int  # Size of the recordings to work on
+    core_hours: float  # Expected run time on one core, h
 
 
 class Selection(NamedTuple):
-    """
-    Which recordings a run works on.
+    """Which recordings a run works on."""
 
-    Attributes
-    ----------
-    only_failed
-        Whether only those whose row is a refusal or a crash.
-    since
-        Begin of the period, ISO 8601, UTC; empty for all.
-    limit
-        Largest number; None for all.
-
-    """
-
-    only_failed: bool = False
-    since: str = ''
-    limit: int | None = None
+    only_failed: bool = False  # Whether only those whose row is a refusal or a crash
+    since: str = ''  # Begin of the period, ISO 8601, UTC; empty for all
+    limit: int | None = None  # Largest number; None for all
 
 
 def plan(sources: Sequence[Source], recipe: Recipe, results: Results,
          selection: Selection) -> Plan:
-    """
-    Decide which recordings are to be worked on.
-
-    Parameters
-    ----------
-    sources
-        All recordings.
-    recipe
-        What all tasks share.
-    results
-        The rows of earlier runs.
-    selection
-        Which of them.
-
-    Returns
-    -------
-    Plan
-        The recordings, by URL, and what they cost.
-
-    """
+    """Decide which recordings are to be worked on."""
     todo, done = [], 0
     chosen = _since(sources, selection.since, results) if selection.since else sources
     outside = len(sources) - len(chosen)
@@ -156,24 +96,7 @@ def _serial(source: Source, results: Results) -> str:
 
 
 def is_done(source: Source, entry: Entry, recipe: Recipe) -> bool:
-    """
-    Return whether a row is that of a recording as it is now, by the present recipe.
-
-    Parameters
-    ----------
-    source
-        The recording as it is now.
-    entry
-        Its newest row.
-    recipe
-        What all tasks share.
-
-    Returns
-    -------
-    bool
-        Whether nothing is to be done. A recording whose server states no change is read again.
-
-    """
+    """Return whether a row is that of a recording as it is now, by the present recipe."""
     if source.stamp != entry.stamp or not (source.stamp or source.fault):
         return False
     if source.date != (entry.date if entry.date_source == 'manifest' else ''):
@@ -196,35 +119,7 @@ def _expected_s(count: int, size_bytes: int, recipe: Recipe, results: Results) -
 
 def work(pool: Executor, sources: Sequence[Source], recipe: Recipe, results: Results,
          retries: int, show: Callable[[float], None]) -> Iterator[Row]:
-    """
-    Work on recordings, and write each row as soon as it is there.
-
-    Parameters
-    ----------
-    pool
-        Where the tasks run. Their first arguments are the recipe and `Results.keys_of`.
-    sources
-        The recordings.
-    recipe
-        What all tasks share.
-    results
-        Gets the rows.
-    retries
-        Further attempts of a task that crashes.
-    show
-        Receives the fraction that is finished.
-
-    Yields
-    ------
-    Row
-        Each row that was written, with its cost in this run.
-
-    Raises
-    ------
-    UserError
-        The folder cannot be written, or a worker has another version of the package.
-
-    """
+    """Work on recordings, and write each row as soon as it is there."""
     # Two clients on one folder begin at different recordings.
     order = random.Random(os.getpid()).sample(sources, len(sources))
     count = 0

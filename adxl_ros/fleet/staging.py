@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 A recording of any address as a local file, for the time of a task.
@@ -62,23 +50,11 @@ class StagingError(Exception):
 
 
 class Staged(NamedTuple):
-    """
-    The copy of a recording.
+    """The copy of a recording."""
 
-    Attributes
-    ----------
-    path
-        The file or folder.
-    content
-        SHA-256 of the content, as `files.checksum.sha256` gives it.
-    size_bytes
-        Its size.
-
-    """
-
-    path: Path
-    content: str
-    size_bytes: int
+    path: Path  # The file or folder
+    content: str  # SHA-256 of the content, as `files.checksum.sha256` gives it
+    size_bytes: int  # Its size
 
 
 @contextmanager
@@ -115,31 +91,7 @@ def _remove_abandoned(root: Path) -> None:
 
 
 def stage(source: Source, folder: Path, largest_bytes: int = LARGEST_BYTES) -> Staged:
-    """
-    Copy a recording into a folder.
-
-    Parameters
-    ----------
-    source
-        The recording.
-    folder
-        An empty folder of this machine.
-    largest_bytes
-        Largest permitted size, byte.
-
-    Returns
-    -------
-    Staged
-        The copy.
-
-    Raises
-    ------
-    UserError
-        The recording is not there, too large, or names files outside of its folder.
-    StagingError
-        It could not be read now, changed meanwhile, or does not fit on the disk.
-
-    """
+    """Copy a recording into a folder."""
     try:
         fs, path = file_system(source.url, source.secret)
     except Unreachable as reason:

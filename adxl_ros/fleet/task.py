@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The task of a worker: from the address of a recording to one row.
@@ -66,29 +54,13 @@ _RESET_PEAK = '5'
 
 
 class Result(NamedTuple):
-    """
-    What a task leaves.
+    """What a task leaves."""
 
-    Attributes
-    ----------
-    row
-        The row; without results where `is_known` holds.
-    files
-        Files of the recording, by name.
-    stamp
-        Stamp of the recording that was read.
-    digest
-        See `Recipe.digest`.
-    is_known
-        Whether there is a row with this key.
-
-    """
-
-    row: Row
-    files: dict[str, bytes]
-    stamp: str
-    digest: str
-    is_known: bool = False
+    row: Row  # The row; without results where `is_known` holds
+    files: dict[str, bytes]  # Files of the recording, by name
+    stamp: str  # Stamp of the recording that was read
+    digest: str  # See `Recipe.digest`
+    is_known: bool = False  # Whether there is a row with this key
 
 
 class TaskCrashed(Exception):
@@ -109,33 +81,7 @@ class WrongCode(UserError):
 
 
 def make_row(recipe: Recipe, earlier: frozenset[str], source: Source, is_again: bool) -> Result:
-    """
-    Make the row of a recording; see the module.
-
-    Parameters
-    ----------
-    recipe
-        What all tasks share.
-    earlier
-        Keys of rows that were there before the run.
-    source
-        The recording.
-    is_again
-        Whether its row failed, and is to be made again.
-
-    Returns
-    -------
-    Result
-        The row. A recording that cannot be used leaves a row with the reason.
-
-    Raises
-    ------
-    WrongCode
-        This worker has another version of the package.
-    StagingError, TaskCrashed
-        It may be possible in another attempt.
-
-    """
+    """Make the row of a recording; see the module."""
     if recipe.code != code_version():
         raise WrongCode(f'worker {_worker()}: has another version of adxl_ros '
                         f'({code_version()[:12]}, the client has {recipe.code[:12]}); install the '
@@ -156,26 +102,7 @@ def make_row(recipe: Recipe, earlier: frozenset[str], source: Source, is_again: 
 
 
 def refused(recipe: Recipe, source: Source, reason: str, outcome: str = 'refused') -> Result:
-    """
-    Return the row of a recording whose content is not known.
-
-    Parameters
-    ----------
-    recipe
-        What all tasks share.
-    source
-        The recording.
-    reason
-        Why it has no result, in one line.
-    outcome
-        `refused`, or `crashed`.
-
-    Returns
-    -------
-    Result
-        Its row.
-
-    """
+    """Return the row of a recording whose content is not known."""
     parameters = recipe.parameters_of(source.serial, source.date, source.params)
     digest = recipe.digest(parameters, source.serial)
     row = _identity(recipe, source, None, source.serial, (source.date, 'manifest'), parameters)
@@ -313,19 +240,7 @@ class _Job:
                 self.row, self.files, self.source.stamp, self.digest)) from None
 
     def refuse(self, name: str, reason: str, outcome: str = 'refused') -> None:
-        """
-        Note why a task has no result; the first reason counts.
-
-        Parameters
-        ----------
-        name
-            The task.
-        reason
-            Why, in one line.
-        outcome
-            `refused`, or `crashed`.
-
-        """
+        """Note why a task has no result; the first reason counts."""
         if self.row['refusal'] is None:
             self.row |= {'outcome': outcome, 'refusal': reason, 'refused_by': name}
 

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The diagnosis of an investigation in a process of its own, so that no sample is lost meanwhile.
@@ -45,19 +33,7 @@ class BackgroundDiagnoser:
     """Diagnoses in a process of its own."""
 
     def __init__(self, folder: OutputFolder, limits: StageLimits, seed: int) -> None:
-        """
-        Diagnose the bag of a folder.
-
-        Parameters
-        ----------
-        folder
-            Files of the investigation; the baseline is among them.
-        limits
-            Limits of the stage.
-        seed
-            Seed of the diagnosis.
-
-        """
+        """Diagnose the bag of a folder."""
         self._folder, self._limits, self._seed = folder, limits, seed
         self._process: subprocess.Popen | None = None
         self._errors: IO[bytes] | None = None
@@ -74,15 +50,7 @@ class BackgroundDiagnoser:
             stdout=subprocess.DEVNULL, stderr=self._errors, start_new_session=True)
 
     def answer(self) -> Answer | None:
-        """
-        Return the answer, or None while the process runs.
-
-        Raises
-        ------
-        UserError
-            The process failed.
-
-        """
+        """Return the answer, or None while the process runs."""
         process = self._process
         if process is None or process.poll() is None:
             return None

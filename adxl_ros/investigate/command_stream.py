@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Commands of a stage along a manoeuvre: positions in short steps.
@@ -40,34 +28,14 @@ class CommandStream:
     """
     The commands of one manoeuvre.
 
-    Attributes
-    ----------
-    command
-        The newest command.
-    speed
-        Speed of each joint on the way to it, rad/s.
-    waited_s
-        Time for which the command has waited for the stage, s.
-
+    command: the newest command.
     """
 
     def __init__(self, limits: StageLimits, manoeuvre: PlannedManoeuvre, pose: Pose) -> None:
-        """
-        Begin with the stage in a pose.
-
-        Parameters
-        ----------
-        limits
-            Limits of the stage.
-        manoeuvre
-            The manoeuvre.
-        pose
-            Pose of the stage.
-
-        """
+        """Begin with the stage in a pose."""
         self.command = self._expected = limits.nearest(*pose)
-        self.speed = Pose(0.0, 0.0)
-        self.waited_s = 0.0
+        self.speed = Pose(0.0, 0.0)  # Speed of each joint on the way to it, rad/s
+        self.waited_s = 0.0  # Time for which the command has waited for the stage, s
         self._limits, self._manoeuvre = limits, manoeuvre
         self._elapsed_s = 0.0
 
@@ -86,20 +54,6 @@ class CommandStream:
         Return the next command.
 
         The manoeuvre takes longer where a call is later than `LONGEST_STEP_S`.
-
-        Parameters
-        ----------
-        elapsed_s
-            Time since the last call, s.
-        pose
-            Pose of the stage.
-
-        Returns
-        -------
-        Pose
-            The command, within the limits of angle. It differs from the last one by the limit of
-            rate times the elapsed time at most.
-
         """
         # Where a stage is that has moved on with its last command.
         self._expected = _moved(self._expected, self.command, *(

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """One round of an investigation: samples so far in, probabilities and the next manoeuvre out."""
 
@@ -66,68 +54,28 @@ class Outcome(Enum):
 
 @dataclass(frozen=True)
 class Question:
-    """
-    What a round begins with.
+    """What a round begins with."""
 
-    Attributes
-    ----------
-    pose
-        Pose of the stage.
-    minutes
-        Time since the first sample, min.
-    remaining_minutes
-        Time that remains for manoeuvres, min.
-    has_samples
-        Whether there are samples to diagnose.
-    recorded
-        Names of the manoeuvres that have been recorded.
-    verdict
-        Verdict of the round before; '' for none.
-
-    """
-
-    pose: Pose
-    minutes: float
-    remaining_minutes: float
-    has_samples: bool
-    recorded: tuple[str, ...] = ()
-    verdict: str = ''
+    pose: Pose  # Pose of the stage
+    minutes: float  # Time since the first sample, min
+    remaining_minutes: float  # Time that remains for manoeuvres, min
+    has_samples: bool  # Whether there are samples to diagnose
+    recorded: tuple[str, ...] = ()  # Names of the manoeuvres that have been recorded
+    verdict: str = ''  # Verdict of the round before; '' for none
 
 
 @dataclass(frozen=True)
 class Answer:
-    """
-    What a round ends with.
+    """What a round ends with."""
 
-    Attributes
-    ----------
-    hypotheses
-        Hypotheses by falling probability.
-    outcome
-        Why the investigation goes on or ends.
-    sentence
-        The result in one sentence; '' where it goes on.
-    manoeuvre
-        Name of the next manoeuvre; '' at the end.
-    information_per_minute
-        What it is expected to tell, nat/min.
-    fault
-        Fault of the recording that makes a verdict impossible; '' without one.
-    hidden
-        Effects that this stage cannot show.
-    verdict
-        Status and effects of the diagnosis; '' without a verdict.
-
-    """
-
-    hypotheses: tuple[WeightedHypothesis, ...]
-    outcome: Outcome
-    sentence: str = ''
-    manoeuvre: str = ''
-    information_per_minute: float = 0.0
-    fault: str = ''
-    hidden: tuple[str, ...] = ()
-    verdict: str = ''
+    hypotheses: tuple[WeightedHypothesis, ...]  # Hypotheses by falling probability
+    outcome: Outcome  # Why the investigation goes on or ends
+    sentence: str = ''  # The result in one sentence; '' where it goes on
+    manoeuvre: str = ''  # Name of the next manoeuvre; '' at the end
+    information_per_minute: float = 0.0  # What it is expected to tell, nat/min
+    fault: str = ''  # Fault of the recording that makes a verdict impossible; '' without one
+    hidden: tuple[str, ...] = ()  # Effects that this stage cannot show
+    verdict: str = ''  # Status and effects of the diagnosis; '' without a verdict
 
     def as_json(self) -> dict[str, Any]:
         """Return the answer as values of JSON."""
@@ -145,20 +93,11 @@ class Answer:
 
 @dataclass(frozen=True)
 class Assessment:
-    """
-    Probabilities of the hypotheses, and the diagnosis that gives them.
+    """Probabilities of the hypotheses, and the diagnosis that gives them."""
 
-    Attributes
-    ----------
-    hypotheses
-        Hypotheses by falling probability, which sums to 1; no effect means no gap.
-    diagnosis
-        The diagnosis; None before there are samples enough.
-
-    """
-
+    # Hypotheses by falling probability, which sums to 1; no effect means no gap
     hypotheses: tuple[WeightedHypothesis, ...]
-    diagnosis: Diagnosis | None = None
+    diagnosis: Diagnosis | None = None  # The diagnosis; None before there are samples enough
 
     @property
     def fault(self) -> str:
@@ -176,54 +115,17 @@ class Assessment:
 
 @dataclass(frozen=True)
 class Ranking:
-    """
-    The manoeuvres by what they are expected to tell per minute.
+    """The manoeuvres by what they are expected to tell per minute."""
 
-    Attributes
-    ----------
-    assessment
-        The assessment, with the effects that only the manoeuvres can show.
-    worth
-        Manoeuvres, the best first.
-    hidden
-        Effects that neither the samples nor a manoeuvre of this stage can show.
-
-    """
-
-    assessment: Assessment
-    worth: tuple[ManoeuvreWorth, ...]
+    assessment: Assessment  # The assessment, with the effects that only the manoeuvres can show
+    worth: tuple[ManoeuvreWorth, ...]  # Manoeuvres, the best first
+    # Effects that neither the samples nor a manoeuvre of this stage can show
     hidden: tuple[str, ...]
 
 
 def run_round(question: Question, recordings: Sequence[Recording], sensor: Sensor,
               limits: StageLimits, seed: int = 0) -> tuple[Answer, Diagnosis | None]:
-    """
-    Diagnose the samples so far, and choose the next manoeuvre.
-
-    Parameters
-    ----------
-    question
-        Pose and times.
-    recordings
-        All samples; none before the first manoeuvre.
-    sensor
-        The baseline.
-    limits
-        Limits of the stage.
-    seed
-        Seed of the diagnosis.
-
-    Returns
-    -------
-    tuple
-        The answer, and the diagnosis; None without samples.
-
-    Raises
-    ------
-    UserError
-        A recording is of another unit, or its reference cannot be followed.
-
-    """
+    """Diagnose the samples so far, and choose the next manoeuvre."""
     assessment = _assess(recordings, sensor, seed)
     hypotheses = assessment.hypotheses
     if assessment.fault:
@@ -249,24 +151,7 @@ def _assess(recordings: Sequence[Recording], sensor: Sensor, seed: int = 0) -> A
 
 def rank(assessment: Assessment, sensor: Sensor, manoeuvres: Sequence[PlannedManoeuvre]
          ) -> Ranking:
-    """
-    Rank manoeuvres by their expected information per minute, given the samples so far.
-
-    Parameters
-    ----------
-    assessment
-        What the samples so far say.
-    sensor
-        The baseline.
-    manoeuvres
-        The manoeuvres.
-
-    Returns
-    -------
-    Ranking
-        The manoeuvres, the best first.
-
-    """
+    """Rank manoeuvres by their expected information per minute, given the samples so far."""
     diagnosis = assessment.diagnosis
     report = diagnosis.report if diagnosis else None
     model = report.linear_model if report else None
@@ -297,21 +182,6 @@ def decide(ranking: Ranking, question: Question, has_time: bool) -> Answer:
 
     A verdict that was the same in the round before is not expected to change by more of the same:
     only manoeuvres of a kind that is not recorded yet follow it.
-
-    Parameters
-    ----------
-    ranking
-        Probabilities of the hypotheses, and the manoeuvres.
-    question
-        What has been recorded, and the verdict before.
-    has_time
-        Whether there is time for each of the manoeuvres.
-
-    Returns
-    -------
-    Answer
-        The next manoeuvre, or the end.
-
     """
     hypotheses, verdict = ranking.assessment.hypotheses, ranking.assessment.verdict
     best = hypotheses[0]

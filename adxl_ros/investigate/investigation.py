@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The investigation as a state machine, free of ROS.
@@ -73,66 +61,25 @@ class Diagnoser(Protocol):
 
 @dataclass(frozen=True)
 class Status:
-    """
-    What an investigation does.
+    """What an investigation does."""
 
-    Attributes
-    ----------
-    state
-        Its state.
-    text
-        What happens, for people.
-    minutes
-        Time since its beginning, min.
-    remaining_s
-        Time to the end of a manoeuvre, s; 0 in other states.
-
-    """
-
-    state: State
-    text: str
-    minutes: float
-    remaining_s: float
+    state: State  # Its state
+    text: str  # What happens, for people
+    minutes: float  # Time since its beginning, min
+    remaining_s: float  # Time to the end of a manoeuvre, s; 0 in other states
 
 
 class Investigation:
-    """
-    The state machine.
-
-    Attributes
-    ----------
-    state
-        The state.
-    answers
-        Answers so far, each with the minutes at which its question was asked.
-    reason
-        Why it was stopped; '' otherwise.
-
-    """
+    """The state machine."""
 
     def __init__(self, limits: StageLimits, longest_minutes: float, diagnoser: Diagnoser,
                  show: Callable[[float, Answer], None] = lambda minutes, answer: None,
                  flush: Callable[[], None] = lambda: None) -> None:
-        """
-        Wait for sensor and stage.
-
-        Parameters
-        ----------
-        limits
-            Limits of the stage.
-        longest_minutes
-            Largest time of all manoeuvres together, min.
-        diagnoser
-            Diagnoses in the background.
-        show
-            Called with the minutes and each answer.
-        flush
-            Called before a diagnosis, so that it finds all samples.
-
-        """
-        self.state = State.RECORDING
+        """Wait for sensor and stage."""
+        self.state = State.RECORDING  # The state
+        # Answers so far, each with the minutes at which its question was asked
         self.answers: list[tuple[float, Answer]] = []
-        self.reason = ''
+        self.reason = ''  # Why it was stopped; '' otherwise
         self._limits, self._longest_s = limits, 60 * longest_minutes
         self._diagnoser, self._show, self._flush = diagnoser, show, flush
         self._begin_s: float | None = None
@@ -174,22 +121,7 @@ class Investigation:
         return Status(self.state, texts[self.state], self._minutes(), remaining_s)
 
     def step(self, now_s: float, pose: Pose | None) -> Pose | None:
-        """
-        Go on.
-
-        Parameters
-        ----------
-        now_s
-            Time, s.
-        pose
-            Newest pose of the stage; None before the first one.
-
-        Returns
-        -------
-        Pose or None
-            The command for the stage; None where it has none.
-
-        """
+        """Go on."""
         elapsed_s, self._now_s, self._pose = now_s - self._now_s, now_s, pose
         if pose is None or self.has_ended:
             self._since_s = now_s
@@ -203,20 +135,7 @@ class Investigation:
         return self._command
 
     def stop(self, reason: str) -> Pose | None:
-        """
-        Stop, and hold the present pose.
-
-        Parameters
-        ----------
-        reason
-            The reason, for people.
-
-        Returns
-        -------
-        Pose or None
-            The command that holds the stage; None where its pose is not known.
-
-        """
+        """Stop, and hold the present pose."""
         if not self.has_ended:
             self.state, self.reason = State.STOPPED, reason
             self._diagnoser.cancel()

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The limits of the stage, and the manoeuvres that an investigation can command in them.
@@ -45,53 +33,24 @@ _SWINGS = 4
 
 
 class Pose(NamedTuple):
-    """
-    Angles of the stage.
+    """Angles of the stage."""
 
-    Attributes
-    ----------
-    alpha_rad, beta_rad
-        Angles, rad.
-
-    """
-
+    # alpha_rad, beta_rad: Angles, rad
     alpha_rad: float
     beta_rad: float
 
 
 @dataclass(frozen=True)
 class StageLimits:
-    """
-    Limits of angle and rate.
+    """Limits of angle and rate."""
 
-    Attributes
-    ----------
-    alpha_rad, beta_rad
-        Lowest and highest angle of each joint, rad.
-    rate_rad_s
-        Largest rate of each joint, rad/s.
-
-    """
-
+    # alpha_rad, beta_rad: Lowest and highest angle of each joint, rad
     alpha_rad: tuple[float, float]
     beta_rad: tuple[float, float]
-    rate_rad_s: float
+    rate_rad_s: float  # Largest rate of each joint, rad/s
 
     def nearest(self, alpha_rad: float, beta_rad: float) -> Pose:
-        """
-        Return the pose within the limits that is nearest to a pose.
-
-        Parameters
-        ----------
-        alpha_rad, beta_rad
-            Angles, rad.
-
-        Returns
-        -------
-        Pose
-            The pose within the limits.
-
-        """
+        """Return the pose within the limits that is nearest to a pose."""
         return Pose(_within(alpha_rad, self.alpha_rad), _within(beta_rad, self.beta_rad))
 
     def excess_rad(self, pose: Pose) -> float:
@@ -106,31 +65,11 @@ def _within(value: float, limits: tuple[float, float]) -> float:
 
 
 class Path:
-    """
-    A path of the stage within its limits, move by move.
-
-    Attributes
-    ----------
-    limits
-        The limits.
-
-    """
+    """A path of the stage within its limits, move by move."""
 
     def __init__(self, limits: StageLimits, pose: Pose, begin_s: float) -> None:
-        """
-        Begin at rest in a pose.
-
-        Parameters
-        ----------
-        limits
-            Limits of the stage.
-        pose
-            Pose at the beginning.
-        begin_s
-            Time at the beginning, s.
-
-        """
-        self.limits = limits
+        """Begin at rest in a pose."""
+        self.limits = limits  # The limits
         self._begin_s = begin_s
         self._script = Script(*limits.nearest(*pose), now=begin_s, slew_rad_s=limits.rate_rad_s)
         self._script.rest(0.5)
@@ -139,13 +78,7 @@ class Path:
         """
         Move to a pose and rest there.
 
-        Parameters
-        ----------
-        alpha_deg, beta_deg
-            Angles of the pose, degrees.
-        seconds
-            Time at rest, s.
-
+        seconds: time at rest, s.
         """
         pose = self.limits.nearest(np.radians(alpha_deg), np.radians(beta_deg))
         if max(abs(pose.alpha_rad - self._script.alpha),
@@ -154,19 +87,7 @@ class Path:
         self._script.rest(seconds)
 
     def turn(self, joint: str, to_rad: float, share: float = 1.0) -> None:
-        """
-        Turn one joint at a constant rate, and rest for a second.
-
-        Parameters
-        ----------
-        joint
-            Name of the joint: alpha or beta.
-        to_rad
-            Angle at the end, rad.
-        share
-            Rate, as a share of the limit.
-
-        """
+        """Turn one joint at a constant rate, and rest for a second."""
         angles = {'alpha': self._script.alpha, 'beta': self._script.beta, joint: to_rad}
         pose = self.limits.nearest(angles['alpha'], angles['beta'])
         to_rad = pose.alpha_rad if joint == 'alpha' else pose.beta_rad
@@ -179,17 +100,7 @@ class Path:
         self._script.rest(1.0)
 
     def swing(self, joint: str, share: float = 1.0) -> None:
-        """
-        Turn one joint about its angle, forth and back.
-
-        Parameters
-        ----------
-        joint
-            Name of the joint: alpha or beta.
-        share
-            Rate, as a share of the limit.
-
-        """
+        """Turn one joint about its angle, forth and back."""
         middle_rad = getattr(self._script, joint)
         low_rad, high_rad = self.limits.alpha_rad if joint == 'alpha' else self.limits.beta_rad
         # A joint at its limit swings to the inner side.
@@ -334,26 +245,12 @@ KIND_OF = {f.__name__: kind for kind, functions in _KINDS.items() for f in funct
 
 @dataclass(frozen=True)
 class PlannedManoeuvre:
-    """
-    A manoeuvre from the pose of the stage on.
+    """A manoeuvre from the pose of the stage on."""
 
-    Attributes
-    ----------
-    name
-        Its name in the catalogue.
-    begin_s
-        Time at which it begins, s.
-    motion
-        The motion; its joints count the time from the same origin.
-    end
-        Pose at its end.
-
-    """
-
-    name: str
-    begin_s: float
-    motion: Motion
-    end: Pose
+    name: str  # Its name in the catalogue
+    begin_s: float  # Time at which it begins, s
+    motion: Motion  # The motion; its joints count the time from the same origin
+    end: Pose  # Pose at its end
 
     @property
     def minutes(self) -> float:
@@ -373,48 +270,12 @@ def description(name: str) -> str:
 
 
 def plan(name: str, limits: StageLimits, pose: Pose, begin_s: float = 0.0) -> PlannedManoeuvre:
-    """
-    Plan a manoeuvre.
-
-    Parameters
-    ----------
-    name
-        Its name in the catalogue.
-    limits
-        Limits of the stage.
-    pose
-        Pose of the stage.
-    begin_s
-        Time at which it begins, s.
-
-    Returns
-    -------
-    PlannedManoeuvre
-        The manoeuvre, which begins and ends at rest.
-
-    """
+    """Plan a manoeuvre."""
     path = Path(limits, pose, begin_s)
     CATALOGUE[name](path)
     return PlannedManoeuvre(name, begin_s, path.motion(), path.end())
 
 
 def plan_all(limits: StageLimits, pose: Pose, begin_s: float = 0.0) -> list[PlannedManoeuvre]:
-    """
-    Plan all manoeuvres of the catalogue.
-
-    Parameters
-    ----------
-    limits
-        Limits of the stage.
-    pose
-        Pose of the stage.
-    begin_s
-        Time at which they begin, s.
-
-    Returns
-    -------
-    list of PlannedManoeuvre
-        The manoeuvres.
-
-    """
+    """Plan all manoeuvres of the catalogue."""
     return [plan(name, limits, pose, begin_s) for name in CATALOGUE]

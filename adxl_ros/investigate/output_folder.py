@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The files of an investigation."""
 
@@ -39,17 +27,9 @@ _WITHOUT_DIAGNOSIS = {'bag', 'baseline.yaml', 'answer.json'}
 
 @dataclass(frozen=True)
 class OutputFolder:
-    """
-    The folder of an investigation.
+    """The folder of an investigation."""
 
-    Attributes
-    ----------
-    path
-        The folder.
-
-    """
-
-    path: Path
+    path: Path  # The folder
 
     @property
     def bag(self) -> Path:
@@ -101,26 +81,7 @@ class OutputFolder:
 
 def write_diagnosis(folder: OutputFolder, diagnosis: Diagnosis, recording: Recording,
                     with_page: bool) -> None:
-    """
-    Write report and parameters of a diagnosis.
-
-    Parameters
-    ----------
-    folder
-        The folder.
-    diagnosis
-        The diagnosis.
-    recording
-        The recording.
-    with_page
-        Whether to write the page, too.
-
-    Raises
-    ------
-    UserError
-        A file cannot be written.
-
-    """
+    """Write report and parameters of a diagnosis."""
     subject = (f'{folder.bag.name} ({recording.time_s[-1] - recording.time_s[0]:.0f} s, '
                f'{recording.rate_hz:.4g} Hz, {" ".join(recording.axes)})  minus  simulation of '
                f'{folder.baseline.name}')

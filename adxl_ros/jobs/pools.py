@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Pools of workers: processes of this machine, or a Dask cluster.
@@ -80,34 +68,18 @@ class PoolLost(TaskLost):
 
 
 class TaskFuture(Future):
-    """
-    A task that cannot be cancelled, so that its result may come at any time.
-
-    Attributes
-    ----------
-    deaths
-        Number of workers that ended while they ran the task.
-
-    """
+    """A task that cannot be cancelled, so that its result may come at any time."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.deaths = 0
+        self.deaths = 0  # Number of workers that ended while they ran the task
         self.set_running_or_notify_cancel()
 
 
 class Pool(Executor):
-    """
-    A pool that says how many tasks it takes at once, and that can be made again.
+    """A pool that says how many tasks it takes at once, and that can be made again."""
 
-    Attributes
-    ----------
-    slots
-        Number of tasks that are submitted at once at most.
-
-    """
-
-    slots: int
+    slots: int  # Number of tasks that are submitted at once at most
 
     def renew(self) -> None:
         """Make the pool usable after all its tasks were lost."""
@@ -125,29 +97,7 @@ def cores() -> int:
 @contextmanager
 def open_pool(scheduler: str | None, jobs: int | None = None, shared: tuple = ()
               ) -> Iterator[Pool]:
-    """
-    Open a pool. Its workers end with the block, at once if an exception ends it.
-
-    Parameters
-    ----------
-    scheduler
-        Address of a Dask cluster; None for processes of this machine.
-    jobs
-        Number of processes; None for one for each core.
-    shared
-        First arguments of every task, which each worker gets once.
-
-    Yields
-    ------
-    Pool
-        The pool.
-
-    Raises
-    ------
-    UserError
-        Dask is not installed, or its scheduler does not answer.
-
-    """
+    """Open a pool. Its workers end with the block, at once if an exception ends it."""
     pool: Pool = Cluster(scheduler, shared) if scheduler else \
         Processes(jobs or cores(), shared)
     try:
@@ -164,14 +114,6 @@ class Processes(Pool):
     Processes of this machine, each an executor of its own.
 
     A worker that ends breaks only its own executor. The task that it ran is known.
-
-    Parameters
-    ----------
-    count
-        Number of processes.
-    shared
-        First arguments of every task.
-
     """
 
     def __init__(self, count: int, shared: tuple = ()) -> None:
@@ -191,17 +133,7 @@ class Processes(Pool):
             worker.kill()
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """
-        End the workers after their tasks.
-
-        Parameters
-        ----------
-        wait
-            Whether to wait until they have ended.
-        cancel_futures
-            Whether tasks that have not begun are given up.
-
-        """
+        """End the workers after their tasks."""
         for worker in self._workers:
             worker.shutdown(wait, cancel_futures)
 
@@ -359,22 +291,7 @@ def _call(number: int, work: Callable[..., Any], arguments: tuple) -> Any:
 
 
 class Cluster(Pool):
-    """
-    A Dask cluster.
-
-    Parameters
-    ----------
-    address
-        Address of its scheduler.
-    shared
-        First arguments of every task.
-
-    Raises
-    ------
-    UserError
-        Dask is not installed, or the scheduler does not answer.
-
-    """
+    """A Dask cluster."""
 
     def __init__(self, address: str, shared: tuple = ()) -> None:
         try:
@@ -475,15 +392,7 @@ class Cluster(Pool):
         return UserError('the workers end before they run a task; their log has the reason')
 
     def renew(self) -> None:
-        """
-        Connect again to a scheduler that was lost.
-
-        Raises
-        ------
-        UserError
-            It is not back in time.
-
-        """
+        """Connect again to a scheduler that was lost."""
         end_s = monotonic() + _RECONNECT_S
         while True:
             self._close()
@@ -504,17 +413,7 @@ class Cluster(Pool):
             self._client.close(timeout=_COUNT_S)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """
-        Leave the cluster, which runs on.
-
-        Parameters
-        ----------
-        wait
-            Not used: all tasks are given up.
-        cancel_futures
-            Not used.
-
-        """
+        """Leave the cluster, which runs on."""
         with suppress(Exception):
             self._client.set_metadata([self._name], None)
         self._close()

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Tasks in parallel: bounded submission, retries, and a result for each."""
 
@@ -41,26 +29,12 @@ where many others do so, too."""
 
 
 class Finished(NamedTuple):
-    """
-    The end of a task.
+    """The end of a task."""
 
-    Attributes
-    ----------
-    arguments
-        Its arguments.
-    value
-        What it returned; None after an error.
-    error
-        What the last attempt raised; None after a success.
-    attempts
-        Number of attempts.
-
-    """
-
-    arguments: tuple
-    value: Any
-    error: BaseException | None
-    attempts: int
+    arguments: tuple  # Its arguments
+    value: Any  # What it returned; None after an error
+    error: BaseException | None  # What the last attempt raised; None after a success
+    attempts: int  # Number of attempts
 
 
 class _Attempt(NamedTuple):
@@ -118,23 +92,6 @@ def finished_tasks(pool: Executor, work: Callable[..., Any], tasks: Iterable[tup
     A task that raises is repeated. A `UserError` is not: it would come again. A task whose worker
     ends is repeated after all others, and more often where workers end at random. Tasks that are
     lost through no fault of their own are submitted again, and that does not count.
-
-    Parameters
-    ----------
-    pool
-        Where they run.
-    work
-        Receives the arguments of a task.
-    tasks
-        Arguments of each task, made at its turn.
-    retries
-        Further attempts of a task that fails.
-
-    Yields
-    ------
-    Finished
-        The end of a task.
-
     """
     queue, total = _Queue(tasks), _Deaths()
     running: dict[Future, _Attempt] = {}
@@ -203,25 +160,7 @@ def _error(future: Future) -> BaseException | None:
 
 def for_each(pool: Executor, work: Callable[..., Any], jobs: Iterable[Callable[[], tuple]],
              keep: Callable[..., None], show: Callable[[float], None], done: int = 0) -> None:
-    """
-    Run jobs in parallel and keep each result as soon as it is there.
-
-    Parameters
-    ----------
-    pool
-        Threads, processes or a Dask cluster.
-    work
-        Receives the arguments of a job; returns a tuple.
-    jobs
-        Each returns the arguments of one job at its turn.
-    keep
-        Receives what `work` returned, in this process.
-    show
-        Receives the fraction that is finished.
-    done
-        Number of jobs that were finished before.
-
-    """
+    """Run jobs in parallel and keep each result as soon as it is there."""
     todo = list(jobs)
     total = done + len(todo)
     results = finished_tasks(pool, work, (job() for job in todo))

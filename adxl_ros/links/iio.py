@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """An ADC with a Linux driver: Industrial I/O through libiio, on this machine or another."""
 
@@ -65,23 +53,14 @@ _RATE_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class Settings(DeviceSettings):
-    """
-    Settings of the link.
+    """Settings of the link."""
 
-    Attributes
-    ----------
-    uri
-        URI of the libiio context.
-    device
-        Name, id or label of the ADC; '' for the only one with buffered channels.
-    channels
-        Ids or labels of the channels, or ROLE=ID: a list of strings, or one string with commas.
-
-    """
-
+    # URI of the libiio context
     uri: str = option('local:', 'URI of libiio: local:, ip:HOST or ip:HOST:PORT, usb:...')
+    # Name, id or label of the ADC; '' for the only one with buffered channels
     device: str = option('', 'name, id or label of the ADC; empty: the only one that has buffered '
                          'channels')
+    # Ids or labels of the channels, or ROLE=ID: a list of strings, or one string with commas
     channels: str | Sequence[str] = option(
         (), 'ids or labels of x, y, z as the sensor has them, supply, temperature, or ROLE=ID; '
         'empty: the channels with these labels, else the first voltages')
@@ -89,47 +68,16 @@ class Settings(DeviceSettings):
 
 @dataclass(frozen=True)
 class Statistics:
-    """
-    Counts of the link, as diagnostics show them.
+    """Counts of the link, as diagnostics show them."""
 
-    Attributes
-    ----------
-    connections
-        How often the device was opened.
-    repeated
-        Samples that came twice.
-    buffer_ms
-        Duration of a buffer, ms: its first sample waits for as long; 0 without a device.
-
-    """
-
-    connections: int
-    repeated: int
+    connections: int  # How often the device was opened
+    repeated: int  # Samples that came twice
+    # Duration of a buffer, ms: its first sample waits for as long; 0 without a device
     buffer_ms: float
 
 
 def open_link(sensor: Sensor, settings: Settings) -> IioLink:
-    """
-    Check the settings; `IioLink.read` opens the context, and opens it again after each loss.
-
-    Parameters
-    ----------
-    sensor
-        Sensor of the driver's parameters.
-    settings
-        Settings of the link.
-
-    Returns
-    -------
-    IioLink
-        The link.
-
-    Raises
-    ------
-    UserError
-        The URI names no device, or libiio is not installed.
-
-    """
+    """Check the settings; `IioLink.read` opens the context, and opens it again after each loss."""
     uri = settings.uri
     # Without a host libiio looks for one on the network, but the parameters choose the device.
     if not uri.startswith(_URI_KINDS) or uri == 'ip:' or not uri.isascii():
@@ -153,22 +101,7 @@ class IioLink:
     references = tuple(channels.COLUMNS.values())
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
-        """
-        Prepare the link without opening the device.
-
-        Parameters
-        ----------
-        sensor
-            Sensor of the driver's parameters.
-        settings
-            Settings of the link.
-
-        Raises
-        ------
-        UserError
-            `link.channels` is no list of strings.
-
-        """
+        """Prepare the link without opening the device."""
         self._declared, self._settings = sensor, settings
         self._entries = channels.parse_channels(settings.channels)
         self._layout = channels.Layout(sensor.axes, self.references, settings.supply_scale)

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A recording that is played as a live sensor, in real time or faster."""
 
@@ -42,44 +30,16 @@ _MAX_CLOCK_NS = 2 ** 31 * 10 ** 9
 
 @dataclass(frozen=True)
 class Settings(PacedSettings):
-    """
-    Settings of the link.
+    """Settings of the link."""
 
-    Attributes
-    ----------
-    recording
-        Path of the recording.
-    loop
-        Whether the recording starts again at its end.
-
-    """
-
+    # Path of the recording
     recording: str = option('', 'the recording to play: a rosbag2 directory, .mcap or CSV')
+    # Whether the recording starts again at its end
     loop: bool = option(False, 'whether the recording starts again at its end')
 
 
 def open_link(sensor: Sensor, settings: Settings) -> Replay:
-    """
-    Open the recording.
-
-    Parameters
-    ----------
-    sensor
-        Sensor of the driver's parameters. What the recording states about its sensor has priority.
-    settings
-        Settings of the link.
-
-    Returns
-    -------
-    Replay
-        The link.
-
-    Raises
-    ------
-    UserError
-        The recording cannot be read.
-
-    """
+    """Open the recording."""
     if not settings.recording:
         raise UserError('link.recording: names no recording; set it to a rosbag2 directory, an '
                         '.mcap or a CSV file')
@@ -101,22 +61,7 @@ class Replay:
     _volts: np.ndarray
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
-        """
-        Read the first rows.
-
-        Parameters
-        ----------
-        sensor
-            Sensor of the driver's parameters.
-        settings
-            Settings of the link.
-
-        Raises
-        ------
-        UserError
-            The recording cannot be read.
-
-        """
+        """Read the first rows."""
         self._path, self._loop = settings.recording, settings.loop
         self._blocks: Generator[Recording, None, None] = recording.blocks(self._path, _ROWS)
         first = next(self._blocks)

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A microcontroller with an ADC on a serial port, in wire format 1."""
 
@@ -87,108 +75,57 @@ _UNSTATED_RATE_HZ = 1000.0
 
 @dataclass(frozen=True)
 class Settings(DeviceSettings):
-    """
-    Settings of the link.
+    """Settings of the link."""
 
-    Attributes
-    ----------
-    port
-        Device path or pyserial URL.
-    baud
-        Baud rate of a UART, Bd.
-    channels
-        Roles of the channels of a frame: a list of strings, or one string with commas. Empty for
-        x, y, z, supply.
-    temperature_zero_v
-        Output of the temperature sensor at 0 degC, V.
-    temperature_v_per_c
-        Slope of the temperature sensor, V/degC.
-
-    """
-
+    # Device path or pyserial URL
     port: str = option('', 'device path, such as /dev/ttyACM0, or a pyserial URL')
+    # Baud rate of a UART, Bd
     baud: int = option(115200, 'baud rate of a UART; USB and network ports ignore it', 'Bd', 50,
                        100_000_000)
+    # Roles of the channels of a frame: a list of strings, or one string with commas. Empty for x,
+    # y, z, supply.
     channels: str | Sequence[str] = option(
         (), 'roles of the channels of a frame: x, y, z, supply, temperature, or - for unused; '
         'empty: the first channels are x, y, z, supply')
+    # Output of the temperature sensor at 0 degC, V
     temperature_zero_v: float = option(0.5, 'output of the temperature sensor at 0 degC', 'V',
                                        -10.0, 10.0)
+    # Slope of the temperature sensor, V/degC
     temperature_v_per_c: float = option(0.01, 'slope of the temperature sensor', 'V/degC',
                                         -10.0, 10.0)
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """
-    Counts of the link, as diagnostics show them.
+    """Counts of the link, as diagnostics show them."""
 
-    Attributes
-    ----------
-    frames
-        Whole frames.
-    bad_frames
-        Frames that are damaged or contradict the info frame.
-    bytes
-        Bytes received.
-    skipped_bytes
-        Bytes of runs that are too long for a frame.
-    held_back
-        Samples that came before the board had described itself, or do not fit the sensor.
-    repeated
-        Samples of frames that came twice or late.
-    device_overruns
-        Samples that the board itself dropped.
-    frame_ms
-        Duration of the newest frame, ms: its first sample waited for as long.
-    rail_frames
-        Frames with a code at a rail of the ADC.
-    resets
-        How often a new count has begun.
-    connections
-        How often the port was opened.
-
-    """
-
-    frames: int
-    bad_frames: int
+    frames: int  # Whole frames
+    bad_frames: int  # Frames that are damaged or contradict the info frame
+    # Bytes received
     bytes: int  # noqa: A003
-    skipped_bytes: int
+    skipped_bytes: int  # Bytes of runs that are too long for a frame
+    # Samples that came before the board had described itself, or do not fit the sensor
     held_back: int
-    repeated: int
-    device_overruns: int
-    frame_ms: float
-    rail_frames: int
-    resets: int
-    connections: int
+    repeated: int  # Samples of frames that came twice or late
+    device_overruns: int  # Samples that the board itself dropped
+    frame_ms: float  # Duration of the newest frame, ms: its first sample waited for as long
+    rail_frames: int  # Frames with a code at a rail of the ADC
+    resets: int  # How often a new count has begun
+    connections: int  # How often the port was opened
 
 
 @dataclass(frozen=True)
 class _Conversion:
-    """
-    How the codes of a board become samples.
+    """How the codes of a board become samples."""
 
-    Attributes
-    ----------
-    gain, offset
-        Value of a channel is gain · code + offset, V or degC, (m,).
-    axes
-        Channels of the axes of the sensor.
-    reference_channels
-        Channel of each reference by column; None where no channel has it.
-    steps_ns
-        Times of the samples of a frame after its first one, ns, int64, (256,).
-    max_code
-        Largest code.
-
-    """
-
+    # gain, offset: Value of a channel is gain · code + offset, V or degC, (m,)
     gain: np.ndarray
     offset: np.ndarray
-    axes: slice | list[int]
+    axes: slice | list[int]  # Channels of the axes of the sensor
+    # Channel of each reference by column; None where no channel has it
     reference_channels: Mapping[str, int | None]
-    steps_ns: np.ndarray
-    max_code: int
+    steps_ns: np.ndarray  # Times of the samples of a frame after its first one, ns, int64, (256,)
+    max_code: int  # Largest code
 
     def block(self, frame: SampleFrame) -> channels.Block:
         """Return the samples of a frame."""
@@ -209,27 +146,7 @@ class _Arrival(NamedTuple):
 
 
 def open_link(sensor: Sensor, settings: Settings) -> SerialLink:
-    """
-    Check the settings; `SerialLink.read` opens the port, and opens it again after each loss.
-
-    Parameters
-    ----------
-    sensor
-        Sensor of the driver's parameters.
-    settings
-        Settings of the link.
-
-    Returns
-    -------
-    SerialLink
-        The link.
-
-    Raises
-    ------
-    UserError
-        A setting is missing or invalid, or a Python package is not installed.
-
-    """
+    """Check the settings; `SerialLink.read` opens the port, and opens it again after each loss."""
     if not settings.port:
         raise UserError('link.port: names no port; set it to a device path or a pyserial URL')
     if not settings.temperature_v_per_c:
@@ -252,22 +169,7 @@ class SerialLink:
     sensor: Sensor | None = None
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
-        """
-        Prepare the link without opening the port.
-
-        Parameters
-        ----------
-        sensor
-            Sensor of the driver's parameters.
-        settings
-            Settings of the link.
-
-        Raises
-        ------
-        UserError
-            The channels do not fit the sensor, or pyserial is not installed.
-
-        """
+        """Prepare the link without opening the port."""
         self._declared, self._settings = sensor, settings
         self._stated_roles = channels.parse_channels(settings.channels)
         if self._stated_roles:

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A simulated sensor, on a stage that moves or at rest in a pose."""
 
@@ -53,60 +41,24 @@ _FOREVER_NS = 2 ** 63 - 1
 
 @dataclass(frozen=True)
 class Settings(PacedSettings):
-    """
-    Settings of the link.
+    """Settings of the link."""
 
-    Attributes
-    ----------
-    seed
-        Seed of the noise.
-    alpha_rad, beta_rad
-        Pose without a stage, rad.
-
-    """
-
-    seed: int = option(0, 'seed of the noise', '', 0, 2 ** 31 - 1)
+    seed: int = option(0, 'seed of the noise', '', 0, 2 ** 31 - 1)  # Seed of the noise
+    # alpha_rad, beta_rad: Pose without a stage, rad
     alpha_rad: float = option(0.0, 'pose without a stage', 'rad', -100.0, 100.0)
     beta_rad: float = option(0.0, 'pose without a stage', 'rad', -100.0, 100.0)
 
 
 class _Knot(NamedTuple):
-    """
-    Motion of the joints at one stamp.
+    """Motion of the joints at one stamp."""
 
-    Attributes
-    ----------
-    stamp_ns
-        ROS time, ns.
-    position
-        alpha, rad; beta, rad; shift, m.
-    velocity
-        Their rates, rad/s and m/s.
-
-    """
-
-    stamp_ns: int
-    position: tuple[float, ...]
-    velocity: tuple[float, ...]
+    stamp_ns: int  # ROS time, ns
+    position: tuple[float, ...]  # alpha, rad; beta, rad; shift, m
+    velocity: tuple[float, ...]  # Their rates, rad/s and m/s
 
 
 def open_link(sensor: Sensor, settings: Settings) -> SimulatedSensor:
-    """
-    Open the link with the sensor at rest.
-
-    Parameters
-    ----------
-    sensor
-        Sensor that is simulated.
-    settings
-        Settings of the link.
-
-    Returns
-    -------
-    SimulatedSensor
-        The link.
-
-    """
+    """Open the link with the sensor at rest."""
     return SimulatedSensor(sensor, settings)
 
 
@@ -126,17 +78,7 @@ class SimulatedSensor:
     joint_state_topic = 'stage/true_joint_states'
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
-        """
-        Rest in the pose of the settings.
-
-        Parameters
-        ----------
-        sensor
-            Sensor that is simulated.
-        settings
-            Settings of the link.
-
-        """
+        """Rest in the pose of the settings."""
         self.sensor = sensor
         self._seed = settings.seed
         self._knots = [_resting((settings.alpha_rad, settings.beta_rad, 0.0))]
@@ -149,19 +91,7 @@ class SimulatedSensor:
 
     def sense_stage(self, stamp_ns: int, position: Mapping[str, float],
                     velocity: Mapping[str, float]) -> None:
-        """
-        Take the true motion of the stage at a stamp, which may lie ahead.
-
-        Parameters
-        ----------
-        stamp_ns
-            ROS time, ns.
-        position
-            Position by joint, rad or m. A joint that is not named stays.
-        velocity
-            Velocity by joint, rad/s or m/s.
-
-        """
+        """Take the true motion of the stage at a stamp, which may lie ahead."""
         if not np.isfinite([*position.values(), *velocity.values()]).all():
             self._status = LinkStatus(
                 Level.WARN, f'{self.joint_state_topic}: not finite: {position}')
@@ -258,20 +188,8 @@ class SimulatedSensor:
 
         The interpolation is exact in position and velocity at the stage's stamps.
 
-        Parameters
-        ----------
-        joint
-            Number of the joint in `JOINTS`.
-        time_s
-            Times since the origin, s, (n,).
-        order
-            Order of the derivative: 0, 1 or 2.
-
-        Returns
-        -------
-        ndarray
-            Position, rad or m, or its derivative, (n,).
-
+        time_s: times since the origin, s, (n,); returns: position, rad or m, or its derivative,
+        (n,).
         """
         stamps = self._origin_ns + np.rint(time_s * 1e9).astype(np.int64)
         knots = np.array([knot.stamp_ns for knot in self._knots], np.int64)

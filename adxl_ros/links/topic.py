@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A realistic sensor in another simulator: the signal chain on its ideal Imu stream."""
 
@@ -78,27 +66,16 @@ _ABSENT = {'orientation': np.array([0.0, 0.0, 0.0, 1.0]), 'angular_velocity': np
 
 @dataclass(frozen=True)
 class Settings(SimulatorSettings):
-    """
-    Settings of the link.
+    """Settings of the link."""
 
-    Attributes
-    ----------
-    topic
-        Topic of the ideal samples.
-    temperature_topic
-        Topic of the temperature of the sensor.
-    seed
-        Seed of the noise.
-    roll_rad, pitch_rad, yaw_rad
-        Orientation of the case in the frame of the ideal samples, rad.
-
-    """
-
+    # Topic of the ideal samples
     topic: str = option('imu/ideal', 'topic of the ideal sensor_msgs/Imu of a simulator: specific '
                         'force')
+    # Topic of the temperature of the sensor
     temperature_topic: str = option('temperature', 'topic of the temperature of the sensor, '
                                     'sensor_msgs/Temperature; 25 °C until it comes')
-    seed: int = option(0, 'seed of the noise', '', 0, 2 ** 31 - 1)
+    seed: int = option(0, 'seed of the noise', '', 0, 2 ** 31 - 1)  # Seed of the noise
+    # roll_rad, pitch_rad, yaw_rad: Orientation of the case in the frame of the ideal samples, rad
     roll_rad: float = option(0.0, 'roll of the case in the frame of the ideal samples', 'rad',
                              -7.0, 7.0)
     pitch_rad: float = option(0.0, 'pitch of the case in that frame', 'rad', -7.0, 7.0)
@@ -112,29 +89,13 @@ class Settings(SimulatorSettings):
 
 @dataclass(frozen=True)
 class _Statistics:
-    """
-    Counts of the link.
+    """Counts of the link."""
 
-    Attributes
-    ----------
-    resets
-        How often simulated time has jumped backwards.
-    rate_changes
-        How often the rate of the stream has changed.
-    gaps
-        Gaps of more than a second.
-    late
-        Samples that came twice or late, and were not published.
-    not_finite
-        Samples whose force was no number.
-
-    """
-
-    resets: int = 0
-    rate_changes: int = 0
-    gaps: int = 0
-    late: int = 0
-    not_finite: int = 0
+    resets: int = 0  # How often simulated time has jumped backwards
+    rate_changes: int = 0  # How often the rate of the stream has changed
+    gaps: int = 0  # Gaps of more than a second
+    late: int = 0  # Samples that came twice or late, and were not published
+    not_finite: int = 0  # Samples whose force was no number
 
 
 class _Ideal(NamedTuple):
@@ -150,17 +111,7 @@ class _Ideal(NamedTuple):
 
 
 class _Chain:
-    """
-    The signal chain at the rate of the samples, as `simulate` runs it.
-
-    Parameters
-    ----------
-    sensor
-        The unit at that rate, with effects that need no stage.
-    seed
-        Seed of its noise.
-
-    """
+    """The signal chain at the rate of the samples, as `simulate` runs it."""
 
     def __init__(self, sensor: Sensor, seed: int) -> None:
         self._rate_hz = sensor.rate_hz
@@ -177,18 +128,8 @@ class _Chain:
         """
         Advance over the next samples.
 
-        Parameters
-        ----------
-        force
-            Specific force in the case frame, m/s², (n, 3).
-        temperature_c
-            Temperature, °C.
-
-        Returns
-        -------
-        ndarray
-            Output of the sensor, V, (n, m).
-
+        force: specific force in the case frame, m/s², (n, 3); returns: output of the sensor, V,
+        (n, m).
         """
         if not self._count:
             # Before its first sample the sensor has rested.
@@ -220,22 +161,7 @@ class _Chain:
 
 
 def open_link(sensor: Sensor, settings: Settings) -> EmulatedSensor:
-    """
-    Open the link.
-
-    Parameters
-    ----------
-    sensor
-        Sensor that is emulated.
-    settings
-        Settings of the link.
-
-    Returns
-    -------
-    EmulatedSensor
-        The link, which waits for the simulator.
-
-    """
+    """Open the link."""
     return EmulatedSensor(sensor, settings)
 
 
@@ -254,22 +180,7 @@ class EmulatedSensor:
     start_ns = None
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
-        """
-        Wait for the first sample.
-
-        Parameters
-        ----------
-        sensor
-            Sensor that is emulated.
-        settings
-            Settings of the link.
-
-        Raises
-        ------
-        UserError
-            The effects of the sensor do not fit together.
-
-        """
+        """Wait for the first sample."""
         self.sensor: Sensor | None = None
         self.imu_topic, self.temperature_topic = settings.topic, settings.temperature_topic
         self._seed = settings.seed
@@ -300,30 +211,15 @@ class EmulatedSensor:
             self._temperature_c = temperature_c
 
     def sense_publishers(self, count: int, mixture: str = '') -> None:
-        """
-        Take who publishes the ideal samples.
-
-        Parameters
-        ----------
-        count
-            Number of nodes that publish them.
-        mixture
-            That the samples of several nodes mix, in words, or ''.
-
-        """
+        """Take who publishes the ideal samples."""
         self._publishers, self._mixture = count, mixture
 
     def sense_imu(self, stamp_ns: np.ndarray, fields: Mapping[str, np.ndarray]) -> None:
         """
         Take ideal samples.
 
-        Parameters
-        ----------
-        stamp_ns
-            Their stamps, ns, (n,).
-        fields
-            Number fields of sensor_msgs/Imu by name, (n, k) each, in the simulator's frame.
-
+        stamp_ns: their stamps, ns, (n,); fields: number fields of sensor_msgs/Imu by name, (n, k)
+        each, in the simulator's frame.
         """
         self._heard_s = time.monotonic()
         for i, stamp in enumerate(stamp_ns.tolist()):
@@ -484,22 +380,7 @@ class EmulatedSensor:
 
 def _in_case(fields: dict[str, np.ndarray], case: scipy.spatial.transform.Rotation | None
              ) -> dict[str, np.ndarray]:
-    """
-    Turn a message of the simulator into the frame of the case.
-
-    Parameters
-    ----------
-    fields
-        Number fields of the message by name.
-    case
-        Orientation of the case in the frame of the message; None where they are the same.
-
-    Returns
-    -------
-    dict
-        The fields. What is no number is marked as not measured, except for the force.
-
-    """
+    """Turn a message of the simulator into the frame of the case."""
     for name, value in _ABSENT.items():
         if not np.isfinite([*fields[name], *fields[f'{name}_covariance']]).all():
             fields |= {name: value, f'{name}_covariance': _NOT_MEASURED}

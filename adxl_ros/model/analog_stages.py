@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The analog stages of the chain: mounting, sensing element and electronics."""
 
@@ -47,18 +35,7 @@ class AnalogStages:
         """
         Begin the chain with the effects of the mounting.
 
-        Parameters
-        ----------
-        force
-            Specific force in the case frame, m/s², three components (n,) or floats.
-        environment
-            Surroundings in the shape of the force.
-
-        Returns
-        -------
-        Signals
-            Signals with the force along the sensing axes.
-
+        force: specific force in the case frame, m/s², three components (n,) or floats.
         """
         signals = Signals(environment, sensed=[f / G0_MPS2 for f in force],
                           nominal_scale_v_per_g=self._scale_v_per_g)
@@ -83,18 +60,8 @@ class AnalogStages:
         """
         Return the volts at the input of the ADC.
 
-        Parameters
-        ----------
-        force
-            Specific force in the case frame, m/s², three components (n,) or floats.
-        environment
-            Surroundings in the shape of the force.
-
-        Returns
-        -------
-        list
-            Volts by measured axis, V.
-
+        force: specific force in the case frame, m/s², three components (n,) or floats; returns:
+        volts by measured axis, V.
         """
         signals = self.sense(force, environment)
         self.respond(signals)

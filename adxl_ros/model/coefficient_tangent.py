@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Derivatives of the volts by the coefficients of a sensor.
@@ -116,19 +104,6 @@ def _shared_chain(sensor: Sensor, complete: Slopes) -> Slopes:
     Prepare the differences with the parts of the chain that the coefficients share.
 
     Coefficients of one parameter are changed together if each changes its own axis only.
-
-    Parameters
-    ----------
-    sensor
-        The sensor with its covariance.
-    complete
-        Differences of the complete chain, which are returned where the shared parts do not agree.
-
-    Returns
-    -------
-    callable
-        The differences.
-
     """
     if analog_stages.effects_at(sensor, Place.ADC, True):
         return complete  # a step of the ADC shows at some forces only
@@ -170,18 +145,7 @@ def _groups(sensor: Sensor, slopes: np.ndarray) -> list[list[int]]:
     """
     Return which coefficients are changed together, by number.
 
-    Parameters
-    ----------
-    sensor
-        The sensor with its covariance.
-    slopes
-        Derivatives by coefficient and axis, (k, m, n).
-
-    Returns
-    -------
-    list
-        Coefficients of one parameter, or a single coefficient.
-
+    slopes: derivatives by coefficient and axis, (k, m, n).
     """
     groups: dict[Coefficient, list[int]] = {}
     for row, name in enumerate(sensor.covariance_names):
@@ -192,22 +156,7 @@ def _groups(sensor: Sensor, slopes: np.ndarray) -> list[list[int]]:
 
 
 def _difference(sensor: Sensor, names: tuple[Coefficient, ...]) -> Difference:
-    """
-    Prepare the difference that coefficients make when they are larger and smaller by a step.
-
-    Parameters
-    ----------
-    sensor
-        The sensor.
-    names
-        Coefficients of one effect.
-
-    Returns
-    -------
-    callable
-        The difference.
-
-    """
+    """Prepare the difference that coefficients make when they are larger and smaller by a step."""
     effect = effect_named(names[0].effect)
     above, below = (_changed(sensor, names, sign) for sign in (1, -1))
     if effect.place is Place.ELEMENT:

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Covariance of the specific force of samples: noise and uncertain coefficients.
@@ -120,22 +108,11 @@ def prepared_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = 
 
 
 class MeasuredCovariance(NamedTuple):
-    """
-    Uncertainty of the force along the measured axes.
+    """Uncertainty of the force along the measured axes."""
 
-    Attributes
-    ----------
-    covariance
-        Covariance, (m/s²)², (m, m, n).
-    tangent
-        The tangent of the inverse at the force.
-    leverage
-        Leverage of the force in the validity range, (m/s²)², (n,); 0 without such a range.
-
-    """
-
-    covariance: np.ndarray
-    tangent: signal_chain.Tangent
+    covariance: np.ndarray  # Covariance, (m/s²)², (m, m, n)
+    tangent: signal_chain.Tangent  # The tangent of the inverse at the force
+    # Leverage of the force in the validity range, (m/s²)², (n,); 0 without such a range
     leverage: np.ndarray
 
 
@@ -195,20 +172,9 @@ def _prepared_variance(sensor: Sensor, follows: bool
     """
     Prepare the covariance of the volts by that of the coefficients.
 
-    Parameters
-    ----------
-    sensor
-        Calibrated unit with the covariance of its coefficients.
-    follows
-        Whether an effect depends on the surroundings.
-
-    Returns
-    -------
-    callable
-        Maps specific force, m/s², three components (n,) or floats, and the surroundings to the
-        covariance, V², (m, m, n). Many samples get that of polynomials, where the derivatives
-        by the coefficients consist of them.
-
+    returns: maps specific force, m/s², three components (n,) or floats, and the surroundings to
+    the covariance, V², (m, m, n). Many samples get that of polynomials, where the derivatives by
+    the coefficients consist of them.
     """
     by_coefficient = coefficient_tangent(sensor)
     roots = cache(lambda: None if follows else _polynomial_roots(sensor, by_coefficient))
@@ -227,19 +193,8 @@ def _polynomial_roots(sensor: Sensor, by_coefficient: Callable[..., np.ndarray]
     """
     Return polynomials of which the sums of products are the covariance of the volts.
 
-    Parameters
-    ----------
-    sensor
-        Calibrated unit with the covariance of its k coefficients.
-    by_coefficient
-        From `coefficient_tangent`.
-
-    Returns
-    -------
-    ndarray or None
-        Coefficients of the monomials by axis, (m, k, 20); None where the derivatives by the
-        coefficients are no polynomials.
-
+    returns: coefficients of the monomials by axis, (m, k, 20); None where the derivatives by the
+    coefficients are no polynomials.
     """
     force, _ = drawn()
     slopes = by_coefficient(list(force))
@@ -266,18 +221,9 @@ def _coefficient_variance(slope: np.ndarray, covariance: np.ndarray) -> np.ndarr
     """
     Propagate the covariance of coefficients to the volts.
 
-    Parameters
-    ----------
-    slope
-        Derivatives of the volts by the coefficients, (m, k), or (m, k, n) for arrays.
-    covariance
-        Covariance of the coefficients, (k, k).
-
-    Returns
-    -------
-    ndarray
-        Covariance of the volts, V², (m, m, n).
-
+    slope: derivatives of the volts by the coefficients, (m, k), or (m, k, n) for arrays;
+    covariance: covariance of the coefficients, (k, k); returns: covariance of the volts, V², (m,
+    m, n).
     """
     m, k = slope.shape[:2]
     columns = np.ascontiguousarray(np.swapaxes(slope, 0, 1)).reshape(k, m, -1)
@@ -293,18 +239,9 @@ def _propagated(back: list[Components], volts: np.ndarray) -> np.ndarray:
     """
     Propagate a covariance of the volts to the force.
 
-    Parameters
-    ----------
-    back
-        Derivatives of the force by the volts, m rows of m components, arrays (n,) or floats.
-    volts
-        Covariance of the volts, V², (m, m, n).
-
-    Returns
-    -------
-    ndarray
-        Covariance of the force, (m/s²)², (m, m, n).
-
+    back: derivatives of the force by the volts, m rows of m components, arrays (n,) or floats;
+    volts: covariance of the volts, V², (m, m, n); returns: covariance of the force, (m/s²)², (m,
+    m, n).
     """
     m = len(back)
     half = [[sum(back[i][a] * volts[a, b] for a in range(m)) for b in range(m)] for i in range(m)]

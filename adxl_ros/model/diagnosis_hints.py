@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What the diagnosis needs to know about an effect, declared in the file of the effect."""
 
@@ -133,64 +121,40 @@ class ProofVariable(Enum):
 
 @dataclass(frozen=True)
 class DiagnosisHints:
-    """
-    Properties of an effect that only the diagnosis uses.
+    """Properties of an effect that only the diagnosis uses."""
 
-    Attributes
-    ----------
-    straight_line
-        Coefficient of the straight line that the effect is; None for all other effects.
-    healthy_std
-        Day-to-day standard deviation of a healthy unit's coefficients, in addition to the
-        covariance of the parameter file. The unit is that of the parameter, but g for the zero-g
-        and 1 for the scale factor. An effect with this value is a nuisance parameter of every
-        hypothesis.
-    stated_by : tuple of str
-        Nominal values of `Sensor` that state the effect's. Where a file leaves one out, a healthy
-        unit may have any, and the nuisance parameter is free.
-    imitated
-        Whether zero-g and scale factor together imitate the effect completely.
-    time_constant
-        Name of the parameter that is a time constant, s. Recordings that are not much longer do
-        not show it: the effect would imitate what drives it.
-    drift
-        Spectrum, if the effect lets the zero-g drift.
-    healthy_density
-        Largest density of a healthy unit's drift, in the unit of the parameter.
-    detector
-        Statistic of the noise that shows the effect.
-    revealed_by
-        Manoeuvre that shows the effect best.
-    half_turn
-        Name of the parameter, rad, that changes by π when the sensor is remounted by half a turn
-        about its z axis; empty for other effects.
-    imitated_by
-        Name of the effect of the sensor that gives the same samples, so that no recording
-        separates the two; empty for other effects.
-    smooths_reference
-        Whether the effect describes a reference that lacks fast motion. What no reference has
-        cannot be simulated, and remains beside it.
-    form : tuple of FormDimension
-        Dimensions along which the form differs between real sensors. Empty where the form is
-        exact, as of geometry, of a clock and of a straight line, and for effects of the noise.
-    proof : tuple of ProofVariable
-        Variables over which the effect shows; the report takes the one that shows it best.
-
-    """
-
+    # Coefficient of the straight line that the effect is; None for all other effects
     straight_line: StraightLine | None = None
+    # Day-to-day standard deviation of a healthy unit's coefficients, in addition to the covariance
+    # of the parameter file. The unit is that of the parameter, but g for the zero-g and 1 for the
+    # scale factor. An effect with this value is a nuisance parameter of every hypothesis.
     healthy_std: float | None = None
+    # Nominal values of `Sensor` that state the effect's. Where a file leaves one out, a healthy
+    # unit may have any, and the nuisance parameter is free.
     stated_by: tuple[str, ...] = ()
+    # Whether zero-g and scale factor together imitate the effect completely
     imitated: bool = False
+    # Name of the parameter that is a time constant, s. Recordings that are not much longer do not
+    # show it: the effect would imitate what drives it.
     time_constant: str = ''
-    drift: DriftSpectrum | None = None
+    drift: DriftSpectrum | None = None  # Spectrum, if the effect lets the zero-g drift
+    # Largest density of a healthy unit's drift, in the unit of the parameter
     healthy_density: float = 0.0
-    detector: Detector | None = None
-    revealed_by: Manoeuvre | None = None
+    detector: Detector | None = None  # Statistic of the noise that shows the effect
+    revealed_by: Manoeuvre | None = None  # Manoeuvre that shows the effect best
+    # Name of the parameter, rad, that changes by π when the sensor is remounted by half a turn
+    # about its z axis; empty for other effects
     half_turn: str = ''
+    # Name of the effect of the sensor that gives the same samples, so that no recording separates
+    # the two; empty for other effects
     imitated_by: str = ''
+    # Whether the effect describes a reference that lacks fast motion. What no reference has cannot
+    # be simulated, and remains beside it.
     smooths_reference: bool = False
+    # Dimensions along which the form differs between real sensors. Empty where the form is exact,
+    # as of geometry, of a clock and of a straight line, and for effects of the noise.
     form: tuple[FormDimension, ...] = ()
+    # Variables over which the effect shows; the report takes the one that shows it best
     proof: tuple[ProofVariable, ...] = ()
 
     @property

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Gauss-Newton iteration with step halving, which reports whether it has converged."""
 
@@ -26,23 +14,11 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Iterate:
-    """
-    A model linearised about values of its coefficients.
+    """A model linearised about values of its coefficients."""
 
-    Attributes
-    ----------
-    values
-        Coefficients, (p,).
-    step
-        Gauss-Newton step to the optimum of the linearised model, (p,).
-    cost
-        Quantity to minimise, at the values. A constant accepts every step.
-
-    """
-
-    values: np.ndarray
-    step: np.ndarray
-    cost: float
+    values: np.ndarray  # Coefficients, (p,)
+    step: np.ndarray  # Gauss-Newton step to the optimum of the linearised model, (p,)
+    cost: float  # Quantity to minimise, at the values. A constant accepts every step.
 
 
 State = TypeVar('State', bound=Iterate)
@@ -51,24 +27,13 @@ Trial = TypeVar('Trial')
 
 @dataclass(frozen=True)
 class Solution(Generic[State]):
-    """
-    Result of a Gauss-Newton iteration.
+    """Result of a Gauss-Newton iteration."""
 
-    Attributes
-    ----------
-    last
-        The last iterate that was accepted.
-    converged
-        False if the iteration ended by its count of evaluations, or if no share of a step lowered
-        the cost.
-    evaluations
-        How often the model was linearised.
-
-    """
-
-    last: State
+    last: State  # The last iterate that was accepted
+    # False if the iteration ended by its count of evaluations, or if no share of a step lowered
+    # the cost
     converged: bool
-    evaluations: int
+    evaluations: int  # How often the model was linearised
 
 
 def gauss_newton(linearise: Callable[[np.ndarray], State], start: np.ndarray,

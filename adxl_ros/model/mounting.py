@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The case of the sensor in the frame of the robot."""
 
@@ -34,15 +22,9 @@ class Mounting:
 
     A vector v of the case is R·v in the frame of the robot, with R = Rz(yaw)·Ry(pitch)·Rx(roll)
     (fixed axes, REP-103).
-
-    Attributes
-    ----------
-    rpy_rad
-        Roll, pitch and yaw, rad.
-
     """
 
-    rpy_rad: Vector = (0.0, 0.0, 0.0)
+    rpy_rad: Vector = (0.0, 0.0, 0.0)  # Roll, pitch and yaw, rad
 
     @property
     def turns(self) -> bool:
@@ -88,20 +70,7 @@ class Mounting:
         return tuple((rotation @ matrix @ rotation.T).ravel().tolist())
 
     def rotate_orientation(self, quaternion: Sequence[float]) -> tuple[float, ...]:
-        """
-        Return the orientation of the robot from that of the case.
-
-        Parameters
-        ----------
-        quaternion
-            Orientation of the case in the world: x, y, z, w.
-
-        Returns
-        -------
-        tuple
-            Orientation of the robot in the world, q·q(Rᵀ): x, y, z, w.
-
-        """
+        """Return the orientation of the robot from that of the case."""
         ax, ay, az, aw = quaternion
         bx, by, bz, bw = self.inverse_quaternion
         return (aw * bx + ax * bw + ay * bz - az * by, aw * by - ax * bz + ay * bw + az * bx,
@@ -111,16 +80,7 @@ class Mounting:
         """
         Return the mounting that makes a force at rest vertical, with the yaw of this one.
 
-        Parameters
-        ----------
-        force_mps2
-            Mean specific force in the frame of the case, on level ground, m/s², (3,).
-
-        Returns
-        -------
-        Mounting
-            Roll and pitch are those of the case; see docs/frames.md.
-
+        force_mps2: mean specific force in the frame of the case, on level ground, m/s², (3,).
         """
         x, y, z = force_mps2
         return Mounting((atan2(y, z), atan2(-x, hypot(y, z)), self.rpy_rad[2]))

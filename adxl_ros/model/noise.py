@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Noise of the samples: standard deviations, spectral density and effective sample counts."""
 
@@ -34,37 +22,17 @@ _HARMONICS = 50
 
 
 class Rounding(NamedTuple):
-    """
-    Variance of the ADC's rounding on one axis.
+    """Variance of the ADC's rounding on one axis."""
 
-    Attributes
-    ----------
-    held_v2
-        Part that stays while the output stays, V².
-    white_v2
-        Part that is new in each sample, V².
-
-    """
-
-    held_v2: float
-    white_v2: float
+    held_v2: float  # Part that stays while the output stays, V²
+    white_v2: float  # Part that is new in each sample, V²
 
 
 class Electronics(NamedTuple):
-    """
-    RC filter and white noise of a unit.
+    """RC filter and white noise of a unit."""
 
-    Attributes
-    ----------
-    rc_s
-        Time constant of the RC filter by axis, s, (m,).
-    noise_ratio
-        Noise density divided by the nominal one, by axis, (m,).
-
-    """
-
-    rc_s: np.ndarray
-    noise_ratio: np.ndarray
+    rc_s: np.ndarray  # Time constant of the RC filter by axis, s, (m,)
+    noise_ratio: np.ndarray  # Noise density divided by the nominal one, by axis, (m,)
 
 
 def electronics(sensor: Sensor) -> Electronics:

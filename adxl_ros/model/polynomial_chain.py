@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The chain as polynomials of the specific force, which many samples share.
@@ -127,13 +115,7 @@ class PolynomialChain:
         """
         Take the polynomials.
 
-        Parameters
-        ----------
-        stages
-            The stages of the chain.
-        coefficients
-            The polynomials of the output of each measured axis, g, (m, 20).
-
+        coefficients: the polynomials of the output of each measured axis, g, (m, 20).
         """
         self._stages, self._coefficients = stages, coefficients
         slopes = [coefficients @ table / G0_MPS2 for table in _derivatives()]
@@ -155,18 +137,8 @@ class PolynomialChain:
         """
         Return the volts of each measured axis.
 
-        Parameters
-        ----------
-        force
-            Specific force in the case frame, m/s², three components (n,).
-        environment
-            Surroundings of the samples.
-
-        Returns
-        -------
-        list
-            Volts by axis, V, (n,) each.
-
+        force: specific force in the case frame, m/s², three components (n,); returns: volts by
+        axis, V, (n,) each.
         """
         return [offset + gain * output for offset, gain, output in zip(
             *self.levels(environment), self.output(monomials(np.array(force))))]
@@ -175,18 +147,7 @@ class PolynomialChain:
         """
         Return the output of the element by the volts.
 
-        Parameters
-        ----------
-        volts
-            Volts by axis, V, (m, n).
-        environment
-            Surroundings of the samples.
-
-        Returns
-        -------
-        ndarray
-            Output by axis, g, (m, n).
-
+        volts: volts by axis, V, (m, n); returns: output by axis, g, (m, n).
         """
         return np.array([(v - offset) / gain for v, offset, gain in zip(
             volts, *self.levels(environment))])

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The population of units that a unit is from, as a prior of its zero-g and scale factor.
@@ -40,48 +28,25 @@ _EFFECTS = ('bias', 'scale_factor')
 
 @dataclass(frozen=True)
 class PooledCoefficient:
-    """
-    A coefficient over the units of a fleet, in the unit of its column.
+    """A coefficient over the units of a fleet, in the unit of its column."""
 
-    Attributes
-    ----------
-    mean, mean_std
-        Mean over the units and its standard deviation.
-    spread
-        Standard deviation of the units about the mean, without their own errors.
-    spread_low, spread_high
-        90 % interval of the spread.
-    prediction_std
-        Standard deviation of the coefficient of a further unit about the mean.
-    units
-        Number of units.
-
-    """
-
+    # mean, mean_std: Mean over the units and its standard deviation
     mean: float
     mean_std: float
-    spread: float
+    spread: float  # Standard deviation of the units about the mean, without their own errors
+    # spread_low, spread_high: 90 % interval of the spread
     spread_low: float
     spread_high: float
-    prediction_std: float
-    units: int
+    prediction_std: float  # Standard deviation of the coefficient of a further unit about the mean
+    units: int  # Number of units
 
 
 @dataclass(frozen=True)
 class Population:
-    """
-    Coefficients over the units of a fleet.
+    """Coefficients over the units of a fleet."""
 
-    Attributes
-    ----------
-    name
-        What messages call it.
-    coefficients
-        Coefficients by their column of the fleet's table: `zero_g_x_v`, `scale_x_v_per_g`, ...
-
-    """
-
-    name: str
+    name: str  # What messages call it
+    # Coefficients by their column of the fleet's table: `zero_g_x_v`, `scale_x_v_per_g`, ..
     coefficients: Mapping[str, PooledCoefficient]
 
     def prior(self, sensor: Sensor) -> Prior:
@@ -101,41 +66,20 @@ class Population:
 
 
 class Prior(NamedTuple):
-    """
-    A normal prior of coefficients.
+    """A normal prior of coefficients."""
 
-    Attributes
-    ----------
-    names
-        The coefficients, (k,).
-    mean, std
-        Their means and standard deviations, (k,) each.
-
-    """
-
-    names: tuple[Coefficient, ...]
+    names: tuple[Coefficient, ...]  # The coefficients, (k,)
+    # mean, std: Their means and standard deviations, (k,) each
     mean: np.ndarray
     std: np.ndarray
 
 
 class Posterior(NamedTuple):
-    """
-    A unit as one of a population.
+    """A unit as one of a population."""
 
-    Attributes
-    ----------
-    sensor
-        The unit; unchanged if it is a stranger.
-    line
-        How the population is used, or why it is not, for people.
-    is_stranger
-        Whether the unit is not of the population.
-
-    """
-
-    sensor: Sensor
-    line: str
-    is_stranger: bool = False
+    sensor: Sensor  # The unit; unchanged if it is a stranger
+    line: str  # How the population is used, or why it is not, for people
+    is_stranger: bool = False  # Whether the unit is not of the population
 
 
 def posterior(sensor: Sensor, population: Population) -> Posterior:

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Elementary functions for arrays and for single floats.
@@ -30,29 +18,15 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Maths:
-    """
-    Functions of components, which are arrays (n,) or floats; see `effects.base.Value`.
+    """Functions of components, which are arrays (n,) or floats; see `effects.base.Value`."""
 
-    Attributes
-    ----------
-    sqrt
-        Square root.
-    sin, cos
-        Sine and cosine of an angle, rad.
-    atan2
-        Angle of the point (second value, first value), rad.
-    maximum
-        The larger of two values.
-    where
-        The second value where the first is true, otherwise the third.
-
-    """
-
-    sqrt: Callable[[Any], Any]
+    sqrt: Callable[[Any], Any]  # Square root
+    # sin, cos: Sine and cosine of an angle, rad
     sin: Callable[[Any], Any]
     cos: Callable[[Any], Any]
-    atan2: Callable[[Any, Any], Any]
-    maximum: Callable[[Any, Any], Any]
+    atan2: Callable[[Any, Any], Any]  # Angle of the point (second value, first value), rad
+    maximum: Callable[[Any, Any], Any]  # The larger of two values
+    # The second value where the first is true, otherwise the third
     where: Callable[[Any, Any, Any], Any]
 
 

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A sensor: its nominal values, its effects with their coefficients, and its provenance."""
 
@@ -49,107 +37,74 @@ class Sensor:
     The metadata of the fields are the only description of the nominal values. Parameter files,
     the nodes' parameters and error messages use them. Arrays marked (m,) have one entry for each
     measured axis.
-
-    Attributes
-    ----------
-    serial
-        Serial number; "nominal" is no unit in particular.
-    axes
-        Measured axes: x, xy or xyz.
-    nominal_zero_g_v
-        Zero-g by the datasheet, V, (m,).
-    nominal_scale_v_per_g
-        Scale factor by the datasheet, V/g, (m,).
-    noise_density_g_per_rthz
-        Density of the white noise by the datasheet, g/√Hz, (m,).
-    rc_resistance_ohm
-        Output resistance that the filter capacitor sees, Ω.
-    rc_capacitance_f
-        Filter capacitor, F; 0 for no filter.
-    adc_bits
-        Resolution of the ADC, bit; 0 does not quantise.
-    adc_vref_v
-        Full scale of the ADC, V.
-    rate_hz
-        Sample rate, Hz.
-    range_g
-        Measuring range by the datasheet, g.
-    local_gravity_mps2
-        Local gravity, m/s².
-    z_sign
-        Sign of the z of equation 5: 1 is upright, −1 is upside down.
-    stage_resolution_rad
-        Step of the stage's encoders, rad.
-    model
-        Model that was fitted, one of `MODELS`.
-    effects
-        Names of the effects.
-    values
-        Values by effect and parameter, (m,) or (), each in the unit of its parameter.
-    covariance
-        Covariance of the coefficients in `covariance_names`, (k, k).
-    covariance_names
-        Coefficients with a covariance, (k,). The others count as exact.
-    provenance
-        Texts by key: when, from what and by which version the coefficients were fitted.
-    envelope
-        Validity range of the calibration.
-    datasheet_name
-        Name of the datasheet of `datasheet`.
-    datasheet
-        Typical and largest departure by parameter, as the datasheet states them, each in the
-        unit of the parameter; 0 where it does not.
-    link
-        How the driver reaches the unit: values of `link.*` by name. Its file carries them.
-    unstated
-        Names of the nominal values that the parameter file leaves out. Their fields hold
-        placeholders until `signals.measured_values` measures them.
-    measured
-        Names of the nominal values that were measured from samples in their place.
-
     """
 
+    # Serial number; "nominal" is no unit in particular
     serial: str = _nominal('sensor.serial', 'serial number; nominal is no unit in particular')
+    # Measured axes: x, xy or xyz
     axes: str = _nominal('sensor.axes', 'measured axes', choices=MEASURED_AXES)
+    # Zero-g by the datasheet, V, (m,)
     nominal_zero_g_v: np.ndarray = _nominal(
         'sensor.nominal_zero_g_v', 'zero-g output by the datasheet, by axis', 'V', -10.0, 10.0)
+    # Scale factor by the datasheet, V/g, (m,)
     nominal_scale_v_per_g: np.ndarray = _nominal(
         'sensor.nominal_scale_v_per_g', 'scale factor by the datasheet, by axis', 'V/g',
         1e-3, 10.0)
+    # Density of the white noise by the datasheet, g/√Hz, (m,)
     noise_density_g_per_rthz: np.ndarray = _nominal(
         'sensor.noise_density_g_per_rthz', 'white noise density, by axis', 'g/sqrt(Hz)',
         0.0, 0.1, placeholder=0.0)
+    # Output resistance that the filter capacitor sees, Ω
     rc_resistance_ohm: float = _nominal(
         'sensor.rc_resistance_ohm', 'output resistance that the filter capacitor sees', 'Ohm',
         0.0, 1e9, placeholder=0.0)
+    # Filter capacitor, F; 0 for no filter
     rc_capacitance_f: float = _nominal(
         'sensor.rc_capacitance_f', 'filter capacitor; 0 is no filter', 'F', 0.0, 1.0,
         placeholder=0.0)
+    # Resolution of the ADC, bit; 0 does not quantise
     adc_bits: int = _nominal('sensor.adc_bits', 'resolution of the ADC; 0 does not quantise',
                              'bit', 0, 32, placeholder=0)
+    # Full scale of the ADC, V
     adc_vref_v: float = _nominal('sensor.adc_vref_v', 'full scale of the ADC', 'V', 0.1, 100.0,
                                  placeholder=100.0)
+    # Sample rate, Hz
     rate_hz: float = _nominal('sensor.rate_hz', 'sample rate', 'Hz', 0.01, 100000.0)
+    # Measuring range by the datasheet, g
     range_g: float = _nominal('sensor.range_g', 'measuring range by the datasheet', 'g',
                               0.1, 1000.0, placeholder=1000.0)
+    # Local gravity, m/s²
     local_gravity_mps2: float = _nominal(
         'sensor.local_gravity_mps2', 'gravity where the sensor is', 'm/s^2', 9.7, 9.9)
+    # Sign of the z of equation 5: 1 is upright, −1 is upside down
     z_sign: int = _nominal(
         'sensor.z_sign', 'which way up, for the z of equation 5: 1 or -1', '', -1, 1)
+    # Step of the stage's encoders, rad
     stage_resolution_rad: float = _nominal(
         'stage.resolution_rad', "step of the stage's encoder, or of the scale read by hand",
         'rad', 0.0, 1.0)
+    # Model that was fitted, one of `MODELS`
     model: str = _nominal('model', 'what was fitted', choices=MODELS)
-    effects: tuple[str, ...] = ()
+    effects: tuple[str, ...] = ()  # Names of the effects
+    # Values by effect and parameter, (m,) or (), each in the unit of its parameter
     values: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
+    # Covariance of the coefficients in `covariance_names`, (k, k)
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    # Coefficients with a covariance, (k,). The others count as exact.
     covariance_names: tuple[Coefficient, ...] = ()
+    # Texts by key: when, from what and by which version the coefficients were fitted
     provenance: dict[str, str] = field(default_factory=dict)
-    envelope: Envelope = Envelope()
-    datasheet_name: str = ''
+    envelope: Envelope = Envelope()  # Validity range of the calibration
+    datasheet_name: str = ''  # Name of the datasheet of `datasheet`
+    # Typical and largest departure by parameter, as the datasheet states them, each in the unit of
+    # the parameter; 0 where it does not
     datasheet: dict[Coefficient, tuple[float, float]] = field(default_factory=dict)
+    # How the driver reaches the unit: values of `link.*` by name. Its file carries them.
     link: dict[str, Any] = field(default_factory=dict)
+    # Names of the nominal values that the parameter file leaves out. Their fields hold
+    # placeholders until `signals.measured_values` measures them.
     unstated: tuple[str, ...] = ()
+    # Names of the nominal values that were measured from samples in their place
     measured: tuple[str, ...] = ()
 
     @property

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The signal chain at rest, from specific force to volts, and its exact inverse."""
 
@@ -183,20 +171,12 @@ def jacobian(respond: Callable[..., Components], force: Components,
 
 @dataclass(frozen=True)
 class Tangent:
-    """
-    The inverse of the chain to first order, around one or many forces.
+    """The inverse of the chain to first order, around one or many forces."""
 
-    Attributes
-    ----------
-    back
-        Derivatives of the force along the measured axes by the volts, (m/s²)/V, m rows of m
-        components.
-    slope
-        Derivatives of the estimates of x and y by z; empty unless z is derived (equation 5).
-
-    """
-
+    # Derivatives of the force along the measured axes by the volts, (m/s²)/V, m rows of m
+    # components
     back: list[Components]
+    # Derivatives of the estimates of x and y by z; empty unless z is derived (equation 5)
     slope: Components
 
 
@@ -396,18 +376,7 @@ def _is_clear_of_the_fold(force: np.ndarray, gravity: float) -> np.ndarray:
     """
     Return where |f| = g clearly has a z, so that every tangent leads to the same one.
 
-    Parameters
-    ----------
-    force
-        Forces, m/s², (3, n).
-    gravity
-        |f| at rest, m/s².
-
-    Returns
-    -------
-    ndarray
-        Whether z is clear, (n,).
-
+    force: forces, m/s², (3, n); gravity: |f| at rest, m/s²; returns: whether z is clear, (n,).
     """
     x, y, z = force
     excess = x * x + y * y + z * z - gravity * gravity
@@ -419,22 +388,8 @@ def _steps(following: Callable[[int, np.ndarray], np.ndarray], tolerances_mps2: 
     """
     Take steps from no force until all samples have converged.
 
-    Parameters
-    ----------
-    following
-        Maps the number of a step and the forces, m/s², (3, n), to the next forces.
-    tolerances_mps2
-        Change by each step below which a sample has converged, m/s².
-    count
-        Number of samples.
-
-    Returns
-    -------
-    force : ndarray
-        Last forces, m/s², (3, n).
-    is_solved : ndarray
-        Which of them have converged, (n,).
-
+    following: maps the number of a step and the forces, m/s², (3, n), to the next forces; returns:
+    last forces, m/s², (3, n). Which of them have converged, (n,).
     """
     force, moves = np.zeros((3, count)), np.ones(count, bool)
     for number, tolerance_mps2 in enumerate(tolerances_mps2):
@@ -468,24 +423,8 @@ def _newton_steps(linearise: Callable[..., tuple[Any, Tangent]],
     """
     Take Newton's steps from no force, with a tangent of each sample, until it has converged.
 
-    Parameters
-    ----------
-    linearise
-        Maps force and surroundings to the response and the `Tangent` there.
-    step
-        Maps signs of z to `newton_step`.
-    target
-        The response to reach, (m, n).
-    signs
-        Sign of a derived z, (n,).
-    environment
-        Surroundings of the samples.
-
-    Returns
-    -------
-    ndarray
-        Forces, m/s², (3, n); NaN where there is no solution.
-
+    target: the response to reach, (m, n); signs: sign of a derived z, (n,); returns: forces, m/s²,
+    (3, n); NaN where there is no solution.
     """
     count = target.shape[1]
     force, unsolved = np.zeros((3, count)), np.ones(count, bool)
@@ -525,24 +464,8 @@ def _polynomial_steps(chain: PolynomialChain, axes: str, advance: Callable[..., 
     """
     Take steps on polynomials, with the tangent at rest and then with that of each sample.
 
-    Parameters
-    ----------
-    chain
-        The polynomials.
-    axes
-        Measured axes.
-    advance
-        From `newton_step`; its volts are outputs of the element here.
-    output
-        Output of the element, g, (m, n).
-
-    Returns
-    -------
-    force : ndarray
-        Last forces, m/s², (3, n).
-    is_solved : ndarray
-        Which of them have converged, (n,).
-
+    output: output of the element, g, (m, n); returns: last forces, m/s², (3, n). Which of them
+    have converged, (n,).
     """
     slope = _inverted(chain.slopes(monomials(np.zeros((3, 1)))), axes)
 

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Tilt: angles of a sensor at rest by its specific force, with their variances."""
 
@@ -39,29 +27,15 @@ class Tilt:
 
     An angle that is not shown is NaN and has an infinite standard deviation. The force of a
     sensor without z axis does not determine whether it is upright, so that alpha is at most π/2.
-
-    Attributes
-    ----------
-    roll
-        atan2(a_y, a_z), rad, (n,).
-    pitch
-        atan2(−a_x, hypot(a_y, a_z)), rad, (n,).
-    inclination
-        atan2(hypot(a_x, a_y), a_z), rad, (n,).
-    alpha
-        Angle of the stage: the inclination, rad, (n,).
-    beta
-        Angle of the stage: atan2(−a_y, a_x), rad, (n,).
-    roll_std, pitch_std, inclination_std, alpha_std, beta_std
-        Standard deviations of the angles, rad, (n,).
-
     """
 
-    roll: np.ndarray
-    pitch: np.ndarray
-    inclination: np.ndarray
-    alpha: np.ndarray
-    beta: np.ndarray
+    roll: np.ndarray  # atan2(a_y, a_z), rad, (n,)
+    pitch: np.ndarray  # atan2(−a_x, hypot(a_y, a_z)), rad, (n,)
+    inclination: np.ndarray  # atan2(hypot(a_x, a_y), a_z), rad, (n,)
+    alpha: np.ndarray  # Angle of the stage: the inclination, rad, (n,)
+    beta: np.ndarray  # Angle of the stage: atan2(−a_y, a_x), rad, (n,)
+    # roll_std, pitch_std, inclination_std, alpha_std, beta_std: Standard deviations of the angles,
+    # rad, (n,)
     roll_std: np.ndarray
     pitch_std: np.ndarray
     inclination_std: np.ndarray

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Validity range of a calibration, and how its covariance grows outside.
@@ -64,31 +52,19 @@ leave 1.3 m/s² to level, and nearby forces share one result."""
 
 @dataclass(frozen=True)
 class Envelope:
-    """
-    Validity range of a calibration.
+    """Validity range of a calibration."""
 
-    Attributes
-    ----------
-    temperature_c
-        Lowest and highest temperature of the poses, °C; None if it was not measured.
-    zero_g_per_k
-        Typical slope of the zero-g, g/K, by the datasheet; 0 if the model follows temperature.
-    scale_per_k
-        Typical slope of the scale factor, 1/K, by the datasheet; 0 if the model follows it.
-    leverage
-        Largest leverage of the poses, h_max, (m/s²)²; 0 if unknown.
-    misfit_mps2
-        Misfit of held-out poses beyond noise and stage error, by axis, m/s².
-    force_low_mps2, force_high_mps2
-        Lowest and highest specific force of the poses by component, m/s²; empty if unknown.
-
-    """
-
+    # Lowest and highest temperature of the poses, °C; None if it was not measured
     temperature_c: tuple[float, float] | None = None
+    # Typical slope of the zero-g, g/K, by the datasheet; 0 if the model follows temperature
     zero_g_per_k: float = 0.0
+    # Typical slope of the scale factor, 1/K, by the datasheet; 0 if the model follows it
     scale_per_k: float = 0.0
-    leverage: float = 0.0
+    leverage: float = 0.0  # Largest leverage of the poses, h_max, (m/s²)²; 0 if unknown
+    # Misfit of held-out poses beyond noise and stage error, by axis, m/s²
     misfit_mps2: float = 0.0
+    # force_low_mps2, force_high_mps2: Lowest and highest specific force of the poses by component,
+    # m/s²; empty if unknown
     force_low_mps2: tuple[float, ...] = ()
     force_high_mps2: tuple[float, ...] = ()
 
@@ -104,18 +80,8 @@ class Envelope:
         """
         Return the extrapolation ρ of forces, at least 1.
 
-        Parameters
-        ----------
-        force
-            Specific force, m/s², three components, (n,) or floats.
-        leverage
-            Leverage of the forces, (m/s²)², (n,).
-
-        Returns
-        -------
-        ndarray
-            ρ, (n,); 1 inside.
-
+        force: specific force, m/s², three components, (n,) or floats; leverage: leverage of the
+        forces, (m/s²)², (n,); returns: ρ, (n,); 1 inside.
         """
         rho = np.maximum(1.0, leverage / self.leverage if self.leverage else 1.0)
         for value, low, high in zip(force, self.force_low_mps2, self.force_high_mps2):
@@ -128,22 +94,9 @@ class Envelope:
         """
         Return the variance that an axis gets outside of the validity range.
 
-        Parameters
-        ----------
-        axis_mps2
-            Specific force along the axis, m/s², (n,).
-        temperature_c
-            Temperature, °C, (n,) or one value.
-        extrapolation
-            Extrapolation ρ of the forces, (n,).
-        gravity_mps2
-            One g, m/s².
-
-        Returns
-        -------
-        ndarray
-            Variance, (m/s²)², (n,).
-
+        axis_mps2: specific force along the axis, m/s², (n,); temperature_c: temperature, °C, (n,)
+        or one value; extrapolation: extrapolation ρ of the forces, (n,); returns: variance,
+        (m/s²)², (n,).
         """
         beyond_k = self.beyond_k(temperature_c)
         return ((gravity_mps2 * self.zero_g_per_k * beyond_k) ** 2
@@ -154,20 +107,9 @@ class Envelope:
         """
         Return which samples lie outside of the validity range.
 
-        Parameters
-        ----------
-        temperature_c
-            Temperature, °C, (n,) or one value.
-        force
-            Specific force, m/s², three components, (n,) or floats.
-        leverage
-            Leverage of the forces, (m/s²)², (n,).
-
-        Returns
-        -------
-        ndarray
-            Whether each sample is outside, (n,).
-
+        temperature_c: temperature, °C, (n,) or one value; force: specific force, m/s², three
+        components, (n,) or floats; leverage: leverage of the forces, (m/s²)², (n,); returns:
+        whether each sample is outside, (n,).
         """
         return (self.beyond_k(temperature_c) > 0) | (self.extrapolation(force, leverage) > 1)
 
@@ -176,20 +118,7 @@ class Envelope:
         """
         Describe in words how one sample lies outside of the validity range.
 
-        Parameters
-        ----------
-        temperature_c
-            Temperature, °C.
-        force
-            Specific force, m/s², three components.
-        leverage
-            Leverage of the force, (m/s²)².
-
-        Returns
-        -------
-        tuple
-            A text for temperature and one for the force; empty inside.
-
+        force: specific force, m/s², three components; leverage: leverage of the force, (m/s²)².
         """
         texts = []
         if self.temperature_c is not None and self.beyond_k(temperature_c) > 0:

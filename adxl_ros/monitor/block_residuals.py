@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Samples minus their prediction from the reference, in blocks of a second."""
 
@@ -42,61 +30,29 @@ _SMALLEST_MPS2 = 1e-9
 
 @dataclass(frozen=True)
 class Block:
-    """
-    The comparison of one block; m axes.
+    """The comparison of one block; m axes."""
 
-    Attributes
-    ----------
-    end_ns
-        End of the block, ns.
-    mean_mps2
-        Mean of the residual without outliers, m/s², (m,).
-    square
-        Mean square of the residual, (m/s²)², (m,).
-    noise_square
-        Mean square about the mean, with its lost degrees of freedom, (m/s²)², (m,).
-    log_noise
-        Logarithm of the standard deviation within short parts of the block, (m,): a step of the
-        mean hardly changes it.
-    datasheet_square
-        Mean square of the residual to the sensor without effects, (m/s²)², (m,).
-    reference_square
-        Mean square of the force by the steps of an encoder, (m/s²)², (m,).
-    moves
-        Whether the reference moves.
-
-    """
-
-    end_ns: int
-    mean_mps2: np.ndarray
-    square: np.ndarray
+    end_ns: int  # End of the block, ns
+    mean_mps2: np.ndarray  # Mean of the residual without outliers, m/s², (m,)
+    square: np.ndarray  # Mean square of the residual, (m/s²)², (m,)
+    # Mean square about the mean, with its lost degrees of freedom, (m/s²)², (m,)
     noise_square: np.ndarray
+    # Logarithm of the standard deviation within short parts of the block, (m,): a step of the mean
+    # hardly changes it
     log_noise: np.ndarray
+    # Mean square of the residual to the sensor without effects, (m/s²)², (m,)
     datasheet_square: np.ndarray
+    # Mean square of the force by the steps of an encoder, (m/s²)², (m,)
     reference_square: np.ndarray
-    moves: bool
+    moves: bool  # Whether the reference moves
 
 
 class Prediction:
-    """
-    The output of a sensor on the reference, from block to block.
-
-    Parameters
-    ----------
-    sensor
-        The unit with its effects, at the rate of the stream.
-    reference
-        The reference.
-
-    Attributes
-    ----------
-    left_out
-        Effects that need the angles of a stage, which the reference has not.
-
-    """
+    """The output of a sensor on the reference, from block to block."""
 
     def __init__(self, sensor: Sensor, reference: ReferenceStream) -> None:
         stage = [name for name in sensor.effects if _needs_stage(name)]
+        # Effects that need the angles of a stage, which the reference has not
         self.left_out = tuple(stage) if reference.kind is ReferenceKind.IMU else ()
         effects = tuple(name for name in sensor.effects if name not in self.left_out)
         self._sensor, self._reference = sensor, reference
@@ -124,22 +80,7 @@ class Prediction:
         """
         Compare the samples of one prepared block.
 
-        Parameters
-        ----------
-        stamp_ns
-            Stamps, ns, (n,).
-        accel_mps2
-            Samples by nominal conversion, m/s², (n, m).
-        motion
-            What the reference shows.
-        end_ns
-            End of the block, ns.
-
-        Returns
-        -------
-        Block
-            The comparison.
-
+        stamp_ns: stamps, ns, (n,); accel_mps2: samples by nominal conversion, m/s², (n, m).
         """
         if self._responses is None:
             self._responses = (Response(self._modelled, self._motion, 0),

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The record of changes on disk: one line of JSON each, synced before it is reported."""
 
@@ -41,24 +29,7 @@ def iso_time(stamp_ns: int) -> str:
 
 
 def append(folder: Path, change: GapChange, serial: str) -> None:
-    """
-    Append a change to the record of a folder.
-
-    Parameters
-    ----------
-    folder
-        The folder.
-    change
-        The change.
-    serial
-        Serial number of the sensor.
-
-    Raises
-    ------
-    UserError
-        The record cannot be written.
-
-    """
+    """Append a change to the record of a folder."""
     unit = 'mg' if change.quantity == 'mean' else 'ratio'
     line = json.dumps({
         'serial': serial, 'axis': change.axis, 'quantity': change.quantity,

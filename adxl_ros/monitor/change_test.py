@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 A sequential test whether the mean of a series has changed, with a stated rate of false alarms.
@@ -63,54 +51,26 @@ _KINDS = 2
 
 @dataclass(frozen=True)
 class Change:
-    """
-    A change of the mean.
+    """A change of the mean."""
 
-    Attributes
-    ----------
-    channel
-        Number of the series.
-    blocks
-        Number of blocks since the change.
-    size
-        Mean after the change minus mean before.
-    std
-        Usual size of such a difference.
-
-    """
-
-    channel: int
-    blocks: int
-    size: float
-    std: float
+    channel: int  # Number of the series
+    blocks: int  # Number of blocks since the change
+    size: float  # Mean after the change minus mean before
+    std: float  # Usual size of such a difference
 
 
 @dataclass(frozen=True)
 class ChangeSettings:
-    """
-    Settings of the test.
+    """Settings of the test."""
 
-    Attributes
-    ----------
-    channels
-        Number of series.
-    false_alarms_per_day
-        Largest permitted rate, of all series together.
-    block_s
-        Length of a block, s.
-    smallest
-        Smallest usual size of a difference, in the unit of the series; a series without noise has
-        none of its own.
-    walks
-        Random walk of a healthy series, in its unit a root of a second, by series; infinite where
-        every drift is usual.
-
-    """
-
-    channels: int
-    false_alarms_per_day: float
-    block_s: float = 1.0
+    channels: int  # Number of series
+    false_alarms_per_day: float  # Largest permitted rate, of all series together
+    block_s: float = 1.0  # Length of a block, s
+    # Smallest usual size of a difference, in the unit of the series; a series without noise has
+    # none of its own
     smallest: float = 1e-6
+    # Random walk of a healthy series, in its unit a root of a second, by series; infinite where
+    # every drift is usual
     walks: tuple[float, ...] = (np.inf,)
 
     @cached_property
@@ -133,18 +93,10 @@ def _stride(length: int) -> int:
 
 
 class ChangeTest:
-    """
-    Tests several series, block by block.
-
-    Attributes
-    ----------
-    settings
-        Settings of the test.
-
-    """
+    """Tests several series, block by block."""
 
     def __init__(self, settings: ChangeSettings) -> None:
-        self.settings = settings
+        self.settings = settings  # Settings of the test
         self._size = (1 + _BEFORE) * 2 ** (_LENGTHS - 1) + 1
         n = settings.channels
         # Sums up to each block; the place of a block is its number modulo the size.
@@ -162,18 +114,7 @@ class ChangeTest:
         """
         Test the next block.
 
-        Parameters
-        ----------
-        values
-            Means of the block, (channels,).
-        moves
-            Whether the reference moves within the block.
-
-        Returns
-        -------
-        list of Change
-            One change for each series that has changed. It begins and learns again after it.
-
+        values: means of the block, (channels,).
         """
         last = self._count % self._size
         self._count += 1

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A diagnosis of the newest samples in a process of its own, with a budget of time."""
 
@@ -42,77 +30,31 @@ _REASON_LENGTH = 300
 
 @dataclass(frozen=True)
 class DiagnosisInput:
-    """
-    What a diagnosis compares.
+    """What a diagnosis compares."""
 
-    Attributes
-    ----------
-    recording
-        Samples, with the references of a stage.
-    sensor
-        The baseline.
-    force
-        Times, s, (k,), and force of a simulator, m/s², (k, 3); None with a stage.
-
-    """
-
-    recording: Recording
-    sensor: Sensor
+    recording: Recording  # Samples, with the references of a stage
+    sensor: Sensor  # The baseline
+    # Times, s, (k,), and force of a simulator, m/s², (k, 3); None with a stage
     force: tuple[np.ndarray, np.ndarray] | None = None
 
 
 @dataclass(frozen=True)
 class DiagnosisResult:
-    """
-    The end of a diagnosis.
+    """The end of a diagnosis."""
 
-    Attributes
-    ----------
-    is_done
-        Whether there is a report.
-    text
-        The verdict in words, or why there is none.
-    report
-        Path of the page; empty without one.
-    effects
-        Likely effects.
-    probability
-        Probability of the verdict; 0 without one.
-
-    """
-
-    is_done: bool
-    text: str
-    report: str = ''
-    effects: tuple[str, ...] = ()
-    probability: float = 0.0
+    is_done: bool  # Whether there is a report
+    text: str  # The verdict in words, or why there is none
+    report: str = ''  # Path of the page; empty without one
+    effects: tuple[str, ...] = ()  # Likely effects
+    probability: float = 0.0  # Probability of the verdict; 0 without one
 
 
 class DiagnosisRun:
-    """
-    Runs the tool `diagnose`; the files appear whole, and a killed run leaves those before.
-
-    Parameters
-    ----------
-    folder
-        New folder of the run.
-    given
-        What is compared.
-    tool
-        Command of the tool `diagnose`.
-    budget_s
-        Longest time, s; the process is ended then.
-
-    Attributes
-    ----------
-    result
-        The end; None while it runs.
-
-    """
+    """Runs the tool `diagnose`; the files appear whole, and a killed run leaves those before."""
 
     def __init__(self, folder: Path, given: DiagnosisInput, tool: Sequence[str], budget_s: float
                  ) -> None:
-        self.result: DiagnosisResult | None = None
+        self.result: DiagnosisResult | None = None  # The end; None while it runs
         self._folder, self._given, self._tool = folder, given, tool
         self._budget_s = budget_s
         self._is_closed = False
@@ -179,22 +121,7 @@ class DiagnosisRun:
 
 
 def result_of(report: dict, page: str) -> DiagnosisResult:
-    """
-    Put a report of `diagnose` into words.
-
-    Parameters
-    ----------
-    report
-        The JSON.
-    page
-        Path of the page.
-
-    Returns
-    -------
-    DiagnosisResult
-        The verdict.
-
-    """
+    """Put a report of `diagnose` into words."""
     verdict = report['verdict']
     status, effects = verdict['status'], tuple(verdict['effects'])
     probability = float(verdict.get('probability') or 0.0)

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The gap of a running sensor: samples and reference go in, gap, floor and changes come out."""
 
@@ -85,32 +73,15 @@ class Interval:
 
 @dataclass(frozen=True)
 class AxisGap:
-    """
-    The gap of one axis over the window; rms, mg.
+    """The gap of one axis over the window; rms, mg."""
 
-    Attributes
-    ----------
-    axis
-        x, y or z.
-    gap
-        Samples minus prediction.
-    floor
-        Noise about the mean of each second at rest, and the steps of the encoder.
-    floor_source
-        `rest` where it was measured, `parameters` where nothing has rested yet.
-    offset_mg
-        Mean of samples minus prediction.
-    explained
-        Share of the squares of the gap to the datasheet, above the floor, that the parameters
-        remove, 0 to 1; None where that gap is no larger than the floor.
-
-    """
-
-    axis: str
-    gap: Interval
-    floor: Interval
-    floor_source: str
-    offset_mg: float
+    axis: str  # x, y or z
+    gap: Interval  # Samples minus prediction
+    floor: Interval  # Noise about the mean of each second at rest, and the steps of the encoder
+    floor_source: str  # `rest` where it was measured, `parameters` where nothing has rested yet
+    offset_mg: float  # Mean of samples minus prediction
+    # Share of the squares of the gap to the datasheet, above the floor, that the parameters
+    # remove, 0 to 1; None where that gap is no larger than the floor
     explained: float | None
 
     @property
@@ -121,29 +92,13 @@ class AxisGap:
 
 @dataclass(frozen=True)
 class GapChange:
-    """
-    A change of the residual.
+    """A change of the residual."""
 
-    Attributes
-    ----------
-    axis
-        x, y or z.
-    quantity
-        `mean`, or `noise` for the standard deviation within a second.
-    since_ns
-        Stamp of the change, ns.
-    detected_ns
-        Stamp of its detection, ns.
-    size
-        Change of the mean, mg; ratio of the standard deviations.
-
-    """
-
-    axis: str
-    quantity: str
-    since_ns: int
-    detected_ns: int
-    size: float
+    axis: str  # x, y or z
+    quantity: str  # `mean`, or `noise` for the standard deviation within a second
+    since_ns: int  # Stamp of the change, ns
+    detected_ns: int  # Stamp of its detection, ns
+    size: float  # Change of the mean, mg; ratio of the standard deviations
 
     def text(self) -> str:
         """Return the change in words."""
@@ -154,94 +109,42 @@ class GapChange:
 
 @dataclass(frozen=True)
 class GapSettings:
-    """
-    Settings of the comparison.
+    """Settings of the comparison."""
 
-    Attributes
-    ----------
-    window_s
-        Time over which the gap is taken, s.
-    false_alarms_per_day
-        Largest rate of changes that are none.
-    history_s
-        Time that is kept for a diagnosis, s.
-    wait_s
-        Time after a change of an axis in which further ones belong to it, s.
-
-    """
-
-    window_s: float = 60.0
-    false_alarms_per_day: float = 1 / 30
-    history_s: float = 600.0
-    wait_s: float = 120.0
+    window_s: float = 60.0  # Time over which the gap is taken, s
+    false_alarms_per_day: float = 1 / 30  # Largest rate of changes that are none
+    history_s: float = 600.0  # Time that is kept for a diagnosis, s
+    wait_s: float = 120.0  # Time after a change of an axis in which further ones belong to it, s
 
 
 @dataclass(frozen=True)
 class Counts:
-    """
-    Counts since the start.
+    """Counts since the start."""
 
-    Attributes
-    ----------
-    samples
-        Samples that came.
-    missing
-        Samples that are missing between others, by their stamps.
-    dropped
-        Samples that came twice or late, or are no numbers.
-    jumps
-        How often the stamps have jumped.
-    blocks
-        Compared seconds.
-    skipped
-        Seconds that were not compared, for want of samples or reference.
-
-    """
-
-    samples: int = 0
-    missing: int = 0
-    dropped: int = 0
-    jumps: int = 0
-    blocks: int = 0
-    skipped: int = 0
+    samples: int = 0  # Samples that came
+    missing: int = 0  # Samples that are missing between others, by their stamps
+    dropped: int = 0  # Samples that came twice or late, or are no numbers
+    jumps: int = 0  # How often the stamps have jumped
+    blocks: int = 0  # Compared seconds
+    skipped: int = 0  # Seconds that were not compared, for want of samples or reference
 
 
 class LiveGap:
     """
     Compares a stream with the prediction of its parameters, second by second.
 
-    Parameters
-    ----------
-    sensor
-        The unit with its effects; its rate is that of the stream, or is measured.
-    kind
-        What the sensor is compared with.
-    settings
-        Settings of the comparison.
-
-    Attributes
-    ----------
-    sensor
-        The unit at the rate of the stream.
-    reference
-        The reference, which takes its messages itself.
-    counts
-        Counts since the start.
-    obstacle
-        Why the newest second was not compared; empty if it was.
-    changes
-        Changes so far, the newest last.
-
+    sensor: the unit at the rate of the stream.
     """
 
     def __init__(self, sensor: Sensor, kind: ReferenceKind, settings: GapSettings) -> None:
         self.sensor, self._settings = sensor, settings
         span_ns = round(settings.history_s * 1e9)
+        # The reference, which takes its messages itself
         self.reference = ReferenceStream(kind, sensor, span_ns)
         self._samples = StreamBuffer(len(sensor.axes), span_ns)
-        self.counts = Counts()
-        self.obstacle = 'no samples yet'
-        self.changes: list[GapChange] = []
+        self.counts = Counts()  # Counts since the start
+        self.obstacle = 'no samples yet'  # Why the newest second was not compared; empty if it was
+        self.changes: list[GapChange] = []  # Changes so far, the newest last
         self._blocks: deque[Block] = deque(
             maxlen=max(round(settings.window_s * 1e9 / BLOCK_NS), _FEWEST_BLOCKS))
         self._ends_ns: deque[int] = deque(maxlen=_MEMORY)
@@ -268,13 +171,8 @@ class LiveGap:
         """
         Add samples.
 
-        Parameters
-        ----------
-        stamp_ns
-            Stamps, ns, (n,).
-        accel_mps2
-            Specific force by nominal conversion, m/s², (n, m) or with further columns.
-
+        stamp_ns: stamps, ns, (n,); accel_mps2: specific force by nominal conversion, m/s², (n, m)
+        or with further columns.
         """
         accel_mps2 = accel_mps2[:, :len(self.sensor.axes)]
         finite = np.isfinite(accel_mps2).all(axis=1)

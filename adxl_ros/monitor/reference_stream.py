@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What came of the reference, stage or simulator, of the newest time, and its paths."""
 
@@ -53,17 +41,7 @@ _FIRST_ROWS = 1024
 
 
 class StreamBuffer:
-    """
-    Keeps the newest rows of a stream; stamps ascend.
-
-    Parameters
-    ----------
-    columns
-        Numbers of a row.
-    span_ns
-        Time that is kept, ns. Older rows are forgotten, at the latest when they are as many again.
-
-    """
+    """Keeps the newest rows of a stream; stamps ascend."""
 
     def __init__(self, columns: int, span_ns: int) -> None:
         self._span_ns = span_ns
@@ -84,18 +62,7 @@ class StreamBuffer:
         """
         Append rows, and drop those whose stamp does not increase.
 
-        Parameters
-        ----------
-        stamp_ns
-            Stamps, ns, (n,).
-        rows
-            Numbers, (n, k).
-
-        Returns
-        -------
-        int
-            Number of dropped rows.
-
+        stamp_ns: stamps, ns, (n,); rows: numbers, (n, k).
         """
         if not len(stamp_ns):
             return 0
@@ -113,16 +80,7 @@ class StreamBuffer:
         """
         Return copies of the rows of a time.
 
-        Parameters
-        ----------
-        begin_ns, end_ns
-            First stamp, and the stamp after the last, ns.
-
-        Returns
-        -------
-        tuple
-            Stamps, ns, (n,), and rows, (n, k).
-
+        returns: stamps, ns, (n,), and rows, (n, k).
         """
         kept = self._stamps[self._begin:self._end]
         part = slice(*(self._begin + np.searchsorted(kept, [begin_ns, end_ns])))
@@ -158,47 +116,20 @@ class ReferenceKind(Enum):
 
 @dataclass(frozen=True)
 class BlockMotion:
-    """
-    What the reference shows of one block.
+    """What the reference shows of one block."""
 
-    Attributes
-    ----------
-    moves
-        Whether it moves.
-    error_mps2
-        Standard deviation of the force by the steps of an encoder, m/s², (3,).
-
-    """
-
-    moves: bool
+    moves: bool  # Whether it moves
+    # Standard deviation of the force by the steps of an encoder, m/s², (3,)
     error_mps2: np.ndarray
 
 
 class ReferenceStream:
-    """
-    Follows the reference and the surroundings; `motion` is that of the newest prepared block.
-
-    Parameters
-    ----------
-    kind
-        What the sensor is compared with.
-    sensor
-        The unit, with the resolution of its stage.
-    span_ns
-        Time that is kept, ns.
-
-    Attributes
-    ----------
-    kind
-        As given.
-    readings
-        Joints in the order of `JOINTS`, rad and m, or force, m/s².
-
-    """
+    """Follows the reference and the surroundings; `motion` is of the newest prepared block."""
 
     def __init__(self, kind: ReferenceKind, sensor: Sensor, span_ns: int) -> None:
-        self.kind = kind
+        self.kind = kind  # As given
         self._sensor = sensor
+        # Joints in the order of `JOINTS`, rad and m, or force, m/s²
         self.readings = StreamBuffer(3, span_ns)
         self.surroundings = {'temperature_c': StreamBuffer(1, span_ns),
                              'supply_v': StreamBuffer(1, span_ns)}
@@ -208,17 +139,7 @@ class ReferenceStream:
         self._force: ForcePath | None = None
 
     def add_joints(self, stamp_ns: int, positions: Mapping[str, float]) -> None:
-        """
-        Add one message of the stage.
-
-        Parameters
-        ----------
-        stamp_ns
-            Its stamp, ns.
-        positions
-            Positions by joint, rad or m; a joint that is not named stays.
-
-        """
+        """Add one message of the stage."""
         values = np.array([positions.get(joint, held)
                            for joint, held in zip(JOINTS, self._held.tolist())])
         if np.isfinite(values).all():
@@ -229,13 +150,7 @@ class ReferenceStream:
         """
         Add readings; stamps that jump back begin a new reference.
 
-        Parameters
-        ----------
-        stamp_ns
-            Stamps, ns, (n,).
-        readings
-            Joints, rad and m, or force, m/s², (n, 3).
-
+        stamp_ns: stamps, ns, (n,); readings: joints, rad and m, or force, m/s², (n, 3).
         """
         finite = np.isfinite(readings).all(axis=1)
         stamp_ns, readings = stamp_ns[finite], readings[finite]
@@ -246,19 +161,7 @@ class ReferenceStream:
         self.readings.add(stamp_ns, readings)
 
     def add_surroundings(self, name: str, stamp_ns: int, value: float) -> None:
-        """
-        Add a temperature or a supply.
-
-        Parameters
-        ----------
-        name
-            `temperature_c` or `supply_v`.
-        stamp_ns
-            Stamp, ns.
-        value
-            °C or V; NaN is ignored.
-
-        """
+        """Add a temperature or a supply."""
         if np.isfinite(value):
             buffer = self.surroundings[name]
             newest_ns = buffer.newest_ns
@@ -279,20 +182,7 @@ class ReferenceStream:
         return Motion(np.inf, alpha, beta, shift, temperature_c=temperature_c, supply_v=supply_v)
 
     def prepare(self, begin_ns: int, end_ns: int) -> BlockMotion | None:
-        """
-        Make the paths of a block.
-
-        Parameters
-        ----------
-        begin_ns, end_ns
-            Begin and end of the block, ns.
-
-        Returns
-        -------
-        BlockMotion or None
-            What the reference shows; None where it does not cover the block.
-
-        """
+        """Make the paths of a block."""
         stamps_ns, readings = self.readings.between(begin_ns - BEFORE_NS, end_ns + AFTER_NS)
         first = max(int(np.searchsorted(stamps_ns, begin_ns, 'right')) - 1, 0)
         gaps_ns = np.diff([begin_ns, *stamps_ns[first:], end_ns])
@@ -334,20 +224,7 @@ class ReferenceStream:
         """
         Return the temperature or the supply at times.
 
-        Parameters
-        ----------
-        name
-            `temperature_c` or `supply_v`.
-        time_s
-            Times of the motion, s, (n,).
-        default
-            Value before the first reading, °C or V.
-
-        Returns
-        -------
-        ndarray
-            Values, (n,).
-
+        time_s: times of the motion, s, (n,); returns: values, (n,).
         """
         buffer = self.surroundings[name]
         if not len(buffer):

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Overlapping Allan deviation and cell means of a stream of any length, in bounded memory."""
 
@@ -34,22 +22,11 @@ _FEWEST_AVERAGES = 3
 
 @dataclass(frozen=True)
 class AllanDeviation:
-    """
-    The overlapping Allan deviation of a stream; u is its unit.
+    """The overlapping Allan deviation of a stream; u is its unit."""
 
-    Attributes
-    ----------
-    tau_s
-        Averaging times, s, (k,).
-    deviation
-        Allan deviation by time and axis, u, (k, m).
-    averages
-        Number of averages side by side, (k,): the time of the stream divided by `tau_s`.
-
-    """
-
-    tau_s: np.ndarray
-    deviation: np.ndarray
+    tau_s: np.ndarray  # Averaging times, s, (k,)
+    deviation: np.ndarray  # Allan deviation by time and axis, u, (k, m)
+    # Number of averages side by side, (k,): the time of the stream divided by `tau_s`
     averages: np.ndarray
 
     @property
@@ -70,18 +47,11 @@ class CellMeans:
     columns
         Number of columns of the stream.
 
-    Attributes
-    ----------
-    size
-        Samples of a cell.
-    count
-        Complete cells.
-
     """
 
     def __init__(self, columns: int) -> None:
-        self.size = 1
-        self.count = 0
+        self.size = 1  # Samples of a cell
+        self.count = 0  # Complete cells
         self._means = np.empty((_MOST_CELLS, columns))
         self._squares = np.empty((_MOST_CELLS, columns))
         self._leftover = np.empty((0, columns))
@@ -160,22 +130,7 @@ class AllanStream:
             size *= 2
 
     def result(self, rate_hz: float, cells: CellMeans) -> AllanDeviation:
-        """
-        Return the Allan deviation of the samples so far.
-
-        Parameters
-        ----------
-        rate_hz
-            Sample rate, Hz.
-        cells
-            Cell means of the same stream; the first columns are the axes.
-
-        Returns
-        -------
-        AllanDeviation
-            At 1, 2, 4, ... samples, as long as there are three averages.
-
-        """
+        """Return the Allan deviation of the samples so far."""
         sizes = [1 << i for i in range(len(self._sums))
                  if _FEWEST_AVERAGES << i <= self.count]
         variances = [sums / (2 * size ** 2 * count) for size, sums, count
@@ -219,20 +174,7 @@ def _sum_of_squares(phase: np.ndarray, size: int, start: int, stop: int) -> floa
     """
     Return the sum of squares of second differences.
 
-    Parameters
-    ----------
-    phase
-        Sums of the samples, (n,).
-    size
-        Distance of the differences, samples.
-    start, stop
-        First end of a difference, and the one after the last.
-
-    Returns
-    -------
-    float
-        The sum.
-
+    phase: sums of the samples, (n,).
     """
     total = 0.0
     for begin in range(start, stop, _AT_ONCE):

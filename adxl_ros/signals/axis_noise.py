@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The noise of each axis of a sensor at rest: fitted terms, drift, and what limits them."""
 
@@ -52,39 +40,18 @@ capacitor matters."""
 
 @dataclass(frozen=True)
 class AxisNoise:
-    """
-    The noise of one axis.
+    """The noise of one axis."""
 
-    Attributes
-    ----------
-    axis
-        Its letter.
-    fit
-        White noise, bias instability and random walk, in m/s².
-    drift
-        A drift that is no noise; None where there is none.
-    sample_std
-        Standard deviation of a sample, m/s².
-    resolution
-        Smallest change of a sample, m/s².
-    rounding
-        N of the rounding to this resolution, m/s²/√Hz, which `fit` does not contain.
-    lowest_s, lowest
-        Time, s, and value, m/s², of the lowest point of the Allan deviation.
-    needed_s
-        Time that would show half of a term's upper limit, s, by name of the terms that are not
-        seen.
-
-    """
-
-    axis: str
-    fit: NoiseFit
-    drift: Drift | None
-    sample_std: float
-    resolution: float
-    rounding: float
+    axis: str  # Its letter
+    fit: NoiseFit  # White noise, bias instability and random walk, in m/s²
+    drift: Drift | None  # A drift that is no noise; None where there is none
+    sample_std: float  # Standard deviation of a sample, m/s²
+    resolution: float  # Smallest change of a sample, m/s²
+    rounding: float  # N of the rounding to this resolution, m/s²/√Hz, which `fit` does not contain
+    # lowest_s, lowest: Time, s, and value, m/s², of the lowest point of the Allan deviation
     lowest_s: float
     lowest: float
+    # Time that would show half of a term's upper limit, s, by name of the terms that are not seen
     needed_s: dict[str, float]
 
     @property
@@ -105,47 +72,16 @@ class AxisNoise:
 
 @dataclass(frozen=True)
 class RecordingNoise:
-    """
-    The noise of a recording.
+    """The noise of a recording."""
 
-    Attributes
-    ----------
-    path
-        The recording.
-    rest
-        Its samples at rest.
-    axes
-        The noise by axis.
-
-    """
-
-    path: str
-    rest: StillStretch
-    axes: list[AxisNoise]
+    path: str  # The recording
+    rest: StillStretch  # Its samples at rest
+    axes: list[AxisNoise]  # The noise by axis
 
 
 def recording_noise(path: str, rest: StillStretch, axes: str, show: Callable[[float], None]
                     ) -> RecordingNoise:
-    """
-    Fit the noise of all axes.
-
-    Parameters
-    ----------
-    path
-        The recording.
-    rest
-        The samples at rest.
-    axes
-        Letters of the axes.
-    show
-        Shows which share of the axes is done.
-
-    Returns
-    -------
-    RecordingNoise
-        The noise by axis.
-
-    """
+    """Fit the noise of all axes."""
     variances = coefficient_variances(len(rest.means), rest.step_s)
     noises = []
     for i, axis in enumerate(axes):
@@ -172,22 +108,8 @@ def without_rounding(fit: NoiseFit, std: float, resolution: float, rounding: flo
     Above 0.6 steps of noise, rounding adds independent noise of the variance step²/12. Less noise
     is hidden: it may be anything up to that, and codes that do not change show less.
 
-    Parameters
-    ----------
-    fit
-        The noise of the samples.
-    std
-        Standard deviation of a sample within some seconds, m/s².
-    resolution
-        Smallest change of a sample, m/s².
-    rounding
-        N of the rounding, m/s²/√Hz.
-
-    Returns
-    -------
-    NoiseFit
-        The fit without it; upper limits where it hides the noise.
-
+    std: standard deviation of a sample within some seconds, m/s²; resolution: smallest change of a
+    sample, m/s².
     """
     if not _is_coarse(std, resolution):
         return replace(fit, white=Estimate(*(float(np.sqrt(max(value ** 2 - rounding ** 2, 0.0)))
@@ -227,19 +149,6 @@ def with_noise(sensor: Sensor, noises: list[AxisNoise]) -> Sensor:
     noise: white noise of the density 2·N² over positive frequencies has the variance N²/(2·RC)
     behind it. A rest shows neither range nor resolution: where they are not stated, the
     placeholders of `Sensor` stay, which limit and round nothing.
-
-    Parameters
-    ----------
-    sensor
-        The sensor, with the axes and the rate of the recording.
-    noises
-        The noise by axis.
-
-    Returns
-    -------
-    Sensor
-        The sensor with its other values as they were.
-
     """
     values = {name: value for name, value in sensor.values.items() if name != 'noise_excess'}
     to_g = np.array([ONE_SIDED, 1 / np.sqrt(np.pi), 1.0])[:, None] / G0_MPS2

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Statistics of a stream of samples in short blocks, from which rests are found."""
 
@@ -42,38 +30,19 @@ def block_samples(rate_hz: float) -> int:
 
 @dataclass(frozen=True)
 class Blocks:
-    """
-    Sums over k blocks of equally many rows.
+    """Sums over k blocks of equally many rows."""
 
-    Attributes
-    ----------
-    start
-        Row of the stream at which each block begins, (k,).
-    time_s
-        Time of the first and last row, s, (k, 2).
-    run
-        Number of the gapless run that the block belongs to, (k,).
-    count
-        Number of rows without NaN, (k,); 0 if these are at most half of the rows.
-    mean
-        Mean of these rows by axis, (k, m); without such rows the mean of the block before.
-    squares
-        Sum of the squared deviations from the mean, (k, m).
-    step
-        Smallest change between consecutive rows that is not 0, (k, m); inf if nothing changes. It
-        is the step of the ADC if the noise exceeds that step.
-    angle
-        Lowest and highest encoder angle, rad, (k, 2, a); NaN where none was sampled.
-
-    """
-
-    start: np.ndarray
-    time_s: np.ndarray
-    run: np.ndarray
-    count: np.ndarray
+    start: np.ndarray  # Row of the stream at which each block begins, (k,)
+    time_s: np.ndarray  # Time of the first and last row, s, (k, 2)
+    run: np.ndarray  # Number of the gapless run that the block belongs to, (k,)
+    count: np.ndarray  # Number of rows without NaN, (k,); 0 if these are at most half of the rows
+    # Mean of these rows by axis, (k, m); without such rows the mean of the block before
     mean: np.ndarray
-    squares: np.ndarray
+    squares: np.ndarray  # Sum of the squared deviations from the mean, (k, m)
+    # Smallest change between consecutive rows that is not 0, (k, m); inf if nothing changes. It is
+    # the step of the ADC if the noise exceeds that step.
     step: np.ndarray
+    # Lowest and highest encoder angle, rad, (k, 2, a); NaN where none was sampled
     angle: np.ndarray
 
     def __len__(self) -> int:
@@ -97,14 +66,6 @@ class BlockCutter:
 
     A gap in time, or time that runs backwards, begins a new run. The incomplete block before it
     is dropped.
-
-    Parameters
-    ----------
-    rate_hz
-        Nominal sample rate, Hz.
-    axes, angles
-        Number of measured axes m and of encoder angles a.
-
     """
 
     def __init__(self, rate_hz: float, axes: int, angles: int = 0):
@@ -122,20 +83,8 @@ class BlockCutter:
         """
         Add the next rows of the stream.
 
-        Parameters
-        ----------
-        time_s
-            Time of each row, s, (n,).
-        samples
-            Rows of the stream, (n, m); a row with a NaN is left out.
-        angles_rad
-            Encoder angles, rad, (n, a), NaN where not sampled.
-
-        Returns
-        -------
-        Blocks
-            The blocks that these rows complete.
-
+        time_s: time of each row, s, (n,); samples: rows of the stream, (n, m); a row with a NaN is
+        left out; angles_rad: encoder angles, rad, (n, a), NaN where not sampled.
         """
         columns = [time_s[:, None], samples] + ([] if angles_rad is None else [angles_rad])
         return Blocks.join([self.none()] + [

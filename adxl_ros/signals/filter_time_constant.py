@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Time constant of the output filter, from the spectrum of the noise at rest.
@@ -72,22 +60,11 @@ hum exceed it."""
 
 @dataclass(frozen=True)
 class FilterNoise:
-    """
-    Estimate of the filter of one axis.
+    """Estimate of the filter of one axis."""
 
-    Attributes
-    ----------
-    rc_s
-        Time constant, s.
-    ratio_std
-        Relative standard deviation of the time constant.
-    scatter
-        Mean square of the ordinates' deviations, relative to that of filtered white noise.
-
-    """
-
-    rc_s: float
-    ratio_std: float
+    rc_s: float  # Time constant, s
+    ratio_std: float  # Relative standard deviation of the time constant
+    # Mean square of the ordinates' deviations, relative to that of filtered white noise
     scatter: float
 
     @property
@@ -101,22 +78,7 @@ def estimate_filter(rests: Iterable[np.ndarray], rate_hz: float, rc_s: float, ls
     """
     Estimate the time constant of one axis.
 
-    Parameters
-    ----------
-    rests
-        Volts of each rest without gaps, (n,) each.
-    rate_hz
-        Sample rate, Hz.
-    rc_s
-        Stated time constant, s, to begin with.
-    lsb_v
-        Step of the ADC, V.
-
-    Returns
-    -------
-    FilterNoise or None
-        None without noise, without a long rest, or if the noise does not show a filter.
-
+    rests: volts of each rest without gaps, (n,) each.
     """
     # scipy.signal takes 0.3 s to import, which a calibration needs only at its end.
     from scipy.signal.windows import hann
@@ -188,23 +150,7 @@ def _information(x: np.ndarray, used: np.ndarray, lags: np.ndarray) -> np.ndarra
 
 def with_filter(fitted: Sensor, estimates: Sequence[Sequence[FilterNoise | None]]
                 ) -> tuple[Sensor, list[str]]:
-    """
-    Add the effect `bandwidth` with its variance to a fitted unit.
-
-    Parameters
-    ----------
-    fitted
-        The unit.
-    estimates
-        Estimates of the filter by recording and axis.
-
-    Returns
-    -------
-    tuple
-        The unit, and the reasons if it is unchanged: one line for an axis whose noise does not
-        show the filter.
-
-    """
+    """Add the effect `bandwidth` with its variance to a fitted unit."""
     if not fitted.rc_s or not estimates:
         return fitted, []
     ratios, variances = [], []

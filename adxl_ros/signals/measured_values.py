@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Nominal values that a parameter file leaves out, measured from the samples of the sensor."""
 
@@ -52,26 +40,12 @@ _RESISTANCE_OHM = 1.0e4
 
 
 class MeasuredValues(NamedTuple):
-    """
-    What samples show of their sensor.
+    """What samples show of their sensor."""
 
-    Attributes
-    ----------
-    noise_v
-        Standard deviation of one sample at rest by axis, V, (m,).
-    step_v
-        Smallest change of the samples by axis, V, (m,).
-    rc_s
-        Time constant of the filter, s; 0 where the noise shows none.
-    largest_g
-        Magnitude of the largest reading of an axis, g.
-
-    """
-
-    noise_v: np.ndarray
-    step_v: np.ndarray
-    rc_s: float
-    largest_g: float
+    noise_v: np.ndarray  # Standard deviation of one sample at rest by axis, V, (m,)
+    step_v: np.ndarray  # Smallest change of the samples by axis, V, (m,)
+    rc_s: float  # Time constant of the filter, s; 0 where the noise shows none
+    largest_g: float  # Magnitude of the largest reading of an axis, g
 
     @property
     def range_g(self) -> float:
@@ -85,25 +59,7 @@ def measure(time_s: np.ndarray, volts: np.ndarray, sensor: Sensor) -> MeasuredVa
 
     The noise is that of the quietest quarter seconds, so that the samples may hold motion.
 
-    Parameters
-    ----------
-    time_s
-        Stamps, s, (n,).
-    volts
-        Samples, V, (n, m).
-    sensor
-        Nominal zero-g and scale factor, and the sample rate.
-
-    Returns
-    -------
-    MeasuredValues
-        What the samples show.
-
-    Raises
-    ------
-    UserError
-        The samples are too few to show the noise.
-
+    time_s: stamps, s, (n,); volts: samples, V, (n, m).
     """
     cutter = BlockCutter(sensor.rate_hz, len(sensor.axes))
     blocks, spans = cutter.feed(time_s, volts), Spans.for_rate(sensor.rate_hz)
@@ -138,22 +94,7 @@ def _filter_s(volts: np.ndarray, blocks: Blocks, quiet: np.ndarray, sensor: Sens
 
 
 def with_measured_values(sensor: Sensor, values: MeasuredValues) -> Sensor:
-    """
-    Fill in what the parameter file of a sensor leaves out.
-
-    Parameters
-    ----------
-    sensor
-        The sensor, with `unstated` fields.
-    values
-        What its samples show.
-
-    Returns
-    -------
-    Sensor
-        The sensor, in which everything is stated.
-
-    """
+    """Fill in what the parameter file of a sensor leaves out."""
     rc_s = sensor.rc_s if _states_filter(sensor) else values.rc_s
     bandwidth_hz = 0.25 / rc_s if rc_s else sensor.rate_hz / 2
     density = values.noise_v / sensor.nominal_scale_v_per_g / np.sqrt(bandwidth_hz)
@@ -172,26 +113,8 @@ def unit_of_stream(sensor: Sensor, stamps_ns: np.ndarray, accel_mps2: np.ndarray
     """
     Return the unit of a live stream that states nothing of itself.
 
-    Parameters
-    ----------
-    sensor
-        Gives the nominal values. The stream gives the axes where they are not calibrated, the
-        sample rate, and what the parameter file leaves out.
-    stamps_ns
-        Stamps, ns, (n,).
-    accel_mps2
-        Specific force, m/s², (n, 3); an axis that is always 0 is not measured.
-
-    Returns
-    -------
-    tuple
-        The unit, and a line for each measured quantity.
-
-    Raises
-    ------
-    UserError
-        The stamps do not advance, or the samples do not show the noise.
-
+    stamps_ns: stamps, ns, (n,); accel_mps2: specific force, m/s², (n, 3); an axis that is always 0
+    is not measured.
     """
     steps_s = np.diff(stamps_ns) * 1e-9
     if steps_s.sum() < SHORTEST_S:
@@ -218,22 +141,7 @@ def _states_filter(sensor: Sensor) -> bool:
 
 
 def describe(sensor: Sensor, values: MeasuredValues) -> list[str]:
-    """
-    Return what is measured in place of the file, for people.
-
-    Parameters
-    ----------
-    sensor
-        The sensor, with `unstated` fields.
-    values
-        What its samples show.
-
-    Returns
-    -------
-    list
-        One line for each quantity; none where the file states everything.
-
-    """
+    """Return what is measured in place of the file, for people."""
     lines = []
     scale_v_per_g = sensor.nominal_scale_v_per_g
     if 'noise_density_g_per_rthz' in sensor.unstated:

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Drift of a signal at rest that is no noise: with temperature, steady, or in a step."""
 
@@ -44,26 +32,12 @@ class DriftKind(Enum):
 
 @dataclass(frozen=True)
 class Drift:
-    """
-    A drift of one axis; u is its unit.
+    """A drift of one axis; u is its unit."""
 
-    Attributes
-    ----------
-    kind
-        What it follows.
-    size
-        Its size: u/K, u/s, or u.
-    cell
-        Number of the cell at which a step is; 0 for the others.
-    without
-        The noise without the drift.
-
-    """
-
-    kind: DriftKind
-    size: float
-    cell: int
-    without: NoiseFit
+    kind: DriftKind  # What it follows
+    size: float  # Its size: u/K, u/s, or u
+    cell: int  # Number of the cell at which a step is; 0 for the others
+    without: NoiseFit  # The noise without the drift
 
 
 def find_drift(means: np.ndarray, step_s: float, variances: np.ndarray, fit: NoiseFit,

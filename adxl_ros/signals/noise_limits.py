@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Limits of variance and drift that noise explains, from the datasheet or learned."""
 
@@ -60,20 +48,10 @@ END_SIGMAS = 3.5
 
 @dataclass(frozen=True)
 class Noise:
-    """
-    Noise of one sample.
+    """Noise of one sample."""
 
-    Attributes
-    ----------
-    sigma
-        Standard deviation by axis, in the unit of the samples, (m,).
-    tau_s
-        Time constant of the filter that correlates it, s.
-
-    """
-
-    sigma: np.ndarray
-    tau_s: float = 0.0
+    sigma: np.ndarray  # Standard deviation by axis, in the unit of the samples, (m,)
+    tau_s: float = 0.0  # Time constant of the filter that correlates it, s
 
 
 def datasheet_noise(sensor: Sensor) -> Noise:
@@ -83,24 +61,13 @@ def datasheet_noise(sensor: Sensor) -> Noise:
 
 @dataclass(frozen=True)
 class Spans:
-    """
-    Lengths of windows in blocks.
+    """Lengths of windows in blocks."""
 
-    Attributes
-    ----------
-    size, dt_s
-        Samples in a block, and the time between them, s.
-    window
-        Blocks of the window of a variance; odd, so that one is in the middle.
-    half
-        Blocks of the shortest halves whose means are compared.
-
-    """
-
+    # size, dt_s: Samples in a block, and the time between them, s
     size: int
     dt_s: float
-    window: int
-    half: int
+    window: int  # Blocks of the window of a variance; odd, so that one is in the middle
+    half: int  # Blocks of the shortest halves whose means are compared
 
     @staticmethod
     def for_rate(rate_hz: float) -> Spans:
@@ -123,23 +90,13 @@ class Spans:
 
 @dataclass(frozen=True)
 class NoiseLimits:
-    """
-    Limits of what noise explains, for m axes.
+    """Limits of what noise explains, for m axes."""
 
-    Attributes
-    ----------
-    variance
-        Largest variance within a window, (m,).
-    drift
-        Standard deviation of the difference of two neighbouring halves, by octaves of their
-        length, (DRIFT_OCTAVES, m).
-    step
-        Largest change of a mean by rounding of the ADC, where the input does not change, (m,).
-
-    """
-
-    variance: np.ndarray
+    variance: np.ndarray  # Largest variance within a window, (m,)
+    # Standard deviation of the difference of two neighbouring halves, by octaves of their length,
+    # (DRIFT_OCTAVES, m)
     drift: np.ndarray
+    # Largest change of a mean by rounding of the ADC, where the input does not change, (m,)
     step: np.ndarray
 
     def larger(self, other: NoiseLimits) -> NoiseLimits:
@@ -162,20 +119,7 @@ class NoiseLimits:
         """
         Return whether two sequences of blocks differ by more than noise.
 
-        Parameters
-        ----------
-        before, after
-            Means of blocks, (k, m) each.
-        spans
-            Lengths for the rate of the stream.
-        sigmas
-            Standard deviations up to which a difference is noise.
-
-        Returns
-        -------
-        bool
-            Whether the means of an axis differ by more.
-
+        before, after: means of blocks, (k, m) each.
         """
         white = self.block_noise(spans) ** 2 * (1 / len(before) + 1 / len(after))
         allowed = sigmas * np.sqrt(white + self.flicker ** 2) + self.step

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Noise parameters under the names and in the units of other software, ready to paste."""
 
@@ -28,23 +16,11 @@ _PX4_HZ = 100.0
 
 @dataclass(frozen=True)
 class Setting:
-    """
-    A line of another program's settings.
+    """A line of another program's settings."""
 
-    Attributes
-    ----------
-    name
-        Name of the setting.
-    values
-        Its values: one, or nine of a matrix.
-    unit
-        Their unit, and what they are.
-
-    """
-
-    name: str
-    values: tuple[float, ...]
-    unit: str
+    name: str  # Name of the setting
+    values: tuple[float, ...]  # Its values: one, or nine of a matrix
+    unit: str  # Their unit, and what they are
 
     def lines(self) -> list[str]:
         """Return the setting in YAML, with its unit as a comment."""

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 White noise, bias instability and random walk of a signal at rest, with intervals.
@@ -75,20 +63,11 @@ FLOOR = float(np.sqrt(2 * np.log(2) / np.pi))
 
 
 class Estimate(NamedTuple):
-    """
-    A value with its interval.
+    """A value with its interval."""
 
-    Attributes
-    ----------
-    value
-        The most likely value.
-    low, high
-        Ends of the 90 % interval. Where `low` is 0 the term is not seen, and `high` is an upper
-        limit.
-
-    """
-
-    value: float
+    value: float  # The most likely value
+    # low, high: Ends of the 90 % interval. Where `low` is 0 the term is not seen, and `high` is an
+    # upper limit.
     low: float
     high: float
 
@@ -103,61 +82,32 @@ class Estimate(NamedTuple):
 
 
 class Octave(NamedTuple):
-    """
-    An octave of frequency whose power contradicts the fitted terms.
+    """An octave of frequency whose power contradicts the fitted terms."""
 
-    Attributes
-    ----------
-    low_hz, high_hz
-        Its bounds, Hz.
-    ratio
-        Measured power divided by the fitted power.
-
-    """
-
+    # low_hz, high_hz: Its bounds, Hz
     low_hz: float
     high_hz: float
-    ratio: float
+    ratio: float  # Measured power divided by the fitted power
 
 
 @dataclass(frozen=True)
 class NoiseFit:
-    """
-    The noise of one axis; u is the unit of the signal.
+    """The noise of one axis; u is the unit of the signal."""
 
-    Attributes
-    ----------
-    white
-        White noise N, u/√Hz: the density over positive and negative frequencies is N².
-    instability
-        Bias instability B, u: the density is B²/(2π·f).
-    walk
-        Random walk K, u/√s: the density is K²/(2π·f)², or K²/((2π·f)² + 1/T²) with bounds.
-    correlation
-        Correlation time T of a bounded walk (first-order Gauss-Markov), s, whose standard
-        deviation is K·√(T/2); None where no bounds show.
-    highest
-        Number of cosine coefficients of the fit, from the lowest.
-    highest_hz
-        Frequency of the last one, Hz.
-    kept
-        Groups of coefficients without lines, bool.
-    octaves
-        Octaves that contradict the fit. Above `highest_hz` only those with too much power.
-    log_likelihood
-        Largest log likelihood, up to a constant.
-
-    """
-
+    # White noise N, u/√Hz: the density over positive and negative frequencies is N²
     white: Estimate
-    instability: Estimate
+    instability: Estimate  # Bias instability B, u: the density is B²/(2π·f)
+    # Random walk K, u/√s: the density is K²/(2π·f)², or K²/((2π·f)² + 1/T²) with bounds
     walk: Estimate
+    # Correlation time T of a bounded walk (first-order Gauss-Markov), s, whose standard deviation
+    # is K·√(T/2); None where no bounds show
     correlation: Estimate | None
-    highest: int
-    highest_hz: float
-    kept: np.ndarray
+    highest: int  # Number of cosine coefficients of the fit, from the lowest
+    highest_hz: float  # Frequency of the last one, Hz
+    kept: np.ndarray  # Groups of coefficients without lines, bool
+    # Octaves that contradict the fit. Above `highest_hz` only those with too much power.
     octaves: tuple[Octave, ...]
-    log_likelihood: float
+    log_likelihood: float  # Largest log likelihood, up to a constant
 
     @property
     def squares(self) -> np.ndarray:
@@ -184,26 +134,12 @@ class NoiseFit:
 
 @dataclass(frozen=True)
 class _Groups:
-    """
-    Groups of neighbouring coefficients.
+    """Groups of neighbouring coefficients."""
 
-    Attributes
-    ----------
-    power
-        Mean square of the coefficients, (g,).
-    count
-        Number of coefficients, (g,).
-    shapes
-        Their mean variance for N², B² and K² of 1, (g, 3).
-    first
-        Number of the first coefficient, from 1, (g,).
-
-    """
-
-    power: np.ndarray
-    count: np.ndarray
-    shapes: np.ndarray
-    first: np.ndarray
+    power: np.ndarray  # Mean square of the coefficients, (g,)
+    count: np.ndarray  # Number of coefficients, (g,)
+    shapes: np.ndarray  # Their mean variance for N², B² and K² of 1, (g, 3)
+    first: np.ndarray  # Number of the first coefficient, from 1, (g,)
 
     def where(self, kept: np.ndarray) -> _Groups:
         """Return the groups that are marked, (g,) bool."""
@@ -419,22 +355,7 @@ def _fit(groups: _Groups, fixed: int | None = None, value: float = 0.0
     """
     Maximise the likelihood over N², B² and K² of 0 or more by Fisher scoring.
 
-    Parameters
-    ----------
-    groups
-        The coefficients.
-    fixed
-        Index of a term that keeps `value`; None for none.
-    value
-        The square of that term.
-
-    Returns
-    -------
-    theta : ndarray
-        N², B² and K², (3,).
-    likelihood : float
-        The log likelihood there.
-
+    returns: n², B² and K², (3,). The log likelihood there.
     """
     free = [term for term in range(3) if term != fixed]
     offset = groups.shapes[:, fixed] * value if fixed is not None else np.zeros(len(groups.power))

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The sensor of a recording: its parameter file, and what is measured where the file is silent."""
 
@@ -27,28 +15,7 @@ import numpy as np
 
 
 def load_sensor(params: str | None, read: Recording) -> Sensor:
-    """
-    Load the parameter file of a recording.
-
-    Parameters
-    ----------
-    params
-        The file; None takes the nominal sensor. A recording in m/s² that states nothing of its
-        sensor is of any IMU.
-    read
-        The recording, or its first block.
-
-    Returns
-    -------
-    Sensor
-        The sensor. Values that the file leaves out are in `unstated`.
-
-    Raises
-    ------
-    UserError
-        The file cannot be read, or something in it is wrong.
-
-    """
+    """Load the parameter file of a recording."""
     if params is None:
         is_of_nominal = read.sensor_columns[0] in VOLTS or \
             read.stream_info.nominal_values(read.axes)
@@ -58,27 +25,7 @@ def load_sensor(params: str | None, read: Recording) -> Sensor:
 
 
 def measure_unstated(sensor: Sensor, read: Recording) -> tuple[Sensor, list[str]]:
-    """
-    Measure from a recording its sample rate, and what the parameter file of its sensor leaves out.
-
-    Parameters
-    ----------
-    sensor
-        The sensor.
-    read
-        The recording, or its first block.
-
-    Returns
-    -------
-    tuple
-        The sensor, in which everything is stated, and a line for each measured quantity.
-
-    Raises
-    ------
-    UserError
-        The samples are too few to show the noise.
-
-    """
+    """Measure from a recording its rate and what the parameter file leaves out."""
     name = Path(read.path).name
     if len(read) > 1:
         sensor = replace(sensor, rate_hz=round(read.rate_hz, 6),
@@ -110,13 +57,7 @@ class BeyondRange:
         """
         Count further samples.
 
-        Parameters
-        ----------
-        volts
-            Samples, V, (n, m).
-        sensor
-            The sensor, with its range.
-
+        volts: samples, V, (n, m).
         """
         readings_g = np.abs(volts - sensor.nominal_zero_g_v) / sensor.nominal_scale_v_per_g
         beyond = readings_g > sensor.range_g

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What a recording holds, and what is wrong with its stamps and samples, read in blocks."""
 
@@ -70,160 +58,64 @@ _LARGEST_CLOCK_DRIFT = 0.01
 
 @dataclass(frozen=True)
 class AxisRange:
-    """
-    The samples of one axis.
+    """The samples of one axis."""
 
-    Attributes
-    ----------
-    name
-        Its column.
-    lowest_mps2, highest_mps2
-        Its extreme values, m/s².
-    clipped
-        Times at which it stays at an extreme value in motion.
-    is_stuck
-        Whether it never changes.
-    held_s
-        Longest time in which it does not change although it usually does, s; 0 for none.
-
-    """
-
-    name: str
+    name: str  # Its column
+    # lowest_mps2, highest_mps2: Its extreme values, m/s²
     lowest_mps2: float
     highest_mps2: float
-    clipped: int
-    is_stuck: bool
+    clipped: int  # Times at which it stays at an extreme value in motion
+    is_stuck: bool  # Whether it never changes
+    # Longest time in which it does not change although it usually does, s; 0 for none
     held_s: float
 
 
 @dataclass(frozen=True)
 class LogDelay:
-    """
-    Log time minus header stamp of the samples of a bag.
+    """Log time minus header stamp of the samples of a bag."""
 
-    Attributes
-    ----------
-    median_s
-        Median, s.
-    spread_s
-        Time from the 1st to the 99th percentile without drift, s.
-    drift_ppm
-        Its drift by log time, 10⁻⁶.
-    is_simulated
-        Whether it drifts by more than any clock does, and not in one step: header time is
-        simulated, and its pace varies.
-
-    """
-
-    median_s: float
-    spread_s: float
-    drift_ppm: float
+    median_s: float  # Median, s
+    spread_s: float  # Time from the 1st to the 99th percentile without drift, s
+    drift_ppm: float  # Its drift by log time, 10⁻⁶
+    # Whether it drifts by more than any clock does, and not in one step: header time is simulated,
+    # and its pace varies
     is_simulated: bool
 
 
 @dataclass(frozen=True)
 class RecordingContents:
-    """
-    What a recording holds.
+    """What a recording holds."""
 
-    Attributes
-    ----------
-    path
-        The recording.
-    samples
-        Number of samples.
-    span_s
-        Time from the first to the last sample, s.
-    rate_hz
-        Usual rate, Hz.
-    jitter_s
-        Rms deviation of the steps of the stamps, without gaps, s.
-    burst
-        Samples of a burst of stamps; 1 for none.
-    missing
-        Missing samples.
-    gaps
-        Number of gaps.
-    longest_gap_s
-        Longest gap, s; 0 for none.
-    bad_stamps
-        Samples whose stamp does not increase.
-    axes
-        Ranges by axis.
-    held_s
-        Longest time in which no axis changes although the samples usually do, s; 0 for none.
-    rest_share
-        Share of the time at rest.
-    longest_rest_s
-        Longest rest, s.
-    rests
-        Number of rests.
-    poses
-        Number of different orientations among them.
-    length_g
-        Median length of the specific force at rest, g; None without three axes or rests.
-    reference_ranges
-        Lowest and highest value of each reference, by column.
-    reference_means
-        Mean of each reference, by column.
-    delay
-        Log time minus header stamp; None where there is no bag.
-    remarks
-        What was assumed or left out in reading.
-    cut
-        Where a damaged file ends; empty if it is whole.
-
-    """
-
-    path: str
-    samples: int
-    span_s: float
-    rate_hz: float
-    jitter_s: float
-    burst: int
-    missing: int
-    gaps: int
-    longest_gap_s: float
-    bad_stamps: BadStamps
-    axes: tuple[AxisRange, ...]
+    path: str  # The recording
+    samples: int  # Number of samples
+    span_s: float  # Time from the first to the last sample, s
+    rate_hz: float  # Usual rate, Hz
+    jitter_s: float  # Rms deviation of the steps of the stamps, without gaps, s
+    burst: int  # Samples of a burst of stamps; 1 for none
+    missing: int  # Missing samples
+    gaps: int  # Number of gaps
+    longest_gap_s: float  # Longest gap, s; 0 for none
+    bad_stamps: BadStamps  # Samples whose stamp does not increase
+    axes: tuple[AxisRange, ...]  # Ranges by axis
+    # Longest time in which no axis changes although the samples usually do, s; 0 for none
     held_s: float
-    rest_share: float
-    longest_rest_s: float
-    rests: int
-    poses: int
+    rest_share: float  # Share of the time at rest
+    longest_rest_s: float  # Longest rest, s
+    rests: int  # Number of rests
+    poses: int  # Number of different orientations among them
+    # Median length of the specific force at rest, g; None without three axes or rests
     length_g: float | None
+    # Lowest and highest value of each reference, by column
     reference_ranges: dict[str, tuple[float, float]]
-    reference_means: dict[str, float]
-    delay: LogDelay | None
-    remarks: tuple[str, ...]
-    cut: str
+    reference_means: dict[str, float]  # Mean of each reference, by column
+    delay: LogDelay | None  # Log time minus header stamp; None where there is no bag
+    remarks: tuple[str, ...]  # What was assumed or left out in reading
+    cut: str  # Where a damaged file ends; empty if it is whole
 
 
 def examine(blocks: Iterable[Recording], unit_of: Callable[[Recording], Sensor],
             delay: LogDelay | None) -> RecordingContents:
-    """
-    Find what a recording holds.
-
-    Parameters
-    ----------
-    blocks
-        Its blocks, without samples whose stamp does not increase.
-    unit_of
-        Returns the nominal sensor of the recording from its first block.
-    delay
-        Its log times; None where there is no bag.
-
-    Returns
-    -------
-    RecordingContents
-        Stamps, ranges, rests and references.
-
-    Raises
-    ------
-    UserError
-        The recording cannot be read, or has fewer than two samples.
-
-    """
+    """Find what a recording holds."""
     stamps = values = rests = block = unit = None
     references: dict[str, _Reference] = {}
     for block in blocks:

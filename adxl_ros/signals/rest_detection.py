@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Rest detection: the intervals of a stream in which the sensor does not move.
@@ -88,24 +76,15 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Rest:
-    """
-    A rest of a stream.
+    """A rest of a stream."""
 
-    Attributes
-    ----------
-    start, stop
-        First row of the rest and the row after its last.
-    time_start_s, time_stop_s
-        Times of the first and the last row, s.
-    disturbed_s
-        Times between which it was disturbed, or has no samples, s.
-
-    """
-
+    # start, stop: First row of the rest and the row after its last
     start: int
     stop: int
+    # time_start_s, time_stop_s: Times of the first and the last row, s
     time_start_s: float
     time_stop_s: float
+    # Times between which it was disturbed, or has no samples, s
     disturbed_s: tuple[tuple[float, float], ...] = ()
 
     @property
@@ -116,47 +95,18 @@ class Rest:
 
 @dataclass(frozen=True)
 class Stillness:
-    """
-    Whether the newest samples are at rest, with the statistic that decides it.
+    """Whether the newest samples are at rest, with the statistic that decides it."""
 
-    Attributes
-    ----------
-    at_rest
-        Whether all statistics are within their limits.
-    axis
-        Index of the axis with the largest motion.
-    statistic
-        'rms' of the samples about their mean over 0.25 s, or 'drift' of the mean over 0.5 s.
-    value, limit
-        The statistic and its limit, in the unit of the samples.
-
-    """
-
-    at_rest: bool
-    axis: int
+    at_rest: bool  # Whether all statistics are within their limits
+    axis: int  # Index of the axis with the largest motion
+    # 'rms' of the samples about their mean over 0.25 s, or 'drift' of the mean over 0.5 s
     statistic: str
+    # value, limit: The statistic and its limit, in the unit of the samples
     value: float
     limit: float
 
     def describe(self, unit: str, scale: float = 1.0, axes: str = AXES) -> str:
-        """
-        Return one line with the statistic and its limit.
-
-        Parameters
-        ----------
-        unit
-            Name of the unit of the line.
-        scale
-            Value in that unit of 1 in the unit of the samples.
-        axes
-            Letters of the axes.
-
-        Returns
-        -------
-        str
-            For example 'moving: 0.2 m/s² on x, must be below 0.1'.
-
-        """
+        """Return one line with the statistic and its limit."""
         state = 'at rest' if self.at_rest else \
             {'rms': 'moving', 'drift': 'drifting'}[self.statistic]
         return (f'{state}: {self.value * scale:.2g} {unit} on {axes[self.axis]}, '
@@ -172,24 +122,7 @@ class RestFinder:
     """
     Finds the rests in a stream while it runs.
 
-    Parameters
-    ----------
-    rate_hz
-        Nominal sample rate, Hz, 1 to 10 000.
-    axes
-        Number of measured axes, m.
-    noise
-        Noise of a sample; None learns it.
-    learn
-        Whether to learn the noise, with `noise` as its lower bound. A unit in a recording may be
-        noisier than its parameter file states. A live stage has no time to learn.
-    angle_tolerance_rad
-        Largest distance of each of two encoder angles from the middle of its values in a rest,
-        rad. None for a stream without angles.
-    min_rest_s
-        Shortest rest, s. By default 1.4 s where noise is learned and there are no angles, else
-        0.6 s.
-
+    axes: number of measured axes, m.
     """
 
     def __init__(self, rate_hz: float, axes: int, noise: Noise | None = None,
@@ -214,15 +147,8 @@ class RestFinder:
         """
         Add the next rows of the stream.
 
-        Parameters
-        ----------
-        time_s
-            Time of each row, s, (n,).
-        samples
-            Rows of the stream, (n, m).
-        angles_rad
-            Encoder angles, rad, (n, 2), if the stream has them.
-
+        time_s: time of each row, s, (n,); samples: rows of the stream, (n, m); angles_rad: encoder
+        angles, rad, (n, 2), if the stream has them.
         """
         self._parts.append(self._cutter.feed(time_s, samples, angles_rad))
 
@@ -395,43 +321,21 @@ class RestFinder:
 
 
 def recording_finder(unit: Sensor, has_angles: bool) -> RestFinder:
-    """
-    Return the finder of rests in a recording that all tools use.
-
-    Parameters
-    ----------
-    unit
-        The sensor of the recording, with its sample rate; samples are in volts.
-    has_angles
-        Whether the recording has stage angles.
-
-    Returns
-    -------
-    RestFinder
-        A finder that learns the noise, which is at least that of the unit's file.
-
-    """
+    """Return the finder of rests in a recording that all tools use."""
     noise = None if 'noise_density_g_per_rthz' in unit.unstated else datasheet_noise(unit)
     tolerance_rad = max(unit.stage_resolution_rad, SAME_ANGLE_RAD) if has_angles else None
     return RestFinder(unit.rate_hz, len(unit.axes), noise, True, tolerance_rad)
 
 
 class RecordedRests:
-    """
-    Finds the rests of a recording of any length; the memory is that of an hour.
-
-    Attributes
-    ----------
-    detected
-        Rests of all blocks up to the last `take`, each with its mean, V.
-
-    """
+    """Finds the rests of a recording of any length; the memory is that of an hour."""
 
     def __init__(self, unit: Sensor, first: Recording) -> None:
         self._unit = replace(unit, rate_hz=first.rate_hz)
         self._has_angles = set(_ANGLES) <= set(first.columns)
         self._finder = recording_finder(self._unit, self._has_angles)
         self._taken_s = float(first.time_s[0])
+        # Rests of all blocks up to the last `take`, each with its mean, V
         self.detected: list[tuple[Rest, np.ndarray]] = []
 
     def feed(self, block: Recording) -> None:
@@ -465,18 +369,8 @@ def find_rests(time_s: np.ndarray, samples: np.ndarray, rate_hz: float,
     """
     Find the rests of a recording.
 
-    Parameters
-    ----------
-    time_s, samples, angles_rad
-        Time s (n,), samples (n, m) in any unit, encoder angles rad (n, 2).
-    rate_hz, noise, learn, angle_tolerance_rad, min_rest_s
-        As for `RestFinder`.
-
-    Returns
-    -------
-    list
-        Rests in the order of time.
-
+    time_s, samples, angles_rad: time s (n,), samples (n, m) in any unit, encoder angles rad (n,
+    2).
     """
     finder = RestFinder(rate_hz, samples.shape[1], noise, learn, angle_tolerance_rad, min_rest_s)
     finder.feed(time_s, samples, angles_rad)
@@ -488,27 +382,9 @@ def rest_means(time_s: np.ndarray, samples: np.ndarray, rests: list[Rest], rate_
     """
     Average the rests of a recording, with the same results as `RestFinder.means`.
 
-    Parameters
-    ----------
-    time_s, samples
-        Time s (n,), samples (n, m).
-    rests
-        Rests in rows of the recording.
-    rate_hz, noise
-        As for `RestFinder`.
-
-    Returns
-    -------
-    tuple
-        Mean and its standard deviation, (k, m) each, in the unit of the samples. The standard
-        deviation is that by the scatter between parts of the rest, and at least that of the given
-        noise.
-
-    Raises
-    ------
-    UserError
-        A rest has no samples.
-
+    time_s, samples: time s (n,), samples (n, m); returns: mean and its standard deviation, (k, m)
+    each, in the unit of the samples. The standard deviation is that by the scatter between parts
+    of the rest, and at least that of the given noise.
     """
     parts = [BlockCutter(rate_hz, samples.shape[1]).feed(
         time_s[rest.start:rest.stop], samples[rest.start:rest.stop]) for rest in rests]

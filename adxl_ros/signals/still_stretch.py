@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The longest part of a recording in which the sensor rests, read in blocks."""
 
@@ -43,51 +31,24 @@ SHORTEST_S = 10.0
 
 @dataclass(frozen=True)
 class StillStretch:
-    """
-    The samples of the longest rest.
+    """The samples of the longest rest."""
 
-    Attributes
-    ----------
-    start_s, stop_s
-        Its first and last stamp, s.
-    rate_hz
-        Sample rate by its stamps, Hz.
-    count
-        Number of its samples.
-    filled
-        Samples among them that were missing, and lie on a line between their neighbours.
-    allan
-        Their Allan deviation, m/s².
-    step_s
-        Length of a cell, s.
-    means
-        Means of the cells by axis, m/s², (k, m).
-    temperature_c
-        Mean temperature of the cells, °C, (k,); None where it is not measured throughout.
-    sample_std
-        Standard deviation of a sample within some seconds by axis, m/s², (m,).
-    resolution
-        Smallest change of a sample by axis, m/s², (m,).
-    recorded_s
-        Time of the whole recording, s.
-    motion_s
-        Times at which it moves or has long gaps, s, (j, 2).
-
-    """
-
+    # start_s, stop_s: Its first and last stamp, s
     start_s: float
     stop_s: float
-    rate_hz: float
-    count: int
-    filled: int
-    allan: AllanDeviation
-    step_s: float
-    means: np.ndarray
+    rate_hz: float  # Sample rate by its stamps, Hz
+    count: int  # Number of its samples
+    filled: int  # Samples among them that were missing, and lie on a line between their neighbours
+    allan: AllanDeviation  # Their Allan deviation, m/s²
+    step_s: float  # Length of a cell, s
+    means: np.ndarray  # Means of the cells by axis, m/s², (k, m)
+    # Mean temperature of the cells, °C, (k,); None where it is not measured throughout
     temperature_c: np.ndarray | None
+    # Standard deviation of a sample within some seconds by axis, m/s², (m,)
     sample_std: np.ndarray
-    resolution: np.ndarray
-    recorded_s: float
-    motion_s: list[tuple[float, float]]
+    resolution: np.ndarray  # Smallest change of a sample by axis, m/s², (m,)
+    recorded_s: float  # Time of the whole recording, s
+    motion_s: list[tuple[float, float]]  # Times at which it moves or has long gaps, s, (j, 2)
 
     @property
     def span_s(self) -> float:
@@ -107,24 +68,6 @@ def longest_rest(read: Callable[[], Iterable[Recording]], unit_of: Callable[[Rec
 
     A recording at rest throughout is read once. Any other is read twice, and the memory is
     bounded in both cases.
-
-    Parameters
-    ----------
-    read
-        Opens the recording and returns its blocks.
-    unit_of
-        Returns the nominal sensor of the recording by a block.
-
-    Returns
-    -------
-    StillStretch
-        The longest rest.
-
-    Raises
-    ------
-    UserError
-        The recording cannot be read, does not rest, or an axis does not change.
-
     """
     survey = _read(read, unit_of, None)
     rests = [rest for rest, _ in survey.rests.detected]

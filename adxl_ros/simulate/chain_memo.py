@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Signals of one manoeuvre that many simulations share, because only later places differ."""
 
@@ -33,24 +21,7 @@ class ChainMemo:
         self._kept: dict[str, dict[Hashable, object]] = {}
 
     def __call__(self, part: str, key: Hashable, compute: Callable[[], _Result]) -> _Result:
-        """
-        Return a result that was computed before, or compute it.
-
-        Parameters
-        ----------
-        part
-            Name of the part.
-        key
-            Everything that the result depends on.
-        compute
-            Computes the result.
-
-        Returns
-        -------
-        object
-            The result; several callers share it.
-
-        """
+        """Return a result that was computed before, or compute it."""
         kept = self._kept.setdefault(part, {})
         # The entry moves to the end, so that the one that was not used for longest is dropped.
         kept[key] = kept.pop(key) if key in kept else compute()

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Motions that follow the references of a recording."""
 
@@ -39,25 +27,8 @@ def motion_from_force(path: str | os.PathLike, resampled: bool, epoch_ns: int = 
     """
     Make a motion from the specific force of a recording.
 
-    Parameters
-    ----------
-    path
-        Recording with specific force in the case frame, m/s².
-    resampled
-        Whether the chain runs at the rate of the samples; otherwise at 1 kHz at least.
-    epoch_ns
-        Origin of the times of the motion, ns: that of the recording it belongs to.
-
-    Returns
-    -------
-    tuple
-        The motion, and the time at which it begins, s.
-
-    Raises
-    ------
-    UserError
-        The recording has fewer than four samples.
-
+    path: recording with specific force in the case frame, m/s²; returns: the motion, and the time
+    at which it begins, s.
     """
     time_s, force_mps2 = recording.read_ideal(path, epoch_ns)
     if len(time_s) < _MIN_FORCE_SAMPLES:
@@ -72,27 +43,7 @@ def motion_from_force(path: str | os.PathLike, resampled: bool, epoch_ns: int = 
 
 
 def motion_from_references(read: Recording, sensor: Sensor) -> Motion:
-    """
-    Make a motion from the stage angles, temperature and supply of a recording.
-
-    Parameters
-    ----------
-    read
-        The recording.
-    sensor
-        The unit with the resolution of its stage.
-
-    Returns
-    -------
-    Motion
-        A motion that begins with the recording.
-
-    Raises
-    ------
-    UserError
-        The recording has no stage angles, or an angle jumps.
-
-    """
+    """Make a motion from the stage angles, temperature and supply of a recording."""
     for name in ('alpha_rad', 'beta_rad'):
         if name not in read.columns or np.isnan(read.columns[name]).all():
             raise UserError(f'{read.path}: no stage angle {name} to follow; for specific force '

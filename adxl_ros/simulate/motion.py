@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Manoeuvres: motion of the joints of the stage, and surroundings, over time."""
 
@@ -36,34 +24,16 @@ class Path(Protocol):
         """
         Return a derivative of the quantity.
 
-        Parameters
-        ----------
-        time_s
-            Times, s, (n,). Outside of its own range the quantity is at rest.
-        order
-            Order of the derivative: 0, 1 or 2.
-
-        Returns
-        -------
-        ndarray
-            Derivative, (n,).
-
+        time_s: times, s, (n,). Outside of its own range the quantity is at rest.; returns:
+        derivative, (n,).
         """
 
 
 @dataclass(frozen=True)
 class Held:
-    """
-    A constant quantity.
+    """A constant quantity."""
 
-    Attributes
-    ----------
-    value
-        The constant.
-
-    """
-
-    value: float = 0.0
+    value: float = 0.0  # The constant
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
         """Return a derivative; see `Path`."""
@@ -83,15 +53,8 @@ class Knots:
         """
         Interpolate knots.
 
-        Parameters
-        ----------
-        time_s
-            Ascending times of the knots, s, (k,).
-        position
-            Values at the knots, (k,).
-        velocity
-            First derivatives at the knots, (k,); 0 unless given. The second are 0.
-
+        time_s: ascending times of the knots, s, (k,); position: values at the knots, (k,);
+        velocity: first derivatives at the knots, (k,); 0 unless given. The second are 0.
         """
         rates = np.zeros(len(time_s)) if velocity is None else np.asarray(velocity, float)
         derivatives = np.column_stack([position, rates, np.zeros(len(time_s))])
@@ -110,31 +73,18 @@ class Knots:
 
 @dataclass(frozen=True)
 class Motion:
-    """
-    A manoeuvre from time 0 on.
+    """A manoeuvre from time 0 on."""
 
-    Attributes
-    ----------
-    duration_s
-        Duration, s.
-    alpha, beta, shift
-        Joints, rad, rad and m.
-    temperature_c, supply_v
-        Temperature, °C, and supply voltage, V, if they change or are measured; None for the
-        nominal ones.
-    force
-        Maps times, s, (n,), to specific force in the case frame, m/s², three components, where
-        no stage moves the sensor. The joints then have no meaning.
-    internal_rate_hz
-        Lowest rate at which the chain runs, Hz.
-
-    """
-
-    duration_s: float
+    duration_s: float  # Duration, s
+    # alpha, beta, shift: Joints, rad, rad and m
     alpha: Path = Held()
     beta: Path = Held()
     shift: Path = Held()
+    # temperature_c, supply_v: Temperature, °C, and supply voltage, V, if they change or are
+    # measured; None for the nominal ones
     temperature_c: Path | None = None
     supply_v: Path | None = None
+    # Maps times, s, (n,), to specific force in the case frame, m/s², three components, where no
+    # stage moves the sensor. The joints then have no meaning.
     force: Callable[[np.ndarray], Components] | None = None
-    internal_rate_hz: float = INTERNAL_RATE_HZ
+    internal_rate_hz: float = INTERNAL_RATE_HZ  # Lowest rate at which the chain runs, Hz

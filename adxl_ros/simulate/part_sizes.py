@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Sizes of the parts of a sensor: what each changes in the output, by simulation."""
 
@@ -50,15 +38,7 @@ class PartSizes:
     """Simulates a sensor in the manoeuvre `rich` with and without parts of it."""
 
     def __init__(self, sensor: Sensor) -> None:
-        """
-        Prepare the comparison.
-
-        Parameters
-        ----------
-        sensor
-            The unit.
-
-        """
+        """Prepare the comparison."""
         rich = TRAJECTORIES['rich'](np.random.default_rng(_SEED))
         self._sensor = replace(sensor, rate_hz=min(sensor.rate_hz, _RATE_HZ))
         self._motion: Motion = replace(rich, internal_rate_hz=self._sensor.rate_hz)
@@ -68,22 +48,7 @@ class PartSizes:
 
     def effects_mg(self, effects: Collection[str], show: Callable[[float], None]
                    ) -> dict[str, float]:
-        """
-        Return the size of each effect.
-
-        Parameters
-        ----------
-        effects
-            Names of effects of the sensor.
-        show
-            Takes the fraction that is done.
-
-        Returns
-        -------
-        dict
-            Rms over samples and axes of what the effect changes, mg, by name.
-
-        """
+        """Return the size of each effect."""
         sizes = {}
         for number, name in enumerate(effects):
             show(number / len(effects))
@@ -97,23 +62,7 @@ class PartSizes:
         return self._change_mg(self._quiet(), _unfiltered(self._quiet()))
 
     def remaining_mg(self, held: Collection[str], is_filtered: bool) -> float:
-        """
-        Return the size of all that some effects leave out.
-
-        Parameters
-        ----------
-        held
-            Names of the effects that are there.
-        is_filtered
-            Whether the RC filter is there.
-
-        Returns
-        -------
-        float
-            Rms over samples and axes of the change of the output, mg, without white noise and
-            steps of the ADC.
-
-        """
+        """Return the size of all that some effects leave out."""
         sensor = self._quiet()
         other = _without(sensor, [name for name in sensor.effects if name not in held])
         return self._change_mg(sensor, other if is_filtered else _unfiltered(other))

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The signal chain over time: volts of a sensor during a manoeuvre, block by block."""
 
@@ -78,26 +66,7 @@ class Response:
     """
 
     def __init__(self, sensor: Sensor, motion: Motion, seed: int, begin_s: float = 0.0) -> None:
-        """
-        Put the sensor, settled, at the beginning of a manoeuvre.
-
-        Parameters
-        ----------
-        sensor
-            The unit with its effects.
-        motion
-            The manoeuvre.
-        seed
-            Seed of all randomness; each effect has its own generator.
-        begin_s
-            Stamp of the first sample, s.
-
-        Raises
-        ------
-        UserError
-            An effect needs the stage, the ADC or the noise, which is missing.
-
-        """
+        """Put the sensor, settled, at the beginning of a manoeuvre."""
         check_needs(sensor, motion)
         self.sensor, self._motion, self._begin_s = sensor, motion, begin_s
         self._seed = seed
@@ -125,16 +94,8 @@ class Response:
         """
         Advance to the next samples.
 
-        Parameters
-        ----------
-        stamps_s
-            Stamps of the samples, s, (n,), ascending and later than those of the last call.
-
-        Returns
-        -------
-        ndarray
-            Volts of the ADC, V, (n, m).
-
+        stamps_s: stamps of the samples, s, (n,), ascending and later than those of the last call;
+        returns: volts of the ADC, V, (n, m).
         """
         if not len(stamps_s):
             return np.zeros((0, len(self.sensor.axes)))
@@ -161,18 +122,8 @@ class Response:
         """
         Simulate a whole recording.
 
-        Parameters
-        ----------
-        stamps_s
-            Stamps of all samples, s, (n,), ascending.
-        memo
-            Signals of earlier simulations of this manoeuvre; this one adds its own.
-
-        Returns
-        -------
-        ndarray
-            Volts of the ADC, V, (n, m). Nothing can follow.
-
+        stamps_s: stamps of all samples, s, (n,), ascending; returns: volts of the ADC, V, (n, m).
+        Nothing can follow.
         """
         steps = ceil((float(stamps_s[-1]) - self._begin_s) / self._step_s) + POINTS
         if steps > _WHOLE_STEPS:
@@ -364,19 +315,7 @@ class EffectState:
     """An effect of the sensor: its parameters, its memory and its random generator."""
 
     def __init__(self, name: str, values: Parameters, seed: int) -> None:
-        """
-        Prepare the effect before its first sample.
-
-        Parameters
-        ----------
-        name
-            Name of the effect.
-        values
-            Values of its parameters.
-        seed
-            Seed of all randomness.
-
-        """
+        """Prepare the effect before its first sample."""
         effect = effect_named(name)
         sizes = [p for p in effect.parameters if p.role is not Role.SHAPE]
         # At the neutral values of its sizes and limits an effect does nothing.
@@ -410,22 +349,7 @@ def lagrange_weights(position: np.ndarray) -> np.ndarray:
 
 
 def check_needs(sensor: Sensor, motion: Motion) -> None:
-    """
-    Refuse an effect that has nothing to act on.
-
-    Parameters
-    ----------
-    sensor
-        The unit with its effects.
-    motion
-        The manoeuvre.
-
-    Raises
-    ------
-    UserError
-        An effect needs the stage, the filter, the ADC or the noise, which is missing.
-
-    """
+    """Refuse an effect that has nothing to act on."""
     missing = {}
     if motion.force is not None:
         missing[Need.STAGE] = 'this manoeuvre has none, only specific force'

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The signal chain as a call for simulators: one sample of one or many sensors at a time."""
 
@@ -49,39 +37,17 @@ class SensorModel:
     All sensors of a batch are copies of one unit with noise of their own. The chain runs at the
     time steps of the simulator. Otherwise it is that of `simulate`, and one sensor gives the same
     readings with the same seed.
-
-    Attributes
-    ----------
-    sensor
-        The unit.
-    left_out
-        Reason by name of an effect of the unit that is not simulated.
-
     """
 
     def __init__(self, params: Sensor | str | PathLike, seed: int = 0) -> None:
-        """
-        Put the sensors at the time of power-on.
-
-        Parameters
-        ----------
-        params
-            The unit, or its parameter file.
-        seed
-            Seed of all randomness; equal seeds give equal readings.
-
-        Raises
-        ------
-        UserError
-            The file cannot be read, or an effect needs the filter, the ADC or the noise, which is
-            missing.
-
-        """
+        """Put the sensors at the time of power-on."""
+        # The unit
         self.sensor = params if isinstance(params, Sensor) else parameter_file.load(params)
         check_needs(self.sensor, Motion(0.0))
         self._delay_s = float(self.sensor.values.get('time_offset', {}).get('offset_s', 0.0))
         reasons = {name: _reason_to_leave_out(effect_named(name), self._delay_s)
                    for name in self.sensor.effects}
+        # Reason by name of an effect of the unit that is not simulated
         self.left_out = {name: reason for name, reason in reasons.items() if reason}
         states = [EffectState(name, analog_stages.parameters(self.sensor, name), seed)
                   for name in self.sensor.effects if name not in self.left_out]

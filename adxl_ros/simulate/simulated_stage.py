@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A rotary stage of two axes with a linear third joint: how its motors follow a command."""
 
@@ -43,14 +31,6 @@ class SimulatedStage:
     rate, and the joint follows it as a critically damped system of second order. A time step is
     exact for a reference that is linear within it. A joint comes to rest within the encoder step
     of the command; its place in that step is random for each command.
-
-    Attributes
-    ----------
-    position
-        True position, (3,).
-    velocity
-        True velocity, (3,).
-
     """
 
     def __init__(self, pose: np.ndarray, slew: np.ndarray, settling_s: float,
@@ -58,19 +38,8 @@ class SimulatedStage:
         """
         Rest at a pose.
 
-        Parameters
-        ----------
-        pose
-            Initial position, rad, rad, m, (3,).
-        slew
-            Largest velocity, rad/s, rad/s, m/s, (3,).
-        settling_s
-            Time of the step response to 1 %, s.
-        resolution
-            Steps of the encoders, rad, rad, m, (3,); 0 for none.
-        seed
-            Seed of the places of rest within the encoder steps.
-
+        pose: initial position, rad, rad, m, (3,); slew: largest velocity, rad/s, rad/s, m/s, (3,);
+        resolution: steps of the encoders, rad, rad, m, (3,); 0 for none.
         """
         self._slew = slew
         self._speed = np.array(slew, float)
@@ -80,27 +49,12 @@ class SimulatedStage:
         self._commanded = np.array(pose, float)
         self._goal = self._reachable(self._commanded)
         self._reference = self._goal.copy()
-        self.position = self._goal.copy()
-        self.velocity = np.zeros(3)
+        self.position = self._goal.copy()  # True position, (3,)
+        self.velocity = np.zeros(3)  # True velocity, (3,)
 
     def command(self, positions: Mapping[str, float],
                 speeds: Mapping[str, float] = MappingProxyType({})) -> None:
-        """
-        Command joints to positions; a joint whose command does not change goes on.
-
-        Parameters
-        ----------
-        positions
-            Position by joint, rad or m.
-        speeds
-            Largest speed on the way by joint, rad/s or m/s; 0 or absent: that of the stage.
-
-        Raises
-        ------
-        UserError
-            A joint is unknown, or a position is not finite or out of reach; no joint moves.
-
-        """
+        """Command joints to positions; a joint whose command does not change goes on."""
         target = self._commanded.copy()
         for name, position in positions.items():
             if name not in JOINTS:

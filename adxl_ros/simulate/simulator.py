@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Simulated recordings: samples of a sensor during a manoeuvre, and the stage's encoders."""
 
@@ -35,21 +23,8 @@ def simulate(sensor: Sensor, motion: Motion, seed: int) -> Columns:
     """
     Simulate a whole recording.
 
-    Parameters
-    ----------
-    sensor
-        The unit, sampled at its rate.
-    motion
-        The manoeuvre.
-    seed
-        Seed of all randomness; equal seeds give equal bits.
-
-    Returns
-    -------
-    dict
-        Columns by canonical name, (n,) each: `time_s`, volts by axis, readings of the encoders,
-        and temperature and supply if the manoeuvre has them.
-
+    returns: columns by canonical name, (n,) each: `time_s`, volts by axis, readings of the
+    encoders, and temperature and supply if the manoeuvre has them.
     """
     parts = list(simulate_blocks(sensor, motion, seed))
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -57,26 +32,7 @@ def simulate(sensor: Sensor, motion: Motion, seed: int) -> Columns:
 
 def simulate_blocks(sensor: Sensor, motion: Motion, seed: int, begin_s: float = 0.0
                     ) -> Iterator[Columns]:
-    """
-    Simulate a recording block by block.
-
-    Parameters
-    ----------
-    sensor
-        The unit, sampled at its rate.
-    motion
-        The manoeuvre.
-    seed
-        Seed of all randomness; equal seeds give equal bits.
-    begin_s
-        Stamp of the first sample, s.
-
-    Yields
-    ------
-    dict
-        Columns of the next samples, as `simulate` returns them.
-
-    """
+    """Simulate a recording block by block."""
     respond = Response(sensor, motion, seed, begin_s)
     count = max(int(round(motion.duration_s * sensor.rate_hz, 6)), 1)
     for begin in range(0, count, _BLOCK_ROWS):
@@ -92,23 +48,8 @@ def simulate_at_stamps(sensor: Sensor, motion: Motion, recording: Recording, see
     """
     Simulate samples at the stamps of a recording, block by block.
 
-    Parameters
-    ----------
-    sensor
-        The unit, sampled at about the rate of the recording.
-    motion
-        The manoeuvre, from the first stamp on.
-    recording
-        The recording, which gives the stamps and the references.
-    seed
-        Seed of all randomness; equal seeds give equal bits.
-
-    Yields
-    ------
-    dict
-        Columns of the next samples by canonical name, (n,) each: `time_s`, volts by axis, and
-        the references of the recording.
-
+    yields: columns of the next samples by canonical name, (n,) each: `time_s`, volts by axis, and
+    the references of the recording.
     """
     respond = Response(sensor, motion, seed, float(recording.time_s[0]))
     references = [name for name in REFERENCES if name in recording.columns]
@@ -124,20 +65,8 @@ def reference_columns(sensor: Sensor, motion: Motion, time_s: np.ndarray) -> Col
     """
     Return the columns of a recording that are not those of the sensor.
 
-    Parameters
-    ----------
-    sensor
-        The unit with the resolution of its stage.
-    motion
-        The manoeuvre.
-    time_s
-        Stamps, s, (n,).
-
-    Returns
-    -------
-    dict
-        Readings of the encoders, temperature and supply by canonical name, (n,) each.
-
+    time_s: stamps, s, (n,); returns: readings of the encoders, temperature and supply by canonical
+    name, (n,) each.
     """
     columns = {}
     if motion.force is None:
@@ -157,18 +86,7 @@ def encoder_reading(angle_rad: np.ndarray, resolution_rad: float) -> np.ndarray:
     """
     Round angles to the steps of an encoder.
 
-    Parameters
-    ----------
-    angle_rad
-        Angles, rad, (n,).
-    resolution_rad
-        Step, rad; 0 for an exact encoder.
-
-    Returns
-    -------
-    ndarray
-        Readings, rad, (n,).
-
+    angle_rad: angles, rad, (n,); returns: readings, rad, (n,).
     """
     if not resolution_rad:
         return angle_rad

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Smooth paths through recorded joints and forces."""
 
@@ -111,19 +99,10 @@ _THIRD_DIFFERENCE = np.array([-1.0, 3.0, -3.0, 1.0])
 
 @dataclass(frozen=True)
 class PathErrors:
-    """
-    What is to be expected of the error of a smoothed path, at n times.
+    """What is to be expected of the error of a smoothed path, at n times."""
 
-    Attributes
-    ----------
-    std
-        Standard deviation, in the unit of the path, (n,).
-    forgetting_per_s
-        Rate at which the error forgets its past value, 1/s, (n,); 0 at rest.
-
-    """
-
-    std: np.ndarray
+    std: np.ndarray  # Standard deviation, in the unit of the path, (n,)
+    # Rate at which the error forgets its past value, 1/s, (n,); 0 at rest
     forgetting_per_s: np.ndarray
 
 
@@ -148,17 +127,8 @@ class SmoothedPath:
         """
         Prepare for the readings of an encoder.
 
-        Parameters
-        ----------
-        time_s
-            Ascending times, s, (n,).
-        reading
-            Readings, rad or m, (n,); NaN where there is none.
-        step
-            Step of the encoder, in the unit of the readings; 0 for an exact encoder.
-        degree
-            Degree of the spline through exact readings.
-
+        time_s: ascending times, s, (n,); reading: readings, rad or m, (n,); NaN where there is
+        none.
         """
         sampled = np.isfinite(reading)
         self._time_s, self._reading = time_s[sampled], reading[sampled]
@@ -192,16 +162,7 @@ class SmoothedPath:
         averages over. Its corner is 1/(2π·h·s^(1/6)) with the distance h of the knots and the
         matched strength s.
 
-        Parameters
-        ----------
-        time_s
-            Times, s, (n,).
-
-        Returns
-        -------
-        PathErrors or None
-            The error; None for an exact encoder.
-
+        time_s: times, s, (n,).
         """
         if not self._step or len(self._time_s) <= 2 * _DEGREE:
             return None
@@ -253,24 +214,7 @@ def smoothing_spline(time_s: np.ndarray, reading: np.ndarray, strength: float, s
     """
     Fit the smoothing spline of one window; see `SmoothedPath`.
 
-    Parameters
-    ----------
-    time_s
-        Ascending times, s, (n,).
-    reading
-        Readings, rad or m, (n,), all finite.
-    strength
-        Matched strength of the penalty per sample.
-    step
-        Step of the encoder, in the unit of the readings; 0 interpolates.
-    degree
-        Degree of a spline that interpolates.
-
-    Returns
-    -------
-    BSpline
-        The spline over time.
-
+    time_s: ascending times, s, (n,); reading: readings, rad or m, (n,), all finite.
     """
     if len(time_s) <= 2 * _DEGREE or np.ptp(reading) == 0:
         return scipy.interpolate.make_interp_spline(time_s, reading, k=1) if len(time_s) > 1 else \
@@ -305,18 +249,7 @@ def visible_step(reading: np.ndarray, step: float) -> float:
     motion hardly shows in them. Where lines connect the readings of a slow encoder, it is taken
     at the distance of these readings: there is no noise on a line.
 
-    Parameters
-    ----------
-    reading
-        Readings, rad or m, (n,), all finite.
-    step
-        Stated step of the encoder, in the unit of the readings.
-
-    Returns
-    -------
-    float
-        The stated step, or a finer one; 0 for exact readings.
-
+    reading: readings, rad or m, (n,), all finite.
     """
     if not _is_interpolated(reading, step):
         return step
@@ -364,20 +297,7 @@ def matched_strength(time_s: np.ndarray, reading: np.ndarray, step: float) -> fl
     """
     Find the largest strength whose deviation is at most that of an encoder.
 
-    Parameters
-    ----------
-    time_s
-        Ascending times, s, (n,).
-    reading
-        Readings, rad or m, (n,), all finite.
-    step
-        Step of the encoder, in the unit of the readings.
-
-    Returns
-    -------
-    float
-        Strength per sample; 0 where too few readings move, and where any strength follows them.
-
+    time_s: ascending times, s, (n,); reading: readings, rad or m, (n,), all finite.
     """
     moving = _moving(reading)
     if not step or moving.sum() < _MIN_MOVING:
@@ -393,32 +313,20 @@ def matched_strength(time_s: np.ndarray, reading: np.ndarray, step: float) -> fl
 
 
 class _Window:
-    """
-    Normal equations of the spline of one window.
-
-    Attributes
-    ----------
-    knots
-        Knots of the spline, s.
-    design
-        Splines at the samples, (n, k), sparse.
-    mean
-        Mean of the readings, which the spline leaves out.
-    right
-        Right-hand side of the normal equations, (k,).
-
-    """
+    """Normal equations of the spline of one window."""
 
     def __init__(self, time_s: np.ndarray, reading: np.ndarray) -> None:
         duration_s = time_s[-1] - time_s[0]
         inner = np.linspace(time_s[0], time_s[-1],
                             max(int(min(duration_s / KNOT_S, len(time_s) / 2)), 1) + 1)
         outer = (inner[1] - inner[0]) * np.arange(1, _DEGREE + 1)
+        # Knots of the spline, s
         self.knots = np.concatenate([inner[0] - outer[::-1], inner, inner[-1] + outer])
+        # Splines at the samples, (n, k), sparse
         self.design = scipy.interpolate.BSpline.design_matrix(time_s, self.knots, _DEGREE)
-        self.mean = float(reading.mean())
+        self.mean = float(reading.mean())  # Mean of the readings, which the spline leaves out
         self._values = reading - self.mean
-        self.right = self.design.T @ self._values
+        self.right = self.design.T @ self._values  # Right-hand side of the normal equations, (k,)
         self._normal = _banded(self.design.T @ self.design)
         self._normal[-1] += _RIDGE * self._normal[-1].max()
         self._samples_per_coefficient = len(time_s) / len(self.right)
@@ -435,20 +343,8 @@ class _Window:
         They are found by alternating directions (Boyd et al. 2011, section 5.2). Where no spline
         fits the bounds, the deviation becomes as small as it can.
 
-        Parameters
-        ----------
-        strength
-            Matched strength of the penalty per sample.
-        weights
-            Weight of the squared deviation of each reading, beside the bounds, (n,).
-        bound
-            Largest deviation, in the unit of the readings.
-
-        Returns
-        -------
-        numpy.ndarray
-            Coefficients, (k,).
-
+        weights: weight of the squared deviation of each reading, beside the bounds, (n,); returns:
+        coefficients, (k,).
         """
         transposed = self.design.T.tocsr()
         weighted = self.design.multiply(1 + weights[:, None]).tocsr()
@@ -503,29 +399,16 @@ def _moving(reading: np.ndarray) -> np.ndarray:
 
 
 class ForcePath:
-    """
-    Specific force of a recording or of another simulator, as cubic splines.
-
-    Attributes
-    ----------
-    time_s
-        Times of the samples, s, (n,).
-
-    """
+    """Specific force of a recording or of another simulator, as cubic splines."""
 
     def __init__(self, time_s: np.ndarray, force_mps2: np.ndarray) -> None:
         """
         Interpolate samples.
 
-        Parameters
-        ----------
-        time_s
-            Ascending times, s, (n,).
-        force_mps2
-            Specific force in the case frame, m/s², (n, 3).
-
+        time_s: ascending times, s, (n,); force_mps2: specific force in the case frame, m/s², (n,
+        3).
         """
-        self.time_s = time_s
+        self.time_s = time_s  # Times of the samples, s, (n,)
         self._force_mps2 = force_mps2
         self._spline = scipy.interpolate.CubicSpline(time_s, force_mps2)
 

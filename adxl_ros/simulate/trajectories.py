@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Manoeuvres of the stage and its surroundings, by name, for the tool simulate."""
 
@@ -57,20 +45,10 @@ frequency."""
 
 @dataclass(frozen=True)
 class Sine:
-    """
-    A sine from time 0 on.
+    """A sine from time 0 on."""
 
-    Attributes
-    ----------
-    amplitude_m
-        Amplitude, m.
-    frequency_hz
-        Frequency, Hz.
-
-    """
-
-    amplitude_m: float
-    frequency_hz: float
+    amplitude_m: float  # Amplitude, m
+    frequency_hz: float  # Frequency, Hz
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
         """Return a derivative; see `motion.Path`."""
@@ -86,17 +64,7 @@ class SweptSine:
     """
 
     def __init__(self, begin_s: float, duration_s: float) -> None:
-        """
-        Set the times of the sine.
-
-        Parameters
-        ----------
-        begin_s
-            Time at which it begins, s.
-        duration_s
-            Duration, s.
-
-        """
+        """Set the times of the sine."""
         self._begin_s, self._end_s = begin_s, begin_s + duration_s
         self._omega = 2 * np.pi * _SHAKE_LOW_HZ
         self._k = np.log(_SHAKE_HIGH_HZ / _SHAKE_LOW_HZ) / duration_s
@@ -128,17 +96,9 @@ class SweptSine:
 
 @dataclass(frozen=True)
 class Sum:
-    """
-    A sum of paths.
+    """A sum of paths."""
 
-    Attributes
-    ----------
-    parts
-        The paths.
-
-    """
-
-    parts: tuple[Path, ...]
+    parts: tuple[Path, ...]  # The paths
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
         """Return a derivative; see `motion.Path`."""
@@ -147,23 +107,11 @@ class Sum:
 
 @dataclass(frozen=True)
 class Steps:
-    """
-    Steps to levels, each approached exponentially.
+    """Steps to levels, each approached exponentially."""
 
-    Attributes
-    ----------
-    begin
-        Level at the beginning.
-    steps
-        Time, s, and level of each step.
-    tau_s
-        Time constant of each step, s.
-
-    """
-
-    begin: float
-    steps: tuple[tuple[float, float], ...]
-    tau_s: float
+    begin: float  # Level at the beginning
+    steps: tuple[tuple[float, float], ...]  # Time, s, and level of each step
+    tau_s: float  # Time constant of each step, s
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
         """Return the value; see `motion.Path`. It has no derivatives."""
@@ -177,26 +125,14 @@ class Steps:
 
 @dataclass
 class Script:
-    """
-    Builds the paths of both angles, move by move.
+    """Builds the paths of both angles, move by move."""
 
-    Attributes
-    ----------
-    alpha, beta
-        Angles at present, rad.
-    now
-        Time at present, s.
-    slew_rad_s
-        Largest velocity of a move to a pose, rad/s.
-    rows
-        Knots: time, s, alpha and beta, rad, and their derivatives, rad/s.
-
-    """
-
+    # alpha, beta: Angles at present, rad
     alpha: float
     beta: float
-    now: float = 0.0
-    slew_rad_s: float = SLEW_RAD_S
+    now: float = 0.0  # Time at present, s
+    slew_rad_s: float = SLEW_RAD_S  # Largest velocity of a move to a pose, rad/s
+    # Knots: time, s, alpha and beta, rad, and their derivatives, rad/s
     rows: list[tuple[float, ...]] = field(default_factory=list)
 
     def rest(self, seconds: float) -> None:
@@ -209,11 +145,7 @@ class Script:
         """
         Move to a pose by minimum jerk, whose velocity peaks at the slew rate.
 
-        Parameters
-        ----------
-        alpha, beta
-            Angles of the pose, rad.
-
+        alpha, beta: angles of the pose, rad.
         """
         distance = max(abs(alpha - self.alpha), abs(beta - self.beta))
         self._knot(0.0, 0.0)
@@ -225,15 +157,7 @@ class Script:
         """
         Turn one joint at a constant velocity, between a run-up and a stop.
 
-        Parameters
-        ----------
-        joint
-            Name of the joint: alpha or beta.
-        to
-            Angle at the end, rad.
-        speed
-            Magnitude of the velocity, rad/s.
-
+        to: angle at the end, rad; speed: magnitude of the velocity, rad/s.
         """
         distance = to - getattr(self, joint)
         rate = np.copysign(speed, distance)
@@ -263,22 +187,7 @@ class Script:
 
 
 def visit(poses_rad: Sequence[tuple[float, float]], dwell_s: float = DWELL_S) -> Motion:
-    """
-    Rest in poses and move between them.
-
-    Parameters
-    ----------
-    poses_rad
-        Alpha and beta of each pose, rad, in order.
-    dwell_s
-        Dwell of each pose, s, without the time to settle.
-
-    Returns
-    -------
-    Motion
-        The manoeuvre.
-
-    """
+    """Rest in poses and move between them."""
     script = Script(*poses_rad[0])
     for pose in poses_rad:
         script.go(*pose)

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The last lines of a tool: its result, the files that it wrote, and the next command."""
 
@@ -47,60 +35,21 @@ _OUTCOME = re.compile(rf'\b({"|".join(_COLOURS)})\b')
 
 
 class NextStep(NamedTuple):
-    """
-    Something that a user does next.
+    """Something that a user does next."""
 
-    Attributes
-    ----------
-    purpose
-        What it is for, one sentence without a period.
-    command
-        The command line that does it.
-
-    """
-
-    purpose: str
-    command: str
+    purpose: str  # What it is for, one sentence without a period
+    command: str  # The command line that does it
 
 
 def wrapped(text: str, indent: int = 0) -> list[str]:
-    """
-    Wrap a text between words.
-
-    Parameters
-    ----------
-    text
-        The text.
-    indent
-        Columns before further lines.
-
-    Returns
-    -------
-    list
-        Lines of 79 columns at most.
-
-    """
+    """Wrap a text between words."""
     return textwrap.wrap(text, COLUMNS, subsequent_indent=indent * ' ', break_long_words=False,
                          break_on_hyphens=False)
 
 
 def print_end(result: Sequence[str], files: Iterable[str | os.PathLike],
               following: str | Sequence[NextStep] = '', took_s: float | None = None) -> None:
-    """
-    Print the end of a tool within 79 columns; outcomes are coloured in a terminal.
-
-    Parameters
-    ----------
-    result
-        Lines of the result; longer ones are wrapped.
-    files
-        The files that were written. One that does not exist is left out.
-    following
-        The command that follows, or several steps; empty for none.
-    took_s
-        Run time of the tool, s; None where it is of no interest.
-
-    """
+    """Print the end of a tool within 79 columns; outcomes are coloured in a terminal."""
     lines = [part for line in result for part in wrapped(line, 2) or ['']]
     written = '  '.join(str(path) for path in files if Path(path).exists())
     if written:

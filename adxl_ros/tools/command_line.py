@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The argument parsers of the tools: examples, list of effects, and version in each help text."""
 
@@ -61,26 +49,7 @@ class _Parser(argparse.ArgumentParser):
 
 def argument_parser(tool: str, description: str | None, examples: Mapping[str, str],
                     details: Callable[[], str] | None = None) -> argparse.ArgumentParser:
-    """
-    Make the parser of a tool, which has `--help` with examples, and `--version`.
-
-    Parameters
-    ----------
-    tool
-        Name of the tool.
-    description
-        Purpose of the tool, one or more sentences.
-    examples : mapping
-        Arguments of each example, by its purpose.
-    details
-        Returns further text for the end, with its line breaks; None for none.
-
-    Returns
-    -------
-    argparse.ArgumentParser
-        The parser, without the arguments of the tool.
-
-    """
+    """Make the parser of a tool, which has `--help` with examples, and `--version`."""
     lines = [f'  {purpose}:\n    {command(tool, arguments)}'
              for purpose, arguments in examples.items()]
     parse = _Parser(
@@ -92,22 +61,7 @@ def argument_parser(tool: str, description: str | None, examples: Mapping[str, s
 
 
 def command(tool: str, arguments: str) -> str:
-    """
-    Return the command line that runs a tool, for examples and next steps.
-
-    Parameters
-    ----------
-    tool
-        Name of the tool.
-    arguments
-        Its arguments.
-
-    Returns
-    -------
-    str
-        One line, unless the arguments have several.
-
-    """
+    """Return the command line that runs a tool, for examples and next steps."""
     return f'ros2 run adxl_ros {tool} {arguments}'
 
 
@@ -118,22 +72,7 @@ def effect_list(effects: Iterable[Effect]) -> str:
 
 
 def entry_list(title: str, entries: Mapping[str, str]) -> str:
-    """
-    Return a list for a help text.
-
-    Parameters
-    ----------
-    title
-        Its title.
-    entries
-        Meanings by name.
-
-    Returns
-    -------
-    str
-        Lines of at most `COLUMNS` columns.
-
-    """
+    """Return a list for a help text."""
     width = max(map(len, entries)) + 2
     return '\n'.join([f'{title}:', *(
         textwrap.fill(f'  {name:{width}}{meaning}', COLUMNS, subsequent_indent=(width + 2) * ' ')

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What the tools share: exit status, messages about recordings, and progress."""
 
@@ -42,23 +30,7 @@ _BAR_COLUMNS = 24
 
 @ended_by_closed_output()
 def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace], int]) -> int:
-    """
-    Parse the command line and run a tool.
-
-    Parameters
-    ----------
-    parser
-        The tool's arguments. It ends the process with status 2 on wrong usage.
-    command
-        The tool, which returns its exit status; it may raise `UserError`.
-
-    Returns
-    -------
-    int
-        The exit status: that of the tool, 1 after an error (one line on stderr), 130 after
-        Ctrl-C.
-
-    """
+    """Parse the command line and run a tool."""
     signal.signal(signal.SIGTERM, _terminated)
     try:
         return command(parser.parse_args())
@@ -71,17 +43,7 @@ def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace],
 
 
 def note(text: str, paste: str = '') -> None:
-    """
-    Print a message on stderr: one line, which a terminal gets wrapped between words.
-
-    Parameters
-    ----------
-    text
-        The message.
-    paste
-        Its end for a command line, which a terminal gets on a line of its own, as it is.
-
-    """
+    """Print a message on stderr: one line, which a terminal gets wrapped between words."""
     if sys.stderr.isatty():
         text = textwrap.fill(text.removesuffix(paste), COLUMNS, subsequent_indent='  ',
                              break_long_words=False, break_on_hyphens=False)
@@ -95,15 +57,7 @@ def _terminated(number: int, frame: FrameType | None) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """
-    Create a folder for the output of a tool, if it does not exist.
-
-    Raises
-    ------
-    UserError
-        The folder cannot be created.
-
-    """
+    """Create a folder for the output of a tool, if it does not exist."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -111,17 +65,7 @@ def make_folder(folder: Path) -> None:
 
 
 def report_reading(tool: str, recording: Recording) -> None:
-    """
-    Report on stderr what was assumed in reading, the cut, and the alignment of references.
-
-    Parameters
-    ----------
-    tool
-        Name of the tool, for the message.
-    recording
-        The recording, or its last block.
-
-    """
+    """Report on stderr what was assumed in reading, the cut, and the alignment of references."""
     for line in (*recording.remarks, *[recording.cut] * bool(recording.cut)):
         note(f'{tool}: {line}')
     for name, alignment in recording.alignments.items():
@@ -137,17 +81,7 @@ class ShowDone(Protocol):
     """Shows how much is done."""
 
     def __call__(self, done: float, stage: str = '') -> None:
-        """
-        Show a fraction.
-
-        Parameters
-        ----------
-        done
-            The fraction that is done, 0 to 1.
-        stage
-            Name of the present stage, where there are several.
-
-        """
+        """Show a fraction."""
 
 
 def _show_nothing(done: float, stage: str = '') -> None:
@@ -178,20 +112,7 @@ class _Clock:
 
 @contextmanager
 def progress(title: str) -> Iterator[ShowDone]:
-    """
-    Show a progress bar on a terminal where rich is installed, else nothing.
-
-    Parameters
-    ----------
-    title
-        What is done; the name of a stage takes its place.
-
-    Yields
-    ------
-    ShowDone
-        Shows the fraction that is done.
-
-    """
+    """Show a progress bar on a terminal where rich is installed, else nothing."""
     try:
         from rich.console import Console
         from rich.progress import (
@@ -232,20 +153,7 @@ def progress(title: str) -> Iterator[ShowDone]:
 
 @contextmanager
 def staged_progress(work: Mapping[str, float]) -> Iterator[Callable[[str, float], None]]:
-    """
-    Show a progress bar over stages of different length, as `progress` does.
-
-    Parameters
-    ----------
-    work
-        Usual duration of each stage in any unit, in their order.
-
-    Yields
-    ------
-    callable
-        Takes the name of the present stage and the fraction of it that is done.
-
-    """
+    """Show a progress bar over stages of different length, as `progress` does."""
     names, total = list(work), sum(work.values())
     with progress(f'1/{len(names)} {names[0]}') as show:
         def show_stage(stage: str, share: float = 0.0) -> None:

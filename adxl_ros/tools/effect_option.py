@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The option `--effect` of a command line: NAME[:key=value,...]."""
 
@@ -35,28 +23,7 @@ _SIMILARITY = 0.4
 
 
 def with_effects(sensor: Sensor, texts: Sequence[str]) -> Sensor:
-    """
-    Add effects to a sensor, or change their parameters.
-
-    Parameters
-    ----------
-    sensor
-        The sensor of the parameter file; its effects stay.
-    texts
-        The options `--effect`, one text each.
-
-    Returns
-    -------
-    Sensor
-        The sensor with the effects.
-
-    Raises
-    ------
-    UserError
-        An effect, parameter or axis is unknown (the nearest name is suggested), a value is no
-        number or out of bounds, or a parameter is stated twice.
-
-    """
+    """Add effects to a sensor, or change their parameters."""
     stated: dict[Coefficient, str] = {}
     for text in texts:
         name, _, rest = text.partition(':')

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Find the noise parameters of a sensor in a recording at rest."""
 
@@ -101,13 +89,7 @@ class _Source:
     """
     The recording and its unit.
 
-    Attributes
-    ----------
-    axes
-        Measured axes, known after the first block.
-    last
-        The newest block.
-
+    last: the newest block.
     """
 
     def __init__(self, options: argparse.Namespace) -> None:
@@ -116,7 +98,7 @@ class _Source:
         self._reading = reading_options(options)
         self._sensor: Sensor | None = None
         self._unit: Sensor | None = None
-        self.axes = ''
+        self.axes = ''  # Measured axes, known after the first block
 
     def blocks(self, show: ShowDone) -> Iterator[Recording]:
         """Yield the blocks of the recording, and show how much has been read."""

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The page and the plot of `noise`: the Allan deviation with the fitted lines."""
 
@@ -34,27 +22,7 @@ _COLUMNS = ('axis', 'white noise N, µg/√Hz', 'bias instability B, µg', 'rand
 
 
 def write(folder: Path, result: RecordingNoise) -> list[Path]:
-    """
-    Write the page, the plot and the curve.
-
-    Parameters
-    ----------
-    folder
-        Where to.
-    result
-        The noise of a recording.
-
-    Returns
-    -------
-    list
-        The files.
-
-    Raises
-    ------
-    UserError
-        A file cannot be written, or plotly, jinja2 or matplotlib is not installed.
-
-    """
+    """Write the page, the plot and the curve."""
     page, plot, curve = (folder / name for name in ('report.html', 'allan.png', 'allan.csv'))
     figure = _plot(result)
     write_text(page, _page(result, figure))

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The options by which all tools read recordings that other software has made."""
 
@@ -55,25 +43,7 @@ def add_recording_options(parse: argparse.ArgumentParser) -> None:
 
 
 def reading_options(options: argparse.Namespace) -> ReadingOptions:
-    """
-    Return how recordings are to be read.
-
-    Parameters
-    ----------
-    options
-        Parsed options of a parser with `add_recording_options`.
-
-    Returns
-    -------
-    ReadingOptions
-        For `recording.read` and `recording.blocks`.
-
-    Raises
-    ------
-    UserError
-        An option is wrong.
-
-    """
+    """Return how recordings are to be read."""
     if options.rate is not None and not 0 < options.rate <= _HIGHEST_RATE_HZ:
         raise UserError(f'--rate {options.rate:g}: expected samples a second, at most '
                         f'{_HIGHEST_RATE_HZ:g}')
@@ -85,20 +55,7 @@ def reading_options(options: argparse.Namespace) -> ReadingOptions:
 
 
 def reading_text(options: argparse.Namespace) -> str:
-    """
-    Return the given options for a command line that reads the same recording.
-
-    Parameters
-    ----------
-    options
-        Parsed options of a parser with `add_recording_options`.
-
-    Returns
-    -------
-    str
-        A blank and the options, quoted for a shell; empty where none is given.
-
-    """
+    """Return the given options for a command line that reads the same recording."""
     values = {'--topic': options.topic, '--columns': options.columns,
               '--lsb-per-g': options.lsb_per_g, '--lsb-at-0g': options.lsb_at_0g,
               '--rate': '' if options.rate is None else f'{options.rate:g}',

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Simulate a recording of a manoeuvre by a sensor with effects."""
 
@@ -60,26 +48,12 @@ Output = Callable[[simulator.Columns], None]
 
 @dataclass(frozen=True)
 class _Run:
-    """
-    A simulation to be carried out.
+    """A simulation to be carried out."""
 
-    Attributes
-    ----------
-    sensor
-        The sensor, at its sample rate.
-    begin_s
-        Time of the first sample, s.
-    duration_s
-        Time from the first to the last sample, s.
-    blocks
-        The samples.
-
-    """
-
-    sensor: Sensor
-    begin_s: float
-    duration_s: float
-    blocks: Iterator[simulator.Columns]
+    sensor: Sensor  # The sensor, at its sample rate
+    begin_s: float  # Time of the first sample, s
+    duration_s: float  # Time from the first to the last sample, s
+    blocks: Iterator[simulator.Columns]  # The samples
 
 
 def parser() -> argparse.ArgumentParser:

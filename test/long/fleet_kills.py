@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Thousands of recordings while workers, scheduler and client are killed: `make fleet`.
@@ -66,18 +54,11 @@ class Client:
     """
     A client and its largest memory.
 
-    Attributes
-    ----------
-    process
-        The process of the command.
-    peak_mb
-        Largest memory so far, MB.
-    processor_s
-        Processor time so far, s.
-
+    peak_mb: largest memory so far, MB; processor_s: processor time so far, s.
     """
 
     def __init__(self, folder: Path, *words: object) -> None:
+        # The process of the command
         self.process = subprocess.Popen([executable('fleet'), *map(str, words)], cwd=folder,
                                         stdout=subprocess.DEVNULL, start_new_session=True)
         self.peak_mb = self.processor_s = 0.0
@@ -98,22 +79,7 @@ class Client:
 
 
 def busy_share(rows: list[dict], jobs: int) -> float:
-    """
-    Return the share of the workers' time that tasks used.
-
-    Parameters
-    ----------
-    rows
-        Rows of the table.
-    jobs
-        Number of workers.
-
-    Returns
-    -------
-    float
-        The share, from the begin of the first task to the last row.
-
-    """
+    """Return the share of the workers' time that tasks used."""
     begin = min(row['written'] - timedelta(seconds=row['seconds']) for row in rows)
     span_s = (max(row['written'] for row in rows) - begin).total_seconds()
     return sum(row['seconds'] for row in rows) / (jobs * span_s)
@@ -128,52 +94,21 @@ def count_rows(folder: Path) -> int:
 
 @dataclass
 class KilledRun:
-    """
-    What a run under kills shows.
+    """What a run under kills shows."""
 
-    Attributes
-    ----------
-    workers, scheduler, client
-        Number of kills.
-    client_mb, scheduler_mb
-        Largest memory, MB.
-    changed
-        Rows that changed after they were written.
-    span_s
-        Time of the run, s.
-
-    """
-
+    # workers, scheduler, client: Number of kills
     workers: int = 0
     scheduler: int = 0
     client: int = 0
+    # client_mb, scheduler_mb: Largest memory, MB
     client_mb: float = 0.0
     scheduler_mb: float = 0.0
-    changed: int = 0
-    span_s: float = 0.0
+    changed: int = 0  # Rows that changed after they were written
+    span_s: float = 0.0  # Time of the run, s
 
 
 def killed_run(folder: Path, words: list[object], count: int, seed: int) -> KilledRun:
-    """
-    Work on all recordings on a cluster under kills.
-
-    Parameters
-    ----------
-    folder
-        Has the recordings; gets `killed`.
-    words
-        Arguments of the command.
-    count
-        Number of recordings.
-    seed
-        Seed of the kills.
-
-    Returns
-    -------
-    KilledRun
-        Kills, memory, and rows that changed.
-
-    """
+    """Work on all recordings on a cluster under kills."""
     chance, stop, run = random.Random(seed), Event(), KilledRun()
     begin_s = time.monotonic()
     with dask_cluster(folder) as cluster:

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Rests in simulated and real streams, and equality of live and offline detection."""
 
@@ -40,12 +28,8 @@ def handled_stream(rng, rate_hz, rest_s, turn_s=1.0, sigma=SIGMA):
     """
     Make a stream of rests with turns between them.
 
-    Returns
-    -------
-    time_s, samples, bounds, poses
-        Times (n,), samples (n, 3), first and last rows of the rests (k, 2), and their true means
-        (k, 3).
-
+    returns: times (n,), samples (n, 3), first and last rows of the rests (k, 2), and their true
+    means (k, 3).
     """
     poses = directions(rng, len(rest_s) + 1)
     parts, bounds, row = [], [], 0

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Faults of devices. After each injected fault, the driver must have published the right samples.
@@ -36,41 +24,22 @@ TABLE_HEAD = ('| fault | published | wrong | missing | counted | recovered in '
 
 @dataclass(frozen=True)
 class Fault:
-    """
-    A fault of a device or of its driver.
+    """A fault of a device or of its driver."""
 
-    Attributes
-    ----------
-    name
-        Name in the table.
-    inject
-        Function of the rig, the process id of the driver and a duration, s. It returns the
-        monotonic time at which the device works again, ns, or 0 where it was never absent.
-    exact
-        Whether the device's count continues, so that the missing samples are counted exactly.
-
-    """
-
-    name: str
+    name: str  # Name in the table
+    # Function of the rig, the process id of the driver and a duration, s. It returns the monotonic
+    # time at which the device works again, ns, or 0 where it was never absent.
     inject: Callable
+    # Whether the device's count continues, so that the missing samples are counted exactly
     exact: bool = True
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """
-    The samples during and after a fault.
+    """The samples during and after a fault."""
 
-    Attributes
-    ----------
-    report
-        Samples during the fault and after it.
-    recovery_ms
-        Time until samples came again, ms; None where the device was never absent.
-
-    """
-
-    report: SampleReport
+    report: SampleReport  # Samples during the fault and after it
+    # Time until samples came again, ms; None where the device was never absent
     recovery_ms: float | None
 
 

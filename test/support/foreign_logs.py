@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Logs of a turned sensor in the forms that other software writes."""
 
@@ -31,23 +19,11 @@ SCALE = np.array([1.02, 0.99, 1.01])
 
 @dataclass(frozen=True)
 class Turned:
-    """
-    A sensor that is turned from rest to rest.
+    """A sensor that is turned from rest to rest."""
 
-    Attributes
-    ----------
-    time_s
-        Instants, s, (n,).
-    output_g
-        Output of the sensor, g, (n, 3).
-    angles_rad
-        Stage angles alpha and beta, rad, (n, 2); NaN in motion.
-
-    """
-
-    time_s: np.ndarray
-    output_g: np.ndarray
-    angles_rad: np.ndarray
+    time_s: np.ndarray  # Instants, s, (n,)
+    output_g: np.ndarray  # Output of the sensor, g, (n, 3)
+    angles_rad: np.ndarray  # Stage angles alpha and beta, rad, (n, 2); NaN in motion
 
     @property
     def tilt_deg(self) -> np.ndarray:

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 A sweep that is killed repeatedly, at random moments: no accepted pose is lost.
@@ -55,21 +43,10 @@ class Sweeps:
     """
     Runs the calibration node on a simulated stage, kills it, and checks its files.
 
-    Attributes
-    ----------
-    kills
-        Number of kills.
-    sweeps
-        Number of sweeps that came to their end in spite of the kills.
-    poses
-        Number of acknowledged poses.
-    lost
-        Acknowledged poses and earlier calibrations that are missing or changed.
-    broken
-        Incomplete files, and other failures.
-    moments
-        Number of kills by the activity of the node.
-
+    kills: number of kills; sweeps: number of sweeps that came to their end in spite of the kills;
+    poses: number of acknowledged poses; lost: acknowledged poses and earlier calibrations that are
+    missing or changed; broken: incomplete files, and other failures; moments: number of kills by
+    the activity of the node.
     """
 
     def __init__(self, folder, env, seed):

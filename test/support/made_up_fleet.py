@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Tables of made-up fleets: units of a population, recorded again and again."""
 
 from dataclasses import dataclass
@@ -26,34 +14,16 @@ MPS2_PER_MG = 9.80665e-3
 
 @dataclass(frozen=True)
 class MadeUpFleet:
-    """
-    Drawn units, and what is wrong with some of them.
+    """Drawn units, and what is wrong with some of them."""
 
-    Attributes
-    ----------
-    units
-        Number of units.
-    per_unit
-        Recordings of each unit, spread over a year.
-    batch
-        Number of units whose serial numbers begin with B and that have temperature_bias.
-    batch_scale
-        Scale factor of these units over that of the others.
-    drifting_mg
-        Drift of the zero-g of unit A-0003, mg per year.
-    refused
-        Share of refused recordings.
-    stage_fault
-        Whether the recordings on stage 2, a fifth of all, have stage_eccentricity.
-
-    """
-
-    units: int = 20
-    per_unit: int = 10
+    units: int = 20  # Number of units
+    per_unit: int = 10  # Recordings of each unit, spread over a year
+    # Number of units whose serial numbers begin with B and that have temperature_bias
     batch: int = 0
-    batch_scale: float = 1.0
-    drifting_mg: float = 0.0
-    refused: float = 0.0
+    batch_scale: float = 1.0  # Scale factor of these units over that of the others
+    drifting_mg: float = 0.0  # Drift of the zero-g of unit A-0003, mg per year
+    refused: float = 0.0  # Share of refused recordings
+    # Whether the recordings on stage 2, a fifth of all, have stage_eccentricity
     stage_fault: bool = False
 
     def write(self, folder, seed=0):

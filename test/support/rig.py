@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A driver on an emulated device with faults, and a report of what it published."""
 
@@ -38,23 +26,14 @@ HERE = Path(__file__).resolve().parent
 
 
 class ScriptProcess:
-    """
-    A script of this folder that answers lines with lines of JSON.
-
-    Attributes
-    ----------
-    popen
-        The process.
-    first_line
-        Its first line on stdout.
-
-    """
+    """A script of this folder that answers lines with lines of JSON."""
 
     def __init__(self, script, *args):
+        # The process
         self.popen = subprocess.Popen(
             [sys.executable, HERE / script, *map(str, args)], text=True, bufsize=1,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
-        self.first_line = self.popen.stdout.readline().strip()
+        self.first_line = self.popen.stdout.readline().strip()  # Its first line on stdout
 
     def ask(self, line):
         """Send a line and return the answer."""
@@ -71,32 +50,14 @@ class ScriptProcess:
 
 @dataclass(frozen=True)
 class SampleReport:
-    """
-    What a driver has published, and what it reports about it.
+    """What a driver has published, and what it reports about it."""
 
-    Attributes
-    ----------
-    published
-        Samples that were published.
-    wrong
-        Samples with wrong values or in a wrong order.
-    missing
-        Samples that the device took and that were not published.
-    counted
-        Missing samples, as diagnostics report them.
-    estimated
-        Part of `counted` that diagnostics call an estimate.
-    max_error_ms
-        Largest error of a stamp, ms.
-
-    """
-
-    published: int
-    wrong: int
-    missing: int
-    counted: int
-    estimated: int
-    max_error_ms: float
+    published: int  # Samples that were published
+    wrong: int  # Samples with wrong values or in a wrong order
+    missing: int  # Samples that the device took and that were not published
+    counted: int  # Missing samples, as diagnostics report them
+    estimated: int  # Part of `counted` that diagnostics call an estimate
+    max_error_ms: float  # Largest error of a stamp, ms
 
     @property
     def exact(self):
@@ -108,19 +69,15 @@ class DriverRig:
     """
     Collects the samples of a driver and identifies them on the device.
 
-    Attributes
-    ----------
-    numbers, stamps, errors
-        Number of each sample on the device, its stamp, ns, and the error of the stamp, ms.
-    wrong
-        Samples with wrong values or in a wrong order.
-
+    wrong: samples with wrong values or in a wrong order.
     """
 
     def __init__(self, graph, rate_hz):
         self.graph = graph
         self._rate_hz = rate_hz
         self._raws = graph.listen(Imu, 'imu/data_raw', raw=True)
+        # numbers, stamps, errors: Number of each sample on the device, its stamp, ns, and the
+        # error of the stamp, ms
         self.numbers = np.zeros(0, np.int64)
         self.stamps = np.zeros(0, np.int64)
         self.errors = np.zeros(0)
@@ -212,22 +169,13 @@ class DriverRig:
 
 
 class SerialRig(DriverRig):
-    """
-    A driver on a faulty board.
-
-    Attributes
-    ----------
-    path
-        Port of the board.
-    board
-        Process of the board.
-
-    """
+    """A driver on a faulty board."""
 
     def __init__(self, graph, folder, options=None):
         options = options or {}
         super().__init__(graph, options.get('rate', 1000.0))
-        self.path = Path(folder) / 'board'
+        self.path = Path(folder) / 'board'  # Port of the board
+        # Process of the board
         self.board = ScriptProcess('faulty_board.py', self.path, json.dumps(options))
         self._origin_ns = json.loads(self.board.first_line)['origin_ns']
         self._period_ns = 1e9 / self._rate_hz * (1 + options.get('ppm', 0) * 1e-6)
@@ -271,11 +219,7 @@ class IioRig(DriverRig):
     """
     A driver on the IIOD of the tests.
 
-    Attributes
-    ----------
-    server
-        Process of the IIOD.
-
+    server: process of the IIOD.
     """
 
     def __init__(self, graph):

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A sensor in the formats of other software: each file is read by its reader and compared."""
 
@@ -135,19 +123,7 @@ def test_sdf(exported):
 
 
 def check_described(element, description, folder):
-    """
-    Check an element of an SDF file against the description of SDFormat, and all in it.
-
-    Parameters
-    ----------
-    element
-        The element.
-    description
-        Its description.
-    folder
-        Folder of the descriptions.
-
-    """
+    """Check an element of an SDF file against the description of SDFormat, and all in it."""
     children = {d.get('name'): d for d in description.findall('element')}
     required = {name for name, d in children.items() if d.get('required') in ('1', '+')}
     for include in description.findall('include'):

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Report of a full fit as lines of text: stage, outliers, weakest direction, terms."""
 
@@ -50,24 +38,13 @@ _MIN_PART = 0.2
 
 
 class WeakestDirection(NamedTuple):
-    """
-    The direction of the sensor's coefficients that the poses determine least.
+    """The direction of the sensor's coefficients that the poses determine least."""
 
-    Attributes
-    ----------
-    condition_number
-        Square root of the ratio of the extreme eigenvalues of the covariance, with each
-        coefficient in units of its typical size.
-    std
-        Standard deviation along the direction, in typical sizes.
-    parts
-        Largest components of its unit vector.
-
-    """
-
+    # Square root of the ratio of the extreme eigenvalues of the covariance, with each coefficient
+    # in units of its typical size
     condition_number: float
-    std: float
-    parts: list[tuple[Coefficient, float]]
+    std: float  # Standard deviation along the direction, in typical sizes
+    parts: list[tuple[Coefficient, float]]  # Largest components of its unit vector
 
 
 def weakest_direction(full: full_model.FullFit) -> WeakestDirection:

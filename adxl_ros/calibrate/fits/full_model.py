@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The full model: one maximum-likelihood fit of all poses and axes, with the error of the stage.
@@ -121,47 +109,20 @@ _SHAPE_STARTS = 3
 
 @dataclass(frozen=True)
 class FullFit:
-    """
-    Result of the fit of k poses.
+    """Result of the fit of k poses."""
 
-    Attributes
-    ----------
-    fitted
-        The unit with its covariance, without effects of the stage.
-    unit
-        The unit with the fitted effects of the stage.
-    names
-        Fitted coefficients, (p,).
-    stage
-        Estimated standard deviations of the stage's error.
-    stated_std_rad
-        Stated standard deviation of a joint's error: step/√12, rad.
-    outliers
-        Indices of the outliers, which the fit leaves out.
-    information
-        Inverse covariance of `names`, priors included, (p, p).
-    squared_distances
-        Squared Mahalanobis distance of each pose, given its settings, (k,).
-    linear_poses
-        The poses at the most likely angles, about which the model is linear.
-    deviance
-        −2 times the logarithm of the restricted likelihood, up to a constant.
-    converged
-        Whether coefficients, stage error and outliers have converged.
-
-    """
-
-    fitted: Sensor
-    unit: Sensor
-    names: tuple[Coefficient, ...]
-    stage: StageError
-    stated_std_rad: float
-    outliers: tuple[int, ...]
-    information: np.ndarray
+    fitted: Sensor  # The unit with its covariance, without effects of the stage
+    unit: Sensor  # The unit with the fitted effects of the stage
+    names: tuple[Coefficient, ...]  # Fitted coefficients, (p,)
+    stage: StageError  # Estimated standard deviations of the stage's error
+    stated_std_rad: float  # Stated standard deviation of a joint's error: step/√12, rad
+    outliers: tuple[int, ...]  # Indices of the outliers, which the fit leaves out
+    information: np.ndarray  # Inverse covariance of `names`, priors included, (p, p)
+    # Squared Mahalanobis distance of each pose, given its settings, (k,)
     squared_distances: np.ndarray
-    linear_poses: Poses
-    deviance: float
-    converged: bool
+    linear_poses: Poses  # The poses at the most likely angles, about which the model is linear
+    deviance: float  # −2 times the logarithm of the restricted likelihood, up to a constant
+    converged: bool  # Whether coefficients, stage error and outliers have converged
 
     @property
     def stage_std_rad(self) -> float:
@@ -241,23 +202,11 @@ def _start(sensor: Sensor, poses: Poses, may_be_open: bool) -> Sensor:
 
 @dataclass(frozen=True)
 class _Problem:
-    """
-    Poses, coefficients and stated stage error of one fit.
+    """Poses, coefficients and stated stage error of one fit."""
 
-    Attributes
-    ----------
-    poses
-        The measured poses, at the angles of the encoder.
-    names
-        Coefficients to fit, (p,).
-    stated
-        Stated error of the stage.
-
-    """
-
-    poses: Poses
-    names: tuple[Coefficient, ...]
-    stated: StageError
+    poses: Poses  # The measured poses, at the angles of the encoder
+    names: tuple[Coefficient, ...]  # Coefficients to fit, (p,)
+    stated: StageError  # Stated error of the stage
 
     @property
     def precision(self) -> np.ndarray:
@@ -269,20 +218,7 @@ class _Problem:
         """
         Linearise poses about a unit.
 
-        Parameters
-        ----------
-        unit
-            Sensor with the coefficients.
-        poses
-            The poses, at the angles about which the model is linear.
-        kept
-            Poses that count, (k,) bool; None for all.
-
-        Returns
-        -------
-        Linearised
-            Residuals and Jacobians.
-
+        kept: poses that count, (k,) bool; None for all.
         """
         return linearised(unit, poses, self.names, self.precision, kept)
 
@@ -330,32 +266,14 @@ def _with_shape(unit: Sensor, shape: tuple[str, Parameter], value: float) -> Sen
 
 @dataclass(frozen=True)
 class _State:
-    """
-    State of the fit between two rounds.
+    """State of the fit between two rounds."""
 
-    Attributes
-    ----------
-    unit
-        Sensor with the coefficients.
-    stage
-        Standard deviations of the stage's error.
-    errors
-        Predicted errors of the angles.
-    poses
-        The poses turned by these errors; see `_turned_linearly`.
-    kept
-        Poses that are no outliers, (k,) bool.
-    curvature_v
-        Volts by which the model departs from its linearisation, (m,).
-
-    """
-
-    unit: Sensor
-    stage: StageError
-    errors: AngleErrors
-    poses: Poses
-    kept: np.ndarray
-    curvature_v: np.ndarray
+    unit: Sensor  # Sensor with the coefficients
+    stage: StageError  # Standard deviations of the stage's error
+    errors: AngleErrors  # Predicted errors of the angles
+    poses: Poses  # The poses turned by these errors; see `_turned_linearly`
+    kept: np.ndarray  # Poses that are no outliers, (k,) bool
+    curvature_v: np.ndarray  # Volts by which the model departs from its linearisation, (m,)
 
 
 def _fit_from(unit: Sensor, problem: _Problem) -> FullFit:
@@ -537,16 +455,7 @@ def _solved(unit: Sensor, problem: _Problem, poses: Poses, stage: StageError, ke
 
 
 def _step(state: _State, problem: _Problem) -> tuple[Sensor, AngleErrors, float]:
-    """
-    Move coefficients and angles to the most likely ones, or part of the way if that is better.
-
-    Returns
-    -------
-    tuple
-        The unit, the errors of the angles, and the longest step of a coefficient in its standard
-        deviations.
-
-    """
+    """Move coefficients and angles to the most likely ones, or part of the way if better."""
     solved = _solved(state.unit, problem, state.poses, state.stage, state.kept, _ROUND_STEPS).last
     covariance, precision = solved.covariance, problem.precision
     errors = covariance.predicted_errors(solved.about.residual)

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Fit of nine parameters of a three-axis sensor to the magnitude of gravity over its rests.
@@ -98,58 +86,31 @@ _MAX_GRAVITY_RATIO = 2.0
 
 @dataclass(frozen=True)
 class GravityFit:
-    """
-    Result of the fit of k rests.
+    """Result of the fit of k rests."""
 
-    Attributes
-    ----------
-    values
-        Parameters of effects by axis, as `Sensor.values` has them.
-    covariance
-        Covariance of the coefficients NAMES, in their units, (9, 9).
-    before_mps2, residual_mps2, held_out_mps2
-        Magnitude minus local gravity, m/s², (k,): by nominal values, by the fit, and by the fit to
-        the rests outside of the rest's own stretch of time.
-    expected_mps2
-        Standard deviation of a rest's magnitude, m/s², (k,): noise of the mean and excess.
-    excess_mps2
-        Part of `expected_mps2` that the noise of the means does not explain, m/s².
-    outliers
-        Indices of the outliers, which the fit leaves out.
-    converged
-        Whether parameters and excess variance have converged.
-
-    """
-
+    # Parameters of effects by axis, as `Sensor.values` has them
     values: dict[str, dict[str, np.ndarray]]
-    covariance: np.ndarray
+    covariance: np.ndarray  # Covariance of the coefficients NAMES, in their units, (9, 9)
+    # before_mps2, residual_mps2, held_out_mps2: Magnitude minus local gravity, m/s², (k,): by
+    # nominal values, by the fit, and by the fit to the rests outside of the rest's own stretch of
+    # time
     before_mps2: np.ndarray
     residual_mps2: np.ndarray
     held_out_mps2: np.ndarray
+    # Standard deviation of a rest's magnitude, m/s², (k,): noise of the mean and excess
     expected_mps2: np.ndarray
+    # Part of `expected_mps2` that the noise of the means does not explain, m/s²
     excess_mps2: float
-    outliers: tuple[int, ...]
-    converged: bool = True
+    outliers: tuple[int, ...]  # Indices of the outliers, which the fit leaves out
+    converged: bool = True  # Whether parameters and excess variance have converged
 
 
 class _Estimate(NamedTuple):
-    """
-    An estimate of the parameters.
+    """An estimate of the parameters."""
 
-    Attributes
-    ----------
-    parameters : ndarray
-        The nine parameters, (9,).
-    excess_g2
-        Variance of the magnitudes beyond the noise of the means, g².
-    converged
-        Whether parameters and excess have converged.
-
-    """
-
-    parameters: np.ndarray
-    excess_g2: float
-    converged: bool
+    parameters: np.ndarray  # The nine parameters, (9,)
+    excess_g2: float  # Variance of the magnitudes beyond the noise of the means, g²
+    converged: bool  # Whether parameters and excess have converged
 
 
 def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor,
@@ -375,20 +336,8 @@ def _solve_nearby(rests: NominalRests, start: np.ndarray, variance: np.ndarray
     """
     Fit as `_solve`, from a start near the solution, where plain Gauss-Newton steps suffice.
 
-    Parameters
-    ----------
-    rests
-        k rests.
-    start
-        First values of the parameters, (9,).
-    variance
-        Variances of the magnitudes, g², (k,).
-
-    Returns
-    -------
-    tuple
-        Parameters, (9,), and whether they have converged.
-
+    start: first values of the parameters, (9,); variance: variances of the magnitudes, g², (k,);
+    returns: parameters, (9,), and whether they have converged.
     """
     (parameters,), (converged,) = _nearby(rests, start[None], 1 / variance[None])
     return (parameters, True) if converged else _solve(rests, start, variance)
@@ -399,20 +348,8 @@ def _nearby(rests: NominalRests, starts: np.ndarray, weights: np.ndarray
     """
     Take plain Gauss-Newton steps for several fits side by side.
 
-    Parameters
-    ----------
-    rests
-        k rests.
-    starts
-        First values of the parameters, (s, 9).
-    weights
-        Weights of the rests in each fit, 1/g², (s, k).
-
-    Returns
-    -------
-    tuple
-        Parameters, (s, 9), and which of them have converged, (s,) bool.
-
+    starts: first values of the parameters, (s, 9); weights: weights of the rests in each fit,
+    1/g², (s, k); returns: parameters, (s, 9), and which of them have converged, (s,) bool.
     """
     parameters, converged = starts, np.zeros(len(starts), bool)
     for _ in range(_NEARBY_STEPS):

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The magnitude of specific force that a three-axis sensor reads at rest, by nine parameters."""
 
@@ -52,23 +40,11 @@ _PRIOR_INFORMATION = np.eye(len(NAMES)) / PRIOR_STD ** 2
 
 @dataclass(frozen=True)
 class NominalRests:
-    """
-    k rests, converted by the nominal zero-g and scale factor.
+    """k rests, converted by the nominal zero-g and scale factor."""
 
-    Attributes
-    ----------
-    mean
-        Means, g, (k, 3).
-    variance
-        Variances of the means, g², (k, 3).
-    gravity_g
-        Local gravity, g.
-
-    """
-
-    mean: np.ndarray
-    variance: np.ndarray
-    gravity_g: float
+    mean: np.ndarray  # Means, g, (k, 3)
+    variance: np.ndarray  # Variances of the means, g², (k, 3)
+    gravity_g: float  # Local gravity, g
 
     def __getitem__(self, part: np.ndarray) -> NominalRests:
         return NominalRests(self.mean[part], self.variance[part], self.gravity_g)
@@ -98,20 +74,11 @@ def nominal_rests(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor) -> Nomi
 
 
 class EffectValues(NamedTuple):
-    """
-    Parameters in the units of the effects.
+    """Parameters in the units of the effects."""
 
-    Attributes
-    ----------
-    values
-        Parameters of effects, (3,) each, as `Sensor.values` has them.
-    units
-        Factor from each parameter to the coefficient in NAMES, (9,).
-
-    """
-
+    # Parameters of effects, (3,) each, as `Sensor.values` has them
     values: dict[str, dict[str, np.ndarray]]
-    units: np.ndarray
+    units: np.ndarray  # Factor from each parameter to the coefficient in NAMES, (9,)
 
 
 def effect_values(parameters: np.ndarray, sensor: Sensor) -> EffectValues:
@@ -227,23 +194,11 @@ def _sensed_gradient(direction: np.ndarray, sines: list[tuple[Any, Any]]) -> np.
 
 
 class Linearised(NamedTuple):
-    """
-    Magnitudes of k rests to first order; s sets of parameters put an axis of length s in front.
+    """Magnitudes of k rests to first order; s sets of parameters put an axis s in front."""
 
-    Attributes
-    ----------
-    magnitude
-        Magnitudes, g, (k,).
-    by_output
-        Derivatives by the means, (k, 3).
-    jacobian
-        Derivatives by the parameters, (k, 9).
-
-    """
-
-    magnitude: np.ndarray
-    by_output: np.ndarray
-    jacobian: np.ndarray
+    magnitude: np.ndarray  # Magnitudes, g, (k,)
+    by_output: np.ndarray  # Derivatives by the means, (k, 3)
+    jacobian: np.ndarray  # Derivatives by the parameters, (k, 9)
 
 
 def linearised(mean: np.ndarray, parameters: np.ndarray) -> Linearised:

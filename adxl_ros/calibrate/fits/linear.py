@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The manufacturer's linear model: equations 1 to 3."""
 
@@ -40,23 +28,11 @@ _OPEN_STD_V_PER_G = 0.2
 
 
 class _Line(NamedTuple):
-    """
-    A line fitted to one axis.
+    """A line fitted to one axis."""
 
-    Attributes
-    ----------
-    zero_g_v
-        Volts at 0 g.
-    scale_v_per_g
-        Volts per g.
-    covariance
-        Covariance of both, (2, 2).
-
-    """
-
-    zero_g_v: float
-    scale_v_per_g: float
-    covariance: np.ndarray
+    zero_g_v: float  # Volts at 0 g
+    scale_v_per_g: float  # Volts per g
+    covariance: np.ndarray  # Covariance of both, (2, 2)
 
 
 def fit(sensor: Sensor, poses: Poses, may_be_open: bool = False) -> Sensor:

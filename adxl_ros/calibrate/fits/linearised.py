@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 A fit linearised at its coefficients, and the stage's error by restricted maximum likelihood.
@@ -73,35 +61,16 @@ _LEAST_WEIGHT = 1e-3
 
 @dataclass(frozen=True)
 class Linearised:
-    """
-    Poses of a unit about its coefficients: k poses, m axes, p coefficients.
+    """Poses of a unit about its coefficients: k poses, m axes, p coefficients."""
 
-    Attributes
-    ----------
-    poses
-        Poses with their noise, angles and settings.
-    angle_jacobian
-        Derivatives of the volts by alpha and beta, V/rad, (k, m, 2).
-    design
-        Derivatives of the volts by coefficients, V per unit of the coefficient, (k, m, p).
-    residual
-        Measured volts minus predicted volts, V, (k, m).
-    values
-        The coefficients, (p,).
-    precision
-        Inverse variances of their prior about 0, (p,).
-    kept
-        Poses that count, (k,) bool.
-
-    """
-
-    poses: Poses
-    angle_jacobian: np.ndarray
+    poses: Poses  # Poses with their noise, angles and settings
+    angle_jacobian: np.ndarray  # Derivatives of the volts by alpha and beta, V/rad, (k, m, 2)
+    # Derivatives of the volts by coefficients, V per unit of the coefficient, (k, m, p)
     design: np.ndarray
-    residual: np.ndarray
-    values: np.ndarray
-    precision: np.ndarray
-    kept: np.ndarray
+    residual: np.ndarray  # Measured volts minus predicted volts, V, (k, m)
+    values: np.ndarray  # The coefficients, (p,)
+    precision: np.ndarray  # Inverse variances of their prior about 0, (p,)
+    kept: np.ndarray  # Poses that count, (k,) bool
 
     @cached_property
     def _shared(self) -> SharedSettings:
@@ -161,23 +130,7 @@ class Linearised:
                      + np.linalg.slogdet(information)[1] - np.sum(np.log(self.precision)))
 
     def stage_error(self, stated_rad: float, start: StageError | None = None) -> StageError:
-        """
-        Estimate the stage error by restricted maximum likelihood.
-
-        Parameters
-        ----------
-        stated_rad
-            The stated standard deviation of a joint's error, rad, as the centre of the prior. 0
-            where nothing is stated.
-        start
-            Start of the search. By default the stated error, all of it by setting.
-
-        Returns
-        -------
-        StageError
-            The estimate.
-
-        """
+        """Estimate the stage error by restricted maximum likelihood."""
         start = start or StageError(stated_rad)
 
         total = float(np.log(np.clip(start.total_rad, 10 * _MIN_TOTAL_RAD, _MAX_TOTAL_RAD)))
@@ -204,16 +157,8 @@ class Linearised:
         joint therefore is integrated over its posterior; by the law of total variance this adds
         the mean change of the covariance and the covariance of the best coefficients.
 
-        Parameters
-        ----------
-        error, stated_rad
-            The estimate of `stage_error`, and the stated error that it began with, rad.
-
-        Returns
-        -------
-        ndarray
-            Covariance, (p, p).
-
+        error, stated_rad: the estimate of `stage_error`, and the stated error that it began with,
+        rad; returns: covariance, (p, p).
         """
         best, information = self.solve(self.covariance(error))
         at_estimate = np.linalg.inv(information)

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Directions in which a sensor is held by hand: their information and their names."""
 
@@ -40,21 +28,12 @@ is chosen."""
 
 
 class InformationGain(NamedTuple):
-    """
-    What a further rest in each candidate would add.
+    """What a further rest in each candidate would add."""
 
-    Attributes
-    ----------
-    gain
-        Variance of the predicted magnitude, g², by the number of axes that are not horizontal,
-        (26,). With one or two axes along gravity a pose is easier to hold.
-    rows
-        Derivatives of the magnitude by the parameters, (26, 9).
-
-    """
-
+    # Variance of the predicted magnitude, g², by the number of axes that are not horizontal,
+    # (26,). With one or two axes along gravity a pose is easier to hold.
     gain: np.ndarray
-    rows: np.ndarray
+    rows: np.ndarray  # Derivatives of the magnitude by the parameters, (26, 9)
 
 
 def information_gain(information: np.ndarray, parameters: np.ndarray, gravity_g: float

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The paper's sequential fit of its nonlinear regression model: equations 4 to 19.
@@ -64,33 +52,18 @@ _REPLICAS = 200
 
 @dataclass(frozen=True)
 class AxisRegression:
-    """
-    Regressions of one axis before the gauge is fixed, for figures 4 to 8 of the paper.
+    """Regressions of one axis before the gauge is fixed, for figures 4 to 8 of the paper."""
 
-    Attributes
-    ----------
-    zero_g_v, scale_v_per_g
-        Zero-g and scale factor of the linear model, V and V/g.
-    p, q
-        Coefficients of 1, a, a² in g(V_c) (11) and h(V_z) (13): V, V/g, V/g², (3,).
-    r
-        Coefficients of 1, a, a² in SF(V_z) (15): V/g, V/g², V/g³, (3,).
-    plane_az_g
-        Mean reference of z in each of n planes, g, (n,).
-    plane_bias_v
-        Bias of each plane minus the zero-g, V, (n,).
-    plane_scale_v_per_g
-        Scale factor of each plane, V/g, (n,); NaN where the plane does not determine it.
-
-    """
-
+    # zero_g_v, scale_v_per_g: Zero-g and scale factor of the linear model, V and V/g
     zero_g_v: float
     scale_v_per_g: float
+    # p, q: Coefficients of 1, a, a² in g(V_c) (11) and h(V_z) (13): V, V/g, V/g², (3,)
     p: np.ndarray
     q: np.ndarray
-    r: np.ndarray
-    plane_az_g: np.ndarray
-    plane_bias_v: np.ndarray
+    r: np.ndarray  # Coefficients of 1, a, a² in SF(V_z) (15): V/g, V/g², V/g³, (3,)
+    plane_az_g: np.ndarray  # Mean reference of z in each of n planes, g, (n,)
+    plane_bias_v: np.ndarray  # Bias of each plane minus the zero-g, V, (n,)
+    # Scale factor of each plane, V/g, (n,); NaN where the plane does not determine it
     plane_scale_v_per_g: np.ndarray
 
 

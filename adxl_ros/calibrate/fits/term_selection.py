@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Selection of the full model's terms by Bayes factors.
@@ -55,22 +43,11 @@ _GAUGE_CHANCE = 0.01
 
 @dataclass(frozen=True)
 class Term:
-    """
-    Evidence for a term.
+    """Evidence for a term."""
 
-    Attributes
-    ----------
-    name
-        Effect, or one of `full_model.GAUGE`.
-    is_fitted
-        Whether the fit has the term.
-    log_bayes_factor
-        Log marginal likelihood of the poses with the term minus that without, nats.
-
-    """
-
-    name: str
-    is_fitted: bool
+    name: str  # Effect, or one of `full_model.GAUGE`
+    is_fitted: bool  # Whether the fit has the term
+    # Log marginal likelihood of the poses with the term minus that without, nats
     log_bayes_factor: float
 
     @property
@@ -80,20 +57,10 @@ class Term:
 
 
 class SelectedFit(NamedTuple):
-    """
-    A full fit with selected terms.
+    """A full fit with selected terms."""
 
-    Attributes
-    ----------
-    full
-        The fit.
-    terms
-        Evidence for its terms and for the candidates.
-
-    """
-
-    full: full_model.FullFit
-    terms: list[Term]
+    full: full_model.FullFit  # The fit
+    terms: list[Term]  # Evidence for its terms and for the candidates
 
 
 def candidates(poses: Poses) -> tuple[str, ...]:

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Zero-g over temperature, fitted to a sensor that rests while it warms and cools."""
 
@@ -60,90 +48,37 @@ _RELATIVE_STEP = 0.02
 
 @dataclass(frozen=True)
 class ThermalBlocks:
-    """
-    Means of k blocks of a resting sensor with m axes, in the order of time.
+    """Means of k blocks of a resting sensor with m axes, in the order of time."""
 
-    Attributes
-    ----------
-    time_s
-        Middle of each block, s, (k,).
-    temperature_c
-        Temperature of each block, °C, (k,).
-    volts
-        Mean output, V, (k, m).
-
-    """
-
-    time_s: np.ndarray
-    temperature_c: np.ndarray
-    volts: np.ndarray
+    time_s: np.ndarray  # Middle of each block, s, (k,)
+    temperature_c: np.ndarray  # Temperature of each block, °C, (k,)
+    volts: np.ndarray  # Mean output, V, (k, m)
 
 
 class History(NamedTuple):
-    """
-    A dependence on the history of the temperature.
+    """A dependence on the history of the temperature."""
 
-    Attributes
-    ----------
-    effect
-        `thermal_lag` or `thermal_hysteresis`; '' for none.
-    shape
-        Its time constant, s, or its reach, K.
-
-    """
-
-    effect: str = ''
-    shape: float = 0.0
+    effect: str = ''  # `thermal_lag` or `thermal_hysteresis`; '' for none
+    shape: float = 0.0  # Its time constant, s, or its reach, K
 
 
 @dataclass(frozen=True)
 class ThermalFit:
-    """
-    Zero-g over temperature with its covariance.
+    """Zero-g over temperature with its covariance."""
 
-    Attributes
-    ----------
-    names
-        Coefficients, (p,).
-    values
-        Their values, (p,), each in the unit of its parameter.
-    covariance
-        Their covariance, (p, p).
-    history
-        The supported dependence on the history.
-    gains
-        Gain of each tried history in half of the BIC, by effect.
-    residual_g
-        Rms residual of each axis, g, (m,).
-    span_c
-        Lowest and highest temperature, °C.
-
-    """
-
-    names: tuple[Coefficient, ...]
-    values: np.ndarray
-    covariance: np.ndarray
-    history: History
-    gains: dict[str, float]
-    residual_g: np.ndarray
-    span_c: tuple[float, float]
+    names: tuple[Coefficient, ...]  # Coefficients, (p,)
+    values: np.ndarray  # Their values, (p,), each in the unit of its parameter
+    covariance: np.ndarray  # Their covariance, (p, p)
+    history: History  # The supported dependence on the history
+    gains: dict[str, float]  # Gain of each tried history in half of the BIC, by effect
+    residual_g: np.ndarray  # Rms residual of each axis, g, (m,)
+    span_c: tuple[float, float]  # Lowest and highest temperature, °C
 
     def error_g(self, temperatures_c: np.ndarray, calibrated_c: float) -> np.ndarray:
         """
         Return the expected error of the zero-g of the worst axis.
 
-        Parameters
-        ----------
-        temperatures_c
-            Temperatures, °C, (n,).
-        calibrated_c
-            Temperature at which the zero-g is calibrated, °C.
-
-        Returns
-        -------
-        ndarray
-            Standard deviation, g, (n,).
-
+        temperatures_c: temperatures, °C, (n,); returns: standard deviation, g, (n,).
         """
         warmer_k = np.asarray(temperatures_c) - NOMINAL_TEMPERATURE_C
         base_k = calibrated_c - NOMINAL_TEMPERATURE_C

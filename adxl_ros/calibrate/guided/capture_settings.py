@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """How poses are taken, and what a guided calibration waits for."""
 
@@ -33,33 +21,17 @@ class StageMode(Enum):
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """
-    How poses are taken; times are by the stamps of the samples.
+    """How poses are taken; times are by the stamps of the samples."""
 
-    Attributes
-    ----------
-    dwell_s
-        Time at rest for each pose, s.
-    tolerance_rad
-        Largest distance of a joint from the pose at which a stage that turns itself has arrived,
-        rad.
-    timeout_s
-        Time after which an open pose is reported as late, s.
-    stage_mode
-        Who turns the stage.
-    near_rad
-        Largest distance of a joint from the pose at which a capture by hand is accepted, rad.
-        The default is 2°.
-    temperature_span_c
-        Largest difference of the temperature from that of the first pose, °C.
-
-    """
-
-    dwell_s: float
+    dwell_s: float  # Time at rest for each pose, s
+    # Largest distance of a joint from the pose at which a stage that turns itself has arrived, rad
     tolerance_rad: float
-    timeout_s: float
-    stage_mode: StageMode
+    timeout_s: float  # Time after which an open pose is reported as late, s
+    stage_mode: StageMode  # Who turns the stage
+    # Largest distance of a joint from the pose at which a capture by hand is accepted, rad. The
+    # default is 2°.
     near_rad: float = 0.035
+    # Largest difference of the temperature from that of the first pose, °C
     temperature_span_c: float = 3.0
 
 
@@ -92,20 +64,9 @@ class Phase(Enum):
 
 @dataclass(frozen=True)
 class Status:
-    """
-    What a guided calibration waits for, for people.
+    """What a guided calibration waits for, for people."""
 
-    Attributes
-    ----------
-    phase
-        What it waits for.
-    text
-        One line with the values that matter.
-    late
-        Whether somebody should look: it waits longer than the time-out, or refuses its input.
-
-    """
-
-    phase: Phase
-    text: str
+    phase: Phase  # What it waits for
+    text: str  # One line with the values that matter
+    # Whether somebody should look: it waits longer than the time-out, or refuses its input
     late: bool

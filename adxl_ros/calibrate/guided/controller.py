@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The guided calibration as a state machine, free of ROS.
@@ -85,57 +73,25 @@ class Severity(Enum):
 
 
 class Answer(NamedTuple):
-    """
-    The answer to a request.
+    """The answer to a request."""
 
-    Attributes
-    ----------
-    success
-        Whether the request was carried out.
-    message
-        One line for people.
-
-    """
-
-    success: bool
-    message: str
+    success: bool  # Whether the request was carried out
+    message: str  # One line for people
 
 
 class Report(NamedTuple):
-    """
-    What the diagnostics report.
+    """What the diagnostics report."""
 
-    Attributes
-    ----------
-    status
-        What the calibration waits for.
-    serial
-        Serial number of the sensor; '' while it is unknown.
-    values
-        Further values by key.
-
-    """
-
-    status: Status
-    serial: str
-    values: dict[str, str | float]
+    status: Status  # What the calibration waits for
+    serial: str  # Serial number of the sensor; '' while it is unknown
+    values: dict[str, str | float]  # Further values by key
 
 
 class Outputs(Protocol):
     """Where a controller's lines, answers and announcements go."""
 
     def log(self, severity: Severity, text: str) -> None:
-        """
-        Log a line.
-
-        Parameters
-        ----------
-        severity
-            Severity of the line.
-        text
-            The line.
-
-        """
+        """Log a line."""
 
     def answer_captures(self, answer: Answer) -> None:
         """Answer all callers that wait for the end of a capture."""
@@ -151,17 +107,9 @@ class Outputs(Protocol):
 
 
 class SampleSource(Protocol):
-    """
-    Where samples come from.
+    """Where samples come from."""
 
-    Attributes
-    ----------
-    fault
-        Why the newest samples are of no use, or ''.
-
-    """
-
-    fault: str
+    fault: str  # Why the newest samples are of no use, or ''
 
     def take(self, unit: Sensor) -> tuple[np.ndarray, np.ndarray]:
         """Return the samples since the last call: stamps, ns, (n,), and volts, (n, m)."""
@@ -186,49 +134,21 @@ class Controller:
     """
     Runs guided calibrations, one after the other.
 
-    Parameters
-    ----------
-    settings
-        What a calibration is to do.
-    sensor
-        The sensor of the parameters, which gives what the stream does not state.
-    resume
-        What to do with an interrupted calibration.
-    samples
-        Where samples come from.
-    outputs
-        Where lines, answers and announcements go.
-    anonymous
-        The sensor of a stream that states nothing of itself; None for `sensor`.
-
-    Attributes
-    ----------
-    state
-        The present state.
-    unit
-        The nominal sensor of the stream; None while it is unknown.
-    session
-        The running calibration; None in the states IDLE, WAITING_FOR_SENSOR and ASKING.
-    question
-        The question to the operator in the state ASKING, else ''.
-    outcome
-        Lines on the calibration that ended last.
-    may_ask
-        Whether somebody is at a screen who can be asked.
-    shows_idle_stream
-        Whether a screen shows the samples while no calibration runs.
-
+    may_ask: whether somebody is at a screen who can be asked; shows_idle_stream: whether a screen
+    shows the samples while no calibration runs.
     """
 
     def __init__(self, settings: SessionSettings, sensor: Sensor, resume: Resume,
                  samples: SampleSource, outputs: Outputs, anonymous: Sensor | None = None
                  ) -> None:
         self.settings = settings
-        self.state = ControllerState.IDLE
+        self.state = ControllerState.IDLE  # The present state
+        # The nominal sensor of the stream; None while it is unknown
         self.unit: Sensor | None = None
+        # The running calibration; None in the states IDLE, WAITING_FOR_SENSOR and ASKING
         self.session: Session | None = None
-        self.question = ''
-        self.outcome: tuple[str, ...] = ()
+        self.question = ''  # The question to the operator in the state ASKING, else ''
+        self.outcome: tuple[str, ...] = ()  # Lines on the calibration that ended last
         self.may_ask = self.shows_idle_stream = False
         self._sensor, self._resume = sensor, resume
         self._samples, self._outputs = samples, outputs
@@ -251,21 +171,7 @@ class Controller:
         self.state = ControllerState.WAITING_FOR_SENSOR
 
     def start(self, start_over: bool | None = None) -> Answer:
-        """
-        Begin a calibration, or resume an interrupted one.
-
-        Parameters
-        ----------
-        start_over
-            Whether to put an interrupted calibration aside, which also answers the question. None
-            for a start that is no answer.
-
-        Returns
-        -------
-        Answer
-            Whether it begins.
-
-        """
+        """Begin a calibration, or resume an interrupted one."""
         if self.session is not None:
             return Answer(False, 'a calibration is running; finish or abort it first')
         if self.state is ControllerState.ASKING and start_over is None:
@@ -354,61 +260,23 @@ class Controller:
         self._outlook = self.settings.outlook(unit)
 
     def read_stage(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
-        """
-        Take the angles of the stage.
-
-        Parameters
-        ----------
-        stamp_ns
-            Their stamp, ns.
-        alpha_rad, beta_rad
-            The angles, rad.
-
-        """
+        """Take the angles of the stage."""
         if self.session is not None:
             self.session.guide.read_encoder(stamp_ns, alpha_rad, beta_rad)
 
     def read_command(self, alpha_rad: float, beta_rad: float) -> None:
-        """
-        Take a command that somebody gave the stage.
-
-        Parameters
-        ----------
-        alpha_rad, beta_rad
-            The commanded angles, rad; NaN for a joint without one.
-
-        """
+        """Take a command that somebody gave the stage."""
         if self.session is not None:
             self.session.guide.read_command(alpha_rad, beta_rad)
 
     def read_temperature(self, stamp_ns: int, temperature_c: float) -> None:
-        """
-        Take a temperature.
-
-        Parameters
-        ----------
-        stamp_ns
-            Its stamp, ns; 0 for none.
-        temperature_c
-            The temperature, °C.
-
-        """
+        """Take a temperature."""
         if self.session is not None:
             readings = self.session.guide.surroundings.temperature_c
             self._add_reading(self.session, readings, 'temperature', stamp_ns, temperature_c)
 
     def read_supply(self, stamp_ns: int, supply_v: float) -> None:
-        """
-        Take a supply voltage.
-
-        Parameters
-        ----------
-        stamp_ns
-            Its stamp, ns; 0 for none.
-        supply_v
-            The voltage, V.
-
-        """
+        """Take a supply voltage."""
         if self.session is not None:
             readings = self.session.guide.surroundings.supply_v
             self._add_reading(self.session, readings, 'supply', stamp_ns, supply_v)

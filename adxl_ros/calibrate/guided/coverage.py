@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """How many poses of each group are taken: by plane, by direction of travel, by orientation."""
 
@@ -34,22 +22,7 @@ _BACK = 'beta back'
 
 
 def by_plane(targets: Sequence[Target], accepted: Collection[int]) -> tuple[Coverage, ...]:
-    """
-    Count the poses of a plan by plane and by direction of travel, and the check poses.
-
-    Parameters
-    ----------
-    targets
-        The pose plan.
-    accepted
-        Numbers of the accepted poses, from 0.
-
-    Returns
-    -------
-    tuple
-        Planes first, then directions of travel, then the check poses.
-
-    """
+    """Count the poses of a plan by plane and by direction of travel, and the check poses."""
     groups: dict[str, list[int]] = {}
     previous = None
     for number, target in enumerate(targets):

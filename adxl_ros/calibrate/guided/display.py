@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """From a session to the contents of the calibration screen."""
 
@@ -33,15 +21,7 @@ from adxl_ros.signals.rest_detection import Stillness
 
 
 class SessionDisplay:
-    """
-    The displayed values of one session; the slow estimate is computed only once for each pose.
-
-    Parameters
-    ----------
-    session
-        The session.
-
-    """
+    """The displayed values of one session; the slow estimate is computed once for each pose."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
@@ -70,24 +50,7 @@ class SessionDisplay:
 
 def live_reading(newest: NewestSamples, unit: Sensor, stillness: Stillness | None
                  ) -> LiveReading | None:
-    """
-    Return what the sensor reads at present.
-
-    Parameters
-    ----------
-    newest
-        The newest samples.
-    unit
-        The nominal sensor of the stream.
-    stillness
-        Whether it is at rest; None while the samples are too few.
-
-    Returns
-    -------
-    LiveReading or None
-        The reading; None without samples.
-
-    """
+    """Return what the sensor reads at present."""
     if not len(newest.volts):
         return None
     axes = tuple(AxisReading(axis, mean_mps2, rms_mps2) for axis, mean_mps2, rms_mps2 in zip(

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The dwell in one pose: the samples since the arrival, and the rests among them."""
 
@@ -25,39 +13,19 @@ import numpy as np
 
 
 class RestMean(NamedTuple):
-    """
-    The average of a rest.
+    """The average of a rest."""
 
-    Attributes
-    ----------
-    start_ns, stop_ns
-        Stamps of the first and the last sample, ns.
-    samples
-        Number of samples.
-    mean_v, std_v
-        Mean output of each axis and the standard deviation of that mean, V, (m,).
-
-    """
-
+    # start_ns, stop_ns: Stamps of the first and the last sample, ns
     start_ns: int
     stop_ns: int
-    samples: int
+    samples: int  # Number of samples
+    # mean_v, std_v: Mean output of each axis and the standard deviation of that mean, V, (m,)
     mean_v: tuple[float, ...]
     std_v: tuple[float, ...]
 
 
 class Dwell:
-    """
-    Samples from an arrival on.
-
-    Parameters
-    ----------
-    sensor
-        The nominal sensor of the stream; its noise decides what is at rest.
-    arrived_ns
-        Stamp of the arrival, ns; earlier samples do not belong to the pose.
-
-    """
+    """Samples from an arrival on."""
 
     def __init__(self, sensor: Sensor, arrived_ns: int) -> None:
         self.arrived_ns = arrived_ns
@@ -75,13 +43,7 @@ class Dwell:
         """
         Take samples.
 
-        Parameters
-        ----------
-        stamps_ns
-            Their stamps, ns, (n,).
-        volts
-            The samples, V, (n, m).
-
+        stamps_ns: their stamps, ns, (n,); volts: the samples, V, (n, m).
         """
         new = stamps_ns >= self.arrived_ns
         self._stamps.append(stamps_ns[new])
@@ -116,22 +78,7 @@ class Dwell:
         return np.concatenate(self._volts)[rest.start:rest.stop]
 
     def mean(self, rest: Rest, samples: int) -> RestMean:
-        """
-        Average the first samples of a rest.
-
-        Parameters
-        ----------
-        rest
-            The rest.
-        samples
-            Number of samples to average.
-
-        Returns
-        -------
-        RestMean
-            Their average.
-
-        """
+        """Average the first samples of a rest."""
         stamps, start, stop = np.concatenate(self._stamps), rest.start, rest.start + samples
         times = (stamps - self.arrived_ns) * 1e-9
         mean, std = rest_means(times, np.concatenate(self._volts),

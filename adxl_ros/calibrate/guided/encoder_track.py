@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What the encoder of the stage has read: angles over time, its silence and its clock."""
 
@@ -51,22 +39,7 @@ class EncoderTrack:
         return self._readings[-1][1:] if self._readings else None
 
     def read(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> bool:
-        """
-        Take a reading.
-
-        Parameters
-        ----------
-        stamp_ns
-            Its stamp, ns.
-        alpha_rad, beta_rad
-            The angles, rad.
-
-        Returns
-        -------
-        bool
-            Whether the stamps went back, so that the earlier readings are forgotten.
-
-        """
+        """Take a reading."""
         restarted = self.newest_ns is not None and went_back(self.newest_ns, stamp_ns)
         if restarted:
             self._readings.clear()
@@ -104,16 +77,7 @@ class EncoderTrack:
         """
         Return the angles between two stamps.
 
-        Parameters
-        ----------
-        first_ns, last_ns
-            The stamps, ns.
-
-        Returns
-        -------
-        numpy.ndarray
-            Angles alpha and beta, rad, (n, 2).
-
+        returns: angles alpha and beta, rad, (n, 2).
         """
         inside = [(alpha_rad, beta_rad) for stamp_ns, alpha_rad, beta_rad in self._readings
                   if first_ns <= stamp_ns <= last_ns]
@@ -123,16 +87,7 @@ class EncoderTrack:
         """
         Average the angles between two stamps; without any, take the newest ones.
 
-        Parameters
-        ----------
-        first_ns, last_ns
-            The stamps, ns.
-
-        Returns
-        -------
-        tuple
-            Angles alpha and beta, rad.
-
+        returns: angles alpha and beta, rad.
         """
         inside = self.between(first_ns, last_ns)
         alpha_rad, beta_rad = np.mean(

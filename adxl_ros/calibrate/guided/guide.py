@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What a guide is: it leads through the poses of one calibration, with a stage or by hand."""
 
@@ -28,46 +16,21 @@ import numpy as np
 
 
 class NextPose(NamedTuple):
-    """
-    The pose to go to, as it is announced.
+    """The pose to go to, as it is announced."""
 
-    Attributes
-    ----------
-    text
-        One line for people.
-    values
-        Values for programs, by key.
-    command_rad
-        Angles alpha and beta for a stage that turns itself, rad; None for others.
-    newest_ns
-        Stamp of the newest sample, ns: a command is given after it.
-
-    """
-
-    text: str
-    values: Mapping[str, str | float]
+    text: str  # One line for people
+    values: Mapping[str, str | float]  # Values for programs, by key
+    # Angles alpha and beta for a stage that turns itself, rad; None for others
     command_rad: tuple[float, float] | None
-    newest_ns: int = 0
+    newest_ns: int = 0  # Stamp of the newest sample, ns: a command is given after it
 
 
 class Guide(Protocol):
-    """
-    Leads through the poses of one calibration: samples go in, accepted poses come out.
+    """Leads through the poses of one calibration: samples go in, accepted poses come out."""
 
-    Attributes
-    ----------
-    accepted
-        Accepted poses by number.
-    surroundings
-        Temperature and supply over time.
-    newest_ns
-        Stamp of the newest sample, ns; None before the first.
-
-    """
-
-    accepted: dict[int, PoseRecord]
-    surroundings: Surroundings
-    newest_ns: int | None
+    accepted: dict[int, PoseRecord]  # Accepted poses by number
+    surroundings: Surroundings  # Temperature and supply over time
+    newest_ns: int | None  # Stamp of the newest sample, ns; None before the first
 
     @property
     def moves_itself(self) -> bool:
@@ -97,38 +60,14 @@ class Guide(Protocol):
         """
         Take samples.
 
-        Parameters
-        ----------
-        stamps_ns
-            Their stamps, ns, (n,).
-        volts
-            The samples, V, (n, m).
-
+        stamps_ns: their stamps, ns, (n,); volts: the samples, V, (n, m).
         """
 
     def read_encoder(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
-        """
-        Take the angles of the stage.
-
-        Parameters
-        ----------
-        stamp_ns
-            Their stamp, ns.
-        alpha_rad, beta_rad
-            The angles, unwrapped, rad.
-
-        """
+        """Take the angles of the stage."""
 
     def read_command(self, alpha_rad: float, beta_rad: float) -> None:
-        """
-        Take a command that somebody gave the stage.
-
-        Parameters
-        ----------
-        alpha_rad, beta_rad
-            The commanded angles, rad; NaN for a joint without one.
-
-        """
+        """Take a command that somebody gave the stage."""
 
     def accept(self) -> PoseRecord | None:
         """Return the next pose for the journal, if one is complete."""

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The guide of a hand-held sensor: samples go in, accepted rests come out."""
 
@@ -79,16 +67,6 @@ class HandGuide(StagelessGuide):
     The noise of the unit is learned from the quietest parts of the stream. The rests can therefore
     change while the stream runs. Rests are announced as they end. `poses_to_fit` finds
     the rests of the complete stream once more, as `fit` does with a recording.
-
-    Parameters
-    ----------
-    sensor
-        The nominal sensor of the stream, of three axes.
-    temperature_span_c
-        Largest difference of the temperature from that of the first rest, °C.
-    accepted
-        Rests of an interrupted calibration.
-
     """
 
     is_over = False
@@ -116,13 +94,7 @@ class HandGuide(StagelessGuide):
         """
         Take samples.
 
-        Parameters
-        ----------
-        stamps_ns
-            Their stamps, ns, (n,).
-        volts
-            The samples, V, (n, m).
-
+        stamps_ns: their stamps, ns, (n,); volts: the samples, V, (n, m).
         """
         if not len(stamps_ns):
             return

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The newest samples of a stream, and readings of temperature and supply over time."""
 
@@ -46,61 +34,25 @@ Chosen: temperature and supply hardly change in a minute.
 
 
 def went_back(newest_ns: int, stamp_ns: int) -> bool:
-    """
-    Return whether stamps go back, since the driver was restarted or a clock was set.
-
-    Parameters
-    ----------
-    newest_ns
-        Newest stamp so far, ns.
-    stamp_ns
-        The next stamp, ns.
-
-    Returns
-    -------
-    bool
-        Whether the next stamp is earlier by more than a second.
-
-    """
+    """Return whether stamps go back, since the driver was restarted or a clock was set."""
     return stamp_ns < newest_ns - _BACK_NS
 
 
 class NewestSamples:
-    """
-    The newest 1.2 s of a stream, and at least twenty samples.
-
-    Parameters
-    ----------
-    sensor
-        The nominal sensor of the stream.
-
-    Attributes
-    ----------
-    stamps_ns
-        Stamps, ns, (n,).
-    volts
-        Samples, V, (n, m).
-
-    """
+    """The newest 1.2 s of a stream, and at least twenty samples."""
 
     def __init__(self, sensor: Sensor) -> None:
         self._sensor = sensor
         self._keep = max(round(_REST_WINDOW_S * sensor.rate_hz), _FEWEST_SAMPLES)
         self._show = max(round(_SHOWN_S * sensor.rate_hz), _FEWEST_SAMPLES)
-        self.stamps_ns = np.zeros(0, np.int64)
-        self.volts = np.zeros((0, len(sensor.axes)))
+        self.stamps_ns = np.zeros(0, np.int64)  # Stamps, ns, (n,)
+        self.volts = np.zeros((0, len(sensor.axes)))  # Samples, V, (n, m)
 
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
         """
         Take samples.
 
-        Parameters
-        ----------
-        stamps_ns
-            Their stamps, ns, (n,).
-        volts
-            The samples, V, (n, m).
-
+        stamps_ns: their stamps, ns, (n,); volts: the samples, V, (n, m).
         """
         self.stamps_ns = np.concatenate([self.stamps_ns, stamps_ns])[-self._keep:]
         self.volts = np.concatenate([self.volts, volts])[-self._keep:]
@@ -139,17 +91,7 @@ class Readings:
         self._values: deque[float] = deque(maxlen=_KEPT_READINGS)
 
     def add(self, stamp_ns: int, value: float) -> None:
-        """
-        Take a reading; one that is not finite is left out.
-
-        Parameters
-        ----------
-        stamp_ns
-            Its stamp, ns. A stamp before the newest one begins a new history.
-        value
-            The reading, in its unit.
-
-        """
+        """Take a reading; one that is not finite is left out."""
         if not np.isfinite(value):
             return
         if self._stamps_ns and stamp_ns < self._stamps_ns[-1]:
@@ -159,20 +101,7 @@ class Readings:
         self._values.append(value)
 
     def mean(self, first_ns: int, last_ns: int) -> float:
-        """
-        Average the readings between two stamps, or return the last reading before.
-
-        Parameters
-        ----------
-        first_ns, last_ns
-            The stamps, ns.
-
-        Returns
-        -------
-        float
-            The average; NaN where no reading is recent enough.
-
-        """
+        """Average the readings between two stamps, or return the last reading before."""
         begin = bisect_left(self._stamps_ns, first_ns)
         end = bisect_right(self._stamps_ns, last_ns)
         if begin == end and end and first_ns - self._stamps_ns[end - 1] < STALE_NS:
@@ -183,18 +112,8 @@ class Readings:
 
 
 class Surroundings:
-    """
-    Temperature and supply over time.
-
-    Attributes
-    ----------
-    temperature_c
-        Readings of the temperature, °C.
-    supply_v
-        Readings of the supply, V.
-
-    """
+    """Temperature and supply over time."""
 
     def __init__(self) -> None:
-        self.temperature_c = Readings()
-        self.supply_v = Readings()
+        self.temperature_c = Readings()  # Readings of the temperature, °C
+        self.supply_v = Readings()  # Readings of the supply, V

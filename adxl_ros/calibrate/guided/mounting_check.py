@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The check that the sensor is mounted as it was when earlier poses were taken."""
 
@@ -44,24 +32,7 @@ def to_take_again(records: Sequence[PoseRecord]) -> list[PoseRecord]:
 
 
 def changed(sensor: Sensor, before: PoseRecord, now: PoseRecord, tolerance_rad: float) -> str:
-    """
-    Compare two readings of the same pose, before and after an interruption.
-
-    Parameters
-    ----------
-    sensor
-        The nominal sensor.
-    before, now
-        The pose in the journal, and the same pose taken again.
-    tolerance_rad
-        How far the stage may be from its angles each time, rad.
-
-    Returns
-    -------
-    str
-        The axis that changed most, with its limit and what to do, or ''.
-
-    """
+    """Compare two readings of the same pose, before and after an interruption."""
     before_v, now_v = np.array(before.mean_v), np.array(now.mean_v)
     change_g = np.abs(now_v - before_v) / sensor.nominal_scale_v_per_g
     noise_g = np.hypot(before.std_v, now.std_v) / sensor.nominal_scale_v_per_g

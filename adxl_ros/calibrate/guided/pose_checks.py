@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Checks of a pose: one line with the value that is wrong, and what to do.
@@ -44,24 +32,7 @@ _LONGEST_IN_S = 600
 
 
 def angle_fault(target: Target, alpha_rad: float, beta_rad: float, tolerance_rad: float) -> str:
-    """
-    Refuse a stage that is not at the pose.
-
-    Parameters
-    ----------
-    target
-        The pose.
-    alpha_rad, beta_rad
-        The angles of the stage, rad.
-    tolerance_rad
-        Largest permitted distance of a joint, rad.
-
-    Returns
-    -------
-    str
-        The joints that are too far, or ''.
-
-    """
+    """Refuse a stage that is not at the pose."""
     return ', '.join(
         f'{name} is {degrees_text(now - wanted)} from the target {np.degrees(wanted):.4g}°'
         for name, now, wanted in (('alpha', alpha_rad, target.alpha_rad),
@@ -73,20 +44,7 @@ def motion_fault(name: str, angles_rad: np.ndarray, tolerance_rad: float) -> str
     """
     Refuse a joint that turned while the pose was averaged.
 
-    Parameters
-    ----------
-    name
-        Name of the joint.
-    angles_rad
-        Its readings during the dwell, rad, (n,).
-    tolerance_rad
-        Largest permitted range, rad.
-
-    Returns
-    -------
-    str
-        How far the joint moved, or ''.
-
+    angles_rad: its readings during the dwell, rad, (n,).
     """
     range_rad = float(np.ptp(angles_rad)) if len(angles_rad) else 0.0
     if range_rad <= tolerance_rad:
@@ -99,18 +57,7 @@ def saturation_fault(sensor: Sensor, volts: np.ndarray) -> str:
     """
     Refuse volts at a rail of the ADC or beyond the range of the sensor.
 
-    Parameters
-    ----------
-    sensor
-        The nominal sensor.
-    volts
-        Samples of the pose, V, (n, m).
-
-    Returns
-    -------
-    str
-        The first of these samples, or ''.
-
+    volts: samples of the pose, V, (n, m).
     """
     rows, columns = np.nonzero(sensor.saturated(volts))
     if not len(rows):
@@ -124,22 +71,7 @@ def saturation_fault(sensor: Sensor, volts: np.ndarray) -> str:
 
 
 def temperature_fault(first_c: float, now_c: float, span_c: float) -> str:
-    """
-    Refuse a pose whose temperature differs from that of the first pose.
-
-    Parameters
-    ----------
-    first_c, now_c
-        Temperature of the first pose and of this one, °C; NaN without a reading.
-    span_c
-        Largest permitted difference, °C.
-
-    Returns
-    -------
-    str
-        By how much the temperature moved, or ''.
-
-    """
+    """Refuse a pose whose temperature differs from that of the first pose."""
     if not abs(now_c - first_c) > span_c:
         return ''
     return (f'temperature moved {abs(now_c - first_c):.1f} °C since the first pose '
@@ -148,22 +80,7 @@ def temperature_fault(first_c: float, now_c: float, span_c: float) -> str:
 
 
 def rate_fault(measured_hz: float, unit: Sensor) -> str:
-    """
-    Refuse samples whose rate is not that of the unit.
-
-    Parameters
-    ----------
-    measured_hz
-        Rate by the stamps, Hz; NaN where it is unknown.
-    unit
-        The unit, whose rate `sensor_info` states or its first samples show.
-
-    Returns
-    -------
-    str
-        Both rates, or ''.
-
-    """
+    """Refuse samples whose rate is not that of the unit."""
     if not abs(measured_hz / unit.rate_hz - 1) > _RATE_ERROR:
         return ''
     expected = f'were {unit.rate_hz:.4g} at the start; keep the rate of the sensor' \
@@ -187,22 +104,7 @@ def reading_fault(estimate: RunningEstimate, target: Target, volts: np.ndarray,
     """
     Refuse a pose whose mean is an outlier to the prediction from the poses so far.
 
-    Parameters
-    ----------
-    estimate
-        The unit by the poses so far and the datasheet.
-    target
-        The angles at which the pose was taken.
-    volts
-        Mean of the pose, V, (m,).
-    tolerance_rad
-        How far the stage may be from its angles, rad.
-
-    Returns
-    -------
-    str
-        Measured and expected value with a probable cause, or ''.
-
+    volts: mean of the pose, V, (m,).
     """
     sensor = estimate.unit
     expected_v, std_v = estimate.predicted(target.alpha_rad, target.beta_rad)

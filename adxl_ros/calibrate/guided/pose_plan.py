@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The pose plan: which poses a sweep visits, in which order."""
 
@@ -43,47 +31,16 @@ _HIGHEST_COSINE = 0.97
 
 @dataclass(frozen=True)
 class Target:
-    """
-    One pose to visit.
+    """One pose to visit."""
 
-    Attributes
-    ----------
-    alpha_rad, beta_rad
-        Angles of the joints, rad.
-    check
-        Whether the pose is kept out of the fit, to show how good the fit is.
-
-    """
-
+    # alpha_rad, beta_rad: Angles of the joints, rad
     alpha_rad: float
     beta_rad: float
-    check: bool = False
+    check: bool = False  # Whether the pose is kept out of the fit, to show how good the fit is
 
 
 def sweep(planes_rad: Sequence[float], step_rad: float, check_poses: int) -> list[Target]:
-    """
-    Plan the paper's two experiments: in each plane alpha, beta through a turn forth and back.
-
-    Parameters
-    ----------
-    planes_rad
-        Angles alpha, in the order of the visit.
-    step_rad
-        Step of beta from 0 to 2π and back; the paper's is 30°.
-    check_poses
-        Number of poses off the grid after the sweep, spread evenly over the sphere.
-
-    Returns
-    -------
-    list
-        The poses in the order of the visit.
-
-    Raises
-    ------
-    UserError
-        There is no plane, or the step makes less than four or more than 720 poses a turn.
-
-    """
+    """Plan the paper's two experiments: in each plane alpha, beta turns forth and back."""
     forth = _turn(planes_rad, step_rad)
     grid = [Target(float(alpha), float(beta)) for alpha in planes_rad
             for beta in (*forth, *forth[::-1])]
@@ -110,26 +67,6 @@ def guided(planes_rad: Sequence[float], step_rad: float, check_poses: int) -> li
     complete after half of the sweep, and each pose is reached in both directions of both joints.
     Where |sin alpha| < 0.2 beta hardly shows, and quarter turns of beta are enough. Check poses
     follow in whole degrees, which can be set by hand on a scale.
-
-    Parameters
-    ----------
-    planes_rad
-        Angles alpha, in any order, rad.
-    step_rad
-        Step of beta from 0 to 2π and back, rad.
-    check_poses
-        Number of check poses.
-
-    Returns
-    -------
-    list
-        The poses in the order of the visit.
-
-    Raises
-    ------
-    UserError
-        There is no plane, or the step makes less than four or more than 720 poses a turn.
-
     """
     forth = _turn(planes_rad, step_rad)
     planes = np.array(sorted({float(alpha) for alpha in planes_rad}))
@@ -143,22 +80,7 @@ def guided(planes_rad: Sequence[float], step_rad: float, check_poses: int) -> li
 
 
 def with_checks(targets: list[Target], check_poses: int) -> list[Target]:
-    """
-    Add check poses in whole degrees, each the nearest to the pose before.
-
-    Parameters
-    ----------
-    targets
-        The poses of the fit.
-    check_poses
-        Number of check poses.
-
-    Returns
-    -------
-    list
-        All poses.
-
-    """
+    """Add check poses in whole degrees, each the nearest to the pose before."""
     checks = [Target(_whole_degrees(target.alpha_rad), _whole_degrees(target.beta_rad), True)
               for target in spread(check_poses)]
     return targets + nearest(targets[-1], checks)
@@ -187,22 +109,7 @@ def _distance_rad(first: Target, second: Target) -> float:
 
 
 def nearest(start: Target, targets: list[Target]) -> list[Target]:
-    """
-    Order poses so that each one is the nearest to the pose before.
-
-    Parameters
-    ----------
-    start
-        The pose before the first.
-    targets
-        The poses.
-
-    Returns
-    -------
-    list
-        The poses in that order.
-
-    """
+    """Order poses so that each one is the nearest to the pose before."""
     remaining, path = list(targets), [start]
     while remaining:
         path.append(min(remaining, key=lambda target: _distance_rad(path[-1], target)))

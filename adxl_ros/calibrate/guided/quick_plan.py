@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The quick plan: the fewest poses that reach a stated tilt error.
@@ -39,26 +27,7 @@ _MOST_POSES = 90
 
 def quick(sensor: Sensor, dwell_s: float, tilt_error_rad: float, check_poses: int
           ) -> list[Target]:
-    """
-    Choose the fewest poses that reach a tilt error, and never more than 90.
-
-    Parameters
-    ----------
-    sensor
-        The nominal sensor; its stage resolution is the stated error of the stage.
-    dwell_s
-        Time that a pose is averaged, s.
-    tilt_error_rad
-        Rms error of alpha and beta to reach, rad.
-    check_poses
-        Number of poses off the grid after the others.
-
-    Returns
-    -------
-    list
-        Poses in the order of the visit.
-
-    """
+    """Choose the fewest poses that reach a tilt error, and never more than 90."""
     start = datasheet_estimate(sensor, dwell_s)
     fewest = ceil((len(start.names) + _SPARE_READINGS) / len(sensor.axes))
     grid = d_optimal.candidate_poses(start.pose_std_v)
@@ -74,46 +43,14 @@ def quick(sensor: Sensor, dwell_s: float, tilt_error_rad: float, check_poses: in
 
 
 def datasheet_estimate(sensor: Sensor, dwell_s: float) -> running_estimate.RunningEstimate:
-    """
-    Return the estimate of a unit before its first pose, by the datasheet alone.
-
-    Parameters
-    ----------
-    sensor
-        The nominal sensor.
-    dwell_s
-        Time that a pose is averaged, s.
-
-    Returns
-    -------
-    RunningEstimate
-        The estimate.
-
-    """
+    """Return the estimate of a unit before its first pose, by the datasheet alone."""
     return running_estimate.from_poses(
         sensor, running_estimate.no_poses(len(sensor.axes)), dwell_s,
         sensor.stage_std_rad)
 
 
 def expected_tilt_error_rad(sensor: Sensor, dwell_s: float, targets: Sequence[Target]) -> float:
-    """
-    Predict the rms error of alpha and beta after a pose plan.
-
-    Parameters
-    ----------
-    sensor
-        The nominal sensor.
-    dwell_s
-        Time that a pose is averaged, s.
-    targets
-        The pose plan; check poses do not count.
-
-    Returns
-    -------
-    float
-        The error, rad; NaN where no pose shows both angles.
-
-    """
+    """Predict the rms error of alpha and beta after a pose plan."""
     fitted = [target for target in targets if not target.check]
     return datasheet_estimate(sensor, dwell_s).with_poses(fitted).tilt_error_rad()
 

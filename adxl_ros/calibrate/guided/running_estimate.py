@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The estimate of a unit after each pose: coefficients and expected tilt error."""
 
@@ -59,35 +47,17 @@ _EXPLAINED_STDS = 3.0
 
 @dataclass(frozen=True)
 class RunningEstimate:
-    """
-    The unit by the poses so far and the datasheet.
+    """The unit by the poses so far and the datasheet."""
 
-    Attributes
-    ----------
-    unit
-        The unit with the most likely coefficients, those of the stage's base among them.
-    names
-        Names of those coefficients, (p,).
-    covariance
-        Their covariance, the inverse of the Fisher information of poses and datasheet, (p, p).
-    prior
-        Standard deviation of each coefficient by the datasheet alone, (p,).
-    stage
-        Levels of the stage's error, by the stated one and by the poses.
-    pose_std_v
-        Standard deviation of the mean of one pose, V, (m,).
-    poses
-        Number of poses.
-
-    """
-
+    # The unit with the most likely coefficients, those of the stage's base among them
     unit: Sensor
-    names: tuple[Coefficient, ...]
+    names: tuple[Coefficient, ...]  # Names of those coefficients, (p,)
+    # Their covariance, the inverse of the Fisher information of poses and datasheet, (p, p)
     covariance: np.ndarray
-    prior: np.ndarray
-    stage: StageError
-    pose_std_v: np.ndarray
-    poses: int
+    prior: np.ndarray  # Standard deviation of each coefficient by the datasheet alone, (p,)
+    stage: StageError  # Levels of the stage's error, by the stated one and by the poses
+    pose_std_v: np.ndarray  # Standard deviation of the mean of one pose, V, (m,)
+    poses: int  # Number of poses
 
     @property
     def std(self) -> np.ndarray:
@@ -98,16 +68,7 @@ class RunningEstimate:
         """
         Predict the volts of a pose.
 
-        Parameters
-        ----------
-        alpha_rad, beta_rad
-            Angles of the pose, rad.
-
-        Returns
-        -------
-        volts, std_v
-            The volts and their standard deviations, V, (m,) each.
-
+        returns: the volts and their standard deviations, V, (m,) each.
         """
         pose = Poses.without_volts(np.array([alpha_rad]), np.array([beta_rad]), self.pose_std_v)
         slope = pose_response.coefficient_jacobian(self.unit, pose, self.names)[0]
@@ -122,20 +83,8 @@ class RunningEstimate:
 
         An angle that the volts do not show stays as it is.
 
-        Parameters
-        ----------
-        alpha_rad, beta_rad
-            Angles of the pose, rad.
-        volts
-            The volts that are read, V, (m,).
-        slack_v
-            Their standard deviation about the model, V, (m,).
-
-        Returns
-        -------
-        tuple or None
-            Angles alpha and beta, rad; None if no angles explain the volts.
-
+        volts: the volts that are read, V, (m,); slack_v: their standard deviation about the model,
+        V, (m,); returns: angles alpha and beta, rad; None if no angles explain the volts.
         """
         change_rad, damping = np.zeros(2), 1 / _SEARCH_STD_RAD ** 2
         for _ in range(_SEARCH_STEPS):
@@ -181,28 +130,7 @@ class RunningEstimate:
 
 def from_poses(sensor: Sensor, poses: Poses, dwell_s: float, stage_rad: float,
                previous: RunningEstimate | None = None) -> RunningEstimate:
-    """
-    Estimate a unit by a linearised fit of the full model with the priors of the datasheet.
-
-    Parameters
-    ----------
-    sensor
-        The nominal sensor.
-    poses
-        All poses so far; there may be none.
-    dwell_s
-        Time that a pose is averaged, s.
-    stage_rad
-        Stated standard deviation of a joint's error, rad.
-    previous
-        The estimate without the newest pose, where the fit begins; None for the datasheet.
-
-    Returns
-    -------
-    RunningEstimate
-        The estimate.
-
-    """
+    """Estimate a unit by a linearised fit of the full model with the priors of the datasheet."""
     terms = full_model.default_terms(sensor.axes)
     names = full_model.fitted_coefficients(sensor.axes, terms)
     unit = previous.unit if previous else with_neutral(sensor, (*terms, 'base_tilt'))
@@ -232,18 +160,7 @@ def tilt_error_rad(sensor: Sensor, pose_std_v: np.ndarray) -> float:
     """
     Predict the rms error of alpha and beta over the sphere.
 
-    Parameters
-    ----------
-    sensor
-        The unit with the covariance of its coefficients.
-    pose_std_v
-        Standard deviation of the readings, V, (m,).
-
-    Returns
-    -------
-    float
-        The error, rad; NaN where no pose shows both angles, as for a sensor of one axis.
-
+    pose_std_v: standard deviation of the readings, V, (m,).
     """
     alpha_rad, beta_rad = np.array([(target.alpha_rad, target.beta_rad)
                                     for target in spread(_EVALUATION_POSES)]).T
@@ -268,18 +185,7 @@ def in_g(sensor: Sensor, volts: np.ndarray) -> np.ndarray:
     """
     Convert volts by zero-g and scale factor of a unit.
 
-    Parameters
-    ----------
-    sensor
-        The unit.
-    volts
-        The volts, (m,).
-
-    Returns
-    -------
-    numpy.ndarray
-        Specific force, g, (m,).
-
+    volts: the volts, (m,); returns: specific force, g, (m,).
     """
     return (volts - sensor.zero_g_v) / sensor.scale_v_per_g
 
@@ -289,18 +195,8 @@ def coefficient_rows(names: Sequence[Coefficient], values: np.ndarray, std: np.n
     """
     Lay out coefficients for the screen, one row for each parameter of the unit.
 
-    Parameters
-    ----------
-    names
-        Names of the coefficients, (p,).
-    values, std, prior
-        Their values, their standard deviations, and those by the datasheet alone, (p,).
-
-    Returns
-    -------
-    tuple
-        The rows.
-
+    names: names of the coefficients, (p,); values, std, prior: their values, their standard
+    deviations, and those by the datasheet alone, (p,).
     """
     indices: dict[Coefficient, list[int]] = {}
     for i, name in enumerate(names):

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A guided calibration from its first pose to its parameter file, free of ROS."""
 
@@ -48,37 +36,7 @@ import numpy as np
 
 
 class Session:
-    """
-    One calibration of one unit: a guide, its journal, and the fit.
-
-    Parameters
-    ----------
-    unit
-        The nominal sensor of the stream.
-    settings
-        What the calibration is to do.
-    start_over
-        Begin a new journal although an interrupted calibration could be resumed.
-    base
-        The unit as it is calibrated so far, for a calibration over temperature; None for `unit`.
-
-    Attributes
-    ----------
-    guide
-        Leads through the poses.
-    newest
-        The newest samples.
-    journal
-        The accepted poses on disk.
-    resumed
-        Number of the poses of an interrupted calibration.
-
-    Raises
-    ------
-    UserError
-        The output or the journal cannot be written, or the interrupted calibration is another.
-
-    """
+    """One calibration of one unit: a guide, its journal, and the fit."""
 
     def __init__(self, unit: Sensor, settings: SessionSettings, start_over: bool,
                  base: Sensor | None = None) -> None:
@@ -91,15 +49,16 @@ class Session:
         targets = settings.targets(unit)
         self._base = _calibrated(base, unit) if settings.mode == 'thermal' else unit
         self.unit, self.settings = unit, settings
-        self.newest = NewestSamples(unit)
+        self.newest = NewestSamples(unit)  # The newest samples
+        # The accepted poses on disk
         self.journal = Journal(settings.journal, settings.head(unit), start_over)
         self._remove_unfinished()
         self._fitted: list[PoseRecord] = []
         self._is_mounting_unchecked = any(isinstance(entry, MountingUnchecked)
                                           for entry in self.journal.entries)
         accepted = accepted_poses(self.journal.entries)
-        self.resumed = len(accepted)
-        self.guide: Guide
+        self.resumed = len(accepted)  # Number of the poses of an interrupted calibration
+        self.guide: Guide  # Leads through the poses
         if settings.mode == 'gravity':
             self.guide = HandGuide(unit, settings.capture.temperature_span_c, accepted)
         elif settings.mode == 'thermal':
@@ -117,18 +76,7 @@ class Session:
         """
         Take samples.
 
-        Parameters
-        ----------
-        stamps_ns
-            Their stamps, ns, (n,).
-        volts
-            The samples, V, (n, m).
-
-        Returns
-        -------
-        str
-            Why the samples are of no use, or ''.
-
+        stamps_ns: their stamps, ns, (n,); volts: the samples, V, (n, m).
         """
         self.newest.feed(stamps_ns, volts)
         fault = pose_checks.rate_fault(self.newest.rate_hz(), self.unit)
@@ -137,22 +85,7 @@ class Session:
         return fault
 
     def take_poses(self) -> Iterator[str]:
-        """
-        Take the poses that are complete.
-
-        Yields
-        ------
-        str
-            A line for people on each pose, once it is on disk.
-
-        Raises
-        ------
-        MountingError
-            The mounting of the sensor changed.
-        UserError
-            The disk does not take a pose; the pose is taken again.
-
-        """
+        """Take the poses that are complete."""
         unverified = self.guide.poses_to_verify
         while (record := self.guide.accept()) is not None:
             try:
@@ -190,17 +123,6 @@ class Session:
         Fit the poses so far and write the parameter file.
 
         Call `end` once the report and the copy in the store are written, too.
-
-        Returns
-        -------
-        CalibrationResult
-            The calibration.
-
-        Raises
-        ------
-        UserError
-            There are too few poses, or the file cannot be written; the poses are kept.
-
         """
         records = self.guide.poses_to_fit()
         if not records:
@@ -226,12 +148,6 @@ class Session:
         Note in the journal that the fit is written; a sweep with open poses can be resumed.
 
         Without this note the next start fits and writes the files again.
-
-        Raises
-        ------
-        UserError
-            The disk does not take the note.
-
         """
         try:
             self.journal.append(Fitted(tuple(self._fitted), not self.guide.open_poses))

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What a guided calibration is to do, whatever the unit."""
 
@@ -36,50 +24,21 @@ _UNIT_FIELDS = (
 
 @dataclass(frozen=True)
 class SessionSettings:
-    """
-    What a guided calibration is to do, whatever the unit.
+    """What a guided calibration is to do, whatever the unit."""
 
-    Attributes
-    ----------
-    mode
-        'stage', 'gravity' or 'thermal'.
-    plan_kind
-        Kind of the pose plan: 'full' or 'quick'.
-    planes_rad
-        Planes alpha of the plan `full`, rad; empty for those that the axes of the unit need.
-    step_rad
-        Step of beta of the plan `full`, rad.
-    tilt_error_rad
-        Rms error of the tilt that the plan `quick` is to reach, rad.
-    check_poses
-        Number of poses that are kept out of the fit.
-    capture
-        How poses are taken.
-    output
-        The parameter file to write.
-    journal
-        The journal of the accepted poses.
-    report
-        Folder of the report, or ''.
-    store
-        Folder of the calibration store, or ''.
-    thermal
-        What a calibration over temperature is to cover.
-
-    """
-
-    mode: str
-    plan_kind: str
+    mode: str  # 'stage', 'gravity' or 'thermal'
+    plan_kind: str  # Kind of the pose plan: 'full' or 'quick'
+    # Planes alpha of the plan `full`, rad; empty for those that the axes of the unit need
     planes_rad: tuple[float, ...]
-    step_rad: float
-    tilt_error_rad: float
-    check_poses: int
-    capture: CaptureSettings
-    output: Path
-    journal: Path
-    report: str
-    store: str
-    thermal: ThermalSettings = ThermalSettings()
+    step_rad: float  # Step of beta of the plan `full`, rad
+    tilt_error_rad: float  # Rms error of the tilt that the plan `quick` is to reach, rad
+    check_poses: int  # Number of poses that are kept out of the fit
+    capture: CaptureSettings  # How poses are taken
+    output: Path  # The parameter file to write
+    journal: Path  # The journal of the accepted poses
+    report: str  # Folder of the report, or ''
+    store: str  # Folder of the calibration store, or ''
+    thermal: ThermalSettings = ThermalSettings()  # What a calibration over temperature is to cover
 
     @property
     def operator_captures(self) -> bool:
@@ -87,15 +46,7 @@ class SessionSettings:
         return self.mode == 'stage' and self.capture.stage_mode is not StageMode.COMMANDED
 
     def targets(self, unit: Sensor) -> list[pose_plan.Target]:
-        """
-        Return the poses in the order of the visit; none without a stage.
-
-        Raises
-        ------
-        UserError
-            The parameters make no pose plan.
-
-        """
+        """Return the poses in the order of the visit; none without a stage."""
         if self.mode != 'stage':
             return []
         if self.plan_kind == 'quick':

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The guide of a sweep on a stage: samples and encoder angles go in, accepted poses come out.
@@ -67,47 +55,17 @@ class PoseState(Enum):
 
 @dataclass
 class _Attempt:
-    """
-    The attempt to take the open pose.
+    """The attempt to take the open pose."""
 
-    Attributes
-    ----------
-    state
-        State of the attempt.
-    dwell
-        The samples since the pose was reached.
-    since_ns
-        Newest stamp of the samples when the attempt began, ns; None before the first sample.
-    refusal
-        Why the pose was refused; '' if it was not.
-
-    """
-
-    state: PoseState
-    dwell: Dwell
+    state: PoseState  # State of the attempt
+    dwell: Dwell  # The samples since the pose was reached
+    # Newest stamp of the samples when the attempt began, ns; None before the first sample
     since_ns: int | None
-    refusal: str = ''
+    refusal: str = ''  # Why the pose was refused; '' if it was not
 
 
 class StageGuide:
-    """
-    Leads a stage, or the operator who turns it, through the poses of a plan; a `Guide`.
-
-    Parameters
-    ----------
-    sensor
-        The nominal sensor of the stream; its noise decides what is at rest.
-    targets
-        The pose plan.
-    settings
-        How poses are taken.
-    accepted
-        Poses of an interrupted sweep. The stage may have lost power since: the next pose has new
-        settings of both joints, numbered on from the highest.
-    skipped
-        Numbers of the poses that the operator of an interrupted sweep left out.
-
-    """
+    """Leads a stage, or the operator who turns it, through the poses of a plan; a `Guide`."""
 
     def __init__(self, sensor: Sensor, targets: Sequence[Target], settings: CaptureSettings,
                  accepted: Sequence[PoseRecord] = (), skipped: Iterable[int] = ()) -> None:
@@ -216,17 +174,7 @@ class StageGuide:
         return f'pose {number + 1} will be taken again'
 
     def read_encoder(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
-        """
-        Take the angles of the stage.
-
-        Parameters
-        ----------
-        stamp_ns
-            Their stamp, ns.
-        alpha_rad, beta_rad
-            The angles, unwrapped, rad.
-
-        """
+        """Take the angles of the stage."""
         if self.encoder.read(stamp_ns, alpha_rad, beta_rad):
             # A stage that has restarted may have moved in between.
             self._tracker.lose_track()
@@ -247,12 +195,6 @@ class StageGuide:
         Take a command that somebody gave the stage.
 
         It counts in stage mode `encoder`. In the other modes the targets are the commands.
-
-        Parameters
-        ----------
-        alpha_rad, beta_rad
-            The commanded angles, rad; NaN for a joint without one.
-
         """
         if self.settings.stage_mode is StageMode.ENCODER:
             self._tracker.command(self.newest_ns or 0, alpha_rad, beta_rad)
@@ -261,13 +203,7 @@ class StageGuide:
         """
         Take samples.
 
-        Parameters
-        ----------
-        stamps_ns
-            Their stamps, ns, (n,).
-        volts
-            The samples, V, (n, m).
-
+        stamps_ns: their stamps, ns, (n,); volts: the samples, V, (n, m).
         """
         if not len(stamps_ns):
             return
@@ -281,15 +217,7 @@ class StageGuide:
             self._attempt.dwell.feed(stamps_ns, volts)
 
     def accept(self) -> PoseRecord | None:
-        """
-        Return the pose for the journal when a full dwell at rest is complete, else None.
-
-        Raises
-        ------
-        MountingError
-            A pose from before the interruption reads something else now.
-
-        """
+        """Return the pose for the journal when a full dwell at rest is complete, else None."""
         target = self.target
         if target is None or self._attempt.state is not PoseState.AVERAGING or (
                 self._uses_encoder and self.encoder.clock_fault()):

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What the guides of a sensor share that no stage carries."""
 
@@ -29,14 +17,6 @@ class StagelessGuide:
 
     No pose is known before it is taken, so that none is open, and none can be taken again to
     check the mounting.
-
-    Parameters
-    ----------
-    sensor
-        The nominal sensor of the stream.
-    accepted
-        Poses of an interrupted calibration.
-
     """
 
     moves_itself = False
@@ -69,28 +49,10 @@ class StagelessGuide:
         """Do nothing: no pose can be taken again."""
 
     def read_encoder(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
-        """
-        Do nothing: no stage carries the sensor.
-
-        Parameters
-        ----------
-        stamp_ns
-            Stamp of the angles, ns.
-        alpha_rad, beta_rad
-            Angles of a stage that carries something else, rad.
-
-        """
+        """Do nothing: no stage carries the sensor."""
 
     def read_command(self, alpha_rad: float, beta_rad: float) -> None:
-        """
-        Do nothing: no stage carries the sensor.
-
-        Parameters
-        ----------
-        alpha_rad, beta_rad
-            Command for a stage that carries something else, rad.
-
-        """
+        """Do nothing: no stage carries the sensor."""
 
     def skip_entry(self) -> JournalEntry | None:
         """Return None: what is left out has no entry in the journal."""

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The guide of a sensor that rests while it warms and cools: samples in, blocks out."""
 
@@ -44,38 +32,14 @@ _PATIENCE = 3
 
 @dataclass(frozen=True)
 class ThermalSettings:
-    """
-    What a calibration over temperature is to cover.
+    """What a calibration over temperature is to cover."""
 
-    Attributes
-    ----------
-    range_c
-        Lowest and highest wanted temperature, °C.
-    block_s
-        Length of a block, s.
-
-    """
-
-    range_c: tuple[float, float] = (0.0, 50.0)
-    block_s: float = thermal_calibration.BLOCK_S
+    range_c: tuple[float, float] = (0.0, 50.0)  # Lowest and highest wanted temperature, °C
+    block_s: float = thermal_calibration.BLOCK_S  # Length of a block, s
 
 
 class ThermalGuide(StagelessGuide):
-    """
-    Averages a resting sensor block by block while its temperature changes; a `Guide`.
-
-    Parameters
-    ----------
-    sensor
-        The nominal sensor of the stream.
-    base
-        The unit as it is calibrated at one temperature.
-    settings
-        What is to be covered.
-    accepted
-        Blocks of an interrupted calibration.
-
-    """
+    """Averages a resting sensor block by block while its temperature changes; a `Guide`."""
 
     def __init__(self, sensor: Sensor, base: Sensor, settings: ThermalSettings,
                  accepted: Sequence[PoseRecord] = ()) -> None:
@@ -100,13 +64,7 @@ class ThermalGuide(StagelessGuide):
         """
         Take samples.
 
-        Parameters
-        ----------
-        stamps_ns
-            Their stamps, ns, (n,).
-        volts
-            The samples, V, (n, m).
-
+        stamps_ns: their stamps, ns, (n,); volts: the samples, V, (n, m).
         """
         if not len(stamps_ns):
             return

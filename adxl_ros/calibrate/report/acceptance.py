@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Acceptance of a calibration: PASS or FAIL against the datasheet and against the noise."""
 
@@ -51,26 +39,15 @@ _NONLINEARITY = Coefficient('nonlinearity', 'cubic_per_g2')
 
 @dataclass(frozen=True)
 class Assessment:
-    """
-    The outcomes of one model: PASS, FAIL or NOT SHOWN against each limit, '' without a limit.
+    """The outcomes of one model: PASS, FAIL or NOT SHOWN by limit, '' without a limit."""
 
-    Attributes
-    ----------
-    model
-        Name of the model.
-    accel, tilt
-        Error budgets of acceleration, (m/s²)² per axis, and of tilt, rad².
-    accel_datasheet, tilt_datasheet
-        Outcomes against the typical nonlinearity of the datasheet.
-    accel_noise, tilt_noise
-        Outcomes against the noise of one sample.
-
-    """
-
-    model: str
+    model: str  # Name of the model
+    # accel, tilt: Error budgets of acceleration, (m/s²)² per axis, and of tilt, rad²
     accel: ErrorBudget
     tilt: ErrorBudget
+    # accel_datasheet, tilt_datasheet: Outcomes against the typical nonlinearity of the datasheet
     accel_datasheet: str
+    # accel_noise, tilt_noise: Outcomes against the noise of one sample
     accel_noise: str
     tilt_datasheet: str = ''
     tilt_noise: str = ''
@@ -112,21 +89,6 @@ def assess(model: str, budgets: ErrorBudgets, sensor: Sensor) -> Assessment:
     The limit by the datasheet is the typical nonlinearity at full scale, the only error that the
     manufacturer's own calibration leaves. The limit by the noise is the noise of one sample, rms
     over the axes. The limits of tilt are the tilt errors that such errors of each axis cause.
-
-    Parameters
-    ----------
-    model
-        Name of the model.
-    budgets
-        From `error_budget.error_budgets`.
-    sensor
-        The unit with its datasheet values and noise.
-
-    Returns
-    -------
-    Assessment
-        The outcomes against all limits.
-
     """
     datasheet, noise = nonlinearity_mps2(sensor) ** 2, sample_noise_mps2(sensor) ** 2
     accel, tilt = budgets
@@ -167,22 +129,7 @@ def beyond_datasheet(sensor: Sensor) -> list[str]:
 
 
 def table(assessments: Sequence[Assessment], models: Sequence[HeldOutErrors]) -> list[str]:
-    """
-    Return errors and outcomes of all models as lines for a terminal.
-
-    Parameters
-    ----------
-    assessments
-        Assessments of the models, one row each.
-    models
-        Held-out errors of the same models, and possibly of others.
-
-    Returns
-    -------
-    list of str
-        The head, and a line for each assessment.
-
-    """
+    """Return errors and outcomes of all models as lines for a terminal."""
     lines = [f'{"model":9} {"tilt rms (90 %) deg":>23} {"accel rms (90 %) mg":>23}  '
              f'{"error mg":>8}  {"datasheet":9} {"noise":9} limited by']
     errors_of = {errors.model: errors for errors in models}
@@ -196,22 +143,7 @@ def table(assessments: Sequence[Assessment], models: Sequence[HeldOutErrors]) ->
 
 
 def explanation(assessment: Assessment, sensor: Sensor) -> list[str]:
-    """
-    State the limits, and the parts of the error of the saved model.
-
-    Parameters
-    ----------
-    assessment
-        Assessment of that model.
-    sensor
-        The unit with its datasheet values and noise.
-
-    Returns
-    -------
-    list of str
-        Lines of text.
-
-    """
+    """State the limits, and the parts of the error of the saved model."""
     accel = assessment.accel
     limit_mps2, noise_mps2 = nonlinearity_mps2(sensor), sample_noise_mps2(sensor)
     tilt = '' if np.isnan(assessment.error_deg) else f' and {assessment.error_deg:.3f} deg'
@@ -244,22 +176,7 @@ def explanation(assessment: Assessment, sensor: Sensor) -> list[str]:
 
 
 def limit_table(assessment: Assessment, sensor: Sensor) -> list[str]:
-    """
-    Lay out the error of the calibration below its limits, with one outcome for each figure.
-
-    Parameters
-    ----------
-    assessment
-        Assessment of the saved model.
-    sensor
-        The unit with its datasheet values and noise.
-
-    Returns
-    -------
-    list of str
-        A line for the error, and a line for each limit.
-
-    """
+    """Lay out the error of the calibration below its limits, with one outcome for each figure."""
     rows = [('calibration error', 1e3 * assessment.accel.calibration ** 0.5 / G0_MPS2,
              assessment.error_deg, '', '')]
     for name, limit_mps2, accel, tilt in (
@@ -295,22 +212,7 @@ def unit_line(sensor: Sensor) -> list[str]:
 
 
 def headline(assessment: Assessment | None, models: Sequence[HeldOutErrors]) -> list[str]:
-    """
-    State outcomes and held-out errors of the saved model, in a line each.
-
-    Parameters
-    ----------
-    assessment
-        Assessment of that model; None where no pose was held out.
-    models
-        Held-out errors of all models.
-
-    Returns
-    -------
-    list of str
-        One or two lines.
-
-    """
+    """State outcomes and held-out errors of the saved model, in a line each."""
     if assessment is None:
         return ['not assessed: too few poses to hold some of them out']
     outcomes = {'datasheet': assessment.datasheet, 'noise': assessment.noise}
@@ -330,22 +232,7 @@ def headline(assessment: Assessment | None, models: Sequence[HeldOutErrors]) -> 
 
 def narrow_table(assessments: Sequence[Assessment], models: Sequence[HeldOutErrors]
                  ) -> list[str]:
-    """
-    Return errors and outcomes of all models in at most 79 columns, the simplest model first.
-
-    Parameters
-    ----------
-    assessments
-        Assessments of some of the models.
-    models
-        Held-out errors, one row each.
-
-    Returns
-    -------
-    list of str
-        The head, and a line for each model; nothing without models.
-
-    """
+    """Return errors and outcomes of all models in at most 79 columns, the simplest model first."""
     if not models:
         return []
     row_of, limits = {row.model: row for row in assessments}, f'{"datasheet":9} {"noise":9}'
@@ -369,19 +256,8 @@ def gravity_line(assessment: Assessment, held_out_mps2: np.ndarray) -> str:
     """
     State errors and outcomes of a calibration against gravity in one line.
 
-    Parameters
-    ----------
-    assessment
-        Assessment of that calibration.
-    held_out_mps2
-        Error of the magnitude of gravity at each rest by the fit to the other stretches of time,
-        m/s², (k,).
-
-    Returns
-    -------
-    str
-        The line.
-
+    held_out_mps2: error of the magnitude of gravity at each rest by the fit to the other stretches
+    of time, m/s², (k,).
     """
     mg = held_out_mps2 / G0_MPS2 * 1e3
     low, high = rms_interval(mg)
@@ -393,22 +269,7 @@ def gravity_line(assessment: Assessment, held_out_mps2: np.ndarray) -> str:
 
 def provenance_entries(assessment: Assessment | None, models: Sequence[HeldOutErrors]
                        ) -> dict[str, str]:
-    """
-    Return the entries of the provenance about the saved model, without NaN.
-
-    Parameters
-    ----------
-    assessment
-        Assessment of that model; None gives no entries.
-    models
-        Held-out errors of all models.
-
-    Returns
-    -------
-    dict
-        Text by key.
-
-    """
+    """Return the entries of the provenance about the saved model, without NaN."""
     if assessment is None:
         return {}
     numbers: dict[str, float] = {'own_accel_mg': assessment.error_mg,

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Comparison of fitted coefficients with the true ones of a simulated unit."""
 
@@ -60,35 +48,15 @@ _LINEAR = (Coefficient('cross_axis', 'linear'), Coefficient('cross_axis_z', 'lin
 
 @dataclass(frozen=True)
 class Comparison:
-    """
-    A fitted coefficient and its true value.
+    """A fitted coefficient and its true value."""
 
-    Attributes
-    ----------
-    name
-        'effect.parameter', as in the parameter file.
-    axis
-        'x', 'y' or 'z'; empty for a coefficient of all axes.
-    label
-        The coefficient in words.
-    unit
-        Unit of the values: degrees for an angle, else the unit of the parameter.
-    fitted
-        The fitted value. Zero-g and scale factor are absolute, in V and V/g.
-    half_width
-        Half of the 90 % interval.
-    truth
-        The true value; 0 for an effect that the unit does not have.
-
-    """
-
-    name: str
-    axis: str
-    label: str
-    unit: str
-    fitted: float
-    half_width: float
-    truth: float
+    name: str  # 'effect.parameter', as in the parameter file
+    axis: str  # 'x', 'y' or 'z'; empty for a coefficient of all axes
+    label: str  # The coefficient in words
+    unit: str  # Unit of the values: degrees for an angle, else the unit of the parameter
+    fitted: float  # The fitted value. Zero-g and scale factor are absolute, in V and V/g.
+    half_width: float  # Half of the 90 % interval
+    truth: float  # The true value; 0 for an effect that the unit does not have
 
     @property
     def inside(self) -> bool:
@@ -102,24 +70,6 @@ def compare(fitted: Sensor, truth: Sensor) -> list[Comparison]:
 
     A misalignment and a linear cross-axis term are the same to first order. Where the fit has no
     linear cross-axis term, the true one counts as part of the true misalignment.
-
-    Parameters
-    ----------
-    fitted
-        The fitted unit with the covariance of its coefficients.
-    truth
-        The same unit with its true coefficients.
-
-    Returns
-    -------
-    list of Comparison
-        One for each fitted coefficient.
-
-    Raises
-    ------
-    UserError
-        The units have different axes.
-
     """
     if fitted.axes != truth.axes:
         raise UserError(f'the fitted unit has the axes {fitted.axes}, the true unit has '
@@ -132,20 +82,7 @@ def compare(fitted: Sensor, truth: Sensor) -> list[Comparison]:
 
 
 def added_effects(fitted: Sensor, truth: Sensor) -> list[str]:
-    """
-    Return the effects of the fit that neither the full model nor the unit has.
-
-    Parameters
-    ----------
-    fitted, truth
-        The fitted unit, and the same unit with its true coefficients.
-
-    Returns
-    -------
-    list of str
-        Names of effects.
-
-    """
+    """Return the effects of the fit that neither the full model nor the unit has."""
     expected = {*full_model.default_terms(fitted.axes), *truth.effects}
     return [effect for effect in fitted.effects if effect not in expected]
 
@@ -196,21 +133,6 @@ def _as_misalignment(truth: Sensor, axis: str, moved: list[Coefficient]
 
     A_d + p·A_c = (Θ_d + p·Θ_c)·f is again a projection of the specific force, along another
     direction and scaled by its length. Products of p with the other terms are neglected.
-
-    Parameters
-    ----------
-    truth
-        The unit with the linear terms.
-    axis
-        The axis 'x', 'y' or 'z'.
-    moved
-        The linear coefficients to move.
-
-    Returns
-    -------
-    tuple
-        Names of the coefficients that change, and their new values.
-
     """
     case_axis = AXES.index(axis)
     along = _direction(truth, case_axis)

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Cross-validation of calibration models: errors on poses that a fit has not seen."""
 
@@ -44,84 +32,42 @@ Chosen: it leaves out poses near ±90°, which determine alpha poorly without z.
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """
-    Errors of a calibrated sensor, measured minus reference, pose by pose.
+    """Errors of a calibrated sensor, measured minus reference, pose by pose."""
 
-    Attributes
-    ----------
-    alpha_rad, beta_rad
-        Errors of the angles, rad, (k,). NaN where the pose does not determine the angle.
-    accel_mps2
-        Errors along the measured axes, m/s², (k, m).
-    tilt_rad
-        Angle between the measured and the reference vertical, rad, (k,). NaN where the pose does
-        not determine alpha.
-    force_mps2
-        The measured specific force, m/s², (k, 3).
-
-    """
-
+    # alpha_rad, beta_rad: Errors of the angles, rad, (k,). NaN where the pose does not determine
+    # the angle.
     alpha_rad: np.ndarray
     beta_rad: np.ndarray
-    accel_mps2: np.ndarray
+    accel_mps2: np.ndarray  # Errors along the measured axes, m/s², (k, m)
+    # Angle between the measured and the reference vertical, rad, (k,). NaN where the pose does not
+    # determine alpha.
     tilt_rad: np.ndarray
-    force_mps2: np.ndarray
+    force_mps2: np.ndarray  # The measured specific force, m/s², (k, 3)
 
 
 @dataclass(frozen=True)
 class ErrorStatistic:
-    """
-    Size of one kind of error over all poses; NaN where no pose shows it.
+    """Size of one kind of error over all poses; NaN where no pose shows it."""
 
-    Attributes
-    ----------
-    rms
-        Root mean square.
-    largest
-        Largest magnitude.
-    interval
-        90 % interval of the rms.
-
-    """
-
-    rms: float
-    largest: float
-    interval: tuple[float, float]
+    rms: float  # Root mean square
+    largest: float  # Largest magnitude
+    interval: tuple[float, float]  # 90 % interval of the rms
 
 
 @dataclass(frozen=True)
 class HeldOutErrors:
-    """
-    Errors of one model over held-out poses.
+    """Errors of one model over held-out poses."""
 
-    Attributes
-    ----------
-    model
-        Name of the model.
-    tilt_deg, alpha_deg, beta_deg
-        Errors of the angles, degrees.
-    accel_mg
-        Error of acceleration over the measured axes, mg.
-    errors
-        The errors of all held-out poses.
-    pose_index
-        Index of each held-out pose among all poses, (k,).
-    fitted
-        The fitted sensor of each fold.
-    fold
-        Index in `fitted` of the sensor that measured each pose, (k,).
-
-    """
-
-    model: str
+    model: str  # Name of the model
+    # tilt_deg, alpha_deg, beta_deg: Errors of the angles, degrees
     tilt_deg: ErrorStatistic
     alpha_deg: ErrorStatistic
     beta_deg: ErrorStatistic
-    accel_mg: ErrorStatistic
-    errors: PoseErrors
-    pose_index: np.ndarray
-    fitted: tuple[Sensor, ...]
-    fold: np.ndarray
+    accel_mg: ErrorStatistic  # Error of acceleration over the measured axes, mg
+    errors: PoseErrors  # The errors of all held-out poses
+    pose_index: np.ndarray  # Index of each held-out pose among all poses, (k,)
+    fitted: tuple[Sensor, ...]  # The fitted sensor of each fold
+    fold: np.ndarray  # Index in `fitted` of the sensor that measured each pose, (k,)
 
     @property
     def pose_count(self) -> int:
@@ -141,22 +87,6 @@ def pose_errors(sensor: Sensor, poses: Poses, stage: Sensor | None = None) -> Po
     As f(−α, β + π) = f(α, β), the angles of the reference are those with 0 ≤ α ≤ π. A sensor
     without z cannot distinguish α from π − α: its alpha is at most π/2, and the reference gives
     the sign of its z.
-
-    Parameters
-    ----------
-    sensor
-        The calibrated unit.
-    poses
-        The poses, k of them.
-    stage
-        The unit with the fitted errors of the stage, which are part of the reference. None takes
-        the angles of the stage as they are.
-
-    Returns
-    -------
-    PoseErrors
-        Errors of the k poses.
-
     """
     reference = reference_force(poses, sensor.local_gravity_mps2) if stage is None else \
         stage_force(stage, poses.alpha_rad, poses.beta_rad)
@@ -187,16 +117,7 @@ def angle_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """
     Return the angles between pairs of vectors.
 
-    Parameters
-    ----------
-    first, second
-        The vectors, of any length, (k, 3).
-
-    Returns
-    -------
-    numpy.ndarray
-        Angles from 0 to π, rad, (k,).
-
+    first, second: the vectors, of any length, (k, 3); returns: angles from 0 to π, rad, (k,).
     """
     across = np.linalg.norm(np.cross(first, second), axis=1)
     return np.arctan2(across, np.sum(first * second, axis=1))
@@ -207,24 +128,8 @@ def summarise(model: str, errors: PoseErrors, pose_index: np.ndarray | None = No
     """
     Summarise the errors of one model over held-out poses.
 
-    Parameters
-    ----------
-    model
-        Name of the model.
-    errors
-        Errors of k poses in the order of their visit.
-    pose_index
-        Index of each pose among all poses, (k,); None is 0 to k − 1.
-    fitted
-        The fitted sensor of each fold.
-    fold
-        Index in `fitted` of the sensor of each pose, (k,); None is 0 for all.
-
-    Returns
-    -------
-    HeldOutErrors
-        The errors with their statistics.
-
+    pose_index: index of each pose among all poses, (k,); None is 0 to k − 1; fold: index in
+    `fitted` of the sensor of each pose, (k,); None is 0 for all.
     """
     count = len(errors.accel_mps2)
     accel_mg = errors.accel_mps2[determining_alpha(errors)] / G0_MPS2 * 1e3
@@ -260,11 +165,7 @@ def degrees_of_freedom(values: np.ndarray) -> float:
     Then var(s̄) = γ₀/n·(1 + 2·Σ(1 − k/n)·ρ_k), summed up to the first ρ_k that is not positive
     (Geyer 1992), and ν = 2·s̄²/var(s̄) (Satterthwaite 1946), at most the number of errors.
 
-    Parameters
-    ----------
-    values
-        Errors in the order of the visit, (k,) or (k, m). Rows with NaN do not count.
-
+    values: errors in the order of the visit, (k,) or (k, m). Rows with NaN do not count.
     """
     table = values.reshape(len(values), -1)
     table = table[np.isfinite(table).all(axis=1)]
@@ -302,23 +203,6 @@ def cross_validate(fits: dict[str, Fit], sensor: Sensor, poses: Poses,
     Poses marked `check` are held out of a fit to all others. Without check poses, every pose
     belongs to one of five folds, and each fold is held out of a fit to the others. A fold is
     skipped for a model whose fit fails.
-
-    Parameters
-    ----------
-    fits
-        Fit functions by the name of their model.
-    sensor
-        The nominal sensor, from which the fits start.
-    poses
-        All poses, with the check poses.
-    stage
-        As for `pose_errors`.
-
-    Returns
-    -------
-    list of HeldOutErrors
-        One entry for each model with at least one fold.
-
     """
     models = []
     for model, fit in fits.items():

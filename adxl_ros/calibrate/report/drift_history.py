@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Drift of a unit from one calibration to the next."""
 
@@ -35,23 +23,11 @@ _TYPICAL_SLOPE_PER_K = 1e-4
 
 
 class _Quantity(NamedTuple):
-    """
-    A quantity that is compared between calibrations.
+    """A quantity that is compared between calibrations."""
 
-    Attributes
-    ----------
-    label
-        Its name for people.
-    parameter
-        The fitted parameter.
-    unit
-        Unit of a change.
-
-    """
-
-    label: str
-    parameter: Coefficient
-    unit: str
+    label: str  # Its name for people
+    parameter: Coefficient  # The fitted parameter
+    unit: str  # Unit of a change
 
 
 _ZERO_G = _Quantity('zero-g', Coefficient('bias', 'offset_v'), 'mg')
@@ -62,62 +38,28 @@ _QUANTITIES = (_ZERO_G, _SCALE_FACTOR)
 
 @dataclass(frozen=True)
 class DriftSeries:
-    """
-    Zero-g and scale factor of k calibrations minus those of the newest.
+    """Zero-g and scale factor of k calibrations minus those of the newest."""
 
-    Attributes
-    ----------
-    dates
-        Dates of the calibrations, as text, (k,).
-    axes
-        Measured axes, m of them.
-    zero_g_mg, scale_permille
-        Differences, (k, m).
-    zero_g_std_mg, scale_std_permille
-        Standard deviations of the values, (k, m).
-
-    """
-
-    dates: list[str]
-    axes: str
+    dates: list[str]  # Dates of the calibrations, as text, (k,)
+    axes: str  # Measured axes, m of them
+    # zero_g_mg, scale_permille: Differences, (k, m)
     zero_g_mg: np.ndarray
     scale_permille: np.ndarray
+    # zero_g_std_mg, scale_std_permille: Standard deviations of the values, (k, m)
     zero_g_std_mg: np.ndarray
     scale_std_permille: np.ndarray
 
 
 @dataclass(frozen=True)
 class DriftHistory:
-    """
-    Calibrations of one unit, oldest first.
+    """Calibrations of one unit, oldest first."""
 
-    Attributes
-    ----------
-    sensors
-        The stored calibrations, then the newest. Empty where the newest is the only one.
-
-    """
-
+    # The stored calibrations, then the newest. Empty where the newest is the only one.
     sensors: tuple[Sensor, ...]
 
     @staticmethod
     def from_store(newest: Sensor, stored: Sequence[Sensor]) -> DriftHistory:
-        """
-        Append the newest calibration to the stored ones of other data and the same axes.
-
-        Parameters
-        ----------
-        newest
-            The new calibration.
-        stored
-            Calibrations of the unit, oldest first.
-
-        Returns
-        -------
-        DriftHistory
-            The history of the unit.
-
-        """
+        """Append the newest calibration to the stored ones of other data and the same axes."""
         data = newest.provenance.get('data_sha256')
         by_data: dict[str, Sensor] = {}
         for sensor in stored:

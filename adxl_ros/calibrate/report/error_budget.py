@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Error budget of a calibration: the mean square of held-out errors, split by cause.
@@ -69,32 +57,19 @@ _UPPER_QUANTILE = 0.95
 
 @dataclass(frozen=True)
 class ErrorBudget:
-    """
-    Parts of a mean square of errors: (m/s²)² per axis for acceleration, rad² for tilt.
+    """Parts of a mean square of errors: (m/s²)² per axis for acceleration, rad² for tilt."""
 
-    Attributes
-    ----------
-    measured
-        Mean square of the held-out errors. By chance it differs from the sum of the parts.
-    noise, stage, coefficients, model
-        The parts, as the module describes them.
-    calibration_high
-        Upper end of the 90 % interval of `coefficients + model`.
-    separable
-        Whether the poses separate stage and model.
-    tilt_per_axis
-        Mean square of tilt that a mean square of 1 (m/s²)² on each measured axis causes; NaN for
-        acceleration.
-
-    """
-
+    # Mean square of the held-out errors. By chance it differs from the sum of the parts.
     measured: float
+    # noise, stage, coefficients, model: The parts, as the module describes them
     noise: float
     stage: float
     coefficients: float
     model: float
-    calibration_high: float
-    separable: bool = True
+    calibration_high: float  # Upper end of the 90 % interval of `coefficients + model`
+    separable: bool = True  # Whether the poses separate stage and model
+    # Mean square of tilt that a mean square of 1 (m/s²)² on each measured axis causes; NaN for
+    # acceleration
     tilt_per_axis: float = float('nan')
 
     @property
@@ -125,97 +100,44 @@ _NO_BUDGET = ErrorBudget(measured=float('nan'), noise=float('nan'), stage=float(
 
 
 class ErrorBudgets(NamedTuple):
-    """
-    The error budgets of one model.
+    """The error budgets of one model."""
 
-    Attributes
-    ----------
-    accel
-        Budget of acceleration, (m/s²)² per axis.
-    tilt
-        Budget of tilt, rad².
-
-    """
-
-    accel: ErrorBudget
-    tilt: ErrorBudget
+    accel: ErrorBudget  # Budget of acceleration, (m/s²)² per axis
+    tilt: ErrorBudget  # Budget of tilt, rad²
 
 
 class _Covariances(NamedTuple):
-    """
-    Covariances of the specific force by cause, (m/s²)², each (3, 3, k).
+    """Covariances of the specific force by cause, (m/s²)², each (3, 3, k)."""
 
-    Attributes
-    ----------
-    noise, coefficients, stage
-        Covariance by the noise of the mean, by the calibration, and by the stated stage error.
-    probe
-        Covariance by an independent error `_PROBE_MPS2` on each measured axis.
-
-    """
-
+    # noise, coefficients, stage: Covariance by the noise of the mean, by the calibration, and by
+    # the stated stage error
     noise: np.ndarray
     coefficients: np.ndarray
     stage: np.ndarray
-    probe: np.ndarray
+    probe: np.ndarray  # Covariance by an independent error `_PROBE_MPS2` on each measured axis
 
 
 class _PredictedParts(NamedTuple):
-    """
-    Parts of a mean square that covariances predict.
+    """Parts of a mean square that covariances predict."""
 
-    Attributes
-    ----------
-    noise, coefficients
-        As in `ErrorBudget`.
-    stated_stage
-        Part of the stage error that the parameter file states.
-
-    """
-
+    # noise, coefficients: As in `ErrorBudget`
     noise: float
     coefficients: float
-    stated_stage: float
+    stated_stage: float  # Part of the stage error that the parameter file states
 
 
 class _Scatter(NamedTuple):
-    """
-    Mean square of errors that no model can explain.
+    """Mean square of errors that no model can explain."""
 
-    Attributes
-    ----------
-    accel, tilt
-        Mean square of acceleration, (m/s²)² per axis, and of tilt, rad².
-    has_noise
-        Whether it includes the noise of the means.
-
-    """
-
+    # accel, tilt: Mean square of acceleration, (m/s²)² per axis, and of tilt, rad²
     accel: float
     tilt: float
-    has_noise: bool
+    has_noise: bool  # Whether it includes the noise of the means
 
 
 def error_budgets(errors: HeldOutErrors, poses: Poses, stage: Sensor | None = None
                   ) -> ErrorBudgets:
-    """
-    Split the held-out errors of one model by cause.
-
-    Parameters
-    ----------
-    errors
-        From `cross_validation.cross_validate`.
-    poses
-        All poses that were given to it.
-    stage
-        The unit with the fitted errors of the stage; None where none were fitted.
-
-    Returns
-    -------
-    ErrorBudgets
-        Of acceleration and of tilt.
-
-    """
+    """Split the held-out errors of one model by cause."""
     held = poses.subset(errors.pose_index)
     sensor = errors.fitted[0]
     gravity = sensor.local_gravity_mps2
@@ -260,22 +182,7 @@ def _budget(errors: np.ndarray, measured: float, predicted: _PredictedParts,
     """
     Split a mean square of errors against the corrected reference.
 
-    Parameters
-    ----------
-    errors
-        Errors against the corrected reference, (k,) or (k, m), in the order of the visit.
-    measured
-        Mean square of the errors against the angles of the stage.
-    predicted
-        The parts that covariances predict.
-    unexplainable
-        Mean square that no model could explain, without noise; None where it is unknown.
-
-    Returns
-    -------
-    ErrorBudget
-        The parts.
-
+    errors: errors against the corrected reference, (k,) or (k, m), in the order of the visit.
     """
     mean_square, nu = float(np.mean(errors ** 2)), degrees_of_freedom(errors)
     lower = mean_square * nu / float(scipy.special.chdtri(nu, _CHANCE))
@@ -367,20 +274,7 @@ def gravity_error_budgets(fit: GravityFit, fitted: Sensor, force: np.ndarray, ke
     The part of the coefficients is that of the force by their covariance. It includes directions
     that a magnitude does not show.
 
-    Parameters
-    ----------
-    fit, fitted
-        The fit, and the unit with its coefficients.
-    force
-        Specific force in all rests by the fit, m/s², (k, 3).
-    kept
-        Indices of the rests that are no outliers.
-
-    Returns
-    -------
-    ErrorBudgets
-        Of acceleration and of tilt.
-
+    force: specific force in all rests by the fit, m/s², (k, 3).
     """
     errors = fit.held_out_mps2[kept]
     excess = fit.excess_mps2 ** 2

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Figures of the page of a calibration, as plotly.js draws them."""
 
 from __future__ import annotations
@@ -41,26 +29,7 @@ _DATES = 4
 
 
 def pose_errors(errors: HeldOutErrors, assessment: Assessment, poses: Poses, axes: str) -> Figure:
-    """
-    Draw the errors at the held-out poses with the band that 90 % of them should be in.
-
-    Parameters
-    ----------
-    errors
-        Errors of the saved model.
-    assessment
-        Assessment of that model, whose budgets give the bands.
-    poses
-        All poses that the models were fitted to or tested on.
-    axes
-        The measured axes.
-
-    Returns
-    -------
-    dict
-        The figure: acceleration above, tilt below.
-
-    """
+    """Draw the errors at the held-out poses with the band that 90 % of them should be in."""
     number = np.arange(1, errors.pose_count + 1)
     held = poses.subset(errors.pose_index)
     angles_deg = np.degrees([held.alpha_rad, held.beta_rad])

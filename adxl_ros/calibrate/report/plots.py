@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Plots of a calibration: figures 2 to 8 of the paper for one unit, and errors of fits."""
 
@@ -41,36 +29,17 @@ _MARKERS = 'os^D'
 
 @dataclass(frozen=True)
 class _AxisData:
-    """
-    What the panels of one axis show; k poses.
+    """What the panels of one axis show; k poses."""
 
-    Attributes
-    ----------
-    d
-        Index of the axis: 0 for x, 1 for y.
-    model
-        Name of the model.
-    force_g
-        Reference along the measured axes, g, (k, m).
-    poses
-        The poses of the sweep.
-    deviation_mv, model_mv
-        Measured and modelled output minus the linear model, mV, (k,).
-    regression
-        Coefficients of the sequential regression.
-    vertical
-        Whether the pose is in the plane alpha = 90°, (k,).
-
-    """
-
-    d: int
-    model: str
-    force_g: np.ndarray
-    poses: Poses
+    d: int  # Index of the axis: 0 for x, 1 for y
+    model: str  # Name of the model
+    force_g: np.ndarray  # Reference along the measured axes, g, (k, m)
+    poses: Poses  # The poses of the sweep
+    # deviation_mv, model_mv: Measured and modelled output minus the linear model, mV, (k,)
     deviation_mv: np.ndarray
     model_mv: np.ndarray
-    regression: paper_regression.AxisRegression
-    vertical: np.ndarray
+    regression: paper_regression.AxisRegression  # Coefficients of the sequential regression
+    vertical: np.ndarray  # Whether the pose is in the plane alpha = 90°, (k,)
 
     @property
     def name(self) -> str:
@@ -84,41 +53,12 @@ class _AxisData:
 
 
 def draw_sweep(path: str | os.PathLike, sensor: Sensor, fitted: Sensor, poses: Poses) -> None:
-    """
-    Write the plot of `sweep` as PNG.
-
-    Parameters
-    ----------
-    path
-        The file.
-    sensor, fitted, poses
-        As for `sweep`.
-
-    """
+    """Write the plot of `sweep` as PNG."""
     write_plot(sweep(sensor, fitted, poses), path)
 
 
 def sweep(sensor: Sensor, fitted: Sensor, poses: Poses, panels: Sequence[int] = range(6)) -> Any:
-    """
-    Draw figures 2 to 8 of the paper for the x and y axes, one row per axis.
-
-    Parameters
-    ----------
-    sensor
-        The nominal unit from which the fit started.
-    fitted
-        The unit by a physical or full model.
-    poses
-        The sweep with its check poses.
-    panels
-        Indices of the panels: figures 2, 3, 4, 5 with 7, 6 and 8.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        The plot.
-
-    """
+    """Draw figures 2 to 8 of the paper for the x and y axes, one row per axis."""
     swept = poses.subset(~poses.check)
     line, regressions = linear.fit(sensor, swept), paper_regression.regress_axes(sensor, swept)
     reference = reference_force(swept, sensor.local_gravity_mps2)
@@ -142,22 +82,7 @@ def sweep(sensor: Sensor, fitted: Sensor, poses: Poses, panels: Sequence[int] = 
 
 
 def gravity_rests(name: str, fit: GravityFit) -> Any:
-    """
-    Draw the error of the magnitude of gravity in each rest, before and after the fit.
-
-    Parameters
-    ----------
-    name
-        Name of the unit.
-    fit
-        Fit of its rests.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        The plot.
-
-    """
+    """Draw the error of the magnitude of gravity in each rest, before and after the fit."""
     figure, axes = pyplot().subplots(1, 2, figsize=(12, 4.5), layout='constrained')
     rests = np.arange(1, len(fit.residual_mps2) + 1)
     for axis, values, title in ((axes[0], fit.before_mps2, 'nominal'),
@@ -173,22 +98,7 @@ def gravity_rests(name: str, fit: GravityFit) -> Any:
 
 
 def held_out(models: Sequence[HeldOutErrors], poses: Poses) -> Any:
-    """
-    Draw the errors on held-out poses, model by model, as in figure 10 of the paper.
-
-    Parameters
-    ----------
-    models
-        Errors of the models.
-    poses
-        All poses that the models were fitted to or tested on.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        The plot.
-
-    """
+    """Draw the errors on held-out poses, model by model, as in figure 10 of the paper."""
     figure, axes = pyplot().subplots(1, 3, figsize=(13, 4), layout='constrained')
     for i, model in enumerate(models):
         errors = model.errors

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The report of a calibration: a page in one file that opens offline, and its plots as PNG."""
 
@@ -73,51 +61,18 @@ _BEYOND_WHISKER = 1.08
 
 
 class _SphereData(NamedTuple):
-    """
-    Errors over the sphere of k poses.
+    """Errors over the sphere of k poses."""
 
-    Attributes
-    ----------
-    models
-        Names of the models.
-    quantities
-        Label and unit of each quantity.
-    errors
-        Errors of each model by pose and quantity, (k, q) each.
-    force
-        Specific force in the case, m/s², (k, 3).
-    labels
-        Text of each pose.
-
-    """
-
-    models: list[str]
-    quantities: list[list[str]]
-    errors: list[np.ndarray]
-    force: np.ndarray
-    labels: list[str]
+    models: list[str]  # Names of the models
+    quantities: list[list[str]]  # Label and unit of each quantity
+    errors: list[np.ndarray]  # Errors of each model by pose and quantity, (k, q) each
+    force: np.ndarray  # Specific force in the case, m/s², (k, 3)
+    labels: list[str]  # Text of each pose
 
 
 def write(folder: str | os.PathLike, result: CalibrationResult,
           store: str | os.PathLike = '') -> None:
-    """
-    Write `report.html`, and the plots of the unit as `calibration.png`.
-
-    Parameters
-    ----------
-    folder
-        An existing folder.
-    result
-        The calibration.
-    store
-        The calibration store with the history of the unit; empty for none.
-
-    Raises
-    ------
-    UserError
-        Plotly, jinja2 or matplotlib is not installed, or a file cannot be written.
-
-    """
+    """Write `report.html`, and the plots of the unit as `calibration.png`."""
     html_page.check_libraries()
     past = calibration_store.history(store, result.fitted.serial).calibrations \
         if str(store) else []
@@ -128,22 +83,7 @@ def write(folder: str | os.PathLike, result: CalibrationResult,
 
 
 def draw(path: str | os.PathLike, result: CalibrationResult) -> None:
-    """
-    Write the plots of a calibrated unit as PNG.
-
-    Parameters
-    ----------
-    path
-        The file.
-    result
-        The calibration.
-
-    Raises
-    ------
-    UserError
-        The poses do not suffice for the plots.
-
-    """
+    """Write the plots of a calibrated unit as PNG."""
     if result.gravity_fit is not None:
         plot_file.write_plot(plots.gravity_rests(result.name, result.gravity_fit), path)
     else:
@@ -151,27 +91,7 @@ def draw(path: str | os.PathLike, result: CalibrationResult) -> None:
 
 
 def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
-    """
-    Lay out the page.
-
-    Parameters
-    ----------
-    result
-        The calibration.
-    past
-        Earlier calibrations of the unit, oldest first.
-
-    Returns
-    -------
-    str
-        The page, HTML.
-
-    Raises
-    ------
-    UserError
-        Plotly, jinja2 or matplotlib is not installed.
-
-    """
+    """Lay out the page."""
     fitted = result.fitted
     assessment = next((row for row in result.assessments if row.model == fitted.model), None)
     errors = next((row for row in result.held_out if row.model == fitted.model), None)

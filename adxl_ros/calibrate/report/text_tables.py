@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Results of a calibration as lines of a terminal with 79 columns."""
 
@@ -82,22 +70,7 @@ def _fitted_row(row: Comparison, width: int) -> str:
 
 
 def rounded(row: Comparison, value: float) -> str:
-    """
-    Write a value with the decimals that show two digits of the interval.
-
-    Parameters
-    ----------
-    row
-        The coefficient.
-    value
-        A value in its unit.
-
-    Returns
-    -------
-    str
-        The value without its unit.
-
-    """
+    """Write a value with the decimals that show two digits of the interval."""
     places = decimals(row.half_width)
     return f'{round(value, places) + 0.0:.{places}f}'
 

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Errors of a unit in plain words: of its datasheet values, and from turn-on to turn-on."""
 
@@ -35,22 +23,7 @@ _SMALL_MG = 10.0
 
 
 def turn_on_lines(fitted: Sensor, recordings: Sequence[Poses]) -> list[str]:
-    """
-    Report the scatter of the zero-g over recordings of one unit.
-
-    Parameters
-    ----------
-    fitted
-        The unit by the fit to all recordings.
-    recordings
-        Poses of each recording.
-
-    Returns
-    -------
-    list
-        One line; none for a single recording.
-
-    """
+    """Report the scatter of the zero-g over recordings of one unit."""
     if len(recordings) < 2:
         return []
     changes_mg = np.array([_zero_g_change_mg(fitted, poses) for poses in recordings])

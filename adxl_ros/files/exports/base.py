@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What the formats share: values of a sensor in SI units, and the head of each file."""
 
@@ -50,41 +38,21 @@ _SMALLEST_MG = 5e-4
 
 @dataclass(frozen=True)
 class Export:
-    """
-    A sensor that is written for other software.
+    """A sensor that is written for other software."""
 
-    Attributes
-    ----------
-    sensor
-        The unit.
-    source
-        Name of its parameter file.
-    sizes_mg
-        Rms of what each part of the sensor changes, mg, by its name: effects but those of the
-        stage, and the constants above.
-    remaining_mg
-        Rms of all that the format does not hold, mg, without noise and steps of the ADC.
-
-    """
-
-    sensor: Sensor
-    source: str
+    sensor: Sensor  # The unit
+    source: str  # Name of its parameter file
+    # Rms of what each part of the sensor changes, mg, by its name: effects but those of the stage,
+    # and the constants above
     sizes_mg: Mapping[str, float]
+    # Rms of all that the format does not hold, mg, without noise and steps of the ADC
     remaining_mg: float
 
 
 class ExportFormat(Protocol):
-    """
-    A format of files.
+    """A format of files."""
 
-    Attributes
-    ----------
-    HOLDS
-        Place in the file by name of the part that it holds.
-
-    """
-
-    HOLDS: Mapping[str, str]
+    HOLDS: Mapping[str, str]  # Place in the file by name of the part that it holds
 
     def text(self, export: Export, /) -> str:
         """Return the content of a file."""
@@ -92,38 +60,17 @@ class ExportFormat(Protocol):
 
 @dataclass(frozen=True)
 class Axis:
-    """
-    Values of one axis in SI units.
+    """Values of one axis in SI units."""
 
-    Attributes
-    ----------
-    name
-        x, y or z.
-    zero_g_mps2
-        Output at 0 g by the nominal conversion, m/s².
-    noise_std_mps2
-        Noise of one sample before the ADC, m/s².
-    sample_variance
-        Variance of one sample with the rounding of the ADC, (m/s²)².
-    noise_density
-        Density of the white noise over positive frequencies, m/s²/√Hz.
-    walk_density
-        Density of the random walk of the zero-g, m/s²/√s; 0 without `bias_walk`.
-    walk_return_per_s
-        Inverse correlation time of a walk that has bounds, 1/s; 0 without them.
-    step_mps2
-        Step of the ADC, m/s²; 0 for none.
-
-    """
-
-    name: str
-    zero_g_mps2: float
-    noise_std_mps2: float
-    sample_variance: float
-    noise_density: float
-    walk_density: float
+    name: str  # x, y or z
+    zero_g_mps2: float  # Output at 0 g by the nominal conversion, m/s²
+    noise_std_mps2: float  # Noise of one sample before the ADC, m/s²
+    sample_variance: float  # Variance of one sample with the rounding of the ADC, (m/s²)²
+    noise_density: float  # Density of the white noise over positive frequencies, m/s²/√Hz
+    walk_density: float  # Density of the random walk of the zero-g, m/s²/√s; 0 without `bias_walk`
+    # Inverse correlation time of a walk that has bounds, 1/s; 0 without them
     walk_return_per_s: float
-    step_mps2: float
+    step_mps2: float  # Step of the ADC, m/s²; 0 for none
 
 
 def axes(sensor: Sensor) -> list[Axis]:
@@ -157,24 +104,7 @@ def variances(sensor: Sensor) -> list[float]:
 
 
 def head(export: Export, format_name: str, holds: Mapping[str, str]) -> list[str]:
-    """
-    Return the head of a file: what it holds of the sensor, and what it cannot hold.
-
-    Parameters
-    ----------
-    export
-        The sensor with the sizes of its parts.
-    format_name
-        Name of the format.
-    holds
-        Place in the file by name of the part that the format holds.
-
-    Returns
-    -------
-    list
-        Lines of at most `COLUMNS` columns, without the signs of a comment.
-
-    """
+    """Return the head of a file: what it holds of the sensor, and what it cannot hold."""
     sensor = export.sensor
     width = max(map(len, export.sizes_mg)) + 2
     lines = [f'Sensor {sensor.serial}, axes {" ".join(sensor.axes)}, {sensor.rate_hz:.5g} Hz.',
@@ -235,20 +165,5 @@ def size_text(size_mg: float) -> str:
 
 
 def place_text(name: str, holds: Mapping[str, str]) -> str:
-    """
-    Return where a file holds a part of the sensor.
-
-    Parameters
-    ----------
-    name
-        Name of the part.
-    holds
-        Place in the file by name of the part that the format holds.
-
-    Returns
-    -------
-    str
-        The place, or "not held".
-
-    """
+    """Return where a file holds a part of the sensor."""
     return holds.get(name, 'not held')

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Kalibr: the accelerometer's part of `imu.yaml`."""
 
@@ -28,24 +16,7 @@ HOLDS = {WHITE_NOISE: 'accelerometer_noise_density',
 
 
 def settings(white: float, walk: float, rate_hz: float) -> list[tuple[str, float, str]]:
-    """
-    Return the settings of Kalibr, which are densities over both signs of the frequency.
-
-    Parameters
-    ----------
-    white
-        White noise N, m/s²/√Hz.
-    walk
-        Random walk K, m/s²/√s.
-    rate_hz
-        Sample rate, Hz.
-
-    Returns
-    -------
-    list
-        Names, values and units.
-
-    """
+    """Return the settings of Kalibr, which are densities over both signs of the frequency."""
     return [('accelerometer_noise_density', white, 'm/s^2/sqrt(Hz)'),
             ('accelerometer_random_walk', walk, 'm/s^3/sqrt(Hz)'), ('update_rate', rate_hz, 'Hz')]
 
@@ -55,12 +26,6 @@ def text(export: Export) -> str:
     Return the content of a file.
 
     Kalibr has one value for all axes: the largest.
-
-    Raises
-    ------
-    UserError
-        The sensor states no noise, which Kalibr refuses.
-
     """
     values = axes(export.sensor)
     white = max(axis.noise_density for axis in values) / ONE_SIDED

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Formats of tables, one file each.
@@ -36,27 +24,7 @@ def is_text(path: str | os.PathLike) -> bool:
 
 
 def open_table(path: str | os.PathLike, topic: str = '') -> Table:
-    """
-    Open a table of any format.
-
-    Parameters
-    ----------
-    path
-        The file.
-    topic
-        The message of a file that holds several; empty for the only one.
-
-    Returns
-    -------
-    Table
-        The open table.
-
-    Raises
-    ------
-    UserError
-        The file cannot be read, or a library for its format is missing.
-
-    """
+    """Open a table of any format."""
     name = next((name for name in _formats() if _is_named(path, name)), delimited_text.NAME)
     return import_module(f'{__name__}.{name}').open_table(str(path), topic)
 

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What all formats of tables share."""
 
@@ -33,57 +21,26 @@ class NoNumbers(UserError):
 
 @dataclass(frozen=True)
 class TableBlock:
-    """
-    Rows of a table.
+    """Rows of a table."""
 
-    Attributes
-    ----------
-    columns
-        Arrays (n,) by column name; an empty cell is NaN.
-    where
-        Returns file and place of a cell for messages, by its row in the block and its column.
-    info
-        Keys and values that the file states.
-    done
-        Fraction of the file that has been read at the end of the rows.
-    cut
-        Where a damaged file ends; empty if it is whole.
-
-    """
-
-    columns: Mapping[str, np.ndarray]
+    columns: Mapping[str, np.ndarray]  # Arrays (n,) by column name; an empty cell is NaN
+    # Returns file and place of a cell for messages, by its row in the block and its column
     where: Callable[[int, str], str]
-    info: Mapping[str, str] = field(default_factory=dict)
-    done: float = 1.0
-    cut: str = ''
+    info: Mapping[str, str] = field(default_factory=dict)  # Keys and values that the file states
+    done: float = 1.0  # Fraction of the file that has been read at the end of the rows
+    cut: str = ''  # Where a damaged file ends; empty if it is whole
 
 
 class Table(Protocol):
-    """
-    A file with columns.
+    """A file with columns."""
 
-    Attributes
-    ----------
-    path
-        The file.
-    names
-        The columns, each once.
-    has_names
-        Whether the file names its columns; otherwise their names are their numbers from 1.
-    form
-        How the file is written, for messages; empty where nothing is special.
-    units
-        Units that the format states, by column.
-    default_mapping
-        The mapping that the definition of the format states; empty where there is none.
-
-    """
-
-    path: str
-    names: tuple[str, ...]
+    path: str  # The file
+    names: tuple[str, ...]  # The columns, each once
+    # Whether the file names its columns; otherwise their names are their numbers from 1
     has_names: bool
-    form: str
-    units: Mapping[str, str]
+    form: str  # How the file is written, for messages; empty where nothing is special
+    units: Mapping[str, str]  # Units that the format states, by column
+    # The mapping that the definition of the format states; empty where there is none
     default_mapping: str
 
     def blocks(self, names: Collection[str]) -> Iterator[TableBlock]:
@@ -99,31 +56,16 @@ class Table(Protocol):
 
 @dataclass(frozen=True)
 class ArrayTable:
-    """
-    A table whose columns are in memory; the attributes are those of `Table`.
+    """A table whose columns are in memory; the attributes are those of `Table`."""
 
-    Attributes
-    ----------
-    path
-        The file.
-    columns
-        Arrays (n,) by name.
-    units
-        Units that the format states, by column.
-    default_mapping
-        The mapping that the definition of the format states.
-    cut
-        Where a damaged file ends; empty if it is whole.
-
-    """
-
-    path: str
-    columns: Mapping[str, np.ndarray]
+    path: str  # The file
+    columns: Mapping[str, np.ndarray]  # Arrays (n,) by name
+    # Units that the format states, by column
     units: Mapping[str, str] = field(default_factory=dict)
-    default_mapping: str = ''
+    default_mapping: str = ''  # The mapping that the definition of the format states
     has_names: bool = True
     form: str = ''
-    cut: str = ''
+    cut: str = ''  # Where a damaged file ends; empty if it is whole
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -147,20 +89,10 @@ class ArrayTable:
 
 @dataclass(frozen=True)
 class RowPlaces:
-    """
-    Names the place of a cell in a file without lines.
+    """Names the place of a cell in a file without lines."""
 
-    Attributes
-    ----------
-    path
-        The file.
-    first
-        Row of the file that is the first of the block, from 0.
-
-    """
-
-    path: str
-    first: int
+    path: str  # The file
+    first: int  # Row of the file that is the first of the block, from 0
 
     def __call__(self, row: int, column: str) -> str:
         """Return the place of a cell."""

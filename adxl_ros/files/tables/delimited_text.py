@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Text tables of any delimiter, decimal mark and header.
@@ -64,32 +52,15 @@ _COMMENT = re.compile(r'\s*(#|//|%)')
 
 @dataclass(frozen=True)
 class Form:
-    """
-    How a text table is written.
+    """How a text table is written."""
 
-    Attributes
-    ----------
-    delimiter
-        A tab, semicolon, comma or blank; several blanks are one.
-    decimal_comma
-        Whether numbers have a decimal comma.
-    names
-        The columns as the header states them; numbers from 1 where there is none.
-    has_header
-        Whether there is a header.
-    first_line
-        Number of the first line with samples, from 1.
-    is_worded
-        Whether lines have dates, labels or quotes, which `_plain` removes.
-
-    """
-
-    delimiter: str
-    decimal_comma: bool
+    delimiter: str  # A tab, semicolon, comma or blank; several blanks are one
+    decimal_comma: bool  # Whether numbers have a decimal comma
+    # The columns as the header states them; numbers from 1 where there is none
     names: tuple[str, ...]
-    has_header: bool
-    first_line: int
-    is_worded: bool = False
+    has_header: bool  # Whether there is a header
+    first_line: int  # Number of the first line with samples, from 1
+    is_worded: bool = False  # Whether lines have dates, labels or quotes, which `_plain` removes
 
     def describe(self) -> str:
         """Return the form for messages; empty for commas with a header."""
@@ -154,27 +125,7 @@ class _Places:
 
 
 def open_table(path: str, topic: str = '') -> DelimitedText:
-    """
-    Find the form of a text table.
-
-    Parameters
-    ----------
-    path
-        The file.
-    topic
-        Must be empty: a text file holds one table.
-
-    Returns
-    -------
-    DelimitedText
-        The open table.
-
-    Raises
-    ------
-    UserError
-        The file cannot be read, or holds no numbers.
-
-    """
+    """Find the form of a text table."""
     if topic:
         raise UserError(f'--topic {topic}: {path} is no bag; leave --topic out')
     with _opened(path) as file:

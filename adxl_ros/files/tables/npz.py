@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Tables in NumPy's .npz: each array of numbers is a column, or several."""
 
@@ -32,23 +20,7 @@ def open_table(path: str, topic: str = '') -> ArrayTable:
     """
     Read the arrays of a file; those of another length than most are left out.
 
-    Parameters
-    ----------
-    path
-        The file.
-    topic
-        Must be empty: a file holds one table.
-
-    Returns
-    -------
-    ArrayTable
-        Columns by the names of the arrays; `acc[0]` is the first column of an array (n, k).
-
-    Raises
-    ------
-    UserError
-        The file cannot be read, or holds no array of numbers.
-
+    returns: columns by the names of the arrays; `acc[0]` is the first column of an array (n, k).
     """
     if topic:
         raise UserError(f'--topic {topic}: {path} is no bag; leave --topic out')

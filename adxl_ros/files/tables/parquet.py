@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Tables in Apache Parquet, read with the library pyarrow."""
 
@@ -30,23 +18,11 @@ ENDINGS = ('.parquet', '.pq')
 
 @dataclass(frozen=True)
 class ParquetTable:
-    """
-    A Parquet file; the attributes are those of `Table`.
+    """A Parquet file; the attributes are those of `Table`."""
 
-    Attributes
-    ----------
-    path
-        The file.
-    names
-        Its columns of numbers and of times.
-    units
-        Units of the columns of times, which are given in ns.
-
-    """
-
-    path: str
-    names: tuple[str, ...]
-    units: Mapping[str, str]
+    path: str  # The file
+    names: tuple[str, ...]  # Its columns of numbers and of times
+    units: Mapping[str, str]  # Units of the columns of times, which are given in ns
     has_names: bool = True
     form: str = ''
     default_mapping: str = ''
@@ -76,27 +52,7 @@ class ParquetTable:
 
 
 def open_table(path: str, topic: str = '') -> ParquetTable:
-    """
-    Open a Parquet file.
-
-    Parameters
-    ----------
-    path
-        The file.
-    topic
-        Must be empty: a file holds one table.
-
-    Returns
-    -------
-    ParquetTable
-        The open table.
-
-    Raises
-    ------
-    UserError
-        The file cannot be read, or the library is missing.
-
-    """
+    """Open a Parquet file."""
     if topic:
         raise UserError(f'--topic {topic}: {path} is no bag; leave --topic out')
     with _opened(path) as file:

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Logs of PX4 (.ulg), read with the library pyulog: a message is a table, `--topic` names it."""
 
@@ -38,28 +26,7 @@ vehicle_imu has changes of velocity, so that it is only named."""
 
 
 def open_table(path: str, topic: str = '') -> ArrayTable:
-    """
-    Read one message of a log.
-
-    Parameters
-    ----------
-    path
-        The file.
-    topic
-        The message, with its instance behind a `_` where it is not the first: `sensor_accel_1`.
-        Empty for the only one with acceleration, the raw readings first.
-
-    Returns
-    -------
-    ArrayTable
-        Its fields as columns.
-
-    Raises
-    ------
-    UserError
-        The file cannot be read, it has no such message, or the library is missing.
-
-    """
+    """Read one message of a log."""
     log = _read(path)
     messages = {_name(data): data for data in log.data_list}
     data = messages.get(topic.removesuffix('_0') or _only(path, messages))

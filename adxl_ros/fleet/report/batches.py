@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Batches: units whose serial numbers begin alike, and whose coefficient is not that of the others.
@@ -55,20 +43,7 @@ def bad_batch(serials: Sequence[str], level: np.ndarray, tolerance: float, tests
     """
     Return the most certain batch whose level differs by more than a tolerance.
 
-    Parameters
-    ----------
-    serials, level
-        Serial number and level of each unit, (m,).
-    tolerance
-        Smallest difference of the means that matters, in the unit of the levels.
-    tests
-        Number of coefficients that share the chance of a false batch.
-
-    Returns
-    -------
-    BadBatch or None
-        None where no batch differs.
-
+    serials, level: serial number and level of each unit, (m,).
     """
     # The larger part of a fleet is what the others are compared with.
     groups = {prefix: members for prefix, members in by_prefix(serials).items()

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Effects by unit, and what units with an effect have in common: a batch, a stage, a place.
@@ -42,29 +30,13 @@ _MANY_EFFECTS = 3
 
 @dataclass(frozen=True)
 class EffectMatrix:
-    """
-    How often each effect is named in each unit.
+    """How often each effect is named in each unit."""
 
-    Attributes
-    ----------
-    effects
-        Effects that are named anywhere, the most frequent first, (e,).
-    units
-        Numbers of the units with a verdict, (k,).
-    judged
-        Number of recordings with a verdict, (k,).
-    named
-        Number of recordings in which each effect is named for certain, (k, e).
-    findings
-        What rows and columns have in common, one sentence each.
-
-    """
-
-    effects: tuple[str, ...]
-    units: np.ndarray
-    judged: np.ndarray
-    named: np.ndarray
-    findings: tuple[str, ...]
+    effects: tuple[str, ...]  # Effects that are named anywhere, the most frequent first, (e,)
+    units: np.ndarray  # Numbers of the units with a verdict, (k,)
+    judged: np.ndarray  # Number of recordings with a verdict, (k,)
+    named: np.ndarray  # Number of recordings in which each effect is named for certain, (k, e)
+    findings: tuple[str, ...]  # What rows and columns have in common, one sentence each
 
     @property
     def share(self) -> np.ndarray:
@@ -153,20 +125,8 @@ def _frequent(groups: dict[str, np.ndarray], effects: Sequence[str], has: np.nda
     """
     Return the group in which each effect is more frequent than elsewhere, if there is one.
 
-    Parameters
-    ----------
-    groups
-        Members by name, (k,) bool each.
-    effects
-        Names of the effects, (e,).
-    has
-        Whether each member has each effect, (k, e) bool.
-
-    Returns
-    -------
-    list
-        Name of the group, effect, members with it, members, others with it, others.
-
+    groups: members by name, (k,) bool each; effects: names of the effects, (e,); has: whether each
+    member has each effect, (k, e) bool.
     """
     groups = {name: members for name, members in groups.items()
               if MIN_GROUP <= members.sum() <= len(members) - 1}

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The table of a fleet as arrays, in the order of units and time, and the quantities in it."""
 
@@ -45,38 +33,17 @@ MG = 1e3 / G0_MPS2
 
 @dataclass(frozen=True)
 class Quantity:
-    """
-    A quantity of the table.
+    """A quantity of the table."""
 
-    Attributes
-    ----------
-    column
-        Column of its value; the quantity is named by it.
-    label
-        Its name for people.
-    unit
-        Unit of the column.
-    std_column
-        Column of its standard deviation; empty where there is an interval.
-    interval_columns
-        Columns of both ends of its 90 % interval; empty where there is a standard deviation.
-    shown_unit
-        Unit on the page.
-    factor
-        Factor from the column's unit to that of the page.
-    is_coefficient
-        Whether the units of a fleet have a population of it.
-
-    """
-
-    column: str
-    label: str
-    unit: str
-    shown_unit: str
-    factor: float
-    std_column: str = ''
+    column: str  # Column of its value; the quantity is named by it
+    label: str  # Its name for people
+    unit: str  # Unit of the column
+    shown_unit: str  # Unit on the page
+    factor: float  # Factor from the column's unit to that of the page
+    std_column: str = ''  # Column of its standard deviation; empty where there is an interval
+    # Columns of both ends of its 90 % interval; empty where there is a standard deviation
     interval_columns: tuple[str, ...] = ()
-    is_coefficient: bool = True
+    is_coefficient: bool = True  # Whether the units of a fleet have a population of it
 
     @property
     def is_force(self) -> bool:
@@ -86,32 +53,16 @@ class Quantity:
 
 @dataclass(frozen=True)
 class FleetTable:
-    """
-    The recordings of n rows, in the order of serial numbers and dates.
+    """The recordings of n rows, in the order of serial numbers and dates."""
 
-    Attributes
-    ----------
-    columns
-        Values by column, (n,): numbers are float with NaN, texts are '' where there is none.
-    serials
-        Serial numbers of the units, (m,).
-    unit
-        Number of the unit of each row, (n,); −1 without a serial number.
-    years
-        Dates in years since 1970, (n,); NaN without a date.
-    period
-        Number of the period between calibrations, (n,), which rises along the rows.
-    first
-        Rows whose content the unit has not had before, (n,) bool.
-
-    """
-
+    # Values by column, (n,): numbers are float with NaN, texts are '' where there is none
     columns: dict[str, np.ndarray]
-    serials: tuple[str, ...]
-    unit: np.ndarray
-    years: np.ndarray
+    serials: tuple[str, ...]  # Serial numbers of the units, (m,)
+    unit: np.ndarray  # Number of the unit of each row, (n,); −1 without a serial number
+    years: np.ndarray  # Dates in years since 1970, (n,); NaN without a date
+    # Number of the period between calibrations, (n,), which rises along the rows
     period: np.ndarray
-    first: np.ndarray
+    first: np.ndarray  # Rows whose content the unit has not had before, (n,) bool
 
     def __len__(self) -> int:
         return len(self.unit)
@@ -125,21 +76,7 @@ class FleetTable:
         return np.arange(begin, end)
 
     def recordings(self, quantity: Quantity) -> tuple[np.ndarray, Recordings]:
-        """
-        Return a quantity in the recordings that have it.
-
-        Parameters
-        ----------
-        quantity
-            The quantity.
-
-        Returns
-        -------
-        tuple
-            The numbers of their rows and the recordings, in the unit of the column; years are
-            their unit of time. Their units are numbered from 0 again.
-
-        """
+        """Return a quantity in the recordings that have it."""
         value = self[quantity.column]
         if quantity.std_column:
             std = self[quantity.std_column]
@@ -153,25 +90,7 @@ class FleetTable:
 
 
 def read(path: str | os.PathLike) -> FleetTable:
-    """
-    Read the columns of a table that the page uses.
-
-    Parameters
-    ----------
-    path
-        A `fleet.parquet`.
-
-    Returns
-    -------
-    FleetTable
-        Its recordings.
-
-    Raises
-    ------
-    UserError
-        The file cannot be read, lacks a column, or pyarrow is not installed.
-
-    """
+    """Read the columns of a table that the page uses."""
     try:
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -241,20 +160,7 @@ def _quantity_columns() -> Iterator[str]:
 
 
 def quantities(table: FleetTable | None) -> tuple[Quantity, ...]:
-    """
-    Return all quantities of a table.
-
-    Parameters
-    ----------
-    table
-        Its median scale factor converts volts into mg; None takes 1 V/g.
-
-    Returns
-    -------
-    tuple
-        The quantities, those of specific force first.
-
-    """
+    """Return all quantities of a table."""
     listed = [Quantity(
         'gap_before_mps2', 'gap', 'm/s²', 'mg', MG, is_coefficient=False,
         interval_columns=('gap_before_low_mps2', 'gap_before_high_mps2'))]

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Variances of units that moderate each other.
@@ -37,19 +25,9 @@ def moderated(variance: np.ndarray, freedom: np.ndarray) -> tuple[np.ndarray, np
     """
     Moderate the variances of units.
 
-    Parameters
-    ----------
-    variance
-        Variances of the units, (m,). Those without a degree of freedom may be NaN.
-    freedom
-        Their degrees of freedom, (m,); 0 for none.
-
-    Returns
-    -------
-    tuple
-        Moderated variances and their degrees of freedom, (m,) each. Without any variance all
-        are 1.
-
+    variance: variances of the units, (m,). Those without a degree of freedom may be NaN.; freedom:
+    their degrees of freedom, (m,); 0 for none; returns: moderated variances and their degrees of
+    freedom, (m,) each. Without any variance all are 1.
     """
     determined = freedom > 0
     common, common_freedom = _common(variance[determined], freedom[determined])

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Recordings far from the others of their unit, by median and median absolute deviation."""
 
@@ -36,17 +24,8 @@ def outlier_distances(recordings: Recordings) -> tuple[np.ndarray, np.ndarray]:
     """
     Return how far recordings are from the median of their unit and period.
 
-    Parameters
-    ----------
-    recordings
-        A quantity in n recordings.
-
-    Returns
-    -------
-    tuple
-        The distance in robust standard deviations, (n,), and the degrees of freedom of its t
-        distribution, (n,). The distance is 0 where a period has too few recordings.
-
+    returns: the distance in robust standard deviations, (n,), and the degrees of freedom of its t
+    distribution, (n,). The distance is 0 where a period has too few recordings.
     """
     period, value = recordings.period, recordings.value
     counts = np.bincount(period)
@@ -67,18 +46,8 @@ def are_outliers(distance: np.ndarray, freedom: np.ndarray, tests: int) -> np.nd
     """
     Mark the recordings that are too far to be chance.
 
-    Parameters
-    ----------
-    distance, freedom
-        As `outlier_distances` returns them, (n,).
-    tests
-        Number of values that share the chance of a false outlier.
-
-    Returns
-    -------
-    numpy.ndarray
-        Whether each recording is an outlier, (n,) bool.
-
+    distance, freedom: as `outlier_distances` returns them, (n,); returns: whether each recording
+    is an outlier, (n,) bool.
     """
     limits = -scipy.special.stdtrit(np.minimum(freedom, 1e6), FALSE_OUTLIERS / (2 * max(tests, 1)))
     return distance > limits

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Figures of the page of a fleet: the trend of a unit, and the matrix of effects."""
 
@@ -58,24 +46,7 @@ def _stamps(years: np.ndarray) -> list[str]:
 
 
 def trend(table: FleetTable, result: QuantityResult, unit: int) -> plotly.Figure:
-    """
-    Plot a quantity of a unit over time.
-
-    Parameters
-    ----------
-    table
-        The recordings.
-    result
-        The quantity.
-    unit
-        Number of the unit.
-
-    Returns
-    -------
-    dict
-        The figure: recordings with 90 % intervals, outliers, lines with bands, calibrations.
-
-    """
+    """Plot a quantity of a unit over time."""
     part = table.unit[result.rows] == unit
     factor, years = result.quantity.factor, result.recordings.time[part]
     value = factor * (result.recordings.value[part] - _origin(result, unit))
@@ -121,23 +92,7 @@ def _axis_title(result: QuantityResult) -> str:
 
 
 def calibration_years(table: FleetTable, unit: int) -> np.ndarray:
-    """
-    Return when the calibrations of a unit changed.
-
-    Parameters
-    ----------
-    table
-        The recordings.
-    unit
-        Number of the unit.
-
-    Returns
-    -------
-    numpy.ndarray
-        Dates, years since 1970. They are those of the calibrations where their age is dated,
-        else of their first recordings.
-
-    """
+    """Return when the calibrations of a unit changed."""
     rows = table.rows_of(unit)
     rows = rows[np.isfinite(table.years[rows])]
     if not len(rows):
@@ -187,22 +142,7 @@ def _lines(result: QuantityResult, unit: int, times: np.ndarray, periods: np.nda
 
 
 def matrix(table: FleetTable, effects: EffectMatrix) -> plotly.Figure:
-    """
-    Plot how often each effect is named in each unit.
-
-    Parameters
-    ----------
-    table
-        The recordings.
-    effects
-        The effects by unit.
-
-    Returns
-    -------
-    dict
-        The figure: units in rows, in the order of serial numbers, and effects in columns.
-
-    """
+    """Plot how often each effect is named in each unit."""
     columns = effects.effects[:_MOST_EFFECTS]
     share = 100 * effects.share[:, :len(columns)]
     serials = [table.serials[unit] for unit in effects.units]

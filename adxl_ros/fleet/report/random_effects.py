@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Random effects: the mean and the spread of a coefficient over units, and what they say of each.
@@ -49,24 +37,13 @@ _FAR_MADS = 5.0
 
 @dataclass(frozen=True)
 class RandomEffects:
-    """
-    A coefficient over n units.
+    """A coefficient over n units."""
 
-    Attributes
-    ----------
-    pooled
-        Mean and spread of the population.
-    estimates, std
-        The units' own estimates and their standard deviations, (n,).
-    is_far_out
-        Units that are not of this population, (n,) bool. They do not count.
-
-    """
-
-    pooled: PooledCoefficient
+    pooled: PooledCoefficient  # Mean and spread of the population
+    # estimates, std: The units' own estimates and their standard deviations, (n,)
     estimates: np.ndarray
     std: np.ndarray
-    is_far_out: np.ndarray
+    is_far_out: np.ndarray  # Units that are not of this population, (n,) bool. They do not count.
 
     def shrunken(self) -> tuple[np.ndarray, np.ndarray]:
         """Return estimates of the units that use the population, and their std, (n,) each."""
@@ -90,21 +67,7 @@ def random_effects(estimates: np.ndarray, std: np.ndarray, tests: int | None = N
     """
     Estimate mean and spread of a population, without the units that are not of it.
 
-    Parameters
-    ----------
-    estimates
-        Estimates of at least `MIN_UNITS` units, (n,).
-    std
-        Their standard deviations, (n,).
-    tests
-        Number of comparisons that share the chance of a false outlier: units times coefficients.
-        None takes the number of units.
-
-    Returns
-    -------
-    RandomEffects
-        The population.
-
+    estimates: estimates of at least `MIN_UNITS` units, (n,); std: their standard deviations, (n,).
     """
     chance = _OUTLIER_CHANCE / (2 * (tests or len(estimates)))
     deviation = np.abs(estimates - np.median(estimates))
@@ -169,20 +132,7 @@ def weighted_mean(y: np.ndarray, variance: np.ndarray, spread2: float) -> tuple[
     """
     Return the mean of a population for a given spread.
 
-    Parameters
-    ----------
-    y
-        Estimates, (n,).
-    variance
-        Their own variances, (n,).
-    spread2
-        Variance between units.
-
-    Returns
-    -------
-    tuple
-        The weighted mean and its variance.
-
+    y: estimates, (n,); variance: their own variances, (n,).
     """
     weight = 1 / (variance + spread2)
     total = float(weight.sum())
@@ -193,18 +143,7 @@ def reml_spread2(y: np.ndarray, variance: np.ndarray) -> float:
     """
     Return the variance between units that maximises the restricted likelihood.
 
-    Parameters
-    ----------
-    y
-        Estimates, (n,).
-    variance
-        Their own variances, (n,).
-
-    Returns
-    -------
-    float
-        The variance; 0 where the estimates differ by no more than their own errors.
-
+    y: estimates, (n,); variance: their own variances, (n,).
     """
     def score(spread2: float) -> float:
         weight = 1 / (variance + spread2)

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The page of a fleet and the files beside it: `fleet.html`, `population.yaml`, `units.csv`."""
 
@@ -65,25 +53,7 @@ _SENTENCES = {
 
 
 def write(folder: Path) -> list[Path]:
-    """
-    Write page, population and estimates of a fleet beside its table.
-
-    Parameters
-    ----------
-    folder
-        Folder with the table.
-
-    Returns
-    -------
-    list
-        The files.
-
-    Raises
-    ------
-    UserError
-        The table cannot be read, a file cannot be written, or a library is missing.
-
-    """
+    """Write page, population and estimates of a fleet beside its table."""
     html_page.check_libraries()
     table = read(folder / TABLE)
     results = analyse(table)
@@ -115,24 +85,7 @@ def _units_csv(results: Sequence[QuantityResult], serials: Sequence[str]) -> str
 
 
 def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> str:
-    """
-    Return the page of a fleet.
-
-    Parameters
-    ----------
-    table
-        The recordings.
-    results
-        Results of the quantities.
-    folder
-        Folder of the page, from which it names single reports.
-
-    Returns
-    -------
-    str
-        HTML.
-
-    """
+    """Return the page of a fleet."""
     distant = far_out(results, table.serials)
     units = rank(table, results, distant)
     effects = effect_matrix(table)

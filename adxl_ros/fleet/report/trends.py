@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Levels and slopes of a quantity by unit, from repeated recordings.
@@ -59,29 +47,14 @@ _FIT_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class Recordings:
-    """
-    A quantity in n recordings, in the order of units and time.
+    """A quantity in n recordings, in the order of units and time."""
 
-    Attributes
-    ----------
-    unit
-        Numbers of the units from 0, (n,).
-    period
-        Numbers of the periods between calibrations from 0, which rise along the array, (n,).
-    time
-        Times, in the unit of time of the slopes, (n,).
-    value
-        Values, (n,).
-    std
-        Stated standard deviations of the values, (n,).
-
-    """
-
-    unit: np.ndarray
+    unit: np.ndarray  # Numbers of the units from 0, (n,)
+    # Numbers of the periods between calibrations from 0, which rise along the array, (n,)
     period: np.ndarray
-    time: np.ndarray
-    value: np.ndarray
-    std: np.ndarray
+    time: np.ndarray  # Times, in the unit of time of the slopes, (n,)
+    value: np.ndarray  # Values, (n,)
+    std: np.ndarray  # Stated standard deviations of the values, (n,)
 
     def __getitem__(self, part: np.ndarray) -> Recordings:
         return Recordings(_numbered(self.unit[part]), _numbered(self.period[part]),
@@ -95,23 +68,11 @@ def _numbered(labels: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Scatter:
-    """
-    What all units share.
+    """What all units share."""
 
-    Attributes
-    ----------
-    recording
-        Standard deviation from recording to recording, beyond the stated errors.
-    calibration
-        Standard deviation of the steps at calibrations.
-    widening
-        Factor of the variances of levels and slopes by correlation in time.
-
-    """
-
-    recording: float
-    calibration: float
-    widening: float = 1.0
+    recording: float  # Standard deviation from recording to recording, beyond the stated errors
+    calibration: float  # Standard deviation of the steps at calibrations
+    widening: float = 1.0  # Factor of the variances of levels and slopes by correlation in time
 
 
 @dataclass(frozen=True)
@@ -120,35 +81,23 @@ class Trends:
     Levels and slopes of m units, and lines of k periods between their calibrations.
 
     NaN stands for a slope that the recordings do not have.
-
-    Attributes
-    ----------
-    scatter
-        What the units share.
-    level, level_std
-        Mean of each unit over its recordings and its standard deviation, (m,).
-    slope, slope_std
-        Slope of each unit and its standard deviation, (m,).
-    freedom
-        Degrees of freedom of the slopes, (m,).
-    period_time, period_value, period_std
-        A point of the line in each period, and the standard deviation of its value, (k,). The
-        point does not depend on the slope: it is the same for a line without one.
-    noise_ratio
-        Variance of each unit's scatter relative to that of all, (m,).
-
     """
 
-    scatter: Scatter
+    scatter: Scatter  # What the units share
+    # level, level_std: Mean of each unit over its recordings and its standard deviation, (m,)
     level: np.ndarray
     level_std: np.ndarray
+    # slope, slope_std: Slope of each unit and its standard deviation, (m,)
     slope: np.ndarray
     slope_std: np.ndarray
-    freedom: np.ndarray
+    freedom: np.ndarray  # Degrees of freedom of the slopes, (m,)
+    # period_time, period_value, period_std: A point of the line in each period, and the standard
+    # deviation of its value, (k,). The point does not depend on the slope: it is the same for a
+    # line without one.
     period_time: np.ndarray
     period_value: np.ndarray
     period_std: np.ndarray
-    noise_ratio: np.ndarray
+    noise_ratio: np.ndarray  # Variance of each unit's scatter relative to that of all, (m,)
 
     @property
     def p_values(self) -> np.ndarray:
@@ -158,20 +107,7 @@ class Trends:
 
 
 def fit_trends(recordings: Recordings) -> Trends:
-    """
-    Fit levels and slopes of all units.
-
-    Parameters
-    ----------
-    recordings
-        A quantity in the recordings of m units; each unit has one at least.
-
-    Returns
-    -------
-    Trends
-        The levels and slopes.
-
-    """
+    """Fit levels and slopes of all units."""
     sums = _Sums.of(recordings)
     scatter = _shared_scatter(sums)
     fit = sums.fit(scatter)
@@ -317,20 +253,7 @@ def _widening(sums: _Sums, fit: _Fit, scatter: Scatter) -> float:
 
 
 def claimed(p_values: np.ndarray) -> np.ndarray:
-    """
-    Mark the slopes that survive the control of the false discovery rate.
-
-    Parameters
-    ----------
-    p_values
-        Probabilities without a drift, of any shape; NaN counts as no slope.
-
-    Returns
-    -------
-    numpy.ndarray
-        Whether each slope is claimed, of the same shape.
-
-    """
+    """Mark the slopes that survive the control of the false discovery rate."""
     tested = np.isfinite(p_values)
     result = np.zeros(p_values.shape, bool)
     if tested.any():
@@ -340,22 +263,7 @@ def claimed(p_values: np.ndarray) -> np.ndarray:
 
 
 def interval_factor(freedom: np.ndarray, is_claimed: np.ndarray) -> np.ndarray:
-    """
-    Return half the width of the intervals of slopes, in standard deviations.
-
-    Parameters
-    ----------
-    freedom
-        Degrees of freedom, of any shape; NaN without a slope.
-    is_claimed
-        Whether each slope is claimed. The intervals of claims hold for that share of the claims.
-
-    Returns
-    -------
-    numpy.ndarray
-        The factor, of the same shape.
-
-    """
+    """Return half the width of the intervals of slopes, in standard deviations."""
     share = is_claimed.sum() / max(np.isfinite(freedom).sum(), 1)
     outside = (1 - _INTERVAL) * np.where(is_claimed, share, 1.0)
     return -scipy.special.stdtrit(freedom, outside / 2)

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What the recordings of a fleet say of each quantity: trends, population and outliers."""
 
@@ -36,47 +24,23 @@ import numpy as np
 
 @dataclass(frozen=True)
 class QuantityResult:
-    """
-    A quantity over the k units that have it, in n recordings.
+    """A quantity over the k units that have it, in n recordings."""
 
-    Attributes
-    ----------
-    quantity
-        The quantity.
-    rows
-        Rows of the recordings in the table, (n,).
-    recordings
-        Its values in the unit of its column.
-    distance
-        Distance of each recording from those of its unit, robust standard deviations, (n,).
-    is_outlier
-        Recordings that are too far from the others of their unit, (n,) bool. They do not count.
-    units
-        Numbers of the units, (k,).
-    trends
-        Levels and slopes of the units.
-    is_claimed
-        Slopes that survive the control of the false discovery rate over all units and
-        quantities, (k,) bool.
-    half_width
-        Half of the interval of each slope, (k,).
-    population
-        Mean and spread over the units; None where they are too few.
-    batch
-        Units of one batch that are not of this population; None for none.
-
-    """
-
-    quantity: Quantity
-    rows: np.ndarray
-    recordings: Recordings
+    quantity: Quantity  # The quantity
+    rows: np.ndarray  # Rows of the recordings in the table, (n,)
+    recordings: Recordings  # Its values in the unit of its column
+    # Distance of each recording from those of its unit, robust standard deviations, (n,)
     distance: np.ndarray
+    # Recordings that are too far from the others of their unit, (n,) bool. They do not count.
     is_outlier: np.ndarray
-    units: np.ndarray
-    trends: Trends
+    units: np.ndarray  # Numbers of the units, (k,)
+    trends: Trends  # Levels and slopes of the units
+    # Slopes that survive the control of the false discovery rate over all units and quantities,
+    # (k,) bool
     is_claimed: np.ndarray
-    half_width: np.ndarray
-    population: RandomEffects | None
+    half_width: np.ndarray  # Half of the interval of each slope, (k,)
+    population: RandomEffects | None  # Mean and spread over the units; None where they are too few
+    # Units of one batch that are not of this population; None for none
     batch: BadBatch | None = None
 
     def place_of(self, unit: int) -> int | None:
@@ -134,22 +98,7 @@ def _with_claims(results: Sequence[QuantityResult]) -> list[QuantityResult]:
 
 
 def population_of(results: Sequence[QuantityResult], name: str) -> Population:
-    """
-    Return what the units of a fleet are like.
-
-    Parameters
-    ----------
-    results
-        The results of the quantities.
-    name
-        What messages call the population.
-
-    Returns
-    -------
-    Population
-        The coefficients that enough units have.
-
-    """
+    """Return what the units of a fleet are like."""
     return Population(name, {
         result.quantity.column: result.population.pooled for result in results
         if result.population is not None and result.population.pooled.prediction_std > 0})
@@ -160,19 +109,7 @@ def far_out(results: Sequence[QuantityResult], serials: Sequence[str]
     """
     Return the units that are not of the population, the farthest first.
 
-    Parameters
-    ----------
-    results
-        The results of the quantities.
-    serials
-        Serial numbers of the units, (m,).
-
-    Returns
-    -------
-    list
-        Serial number, coefficient, value in the unit of the column and distance in standard
-        deviations.
-
+    serials: serial numbers of the units, (m,).
     """
     units: list[dict[str, str | float]] = [
         {'serial': serials[result.units[i]], 'coefficient': result.quantity.column,

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The order of units by urgency.
@@ -63,26 +51,13 @@ class State(IntEnum):
 
 @dataclass(frozen=True)
 class Drift:
-    """
-    A claimed slope of a unit.
+    """A claimed slope of a unit."""
 
-    Attributes
-    ----------
-    result
-        Its quantity.
-    place
-        Where the unit stands among those of the quantity.
-    days
-        Days until the unit is out of its tolerance; infinite for a quantity without one.
-    reached_mg
-        Gap now, or the drift since the calibration where there is no gap; NaN for a quantity
-        without a tolerance.
-
-    """
-
-    result: QuantityResult
-    place: int
-    days: float
+    result: QuantityResult  # Its quantity
+    place: int  # Where the unit stands among those of the quantity
+    days: float  # Days until the unit is out of its tolerance; infinite for a quantity without one
+    # Gap now, or the drift since the calibration where there is no gap; NaN for a quantity without
+    # a tolerance
     reached_mg: float
 
     @property
@@ -97,46 +72,22 @@ class Drift:
 
 @dataclass(frozen=True)
 class UnitState:
-    """
-    One unit.
+    """One unit."""
 
-    Attributes
-    ----------
-    unit
-        Its number.
-    serial
-        Its serial number.
-    state
-        Its state.
-    reason
-        Why it has this state, in one sentence.
-    gap_mg, floor_mg
-        Median of its last gaps and of their noise floors; NaN without any.
-    drifts
-        Its claimed slopes, the most urgent first.
-    recordings, refused
-        Number of its recordings, and of those that are refused or crashed.
-    calibration_age_days
-        Age of its calibration at the last recording; NaN without one.
-    last_year
-        Date of its last recording, years since 1970; NaN without a date.
-    report
-        Folder of the single reports of its last recording; empty for none.
-
-    """
-
-    unit: int
-    serial: str
-    state: State
-    reason: str
+    unit: int  # Its number
+    serial: str  # Its serial number
+    state: State  # Its state
+    reason: str  # Why it has this state, in one sentence
+    # gap_mg, floor_mg: Median of its last gaps and of their noise floors; NaN without any
     gap_mg: float
     floor_mg: float
-    drifts: tuple[Drift, ...]
+    drifts: tuple[Drift, ...]  # Its claimed slopes, the most urgent first
+    # recordings, refused: Number of its recordings, and of those that are refused or crashed
     recordings: int
     refused: int
-    calibration_age_days: float
-    last_year: float
-    report: str
+    calibration_age_days: float  # Age of its calibration at the last recording; NaN without one
+    last_year: float  # Date of its last recording, years since 1970; NaN without a date
+    report: str  # Folder of the single reports of its last recording; empty for none
 
     @property
     def is_drifting(self) -> bool:
@@ -145,24 +96,7 @@ class UnitState:
 
 
 def number(value: float, signed: bool = False, digits: int = 3) -> str:
-    """
-    Return a number with a few digits and no exponent.
-
-    Parameters
-    ----------
-    value
-        The number.
-    signed
-        Whether a positive one has a sign.
-    digits
-        Significant digits.
-
-    Returns
-    -------
-    str
-        The number; '-' for NaN.
-
-    """
+    """Return a number with a few digits and no exponent."""
     if not np.isfinite(value):
         return '-'
     rounded = float(f'{value:.{digits}g}')
@@ -175,26 +109,7 @@ def number(value: float, signed: bool = False, digits: int = 3) -> str:
 def rank(table: FleetTable, results: Sequence[QuantityResult],
          far_out: Sequence[dict[str, str | float]], tolerance_mg: float = TOLERANCE_MG
          ) -> list[UnitState]:
-    """
-    Return all units, the most urgent first.
-
-    Parameters
-    ----------
-    table
-        The recordings.
-    results
-        Results of the quantities.
-    far_out
-        Units that are not of the population, the farthest first.
-    tolerance_mg
-        Largest gap of a unit that is in order, mg.
-
-    Returns
-    -------
-    list
-        The states of the units.
-
-    """
+    """Return all units, the most urgent first."""
     labels = {result.quantity.column: result.quantity.label for result in results}
     distant: dict[str, tuple[float, str]] = {}
     for item in far_out:

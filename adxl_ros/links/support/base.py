@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 What a link is: a source of samples.
@@ -42,29 +30,15 @@ _MAX_SHARE = 1e-3
 
 @dataclass(frozen=True)
 class Option:
-    """
-    One setting of a link, which is the parameter `link.<name>` of the driver.
+    """One setting of a link, which is the parameter `link.<name>` of the driver."""
 
-    Attributes
-    ----------
-    name
-        Name of the field in `Settings`.
-    default
-        Default value; its type is the type of the parameter. An empty tuple stands for a list of
-        strings, or one string with commas.
-    doc
-        Meaning, for the parameter's descriptor.
-    unit
-        Unit of the value; '' without one.
-    lower, upper
-        Permitted range, in `unit`; None without limits.
-
-    """
-
-    name: str
+    name: str  # Name of the field in `Settings`
+    # Default value; its type is the type of the parameter. An empty tuple stands for a list of
+    # strings, or one string with commas.
     default: bool | int | float | str | tuple[()]
-    doc: str
-    unit: str = ''
+    doc: str  # Meaning, for the parameter's descriptor
+    unit: str = ''  # Unit of the value; '' without one
+    # lower, upper: Permitted range, in `unit`; None without limits
     lower: float | None = None
     upper: float | None = None
 
@@ -96,16 +70,9 @@ def options(settings: type) -> tuple[Option, ...]:
 
 @dataclass(frozen=True)
 class LatencySettings:
-    """
-    Settings of every link of this package.
+    """Settings of every link of this package."""
 
-    Attributes
-    ----------
-    latency_ms
-        Longest time for which samples are collected before they are passed on, ms.
-
-    """
-
+    # Longest time for which samples are collected before they are passed on, ms
     latency_ms: float = option(2.0, 'longest time for which samples are collected before they '
                                'are passed on together; 0: each sample alone', 'ms', 0.0, 1000.0)
 
@@ -116,35 +83,20 @@ class LatencySettings:
 
 @dataclass(frozen=True)
 class PacedSettings(LatencySettings):
-    """
-    Settings of a link that makes its own time.
+    """Settings of a link that makes its own time."""
 
-    Attributes
-    ----------
-    speed
-        Sensor time by real time.
-
-    """
-
+    # Sensor time by real time
     speed: float = option(1.0, 'sensor time by real time; other than 1 the driver publishes '
                           '/clock', '', 0.01, 1000.0)
 
 
 @dataclass(frozen=True)
 class DeviceSettings(LatencySettings):
-    """
-    Settings of a link that reads a device.
+    """Settings of a link that reads a device."""
 
-    Attributes
-    ----------
-    delay
-        Shortest time from a sample to its arrival, s.
-    supply_scale
-        Supply voltage by the voltage of its channel, V/V: the ratio of its divider.
-
-    """
-
+    # Shortest time from a sample to its arrival, s
     delay: float = option(0.0, 'shortest time from a sample to its arrival', 's', 0.0, 1.0)
+    # Supply voltage by the voltage of its channel, V/V: the ratio of its divider
     supply_scale: float = option(1.0, 'supply voltage by the voltage of its channel: the ratio '
                                  'of its divider', 'V/V', 1e-3, 1e3)
 
@@ -189,45 +141,22 @@ class Level(Enum):
 
 @dataclass(frozen=True)
 class Event:
-    """
-    Something that happens to a device now and then.
+    """Something that happens to a device now and then."""
 
-    Attributes
-    ----------
-    message
-        What a user is told.
-    count
-        How often it has happened.
-
-    """
-
-    message: str
-    count: int
+    message: str  # What a user is told
+    count: int  # How often it has happened
 
 
 @dataclass(frozen=True)
 class LinkStatus:
-    """
-    How a link works.
+    """How a link works."""
 
-    Attributes
-    ----------
-    level
-        How well.
-    text
-        One or two words, or one line with the reason. It changes only when the condition of the
-        link changes.
-    statistics
-        Dataclasses with the counts of the link and of its clock.
-    events
-        Events that are logged when their count rises.
-
-    """
-
-    level: Level
+    level: Level  # How well
+    # One or two words, or one line with the reason. It changes only when the condition of the link
+    # changes.
     text: str
-    statistics: tuple[Any, ...] = ()
-    events: tuple[Event, ...] = ()
+    statistics: tuple[Any, ...] = ()  # Dataclasses with the counts of the link and of its clock
+    events: tuple[Event, ...] = ()  # Events that are logged when their count rises
 
     def values(self) -> dict[str, Any]:
         """Return the statistics by name, as diagnostics show them."""
@@ -239,35 +168,17 @@ class LinkStatus:
 
 @dataclass(frozen=True)
 class Samples:
-    """
-    What one read of a link returns.
+    """What one read of a link returns."""
 
-    Attributes
-    ----------
-    stamp_ns
-        Times of the samples, ns, (n,) int64, ascending.
-    volts
-        Output of the sensor by axis, V, (n, m), finite.
-    until_ns
-        Time up to which the link has no further samples, ns.
-    missing
-        Samples lost since the last call.
-    references : mapping
-        References by the column names of a recording, (n,) each; NaN where a reference was not
-        sampled.
-    estimated
-        Part of `missing` that is estimated from time, not counted.
-    imu_fields : mapping
-        Further fields of sensor_msgs/Imu by name, (n, k) each, such as `angular_velocity`.
-
-    """
-
-    stamp_ns: np.ndarray
-    volts: np.ndarray
-    until_ns: int
-    missing: int = 0
+    stamp_ns: np.ndarray  # Times of the samples, ns, (n,) int64, ascending
+    volts: np.ndarray  # Output of the sensor by axis, V, (n, m), finite
+    until_ns: int  # Time up to which the link has no further samples, ns
+    missing: int = 0  # Samples lost since the last call
+    # References by the column names of a recording, (n,) each; NaN where a reference was not
+    # sampled
     references: Mapping[str, np.ndarray] = field(default_factory=dict)
-    estimated: int = 0
+    estimated: int = 0  # Part of `missing` that is estimated from time, not counted
+    # Further fields of sensor_msgs/Imu by name, (n, k) each, such as `angular_velocity`
     imu_fields: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def finite(self) -> Samples:
@@ -303,29 +214,16 @@ def no_samples(sensor: Sensor, until_ns: int) -> Samples:
 
 
 class Link(Protocol):
-    """
-    A source of samples, as `open_link` returns it.
+    """A source of samples, as `open_link` returns it."""
 
-    Attributes
-    ----------
-    sensor
-        Sensor that makes the samples readable; None until the device has described itself.
-    live
-        Whether a device sends the samples. Then `read` waits for them for about 50 ms and their
-        stamps are final. Otherwise `read` returns at once what is due.
-    references : tuple
-        Names of the references that come with the samples.
-    waits_for_listener
-        Whether the first sample waits for the first subscriber.
-    start_ns
-        Time of the first sample, ns, where the link has a time of its own; else None.
-
-    """
-
+    # Sensor that makes the samples readable; None until the device has described itself
     sensor: Sensor | None
+    # Whether a device sends the samples. Then `read` waits for them for about 50 ms and their
+    # stamps are final. Otherwise `read` returns at once what is due.
     live: bool
-    references: tuple[str, ...]
-    waits_for_listener: bool
+    references: tuple[str, ...]  # Names of the references that come with the samples
+    waits_for_listener: bool  # Whether the first sample waits for the first subscriber
+    # Time of the first sample, ns, where the link has a time of its own; else None
     start_ns: int | None
 
     def begin(self, now_ns: int) -> int:
@@ -347,17 +245,9 @@ class Link(Protocol):
 
 @runtime_checkable
 class StageLink(Protocol):
-    """
-    A link whose sensor senses the motion of the stage.
+    """A link whose sensor senses the motion of the stage."""
 
-    Attributes
-    ----------
-    joint_state_topic
-        Topic with the true motion of the stage.
-
-    """
-
-    joint_state_topic: str
+    joint_state_topic: str  # Topic with the true motion of the stage
 
     def sense_stage(self, stamp_ns: int, position: Mapping[str, float],
                     velocity: Mapping[str, float]) -> None:
@@ -378,20 +268,10 @@ class StageLink(Protocol):
 
 @runtime_checkable
 class ImuLink(Protocol):
-    """
-    A link that gets the ideal samples of a simulator.
+    """A link that gets the ideal samples of a simulator."""
 
-    Attributes
-    ----------
-    imu_topic
-        Topic of the ideal sensor_msgs/Imu.
-    temperature_topic
-        Topic of the temperature of the sensor.
-
-    """
-
-    imu_topic: str
-    temperature_topic: str
+    imu_topic: str  # Topic of the ideal sensor_msgs/Imu
+    temperature_topic: str  # Topic of the temperature of the sensor
 
     def sense_imu(self, stamp_ns: np.ndarray, fields: Mapping[str, np.ndarray]) -> None:
         """
@@ -424,17 +304,9 @@ class ImuLink(Protocol):
 
 
 class LinkModule(Protocol):
-    """
-    What a module of `links` contains.
+    """What a module of `links` contains."""
 
-    Attributes
-    ----------
-    Settings
-        Frozen dataclass whose fields are declared by `option`.
-
-    """
-
-    Settings: type
+    Settings: type  # Frozen dataclass whose fields are declared by `option`
 
     def open_link(self, sensor: Sensor, settings: Any) -> Link:
         """

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What the channels of an ADC carry: axes of the sensor, its supply, a temperature."""
 
@@ -54,22 +42,7 @@ def parse_channels(value: str | Sequence[str]) -> list[str]:
 
 
 def check_roles(roles: Sequence[str], axes: str) -> None:
-    """
-    Check that the channels make a sensor readable.
-
-    Parameters
-    ----------
-    roles
-        Roles of the channels.
-    axes
-        Axes of the sensor.
-
-    Raises
-    ------
-    UserError
-        A role is unknown, is there twice, or is no axis of the sensor; or an axis has no channel.
-
-    """
+    """Check that the channels make a sensor readable."""
     for role in roles:
         if role not in (*ROLES, UNUSED):
             raise UserError(f'link.channels: {role!r} is none of {", ".join(ROLES)}, or - for '
@@ -99,61 +72,27 @@ def absent(count: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Block:
-    """
-    Samples as a device sends them.
+    """Samples as a device sends them."""
 
-    Attributes
-    ----------
-    device_ns
-        Device time, ns, (n,) int64, ascending.
-    volts
-        Output of the sensor by axis, V, (n, m).
-    references : Mapping
-        References by column, (n,) each.
-
-    """
-
-    device_ns: np.ndarray
-    volts: np.ndarray
-    references: Mapping[str, np.ndarray]
+    device_ns: np.ndarray  # Device time, ns, (n,) int64, ascending
+    volts: np.ndarray  # Output of the sensor by axis, V, (n, m)
+    references: Mapping[str, np.ndarray]  # References by column, (n,) each
 
 
 @dataclass(frozen=True)
 class Layout:
-    """
-    How the channels of a device become samples.
+    """How the channels of a device become samples."""
 
-    Attributes
-    ----------
-    axes
-        Axes of the sensor.
-    columns
-        Columns of the references; NaN where no channel has them.
-    supply_scale
-        Supply voltage by the voltage of its channel, V/V.
-
-    """
-
-    axes: str
-    columns: tuple[str, ...]
-    supply_scale: float
+    axes: str  # Axes of the sensor
+    columns: tuple[str, ...]  # Columns of the references; NaN where no channel has them
+    supply_scale: float  # Supply voltage by the voltage of its channel, V/V
 
     def block(self, device_ns: np.ndarray, values: Mapping[str, np.ndarray]) -> Block:
         """
         Arrange the values of channels as samples.
 
-        Parameters
-        ----------
-        device_ns
-            Device time, ns, (n,) int64, ascending.
-        values
-            Volts, or degC for the temperature, by role, (n,) each.
-
-        Returns
-        -------
-        Block
-            The samples.
-
+        device_ns: device time, ns, (n,) int64, ascending; values: volts, or degC for the
+        temperature, by role, (n,) each.
         """
         volts = np.array([values[axis] for axis in self.axes]).T
         references = {column: absent(len(device_ns)) for column in self.columns}
@@ -177,18 +116,8 @@ class PeriodMeans:
         """
         Return the means in a few rows, and NaN in the others.
 
-        Parameters
-        ----------
-        host_ns
-            Times of the samples, ns, (n,), ascending from call to call.
-        references : Mapping
-            References by column, (n,) each.
-
-        Returns
-        -------
-        dict
-            Means by column, (n,) each.
-
+        host_ns: times of the samples, ns, (n,), ascending from call to call; references:
+        references by column, (n,) each; returns: means by column, (n,) each.
         """
         begins: list[int] = []
         if int(host_ns[-1]) // _PERIOD_NS != self._period:

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Maps from the clock of a device to the host's monotonic clock, and from there to ROS time.
@@ -89,61 +77,31 @@ class _Window(NamedTuple):
 
 @dataclass
 class _LateArrivals:
-    """
-    Arrivals that are far too late: their samples were delayed, or the device's clock stopped.
+    """Arrivals far too late: their samples were delayed, or the device's clock stopped."""
 
-    Attributes
-    ----------
-    first_ns, last_ns
-        Host times of the first and the last one, ns.
-    first_device_ns, last_device_ns
-        Their device times, ns.
-    min_lag_ns
-        Smallest lag of device time behind host time, ns.
-    count
-        Number of arrivals.
-
-    """
-
+    # first_ns, last_ns: Host times of the first and the last one, ns
     first_ns: int
+    # first_device_ns, last_device_ns: Their device times, ns
     first_device_ns: int
     last_device_ns: int
     last_ns: int
-    min_lag_ns: int
-    count: int = 1
+    min_lag_ns: int  # Smallest lag of device time behind host time, ns
+    count: int = 1  # Number of arrivals
 
 
 class ClockMap:
     """
     Map of a device's clock by the arrivals of its samples.
 
-    Attributes
-    ----------
-    steps
-        How often the device's clock has stepped, by its arrivals.
-    drift_ppm
-        Drift of the device's clock, ppm; positive where it is slower than the host's.
-    jitter_ns
-        Median distance of the windows' earliest arrivals from the line, ns.
-    settled
-        Whether samples get stamps. They wait in the first instants of a new clock.
-
+    drift_ppm: drift of the device's clock, ppm; positive where it is slower than the host's;
+    jitter_ns: median distance of the windows' earliest arrivals from the line, ns; settled:
+    whether samples get stamps. They wait in the first instants of a new clock.
     """
 
     def __init__(self, delay_s: float, decision_s: float = _LATER_WAIT_S) -> None:
-        """
-        Begin without arrivals.
-
-        Parameters
-        ----------
-        delay_s
-            Shortest time from a sample to its arrival, s.
-        decision_s
-            Duration of late arrivals after which they show a clock that stopped, s.
-
-        """
+        """Begin without arrivals."""
         self._decision_s = decision_s
-        self.steps = 0
+        self.steps = 0  # How often the device's clock has stepped, by its arrivals
         self._delay_ns = round(delay_s * 1e9)
         self._newest_stamp_ns: int | None = None
         self._wait_s = _FIRST_WAIT_S
@@ -164,22 +122,7 @@ class ClockMap:
         self._slope = 1.0
 
     def observe(self, device_ns: int, arrived_ns: int) -> bool:
-        """
-        Take an arrival.
-
-        Parameters
-        ----------
-        device_ns
-            Device time of the newest sample that arrived, ns.
-        arrived_ns
-            Host time of its arrival, ns.
-
-        Returns
-        -------
-        bool
-            Whether the device's clock has stepped, so that a new map has begun.
-
-        """
+        """Take an arrival."""
         lag_ns = arrived_ns - self._delay_ns - device_ns
         is_early = self._is_early(device_ns, arrived_ns)
         if is_early or self._is_shifted(lag_ns):
@@ -216,16 +159,8 @@ class ClockMap:
         """
         Map device times to host times.
 
-        Parameters
-        ----------
-        device_ns
-            Device times, ns, (n,) int64, ascending.
-
-        Returns
-        -------
-        ndarray
-            Host times, ns, (n,) int64, ascending within the call and from call to call.
-
+        device_ns: device times, ns, (n,) int64, ascending; returns: host times, ns, (n,) int64,
+        ascending within the call and from call to call.
         """
         stamps = np.rint(self._line(device_ns)).astype(np.int64)
         newest_ns = self._newest_stamp_ns
@@ -267,17 +202,7 @@ class ClockMap:
             self._steer(device_ns, max(_HORIZON_S, 2 * open_s))
 
     def _steer(self, device_ns: int, horizon_s: float) -> None:
-        """
-        Turn the line so that it meets the best line at the horizon.
-
-        Parameters
-        ----------
-        device_ns
-            Device time from which the new line holds, ns.
-        horizon_s
-            Time until the lines meet, s.
-
-        """
+        """Turn the line so that it meets the best line at the horizon."""
         host_ns = round(self._line(device_ns))
         horizon_ns = round(horizon_s * 1e9)
         difference_ns = device_ns + self._fit(device_ns) - host_ns
@@ -321,24 +246,7 @@ class ClockMap:
         return self.settled and self._lateness_ns(device_ns, arrived_ns) < -_EARLY_NS
 
     def _is_late(self, device_ns: int, arrived_ns: int, lag_ns: int) -> bool:
-        """
-        Keep an arrival that is far too late out of the windows, until later ones explain it.
-
-        Parameters
-        ----------
-        device_ns
-            Device time of the newest sample, ns.
-        arrived_ns
-            Host time of its arrival, ns.
-        lag_ns
-            Lag of device time behind host time, ns.
-
-        Returns
-        -------
-        bool
-            Whether the arrival is kept out.
-
-        """
+        """Keep an arrival that is far too late out of the windows, until later ones explain it."""
         lateness_ns = self._lateness_ns(device_ns, arrived_ns)
         late = self._late
         if late is None:
@@ -381,16 +289,9 @@ class ClockMap:
 
 
 class IdentityMap:
-    """
-    Map for a device that stamps by the host's own monotonic clock.
+    """Map for a device that stamps by the host's own monotonic clock."""
 
-    Attributes
-    ----------
-    steps, settled, drift_ppm, jitter_ns
-        As those of `ClockMap`, and constant.
-
-    """
-
+    # steps, settled, drift_ppm, jitter_ns: As those of `ClockMap`, and constant
     steps = 0
     settled = True
     drift_ppm = jitter_ns = 0.0
@@ -399,20 +300,7 @@ class IdentityMap:
         """Do nothing: this map learns nothing."""
 
     def observe(self, device_ns: int, arrived_ns: int) -> bool:
-        """
-        Do nothing: this clock does not step.
-
-        Parameters
-        ----------
-        device_ns, arrived_ns
-            As those of `ClockMap.observe`.
-
-        Returns
-        -------
-        bool
-            False.
-
-        """
+        """Do nothing: this clock does not step."""
         return False
 
     def ready(self, now_ns: int) -> bool:
@@ -425,15 +313,7 @@ class IdentityMap:
 
 
 class SystemClockMap:
-    """
-    Map from the host's monotonic clock, which is never set, to ROS time, the system clock.
-
-    Attributes
-    ----------
-    steps
-        How often the system clock was set since the map began.
-
-    """
+    """Map from the host's monotonic clock, which is never set, to ROS time, the system clock."""
 
     _STEP_NS = 1_000_000
     """Change of the offset that counts as a step, ns. Chosen: slewing by NTP is slower."""
@@ -446,7 +326,7 @@ class SystemClockMap:
 
     def __init__(self) -> None:
         """Read both clocks."""
-        self.steps = 0
+        self.steps = 0  # How often the system clock was set since the map began
         self._offset_ns = float(self._read().offset_ns)
 
     def update(self) -> int:

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """An emulated board: samples in wire format 1 on a terminal, in real time."""
 
@@ -67,19 +55,7 @@ class Board:
     """
 
     def __init__(self, sensor: Sensor, roles: list[str], fd: int) -> None:
-        """
-        Begin as after a reset.
-
-        Parameters
-        ----------
-        sensor
-            Sensor of the board, with the ADC and the sample rate.
-        roles
-            Roles of the channels.
-        fd
-            File descriptor of the terminal, which does not block.
-
-        """
+        """Begin as after a reset."""
         self._sensor, self._roles, self._fd = sensor, roles, fd
         self._encoder = Encoder(BoardInfo(sensor.rate_hz, sensor.adc_bits, len(roles),
                                           sensor.adc_vref_v, sensor.serial))
@@ -94,16 +70,7 @@ class Board:
         """
         Send samples, each frame at the time of its last sample.
 
-        Parameters
-        ----------
-        columns
-            Volts by axis, such as `x_v`, and `supply_v` and `temperature_c`, (n,) each.
-
-        Raises
-        ------
-        UserError
-            The terminal is gone.
-
+        columns: volts by axis, such as `x_v`, and `supply_v` and `temperature_c`, (n,) each.
         """
         codes = self._codes(columns)
         if self._began_s is None:
@@ -166,43 +133,13 @@ def _volts(role: str, columns: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def roles_of(sensor: Sensor, columns: Mapping[str, np.ndarray]) -> list[str]:
-    """
-    Return the roles of the channels for columns of samples.
-
-    Parameters
-    ----------
-    sensor
-        Sensor whose axes are sent.
-    columns
-        Samples by column.
-
-    Returns
-    -------
-    list
-        Roles of the axes, and of the references among the columns.
-
-    """
+    """Return the roles of the channels for columns of samples."""
     references = [role for role, column in channels.COLUMNS.items() if column in columns]
     return [*sensor.axes, *references]
 
 
 def driver_command(port: str, roles: list[str]) -> str:
-    """
-    Return the command of a driver that reads this board.
-
-    Parameters
-    ----------
-    port
-        Path of the terminal.
-    roles
-        Roles of the channels.
-
-    Returns
-    -------
-    str
-        One line for a shell.
-
-    """
+    """Return the command of a driver that reads this board."""
     options = [f'-p link.type:=serial -p link.port:={port} -p link.channels:={",".join(roles)}']
     if channels.SUPPLY in roles:
         options.append(f'-p link.supply_scale:={_SUPPLY_SCALE}')
@@ -221,26 +158,7 @@ def check_sensor(sensor: Sensor) -> None:
 
 @contextmanager
 def open_terminal(port: str) -> Iterator[int]:
-    """
-    Open the end of a terminal that a board writes to.
-
-    Parameters
-    ----------
-    port
-        An existing terminal device, or the name of a new pseudo-terminal, which exists as long as
-        the board.
-
-    Yields
-    ------
-    int
-        File descriptor, which does not block.
-
-    Raises
-    ------
-    UserError
-        The terminal cannot be opened.
-
-    """
+    """Open the end of a terminal that a board writes to."""
     path = Path(port)
     if path.exists():
         if not stat.S_ISCHR(path.stat().st_mode):

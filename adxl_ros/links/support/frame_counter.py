@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Order of frames by the device's own count of samples and by its clock."""
 
@@ -39,23 +27,12 @@ _AWAY_TOLERANCE_US = 250e3
 
 @dataclass(frozen=True)
 class AcceptedFrame:
-    """
-    A frame whose samples are published.
+    """A frame whose samples are published."""
 
-    Attributes
-    ----------
-    frame
-        The frame.
-    lost
-        Number of samples that are missing before it, exactly; None where a new count begins.
-    stepped
-        Whether the device's clock has stepped since the previous frame.
-
-    """
-
-    frame: SampleFrame
+    frame: SampleFrame  # The frame
+    # Number of samples that are missing before it, exactly; None where a new count begins
     lost: int | None
-    stepped: bool = False
+    stepped: bool = False  # Whether the device's clock has stepped since the previous frame
 
 
 class _Repetition(NamedTuple):
@@ -69,13 +46,8 @@ class FrameCounter:
     """
     Decides for each frame: the next one, one after a gap, a repeated one, or a new count.
 
-    Attributes
-    ----------
-    repeated
-        Samples of frames that came twice or late.
-    overruns
-        Samples that the device itself dropped.
-
+    repeated: samples of frames that came twice or late; overruns: samples that the device itself
+    dropped.
     """
 
     def __init__(self) -> None:
@@ -106,22 +78,7 @@ class FrameCounter:
         self._forget()
 
     def accept(self, frame: SampleFrame, arrived_ns: int) -> list[AcceptedFrame]:
-        """
-        Take the next frame of the stream.
-
-        Parameters
-        ----------
-        frame
-            The frame.
-        arrived_ns
-            Host time of its arrival, ns.
-
-        Returns
-        -------
-        list
-            No frame, this frame, or a frame that was held back and this one.
-
-        """
+        """Take the next frame of the stream."""
         arrived_us = arrived_ns * 1e-3
         is_repeated = frame.check in self._checks
         pending, self._pending = self._pending, None

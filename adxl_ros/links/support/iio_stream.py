@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A buffered IIO device through libiio: its channels, their conversion to volts, its samples."""
 
@@ -74,23 +62,11 @@ class ReadError(Exception):
 
 @dataclass(frozen=True)
 class AdcInfo:
-    """
-    What a device states about its ADC.
+    """What a device states about its ADC."""
 
-    Attributes
-    ----------
-    rate_hz
-        Sample rate, Hz.
-    bits
-        Resolution, bit; 0 where the codes do not begin at 0 V.
-    vref_v
-        Full scale, V; None where it is not known.
-
-    """
-
-    rate_hz: float
-    bits: int
-    vref_v: float | None = None
+    rate_hz: float  # Sample rate, Hz
+    bits: int  # Resolution, bit; 0 where the codes do not begin at 0 V
+    vref_v: float | None = None  # Full scale, V; None where it is not known
 
     def apply(self, sensor: Sensor) -> Sensor:
         """Return a sensor with this ADC."""
@@ -107,32 +83,14 @@ class BufferSamples(NamedTuple):
 
 @dataclass(frozen=True)
 class _Column:
-    """
-    A channel, with the conversion of its codes to V or degC: (code + offset) * scale + zero.
+    """A channel, with the conversion of its codes to V or degC: (code + offset) * scale + zero."""
 
-    Attributes
-    ----------
-    role
-        Role of the channel.
-    channel
-        The channel of libiio.
-    dtype
-        numpy type of its codes.
-    offset
-        Offset, in codes.
-    scale
-        Scale, V or degC per code.
-    zero
-        Zero-g of a digital sensor's pseudo-volts, V.
-
-    """
-
-    role: str
-    channel: Any
-    dtype: str
-    offset: float
-    scale: float
-    zero: float = 0.0
+    role: str  # Role of the channel
+    channel: Any  # The channel of libiio
+    dtype: str  # numpy type of its codes
+    offset: float  # Offset, in codes
+    scale: float  # Scale, V or degC per code
+    zero: float = 0.0  # Zero-g of a digital sensor's pseudo-volts, V
 
     @property
     def buffered(self) -> bool:
@@ -156,46 +114,18 @@ class Stream:
     """
     A device whose buffer is running.
 
-    Attributes
-    ----------
-    name
-        Name of the device.
-    adc
-        Its ADC.
-    by_host_clock
-        Whether its time stamps are those of this machine's monotonic clock.
-    buffer_s
-        Duration of a buffer, s.
-
+    name: name of the device; adc: its ADC; by_host_clock: whether its time stamps are those of
+    this machine's monotonic clock.
     """
 
     def __init__(self, context: Any, device: Any, columns: Sequence[_Column], timestamp: Any,
                  adc: AdcInfo, by_host_clock: bool, latency: LatencySettings) -> None:
-        """
-        Start the buffer.
-
-        Parameters
-        ----------
-        context, device, timestamp
-            Context, device and timestamp channel of libiio.
-        columns
-            Channels that are read.
-        adc, by_host_clock
-            As the attributes.
-        latency
-            How long samples may wait for their buffer.
-
-        Raises
-        ------
-        OSError
-            The buffer does not start.
-
-        """
+        """Start the buffer."""
         self.name, self.adc, self.by_host_clock = device.name or device.id, adc, by_host_clock
         count = max(latency.samples_together(adc.rate_hz),
                     ceil(_ROUND_TRIPS * _answer_s(columns[0].channel) * adc.rate_hz))
         count = min(count, _MAX_BUFFER)
-        self.buffer_s = count / adc.rate_hz
+        self.buffer_s = count / adc.rate_hz  # Duration of a buffer, s
         self._context, self._device, self._timestamp = context, device, timestamp
         self._columns = [column for column in columns if column.buffered]
         self._polled = [column for column in columns if not column.buffered]
@@ -210,20 +140,7 @@ class Stream:
         self._buffer = import_libiio().Buffer(device, count)
 
     def read(self) -> BufferSamples:
-        """
-        Wait for a buffer.
-
-        Returns
-        -------
-        BufferSamples
-            Its samples.
-
-        Raises
-        ------
-        ReadError
-            The device is lost, or silent for longer than its buffer takes.
-
-        """
+        """Wait for a buffer."""
         try:
             self._buffer.refill()
             device_ns = np.frombuffer(self._timestamp.read(self._buffer), np.int64)
@@ -259,35 +176,7 @@ class Stream:
 
 def open_stream(uri: str, device_name: str, entries: Sequence[str], sensor: Sensor,
                 latency: LatencySettings) -> Stream:
-    """
-    Open a device and start its buffer.
-
-    Parameters
-    ----------
-    uri
-        URI of the libiio context.
-    device_name
-        Name, id or label of the device; '' for the only one with buffered channels.
-    entries
-        Entries of `link.channels`.
-    sensor
-        Sensor whose axes are read, at its sample rate.
-    latency
-        How long samples may wait for their buffer.
-
-    Returns
-    -------
-    Stream
-        The running device.
-
-    Raises
-    ------
-    ReadError
-        The device is absent.
-    UserError
-        The device does not fit the settings.
-
-    """
+    """Open a device and start its buffer."""
     iio = import_libiio()
     try:
         _probe(uri)
@@ -325,17 +214,7 @@ def _quiet_stderr() -> Iterator[None]:
 
 
 def _probe(uri: str) -> None:
-    """
-    Check that an iiod answers.
-
-    Raises
-    ------
-    OSError
-        It does not answer.
-    ValueError
-        The port is no number.
-
-    """
+    """Check that an iiod answers."""
     kind, _, address = uri.partition(':')
     if kind != 'ip':
         return
@@ -380,30 +259,7 @@ class _Assignment(NamedTuple):
 
 
 def _assign_roles(device: Any, entries: Sequence[str], axes: str) -> list[_Assignment]:
-    """
-    Assign the channels of a device to roles.
-
-    Parameters
-    ----------
-    device
-        Device of libiio.
-    entries
-        Entries of `link.channels`; empty for the channels that the labels name, or else for the
-        first voltages.
-    axes
-        Axes of the sensor.
-
-    Returns
-    -------
-    list
-        Assignments, one for each axis among them.
-
-    Raises
-    ------
-    UserError
-        The entries do not fit the device or the sensor.
-
-    """
+    """Assign the channels of a device to roles."""
     if not entries:
         labelled = _by_label(device, axes)
         if labelled:
@@ -526,25 +382,7 @@ def _set_rate(context: Any, device: Any, columns: Sequence[_Column], rate_hz: fl
     """
     Set the sample rate of the device, of a channel or of the only trigger.
 
-    Parameters
-    ----------
-    context, device
-        Context and device of libiio.
-    columns
-        Channels that are read.
-    rate_hz
-        Sample rate of the parameters, Hz.
-
-    Returns
-    -------
-    float
-        Sample rate that the device states then, Hz; `rate_hz` where it states none.
-
-    Raises
-    ------
-    UserError
-        The device states an impossible rate.
-
+    returns: sample rate that the device states then, Hz; `rate_hz` where it states none.
     """
     triggers = [d for d in context.devices if isinstance(d, import_libiio().Trigger)]
     places = [device, *(column.channel for column in columns)]

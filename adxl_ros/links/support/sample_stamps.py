@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Stamps in ROS time for samples with device time, and the number of samples that are missing."""
 
@@ -33,29 +21,13 @@ _FOREVER_NS = 2 ** 63 - 1
 
 @dataclass(frozen=True)
 class ClockStatistics:
-    """
-    How the clocks work, as diagnostics show it.
+    """How the clocks work, as diagnostics show it."""
 
-    Attributes
-    ----------
-    clock
-        `settled` or `settling`.
-    clock_drift_ppm
-        Drift of the device's clock against the host's, ppm.
-    clock_jitter_us
-        Median distance of the earliest arrivals from the line of the map, µs.
-    clock_steps
-        How often the device's clock has stepped.
-    system_clock_steps
-        How often the system clock was set.
-
-    """
-
-    clock: str
-    clock_drift_ppm: float
-    clock_jitter_us: float
-    clock_steps: int
-    system_clock_steps: int
+    clock: str  # `settled` or `settling`
+    clock_drift_ppm: float  # Drift of the device's clock against the host's, ppm
+    clock_jitter_us: float  # Median distance of the earliest arrivals from the line of the map, µs
+    clock_steps: int  # How often the device's clock has stepped
+    system_clock_steps: int  # How often the system clock was set
 
 
 def clock_events(clock: ClockStatistics) -> tuple[Event, Event]:
@@ -66,22 +38,12 @@ def clock_events(clock: ClockStatistics) -> tuple[Event, Event]:
 
 
 class Stamper:
-    """
-    Holds samples until the clock of the device is known, stamps them and counts the lost ones.
-
-    Attributes
-    ----------
-    clock
-        Map of the device's clock.
-    period_ns
-        Sample period, ns; 0 before the first `restart`.
-
-    """
+    """Holds samples until the device's clock is known, stamps them and counts lost ones."""
 
     def __init__(self, clock: ClockMap | IdentityMap) -> None:
         """Begin without samples."""
-        self.clock = clock
-        self.period_ns = 0.0
+        self.clock = clock  # Map of the device's clock
+        self.period_ns = 0.0  # Sample period, ns; 0 before the first `restart`
         self._system_clock = SystemClockMap()
         self._followed_ns = 0
         self._means = PeriodMeans()
@@ -98,15 +60,7 @@ class Stamper:
         return bool(self._stamped)
 
     def restart(self, period_ns: float) -> None:
-        """
-        Begin a new clock or a new device; time gives an estimate of the samples lost before it.
-
-        Parameters
-        ----------
-        period_ns
-            Sample period, ns.
-
-        """
+        """Begin a new clock or device; time gives an estimate of the samples lost before."""
         self.flush()
         self.clock.restart()
         self.period_ns = period_ns
@@ -118,19 +72,7 @@ class Stamper:
         self.clock.restart()
 
     def add(self, block: Block, arrived_ns: int, lost: int | None) -> None:
-        """
-        Take samples.
-
-        Parameters
-        ----------
-        block
-            The samples.
-        arrived_ns
-            Arrival of the newest sample by the host's monotonic clock, ns.
-        lost
-            Samples that are missing before the block; None where the device does not count.
-
-        """
+        """Take samples."""
         stepped = self.clock.observe(int(block.device_ns[-1]), arrived_ns)
         if lost is None:
             self._new_clock |= stepped

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A serial port that may disappear and come back, read without a long wait."""
 
@@ -53,42 +41,15 @@ class SerialPort:
     """
     Bytes from a device path or a pyserial URL.
 
-    Attributes
-    ----------
-    error
-        Why the port is not open, in one line; '' while it is open and before the first attempt.
-    connections
-        How often the port was opened.
-    opened_s
-        Monotonic time of the last opening, s.
-    received_bytes
-        Bytes so far.
-    last_byte_s
-        Monotonic time of the last bytes, s.
-    uart_bytes_per_s
-        Bytes that the open port carries per second; infinite where the baud rate has no meaning.
-
+    connections: how often the port was opened; opened_s: monotonic time of the last opening, s;
+    received_bytes: bytes so far; last_byte_s: monotonic time of the last bytes, s.
     """
 
     def __init__(self, name: str, baud: int) -> None:
-        """
-        Prepare the port; the first `read` opens it.
-
-        Parameters
-        ----------
-        name
-            Device path or pyserial URL.
-        baud
-            Baud rate, Bd.
-
-        Raises
-        ------
-        UserError
-            pyserial is not installed.
-
-        """
+        """Prepare the port; the first `read` opens it."""
         self.connections = self.received_bytes = 0
         self.last_byte_s = self.opened_s = 0.0
+        # Bytes that the open port carries per second; infinite where the baud rate has no meaning
         self.uart_bytes_per_s = inf
         self._name, self._baud = name, baud
         self._pyserial = _import_pyserial()
@@ -96,6 +57,7 @@ class SerialPort:
         self._poll: Any = None
         self._backoff = Backoff()
         self._checked_s = 0.0
+        # Why the port is not open, in one line; '' while it is open and before the first attempt
         self.error = ''
 
     def read(self) -> bytes | None:

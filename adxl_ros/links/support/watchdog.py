@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Watch whether messages of a topic come."""
 
@@ -26,12 +14,6 @@ class Watchdog:
     A node that was held up for seconds finds its messages waiting: they were not missing. And a
     machine that was held up has stopped whoever publishes them, too. So a turn counts as
     `longest_turn_s` at most.
-
-    Parameters
-    ----------
-    longest_turn_s
-        Longest time that counts from one `check` to the next, s.
-
     """
 
     def __init__(self, longest_turn_s: float) -> None:

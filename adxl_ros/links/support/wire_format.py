@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The serial wire format, version 1: frames of samples, encoded and decoded.
@@ -91,81 +79,36 @@ class VersionError(WireError):
 
 @dataclass(frozen=True)
 class BoardInfo:
-    """
-    How a board describes itself.
+    """How a board describes itself."""
 
-    Attributes
-    ----------
-    rate_hz
-        Sample rate, Hz.
-    bits
-        Resolution of the ADC, bit.
-    channels
-        Number of channels.
-    vref_v
-        Reference voltage of the ADC, V.
-    serial
-        Serial number of the sensor; '' without one.
-    flags
-        `AFTER_RESET`; two descriptions are equal whatever their flags.
-
-    """
-
-    rate_hz: float
-    bits: int
-    channels: int
-    vref_v: float
-    serial: str
+    rate_hz: float  # Sample rate, Hz
+    bits: int  # Resolution of the ADC, bit
+    channels: int  # Number of channels
+    vref_v: float  # Reference voltage of the ADC, V
+    serial: str  # Serial number of the sensor; '' without one
+    # `AFTER_RESET`; two descriptions are equal whatever their flags
     flags: int = field(default=0, compare=False)
 
 
 @dataclass(frozen=True)
 class SampleFrame:
-    """
-    Samples at equal steps of the device clock.
+    """Samples at equal steps of the device clock."""
 
-    Attributes
-    ----------
-    flags
-        `RAIL`, `AFTER_RESET`.
-    sequence
-        Number of the frame, wraps at 2^32.
-    time_us
-        Device clock at the first sample, µs.
-    index
-        Number of the first sample, dropped samples included, wraps at 2^32.
-    overruns
-        Samples that the device itself has dropped since its reset, wraps at 2^16.
-    codes
-        ADC codes, (n, m) uint16.
-    check
-        CRC-32 of the payload, which identifies the frame.
-
-    """
-
-    flags: int
-    sequence: int
-    time_us: int
-    index: int
-    overruns: int
-    codes: np.ndarray
-    check: int = 0
+    flags: int  # `RAIL`, `AFTER_RESET`
+    sequence: int  # Number of the frame, wraps at 2^32
+    time_us: int  # Device clock at the first sample, µs
+    index: int  # Number of the first sample, dropped samples included, wraps at 2^32
+    overruns: int  # Samples that the device itself has dropped since its reset, wraps at 2^16
+    codes: np.ndarray  # ADC codes, (n, m) uint16
+    check: int = 0  # CRC-32 of the payload, which identifies the frame
 
 
 class Encoder:
-    """
-    Encodes and numbers frames, as the firmware does.
-
-    Attributes
-    ----------
-    info
-        Description of the board.
-
-    """
+    """Encodes and numbers frames, as the firmware does."""
 
     def __init__(self, info: BoardInfo) -> None:
         """Begin as after a reset."""
-        self.info = info
+        self.info = info  # Description of the board
         self._sequence = 0
         self._flags = AFTER_RESET
 
@@ -181,24 +124,7 @@ class Encoder:
         """
         Encode a frame of samples.
 
-        Parameters
-        ----------
-        time_us
-            Device clock at the first sample, µs.
-        index
-            Number of the first sample.
-        codes
-            ADC codes, (n, m); n and m are at most 255.
-        overruns
-            Samples dropped so far.
-        flags
-            Further flags: `RAIL` and `AFTER_RESET` are set here.
-
-        Returns
-        -------
-        bytes
-            The frame with its 0x00.
-
+        codes: ADC codes, (n, m); n and m are at most 255.
         """
         rail = RAIL if (codes == 0).any() or (codes >= 2 ** self.info.bits - 1).any() else 0
         flags |= self._flags | rail
@@ -219,27 +145,7 @@ def encode_payload(payload: bytes) -> bytes:
 
 
 def decode(raw: bytes) -> BoardInfo | SampleFrame:
-    """
-    Decode one frame.
-
-    Parameters
-    ----------
-    raw
-        The bytes between two 0x00.
-
-    Returns
-    -------
-    BoardInfo or SampleFrame
-        What the frame contains.
-
-    Raises
-    ------
-    VersionError
-        The frame is whole, but of another version.
-    WireError
-        The frame is damaged, or a field is out of range.
-
-    """
+    """Decode one frame."""
     payload, check = _checked_payload(raw)
     kind = payload[0]
     if kind == INFO_TYPE:
@@ -250,47 +156,14 @@ def decode(raw: bytes) -> BoardInfo | SampleFrame:
 
 
 def encode_command(sequence: int, latency_us: int) -> bytes:
-    """
-    Encode the frame by which the host asks for small frames.
-
-    Parameters
-    ----------
-    sequence
-        Number of the command.
-    latency_us
-        Longest time over which the board collects the samples of a frame, µs.
-
-    Returns
-    -------
-    bytes
-        The frame between two 0x00: what the board received before does not damage it.
-
-    """
+    """Encode the frame by which the host asks for small frames."""
     payload = _COMMAND.pack(COMMAND_TYPE, VERSION, 0, sequence % 2 ** 32,
                             min(latency_us, 2 ** 32 - 1))
     return b'\0' + encode_payload(payload)
 
 
 def decode_command(raw: bytes) -> int:
-    """
-    Decode a frame from the host, as a board does.
-
-    Parameters
-    ----------
-    raw
-        The bytes between two 0x00.
-
-    Returns
-    -------
-    int
-        Longest time over which the board shall collect the samples of a frame, µs.
-
-    Raises
-    ------
-    WireError
-        The frame is damaged, or no command.
-
-    """
+    """Decode a frame from the host, as a board does."""
     payload, _ = _checked_payload(raw)
     if payload[0] != COMMAND_TYPE or len(payload) != _COMMAND.size:
         raise WireError('no command')
@@ -298,24 +171,7 @@ def decode_command(raw: bytes) -> int:
 
 
 def samples_that_fit(count: int, info: BoardInfo, bytes_per_s: float) -> int:
-    """
-    Return the smallest number of samples of a frame that a wire carries with a margin.
-
-    Parameters
-    ----------
-    count
-        Number of samples that is wanted.
-    info
-        Description of the board.
-    bytes_per_s
-        Bytes that the wire carries per second.
-
-    Returns
-    -------
-    int
-        `count` or more; the most of a frame where the wire does not carry the samples at all.
-
-    """
+    """Return the smallest number of samples of a frame that a wire carries with a margin."""
     for samples in range(count, MAX_COUNT):
         payload = _SAMPLES.size + 2 * samples * info.channels + _CRC.size
         frame_bytes = payload + 2 + payload // 254
@@ -368,19 +224,11 @@ def _decode_samples(payload: bytes, check: int) -> SampleFrame:
 
 
 class Splitter:
-    """
-    Splits a stream of bytes at each 0x00 and holds at most one frame.
-
-    Attributes
-    ----------
-    skipped
-        Bytes of runs that are too long for a frame.
-
-    """
+    """Splits a stream of bytes at each 0x00 and holds at most one frame."""
 
     def __init__(self) -> None:
         """Begin anywhere in the stream."""
-        self.skipped = 0
+        self.skipped = 0  # Bytes of runs that are too long for a frame
         self._incomplete = b''
         self._skipping = False
 

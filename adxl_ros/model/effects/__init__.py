@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The library of effects: each file of this folder holds one."""
 
@@ -33,17 +21,6 @@ def library() -> dict[str, Effect]:
 
     A package adds an effect by an entry point in the group `adxl_ros.effects` that names an
     `Effect`.
-
-    Returns
-    -------
-    dict
-        Effects by name.
-
-    Raises
-    ------
-    UserError
-        Two effects have one name.
-
     """
     collected = [import_module(f'{__name__}.{module.name}').EFFECT
                  for module in pkgutil.iter_modules(__path__) if module.name != 'base']
@@ -57,15 +34,7 @@ def library() -> dict[str, Effect]:
 
 
 def effect_named(name: str) -> Effect:
-    """
-    Return the effect of that name.
-
-    Raises
-    ------
-    UserError
-        No effect has the name; the message suggests the nearest one.
-
-    """
+    """Return the effect of that name."""
     effects = library()
     if name not in effects:
         near = get_close_matches(name, effects, 1)

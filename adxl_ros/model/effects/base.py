@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Descriptions of effects, and the signals of the chain that they change."""
 
@@ -58,23 +46,11 @@ class Place(IntEnum):
 
 
 class Environment(NamedTuple):
-    """
-    Surroundings of the sensor.
+    """Surroundings of the sensor."""
 
-    Attributes
-    ----------
-    time_s
-        Time since power-on, s.
-    temperature_c
-        Temperature of the sensor, °C.
-    supply_v
-        Supply voltage of the sensor, V.
-
-    """
-
-    time_s: Value
-    temperature_c: Value = NOMINAL_TEMPERATURE_C
-    supply_v: Value = NOMINAL_SUPPLY_V
+    time_s: Value  # Time since power-on, s
+    temperature_c: Value = NOMINAL_TEMPERATURE_C  # Temperature of the sensor, °C
+    supply_v: Value = NOMINAL_SUPPLY_V  # Supply voltage of the sensor, V
 
 
 NOMINAL_ENVIRONMENT = Environment(time_s=float('inf'))
@@ -82,99 +58,60 @@ NOMINAL_ENVIRONMENT = Environment(time_s=float('inf'))
 
 
 class Joint(NamedTuple):
-    """
-    Motion of one joint of the stage.
+    """Motion of one joint of the stage."""
 
-    Attributes
-    ----------
-    position
-        Angle, rad, or shift, m.
-    velocity, acceleration
-        First and second derivative of the position by time.
-
-    """
-
-    position: Value = 0.0
+    position: Value = 0.0  # Angle, rad, or shift, m
+    # velocity, acceleration: First and second derivative of the position by time
     velocity: Value = 0.0
     acceleration: Value = 0.0
 
 
 @dataclass
 class Signals:
-    """
-    Signals of the chain, component by component. Effects change the signals of their place.
+    """Signals of the chain, component by component. Effects change the signals of their place."""
 
-    Attributes
-    ----------
-    environment
-        Surroundings at the instants of the samples.
-    time_s
-        CLOCK: stamps, s, which effects turn into the instants of the samples. REFERENCE: the same
-        of all samples of the reference.
-    alpha, beta, shift
-        STAGE: joints as the encoders read them, which effects turn into the true ones.
-    up
-        STAGE: the vertical in the frame of the stage's base, a unit vector.
-    gravity_mps2
-        STAGE: local gravity, m/s².
-    force
-        FORCE: specific force in the case frame, m/s², three components. REFERENCE: the force that
-        the reference states, all of it, which effects turn into the one that acts on the sensor.
-    sensed
-        MOUNTING: specific force along the sensing axes, g, always three components. Axes that
-        are not measured keep the component along the axis of the case.
-    output
-        ELEMENT: output of the sensing element, g; it begins as `sensed`. Effects read `sensed`
-        and add to `output`, so that their order does not matter.
-    zero_g_v, scale_v_per_g
-        ELECTRONICS: zero-g, V, and scale factor, V/g, by measured axis.
-    rc_s
-        ELECTRONICS: time constant of the RC filter by measured axis, s.
-    noise_ratio
-        ELECTRONICS: density of the white noise divided by the nominal one, by measured axis.
-    lsb_v
-        ELECTRONICS: step of the ADC, V.
-    lsb_ratio
-        ELECTRONICS: step of the ADC by measured axis divided by `lsb_v`.
-    input_v
-        ADC: volts at the input of the ADC by measured axis. Effects only read them.
-    volts
-        ADC: `input_v` with the contributions of effects. CODE: volts that the ADC outputs.
-    nominal_scale_v_per_g
-        Nominal scale factor by measured axis, V/g, which turns g into volts at the ADC.
-    vref_v
-        Full scale of the ADC, V.
-    dt_s
-        Time between the samples of the arrays, s.
-    memory
-        What the current effect keeps from one block to the next; empty before the first.
-    rng
-        Random generator of the current effect, seeded for it alone.
-
-    """
-
-    environment: Environment
+    environment: Environment  # Surroundings at the instants of the samples
+    # CLOCK: stamps, s, which effects turn into the instants of the samples. REFERENCE: the same of
+    # all samples of the reference.
     time_s: Value = 0.0
+    # alpha, beta, shift: STAGE: joints as the encoders read them, which effects turn into the true
+    # ones
     alpha: Joint = Joint()
     beta: Joint = Joint()
     shift: Joint = Joint()
+    # STAGE: the vertical in the frame of the stage's base, a unit vector
     up: Components = field(default_factory=list)
-    gravity_mps2: float = 0.0
+    gravity_mps2: float = 0.0  # STAGE: local gravity, m/s²
+    # FORCE: specific force in the case frame, m/s², three components. REFERENCE: the force that
+    # the reference states, all of it, which effects turn into the one that acts on the sensor.
     force: Components = field(default_factory=list)
+    # MOUNTING: specific force along the sensing axes, g, always three components. Axes that are
+    # not measured keep the component along the axis of the case.
     sensed: Components = field(default_factory=list)
+    # ELEMENT: output of the sensing element, g; it begins as `sensed`. Effects read `sensed` and
+    # add to `output`, so that their order does not matter.
     output: Components = field(default_factory=list)
+    # zero_g_v, scale_v_per_g: ELECTRONICS: zero-g, V, and scale factor, V/g, by measured axis
     zero_g_v: Components = field(default_factory=list)
     scale_v_per_g: Components = field(default_factory=list)
+    # ELECTRONICS: time constant of the RC filter by measured axis, s
     rc_s: list[float] = field(default_factory=list)
+    # ELECTRONICS: density of the white noise divided by the nominal one, by measured axis
     noise_ratio: list[float] = field(default_factory=list)
-    lsb_v: float = 0.0
+    lsb_v: float = 0.0  # ELECTRONICS: step of the ADC, V
+    # ELECTRONICS: step of the ADC by measured axis divided by `lsb_v`
     lsb_ratio: list[float] = field(default_factory=list)
+    # ADC: volts at the input of the ADC by measured axis. Effects only read them.
     input_v: Components = field(default_factory=list)
+    # ADC: `input_v` with the contributions of effects. CODE: volts that the ADC outputs.
     volts: Components = field(default_factory=list)
+    # Nominal scale factor by measured axis, V/g, which turns g into volts at the ADC
     nominal_scale_v_per_g: list[float] = field(default_factory=list)
-    vref_v: float = 0.0
-    dt_s: float = 0.0
+    vref_v: float = 0.0  # Full scale of the ADC, V
+    dt_s: float = 0.0  # Time between the samples of the arrays, s
+    # What the current effect keeps from one block to the next; empty before the first
     memory: dict[Any, Any] = field(default_factory=dict)
+    # Random generator of the current effect, seeded for it alone
     rng: np.random.Generator | None = None
 
 
@@ -184,20 +121,11 @@ class Coefficient:
     Name of one coefficient: a parameter of an effect, for one axis.
 
     Files, messages and reports show it as text: `effect.parameter.axis`.
-
-    Attributes
-    ----------
-    effect
-        Name of the effect.
-    parameter
-        Name of the parameter.
-    axis
-        x, y or z; empty for a parameter without axes, and for all axes of a parameter.
-
     """
 
-    effect: str
-    parameter: str
+    effect: str  # Name of the effect
+    parameter: str  # Name of the parameter
+    # x, y or z; empty for a parameter without axes, and for all axes of a parameter
     axis: str = ''
 
     @classmethod
@@ -258,55 +186,30 @@ class Need(Enum):
 
 @dataclass(frozen=True)
 class Parameter:
-    """
-    One parameter of an effect, a departure from the nominal chain.
+    """One parameter of an effect, a departure from the nominal chain."""
 
-    Attributes
-    ----------
-    name
-        Name, which ends in its unit where it has one.
-    unit
-        Unit, as messages show it.
-    lower, upper
-        Bounds.
-    scale
-        Typical magnitude.
-    source
-        Source of the typical magnitude: datasheet, paper or physics.
-    doc
-        Meaning, in words that continue "it is the ...".
-    axes
-        Axes that it applies to, with one value for each measured axis; values of other axes are
-        neutral. Empty for one value without axes.
-    neutral
-        Value at which the effect does nothing. A parameter of shape has its typical value there.
-    typical
-        Value of an effect that is stated by name only; `scale` unless given.
-    held
-        Whether fits leave it as it is, because zero-g and scale factor can take its place.
-    role
-        Role in its effect.
-    starts : tuple of float
-        Values from which a fit starts, in rising order: of a shape, or of a size in which the
-        effect is far from linear. Empty for multiples of the typical magnitude.
-    shaped
-        Only for a size: whether the shape parameters of its effect change what it does.
-
-    """
-
-    name: str
-    unit: str
+    name: str  # Name, which ends in its unit where it has one
+    unit: str  # Unit, as messages show it
+    # lower, upper: Bounds
     lower: float
     upper: float
-    scale: float
-    source: str
-    doc: str
+    scale: float  # Typical magnitude
+    source: str  # Source of the typical magnitude: datasheet, paper or physics
+    doc: str  # Meaning, in words that continue "it is the ..."
+    # Axes that it applies to, with one value for each measured axis; values of other axes are
+    # neutral. Empty for one value without axes.
     axes: str = AXES
+    # Value at which the effect does nothing. A parameter of shape has its typical value there.
     neutral: float = 0.0
+    # Value of an effect that is stated by name only; `scale` unless given
     typical: float | None = None
+    # Whether fits leave it as it is, because zero-g and scale factor can take its place
     held: bool = False
-    role: Role = Role.SIZE
+    role: Role = Role.SIZE  # Role in its effect
+    # Values from which a fit starts, in rising order: of a shape, or of a size in which the effect
+    # is far from linear. Empty for multiples of the typical magnitude.
     starts: tuple[float, ...] = ()
+    # Only for a size: whether the shape parameters of its effect change what it does
     shaped: bool = True
 
     @property
@@ -334,52 +237,28 @@ class Apply(Protocol):
 
 @dataclass(frozen=True)
 class Effect:
-    """
-    One effect of a real sensor, as the simulator, the inverse and the fits use it.
+    """One effect of a real sensor, as the simulator, the inverse and the fits use it."""
 
-    Attributes
-    ----------
-    name
-        Name, which is unique in the library.
-    place
-        Place in the chain.
-    parameters : tuple of Parameter
-        Its parameters.
-    apply
-        The function of the effect. It takes arrays, and floats too if the effect is invertible.
-    cause
-        Sentence for a report: the cause, and what to do about it.
-    smooth
-        Whether the output is differentiable by the parameters.
-    exact
-        Whether the form of the effect is certain, as that of geometry or of a clock.
-    acts_on
-        Property of the output in which the effect shows; the texts 'mean' and 'noise' are
-        accepted, too.
-    invertible
-        Whether the inverse undoes the effect. The effect then is a smooth function of force and
-        environment of one sample. Effects of the stage, with a memory or with noise are not.
-    needs
-        Parts of the chain that the effect acts on; their names as text are accepted, too.
-    follows
-        Names of the fields of `Environment` that the effect depends on.
-    diagnosis
-        Properties that only the diagnosis uses.
-
-    """
-
-    name: str
-    place: Place
-    parameters: tuple[Parameter, ...]
+    name: str  # Name, which is unique in the library
+    place: Place  # Place in the chain
+    parameters: tuple[Parameter, ...]  # Its parameters
+    # The function of the effect. It takes arrays, and floats too if the effect is invertible.
     apply: Apply
-    cause: str
-    smooth: bool = True
+    cause: str  # Sentence for a report: the cause, and what to do about it
+    smooth: bool = True  # Whether the output is differentiable by the parameters
+    # Whether the form of the effect is certain, as that of geometry or of a clock
     exact: bool = False
+    # Property of the output in which the effect shows; the texts 'mean' and 'noise' are accepted,
+    # too
     acts_on: ActsOn = ActsOn.MEAN
+    # Whether the inverse undoes the effect. The effect then is a smooth function of force and
+    # environment of one sample. Effects of the stage, with a memory or with noise are not.
     invertible: bool = False
+    # Parts of the chain that the effect acts on; their names as text are accepted, too
     needs: tuple[Need, ...] = ()
+    # Names of the fields of `Environment` that the effect depends on
     follows: tuple[str, ...] = ()
-    diagnosis: DiagnosisHints = DiagnosisHints()
+    diagnosis: DiagnosisHints = DiagnosisHints()  # Properties that only the diagnosis uses
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'acts_on', ActsOn(self.acts_on))

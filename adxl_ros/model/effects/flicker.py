@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Flicker noise: 1/f noise as a sum of Ornstein-Uhlenbeck processes, drawn by one filter."""
 
@@ -37,19 +25,11 @@ _BISECTIONS = 60
 
 
 class _Shaping(NamedTuple):
-    """
-    Filter of k first-order sections that turns white noise into flicker noise.
+    """Filter of k first-order sections that turns white noise into flicker noise."""
 
-    Attributes
-    ----------
-    sections : ndarray
-        Coefficients of the sections as `scipy.signal.sosfilt` takes them, (k, 6).
-    stationary : ndarray
-        States of the sections in stationary noise, of k independent standard normals, (k, k).
-
-    """
-
+    # Coefficients of the sections as `scipy.signal.sosfilt` takes them, (k, 6)
     sections: np.ndarray
+    # States of the sections in stationary noise, of k independent standard normals, (k, k)
     stationary: np.ndarray
 
 

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Directions of the sensing axes in the case: equations 18 and 19, and the same for z."""
 
@@ -36,19 +24,6 @@ def direction(axis: int, alpha_rad: float, beta_rad: float) -> Components:
 
     Θx = R_y(α)·R_z(β)·[1 0 0]ᵀ (18), Θy = R_x(α)·R_z(β)·[0 1 0]ᵀ (19), and in the same manner
     Θz = R_x(α)·R_y(β)·[0 0 1]ᵀ.
-
-    Parameters
-    ----------
-    axis
-        Index of the sensing axis.
-    alpha_rad, beta_rad
-        Angles α and β of the axis, rad.
-
-    Returns
-    -------
-    list
-        Three components.
-
     """
     sa, ca, sb, cb = sin(alpha_rad), cos(alpha_rad), sin(beta_rad), cos(beta_rad)
     return [[ca * cb, sb, -sa * cb], [-sb, ca * cb, sa * cb], [sb, -sa * cb, ca * cb]][axis]

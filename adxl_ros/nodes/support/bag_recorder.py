@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The bag of a running node: the sensor's samples and everything that belongs to them."""
 
@@ -43,30 +31,12 @@ _KINDS = {'stage/joint_states': (JointState, 'sensor_msgs/msg/JointState'),
 
 
 class BagRecorder:
-    """
-    Writes the topics of the package into a bag. A thread of its own takes the samples.
-
-    Attributes
-    ----------
-    has_samples
-        Whether a sample has come.
-
-    """
+    """Writes the topics of the package into a bag. A thread of its own takes the samples."""
 
     def __init__(self, node: Node, watchdog: Watchdog) -> None:
-        """
-        Subscribe; nothing is kept before `start`.
-
-        Parameters
-        ----------
-        node
-            The node that subscribes.
-        watchdog
-            Fed by each sample.
-
-        """
+        """Subscribe; nothing is kept before `start`."""
         self._node = node
-        self.has_samples = False
+        self.has_samples = False  # Whether a sample has come
         self._bag: LiveBag | None = None
         self._thread: RepeatingThread | None = None
         self._system = Clock(clock_type=ClockType.SYSTEM_TIME)
@@ -88,20 +58,7 @@ class BagRecorder:
         self._thread = RepeatingThread(self._node, self._samples, _SAMPLES)
 
     def start(self, path: Path) -> None:
-        """
-        Begin to write.
-
-        Parameters
-        ----------
-        path
-            The bag.
-
-        Raises
-        ------
-        UserError
-            The library rosbags is not installed.
-
-        """
+        """Begin to write."""
         self._bag = LiveBag(path)
         for topic, kind, data in self._early:
             self._write(topic, kind, data)

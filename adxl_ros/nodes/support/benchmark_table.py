@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The table of the benchmark: each job beside what does it elsewhere, measured in turns."""
 
@@ -41,50 +29,23 @@ def cpu_s() -> float:
 
 @dataclass(frozen=True)
 class Job:
-    """
-    A job that is measured.
+    """A job that is measured."""
 
-    Attributes
-    ----------
-    name
-        What is done.
-    run
-        Does it with this package.
-    goal
-        Largest ratio to the first rival, or largest processor time, s, without a rival; 0 without
-        a goal.
-    rivals
-        Others that do the same, by name.
-    rounds
-        Largest number of rounds; a long job has few.
-    detail
-        Returns what is to be said of the finished job beside its time.
-    clock
-        What is measured, s; processor time without it.
-
-    """
-
-    name: str
-    run: Callable[[], object]
+    name: str  # What is done
+    run: Callable[[], object]  # Does it with this package
+    # Largest ratio to the first rival, or largest processor time, s, without a rival; 0 without a
+    # goal
     goal: float = 0.0
+    # Others that do the same, by name
     rivals: Mapping[str, Callable[[], object]] = field(default_factory=dict)
-    rounds: int = 100
+    rounds: int = 100  # Largest number of rounds; a long job has few
+    # Returns what is to be said of the finished job beside its time
     detail: Callable[[], str] = str
-    clock: Callable[[], float] = cpu_s
+    clock: Callable[[], float] = cpu_s  # What is measured, s; processor time without it
 
 
 def print_table(jobs: Iterable[Job], rounds: int) -> None:
-    """
-    Measure each job and its rivals in turns, and print a table.
-
-    Parameters
-    ----------
-    jobs
-        The jobs; each is made when its turn has come.
-    rounds
-        Measurements of a row.
-
-    """
+    """Measure each job and its rivals in turns, and print a table."""
     print(f'\n{date.today()}, adxl_ros {version("adxl-ros")}, CPython '
           f'{platform.python_version()}, {platform.machine()}, {os.cpu_count()} cores')
     print(', '.join(f'{name} {text}' for name in _PACKAGES if (text := _version(name))))
@@ -108,22 +69,7 @@ def _version(name: str) -> str:
 
 
 def rows_of(job: Job, rounds: int) -> list[str]:
-    """
-    Measure one job and its rivals in turns.
-
-    Parameters
-    ----------
-    job
-        The job.
-    rounds
-        Measurements of a row.
-
-    Returns
-    -------
-    list of str
-        Its rows of the table, one for each rival.
-
-    """
+    """Measure one job and its rivals in turns."""
     runs = {'': job.run, **job.rivals}
     seconds: dict[str, list[float]] = {name: [] for name in runs}
     missing = set()

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The parameters of the calibration node that describe a calibration."""
 
@@ -37,38 +25,16 @@ _NEAR_RAD = float(np.radians(2))
 
 
 class _PosePlan(NamedTuple):
-    """
-    Parameters of the pose plan.
+    """Parameters of the pose plan."""
 
-    Attributes
-    ----------
-    kind
-        'full' or 'quick'.
-    planes_rad
-        Planes alpha, rad; empty for the default.
-    step_rad
-        Step of beta, rad.
-    check_poses
-        Number of check poses.
-
-    """
-
-    kind: str
-    planes_rad: tuple[float, ...]
-    step_rad: float
-    check_poses: int
+    kind: str  # 'full' or 'quick'
+    planes_rad: tuple[float, ...]  # Planes alpha, rad; empty for the default
+    step_rad: float  # Step of beta, rad
+    check_poses: int  # Number of check poses
 
 
 def declare_settings(node: Node) -> SessionSettings:
-    """
-    Declare the parameters and return the settings of a calibration.
-
-    Raises
-    ------
-    UserError
-        A parameter is out of range, or the parameters make no pose plan.
-
-    """
+    """Declare the parameters and return the settings of a calibration."""
     mode = declare(node, 'mode', 'stage', 'what the reference is',
                    choices=('stage', 'gravity', 'thermal'))
     output = Path(declare(node, 'output', 'calibration.yaml', 'parameter file to write'))

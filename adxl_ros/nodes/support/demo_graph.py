@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The graph of the demonstration: its nodes, each in a process, and what they report."""
 
@@ -39,18 +27,11 @@ _SILENT_S = 60.0
 
 
 class Watcher(Node):
-    """
-    Reads the diagnostics of the nodes that the demonstration runs, and calls ~/finish.
-
-    Attributes
-    ----------
-    reports
-        Newest message and values, by the name of the diagnostic status.
-
-    """
+    """Reads the diagnostics of the nodes that the demonstration runs, and calls ~/finish."""
 
     def __init__(self) -> None:
         super().__init__('demo')
+        # Newest message and values, by the name of the diagnostic status
         self.reports: dict[str, dict[str, str]] = {}
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
         self._finish = self.create_client(Trigger, 'calibration/finish')
@@ -81,40 +62,15 @@ class Watcher(Node):
 
 
 class DemoGraph:
-    """
-    The nodes that the demonstration runs, each in a process of its own.
-
-    Parameters
-    ----------
-    log
-        File that takes what they print.
-
-    Attributes
-    ----------
-    watcher
-        Receives what they report.
-
-    """
+    """The nodes that the demonstration runs, each in a process of its own."""
 
     def __init__(self, log: Path) -> None:
         self._log = log
         self._processes: dict[str, subprocess.Popen] = {}
-        self.watcher = Watcher()
+        self.watcher = Watcher()  # Receives what they report
 
     def start(self, name: str, params_file: Path, *arguments: str) -> None:
-        """
-        Start a node.
-
-        Parameters
-        ----------
-        name
-            Its executable.
-        params_file
-            Its parameter file.
-        arguments
-            Further ROS arguments.
-
-        """
+        """Start a node."""
         command = [executable(name), '--ros-args', '--log-level', 'warn', '--params-file',
                    str(params_file), *arguments]
         with self._log.open('ab') as log:
@@ -127,24 +83,7 @@ class DemoGraph:
 
     def wait(self, finished: Callable[[], bool], progress: Callable[[], object],
              silent_s: float = _SILENT_S) -> None:
-        """
-        Wait until a condition holds.
-
-        Parameters
-        ----------
-        finished
-            The condition.
-        progress
-            Shows the progress, and returns something that changes with it.
-        silent_s
-            Longest time without a change, s.
-
-        Raises
-        ------
-        UserError
-            A node has ended, the fit has failed, or nothing has changed for too long.
-
-        """
+        """Wait until a condition holds."""
         newest: object = None
         changed_s = time.monotonic()
         while not finished():

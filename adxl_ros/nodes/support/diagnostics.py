@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The diagnostics of a node: tasks by name, published on `/diagnostics`."""
 
@@ -41,40 +29,16 @@ class Level(Enum):
 
 @dataclass(frozen=True)
 class Status:
-    """
-    What a task reports.
+    """What a task reports."""
 
-    Attributes
-    ----------
-    level
-        How bad it is.
-    summary
-        One line for people.
-    hardware_id
-        Serial number of the sensor, or kind of the stage.
-    values
-        Further values by key; floats keep all digits.
-
-    """
-
-    level: Level
-    summary: str
-    hardware_id: str
-    values: Mapping[str, object]
+    level: Level  # How bad it is
+    summary: str  # One line for people
+    hardware_id: str  # Serial number of the sensor, or kind of the stage
+    values: Mapping[str, object]  # Further values by key; floats keep all digits
 
 
 class DiagnosticsReporter:
-    """
-    Reports the tasks of a node once a second, and at once when a level changes.
-
-    Parameters
-    ----------
-    node
-        The node; its name stands before the names of the tasks.
-    tasks
-        Functions by the name of their task. The executor's thread calls them for each report.
-
-    """
+    """Reports the tasks of a node once a second, and at once when a level changes."""
 
     def __init__(self, node: Node, tasks: Mapping[str, Callable[[], Status]]) -> None:
         self._node, self._tasks = node, tasks
@@ -85,17 +49,7 @@ class DiagnosticsReporter:
         self._at_once = node.create_guard_condition(self._report)
 
     def notice(self, task: str, level: Level) -> None:
-        """
-        Report at once if a task has another level than in the last report; from any thread.
-
-        Parameters
-        ----------
-        task
-            Name of the task.
-        level
-            The level that it has now.
-
-        """
+        """Report at once if a task has another level than in the last report; from any thread."""
         if level != self._levels.get(task, level):
             self._levels[task] = level
             self._at_once.trigger()
@@ -113,22 +67,7 @@ class DiagnosticsReporter:
 
 
 def status_message(name: str, status: Status) -> DiagnosticStatus:
-    """
-    Make the message of a status.
-
-    Parameters
-    ----------
-    name
-        Name of the task, or of the topic that carries it.
-    status
-        The status.
-
-    Returns
-    -------
-    DiagnosticStatus
-        The message.
-
-    """
+    """Make the message of a status."""
     values = [KeyValue(key=key, value=value if isinstance(value, str) else repr(value))
               for key, value in status.values.items()]
     return DiagnosticStatus(level=status.level.value, name=name, message=status.summary,

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A sensor's parameters that can be exchanged while a node runs: all of them or none."""
 
@@ -63,21 +51,6 @@ class ExchangeableSensor:
     belong to the file and come with it, when the parameter `calibration` is set to its path, or
     when `ros2 param load` sends all that it holds; then all parameters are those of the file. A
     set that is refused changes nothing.
-
-    Parameters
-    ----------
-    node
-        The node that gets the parameters.
-    check
-        Raises `UserError` if the node cannot use a sensor.
-    use
-        Called with the first and with each new sensor, and with its source in words.
-
-    Raises
-    ------
-    UserError
-        The given parameters describe no sensor.
-
     """
 
     def __init__(self, node: Node, check: Callable[[Sensor], None],

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The messages of the monitor: gap and floor by axis, and what has changed since when."""
 
@@ -32,35 +20,15 @@ _TOGETHER_NS = 120_000_000_000
 
 @dataclass(frozen=True)
 class GapState:
-    """
-    What the monitor knows at one moment.
+    """What the monitor knows at one moment."""
 
-    Attributes
-    ----------
-    serial
-        Serial number of the sensor.
-    stamp_ns
-        Stamp of the newest sample, ns; 0 before the first.
-    obstacle
-        Why nothing is compared; empty where it is.
-    axes
-        The gap by axis; empty before the first seconds.
-    changes
-        Changes so far.
-    likely
-        The newest diagnosis; None before it.
-    window_s
-        Time over which the gap is taken, s.
-
-    """
-
-    serial: str
-    stamp_ns: int
-    obstacle: str
-    axes: Sequence[AxisGap]
-    changes: Sequence[GapChange]
-    likely: DiagnosisResult | None
-    window_s: float
+    serial: str  # Serial number of the sensor
+    stamp_ns: int  # Stamp of the newest sample, ns; 0 before the first
+    obstacle: str  # Why nothing is compared; empty where it is
+    axes: Sequence[AxisGap]  # The gap by axis; empty before the first seconds
+    changes: Sequence[GapChange]  # Changes so far
+    likely: DiagnosisResult | None  # The newest diagnosis; None before it
+    window_s: float  # Time over which the gap is taken, s
 
     @property
     def event(self) -> list[GapChange]:

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The check of what a node is started with: files for another node, and unknown parameters."""
 
@@ -57,21 +45,7 @@ _FREE_PREFIXES = ('provenance.', 'qos_overrides.', link_parameters.PREFIX)
 
 
 def check_given_parameters(node: Node) -> None:
-    """
-    Refuse parameters that no node of this package has, and files that name other nodes.
-
-    Parameters
-    ----------
-    node
-        A node before it declares its parameters.
-
-    Raises
-    ------
-    UserError
-        A parameter is unknown, and the message names the nearest one; or a file has no section
-        for the node.
-
-    """
+    """Refuse parameters that no node of this package has, and files that name other nodes."""
     refuse_files_of_others(node.get_fully_qualified_name())
     names = {*_ANY_NODE, *sensor_keys(), *chain(*OWN_PARAMETERS.values())}
     for name, _ in given_parameters(node):

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The samples of the calibration node, as volts of its unit."""
 
@@ -36,26 +24,13 @@ _QUEUE = 20000
 
 
 class Samples:
-    """
-    Takes the serialized messages that wait, and decodes many at once.
-
-    Parameters
-    ----------
-    node
-        The node that subscribes.
-
-    Attributes
-    ----------
-    fault
-        Why the newest samples cannot be used, or ''.
-
-    """
+    """Takes the serialized messages that wait, and decodes many at once."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
         self._raw: list[bytes] = []
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.fault = ''
+        self.fault = ''  # Why the newest samples cannot be used, or ''
         self.restart_silence()
         self._subscription = PolledSubscription(node, Imu, _TOPIC, _QUEUE)
 

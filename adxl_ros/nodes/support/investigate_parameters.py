@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The parameters of the node `investigate`."""
 
@@ -33,38 +21,16 @@ _RATE_DEG_S = 17.0
 
 
 class InvestigateSettings(NamedTuple):
-    """
-    Settings of an investigation.
+    """Settings of an investigation."""
 
-    Attributes
-    ----------
-    output
-        Folder of bag and report.
-    limits
-        Limits of the stage.
-    minutes
-        Largest time of all manoeuvres together, min.
-    seed
-        Seed of the diagnosis.
-
-    """
-
-    output: Path
-    limits: StageLimits
-    minutes: float
-    seed: int
+    output: Path  # Folder of bag and report
+    limits: StageLimits  # Limits of the stage
+    minutes: float  # Largest time of all manoeuvres together, min
+    seed: int  # Seed of the diagnosis
 
 
 def declare_settings(node: Node) -> InvestigateSettings:
-    """
-    Declare the parameters and return the settings.
-
-    Raises
-    ------
-    UserError
-        A parameter is out of range.
-
-    """
+    """Declare the parameters and return the settings."""
     output = Path(declare(node, 'output', 'investigation',
                           'folder of bag, report and parameters; a number is added where it '
                           'has a diagnosis'))

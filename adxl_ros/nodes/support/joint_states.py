@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Messages of joints as bytes, many at once: it takes a tenth of the time of filling messages."""
 
@@ -26,23 +14,11 @@ from sensor_msgs.msg import JointState
 
 
 class JointReading(NamedTuple):
-    """
-    Motion of the joints at one stamp.
+    """Motion of the joints at one stamp."""
 
-    Attributes
-    ----------
-    stamp_ns
-        Stamp, ns.
-    position
-        Position by joint, rad or m.
-    velocity
-        Velocity by joint, rad/s or m/s; empty where the message has none.
-
-    """
-
-    stamp_ns: int
-    position: dict[str, float]
-    velocity: dict[str, float]
+    stamp_ns: int  # Stamp, ns
+    position: dict[str, float]  # Position by joint, rad or m
+    velocity: dict[str, float]  # Velocity by joint, rad/s or m/s; empty where the message has none
 
 
 def joint_readings(messages: Sequence[bytes]) -> list[JointReading]:
@@ -61,15 +37,7 @@ def joint_readings(messages: Sequence[bytes]) -> list[JointReading]:
 
 
 class JointStateWriter:
-    """
-    Makes serialized messages of joints.
-
-    Parameters
-    ----------
-    names
-        Names of the joints.
-
-    """
+    """Makes serialized messages of joints."""
 
     def __init__(self, names: Sequence[str]) -> None:
         zeros = [0.0] * len(names)
@@ -82,20 +50,8 @@ class JointStateWriter:
         """
         Serialize readings.
 
-        Parameters
-        ----------
-        stamp_ns
-            Stamps, ns, (n,).
-        position
-            Positions, rad or m, (n, k).
-        velocity
-            Velocities, rad/s or m/s, (n, k).
-
-        Returns
-        -------
-        list
-            One serialized sensor_msgs/JointState a reading.
-
+        stamp_ns: stamps, ns, (n,); position: positions, rad or m, (n, k); velocity: velocities,
+        rad/s or m/s, (n, k).
         """
         data = cdr.fill(self._template, self._layout, stamp_ns,
                         {'position': position, 'velocity': velocity}).tobytes()

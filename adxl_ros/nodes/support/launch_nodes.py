@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What the launch files share: arguments, the parameters of each node, failed starts."""
 
@@ -48,29 +36,13 @@ _LOG_LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
 
 
 class Argument(NamedTuple):
-    """
-    An argument of a launch that gives a parameter of a node.
+    """An argument of a launch that gives a parameter of a node."""
 
-    Attributes
-    ----------
-    name
-        Its name.
-    parameter
-        The parameter.
-    description
-        Its meaning.
-    kind
-        Type of the parameter: str, int, float, or list for a list of float.
-    choices
-        The values that it may have; empty for any.
-
-    """
-
-    name: str
-    parameter: str
-    description: str
-    kind: type = str
-    choices: tuple[str, ...] = ()
+    name: str  # Its name
+    parameter: str  # The parameter
+    description: str  # Its meaning
+    kind: type = str  # Type of the parameter: str, int, float, or list for a list of float
+    choices: tuple[str, ...] = ()  # The values that it may have; empty for any
 
     def declared(self) -> DeclareLaunchArgument:
         """Return the action that declares it; an empty value leaves the parameter as it is."""
@@ -79,25 +51,7 @@ class Argument(NamedTuple):
             'params_file, or the default', choices=['', *self.choices] if self.choices else None)
 
     def value(self, text: str) -> Any:
-        """
-        Return the value of the parameter.
-
-        Parameters
-        ----------
-        text
-            The value of the argument.
-
-        Returns
-        -------
-        Any
-            An instance of `kind`.
-
-        Raises
-        ------
-        UserError
-            The text is no number, or no list of numbers.
-
-        """
+        """Return the value of the parameter."""
         try:
             if self.kind is list:
                 return [float(part) for part in text.strip('[]').split(',')]
@@ -159,22 +113,7 @@ TRANSFORM = (
 
 def common_arguments(link: Sequence[Argument] = LINK, frame_id: str = 'imu_link'
                      ) -> list[DeclareLaunchArgument]:
-    """
-    Return the arguments that all launch files have.
-
-    Parameters
-    ----------
-    link
-        Arguments of the link.
-    frame_id
-        Default of the frame of the case; '' for that of a simulator's samples.
-
-    Returns
-    -------
-    list
-        The arguments.
-
-    """
+    """Return the arguments that all launch files have."""
     return [
         DeclareLaunchArgument('params_file', default_value=str(parameter_file.nominal_path()),
                               description='parameter file of the sensor, its link and the nodes'),
@@ -193,22 +132,7 @@ def common_arguments(link: Sequence[Argument] = LINK, frame_id: str = 'imu_link'
 
 def describe(arguments: Sequence[DeclareLaunchArgument],
              make_nodes: Callable[[LaunchContext], list[Action]]) -> LaunchDescription:
-    """
-    Describe a launch, which warns of misspelt arguments.
-
-    Parameters
-    ----------
-    arguments
-        Its arguments.
-    make_nodes
-        Takes the context of the launch and returns the nodes.
-
-    Returns
-    -------
-    LaunchDescription
-        The launch.
-
-    """
+    """Describe a launch, which warns of misspelt arguments."""
     return LaunchDescription([
         *arguments,
         OpaqueFunction(function=_warn_of_misspelt, args=[[part.name for part in arguments]]),
@@ -230,33 +154,7 @@ def _warn_of_misspelt(context: LaunchContext, names: Sequence[str]) -> None:
 
 def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, Any],
               params_file: str = '', **options: Any) -> Node:
-    """
-    Make a node of this package with the parameter file of the launch.
-
-    Parameters
-    ----------
-    context
-        The launch, which has the arguments.
-    executable
-        Its executable, which is its name, too.
-    overrides
-        Parameters in place of those of the file.
-    params_file
-        Parameter file in place of that of the launch; empty for that of the launch.
-    options
-        Further options of the action.
-
-    Returns
-    -------
-    Node
-        The action.
-
-    Raises
-    ------
-    UserError
-        The parameter file cannot be read, or it names other nodes than the driver.
-
-    """
+    """Make a node of this package with the parameter file of the launch."""
     path = params_file or text(context, 'params_file')
     namespace, name = text(context, 'namespace'), full_name(context, executable)
     is_named = has_section(path, name)
@@ -286,20 +184,7 @@ def _enclave(context: LaunchContext, executable: str) -> list[str]:
 
 
 def static_transform(context: LaunchContext) -> list[Action]:
-    """
-    Publish where the case is on the robot, if the launch names the frame of the robot.
-
-    Parameters
-    ----------
-    context
-        The launch, with the arguments of `TRANSFORM`.
-
-    Returns
-    -------
-    list
-        The publisher of tf2_ros; nothing without `base_frame`.
-
-    """
+    """Publish where the case is on the robot, if the launch names the frame of the robot."""
     base_frame = text(context, 'base_frame')
     if not base_frame:
         return []
@@ -314,27 +199,7 @@ def static_transform(context: LaunchContext) -> list[Action]:
 
 
 def three_numbers(context: LaunchContext, name: str) -> list[float]:
-    """
-    Return the three numbers of an argument.
-
-    Parameters
-    ----------
-    context
-        The launch.
-    name
-        Name of the argument.
-
-    Returns
-    -------
-    list
-        The numbers.
-
-    Raises
-    ------
-    UserError
-        The argument has no three numbers.
-
-    """
+    """Return the three numbers of an argument."""
     given = text(context, name)
     values: list[float] = Argument(name, '', '', list).value(given)
     if len(values) != 3:
@@ -343,112 +208,30 @@ def three_numbers(context: LaunchContext, name: str) -> list[float]:
 
 
 def text(context: LaunchContext, name: str) -> str:
-    """
-    Return the value of an argument.
-
-    Parameters
-    ----------
-    context
-        The launch.
-    name
-        Name of the argument.
-
-    Returns
-    -------
-    str
-        Its value.
-
-    """
+    """Return the value of an argument."""
     return str(LaunchConfiguration(name).perform(context))
 
 
 def given_parameters(context: LaunchContext, arguments: Sequence[Argument]) -> dict[str, Any]:
-    """
-    Return the parameters that the arguments of a launch give.
-
-    Parameters
-    ----------
-    context
-        The launch.
-    arguments
-        Arguments of the launch.
-
-    Returns
-    -------
-    dict
-        Values by name of the parameter, without those of empty arguments.
-
-    Raises
-    ------
-    UserError
-        An argument has no value of its type.
-
-    """
+    """Return the parameters that the arguments of a launch give."""
     texts = {argument: text(context, argument.name) for argument in arguments}
     return {argument.parameter: argument.value(given) for argument, given in texts.items()
             if given}
 
 
 def full_name(context: LaunchContext, name: str) -> str:
-    """
-    Return the fully qualified name of a node or topic.
-
-    Parameters
-    ----------
-    context
-        The launch.
-    name
-        The executable of the node, or the topic without its namespace.
-
-    Returns
-    -------
-    str
-        The name, with a slash first.
-
-    """
+    """Return the fully qualified name of a node or topic."""
     return '/'.join(('', *filter(None, text(context, 'namespace').split('/')), name))
 
 
 def given_anywhere(context: LaunchContext, argument: Argument, executable: str) -> str:
-    """
-    Return a parameter that an argument or the parameter file gives.
-
-    Parameters
-    ----------
-    context
-        The launch.
-    argument
-        The argument; it counts before the file.
-    executable
-        Executable of the node that has the parameter.
-
-    Returns
-    -------
-    str
-        Its value; '' where none gives it.
-
-    """
+    """Return a parameter that an argument or the parameter file gives."""
     return text(context, argument.name) or given_text(
         text(context, 'params_file'), full_name(context, executable), argument.parameter)
 
 
 def simulated_link(context: LaunchContext, speed: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    Return the parameters of a driver with a speed; a sensor without a link is simulated.
-
-    Parameters
-    ----------
-    context
-        The launch.
-    speed
-        The parameter of the speed; empty for real time.
-
-    Returns
-    -------
-    dict
-        Values by name of the parameter.
-
-    """
+    """Return the parameters of a driver with a speed; a sensor without a link is simulated."""
     link = given_anywhere(context, LINK_TYPE, 'driver')
     return {'link.type': link or 'sim', **speed} if speed else {}
 
@@ -461,22 +244,7 @@ class GiveUp:
         self._refusals_s: list[float] = []
 
     def __call__(self, event: ProcessExited, context: LaunchContext) -> None:
-        """
-        Count the refused starts of a node.
-
-        Parameters
-        ----------
-        event
-            The end of its process.
-        context
-            The launch.
-
-        Raises
-        ------
-        UserError
-            The node has refused to start too often.
-
-        """
+        """Count the refused starts of a node."""
         if context.is_shutdown or event.returncode not in _REFUSED_START:
             return
         now_s = time.monotonic()
@@ -488,22 +256,7 @@ class GiveUp:
 
 
 def end_with(success: str, failure: str) -> Callable[[ProcessExited, LaunchContext], list[Action]]:
-    """
-    Return a function that ends a launch when its main node ends, with the same success.
-
-    Parameters
-    ----------
-    success
-        Line to log where it succeeded.
-    failure
-        What to do where it failed.
-
-    Returns
-    -------
-    Callable
-        Takes the end of the process and the launch.
-
-    """
+    """Return a function that ends a launch when its main node ends, with the same success."""
     def end(event: ProcessExited, context: LaunchContext) -> list[Action]:
         if context.is_shutdown:
             return []

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The parameters of the driver that choose its link; no real unit gets simulated data."""
 
@@ -32,47 +20,15 @@ LINK_TYPE = 'link.type'
 
 
 class ChosenLink(NamedTuple):
-    """
-    The link that the parameters choose.
+    """The link that the parameters choose."""
 
-    Attributes
-    ----------
-    name
-        Value of `link.type`.
-    module
-        Module of the link.
-    settings
-        Instance of the module's `Settings`.
-
-    """
-
-    name: str
-    module: base.LinkModule
-    settings: Any
+    name: str  # Value of `link.type`
+    module: base.LinkModule  # Module of the link
+    settings: Any  # Instance of the module's `Settings`
 
 
 def declare_link(node: Node, serial: str) -> ChosenLink:
-    """
-    Declare the parameters of the link.
-
-    Parameters
-    ----------
-    node
-        The node that gets the parameters.
-    serial
-        Serial number of the sensor. Only the nominal sensor is simulated by default.
-
-    Returns
-    -------
-    ChosenLink
-        The link, not yet open.
-
-    Raises
-    ------
-    UserError
-        The link is not determined, or a given parameter is none of the link.
-
-    """
+    """Declare the parameters of the link."""
     given = [name for name, _ in given_parameters(node) if name.startswith(PREFIX)]
     if LINK_TYPE not in given:
         _refuse_to_guess(given, serial)

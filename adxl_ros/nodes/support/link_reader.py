@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The thread that reads the driver's link, from its activation to its deactivation."""
 
@@ -62,25 +50,7 @@ _LOG_INTERVAL_S = 1.0
 
 
 class LinkReader:
-    """
-    Reads a link in a thread and publishes its samples, until closed.
-
-    Parameters
-    ----------
-    node
-        The node.
-    link
-        The open link; it is closed with the reader, and where the reader cannot start.
-    output
-        Publishes and counts the samples.
-    settings
-        Settings of the link.
-    on_error
-        Called when the link can give no more samples.
-    on_level
-        Called with the level of the link's status when it has changed.
-
-    """
+    """Reads a link in a thread and publishes its samples, until closed."""
 
     def __init__(self, node: Node, link: Link, output: SampleOutput, settings: Any,
                  on_error: Callable[[UserError], None], on_level: Callable[[Level], None]) -> None:
@@ -278,17 +248,7 @@ class LinkReader:
 
 
 class StatusLog:
-    """
-    Logs the status of a link when its text or an event is new, once a second at most.
-
-    Parameters
-    ----------
-    node
-        The node that logs.
-    text
-        Text of the present status, which is not logged.
-
-    """
+    """Logs the status of a link when its text or an event is new, once a second at most."""
 
     def __init__(self, node: Node, text: str) -> None:
         self._logger, self._text = node.get_logger(), text

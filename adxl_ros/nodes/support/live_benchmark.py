@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The part of the benchmark on a graph: age, loss and processor time of nodes at 1 kHz."""
 
@@ -58,22 +46,12 @@ _RELAY = 'bare publisher and relay'
 
 
 class Listener(Node):
-    """
-    Keeps the arrival time and the bytes of each message.
-
-    Attributes
-    ----------
-    raw
-        Serialized messages.
-    arrived_ns
-        Their arrival times, ns.
-
-    """
+    """Keeps the arrival time and the bytes of each message."""
 
     def __init__(self, topic: str) -> None:
         super().__init__('listener')
-        self.raw: list[bytes] = []
-        self.arrived_ns: list[int] = []
+        self.raw: list[bytes] = []  # Serialized messages
+        self.arrived_ns: list[int] = []  # Their arrival times, ns
         subscription = self.create_subscription(
             Imu, topic, self._on_message,
             QoSProfile(depth=_QUEUE, reliability=qos_profile_sensor_data.reliability), raw=True,
@@ -89,18 +67,7 @@ class Listener(Node):
         """
         Keep the messages of some time.
 
-        Parameters
-        ----------
-        seconds
-            Duration, s.
-        limit
-            Number of messages after which it ends early.
-
-        Raises
-        ------
-        UserError
-            There is no message.
-
+        seconds: duration, s.
         """
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s and len(self.raw) < limit:
@@ -172,64 +139,30 @@ def run_bare_reader(port: str) -> int:
 
 
 class _Subject(NamedTuple):
-    """
-    What is measured.
+    """What is measured."""
 
-    Attributes
-    ----------
-    label
-        Its name in the table.
-    topic
-        Topic of its last node; '' for a process that publishes nothing.
-    commands
-        Commands of its processes.
-
-    """
-
-    label: str
-    topic: str
-    commands: Sequence[Sequence[str]]
+    label: str  # Its name in the table
+    topic: str  # Topic of its last node; '' for a process that publishes nothing
+    commands: Sequence[Sequence[str]]  # Commands of its processes
 
 
 @dataclass(frozen=True)
 class _Result:
-    """
-    One measurement of a subject.
+    """One measurement of a subject."""
 
-    Attributes
-    ----------
-    rate_hz
-        Messages by time, Hz; NaN without a topic.
-    missing
-        Samples that did not come.
-    p50_ms, p99_ms
-        Age of the samples on arrival, ms; NaN without a topic.
-    loads
-        Processor time by time, one for each process.
-
-    """
-
-    rate_hz: float
-    missing: float
+    rate_hz: float  # Messages by time, Hz; NaN without a topic
+    missing: float  # Samples that did not come
+    # p50_ms, p99_ms: Age of the samples on arrival, ms; NaN without a topic
     p50_ms: float
     p99_ms: float
-    loads: tuple[float, ...]
+    loads: tuple[float, ...]  # Processor time by time, one for each process
 
 
 def measure_live(seconds: float, rounds: int, iiod: str | None) -> None:
     """
     Print a row for each subject: rate, loss, age on arrival, processor time.
 
-    Parameters
-    ----------
-    seconds
-        Duration of one measurement, s.
-    rounds
-        Measurements of each subject, which take turns. A row has the medians of those that
-        succeeded, and says why others failed.
-    iiod
-        Path of the tests' IIOD, a Python file that prints its port; None for no row of it.
-
+    seconds: duration of one measurement, s.
     """
     print(f'{RATE_HZ:g} Hz, {rounds} x {seconds:g} s: medians (range). '
           f'Load of the machine before: {os.getloadavg()[0]:.1f}')

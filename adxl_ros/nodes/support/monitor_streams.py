@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The subscriptions of the monitor, whose messages it takes many at a time."""
 
@@ -32,19 +20,7 @@ _QUEUE = 10000
 
 
 class MonitorStreams:
-    """
-    Takes samples, reference and surroundings.
-
-    Parameters
-    ----------
-    node
-        The node that subscribes.
-    kind
-        Kind of the reference.
-    reference_topic
-        Topic of the reference.
-
-    """
+    """Takes samples, reference and surroundings."""
 
     def __init__(self, node: Node, kind: ReferenceKind, reference_topic: str) -> None:
         self._kind = kind

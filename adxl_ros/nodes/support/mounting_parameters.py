@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Where the sensor is mounted on the robot: parameters, and the service that levels it."""
 
@@ -47,17 +35,7 @@ _MAX_GRAVITY_ERROR = 0.1
 
 
 class MountingParameters:
-    """
-    The parameters `mounting.*` and the service `~/level` of a node.
-
-    Parameters
-    ----------
-    node
-        The node.
-    stream
-        Its stream, which is turned into the frame of the robot.
-
-    """
+    """The parameters `mounting.*` and the service `~/level` of a node."""
 
     def __init__(self, node: Node, stream: LiveStream) -> None:
         self._node, self._stream = node, stream
@@ -118,25 +96,7 @@ def level(mounting: Mounting, forces_mps2: np.ndarray, sensor: Sensor) -> Mounti
     """
     Return the mounting that makes the force of a rest vertical.
 
-    Parameters
-    ----------
-    mounting
-        The present mounting, whose yaw stays.
-    forces_mps2
-        Corrected samples in the frame of the case, m/s², (n, 3).
-    sensor
-        The sensor, with its noise.
-
-    Returns
-    -------
-    Mounting
-        The new mounting.
-
-    Raises
-    ------
-    UserError
-        The samples are too few, are no rest, or do not show gravity.
-
+    forces_mps2: corrected samples in the frame of the case, m/s², (n, 3).
     """
     if len(forces_mps2) < _FEWEST_SAMPLES:
         raise UserError(f'{len(forces_mps2)} samples in {_LEVEL_S:g} s; at least '

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The next pose of a calibration: announced to people and programs, commanded to a stage."""
 
@@ -40,14 +28,6 @@ class Announcer:
     `~/next_pose` has the pose for people and programs, latched. `stage/command` has the command
     for a stage that turns itself. It is repeated, so that a stage that starts later or loses a
     message gets it, too.
-
-    Parameters
-    ----------
-    node
-        The node that publishes.
-    has_stage
-        Whether there is a stage, which may turn itself.
-
     """
 
     def __init__(self, node: Node, has_stage: bool) -> None:

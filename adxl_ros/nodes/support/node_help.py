@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The help text of a node: its parameters, topics and services, as the node itself declares them.
@@ -57,45 +45,17 @@ _TYPES = {Parameter.Type.DOUBLE: 'float', Parameter.Type.INTEGER: 'int',
 
 
 class NodeHelp(NamedTuple):
-    """
-    What the help text of a node has beside its declarations.
+    """What the help text of a node has beside its declarations."""
 
-    Attributes
-    ----------
-    description
-        Purpose of the node.
-    examples : mapping
-        Arguments of each example, by its purpose.
-    variants
-        Parameters `NAME:=VALUE` with which the node declares others, by a title.
-
-    """
-
-    description: str | None
-    examples: Mapping[str, str]
+    description: str | None  # Purpose of the node
+    examples: Mapping[str, str]  # Arguments of each example, by its purpose
+    # Parameters `NAME:=VALUE` with which the node declares others, by a title
     variants: Mapping[str, Sequence[str]] = {}
 
 
 def print_if_asked(arguments: Sequence[str], make_node: Callable[[], Node], node_help: NodeHelp
                    ) -> bool:
-    """
-    Print version or help where the command line has that option.
-
-    Parameters
-    ----------
-    arguments
-        Arguments of the command line.
-    make_node
-        Creates the node.
-    node_help
-        What the help text has beside the node's declarations.
-
-    Returns
-    -------
-    bool
-        Whether something was printed.
-
-    """
+    """Print version or help where the command line has that option."""
     if '--version' in arguments:
         print(f'adxl_ros {package_version()}')
         return True
@@ -108,24 +68,7 @@ def print_if_asked(arguments: Sequence[str], make_node: Callable[[], Node], node
 
 def program_parser(name: str, description: str | None, examples: Mapping[str, str]
                    ) -> argparse.ArgumentParser:
-    """
-    Make the parser of a program that starts nodes, with `--version` and examples.
-
-    Parameters
-    ----------
-    name
-        Its name.
-    description
-        Its purpose.
-    examples : mapping
-        Arguments of each example, by its purpose.
-
-    Returns
-    -------
-    argparse.ArgumentParser
-        The parser, without the arguments of the program.
-
-    """
+    """Make the parser of a program that starts nodes, with `--version` and examples."""
     text = NodeHelp(description, examples)
     parser = argparse.ArgumentParser(
         prog=name, description='\n'.join(_wrapped(' '.join((description or '').split()))),
@@ -136,29 +79,20 @@ def program_parser(name: str, description: str | None, examples: Mapping[str, st
 
 
 class _Made:
-    """
-    What a node has declared.
-
-    Attributes
-    ----------
-    parameters : dict
-        Parameters with their descriptors, by name.
-    topics
-        Names and types of the topics, by direction.
-    services
-        Names and types of its services, without those of every node.
-
-    """
+    """What a node has declared."""
 
     def __init__(self, node: Node) -> None:
         parameters: dict[str, Any] = dict(node.get_parameters_by_prefix(''))
         descriptors = node.describe_parameters(list(parameters))
+        # Parameters with their descriptors, by name
         self.parameters = {
             name: (parameter, descriptor) for (name, parameter), descriptor
             in sorted(zip(parameters.items(), descriptors), key=lambda item: item[0][0])
             if not name.startswith(_ANY_NODE)}
+        # Names and types of the topics, by direction
         self.topics = {'publishes': _typed(node.publishers),
                        'subscribes': _typed(node.subscriptions)}
+        # Names and types of its services, without those of every node
         self.services = {service.srv_name: _type_name(service.srv_type)
                          for service in node.services if service.srv_name.startswith('~/')}
 

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The screen that the calibration node starts in its own terminal."""
 
 from __future__ import annotations
@@ -32,22 +20,7 @@ _RESET = b'\x1b[?1049l\x1b[?2004l\x1b[?25h\x1b[0m'
 
 
 def open_screen(node_name: str) -> tuple[OwnScreen | None, str]:
-    """
-    Start a screen if this process has a terminal.
-
-    Parameters
-    ----------
-    node_name
-        Full name of the calibration node.
-
-    Returns
-    -------
-    OwnScreen or None
-        The screen; None without a terminal, or without the package that draws it.
-    str
-        What must be installed; '' if nothing is missing.
-
-    """
+    """Start a screen if this process has a terminal."""
     is_terminal = all(stream and stream.isatty() for stream in (sys.stdin, sys.stdout))
     if not is_terminal or os.environ.get('TERM') == 'dumb' or _in_background():
         return None, ''
@@ -68,15 +41,7 @@ def _in_background() -> bool:
 
 
 class OwnScreen:
-    """
-    A process of the executable `screen`, which draws where this process would print.
-
-    Parameters
-    ----------
-    node_name
-        Full name of the calibration node.
-
-    """
+    """A process of the executable `screen`, which draws where this process would print."""
 
     def __init__(self, node_name: str) -> None:
         self._saved = termios.tcgetattr(sys.stdin.fileno())

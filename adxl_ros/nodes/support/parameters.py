@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Parameters of nodes, each declared with its descriptor."""
 
@@ -32,42 +20,7 @@ from rclpy.parameter import Parameter
 def declare(node: Node, name: str, default: Any, description: str, unit: str = '',
             lower: float | None = None, upper: float | None = None,
             choices: Sequence[str] = (), live: bool = False, empty: float = 0.0) -> Any:
-    """
-    Declare one parameter with its descriptor and return its value.
-
-    Parameters
-    ----------
-    node
-        The node that gets the parameter.
-    name
-        Its name, with dots.
-    default
-        Its default value, or a `Parameter.Type` for a parameter without one. An empty tuple
-        stands for a list of strings, or one string with commas.
-    description
-        Its meaning, for the descriptor.
-    unit
-        Its unit, for the descriptor.
-    lower, upper
-        The range of a number; None for no limit.
-    choices
-        The values that a string may have; empty for any.
-    live
-        Whether it can be set while the node runs.
-    empty
-        What others see of a number without a value; texts and lists are empty.
-
-    Returns
-    -------
-    Any
-        bool, int, float, str or a list of them; None where there is no value.
-
-    Raises
-    ------
-    UserError
-        The given value has another type, or is out of range or not among the choices.
-
-    """
+    """Declare one parameter with its descriptor and return its value."""
     text_or_list = isinstance(default, tuple)
     if text_or_list:
         default = ''
@@ -120,40 +73,10 @@ def _set_range(descriptor: ParameterDescriptor, default: Any, lower: float, uppe
 
 
 def nearest(name: str, names: Sequence[str]) -> str:
-    """
-    Return the name that is most like a misspelled one.
-
-    Parameters
-    ----------
-    name
-        The misspelled name.
-    names
-        Names to choose from.
-
-    Returns
-    -------
-    str
-        One of `names`.
-
-    """
+    """Return the name that is most like a misspelled one."""
     return get_close_matches(name, names, 1, 0.0)[0]
 
 
 def parameter_error(key: str, reason: str) -> UserError:
-    """
-    Make the error of a parameter, with its place where it comes from a file.
-
-    Parameters
-    ----------
-    key
-        Name of the parameter.
-    reason
-        What is wrong with it.
-
-    Returns
-    -------
-    UserError
-        The error, to be raised.
-
-    """
+    """Make the error of a parameter, with its place where it comes from a file."""
     return UserError(f'{place_of(key)}{key}: {reason}')

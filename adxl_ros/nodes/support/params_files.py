@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The parameter files that a node is started with, checked and searched by line and column."""
 
@@ -39,12 +27,6 @@ def check_params_files() -> None:
     Check the syntax of all files of `--params-file`.
 
     rcl refuses such a file too, but it names neither line nor column.
-
-    Raises
-    ------
-    UserError
-        A file cannot be read, is not YAML, or has a list of mixed types.
-
     """
     for path in _paths():
         _check_lists(path, compose(path))
@@ -81,20 +63,7 @@ def _is_of_launch(path: str) -> bool:
 
 
 def refuse_files_of_others(node_name: str) -> None:
-    """
-    Refuse a file whose sections name other nodes only: the node would run without it.
-
-    Parameters
-    ----------
-    node_name
-        Fully qualified name of the node.
-
-    Raises
-    ------
-    UserError
-        No section of a file is for the node.
-
-    """
+    """Refuse a file whose sections name other nodes only: the node would run without it."""
     for path in _paths():
         sections = [section for section, _ in _sections(compose(path), '')]
         if sections and not any(_matches(section, node_name) for section in sections):
@@ -103,54 +72,12 @@ def refuse_files_of_others(node_name: str) -> None:
 
 
 def has_section(path: str, node_name: str) -> bool:
-    """
-    Return whether a parameter file has a section for a node.
-
-    Parameters
-    ----------
-    path
-        The file.
-    node_name
-        Fully qualified name of the node.
-
-    Returns
-    -------
-    bool
-        Whether there is one.
-
-    Raises
-    ------
-    UserError
-        The file cannot be read, or is not YAML.
-
-    """
+    """Return whether a parameter file has a section for a node."""
     return any(_matches(section, node_name) for section, _ in _sections(compose(path), ''))
 
 
 def given_text(path: str, node_name: str, key: str) -> str:
-    """
-    Return the text of a parameter in the sections of a file for a node.
-
-    Parameters
-    ----------
-    path
-        The file.
-    node_name
-        Fully qualified name of the node.
-    key
-        Name of the parameter.
-
-    Returns
-    -------
-    str
-        Its value as it is written; '' where the file does not have it.
-
-    Raises
-    ------
-    UserError
-        The file cannot be read, or is not YAML.
-
-    """
+    """Return the text of a parameter in the sections of a file for a node."""
     values = [_find_value(tree, key) for section, tree in _sections(compose(path), '')
               if _matches(section, node_name)]
     return next((str(value.value) for value in values if value is not None), '')

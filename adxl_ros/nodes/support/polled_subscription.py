@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """A subscription whose messages wait until they are asked for."""
 
@@ -31,18 +19,6 @@ class PolledSubscription:
     Samples (sensor_msgs/Imu) of several publishers are withheld.
 
     At 1 kHz an executor that wakes for each message takes a tenth of a core.
-
-    Parameters
-    ----------
-    node
-        The node that subscribes.
-    kind
-        Type of the messages.
-    topic
-        Its name.
-    depth
-        Number of messages that are kept.
-
     """
 
     def __init__(self, node: Node, kind: Any, topic: str, depth: int) -> None:

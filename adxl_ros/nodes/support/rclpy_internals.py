@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Every use of undocumented parts of rclpy, each with its reason."""
 
@@ -66,25 +54,6 @@ def take_messages(subscription: Subscription, kind: Any, raw: bool, limit: int,
 
     A turn costs as much as ten messages, and rclpy takes one message a turn: a node cannot follow
     10 kHz like that.
-
-    Parameters
-    ----------
-    subscription
-        The subscription.
-    kind
-        Type of its messages.
-    raw
-        Whether to return serialized messages.
-    limit
-        The largest number of messages.
-    accept
-        Gets the sequence number of each message; returns whether to yield it.
-
-    Yields
-    ------
-    object
-        Messages, or their bytes.
-
     """
     with subscription.handle:
         for _ in range(limit):
@@ -100,19 +69,6 @@ def take_request(service: Service, kind: Any) -> tuple[Any, Any] | None:
     Take a request that waits in a service, to answer it later by `Service.send_response`.
 
     An executor wants the answer at once, and polls a coroutine that waits without a pause.
-
-    Parameters
-    ----------
-    service
-        The service, in a group that is `NotForExecutors`.
-    kind
-        Its type.
-
-    Returns
-    -------
-    tuple or None
-        The request, and the header that its answer needs; None without a request.
-
     """
     with service.handle:
         request, header = service.handle.service_take_request(kind.Request)
@@ -134,21 +90,7 @@ class MessageWait:
 
     def __call__(self, kind: Any, callback: Callable[[bytes], None], limit: int,
                  accept: Callable[[int | None], bool] = lambda _: True) -> None:
-        """
-        Wait for a message for up to 0.1 s, and give all that have come to a function.
-
-        Parameters
-        ----------
-        kind
-            Type of the messages.
-        callback
-            Takes the bytes of one message.
-        limit
-            The largest number of messages.
-        accept
-            As for `take_messages`.
-
-        """
+        """Wait for a message for up to 0.1 s, and give all that have come to a function."""
         handle, context = self._subscription.handle, self._context.handle
         assert context is not None, 'a node has a context'
         with handle, context:
@@ -171,18 +113,6 @@ def store_empty(node: Node, name: str, kind: Parameter.Type, number: float) -> N
 
     rclpy answers a request for several parameters with nothing when one of them has no value, and
     takes an empty list as a list of bytes when it declares a parameter.
-
-    Parameters
-    ----------
-    node
-        The node that has the parameter.
-    name
-        Its name.
-    kind
-        Its type.
-    number
-        Value of a number.
-
     """
     empty: dict[Parameter.Type, Any] = {
         Parameter.Type.STRING: '', Parameter.Type.INTEGER: round(number),
@@ -202,18 +132,7 @@ def given_parameters(node: Node) -> Iterable[tuple[str, Any]]:
 
 def on_set_request(node: Node,
                    take: Callable[[list[Parameter]], SetParametersResult | None]) -> None:
-    """
-    Let a function take a request of ~/set_parameters, which rclpy carries out one by one.
-
-    Parameters
-    ----------
-    node
-        The node that has the service.
-    take
-        Gets the parameters of a request. It returns the result of all of them, or None for a
-        request that rclpy shall carry out.
-
-    """
+    """Let a function take a request of ~/set_parameters, which rclpy carries out one by one."""
     service = next(s for s in node.services if s.service_name.endswith('/set_parameters'))
     set_one_by_one = service.callback
 

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Threads of a node beside the executor that spins it.
@@ -31,19 +19,7 @@ from rclpy.node import Node
 
 
 class RepeatingThread:
-    """
-    Calls a function again and again until closed; an exception from it ends the node.
-
-    Parameters
-    ----------
-    node
-        The node that ends with an exception of the function.
-    turn
-        The function, called without a pause. It waits itself, for 0.1 s at most.
-    name
-        Name of the thread.
-
-    """
+    """Calls a function again and again until closed; an exception from it ends the node."""
 
     def __init__(self, node: Node, turn: Callable[[], None], name: str) -> None:
         self._turn, self._context = turn, node.context
@@ -76,20 +52,6 @@ class ReceiveTurn:
 
     Subscribes best effort, so that both kinds of publisher connect. Samples of several publishers
     are withheld.
-
-    Parameters
-    ----------
-    node
-        The node that subscribes.
-    kind
-        Type of the messages.
-    topic
-        Its name.
-    callback
-        Takes the bytes of one message.
-    depth
-        Number of messages that are kept while the callback is busy, and the most of one turn.
-
     """
 
     def __init__(self, node: Node, kind: Any, topic: str, callback: Callable[[bytes], None],

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Topics of what is sampled beside the axes: stage angles, temperature, supply."""
 
@@ -39,19 +27,7 @@ _KINDS = {'temperature_c': (Temperature, 'temperature'), 'supply_v': (BatterySta
 
 
 class References:
-    """
-    Publishes what was recorded beside the sensor: stage angles, temperature, supply.
-
-    Parameters
-    ----------
-    node
-        The node that publishes.
-    frame_id
-        Frame of the messages.
-    columns
-        Columns of a recording that the link gives.
-
-    """
+    """Publishes what was recorded beside the sensor: stage angles, temperature, supply."""
 
     def __init__(self, node: Node, frame_id: str, columns: tuple[str, ...]) -> None:
         self._node, self._frame_id = node, frame_id
@@ -74,13 +50,7 @@ class References:
         """
         Publish values that have changed, and others once in a period.
 
-        Parameters
-        ----------
-        stamps_ns
-            Stamps, ns, (n,).
-        columns
-            Values by column, (n,); NaN where there is none.
-
+        stamps_ns: stamps, ns, (n,); columns: values by column, (n,); NaN where there is none.
         """
         if not len(stamps_ns):
             return

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The driver of another project, `witmotion`, on an emulated board, for the benchmark."""
 
@@ -55,19 +43,6 @@ def run_board(port: str, rate_hz: float) -> int:
     Send samples until a signal ends it: one a frame, as these boards do.
 
     The accelerations of a sample are its time, because the frame has no field for it.
-
-    Parameters
-    ----------
-    port
-        Name of a new pseudo-terminal.
-    rate_hz
-        Sample rate, Hz. The library itself sets a board to 200 Hz at most.
-
-    Returns
-    -------
-    int
-        Exit status.
-
     """
     with suppress(KeyboardInterrupt), open_terminal(port) as fd:
         began_s = time.monotonic()
@@ -96,17 +71,7 @@ def _time_us(accel_mps2: tuple[float, ...], now_us: int) -> int:
 
 
 class RivalDriver(Node):
-    """
-    The smallest node on the library: it publishes each sample, stamped by the time of the sample.
-
-    Parameters
-    ----------
-    port
-        Path of the board's terminal.
-    depth
-        Samples that are kept for a slow subscriber.
-
-    """
+    """The smallest node on the library: it publishes each sample, stamped by its time."""
 
     def __init__(self, port: str, depth: int) -> None:
         super().__init__('rival')
@@ -129,22 +94,7 @@ class RivalDriver(Node):
 
 
 def run_driver(port: str, depth: int) -> int:
-    """
-    Run the node until a signal ends it.
-
-    Parameters
-    ----------
-    port
-        Path of the board's terminal.
-    depth
-        Samples that are kept for a slow subscriber.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    """
+    """Run the node until a signal ends it."""
     rclpy.init()
     node = RivalDriver(port, depth)
     try:

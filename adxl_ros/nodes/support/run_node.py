@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """One node as an executable: a clean start, and a clean end by a signal."""
 
@@ -56,25 +44,7 @@ class Closable(Protocol):
 @ended_by_closed_output()
 def run(make_node: Callable[[], Node], node_help: NodeHelp,
         work: Callable[[Any, Executor], None] = lambda _, executor: executor.spin()) -> int:
-    """
-    Run one node until SIGINT or SIGTERM.
-
-    Parameters
-    ----------
-    make_node
-        Creates the node; it may raise `UserError`. The node may be `Closable`.
-    node_help
-        What `--help` prints beside the node's declarations.
-    work
-        What is done with the node and the executor that it has been added to.
-
-    Returns
-    -------
-    int
-        Exit status: 0 ended by a signal, 1 could not start (one line on stderr gives the reason),
-        2 wrong usage.
-
-    """
+    """Run one node until SIGINT or SIGTERM."""
     name = Path(sys.argv[0]).name
     is_initialised = False
     interrupts: list[int] = []

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Topics of the driver's samples: acceleration, the values that make it readable, the clock."""
 
@@ -50,14 +38,6 @@ class ImuWriter:
 
     A sample is one of two or few that have just come, after a pause of the processor. Calls of
     numpy are slow then: these messages would take twice the time.
-
-    Parameters
-    ----------
-    sensor
-        The unit; its nominal values convert volts to acceleration.
-    frame_id
-        Frame of the messages.
-
     """
 
     def __init__(self, sensor: Sensor, frame_id: str) -> None:
@@ -76,20 +56,8 @@ class ImuWriter:
         """
         Serialize samples.
 
-        Parameters
-        ----------
-        stamp_ns
-            Stamps, ns, (n,).
-        volts
-            Output by axis, V, (n, m).
-        imu_fields
-            Further fields of the messages by name, (n, k) each.
-
-        Returns
-        -------
-        list
-            One serialized sensor_msgs/Imu a sample.
-
+        stamp_ns: stamps, ns, (n,); volts: output by axis, V, (n, m); imu_fields: further fields of
+        the messages by name, (n, k) each.
         """
         values = {**imu_fields, 'linear_acceleration': to_nominal_mps2(volts, self._sensor)}
         columns = [(*self._fields[name], rows.tolist()) for name, rows in values.items()]
@@ -108,22 +76,7 @@ class ImuWriter:
 
 
 def imu_message(sensor: Sensor, frame_id: str) -> Imu:
-    """
-    Make the message that all samples have in common.
-
-    Parameters
-    ----------
-    sensor
-        The unit; its noise gives the covariance.
-    frame_id
-        Frame of the message.
-
-    Returns
-    -------
-    Imu
-        The message, without stamp and acceleration.
-
-    """
+    """Make the message that all samples have in common."""
     message = Imu()
     message.header.frame_id = frame_id
     message.orientation_covariance[0] = message.angular_velocity_covariance[0] = -1.0
@@ -138,29 +91,8 @@ class SampleOutput:
     """
     Publishes samples, the values that make them readable, and sensor time.
 
-    Parameters
-    ----------
-    node
-        The node that publishes.
-    sensor
-        Its nominal values convert the samples, until a link states others.
-    frame_id
-        Frame of the samples; '' until the samples of a simulator state it.
-    delay_ns
-        Delay of the sensor, which is taken out of the stamps, ns.
-    is_clock
-        Whether sensor time is the clock of the graph.
-    clock
-        Clock of the stamps, where sensor time is not the clock of the graph.
-    tally
-        Counts the samples.
-
-    Attributes
-    ----------
-    sensor, frame_id, is_clock, tally
-        As given; `sensor` may be replaced, `frame_id` may follow that of a simulator, and
-        `is_clock` ends beside another clock.
-
+    sensor, frame_id, is_clock, tally: as given; `sensor` may be replaced, `frame_id` may follow
+    that of a simulator, and `is_clock` ends beside another clock.
     """
 
     def __init__(self, node: Node, sensor: Sensor, frame_id: str, delay_ns: int, is_clock: bool,
@@ -179,15 +111,7 @@ class SampleOutput:
             self._node.destroy_publisher(publisher)
 
     def follow_other_clock(self) -> str:
-        """
-        Stop being the clock if another node is; a driver follows the one that sorts before it.
-
-        Returns
-        -------
-        str
-            Name of the node that is the clock; '' where this node is, or does not want to be.
-
-        """
+        """Stop being the clock if another node is; the one that sorts first stays."""
         if self._clock is None:
             return ''
         own_name = self._node.get_fully_qualified_name()
@@ -221,17 +145,7 @@ class SampleOutput:
         return self._data.get_subscription_count() > 0
 
     def publish(self, samples: Samples, references: References) -> None:
-        """
-        Publish samples and what was recorded beside them.
-
-        Parameters
-        ----------
-        samples
-            What a link has given; samples that are not finite count as missing.
-        references : References
-            Publishes what was recorded beside the sensor.
-
-        """
+        """Publish samples and what was recorded beside them."""
         finite = samples.finite()
         published_ns = finite.stamp_ns - self._delay_ns
         for message in self._writer.messages(published_ns, finite.volts, finite.imu_fields):

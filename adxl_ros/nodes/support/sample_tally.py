@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Counts of the driver's samples, and of what went wrong with them."""
 
@@ -37,32 +25,16 @@ class Tally:
     """
     Counts samples, and what went wrong with them, between two reports.
 
-    Parameters
-    ----------
-    steady_ns
-        Steady time, ns.
-
-    Attributes
-    ----------
-    now_ns
-        Sensor time up to which samples have been read, ns; None before the first one.
-    samples
-        Published samples.
-    missing
-        Samples that are lost.
-    estimated
-        Part of `missing` that is estimated by time, not counted.
-    saturated
-        Samples at a rail of the ADC or beyond the sensor's range.
-    ages
-        Ages of the samples on publication.
-
+    samples: published samples; missing: samples that are lost; estimated: part of `missing` that
+    is estimated by time, not counted; saturated: samples at a rail of the ADC or beyond the
+    sensor's range.
     """
 
     def __init__(self, steady_ns: int) -> None:
+        # Sensor time up to which samples have been read, ns; None before the first one
         self.now_ns: int | None = None
         self.samples = self.missing = self.estimated = self.saturated = 0
-        self.ages = SampleAges()
+        self.ages = SampleAges()  # Ages of the samples on publication
         self._newest_ns: int | None = None
         self._reported = _Totals(steady_ns, 0, 0, 0, 0, 0)
 
@@ -74,17 +46,7 @@ class Tally:
         """
         Add samples.
 
-        Parameters
-        ----------
-        stamps_ns
-            Stamps of the published ones, ns, (n,).
-        saturated
-            Number of saturated ones among them.
-        missing
-            Number of lost samples.
-        estimated
-            Part of `missing` that is estimated by time, not counted.
-
+        stamps_ns: stamps of the published ones, ns, (n,).
         """
         self.samples += len(stamps_ns)
         self.saturated += saturated
@@ -94,22 +56,7 @@ class Tally:
             self._newest_ns = int(stamps_ns[-1])
 
     def report(self, steady_ns: int, sensor_ns: int) -> tuple[dict[str, Any], str]:
-        """
-        Report what has been counted since the last report.
-
-        Parameters
-        ----------
-        steady_ns
-            Steady time, ns.
-        sensor_ns
-            Sensor time, ns; 0 before the first sample.
-
-        Returns
-        -------
-        tuple
-            Values for diagnostics by key, and a warning or ''.
-
-        """
+        """Report what has been counted since the last report."""
         totals = _Totals(steady_ns, sensor_ns, self.samples, self.missing, self.estimated,
                          self.saturated)
         new = _Totals(*(now - before for now, before in zip(totals, self._reported)))

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The parameters of a node that describe a sensor: those of a parameter file."""
 
@@ -58,19 +46,6 @@ def declare_sensor(node: Node, live: bool = False) -> dict[str, Any]:
 
     Where `format` is given the parameters come from a parameter file, and `make_sensor` refuses
     what the file lacks. Otherwise the installed nominal sensor gives the default values.
-
-    Parameters
-    ----------
-    node
-        The node that gets the parameters.
-    live
-        Whether they can be set while the node runs; the node's callbacks decide which, and how.
-
-    Returns
-    -------
-    dict
-        Values by dotted key.
-
     """
     nominal = {} if is_from_file(node) else parameter_file.to_flat(
         parameter_file.load(parameter_file.nominal_path()))
@@ -117,23 +92,7 @@ def _keys() -> Iterator[_Key]:
 
 
 def anonymous_sensor(node: Node, flat: Mapping[str, Any]) -> Sensor:
-    """
-    Return the sensor of a stream that states nothing of itself.
-
-    Parameters
-    ----------
-    node
-        The node, which knows what is given.
-    flat
-        Values by dotted key, as `declare_sensor` returns them.
-
-    Returns
-    -------
-    Sensor
-        The sensor of the parameter file; without a file any IMU with what is given. Values that
-        neither states are in `unstated`.
-
-    """
+    """Return the sensor of a stream that states nothing of itself."""
     if is_from_file(node):
         return make_sensor(flat, may_measure=True)
     any_imu = parameter_file.load(parameter_file.any_imu_path(), may_measure=True)
@@ -144,29 +103,7 @@ def anonymous_sensor(node: Node, flat: Mapping[str, Any]) -> Sensor:
 def make_sensor(flat: Mapping[str, Any],
                 make_error: Callable[[str, str], UserError] = parameter_error,
                 may_measure: bool = False) -> Sensor:
-    """
-    Check the parameters of a sensor and make it.
-
-    Parameters
-    ----------
-    flat
-        Values by dotted key, as `declare_sensor` returns them.
-    make_error
-        Makes the error of a parameter and a reason; by default it names the parameter file.
-    may_measure
-        Whether values that can be measured may be missing.
-
-    Returns
-    -------
-    Sensor
-        The sensor, without the coefficients of effects that are not listed.
-
-    Raises
-    ------
-    UserError
-        The parameters describe no sensor.
-
-    """
+    """Check the parameters of a sensor and make it."""
     listed = flat.get('effects', [])
     used = dict(flat)
     for effect in library().values():

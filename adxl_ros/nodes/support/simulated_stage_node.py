@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The simulated stage as topics: it follows commands and publishes its encoders."""
 
@@ -51,17 +39,6 @@ class SimulatedStageNode:
 
     A command takes effect after the delay of the controller. The true motion is thus known before
     it happens: `stage/true_joint_states` has it ahead of time, for a simulated sensor.
-
-    Parameters
-    ----------
-    node
-        The node that gets the parameters and topics.
-
-    Raises
-    ------
-    UserError
-        A parameter is out of range.
-
     """
 
     def __init__(self, node: Node) -> None:

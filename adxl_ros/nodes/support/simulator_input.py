@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The topics of a simulator, for a link that emulates a sensor on them."""
 
@@ -48,27 +36,12 @@ _LONGEST_TURN_S = 0.25
 
 
 class SimulatorInput:
-    """
-    Gives the messages of a simulator to a link.
-
-    Parameters
-    ----------
-    node
-        The node that subscribes.
-    link
-        The link.
-
-    Attributes
-    ----------
-    frame_id
-        Frame of the newest samples.
-
-    """
+    """Gives the messages of a simulator to a link."""
 
     def __init__(self, node: Node, link: ImuLink) -> None:
         self._node, self._link = node, link
         self._raw: list[bytes] = []
-        self.frame_id = ''
+        self.frame_id = ''  # Frame of the newest samples
         self._foreign = Watchdog(_LONGEST_TURN_S)
         self._is_warned = False
         self._due_s = self._counted_s = time.monotonic()

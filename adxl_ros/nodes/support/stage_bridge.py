@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The bridge to a real stage: it passes commands and positions between a controller and this package.
@@ -61,26 +49,12 @@ _DEFAULT_COMMANDS = {'trajectory': '/joint_trajectory_controller/joint_trajector
 
 @dataclass
 class _Joint:
-    """
-    One joint of the stage, and how the controller counts its angle.
+    """One joint of the stage, and how the controller counts its angle."""
 
-    Attributes
-    ----------
-    name
-        The controller's name of the joint.
-    sign
-        1.0 or -1.0: the direction in which the controller counts.
-    offset_rad
-        Stage angle where the controller's joint is at 0, rad.
-    angle_rad
-        Stage angle, rad; None before the first joint state.
-
-    """
-
-    name: str
-    sign: float
-    offset_rad: float
-    angle_rad: float | None = None
+    name: str  # The controller's name of the joint
+    sign: float  # 1.0 or -1.0: the direction in which the controller counts
+    offset_rad: float  # Stage angle where the controller's joint is at 0, rad
+    angle_rad: float | None = None  # Stage angle, rad; None before the first joint state
 
     def to_controller(self, stage_rad: float) -> float:
         """Convert a stage angle to the controller's, rad."""
@@ -108,22 +82,7 @@ class _Joint:
 
 
 class StageBridge:
-    """
-    The way from this package's topics to the controller of a stage, and back.
-
-    Parameters
-    ----------
-    node
-        The node that gets the parameters and topics.
-    kind
-        'joint_state' or 'trajectory': the type of command that the controller takes.
-
-    Raises
-    ------
-    UserError
-        A parameter is missing or out of range.
-
-    """
+    """The way from this package's topics to the controller of a stage, and back."""
 
     def __init__(self, node: Node, kind: str) -> None:
         self._node, self._kind = node, kind

@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """Publishers and subscriptions with the QoS of this package, and stamps."""
 
@@ -42,28 +30,7 @@ than the period of slow samples, shorter than two starts of a driver."""
 
 def create_publisher(node: Node, kind: Any, topic: str, depth: int, latched: bool = False
                      ) -> Publisher:
-    """
-    Create a reliable keep-last publisher whose QoS can be overridden by parameters.
-
-    Parameters
-    ----------
-    node
-        The node that publishes.
-    kind
-        Type of the messages.
-    topic
-        Its name.
-    depth
-        Number of messages that are kept.
-    latched
-        Whether late subscribers get the last messages (transient local).
-
-    Returns
-    -------
-    Publisher
-        The publisher.
-
-    """
+    """Create a reliable keep-last publisher whose QoS can be overridden by parameters."""
     qos = QoSProfile(depth=depth)
     if latched:
         qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
@@ -78,31 +45,6 @@ def create_subscription(node: Node, kind: Any, topic: str, callback: Callable[[A
     Subscribe best effort, so that both kinds of publisher connect; QoS can be overridden.
 
     One turn of the executor gives all waiting messages to the callback, one after the other.
-
-    Parameters
-    ----------
-    node
-        The node that subscribes.
-    kind
-        Type of the messages.
-    topic
-        Its name.
-    callback
-        Takes a message, or its bytes.
-    depth
-        Number of messages that are kept while the node is busy, and the most that one turn takes.
-    latched
-        Whether to get what was published before: reliable and transient local.
-    raw
-        Whether the callback gets serialized messages.
-    group
-        Callback group; None for the node's own.
-
-    Returns
-    -------
-    Subscription
-        The subscription.
-
     """
     def take_all(first: Any) -> None:
         callback(first)

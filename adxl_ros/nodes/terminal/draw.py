@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What the screen looks like: contents go in, lines come out, as many as the terminal has."""
 
@@ -66,41 +54,14 @@ _LONGEST_IN_MIN_S = 5400
 
 
 class LogLine(NamedTuple):
-    """
-    A line of the log.
+    """A line of the log."""
 
-    Attributes
-    ----------
-    text
-        The line.
-    style
-        Its style.
-
-    """
-
-    text: str
-    style: str = 'ansibrightblack'
+    text: str  # The line
+    style: str = 'ansibrightblack'  # Its style
 
 
 def draw(contents: ScreenContents, log: Sequence[LogLine], columns: int, rows: int) -> list[Line]:
-    """
-    Lay the contents out.
-
-    Parameters
-    ----------
-    contents
-        What the screen shows.
-    log
-        Lines of the log, the newest last.
-    columns, rows
-        Size of the terminal.
-
-    Returns
-    -------
-    list of Line
-        The lines of the screen.
-
-    """
+    """Lay the contents out."""
     width = max(columns - 1, _LEAST_WIDTH)
     top = [*_head(contents, width), *_pose(contents.progress, width),
            *_reading(contents.live, contents.progress),

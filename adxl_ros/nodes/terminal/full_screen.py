@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """A full screen in a terminal: prompt_toolkit draws lines and reads single keys."""
 
 from __future__ import annotations
@@ -34,29 +22,7 @@ _REFRESH_S = 0.2
 
 def full_screen(lines: Callable[[int, int], list[Line]], press: Callable[[str], None],
                 leave: Callable[[], None]) -> Application[None]:
-    """
-    Make the application of a full screen.
-
-    Parameters
-    ----------
-    lines
-        Returns the lines for a number of columns and of rows.
-    press
-        Takes a pressed key.
-    leave
-        Called when the operator quits, before the end.
-
-    Returns
-    -------
-    prompt_toolkit.application.Application
-        The application, to be run.
-
-    Raises
-    ------
-    UserError
-        There is no terminal, or prompt_toolkit is missing.
-
-    """
+    """Make the application of a full screen."""
     try:
         from prompt_toolkit.application import Application
         from prompt_toolkit.input import create_input

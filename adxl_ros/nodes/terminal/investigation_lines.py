@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """What an investigation shows: a line for each diagnosis, and what the stage does meanwhile."""
 
@@ -49,17 +37,7 @@ class InvestigationScreen:
     """Prints lines; in a terminal that can draw, the last line shows what happens now."""
 
     def __init__(self, folder: Path, settings: Any) -> None:
-        """
-        Print what is about to happen.
-
-        Parameters
-        ----------
-        folder
-            Folder of the files.
-        settings
-            Limits and minutes.
-
-        """
+        """Print what is about to happen."""
         self._live: Any = None
         self._text = ''
         if drawable():
@@ -72,17 +50,7 @@ class InvestigationScreen:
             self._print(line)
 
     def show_answer(self, minutes: float, answer: Answer) -> None:
-        """
-        Print the probabilities after a diagnosis, and what follows.
-
-        Parameters
-        ----------
-        minutes
-            Time since the beginning, min.
-        answer
-            The answer.
-
-        """
+        """Print the probabilities after a diagnosis, and what follows."""
         for line in answer_lines(minutes, answer):
             self._print(line)
 
@@ -110,22 +78,7 @@ class InvestigationScreen:
 
 
 def opening_lines(folder: Path, settings: Any) -> list[str]:
-    """
-    Return what is about to happen.
-
-    Parameters
-    ----------
-    folder
-        Folder of the files.
-    settings
-        Limits and minutes.
-
-    Returns
-    -------
-    list of str
-        The lines.
-
-    """
+    """Return what is about to happen."""
     limits = settings.limits
     ranges = ', '.join(f'{joint} {low:.0f} to {high:.0f}°' for joint, (low, high) in (
         ('alpha', np.degrees(limits.alpha_rad)), ('beta', np.degrees(limits.beta_rad))))
@@ -134,22 +87,7 @@ def opening_lines(folder: Path, settings: Any) -> list[str]:
 
 
 def answer_lines(minutes: float, answer: Answer) -> list[str]:
-    """
-    Return the lines of one diagnosis.
-
-    Parameters
-    ----------
-    minutes
-        Time since the beginning, min.
-    answer
-        The answer.
-
-    Returns
-    -------
-    list of str
-        Probabilities, and the next manoeuvre.
-
-    """
+    """Return the lines of one diagnosis."""
     line, rest = f'{minutes:5.1f} min ', 1.0
     for hypothesis in answer.hypotheses:
         if hypothesis.probability < _SMALLEST_SHOWN:
@@ -176,22 +114,7 @@ def status_line(status: Status) -> str:
 
 
 def closing_lines(investigation: Investigation, folder: OutputFolder) -> list[str]:
-    """
-    Return the result, where the files are, and what to do next.
-
-    Parameters
-    ----------
-    investigation
-        The investigation, which has ended.
-    folder
-        Its files.
-
-    Returns
-    -------
-    list of str
-        The lines.
-
-    """
+    """Return the result, where the files are, and what to do next."""
     bag, baseline, gap, parameters = (shlex.quote(str(path)) for path in (
         folder.bag, folder.baseline, folder.path / 'gap', folder.parameters))
     diagnose = ['ros2 run adxl_ros diagnose', bag, f'--params {baseline}', f'-o {gap}']

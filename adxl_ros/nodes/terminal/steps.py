@@ -1,16 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 """The steps of a job in a terminal: name, progress and time."""
 
@@ -42,21 +30,6 @@ def step(name: str, text: str, total: int = 0) -> Iterator[Step]:
 
     A terminal shows one line with the time and, where the total is known, a bar. Elsewhere, and
     without rich, there is a line for each tenth of the total and one at the end.
-
-    Parameters
-    ----------
-    name
-        Number and name of the step.
-    text
-        Text at its beginning.
-    total
-        Amount of work, in any unit; 0 if it is unknown.
-
-    Yields
-    ------
-    Step
-        The step, to show its progress.
-
     """
     shown_step = (_InTerminal if drawable() else _AsLines)(name, text, total)
     try:
@@ -84,17 +57,7 @@ class Step:
         self._name, self._text, self._total, self._done = name, text, total, 0
 
     def show(self, text: str, done: int = 0) -> None:
-        """
-        Show how far the step is.
-
-        Parameters
-        ----------
-        text
-            Text beside the name.
-        done
-            Amount of work that is done, in the unit of the total.
-
-        """
+        """Show how far the step is."""
         self._text, self._done = text, done
 
     def end(self) -> None:
