@@ -52,6 +52,8 @@ _BITS = 6
 """Number of heaviest bits of the ADC that have a wrong weight. Chosen: that of the library."""
 _TIME_MODES = 16
 """Number of cosines over time. Chosen: a third of the blocks."""
+_AGEING_MODES = 4
+"""Number of cosines over time that multiply the force. Chosen: a scale factor changes slowly."""
 _PRODUCT_DEGREE = 3
 """Highest degree of the products of force. Chosen: that of the library."""
 _SMALLEST_RATE_RAD_S = 1e-3
@@ -160,6 +162,7 @@ def _of_axis(comparison: BaselineComparison, force_g: np.ndarray, axis: int, vol
         FormDimension.FORCE: _modes(along_g, _FORCE_MODES),
         FormDimension.CROSS_FORCE: np.concatenate([
             _products(force_g), *(_modes(f, _CROSS_MODES) for f in across_g)]),
+        FormDimension.AGEING: along_g * _modes(time_s, _AGEING_MODES),
         FormDimension.CODE: _code_functions(volts, comparison.sensor.adc_vref_v),
         FormDimension.LAG: _same_size([
             slope, np.gradient(slope, dt_s), slope * along_g, slope ** 2, *lagging, *levels,
@@ -177,8 +180,10 @@ def _of_axis(comparison: BaselineComparison, force_g: np.ndarray, axis: int, vol
     basis[FormDimension.DIRECTION] = np.array([
         direction * factor for direction in directions for factor in factors])
     since_s = time_since_move_s(time_s, rates)
+    turning = np.sum([np.abs(r) for r in moving], axis=0)
     basis[FormDimension.SINCE_MOVE] = _same_size([
         *(np.exp(-since_s / tau_s) for tau_s in _RELAXATION_S),
+        *(low_pass(turning, tau_s, dt_s, {}) for tau_s in _RELAXATION_S),
         *(low_pass(along_g, tau_s, dt_s, {}) - along_g for tau_s in _CREEP_S)])
     return basis
 

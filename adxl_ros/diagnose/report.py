@@ -43,8 +43,8 @@ _DIMENSIONS = {
     'direction': 'the direction of the last move', 'rate': 'the rate of the joints',
     'alpha_rad': 'alpha', 'beta_rad': 'beta', 'temperature_c': 'the temperature',
     'warming': 'the history of the temperature', 'supply_v': 'the supply', 'time_s': 'the time',
-    'since_move_s': 'the time since a move', 'code': 'the code of the ADC',
-    'lag': 'the recent history of the force'}
+    'ageing': 'force and time together', 'since_move_s': 'the time since a move',
+    'code': 'the code of the ADC', 'lag': 'the recent history of the force'}
 """Dimensions of the reproducible rest, for people."""
 _MOST_DIMENSIONS = 2
 """Dimensions that a sentence names. Chosen: the strongest ones."""

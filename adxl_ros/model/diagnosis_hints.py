@@ -83,6 +83,8 @@ class FormDimension(Enum):
     """Supply voltage."""
     TIME = 'time_s'
     """Time."""
+    AGEING = 'ageing'
+    """Force times a slow function of time: a scale factor that changes."""
     SINCE_MOVE = 'since_move_s'
     """Time since the last move."""
     CODE = 'code'
