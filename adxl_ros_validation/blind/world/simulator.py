@@ -399,7 +399,9 @@ def _force(run: Run) -> np.ndarray:
 
 
 def _second_derivative(values: np.ndarray, dt: float) -> np.ndarray:
-    return np.gradient(np.gradient(values, dt, axis=-1), dt, axis=-1)
+    """Differentiate twice to fourth order: second order lacks 0.3 % of a shaker's 20 Hz."""
+    return scipy.ndimage.correlate1d(
+        values, np.array([-1, 16, -30, 16, -1]) / (12 * dt * dt), axis=-1, mode='nearest')
 
 
 def _one_pole(values: np.ndarray, corner_hz: float, dt: float) -> np.ndarray:
