@@ -481,11 +481,6 @@ def _two_levels(run: Run, size: float, shape: Shape) -> None:
     _add(run, size, shape, np.where(np.sin(phase) + 0.7 * np.sin(2.718 * phase) > 0.4, 1.0, 0.0))
 
 
-def _warming_rate(run: Run, size: float, shape: Shape) -> None:
-    """Shift zero-g by how fast the temperature changes, g, as a gradient does."""
-    _add(run, size, shape, run.temperature - low_pass(run.temperature, 8.0, run.dt))
-
-
 def _fading_gain(run: Run, size: float, shape: Shape) -> None:
     """Change the scale factor with time, as leakage into a reference does."""
     run.u *= 1 + size * column(shape) * run.t / 100
@@ -586,7 +581,6 @@ KINDS = {kind.name: kind for kind in (
     _kind('magnet', _VOLTS, _magnet, 3e-3, 0.1, listed=False, phase=_PHASE),
     _kind('two_levels', _VOLTS, _two_levels, 3e-3, 0.1, listed=False, period_s=(15.0, 60.0),
           phase=_PHASE),
-    _kind('warming_rate', _VOLTS, _warming_rate, 3e-3, 0.1, listed=False, needs='heat'),
     _kind('fading_gain', _ELEMENT, _fading_gain, 3e-3, 0.1, listed=False),
 )}
 """All kinds by name; the order is part of a seed."""

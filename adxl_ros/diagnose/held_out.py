@@ -74,7 +74,8 @@ class Rest:
 
     # Decrease of the squares by all functions together, by block, (m/s²)², (blocks,)
     squares: np.ndarray
-    # Increase of the log likelihood by all functions but those of time, by block, (blocks,)
+    # The same by all functions but those of time, and their increase of the log likelihood
+    steady_squares: np.ndarray
     steady_log_likelihood: np.ndarray
     # Decrease of the squares by the functions of one dimension alone, by block
     by_dimension: dict[str, np.ndarray]
@@ -132,7 +133,7 @@ def reproducible_rest(fits: HeldOutFits, model: LinearModel) -> Rest:
     1992), so that functions that follow noise vanish. The effects keep their values, so that the
     functions take up only what the effects leave.
     """
-    squares, steady = np.zeros(BLOCKS), np.zeros(BLOCKS)
+    squares, steady, steady_squares = np.zeros((3, BLOCKS))
     by_dimension: dict[str, np.ndarray] = {}
     linearised = fits.linearised
     for number, (columns, filters) in enumerate(zip(linearised.columns, linearised.filters)):
@@ -166,11 +167,12 @@ def reproducible_rest(fits: HeldOutFits, model: LinearModel) -> Rest:
                 values = fitted.fit(level, variance)
                 if name == _STEADY:
                     steady[held_out] += 0.5 * whitened.gain(values) / variance
+                    steady_squares[held_out] += flat.gain(values)
                 elif name == _ALL:
                     squares[held_out] += flat.gain(values)
                 else:
                     by_dimension.setdefault(name, np.zeros(BLOCKS))[held_out] += flat.gain(values)
-    return Rest(squares, steady, by_dimension)
+    return Rest(squares, steady_squares, steady, by_dimension)
 
 
 class _Products:

@@ -271,18 +271,23 @@ class _Answer(NamedTuple):
     groups: frozenset[frozenset[str]]
 
 
-def _answer(evidence: Evidence, minimal: Sequence[frozenset[str]], rest: np.ndarray,
-            rest_material: float, drifts: Sequence[str], detected: frozenset[str], rows: slice
-            ) -> _Answer:
+def _answer(evidence: Evidence, minimal: Sequence[frozenset[str]], rest: Rest,
+            drifts: Sequence[str], detected: frozenset[str], rows: slice) -> _Answer:
     """Apply the rule to the figures of all blocks, or of one draw of them."""
     best = minimal[0]
     explained = float(evidence.gain(best, frozenset(), rows)[0])
-    left = float(rest[rows][0])
-    material = _low(rest[rows]) > rest_material
+    all_left, steady_left = (evidence.mean(squares, rows)
+                             for squares in (rest.squares, rest.steady_squares))
+    left, rest_material = float(all_left[0]), evidence.rest_material(rest)
+    material = _low(all_left) > rest_material
     drift = evidence.candidates[best].drift_mps2.get(drifts[0], 0.0) if drifts else 0.0
+    above = float(evidence.left(best, rows)[0])
+    if drifts and _low(steady_left) > rest_material \
+            and float(steady_left[0]) > _SHARE_OF_FORM * drift ** 2:
+        # A drift follows time alone; it takes up what follows something else, too.
+        drifts, drift, material, left = (), 0.0, True, max(left, above)
     if material and left > explained + drift ** 2:
         return _Answer('unknown', frozenset(), frozenset())
-    above = float(evidence.left(best, rows)[0])
     if not best and not detected and not drifts:
         # What neither repeats nor is noise at rest is no gap only while the noise is larger.
         is_much = above > max(evidence.floor_mps2 ** 2, evidence.material_power(1.0))
@@ -345,12 +350,10 @@ def decide(evidence: Evidence, rest_of: Callable[[frozenset[str], str], Rest],
         rest = rest_of(best, HEALTHY)
         drifts = drifts_beside(evidence, best, rest, everything)
         rest = rest_of(best, drifts[0]) if drifts else rest
-    rest_draws = evidence.mean(rest.squares)
-    material = evidence.rest_material(rest)
 
     def answered(rows: slice) -> _Answer:
         minimal = [best] if drifting else minimal_sets(evidence, rows, bool(drifts))
-        return _answer(evidence, minimal, rest_draws, material, drifts, noise_effects, rows)
+        return _answer(evidence, minimal, rest, drifts, noise_effects, rows)
 
     drifting = None
     answer = answered(everything)
@@ -359,11 +362,10 @@ def decide(evidence: Evidence, rest_of: Callable[[frozenset[str], str], Rest],
         if drifting:
             best, drifts = drifting
             rest = rest_of(best, drifts[0])
-            rest_draws, material = evidence.mean(rest.squares), evidence.rest_material(rest)
             answer = answered(everything)
     votes = Counter(answered(slice(i, i + 1)) for i in range(1, len(evidence.weights)))
     explained = evidence.interval(evidence.gain(best, frozenset(), everything))
-    left = evidence.interval(rest_draws)
+    left = evidence.interval(evidence.mean(rest.squares))
     highest = max(evidence.interval(evidence.gain(e, frozenset(), everything)).high
                   for e in evidence.candidates)
     probability, hypotheses = _probabilities(answer, votes, reliability)
