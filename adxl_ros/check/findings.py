@@ -58,6 +58,8 @@ class Findings:
     faults: tuple[str, ...]  # Why it is not sound, one line each
     remarks: tuple[str, ...] = ()  # What else is noteworthy, one line each
     abilities: tuple[Ability, ...] = ()  # What the tools can do with it
+    # By effect what `diagnose` could show: effect, smallest and typical size, what is missing
+    shows: tuple[tuple[str, str, str, str], ...] = ()
     paste: str = ''  # End of the last fault that is for a command line; empty for none
 
     @property

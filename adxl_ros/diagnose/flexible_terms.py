@@ -180,10 +180,11 @@ def _of_axis(comparison: BaselineComparison, force_g: np.ndarray, axis: int, vol
     basis[FormDimension.DIRECTION] = np.array([
         direction * factor for direction in directions for factor in factors])
     since_s = time_since_move_s(time_s, rates)
-    turning = np.sum([np.abs(r) for r in moving], axis=0)
+    turning = np.sum([np.abs(r) * (np.abs(r) > _SMALLEST_RATE_RAD_S) for r in moving], axis=0)
     basis[FormDimension.SINCE_MOVE] = _same_size([
         *(np.exp(-since_s / tau_s) for tau_s in _RELAXATION_S),
-        *(low_pass(turning, tau_s, dt_s, {}) for tau_s in _RELAXATION_S),
+        *(low_pass(past, tau_s, dt_s, {}) for tau_s in _RELAXATION_S
+          for past in (turning, np.sign(turning))),
         *(low_pass(along_g, tau_s, dt_s, {}) - along_g for tau_s in _CREEP_S)])
     return basis
 

@@ -412,6 +412,15 @@ def shown_row(row: CouldShow, scale_v_per_g: float) -> list[str]:
             MENU[row.revealed_by].text if row.revealed_by else '']
 
 
+def shows_row(row: CouldShow, scale_v_per_g: float) -> tuple[str, str, str, str]:
+    """Return effect, smallest and typical size, and what is missing to show it; '' for nothing."""
+    effect, _, smallest, typical, manoeuvre = shown_row(row, scale_v_per_g)
+    if row.shows:
+        return effect, smallest, typical, ''
+    of_reference = effect_named(effect).concern is Concern.REFERENCE
+    return effect, smallest, typical, 'needs --sim' if of_reference else f'needs: {manoeuvre}'
+
+
 def mg(value_mps2: Any) -> Any:
     """Convert m/s² to mg."""
     return 1e3 * value_mps2 / G0_MPS2

@@ -12,8 +12,15 @@ from typing import Any
 
 from adxl_ros.check.findings import Findings
 from adxl_ros.check.recording_check import check_recording
-from adxl_ros.files import html_page
+from adxl_ros.diagnose.data_checks import DataFault
+from adxl_ros.diagnose.diagnosis import what_shows
+from adxl_ros.diagnose.report import shows_row
+from adxl_ros.diagnose.visibility import by_effect
+from adxl_ros.errors import one_line, UserError
+from adxl_ros.files import html_page, recording
 from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files.reading_options import ReadingOptions
+from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
 from adxl_ros.tools import check_text
 from adxl_ros.tools.closing_lines import print_end, quoted
 from adxl_ros.tools.command_line import argument_parser, command
@@ -55,6 +62,8 @@ def check(options: argparse.Namespace) -> int:
         for i, path in enumerate(options.recording):
             step = _Step(show, i, len(options.recording), Path(path).name)
             results.append(check_recording(path, options.params, reading, step))
+        if len(results) == 1:
+            results = [_with_what_shows(results[0], options.params, reading)]
     page = []
     if options.report:
         make_folder(Path(options.report))
@@ -66,6 +75,25 @@ def check(options: argparse.Namespace) -> int:
         print('\n'.join(check_text.lines(results)))
         print_end([check_text.verdict(results)], page, _next_command(results, options))
     return 0 if all(result.is_sound for result in results) else 1
+
+
+def _with_what_shows(result: Findings, params: str | None, reading: ReadingOptions) -> Findings:
+    """Add which effects `diagnose` could show in a recording, and from which size."""
+    if not result.is_sound or not any(a.tool == 'diagnose' and a.is_able
+                                      for a in result.abilities):
+        return result
+    try:
+        read = recording.read(result.path, reading)
+        sensor, _ = measure_unstated(load_sensor(params, read), read)
+        shown = what_shows([read], sensor)
+    except UserError as error:
+        return replace(result, remarks=(*result.remarks, one_line(error)))
+    if isinstance(shown, DataFault):
+        return replace(result, remarks=(*result.remarks, f'diagnose: {shown.message}'))
+    scale_v_per_g = float(sensor.scale_v_per_g.mean())
+    return replace(result, shows=tuple(
+        shows_row(row, scale_v_per_g) for row in sorted(
+            by_effect(shown).values(), key=lambda row: (not row.shows, row.effect))))
 
 
 class _Step:
@@ -102,7 +130,9 @@ def _as_json(result: Findings) -> dict[str, Any]:
     return {'schema': 1, 'recording': result.path, 'sound': result.is_sound,
             'faults': list(result.faults), 'remarks': list(result.remarks), 'contents': values,
             'can': {ability.tool: {'able': ability.is_able, 'reason': ability.reason}
-                    for ability in result.abilities}}
+                    for ability in result.abilities},
+            'could_show': [dict(zip(('effect', 'from', 'typical', 'missing'), row))
+                           for row in result.shows]}
 
 
 def main() -> int:

@@ -18,6 +18,7 @@ _NAME_COLUMNS = 21
 _WIDTHS = (13, 10, 9, 8, 6)
 """Columns of length, rate, missing samples, share at rest and axes."""
 _HEAD = ('length', 'rate', 'missing', 'rest', 'axes')
+SHOWS_HEAD = ('effect', 'from', 'typical', '')
 _MOST_DETAILED = 3
 """Recordings up to which the details of sound ones are printed, too. Chosen: a screen."""
 _LABEL_COLUMNS = 12
@@ -36,6 +37,11 @@ def lines(results: list[Findings]) -> list[str]:
         [result for result in results if not result.is_sound]
     for result in detailed:
         rows += ['', result.path, *_details(result)]
+        if result.shows:
+            count = sum(not missing for *_, missing in result.shows)
+            rows += ['', f'  {count} of {len(result.shows)} effects could show to diagnose',
+                     *(f'  {a:24}{b:16}{c:14}{d}'.rstrip()
+                       for a, b, c, d in (SHOWS_HEAD, *result.shows))]
     if len(detailed) < len(results):
         rows += ['', '--report DIR and --json have the details of all recordings.']
     return [*rows, '']
@@ -119,8 +125,9 @@ def page(results: list[Findings]) -> str:
              'word': 'Sound.' if is_sound else 'Not sound.'}
     rows = [[Path(result.path).name, *_cells(result.contents), _verdict(result)]
             for result in results]
-    recordings = [{'path': result.path, 'entries': _entries(result)} for result in results]
+    recordings = [{'path': result.path, 'entries': _entries(result), 'shows': result.shows}
+                  for result in results]
     return html_page.render('adxl_ros.tools', 'check.html', {
         'title': 'Check of recordings', 'about': [], 'badge': badge,
         'figures': {}, 'columns': ('recording', *_HEAD, 'verdict'), 'rows': rows,
-        'recordings': recordings})
+        'recordings': recordings, 'shows_head': SHOWS_HEAD})

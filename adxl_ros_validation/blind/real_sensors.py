@@ -54,8 +54,7 @@ _REST_S = 1.5
 _NO_PLACE = frozenset(['cogging', 'rate_pull', 'aftermath', 'motor_current', 'magnet', 'supply',
                        'bandwidth', 'saturation', 'flicker'])
 """Defects of joints, supply and filter, which need more than samples; sensors have flicker."""
-_OF_TEMPERATURE = frozenset(['temperature_bias', 'temperature_scale', 'thermal_loop',
-                             'warming_rate'])
+_OF_TEMPERATURE = frozenset(['temperature_bias', 'temperature_scale', 'thermal_loop'])
 _OF_MOTION = frozenset(['time_offset', 'clock_skew', 'vibration_rectification', 'creep'])
 _OF_FORCE = frozenset(['scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z',
                        'scale_factor_cross', 'scale_factor_z', 'nonlinearity', 'quadratic',

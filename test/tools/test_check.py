@@ -234,3 +234,14 @@ def test_a_foreign_log(tmp_path: Path) -> None:
                      'time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg')
     assert result['contents']['length_g'] == pytest.approx(1.0, abs=0.01)
     assert result['sound']
+
+
+def test_effects_that_a_recording_could_show_are_listed(tmp_path: Path) -> None:
+    assert run_executable('simulate', 'tilt_both', '--rate', '100', '-o', 'moves.csv',
+                          cwd=tmp_path).returncode == 0
+    rows = {row['effect']: row for row in checked(tmp_path, 'moves.csv')['could_show']}
+    assert rows['bias']['missing'] == ''
+    assert rows['bias']['from'].endswith('mg')
+    assert rows['supply']['missing'] == 'needs: step the supply at rest'
+    assert rows['reference_delay']['missing'] == 'needs --sim'
+    assert 'needs: step the supply at rest' in run(tmp_path, 'moves.csv').stdout
