@@ -9,8 +9,6 @@
 # make reproduction  docs/reproduction.md and its plots: the paper's experiments on simulated units
 # make coverage do the intervals hold? 300 drawn units and stages, as a table
 # make faults   the links under every fault, as a table
-# make soak     half an hour of random faults, and 200 kills of a sweep
-# make fuzz     the decoder and the serial link, two minutes of hostile bytes
 # make noise    how often the intervals of noise hold the truth: docs/noise.md
 # make investigate  minutes to a verdict of `investigate` over 60 simulated units: docs/investigate.md, an hour
 # make nulls    recordings without any effect through diagnose: docs/nulls.md, 90 minutes
@@ -20,7 +18,7 @@
 # make lint     the linters alone
 # make clean    remove what these made
 
-.PHONY: build developed help demo check test perf bench gallery screenshots reproduction coverage faults soak fuzz noise nulls investigate blind working lint clean \
+.PHONY: build developed help demo check test perf bench gallery screenshots reproduction coverage faults noise nulls investigate blind working lint clean \
     FORCE
 .DEFAULT_GOAL := build
 
@@ -139,15 +137,6 @@ python_in_test = cd test && ../run --exec sh -c 'PYTHONPATH="support:$$PYTHONPAT
 
 faults: developed
 	$(python_in_test) support/faults.py $(ARGS)
-
-soak: developed
-	$(python_in_test) long/soak.py $(ARGS)
-
-# With atheris where it installs; else by mutations of its own.
-fuzz: developed
-	-.venv/bin/python -m pip install --quiet --disable-pip-version-check \
-	    --requirement requirements/fuzz.txt
-	$(python_in_test) long/fuzz_links.py $(ARGS)
 
 noise: developed
 	$(python_in_test) long/noise_coverage.py $(ARGS)

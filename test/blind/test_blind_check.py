@@ -4,13 +4,10 @@
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
-import hashlib
 import json
-from pathlib import Path
 import shutil
 import sys
 
-from adxl_ros.errors import UserError
 from adxl_ros.files.plot_file import pyplot
 from adxl_ros.jobs.pools import open_pool
 from adxl_ros_validation.blind import (
@@ -46,7 +43,6 @@ out.mkdir()
     'gap': {{'closed': None, 'before': 0.01}}, 'candidates': []}}))
 """
 NOTHING = "def answer(recording, parameters): return 'no_gap', [[[], 0.9], [['bias'], 0.1]]"
-ALWAYS = "def answer(recording, parameters): return 'explained', [[['lever_arm'], 1.0]]"
 # Searches labels near its files, in its arguments and environment, and in a given folder.
 CHEAT = """
 def answer(recording, parameters):
@@ -133,37 +129,6 @@ def test_only_the_label_file_contains_labels(committed_check):
         assert b'"seed"' not in data, path
 
 
-def test_labels_have_the_committed_hash(committed_check, null_check, tmp_path, pool):
-    folder, made = null_check
-    text = (folder / 'labels' / 'labels.json').read_bytes()
-    digest = json.loads((committed_check / 'seal.json').read_bytes())['sha256_of_salt_and_labels']
-    assert hashlib.sha256(text).hexdigest() == digest == made['hash']
-    drawn = [trials.draw_label(plan) for plan in trials.plans(SEED, TRIALS, SECONDS)[:1]]
-    opened = trials.committed_labels(folder).labels[:1]
-    assert [label.effects for label in drawn] == [label.effects for label in opened]
-    assert [fault['size'] for label in drawn for fault in label.faults] == pytest.approx(
-        [fault['size'] for label in opened for fault in label.faults])
-    other = copied(committed_check, null_check, tmp_path)
-    (other / 'labels' / 'labels.json').write_bytes(text.replace(b'"single"', b'"pair"'))
-    with pytest.raises(UserError, match='not the labels whose hash'):
-        check.score(other, script(tmp_path, NOTHING), pool, show)
-
-
-def test_a_folder_of_an_older_version_is_refused_in_one_line(committed_check, tmp_path, pool):
-    """Encrypted labels, and labels of an earlier form, do not cause a message about a key."""
-    shutil.copytree(committed_check, tmp_path / 'encrypted')
-    labels = tmp_path / 'encrypted' / 'labels'
-    (labels / 'labels.json').rename(labels / 'labels.sealed')
-    with pytest.raises(UserError, match='an older version encrypted these labels'):
-        check.score(tmp_path / 'encrypted', None, pool, show)
-    drawn = tmp_path / 'drawn' / 'labels' / 'drawn'
-    drawn.mkdir(parents=True)
-    for text in ('{"seed": 1, "trials": 2}', '[]', '', '{"seed": 1, "trials": 2, "label": {}}'):
-        (drawn / 'r0000.json').write_text(text)
-        with pytest.raises(UserError, match='of another version'):
-            check.draw(tmp_path / 'drawn', 1, 2, pool, no_progress)
-
-
 def test_scores_of_a_diagnosis_without_effects(null_check):
     made = null_check[1]
     assert made['scores']['false_alarms']['value'] == 0
@@ -187,81 +152,6 @@ def test_a_diagnosis_cannot_reach_the_labels(committed_check, null_check, tmp_pa
                          show)
     assert all(sorted(row['named']) == sorted(row['effects']) for row in opened['rows']
                if row['group'] != 'zero')
-
-
-def test_scores_of_a_diagnosis_with_a_constant_effect(committed_check, null_check, tmp_path, pool):
-    folder = copied(committed_check, null_check, tmp_path)
-    made = check.score(folder, script(tmp_path, ALWAYS), pool, show)
-    score = made['scores']
-    assert score['false_alarms']['value'] == 1
-    singles = [row for row in made['rows'] if row['group'] == 'single']
-    right = [row['effects'] == ['lever_arm'] for row in singles]
-    assert score['top_1_all_singles']['value'] == sum(right) / len(right)
-    assert {name for row in score['confusion'].values() for name in row} == {'lever_arm'}
-    assert score['set_size']['value'] == 1
-    assert score['calibration_error']['value'] == pytest.approx(
-        1 - score['verdict_right']['value'])
-    met = {row['name']: row['met'] for row in made['bars']}
-    assert not met['false_alarms'] and not met['top_1'] and not met['calibration_error']
-    assert not made['leaks']
-    permuted = made['controls']['labels_permuted']
-    assert permuted['score'] == pytest.approx(permuted['chance'], abs=0.02)
-    text = report_html.page(made, pyplot())
-    assert text.count('<img') == 4 and 'http' not in text.replace('http-equiv', '')
-    assert '| false alarms | 1 (' in report_html.markdown(made)
-
-
-def test_a_process_has_only_its_recording(committed_check, tmp_path):
-    body = """
-def answer(recording, parameters):
-    seen = [sorted(path.name for path in Path.cwd().iterdir()), dict(os.environ)]
-    return 'no_gap', [[[], 1.0], [[json.dumps(seen)], 0.0]]
-"""
-    csv = committed_check / 'recordings' / 'r0000.csv'
-    name, result = diagnosis_runs.diagnose('r0000', csv.read_bytes(), b'', script(tmp_path, body))
-    files, environment = json.loads(result['report']['hypotheses'][1]['effects'][0])
-    assert name == 'r0000' and files == ['r0000.csv', 'r0000.yaml']
-    assert not any(str(committed_check.parent) in value for value in environment.values())
-    assert environment['HOME'] != str(Path.home())
-
-
-def test_an_interrupted_check_resumes(committed_check, null_check, tmp_path, pool):
-    folder = copied(committed_check, null_check, tmp_path)
-    command = script(tmp_path, NOTHING)
-
-    class Cut(Exception):
-        pass
-
-    def cut(done):
-        if done > 0.4:
-            raise Cut
-
-    with pytest.raises(Cut):
-        diagnosis_runs.diagnose_all(folder, command, pool, cut)
-    before = {path: path.stat().st_mtime_ns for path in (folder / 'reports').glob('r*.json')}
-    assert 0 < len(before) < TRIALS
-    assert len(diagnosis_runs.diagnose_all(folder, command, pool, no_progress)) == TRIALS + 2
-    assert all(path.stat().st_mtime_ns == time for path, time in before.items())
-    with pytest.raises(UserError, match='another version'):
-        diagnosis_runs.diagnose_all(folder, script(tmp_path, ALWAYS), pool, no_progress)
-
-
-def test_drawing_resumes(tmp_path, pool):
-    plans = trials.plans(3, 2, SECONDS)
-
-    def twice(plan):
-        if plan.name == 'r0002' and not (tmp_path / 'again').exists():
-            raise KeyboardInterrupt
-        return trials.draw_trial(plan)
-
-    with pytest.raises(KeyboardInterrupt):
-        trials.commit(tmp_path / 'blind', Setup(3, 2), plans, pool, no_progress, twice)
-    (tmp_path / 'again').touch()
-    digest = trials.commit(tmp_path / 'blind', Setup(3, 2), plans, pool, no_progress,
-                           twice)
-    opened = trials.committed_labels(tmp_path / 'blind')
-    assert digest == trials.published_hash(tmp_path / 'blind')
-    assert [label.name for label in opened.labels] == ['r0000', 'r0001', 'r0002']
 
 
 def test_a_failed_diagnosis_is_counted(tmp_path):
@@ -304,16 +194,6 @@ def test_a_generator_that_leaks_labels_is_detected(null_check, tmp_path, pool):
     assert 'LEAKS' in report_html.summary(made) and 'LEAKS' in report_html.page(made, pyplot())
 
 
-def test_an_answer_at_strength_zero_is_a_leak(tmp_path):
-    """A diagnosis that uses marks of the generator names effects of strength zero."""
-    labels, answers = drawn_labels(), []
-    for label in labels:
-        text = padded(label, 'time_s,x_v\n0.0,2.5\n')
-        answers.append(grading.answer(diagnosis_runs.diagnose(
-            label.name, text.encode(), b'', script(tmp_path, PADDED))[1]))
-    assert check.strength_zero(labels, answers)['leaks']
-
-
 def drawn_labels():
     """Return labels of the usual mix, without their recordings."""
     common = {'manoeuvre': 'rich', 'axes': 'xyz', 'floor_mps2': 0.01}
@@ -349,25 +229,6 @@ def test_perfect_and_wrong_answers():
                            for label in labels])
     assert wrong['false_alarms']['value'] == 1 and wrong['top_1']['value'] == 0
     assert {row['name'] for row in scores.bars(wrong) if row['met']} == {'harm'}
-
-
-def test_a_verdict_with_groups_is_right_if_they_contain_the_truth():
-    label = next(label for label in drawn_labels() if label.group == 'pair')
-    first, second = label.effects
-    given = answered(label)
-
-    def verdict(certain, *groups):
-        return replace(given, status='inseparable', certain=frozenset(certain),
-                       groups=tuple(frozenset(group) for group in groups))
-
-    assert grading.verdict_right(verdict([first], [second, 'a']), label)
-    assert grading.verdict_right(verdict([], [second, 'a'], [first, 'b']), label)
-    assert not grading.verdict_right(verdict([first], ['a', 'b']), label)
-    assert not grading.verdict_right(verdict([], [first, second]), label)
-    assert not grading.verdict_right(verdict([first, second], ['a', 'b']), label)
-    label.faults[0]['power'] = 0.1
-    assert grading.verdict_right(verdict([second]), label)
-    assert not grading.verdict_right(verdict([first]), label)
 
 
 def test_the_detection_curve_contains_the_true_strength():
@@ -467,27 +328,6 @@ def said(status, *effects):
     """Return an answer that names effects for certain."""
     return grading.Answer(status, frozenset(effects), (), 0.8, ((frozenset(effects), 0.8),), {},
                           1.0)
-
-
-def test_recordings_that_cannot_take_part_are_named(tmp_path):
-    (tmp_path / 'short.csv').write_text('time_s,ax_mps2\n0.0,1.0\n1.0,1.0\n')
-    (tmp_path / 'other.csv').write_text('a,b\n0,1\n1,2\n')
-    (tmp_path / 'list.yaml').write_text('recordings: [{file: gone.csv, address: http://x}]')
-    with pytest.raises(UserError, match='other.csv: is no recording.*short.csv: has 1 s'):
-        real_sensors.prepare(tmp_path)
-    with pytest.raises(UserError, match='gone.csv: no such file; the manifest has its address'):
-        real_sensors.prepare(tmp_path / 'list.yaml')
-
-
-def test_on_a_cluster(committed_check, null_check, tmp_path):
-    distributed = pytest.importorskip(
-        'distributed', reason='distributed is not installed: pip install distributed')
-    folder = copied(committed_check, null_check, tmp_path)
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None,
-                                  local_directory=str(tmp_path)) as cluster, \
-            open_pool(cluster.scheduler_address) as pool:
-        results = diagnosis_runs.diagnose_all(folder, script(tmp_path, NOTHING), pool, no_progress)
-    assert len(results) == TRIALS + 2 and all(result['report'] for result in results.values())
 
 
 def test_the_command_commits_and_scores(run_tool, tmp_path):

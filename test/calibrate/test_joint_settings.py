@@ -9,9 +9,9 @@ from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, StageMod
 from adxl_ros.calibrate.guided.pose_plan import Target
 from adxl_ros.calibrate.guided.stage_guide import StageGuide
 from adxl_ros.calibrate.joint_settings import recorded_settings, SettingTracker
-from adxl_ros.calibrate.poses import join_poses, Poses
+from adxl_ros.calibrate.poses import Poses
 from adxl_ros.files import recording
-from adxl_ros.files.recording_columns import COMMANDS, Recording
+from adxl_ros.files.recording_columns import COMMANDS
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.files.stream_unit import recorded_unit
 from adxl_ros.model.kinematics import specific_force
@@ -24,9 +24,8 @@ from setting_checks import (
     by_rests,
     check_all_agree,
     same_partition,
-    without_settings,
 )
-from units import Bench, Fed, nominal, pose_record
+from units import Bench, Fed, nominal
 
 NAN = float('nan')
 STEP = 1e-3
@@ -120,20 +119,6 @@ def test_the_live_tracker_and_a_recording_agree(monkeypatch):
     assert 200 < moves < 580
 
 
-def test_rests_may_come_in_any_order():
-    readings, commands = np.array(changed(r15_60=0.3)), np.array(changed(r35_60=0.1))
-    assert recorded_settings(np.array(RESTS)[[2, 0, 1]], readings, commands,
-                             TOLERANCE).tolist() == [2, 0, 1]
-    assert recorded_settings(np.array(RESTS), None, commands, TOLERANCE).tolist() == [0, 0, 1]
-    assert recorded_settings(np.array(RESTS), readings, None, TOLERANCE).tolist() == [0, 1, 1]
-    assert recorded_settings(np.array(RESTS[:1]), readings, None, TOLERANCE).tolist() == [0]
-
-
-def test_the_tolerance_is_one_and_a_half_steps_of_the_encoder():
-    assert joint_settings.angle_tolerance_rad(nominal(stage_resolution_rad=2e-3)) == 3e-3
-    assert joint_settings.angle_tolerance_rad(nominal(stage_resolution_rad=0.0)) == 1e-5
-
-
 ALPHA, BETA = np.pi / 2, np.pi / 6
 PLAN = [Target(ALPHA, 0.0), Target(ALPHA, BETA), Target(1.2, BETA), Target(1.2, BETA),
         Target(1.2, 0.0)]
@@ -165,82 +150,6 @@ def numbers(entries):
     return [e.alpha_setting for e in by_time], [e.beta_setting for e in by_time]
 
 
-@pytest.mark.parametrize('mode', ['commanded', 'encoder', 'manual'])
-def test_a_sweep_numbers_its_settings(mode):
-    """A joint keeps its setting if the next target does not move it."""
-    on = bench(mode)
-    entries = [take(on) for _ in PLAN]
-    assert numbers(entries) == ([0, 0, 1, 1, 1], [0, 1, 1, 1, 2])
-    assert on.sweep.target is None
-
-
-def test_a_joint_that_the_operator_turns_has_moved():
-    """With an encoder a turn away and back is a move, and flicker is not."""
-    step = nominal().stage_resolution_rad
-    on = bench('encoder', [Target(ALPHA, 0.0)] * 4)
-    entries = [take(on)]
-    on.run(0.2, ALPHA + 0.1, 0.0)
-    entries.append(take(on))
-    on.run(0.2, ALPHA + step, -step)
-    entries.append(take(on, ALPHA + step))
-    on.run(0.2, ALPHA, 2 * step)
-    entries.append(take(on))
-    assert numbers(entries) == ([0, 1, 1, 1], [0, 0, 0, 1])
-
-
-def test_a_command_below_the_encoder_step_is_a_move():
-    """A stage has a new error after a command below the encoder step, or away and back."""
-    tiny = nominal().stage_resolution_rad / 10
-    on = bench('commanded', [Target(ALPHA, 0.0), Target(ALPHA, tiny), Target(ALPHA, tiny)])
-    assert numbers([take(on, beta=0.0) for _ in range(3)]) == ([0, 0, 0], [0, 1, 1])
-    by_others = bench('encoder', [Target(ALPHA, 0.0)] * 5)
-    entries = []
-    for commands in ([(ALPHA, 0.0)], [(ALPHA, 0.0), (ALPHA, NAN)], [(ALPHA, 0.1), (NAN, 0.0)],
-                     [(ALPHA, np.inf)], [(1.0, 0.0)]):
-        for command in commands:
-            by_others.sweep.read_command(*command)
-        entries.append(take(by_others))
-    assert numbers(entries) == ([0, 0, 0, 0, 1], [0, 0, 1, 1, 1])
-
-
-@pytest.mark.parametrize('mode', ['commanded', 'manual'])
-def test_a_skipped_target_counts_as_a_command(mode):
-    """Skip and redo move the stage, or the operator, away and back."""
-    on = bench(mode)
-    entries = [take(on)]
-    on.sweep.skip()
-    assert on.sweep.target == PLAN[2]
-    on.sweep.skip()
-    entries.append(take(on))
-    assert numbers(entries) == ([0, 1], [0, 1])
-    # The pose before is repeated: its joints have moved to the last target and back.
-    on.sweep.redo()
-    entries.append(take(on))
-    entries.append(take(on))
-    assert numbers(entries) == ([0, 1, 1, 1], [0, 1, 2, 3])
-
-
-def test_a_refused_pose_and_readings_after_the_dwell_are_no_moves():
-    """Only taken poses count. An early move of the stage belongs to the next pose."""
-    on = bench('encoder', [Target(ALPHA, 0.0)] * 3, temperature_span_c=1.0)
-    on.sweep.surroundings.temperature_c.add(on.now_ns, 20.0)
-    entries = [take(on)]
-    on.sweep.surroundings.temperature_c.add(on.now_ns, 30.0)
-    on.run(0.2, ALPHA, 0.0)
-    assert on.sweep.capture() == ''
-    assert on.run(3, ALPHA, 0.0) is None
-    assert 'temperature moved' in on.sweep.new_refusal()
-    on.sweep.surroundings.temperature_c.add(on.now_ns, 20.0)
-    on.sweep.capture()
-    entry = on.run(3, ALPHA, 0.0)
-    on.sweep.read_encoder(entry.stop_ns + 10_000_000, ALPHA + 0.02, 0.0)
-    again = on.sweep.accept()
-    assert again.alpha_setting == entry.alpha_setting == 0
-    on.sweep.take(again)
-    entries += [again, take(on)]
-    assert numbers(entries) == ([0, 0, 1], [0, 0, 0])
-
-
 def test_after_an_interruption_both_joints_have_moved():
     """The stage may have lost power. Numbers continue, and the mounting check counts as a move."""
     on = bench(targets=[Target(ALPHA, 0.0), *[Target(ALPHA, BETA)] * 5])
@@ -264,41 +173,6 @@ def test_after_an_interruption_both_joints_have_moved():
         assert on.run(3, target.alpha_rad, target.beta_rad) is None
     entries.append(take(on))
     assert numbers(entries) == ([0, 0, 0], [0, 1, 2])
-
-
-@pytest.mark.parametrize('back_s', [5, 86400])
-@pytest.mark.parametrize('mode', ['commanded', 'encoder', 'manual'])
-def test_after_a_clock_step_both_joints_count_as_moved(mode, back_s):
-    """The numbers of later poses follow the usual rule."""
-    on = bench(mode, [Target(ALPHA, 0.0), *[Target(ALPHA, BETA)] * 5])
-    entries = [take(on) for _ in range(3)]
-    on.now_ns -= back_s * 10 ** 9
-    on.run(0.2, ALPHA, BETA)
-    while on.sweep.poses_to_verify:
-        target = on.sweep.target
-        on.sweep.capture()
-        assert on.run(3, target.alpha_rad, target.beta_rad) is None
-    after = [take(on) for _ in range(3)]
-    assert numbers(entries) == ([0, 0, 0], [0, 1, 1])
-    assert numbers(after) == ([1, 1, 1], [2, 2, 2])
-
-
-def test_journals_of_earlier_versions_are_numbered_by_their_angles():
-    """The order of time counts, not that of the entries, also with new entries."""
-    entries = [pose_record(i, mean_v=(2.5,), std_v=(1e-5,), alpha_rad=alpha, beta_rad=beta,
-                           start_ns=10 * i, stop_ns=10 * i + 5)
-               for i, (alpha, beta) in enumerate([(1, 0), (1, 1), (1, 0), (2, 0)])]
-    poses = Poses.from_records([entries[i] for i in (2, 0, 3, 1)])
-    assert poses.alpha_setting.tolist() == [0, 0, 1, 0]
-    assert poses.beta_setting.tolist() == [2, 0, 2, 1]
-    new = [replace(entries[3], start_ns=100 + i, alpha_setting=0, beta_setting=i)
-           for i in range(2)]
-    mixed = Poses.from_records([*entries, *new])
-    assert mixed.alpha_setting.tolist() == [0, 0, 0, 1, 2, 2]
-    assert len(set(mixed.beta_setting.tolist())) == 5
-    both = join_poses([poses, Poses.from_records(new)])
-    assert both.alpha_setting.tolist() == [0, 0, 1, 0, 2, 2]
-    assert Poses.from_records([replace(entries[0], alpha_rad=NAN)]).alpha_setting.tolist() == [0]
 
 
 class Run:
@@ -400,27 +274,3 @@ def test_sweep_journal_bag_and_csv_give_the_same_settings(tmp_path):
     assert (poses.alpha_setting == -1).all(), 'the numbers of a journal are kept'
     _, beta = by_rests(read, unit, entries)
     assert same_partition(beta.tolist(), [0, 1, 3, 4, 5, 5, 5, 5, 7])
-
-
-def test_a_sweep_with_a_journal_of_an_earlier_version_is_numbered_by_the_recording(tmp_path):
-    """The entries determine the rests, and the samples determine the moves."""
-    run = Run([Target(0.5, 0.0), Target(0.5, 0.8), Target(0.5, 0.8)])
-    for _ in range(2):
-        run.pose()
-    # Beta turns away and back.
-    run.stage.position[1] += 0.1
-    run.pose()
-    read = recording.read(run.bag(tmp_path / 'bag'))
-    unit = recorded_unit(run.sensor, read)
-    bare = without_settings(run.entries)
-    poses = pose_extraction.extract_poses(read, unit, bare)
-    assert poses.alpha_setting.tolist() == [0, 0, 0]
-    assert poses.beta_setting.tolist() == [0, 1, 2]
-    assert Poses.from_records(run.entries).beta_setting.tolist() == [0, 1, 2]
-
-
-def test_a_recording_without_a_stage_has_one_setting():
-    columns = {'x_v': np.random.default_rng(0).normal(2.5, 1e-3, 5000)}
-    read = Recording('made', np.arange(5000) / 1000, columns, sensor_info(nominal('x')))
-    poses = pose_extraction.extract_poses(read, replace(nominal('x'), rate_hz=1000.0))
-    assert set(poses.alpha_setting.tolist()) == {0}

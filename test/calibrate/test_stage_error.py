@@ -7,8 +7,6 @@ from dataclasses import replace
 
 from adxl_ros.calibrate import pose_response
 from adxl_ros.calibrate.fits import full_model, linearised
-from adxl_ros.calibrate.guided import pose_plan
-from adxl_ros.calibrate.poses import join_poses, Poses
 from adxl_ros.calibrate.stage_error import PoseCovariance, shared_settings, StageError
 from adxl_ros.model.coefficients import with_neutral
 import numpy as np
@@ -67,18 +65,6 @@ def test_predicted_errors_are_the_best_linear_estimates(poses):
                                rtol=1e-7, atol=1e-15)
 
 
-def test_excluded_poses_change_nothing(poses):
-    """Products of some poses equal those of a covariance of these poses."""
-    slope = pose_response.angle_jacobian(nominal(), poses)
-    columns = np.random.default_rng(1).normal(size=(len(poses), 2, 3))
-    kept = np.arange(len(poses)) % 7 != 0
-    some = PoseCovariance(slope, poses, shared_settings(poses), ERROR, kept)
-    part_of_poses = poses.subset(kept)
-    separate = PoseCovariance(slope[kept], part_of_poses, shared_settings(part_of_poses), ERROR)
-    np.testing.assert_allclose(some.products(columns), separate.products(columns[kept]), rtol=1e-8)
-    assert some.log_determinant() == pytest.approx(separate.log_determinant(), abs=1e-6)
-
-
 def test_the_stated_error_counts_where_poses_do_not_determine_it(poses):
     """With few poses the level is the stated one, and many poses determine it."""
     unit = with_neutral(nominal(), ('bias', 'scale_factor', 'base_tilt'))
@@ -89,32 +75,3 @@ def test_the_stated_error_counts_where_poses_do_not_determine_it(poses):
     quiet = replace(poses, volts=pose_response.predicted_volts(unit, poses))
     many = linearised.linearised(unit, quiet, names, precision)
     assert many.stage_error(1e-3).total_rad < 1e-4
-
-
-def test_different_errors_of_the_joints_are_estimated():
-    """Alpha has nine times the variance of beta, and the sweep moves both often."""
-    rng = np.random.default_rng(5)
-    truth = drawn(rng, nominal())
-    targets = pose_plan.guided(pose_plan.default_planes_rad('xy'), pose_plan.STEP_RAD, 0)
-    poses = swept(rng, truth, targets=targets, noisy=False)
-    step = np.radians(5 / 60)
-    shift_rad = [factor * step * rng.uniform(-0.5, 0.5, len(poses))[setting]
-                 for factor, setting in ((3, poses.alpha_setting), (1, poses.beta_setting))]
-    volts = pose_response.predicted_volts(truth, replace(
-        poses, alpha_rad=poses.alpha_rad + shift_rad[0], beta_rad=poses.beta_rad + shift_rad[1]))
-    estimate = full_model.fit_full(nominal(), replace(
-        poses, volts=volts + poses.std_v * rng.normal(size=volts.shape)))
-    alpha, beta = estimate.stage.setting_rad * estimate.stage.joints * np.sqrt(12) / step
-    assert alpha == pytest.approx(3, rel=0.2) and beta == pytest.approx(1, rel=0.4)
-
-
-def test_settings_without_numbers_follow_the_angles():
-    """Each change of the angle is a move, and a setting ends with its recording."""
-    alpha, beta = np.array([0.0, 0.0, 1.0, 0.0]), np.array([0.0, 1.0, 1.0, 1.0])
-    nothing = np.zeros((4, 2))
-    single = Poses(nothing, nothing, alpha, beta, nothing, np.zeros(4, bool))
-    assert single.alpha_setting.tolist() == [0, 0, 1, 2]
-    assert single.beta_setting.tolist() == [0, 1, 1, 1]
-    both = join_poses([single, single])
-    assert both.alpha_setting.tolist() == [0, 0, 1, 2, 3, 3, 4, 5]
-    assert both.subset(np.array([3, 4])).beta_setting.tolist() == [1, 2]

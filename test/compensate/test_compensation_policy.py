@@ -7,7 +7,6 @@ from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 from adxl_ros.compensate.compensation_policy import CompensationPolicy, Interval, State, Topics
-from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store
 from adxl_ros.files.stream_info import sensor_info, StreamInfo
 from adxl_ros.model.coefficients import with_neutral
@@ -76,20 +75,6 @@ def test_a_stream_is_refused_until_it_belongs_to_the_unit(key: str, value: str,
     assert policy.status(QUIET, None, '') == (State.COMPENSATING, 'compensating')
 
 
-def test_the_papers_inverse_needs_two_axes() -> None:
-    with pytest.raises(UserError, match='needs the axes x and y'):
-        policy_for(unit(), paper=True).check(nominal('x'))
-    policy_for(unit(axes='xyz'), paper=True).check(nominal('xyz'))
-
-
-def test_the_rate_of_the_stream_precedes_that_of_the_calibration() -> None:
-    assert policy_for(unit(), rate_hz='250.0').rate_hz == 250.0
-    assert policy_for(unit(), rate_hz='none').rate_hz == 1000.0
-    policy = CompensationPolicy(False, '', TOPICS)
-    policy.use(unit(), '')
-    assert policy.rate_hz == 1000.0
-
-
 def test_the_newest_calibration_of_the_unit_is_chosen(tmp_path: Path) -> None:
     stored(tmp_path, unit(seed=1), 30.0)
     newest = stored(tmp_path, unit(seed=2), 10.0)
@@ -105,23 +90,6 @@ def test_the_newest_calibration_of_the_unit_is_chosen(tmp_path: Path) -> None:
     assert not policy.is_named(path)
     fresh = stored(tmp_path, unit(seed=5), 0.0)
     assert policy.choose(path) == (str(fresh), [])
-
-
-def test_a_named_calibration_is_not_replaced(tmp_path: Path) -> None:
-    stored(tmp_path, unit(seed=2), 0.0)
-    named = policy_for(nominal(serial='17'), tmp_path)
-    assert named.is_named('/a/file.yaml')
-    assert named.choose('/a/file.yaml') == ('', [])
-    with_coefficients = policy_for(unit(), tmp_path)
-    assert with_coefficients.choose('') == ('', [])
-
-
-def test_without_a_unit_or_a_store_nothing_is_chosen(tmp_path: Path) -> None:
-    stored(tmp_path, unit(), 0.0)
-    assert policy_for(nominal(), tmp_path).choose('') == ('', [])
-    assert policy_for(nominal(serial='17')).choose('') == ('', [])
-    assert policy_for(nominal(serial='18'), tmp_path).choose('') == (
-        '', [f'no calibration of 18 in {tmp_path}'])
 
 
 def test_a_newer_calibration_is_announced_unless_one_was_named(tmp_path: Path) -> None:
@@ -151,21 +119,6 @@ def test_states_of_the_samples(counts: dict[str, int], state: State, text: str) 
     status = policy_for(unit()).status(interval, None, '')
     assert status.state is state
     assert text in status.text
-
-
-def test_a_short_interval_does_not_count_as_silence() -> None:
-    interval = replace(QUIET, counts={'received': 0}, duration_s=0.01)
-    assert policy_for(unit()).status(interval, None, '').state is State.COMPENSATING
-
-
-def test_states_of_the_stream() -> None:
-    policy = CompensationPolicy(False, '', TOPICS)
-    policy.use(unit(), 'a file')
-    assert policy.status(QUIET, None, '') == (
-        State.NOT_CONFIRMED, 'unit not confirmed: nothing on /sensor_info')
-    assert policy.values(QUIET, None)['unit'] == 'not confirmed'
-    assert policy_for(nominal()).status(QUIET, None, '').state is State.NOT_CALIBRATED
-    assert policy_for(nominal()).values(QUIET, None)['validity'] == 'not calibrated'
 
 
 @pytest.mark.parametrize(('of_file', 'of_stream', 'stated'), [

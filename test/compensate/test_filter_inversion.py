@@ -2,23 +2,16 @@
 
 """The inversion of the RC filter, and the paper's approximate inverse with the exact one."""
 
-from dataclasses import replace
 from itertools import pairwise
 
 from adxl_ros.compensate import filter_inversion, paper_inverse
-from adxl_ros.compensate.sample_by_sample import LiveEstimator
-from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.recording_columns import Recording
-from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.coefficients import put, with_neutral
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.filters import low_pass
 from adxl_ros.model.kinematics import specific_force
-from adxl_ros.model.scalar_or_array import FLOATS
 from adxl_ros.simulate.motion import Held, Motion
 from adxl_ros.simulate.response import Response
-from adxl_ros.simulate.trajectories import Sine
 import numpy as np
 import pytest
 from units import drawn, nominal
@@ -43,17 +36,6 @@ def test_amplitude_and_phase_are_restored():
     back = filter_inversion.undo(volts, time_s, RC_S, RATE_HZ)[300:-20]
     expected = np.column_stack([felt(time_s), 2 * felt(time_s)])[300:-20]
     assert np.abs(back - expected).max() < 2e-3
-
-
-def test_the_inverse_does_not_bridge_a_gap():
-    """Samples beside a gap use only samples of their side."""
-    time_s, volts = filtered([np.sin, np.cos])
-    kept = np.ones(len(time_s), bool)
-    kept[900:1400] = False
-    back = filter_inversion.undo(volts[kept], time_s[kept], RC_S, RATE_HZ)
-    without_gap = filter_inversion.undo(volts, time_s, RC_S, RATE_HZ)[kept]
-    assert np.abs(back - without_gap)[500:].max() < 0.03
-    np.testing.assert_array_equal(back[900], volts[kept][900])
 
 
 @pytest.mark.parametrize('sizes', [[2000], [700, 3, 1297], [16] * 125])
@@ -102,30 +84,6 @@ def test_the_predicted_variance_of_restored_noise_is_right():
         filter_inversion.noise_variance_v2(sensor), rel=0.02)
 
 
-def test_apply_restores_the_amplitude_of_a_motion(run_tool, tmp_path):
-    """10 Hz of 0.118 m/s² have their amplitude with --undo-filter, and 0.83 of it without."""
-    sensor = replace(nominal(), noise_density_g_per_rthz=np.zeros(2))
-    motion = Motion(4.0, Held(np.pi / 4), Held(np.pi / 2), Sine(30e-6, 10.0))
-    time_s = np.arange(4000) / 1000
-    volts = Response(sensor, motion, 0)(time_s)
-    parameter_file.save(tmp_path / 'unit.yaml', sensor)
-    recording.write(tmp_path / 'made.csv', Recording(
-        'made', time_s, dict(zip(('x_v', 'y_v'), volts.T)), sensor_info(sensor)), sensor)
-    amplitude = {}
-    for options in ((), ('--undo-filter',)):
-        run_tool('apply', tmp_path / 'made.csv', '--params', tmp_path / 'unit.yaml', *options,
-                 '-o', tmp_path / 'out.csv')
-        table = np.genfromtxt(tmp_path / 'out.csv', delimiter=',', names=True)
-        phase = 2 * np.pi * 10 * time_s[1000:3000]
-        ax = table['ax_mps2'][1000:3000]
-        amplitude[options] = 2 * np.mean(ax * np.exp(-1j * phase)) / -1j
-    # -0.118 m/s² is the acceleration of +30 µm·sin.
-    true_mps2 = -30e-6 * (2 * np.pi * 10) ** 2
-    assert abs(amplitude['--undo-filter',] / true_mps2 - 1) < 5e-3
-    assert abs(amplitude[()] / true_mps2) == pytest.approx(0.833, abs=5e-3)
-    assert np.degrees(np.angle(amplitude[()] / true_mps2)) == pytest.approx(-33.6, abs=0.5)
-
-
 def unit(rng, **options):
     """Draw a unit of the paper's terms."""
     return drawn(rng, nominal(**options))
@@ -148,35 +106,3 @@ def test_the_papers_inverse_is_approximate_and_the_other_exact(axes):
     paper = np.subtract(paper_inverse.inverse(sensor)(volts), force)
     assert np.abs(exact).max() < 1e-9
     assert 1e-4 < np.abs(paper[:2]).max() < 0.05
-
-
-def test_the_papers_inverse_is_exact_for_a_linear_unit():
-    """Without cross-axis terms the inverse has no approximation."""
-    sensor = drawn(np.random.default_rng(2), nominal(), ('bias', 'scale_factor'))
-    force = poses()
-    back = paper_inverse.inverse(sensor)(signal_chain.static_response(sensor)(force))
-    np.testing.assert_allclose(back, force, atol=1e-9)
-
-
-def test_the_papers_inverse_is_equal_for_floats_and_arrays():
-    """Single samples as floats have the results of arrays."""
-    sensor = unit(np.random.default_rng(4))
-    volts = signal_chain.static_response(sensor)(poses(5))
-    force = np.transpose(paper_inverse.inverse(sensor)(volts))
-    single = paper_inverse.inverse(sensor, maths=FLOATS)
-    live = LiveEstimator(sensor, paper=True)
-    for i, expected in enumerate(force):
-        sample_v = [float(v[i]) for v in volts]
-        np.testing.assert_allclose(single(sample_v), expected, atol=1e-12)
-        np.testing.assert_allclose(live.from_volts(sample_v, float(i)).force, expected, atol=1e-12)
-
-
-def test_the_papers_inverse_needs_two_axes(run_tool, tmp_path):
-    """A sensor of one axis is refused in one line."""
-    sensor = nominal('x')
-    parameter_file.save(tmp_path / 'unit.yaml', sensor)
-    recording.write(tmp_path / 'made.csv', Recording(
-        'made', np.arange(10) / 1000, {'x_v': np.full(10, 2.5)}, sensor_info(sensor)), sensor)
-    done = run_tool('apply', tmp_path / 'made.csv', '--params', tmp_path / 'unit.yaml',
-                    '--inverse', 'paper', '-o', tmp_path / 'out.csv')
-    assert done.returncode == 1 and '--inverse paper: needs the axes x and y' in done.stderr

@@ -65,22 +65,6 @@ def test_samples_are_corrected_and_counted() -> None:
     assert (stream.counts['received'], stream.counts['published']) == (1, 1)
 
 
-def test_an_output_rate_leaves_samples_out_and_changes_none() -> None:
-    every, few = Stream(unit()), Stream(unit(), output_rate_hz=240.0)  # 1000 Hz: every fourth
-    for i in range(12):
-        every.send(unit(), 0.7, 0.1 * i)
-        few.send(unit(), 0.7, 0.1 * i)
-    assert few.data == every.data[3::4] and few.tilt == every.tilt[3::4]
-    assert (few.counts['received'], few.counts['published']) == (12, 3)
-
-
-def test_samples_of_a_refused_stream_are_only_counted() -> None:
-    stream = Stream(unit())
-    stream.refused = True
-    stream.send(unit(), 0.7, -1.2)
-    assert (stream.counts['received'], stream.data) == (1, [])
-
-
 def test_invalid_messages_are_dropped() -> None:
     stream = Stream(unit())
     stream(b'too short')

@@ -10,7 +10,6 @@ from adxl_ros.files import parameter_file
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.simulate import simulator
-from adxl_ros.simulate.motion import Held, Motion
 from adxl_ros.simulate.trajectories import tumble
 import numpy as np
 import pytest
@@ -45,18 +44,3 @@ def test_noise_with_errors_of_angles_becomes_that_without():
         assert power(residual_v[:, axis]) > 6 * expected
         assert 0.3 * expected < power(filtered_v) < 2 * expected
         assert np.std(filtered_v) == pytest.approx(np.std(noise_v[:, axis]), rel=0.1)
-
-
-def test_an_exact_reference_needs_no_filter():
-    """Without steps of the encoder, and without a stage that moves, there is no filter."""
-    assert angle_error_filter(
-        comparison_of(tumble(np.random.default_rng(2)), stage_resolution_rad=0.0), 0) is None
-    assert angle_error_filter(comparison_of(Motion(20.0, Held(0.5), Held(0.2))), 0) is None
-
-
-def test_a_finer_encoder_changes_the_noise_less():
-    """The filter of an encoder of a millionth of a step leaves a series as it is."""
-    motion = tumble(np.random.default_rng(2))
-    comparison = comparison_of(motion, stage_resolution_rad=1e-9)
-    residual_v = comparison.residual_v(comparison.sensor).T
-    assert angle_error_filter(comparison, 0)(residual_v) == pytest.approx(residual_v, abs=1e-6)

@@ -25,10 +25,3 @@ def test_lost_bits_by_axis(bits, common, further):
     assert detection.values['lost_bits'] == pytest.approx(common, abs=0.01)
     np.testing.assert_allclose(detection.values['axis_lost_bits'], further, atol=0.01)
     assert (' on y' in detection.message) == (common == 0)
-
-
-@pytest.mark.parametrize('count', [60, 120, 300, 1000, 20000])
-def test_few_samples_of_fine_codes_are_not_coarse(count):
-    """Codes that are left out by chance have no common step."""
-    for seed in range(20):
-        assert coarse_codes(recorded(count, seed=seed), SENSOR) is None

@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import cache
 import json
 
-from adxl_ros.diagnose.diagnosis import diagnose, what_shows
+from adxl_ros.diagnose.diagnosis import diagnose
 from adxl_ros.diagnose.next_experiment import propose_next_experiment, RecordedEvidence
 from adxl_ros.diagnose.report import as_json
 from adxl_ros.diagnose.verdict import WeightedHypothesis
@@ -102,15 +102,6 @@ def test_no_gap_has_an_upper_limit():
     assert diagnosis.report.sensor.values == diagnosis.report.baseline.values
 
 
-def test_a_material_amplitude_raises_the_limit():
-    """Who only cares for 2 mg is told of no smaller gap."""
-    report = report_of(diagnose([simulated(unit(), 'temperature_bias:per_k=1e-4')], unit(),
-                                material_mg=2.0))
-    assert report['verdict']['status'] == 'no_gap'
-    assert report['gap']['upper_limit'] > max(0.0196, diagnosed()[1]['gap']['upper_limit'])
-    assert report['material'] == pytest.approx(0.0196, rel=0.01)
-
-
 @pytest.mark.parametrize('option, parameter, value', [
     ('backlash:alpha_rad=0.004,beta_rad=0.004', 'beta_rad', 0.004),
     ('misalignment:alpha_rad=0.003,beta_rad=-0.002', 'alpha_rad.y', 0.003),
@@ -135,16 +126,6 @@ def test_effects_of_the_noise_are_named(option, effect):
     """Line, level, isolated and repeated samples and coarse codes show in the noise."""
     report = diagnosed(option)[1]
     assert (report['verdict']['status'], report['verdict']['effects']) == ('explained', [effect])
-
-
-def test_a_drift_of_the_noise_is_named():
-    """Noise of 1/f is named, alone or with what it cannot be separated from."""
-    assert 'flicker' in named(diagnosed('flicker:density_g_per_rthz=3e-4')[1])
-
-
-def test_a_drift_is_named():
-    """A random walk is a drift, although slow effects of the library follow it."""
-    assert 'bias_walk' in named(diagnosed('bias_walk:density_g_per_rts=1e-3')[1])
 
 
 def test_noise_is_compared_with_the_simulated_noise():
@@ -189,20 +170,6 @@ def test_two_effects_and_the_parameters_that_close_their_gap(run_tool, pair):
     assert json.loads(again.stdout)['verdict']['status'] == 'no_gap'
 
 
-def test_the_same_command_gives_the_same_report(run_tool, pair):
-    """A seed determines everything; a CSV file and a bag have one diagnosis."""
-    recording.write(pair / 'run.mcap', simulated(unit(), 'lever_arm:x_m=0.03', seed=5), unit())
-    files = []
-    for name in ('c', 'd'):
-        run_tool('diagnose', pair / 'run.csv', pair / 'run.mcap', '--params', pair / 'unit.yaml',
-                 '-o', pair / name)
-        files.append([(pair / name / f).read_bytes() for f in ('report.json', 'params.yaml')])
-    assert files[0] == files[1]
-    report = json.loads(files[0][0])
-    assert [noise['recording'] for noise in report['gap']['noise']] \
-        == [str(pair / 'run.csv'), str(pair / 'run.mcap')]
-
-
 def test_what_recordings_cannot_separate_is_one_group():
     """Where the supply follows the temperature, both give the same samples."""
     motion = warm(turning())
@@ -212,14 +179,6 @@ def test_what_recordings_cannot_separate_is_one_group():
     report = report_of(diagnosis)
     assert 'temperature_bias' in named(report)
     assert len(named(report)) == 1 or report['verdict']['status'] == 'inseparable'
-
-
-def test_two_poses_do_not_separate_the_errors_of_the_stage():
-    """One turn of one joint names the truth in a group, and what would separate it."""
-    motion = turning((0.7,) * 5, (np.pi / 2,) * 3)
-    diagnosis = diagnose([simulated(unit(), 'time_offset:offset_s=0.005', motion=motion)], unit())
-    report = report_of(diagnosis)
-    assert 'time_offset' in named(report)
 
 
 def test_an_effect_outside_the_library_is_unknown():
@@ -240,17 +199,6 @@ def test_the_nominal_file_lacks_zero_g_and_scale_factor():
         nominal('xy'), rate_hz=125.0, stage_resolution_rad=1e-4)))
     assert report['verdict']['effects'] == ['bias', 'scale_factor']
     assert report['gap']['closed'] > 0.95
-
-
-def test_samples_without_numbers_and_a_sensor_without_a_converter():
-    """A digital sensor has no rail at 0 pseudo-volts; a quarter of a minute may lack an axis."""
-    def change(columns):
-        late = (columns['time_s'] > 20) & (columns['time_s'] < 35)
-        return columns | {'y_v': np.where(late, np.nan, columns['y_v'])}
-
-    sensor = replace(unit('xyz'), adc_bits=0, nominal_zero_g_v=np.zeros(3))
-    made = simulated(sensor, 'temperature_bias:per_k=4e-4', change=change)
-    assert named(report_of(diagnose([made], sensor))) == {'temperature_bias'}
 
 
 def values(change):
@@ -279,15 +227,6 @@ def test_faults_of_the_recording_are_one_line(change, fault):
     assert report['verdict']['status'] in ('bad_data', 'insufficient')
     assert report['verdict']['effects'] == [] and '\n' not in report['summary']
     assert text in report['summary']
-
-
-def test_what_could_have_shown():
-    """A recording without heating cannot show a temperature; its rotation shows a lever arm."""
-    rows = what_shows([simulated(unit(), motion=turning())], unit())
-    assert any(row.shows for row in rows if row.effect == 'lever_arm')
-    assert not any(row.shows for row in rows if row.effect == 'temperature_bias')
-    shown = [r for r in diagnosed()[1]['could_show'] if r['effect'] == 'temperature_bias']
-    assert any(r['could_show'] and 0 < r['smallest'] < 4e-4 for r in shown)
 
 
 def drawn(seed):
@@ -331,19 +270,6 @@ def test_a_recording_at_rest_is_insufficient():
     assert 'motion' in report['not_covered'] and report['next_experiment']
 
 
-def test_repeats_determine_the_noise_floor_without_rests():
-    """The difference of two runs of one trajectory is the noise floor."""
-    time_s = np.arange(0.0, 70.0, 0.5)
-    alpha, beta = (Knots(time_s, 1.0 + 0.4 * np.sin(rate * time_s), 0.4 * rate * np.cos(
-        rate * time_s)) for rate in (0.31, 0.53))
-    sensor, motion = replace(unit(), stage_resolution_rad=1e-5), Motion(65.0, alpha, beta)
-    gap = report_of(diagnose([simulated(sensor, motion=motion, seed=seed) for seed in (1, 2)],
-                             sensor))['gap']
-    assert gap['floor_source'] == 'repeats'
-    # 110 ug/rtHz behind 15 Hz and 16 bit at 5 V.
-    assert gap['floor'] == pytest.approx(5.3e-3, rel=0.1)
-
-
 def test_next_experiment_separates_most():
     """Heating separates temperature from supply, and a shaker does not."""
     rivals, sensor = ('temperature_bias', 'supply'), with_effects(
@@ -357,13 +283,6 @@ def test_next_experiment_separates_most():
     worth = {m.text: m.nats_per_minute for m in proposal.menu}
     assert proposal.nats_per_minute == max(worth.values()) == worth[proposal.manoeuvre] > 0
     assert worth['shake along x from 2 to 40 Hz'] < 0.1 * worth['dwell, heat and cool']
-
-
-def test_temperature_is_named_in_a_climatic_chamber(run_tool, tmp_path, shared_dir):
-    """A real recording at rest changes with the temperature."""
-    run = run_tool('diagnose', shared_dir / 'real' / 'thermal_chamber.csv', '-o', tmp_path,
-                   '--json')
-    assert 'temperature_bias' in named(json.loads(run.stdout))
 
 
 def test_a_sensor_that_moves_without_a_reference_gets_no_verdict(run_tool, tmp_path, shared_dir):

@@ -3,17 +3,11 @@
 """What the diagnosis needs to know about an effect stands in the effect's own file."""
 
 import ast
-from collections import Counter
 from pathlib import Path
 
 from adxl_ros import diagnose
-from adxl_ros.diagnose.next_experiment import MENU
 from adxl_ros.model.diagnosis_hints import (
-    Detector,
-    DriftSpectrum,
     FormDimension,
-    Manoeuvre,
-    StraightLine,
 )
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import ActsOn, Need, Place
@@ -29,31 +23,6 @@ def test_diagnosis_names_no_effect(module):
     texts = {node.value for node in ast.walk(tree)
              if isinstance(node, ast.Constant) and isinstance(node.value, str)}
     assert not texts & set(library())
-
-
-def test_each_detector_drift_and_straight_line_has_one_effect():
-    """The diagnosis finds the effect of a detector, so that there must be exactly one."""
-    hints = [effect.diagnosis for effect in library().values()]
-    declared = Counter(value for hint in hints
-                       for value in (hint.detector, hint.drift, hint.straight_line) if value)
-    assert declared == Counter([*Detector, *DriftSpectrum, *StraightLine])
-
-
-def test_effects_of_detectors_have_the_parameters_that_are_estimated():
-    """A detection becomes the values of its effect in the parameter file."""
-    estimated = {Detector.REPEATED_SAMPLES: {'rate_hz', 'duration_s'},
-                 Detector.ISOLATED_SAMPLES: {'rate_hz', 'amplitude_v'},
-                 Detector.COARSE_CODES: {'lost_bits', 'axis_lost_bits'},
-                 Detector.MAINS_LINE: {'amplitude_v', 'frequency_hz', 'phase_rad'},
-                 Detector.NOISE_LEVEL: {'ratio'}}
-    for effect in library().values():
-        if effect.diagnosis.detector:
-            assert {p.name for p in effect.parameters} == estimated[effect.diagnosis.detector]
-
-
-def test_menu_holds_every_manoeuvre():
-    """An effect may name any manoeuvre."""
-    assert set(MENU) == set(Manoeuvre)
 
 
 @pytest.mark.parametrize('effect', library().values(), ids=lambda effect: effect.name)
@@ -76,8 +45,3 @@ def test_a_form_differs_over_what_the_effect_follows(effect):
         assert not form & {'alpha_rad', 'beta_rad', 'rate', 'since_move_s'}
     if effect.place is Place.ADC and form:
         assert form == {'code'}
-
-
-def test_each_effect_declares_what_shows_it():
-    """The report draws the proof of each effect over a variable that the effect declares."""
-    assert [name for name, effect in library().items() if not effect.diagnosis.proof] == []

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of a diagnosis in a real browser: what it shows first, its proofs, layout and files."""
 
-import json
 from subprocess import run
 
 from pages import layout_faults, NEEDS_CHROMIUM, wait_until_drawn, WIDTHS
@@ -105,37 +104,3 @@ def test_zoom_is_linked(page):
         'document.querySelector("[data-figure=signals]").layout.xaxis.autorange !== true')
     assert plot.evaluate('plot => plot.data.every(t => !t.xaxis || t.xaxis === "x")')
     assert plot.locator('.nsewdrag').count() == 4
-
-
-def test_files_and_commands(page, folder):
-    """The button gives the parameter file, and each command has a button that copies it."""
-    with page.expect_download() as download:
-        page.get_by_text('download params.yaml').click()
-    with open(download.value.path(), encoding='utf-8') as file:
-        assert file.read() == (folder / 'gap' / 'params.yaml').read_text()
-    button = page.locator('ol.steps button').first
-    proposal = json.loads((folder / 'gap' / 'report.json').read_text())['next_experiment']
-    assert button.get_attribute('data-copy') == proposal['command']
-    button.click()
-    page.wait_for_function('document.querySelector("ol.steps button").textContent === "copied"')
-
-
-def test_print(page, tmp_path):
-    """The paper has the contents of all tabs, and no plot is wider than it."""
-    page.emulate_media(media='print')
-    page.set_viewport_size({'width': 700, 'height': 900})
-    assert page.locator('[data-figure=spectrum]').is_visible()
-    assert not page.locator('.tabs').is_visible()
-    assert page.evaluate("""() => [...document.querySelectorAll('.main-svg')].every(
-        svg => svg.getBoundingClientRect().right <= innerWidth)""")
-    page.pdf(path=tmp_path / 'page.pdf', format='A4')
-    assert 3 <= (tmp_path / 'page.pdf').read_bytes().count(b'/Type /Page\n') <= 15
-
-
-def test_a_fault_of_the_recording(opened, folder):
-    """Swapped axes give a red badge that names the fault, and no effects."""
-    page, _ = opened(folder / 'fault' / 'report.html')
-    assert 'red' in page.locator('.badge').get_attribute('class')
-    report = json.loads((folder / 'fault' / 'report.json').read_text())
-    assert report['summary'] in page.locator('.badge').inner_text()
-    assert page.locator('.effect').count() == 0

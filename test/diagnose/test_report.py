@@ -2,17 +2,14 @@
 
 """What the diagnosis reports: the gap and its parts, and what it does not determine."""
 
-from dataclasses import replace
 from html import escape
 import json
 import re
 
-from adxl_ros.diagnose.noise_detectors import line_amplitude_v, white_noise_v
 from adxl_ros.diagnose.report import parameter_text
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info
-from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Motion
@@ -20,7 +17,6 @@ from adxl_ros.simulate.simulator import simulate
 from adxl_ros.tools.effect_option import with_effects
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 from units import nominal
 
 pytestmark = pytest.mark.long
@@ -86,31 +82,6 @@ def test_the_gap_is_recording_minus_simulation(diagnosed):
     assert gap['before'] / mg == pytest.approx(np.hypot(2.7, floor_mg), rel=0.03)
 
 
-@pytest.mark.parametrize('filed', [
-    [], ['stage_offset:alpha_rad=0.02', 'misalignment:alpha_rad=0.1']])
-def test_one_alpha_does_not_determine_a_tilt_of_the_axes(diagnosed, filed):
-    """With alpha held, the axes' tilt out of the plane is a straight line at most."""
-    sensor = unit()
-    report = diagnosed(sensor, 'misalignment:alpha_rad=0.01,beta_rad=0.004',
-                       motion=turning([np.pi / 2] * 2), params=with_effects(sensor, filed))
-    parameters = report.parameters('misalignment')
-    for axis in 'xy':
-        assert parameters[f'alpha_rad.{axis}'] == {
-            'value': None, 'ci': None, 'unit': 'rad', 'determined': False}
-    assert parameters['beta_rad.x']['determined']
-    # What is not determined stays as it was, because the file may serve other recordings.
-    filed_rad = 0.1 if filed else 0.0
-    values = report.sensor.values.get('misalignment', {'alpha_rad': [filed_rad] * 2})
-    assert list(values['alpha_rad']) == [filed_rad] * 2
-
-
-def test_two_planes_determine_a_tilt_of_the_axes(diagnosed):
-    """A second plane determines what one alpha does not."""
-    report = diagnosed(unit(), 'misalignment:alpha_rad=0.01,beta_rad=0.004')
-    low, high = report.parameters('misalignment')['alpha_rad.x']['ci']
-    assert low < 0.01 < high
-
-
 def test_a_line_that_stays_is_shown_and_not_called_closed(diagnosed):
     """Beside another scale factor, hum and its harmonic stay in recording minus simulation."""
     def change(columns):
@@ -156,58 +127,6 @@ def test_terminal_page_and_report_agree(diagnosed):
         report.terminal.replace('\\\n', ' ').split())
 
 
-def test_the_floor_is_not_above_what_the_effects_leave(diagnosed):
-    """Coarse steps of an encoder count as far as the residual has them."""
-    sensor = replace(unit(), stage_resolution_rad=2e-3)
-    gap = diagnosed(sensor).json['gap']
-    assert gap['floor'] <= gap['after'] == gap['before']
-
-
-def test_effects_that_are_not_separated_are_named_together(diagnosed):
-    """A turn of the sensor about its axis is one of the stage or of its base at one alpha."""
-    report = diagnosed(unit(), 'stage_offset:beta_rad=0.005', motion=turning([np.pi / 2] * 2))
-    (group,) = report.json['verdict']['groups']
-    assert {'base_tilt', 'stage_offset'} <= set(group)
-    text = ' '.join(report.terminal.split())
-    assert f'{", ".join(group[:-1])} or {group[-1]}: this recording does not separate them' in text
-    assert text.index('CAUSES NOT SEPARATED') < text.index(group[0])
-
-
-@pytest.mark.parametrize('rate_hz', [62.5, 100.0, 250.0])
-def test_amplitude_of_a_line_whose_phase_wanders(rate_hz):
-    """The mains are no exact clock, and a line may alias."""
-    rng = np.random.default_rng(2)
-    time_s = np.arange(round(100 * rate_hz)) / rate_hz
-    phase = 2 * np.pi * 60 * time_s + np.cumsum(rng.normal(size=len(time_s))) * 0.3 / rate_hz
-    values_v = np.column_stack([2e-3 * np.sin(phase + 1), 0 * time_s]) \
-        + 1e-3 * rng.normal(size=(len(time_s), 2))
-    amplitude_v = line_amplitude_v(values_v, time_s, 60.0)
-    assert amplitude_v[0] == pytest.approx(2e-3, rel=0.05)
-    assert amplitude_v[1] < 2e-4
-
-
-def test_level_of_the_noise_beside_a_line_and_spikes():
-    """Neither a line nor spikes change the level of the white noise much."""
-    sensor, rng = unit(), np.random.default_rng(3)
-    std_v = noise.sample_std_v(sensor)
-    time_s = np.arange(8000) / sensor.rate_hz
-    white_v = lfilter_noise(rng, sensor, len(time_s))
-    level_v = white_noise_v(white_v, sensor)
-    np.testing.assert_allclose(level_v, std_v, rtol=0.1)
-    line_v = 2e-3 * np.sin(2 * np.pi * 12 * time_s)[:, None]
-    spikes_v = 0.05 * (np.arange(len(time_s)) % 500 == 0)[:, None]
-    for disturbance_v in (line_v, spikes_v):
-        np.testing.assert_allclose(white_noise_v(white_v + disturbance_v, sensor), level_v,
-                                   rtol=0.1)
-
-
-def lfilter_noise(rng, sensor, count):
-    """Return noise of the sensor's density behind its RC filter, V, (count, m)."""
-    decay = np.exp(-1 / (sensor.rate_hz * noise.electronics(sensor).rc_s))
-    return np.column_stack([lfilter([np.sqrt(1 - a * a)], [1, -a], rng.normal(size=count)) * std
-                            for a, std in zip(decay, noise.sample_std_v(sensor))])
-
-
 @pytest.mark.parametrize('value, ci, unit_name, text', [
     (3.9e-4, [3.47e-4, 4.33e-4], 'g/K', '0.39 (0.35 to 0.43) mg/K'),
     (0.0298, [0.0294, 0.0302], 'm', '29.8 (29.4 to 30.2) mm'),
@@ -219,9 +138,3 @@ def lfilter_noise(rng, sensor, count):
 def test_parameters_have_a_prefix_and_few_digits(value, ci, unit_name, text):
     """A value has the digits that its interval allows; volts are shown as acceleration."""
     assert parameter_text({'value': value, 'ci': ci, 'unit': unit_name}) == text
-
-
-def test_a_parameter_that_is_not_determined_has_no_figure():
-    """A value of null is said in words."""
-    assert parameter_text({'value': None, 'ci': None, 'unit': 'rad', 'determined': False}) == \
-        'not determined'

@@ -5,10 +5,9 @@
 from dataclasses import replace
 from pathlib import Path
 import sys
-from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import bag_reader, cdr, mcap_chunks, recording
+from adxl_ros.files import recording
 from adxl_ros.files.recording_columns import ACCEL, Recording, REFERENCES
 from adxl_ros.files.stream_info import sensor_info
 import numpy as np
@@ -57,18 +56,6 @@ def test_round_trip_to_the_bit(tmp_path: Path, name: str, axes: str) -> None:
     recording.write(tmp_path / 'again', again, sensor)
     last = recording.read(tmp_path / 'again')
     assert all((last.columns[k] == v).all() for k, v in got.columns.items())
-
-
-def test_bag_and_csv_have_the_same_contents(tmp_path: Path) -> None:
-    sensor = nominal('xyz')
-    sent = replace(recorded(), epoch_ns=0)
-    recording.write(tmp_path / 'run.mcap', sent, sensor)
-    recording.write(tmp_path / 'run.csv', recording.read(tmp_path / 'run.mcap'), sensor)
-    from_bag, from_csv = (recording.read(tmp_path / name) for name in ('run.mcap', 'run.csv'))
-    assert (from_bag.time_s == sent.time_s).all()
-    assert (from_bag.time_s == from_csv.time_s).all()
-    assert all((from_csv.columns[k] == v).all() for k, v in from_bag.columns.items())
-    assert from_bag.info == from_csv.info
 
 
 def test_a_written_bag_is_readable_by_other_software(tmp_path: Path) -> None:
@@ -143,61 +130,6 @@ def test_every_storage_and_compression(tmp_path: Path, storage: str, mode: str) 
     assert len(recording.read(target)) == len(plain)
 
 
-def test_split_bags_are_joined_in_the_order_of_their_numbers(tmp_path: Path) -> None:
-    target = tmp_path / 'run'
-    target.mkdir()
-    for i in range(11):
-        part = bags.bag_of(tmp_path / f'part{i}', map(imu, stamps(1100)[100 * i:100 * (i + 1)]))
-        (part / f'part{i}.mcap').rename(target / f'run_{i}.mcap')
-    assert recording.read(target).stamp_ns.tolist() == stamps(1100)
-    (target / 'metadata.yaml').write_text(
-        'rosbag2_bagfile_information: {relative_file_paths: [run_0.mcap, run_11.mcap]}')
-    assert refusal(target) == ': metadata.yaml names run_11.mcap, which is not there'
-
-
-@pytest.mark.parametrize('little_endian', [True, False])
-def test_both_byte_orders(tmp_path: Path, little_endian: bool) -> None:
-    rng = np.random.default_rng(2)
-    accel = rng.normal(size=(200, 3))
-    times = stamps(200)
-    messages = [imu(t, a, '/robot1/imu/data_raw') for t, a in zip(times, accel)]
-    messages += [joints(t, alpha=a[0], beta=a[1]) for t, a in zip(times, accel)]
-    got = recording.read(bags.bag_of(tmp_path / 'run', messages, little_endian))
-    assert got.axes == 'xy'  # as the covariance says
-    assert (np.column_stack([got.columns[n] for n in ACCEL[:2]]) == accel[:, :2]).all()
-    assert (got.columns['beta_rad'] == accel[:, 1]).all()
-    assert 'shift_m' not in got.columns
-    assert got.epoch_ns == EPOCH_NS
-
-
-def test_layouts_are_those_of_an_independent_decoder() -> None:
-    rng = np.random.default_rng(3)
-    for frame in ('', 'a', 'imu_link', 'nine_char'):
-        message = imu(EPOCH_NS, rng.normal(size=3), frame=frame).message
-        for little_endian in (True, False):
-            raw = bytes(STORE.serialize_cdr(message, IMU, little_endian=little_endian))
-            table, = cdr.tables([raw], cdr.imu)
-            force = message.linear_acceleration
-            assert table.numbers('linear_acceleration').tolist() == [[force.x, force.y, force.z]]
-            assert table.stamp_ns().tolist() == [EPOCH_NS]
-            assert table.layout.texts == {'frame_id': frame}
-            new = cdr.fill(raw, table.layout, np.array([5]),
-                           {'linear_acceleration': np.array([[1.0, 2.0, 3.0]])})
-            back = STORE.deserialize_cdr(new[0].tobytes(), IMU)
-            assert (back.linear_acceleration.y, back.header.stamp.nanosec) == (2.0, 5)
-
-
-def test_joints_may_have_messages_of_their_own(tmp_path: Path) -> None:
-    times = stamps(100)
-    messages = [imu(t) for t in times]
-    for i, t in enumerate(times):
-        messages += [joints(t, beta=i / 7, other=5.0), joints(t, alpha=float(i)), joints(t)]
-    got = recording.read(bags.bag_of(tmp_path / 'run', messages))
-    assert got.columns['alpha_rad'].tolist() == list(range(100))
-    assert got.columns['beta_rad'].tolist() == [i / 7 for i in range(100)]
-    assert got.columns.keys() == {*ACCEL[:2], 'alpha_rad', 'beta_rad'}
-
-
 def test_references_at_another_rate_are_interpolated(tmp_path: Path) -> None:
     times = np.array(stamps(4000))
     start = times[1000] + 300_000
@@ -226,27 +158,6 @@ def test_references_at_another_rate_are_interpolated(tmp_path: Path) -> None:
         assert blocks[-1].alignments['beta_rad'].residual == pytest.approx(
             got.alignments['beta_rad'].residual)
         assert blocks[-1].done == 1.0
-
-
-def test_a_move_in_a_gap_of_the_messages_is_unknown(tmp_path: Path) -> None:
-    """A line over half a second is not the motion. A joint at rest and a short gap are bridged."""
-    times = np.array(stamps(4000))
-    s = (times - times[0]) * 1e-9
-    assert s[-1] > 3
-    kept = np.arange(len(times)) % 10 == 0
-    lost, short = (s > 1.0) & (s < 1.5), (s > 2.0) & (s < 2.08)
-    messages = [imu(int(t)) for t in times]
-    messages += [joints(int(t), alpha=1.0, beta=float(np.sin(2 * np.pi * time_s)))
-                 for t, time_s in zip(times[kept & ~lost & ~short], s[kept & ~lost & ~short])]
-    path = bags.bag_of(tmp_path / 'run', sorted(messages, key=lambda sent: sent.stamp_ns))
-    got = recording.read(path)
-    unknown = np.isnan(got.columns['beta_rad'])
-    assert unknown[(s > 1.02) & (s < 1.48)].all()
-    assert not unknown[(s < 0.98) | (s > 1.52) & (s < 2.9)].any()
-    assert (got.columns['alpha_rad'][s < 2.9] == 1.0).all()
-    for rows in (100, 1000):
-        parts = [b.columns['beta_rad'] for b in recording.blocks(path, rows)]
-        assert np.array_equal(np.concatenate(parts), got.columns['beta_rad'], equal_nan=True)
 
 
 def test_a_command_is_in_force_until_the_next_one(tmp_path: Path) -> None:
@@ -281,75 +192,6 @@ def test_a_command_is_in_force_until_the_next_one(tmp_path: Path) -> None:
             # A command that is recorded 3 ms late may not apply to the samples before it.
             assert np.count_nonzero(~((joined == got.columns[name]) | np.isnan(joined))) <= 3
             assert (np.isnan(joined) == np.isnan(got.columns[name])).all()
-
-
-def mixed_messages() -> list[Any]:
-    """Return messages of every kind, at rates of their own and of two lengths."""
-    times = stamps(6000)
-    sent: list[Any] = []
-    for i, t in enumerate(times):
-        sent.append(imu(t))
-        if i % 3 == 0:
-            sent.append(joints(t + 300_000, alpha=i / 7, **({'beta': 1.0} if i % 2 else {})))
-        if i % 500 == 7:
-            sent.append(joints(t, '/stage/command', alpha=float(i)))
-    return sent
-
-
-@pytest.mark.parametrize('fault', ['none', 'index'])
-@pytest.mark.parametrize('rows', [1000, 65536])
-def test_messages_in_arrays_are_those_read_one_by_one(
-        tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str, rows: int) -> None:
-    path = bags.bag_of(tmp_path / 'run', mixed_messages())
-    file, = path.glob('*.mcap')
-    if fault == 'index':
-        data = bytearray(file.read_bytes())
-        with rosbag2.Reader(file) as reader:
-            chunk = reader.storage.chunks[0]
-        for place in chunk.message_index_offsets.values():
-            data[place + 15 + 8] ^= 1  # the offset of the first message in the chunk
-        file.write_bytes(data)
-    quick = list(recording.blocks(path, rows))
-    monkeypatch.setattr(mcap_chunks, 'in_order', lambda *_: [])
-    plain = list(recording.blocks(path, rows))
-    assert len(quick) == len(plain)
-    for first, second in zip(quick, plain):
-        assert (first.stamp_ns == second.stamp_ns).all()
-        assert first.columns.keys() == second.columns.keys()
-        assert first.alignments == second.alignments
-        for name, values in first.columns.items():
-            assert np.array_equal(values, second.columns[name], equal_nan=True), name
-
-
-def test_commands_are_those_of_the_stage_and_of_the_right_type(tmp_path: Path) -> None:
-    """Topics of that name with another type are neither an error nor a column."""
-    commands = [joints(T[0], '/b/stage/command', alpha=1.0),
-                joints(T[0], '/a/stage/command', alpha=2.0)]
-    stage = [joints(t, '/b/stage/joint_states', alpha=0.0) for t in T]
-    got = recording.read(bags.bag_of(tmp_path / 'two', [*map(imu, T), *stage, *commands]))
-    assert got.columns['alpha_command_rad'].tolist() == [1.0] * 3
-    assert 'beta_command_rad' not in got.columns
-    got = recording.read(bags.bag_of(tmp_path / 'other', [*map(imu, T), *commands]))
-    assert not any('command' in name for name in got.columns)
-    text = Sent('/stage/command', STRING, T[0], TYPES[STRING](data='go'))
-    got = recording.read(bags.bag_of(tmp_path / 'text', [*map(imu, T), text]))
-    assert not any('command' in name for name in got.columns)
-    messages = [imu(T[0]), Sent('/stage/command', JOINTS, T[0], raw=b'\0\1\0\0\7')]
-    assert refusal(bags.bag_of(tmp_path / 'cut', messages)).startswith(
-        ': topic /stage/command: a message is damaged')
-
-
-def test_samples_continue_after_the_last_message_of_the_stage(
-        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bag_reader, '_HOLD_ROWS', 500)
-    messages = [m for t in stamps(3000) for m in (imu(t), joints(t, alpha=1.0))
-                if m.kind == IMU or t < stamps(200)[-1]]
-    path = bags.bag_of(tmp_path / 'run', messages)
-    blocks = list(recording.blocks(path, 100))
-    assert sum(map(len, blocks)) == 3000
-    assert max(map(len, blocks)) == 100
-    alpha = np.concatenate([block.columns['alpha_rad'] for block in blocks])
-    assert np.flatnonzero(np.isnan(alpha))[0] == 200
 
 
 @pytest.mark.parametrize('name', ['run', 'run.mcap'])
@@ -455,15 +297,6 @@ def test_invalid_bags_are_refused_in_one_line(
     assert refusal(bags.bag_of(tmp_path / 'run', messages)).startswith(message)
 
 
-def test_the_sensors_own_namespace_comes_first(tmp_path: Path) -> None:
-    messages = [info('/a/sensor_info', serial='A'), info('/b/sensor_info', serial='B')]
-    messages += [imu(t, topic='/a/imu/data_raw') for t in T]
-    messages += [joints(t, '/b/stage/joint_states', alpha=2.0) for t in T]
-    got = recording.read(bags.bag_of(tmp_path / 'run', messages))
-    assert got.info == {'serial': 'A'}
-    assert got.columns['alpha_rad'].tolist() == [2.0, 2.0, 2.0]
-
-
 def test_ideal_force(tmp_path: Path) -> None:
     messages = [imu(t, (i, 2, 3), '/world/imu', (0, 0, 0)) for i, t in enumerate(T)]
     path = bags.bag_of(tmp_path / 'run', messages)
@@ -498,15 +331,6 @@ def test_without_rosbags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         recording.read(tmp_path / 'run')
     with pytest.raises(UserError, match="pip install 'rosbags"):
         recording.write(tmp_path / 'run', recorded(5), nominal('xyz'))
-
-
-def test_real_file_through_a_bag(shared_dir: Path, tmp_path: Path) -> None:
-    sensor = nominal('xyz')
-    real = recording.read(shared_dir / 'real' / 'two_axis_stand.csv')
-    recording.write(tmp_path / 'run', real, sensor)
-    got = recording.read(tmp_path / 'run')
-    assert (got.time_s == real.time_s).all()
-    assert all((got.columns[name] == real.columns[name]).all() for name in ACCEL)
 
 
 def test_memory_is_bounded(tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ import shutil
 import subprocess
 
 from adxl_ros.files import calibration_store, parameter_file
-from adxl_ros.model.validity import Envelope
 import numpy as np
 from processes import executable
 import pytest
@@ -80,59 +79,6 @@ def test_provenance_store_and_the_previous_file(run_tool, swept_csv, tmp_path):
     assert done.returncode == 0, done.stderr
 
 
-def test_a_store_that_cannot_be_written_is_reported(run_tool, swept_csv, tmp_path):
-    """The file is written, and one line states the reason for the missing copy."""
-    shutil.copytree(swept_csv, tmp_path, dirs_exist_ok=True)
-    (tmp_path / 'file').write_text('')
-    done = run_tool('fit', 'sweep.csv', '--params', 'u7.yaml', '--model', 'linear', '-o', 'u.yaml',
-                    '--store', 'file')
-    assert done.returncode == 0
-    assert parameter_file.load(tmp_path / 'u.yaml').model == 'linear'
-    assert 'fit: no copy in the store: file/U%2F7: cannot be made' in done.stderr
-    assert done.stderr.count('\n') == 1
-
-
-def test_a_calibration_without_a_unit_is_not_stored(run_tool, tmp_path):
-    """The serial number `nominal` is that of no unit."""
-    run_tool('simulate', 'sweep', '--rate', '100', '-o', 'a.csv')
-    done = run_tool('fit', 'a.csv', '--model', 'linear', '-o', 'u.yaml')
-    assert done.returncode == 0 and 'names no unit' in done.stderr
-    assert not (tmp_path / 'ros_home').exists()
-
-
-def test_apply_reports_samples_outside_of_the_validity_range(run_tool, swept_csv, tmp_path):
-    """Their standard deviations grow as those of the node `compensation`."""
-    shutil.copytree(swept_csv, tmp_path, dirs_exist_ok=True)
-    run_tool('fit', 'sweep.csv', '--params', 'u7.yaml', '--model', 'linear', '-o', 'u.yaml')
-    head = (tmp_path / 'sweep.csv').read_text().split('\ntime_s')[0]
-    rows = '\n'.join(f'{i / 100},2.6,2.5,{c}' for i, c in enumerate([22.5, 22.5, 60.0, 60.0]))
-    (tmp_path / 'run.csv').write_text(f'{head}\ntime_s,x_v,y_v,temperature_c\n{rows}\n')
-    done = run_tool('apply', 'run.csv', '--params', 'u.yaml', '-o', 'out.csv')
-    assert done.returncode == 0
-    assert '2 of 4 samples lie outside of the validity range' in done.stderr
-    out = np.genfromtxt(tmp_path / 'out.csv', delimiter=',', names=True)['ax_std_mps2']
-    sensor = parameter_file.load(tmp_path / 'u.yaml')
-    off_k = 60 - sensor.envelope.temperature_c[1] - 2
-    assert np.sqrt(out[2] ** 2 - out[0] ** 2) == pytest.approx(off_k * 1e-4 * 9.80665, rel=0.05)
-    assert out[0] == out[1]
-
-
-def test_the_file_holds_envelope_and_datasheet(tmp_path):
-    """Both are equal after a round trip. An older file without them loads with empty values."""
-    sensor = replace(drawn(np.random.default_rng(1), nominal(serial='17')), model='full',
-                     envelope=Envelope((20.5, 23.25), 1e-4, 3e-5, 2e-7, 1e-3, (-9.0, -9.5, 0.5),
-                                       (9.0, 9.5, 8.0)))
-    parameter_file.save(tmp_path / 'u.yaml', sensor)
-    again = parameter_file.load(tmp_path / 'u.yaml')
-    assert again.envelope == sensor.envelope
-    assert again.datasheet == sensor.datasheet and len(sensor.datasheet) == 10
-    assert again.datasheet_name == sensor.datasheet_name
-    bare = replace(sensor, envelope=Envelope(), datasheet={}, datasheet_name='')
-    parameter_file.save(tmp_path / 'old.yaml', bare)
-    assert 'envelope' not in (tmp_path / 'old.yaml').read_text()
-    assert parameter_file.load(tmp_path / 'old.yaml').envelope == Envelope()
-
-
 @pytest.mark.parametrize('serial', ['17', 'A/B', '..', 'ä €', '-x', 'ä' * 200])
 def test_each_serial_number_has_its_folder(tmp_path, serial):
     """The folder is inside the store for every serial number."""
@@ -157,22 +103,6 @@ def test_history_is_ordered_by_date_and_names_unreadable_files(tmp_path):
     calibrations, refused = calibration_store.history(tmp_path, '17')
     assert [s.provenance['date'] for _, s in calibrations] == [dates[1], dates[2], dates[0]]
     assert len(refused) == 2 and 'half.yaml:' in refused[0] and 'unit 18' in refused[1]
-
-
-def test_a_file_that_was_named_by_hand_counts_by_its_date(tmp_path):
-    """Neither a copy nor an old backup whose name sorts last counts as newer."""
-    sensor = replace(drawn(np.random.default_rng(1), nominal(serial='17')), provenance=DATED)
-    path = calibration_store.put(tmp_path, sensor)
-    shutil.copy(path, tmp_path / '17' / 'unit_17.yaml')
-    (tmp_path / '17' / 'zz_half.yaml').write_text('/**:\n  ros__par')
-    backup = tmp_path / '17' / 'zz_backup.yaml'
-    parameter_file.save(backup, replace(sensor, provenance={'date': '2020-01-02T03:04:05+00:00'}))
-    assert calibration_store.newer(tmp_path, sensor) is None
-    parameter_file.save(backup, replace(sensor, provenance={'date': '2027-01-02T03:04:05+00:00'}))
-    assert calibration_store.newer(tmp_path, sensor) == backup
-    parameter_file.save(backup, replace(sensor, serial='18', provenance={
-        'date': '2027-01-02T03:04:05+00:00'}))
-    assert calibration_store.newer(tmp_path, sensor) is None
 
 
 def test_a_full_disk_keeps_the_old_file(swept_csv, tmp_path):

@@ -2,7 +2,7 @@
 
 """The quick ways to read and write the numbers of CSV files do the same as the plain ways."""
 
-from adxl_ros.files import csv_numbers, csv_text
+from adxl_ros.files import csv_numbers
 from adxl_ros.files.csv_lines import Lines
 from adxl_ros.files.csv_numbers import Layout
 import numpy as np
@@ -49,23 +49,3 @@ def test_both_parsers_read_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
             table = csv_numbers._field_by_field(layout, lines)
             assert all(map(same_bits, columns.values(), table.T)), rows
     assert parsed > 500
-
-
-def test_the_text_of_numbers_is_that_of_python() -> None:
-    pytest.importorskip('orjson')
-    rng = np.random.default_rng(9)
-    bits = rng.integers(0, 2 ** 64, 4000, dtype=np.uint64).view(float)
-    ties = (rng.integers(10 ** 11, 10 ** 12, 4000) * 10 + 5) / 10.0 ** rng.integers(1, 17, 4000)
-    edges = np.nextafter(10.0 ** rng.integers(-6, 18, 4000), rng.choice([-np.inf, np.inf], 4000))
-    special = rng.choice([0.0, -0.0, np.nan, np.inf, -np.inf, 1.0, 1e12, 5e-324], 4000)
-    plain = rng.normal(size=4000)
-    columns = [plain, bits, ties, edges, special, np.round(plain, 3)]
-
-    def text(value: float, form: str) -> str:
-        return '' if np.isnan(value) else form % value
-
-    for digits in (None, 12, 6):
-        forms = ['%r'] + [f'%.{digits}g' if digits else '%r'] * 5
-        expected = [','.join(map(text, row, forms)) for row in np.column_stack(columns).tolist()]
-        got = csv_text.rounded_rows(columns, digits) if digits else csv_text.exact_rows(columns)
-        assert got.decode().splitlines() == expected

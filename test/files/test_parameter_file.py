@@ -11,7 +11,7 @@ from adxl_ros.files import parameter_file
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 import pytest
-from units import drawn, NOMINAL, nominal
+from units import drawn, nominal
 import yaml
 
 CALIBRATED = """/**:
@@ -129,25 +129,6 @@ def test_bad_file_is_refused_with_its_place(tmp_path: Path, name: str) -> None:
     path = tmp_path / 'unit.yaml'
     path.write_text(CALIBRATED.replace(right, wrong, 1), encoding='utf-8')
     assert re.match(message, refusal(path)), refusal(path)
-
-
-@pytest.mark.parametrize('content', [
-    b'', b'# nothing\n', b'- 1\n', b'\xff\xfe\x00', b'a: &a [*a]\n', b'--- 1\n--- 2\n',
-    b'/**:\n  ros__parameters: &a\n    b: *a\n'])
-def test_other_files_are_refused(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / 'unit.yaml'
-    path.write_bytes(content)
-    refusal(path)
-
-
-def test_file_that_cannot_be_read(tmp_path: Path) -> None:
-    assert 'No such file' in refusal(tmp_path / 'none.yaml')
-    assert 'directory' in refusal(tmp_path)
-
-
-def test_calibrated_file_is_read() -> None:
-    path = NOMINAL.with_name('adxl203.yaml')
-    assert parameter_file.load(path).serial == 'nominal'
 
 
 def assert_equal(first: Sensor, second: Sensor) -> None:

@@ -8,18 +8,10 @@ import os
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import (
-    accepted_poses,
-    Fitted,
     Journal,
-    PoseDropped,
-    PoseRecord,
-    PoseSkipped,
     read,
-    skipped_poses,
     unfinished,
 )
-from adxl_ros.tools import fit
-import numpy as np
 import pytest
 from units import pose_record
 
@@ -63,19 +55,6 @@ def test_two_calibrations_of_one_journal_are_refused(tmp_path):
     Journal(tmp_path / 'j', HEAD).close()
 
 
-def test_a_finished_journal_is_kept_beside_the_new_one(tmp_path):
-    """After a finished calibration a new one begins, and the old journal is kept."""
-    path = tmp_path / 'j'
-    journal = Journal(path, HEAD)
-    journal.append(POSE)
-    journal.append(Fitted(None, True))
-    journal.close()
-    journal = Journal(path, {**HEAD, 'serial': 'B2'})
-    assert journal.entries == []
-    journal.close()
-    assert read(tmp_path / 'j.previous').entries[0] == POSE
-
-
 @pytest.mark.parametrize('text, words', [
     ('', 'empty journal'), ('hello\n', ':1: not a journal'), ('{"format": 9}\n', 'format 9'),
     ('[1]\n', 'not an object')])
@@ -107,47 +86,6 @@ def test_a_damaged_journal_is_replaced_only_on_request(tmp_path, text, poses):
     assert kept.read_bytes() == text
 
 
-def test_an_incomplete_head_is_written_again(tmp_path):
-    """Without a pose there is no question to the operator."""
-    for text in (b'{"form', bytes(40)):
-        (tmp_path / 'j').write_bytes(text)
-        Journal(tmp_path / 'j', HEAD).close()
-        assert read(tmp_path / 'j')[0]['serial'] == 'A1'
-
-
-def test_a_journal_in_a_missing_folder_is_refused(tmp_path):
-    """The message names the missing folder."""
-    with pytest.raises(UserError, match='cannot write the journal'):
-        Journal(tmp_path / 'none' / 'j', HEAD)
-
-
-def test_a_repeated_pose_replaces_the_first():
-    """`redo` appends the pose again."""
-    first, other, again = pose_record(0), pose_record(1), pose_record(0, samples=3)
-    entries = [first, other, again, Fitted(None, True)]
-    assert accepted_poses(entries) == [again, other]
-
-
-def test_lines_of_every_version_are_read(tmp_path):
-    """Keys and their order are those of all journals; a rest by hand has no angles."""
-    record = {'pose': 1, 'alpha_rad': 0.5, 'beta_rad': 0.25, 'alpha_setting': 0, 'beta_setting': 1,
-              'check': False, 'start_ns': 1, 'stop_ns': 2, 'samples': 5, 'mean_v': [2.5, 2.6],
-              'std_v': [0.1, 0.2], 'temperature_c': 23.0}
-    by_hand = {key: record[key] for key in ('pose', 'start_ns', 'stop_ns', 'samples', 'mean_v',
-                                            'std_v')}
-    earlier = {key: value for key, value in record.items() if not key.endswith('_setting')}
-    lines = [record, by_hand, earlier, {'drop': 1}, {'skip': 3, 'drop': 3},
-             {'mounting': 'not checked'}, {'rests': [record, by_hand], 'done': False}]
-    path = tmp_path / 'j'
-    path.write_text(''.join(f'{json.dumps(line)}\n' for line in (
-        {'format': 1, **HEAD}, *lines, {'note': 'of another version'}, {'done': True})))
-    entries = read(path).entries
-    assert [json.dumps(e.to_json()) for e in entries] == [json.dumps(e) for e in (
-        *lines, {'done': True})]
-    assert entries[0].beta_setting == 1 and entries[2].beta_setting is None
-    assert np.isnan(entries[1].alpha_rad) and entries[1] == PoseRecord.from_json(by_hand)
-
-
 def test_a_pose_is_synced_before_it_is_acknowledged(tmp_path, monkeypatch):
     """The file contains the entry when `append` calls fsync."""
     path, synced = tmp_path / 'j', []
@@ -166,38 +104,6 @@ def _no_room(_):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def test_an_early_fit_can_continue_and_does_not_block_another_unit(tmp_path):
-    """With open poses the calibration can resume. For another unit the journal is finished."""
-    path = tmp_path / 'j'
-    journal = Journal(path, HEAD)
-    journal.append(POSE)
-    journal.append(Fitted((), False))
-    journal.close()
-    assert unfinished(path, HEAD) == (1, '')
-    other = {**HEAD, 'serial': 'B2'}
-    assert unfinished(path, other) is None
-    journal = Journal(path, HEAD)
-    assert accepted_poses(journal.entries) == [POSE]
-    journal.close()
-    journal = Journal(path, other)
-    assert journal.entries == []
-    journal.close()
-    kept, = tmp_path.glob('j.2*')
-    assert accepted_poses(read(kept)[1]) == [POSE]
-
-
-def test_fit_uses_the_fitted_rests_unless_the_sweep_has_continued(tmp_path):
-    """`fit --journal` uses all poses of the end of the sweep."""
-    path = tmp_path / 'j'
-    journal = Journal(path, HEAD)
-    journal.append(POSE)
-    journal.append(Fitted((pose_record(0, samples=7),), False))
-    assert fit._records(path) == [pose_record(0, samples=7)]
-    journal.append(pose_record(1))
-    journal.close()
-    assert fit._records(path) == [POSE, pose_record(1)]
-
-
 def test_a_new_start_keeps_the_interrupted_journal(tmp_path):
     """The poses of an interrupted calibration are kept in another file."""
     path = tmp_path / 'j'
@@ -212,26 +118,3 @@ def test_a_new_start_keeps_the_interrupted_journal(tmp_path):
     kept, = tmp_path.glob('j.2*')
     assert read(kept) == ({'format': 1, **HEAD}, [POSE])
     assert unfinished(path, HEAD) is None
-
-
-def test_dropped_and_skipped_poses():
-    """A dropped pose does not count, and a skipped pose is listed."""
-    entries = [POSE, pose_record(1), PoseDropped(1), PoseSkipped(4), pose_record(2),
-               PoseSkipped(5), PoseDropped(5)]
-    assert accepted_poses(entries) == [POSE, pose_record(2)]
-    assert skipped_poses(entries) == {4}, 'a pose that is taken after all is not skipped'
-
-
-def test_zero_bytes_after_a_power_cut_are_ignored(tmp_path):
-    """A file system may have stored the length of the file before its bytes."""
-    path = tmp_path / 'j'
-    journal = Journal(path, HEAD)
-    journal.append(POSE)
-    journal.close()
-    with open(path, 'ab') as file:
-        file.write(bytes(200))
-    journal = Journal(path, HEAD)
-    assert journal.entries == [POSE]
-    journal.append(pose_record(1))
-    journal.close()
-    assert read(path)[1] == [POSE, pose_record(1)]

@@ -4,7 +4,6 @@
 
 import os
 
-from adxl_ros.errors import UserError
 from adxl_ros.files.reading_options import AS_IT_IS
 from adxl_ros.fleet.inputs import find_sources
 from adxl_ros.fleet.recipe import make_recipe
@@ -42,56 +41,6 @@ def test_a_serial_number_that_contradicts_the_recording_is_refused(tmp_path):
     assert {row['outcome'] for row in rows.values()} == {'done'}
 
 
-def test_a_recording_has_one_serial_number(tmp_path):
-    """Two rows may name one recording in two ways; a row without a serial number says nothing."""
-    write(tmp_path / 'run.csv', 'time_s,x_v')
-    path = write(tmp_path / 'list.csv', 'url,serial', 'run.csv,S1', '', f'{tmp_path}/run.csv,S2')
-    with pytest.raises(UserError) as error:
-        find_sources([path])
-    assert str(error.value) == (f'{path}: rows 2 and 4: the serial of {tmp_path}/run.csv is S1 '
-                                'and S2, expected one')
-    source, = find_sources([write(tmp_path / 'list.csv', 'url,serial', 'run.csv,S1', 'run.csv,',
-                                  './run.csv,S1')])
-    assert source.serial == 'S1'
-
-
-def test_comments_of_a_manifest_are_skipped(tmp_path):
-    for name in 'ab':
-        write(tmp_path / f'{name}.csv', 'time_s,x_v')
-    path = write(tmp_path / 'list.csv', '# by hand, url', ' # twice', 'url,serial', 'a.csv,S1',
-                 '# later: c.csv', 'b.csv,S2')
-    assert [source.serial for source in find_sources([path])] == ['S1', 'S2']
-    path = write(tmp_path / 'list.csv', '# by hand', 'url,serial', '# later', 'a.csv')
-    with pytest.raises(UserError, match='row 4: 1 columns, expected 2'):
-        find_sources([path])
-
-
-def test_a_manifest_without_a_column_url_says_so(tmp_path):
-    """It may be a recording without numbers as well."""
-    parquet = pytest.importorskip('pyarrow.parquet')
-    from pyarrow import table
-    parquet.write_table(table({'file': ['a.csv'], 'serial': ['S1']}), tmp_path / 'list.parquet')
-    rows = rows_of(write(tmp_path / 'list.csv', 'file,serial', 'a.csv,S1'),
-                   str(tmp_path / 'list.parquet'))
-    assert rows['list.csv']['refusal'].startswith('the first 200 lines hold no row of numbers')
-    assert rows['list.parquet']['refusal'].startswith('has no column of numbers')
-    assert all(row['refusal'].endswith('; a manifest needs a column url')
-               for row in rows.values())
-
-
-def test_a_path_with_colons_is_a_path(tmp_path, monkeypatch):
-    """Two colons join addresses only where there is an address."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / 'day::1').mkdir()
-    path = tmp_path / 'day::1' / 'a::b.csv'
-    write(path, *recording_text('S1', '2026-10-01', 1).splitlines())
-    for name in ('day::1/a::b.csv', 'day::1', 'day::1/*.csv', str(path)):
-        row, = rows_of(name).values()
-        assert (row['url'], row['refusal']) == (str(path), None)
-    source, = find_sources(['gone::1.csv'])
-    assert (source.url, source.fault) == (str(tmp_path / 'gone::1.csv'), 'no such file')
-
-
 def test_a_name_that_is_not_utf_8_is_refused_by_its_name(tmp_path):
     name = os.fsdecode(os.fsencode(tmp_path) + b'/b\xe9.csv')
     write(tmp_path / 'a.csv', *recording_text('S1', '2026-10-01', 1).splitlines())
@@ -101,19 +50,6 @@ def test_a_name_that_is_not_utf_8_is_refused_by_its_name(tmp_path):
         rows = rows_of(*inputs)
         assert rows['a.csv']['refusal'] is None
         assert rows['b\\udce9.csv']['refusal'] == 'its name is not UTF-8; rename it'
-
-
-def test_serial_numbers_of_parquet_are_whole_numbers(tmp_path):
-    """A column of numbers with an empty cell comes as floats."""
-    parquet = pytest.importorskip('pyarrow.parquet')
-    from pyarrow import table
-    parquet.write_table(table({'url': ['a.csv', 'b.csv', 'c.csv'], 'serial': [12.0, None, 1.5]}),
-                        tmp_path / 'list.parquet')
-    assert [source.serial for source in find_sources([str(tmp_path / 'list.parquet')])] == [
-        '12', '', '1.5']
-    parquet.write_table(table({'url': ['a.csv'], 'serial': [float('nan')]}),
-                        tmp_path / 'list.parquet')
-    assert [source.serial for source in find_sources([str(tmp_path / 'list.parquet')])] == ['']
 
 
 def test_hidden_folders_are_not_searched(tmp_path, monkeypatch):

@@ -4,7 +4,7 @@
 
 from datetime import datetime, timezone
 
-from adxl_ros.fleet.row import arrow_schema, as_table, COLUMNS, empty_row, finite, TIMING
+from adxl_ros.fleet.row import arrow_schema, as_table, COLUMNS, empty_row, TIMING
 import pytest
 
 
@@ -25,7 +25,3 @@ def test_names_are_unique_and_units_stand_in_the_schema():
     names = [column.name for column in COLUMNS]
     assert len(set(names)) == len(names) and set(TIMING) < set(names)
     assert arrow_schema().field('gap_before_mps2').metadata[b'unit'].decode() == 'm/s²'
-
-
-def test_nan_is_no_value():
-    assert finite(float('nan')) is None and finite(float('inf')) is None and finite(2) == 2.0

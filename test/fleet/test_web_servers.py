@@ -4,18 +4,15 @@
 
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
-from http.server import BaseHTTPRequestHandler, SimpleHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Thread
 import time
 
-from adxl_ros.errors import UserError
 from adxl_ros.fleet import inputs
 from adxl_ros.fleet.inputs import find_sources, Source
 from adxl_ros.fleet.staging import stage, StagingError
 import pytest
 
-aiohttp = pytest.importorskip('aiohttp', reason='aiohttp is not installed')
 http = pytest.importorskip('fsspec.implementations.http', reason='fsspec is not installed')
 
 _PART = b'0.0,2.5\n' * 1000
@@ -64,13 +61,6 @@ def test_a_recording_is_read_once(tmp_path):
     assert reads == ['/run.csv']
 
 
-def test_a_slow_line_may_take_its_time(tmp_path, monkeypatch):
-    http.HTTPFileSystem.clear_instance_cache()
-    monkeypatch.setattr(aiohttp.client, 'DEFAULT_TIMEOUT', aiohttp.ClientTimeout(total=0.5))
-    with web_server(10, 0.2) as (url, _):
-        assert stage(Source(url), tmp_path).size_bytes == 10 * len(_PART)
-
-
 def test_a_silent_server_is_given_up(tmp_path, monkeypatch):
     monkeypatch.setattr(inputs, '_SILENCE_S', 0.2)
     with web_server(2, 2.0) as (url, _), pytest.raises(StagingError, match='cannot be read'):
@@ -87,27 +77,3 @@ def test_a_token_opens_a_recording_and_stays_out_of_its_row(tmp_path):
             stage(replace(first, secret=f'{url}?token=SECRET1&x=1'), tmp_path)
     assert (first.url, second.url, old.url) == (f'{url}?x=1', f'{url}?x=2', f'{url}?x=1')
     assert 'SECRET' not in f'{first} {old} {error.value}'
-
-
-def test_a_message_has_no_token():
-    with pytest.raises(UserError, match='gs2:') as error:
-        find_sources(['gs2://user:SECRET@bucket/*.csv?sig=SECRET'])
-    assert 'SECRET' not in str(error.value)
-
-
-def test_a_bag_is_refused_by_its_own_address(tmp_path):
-    """Recordings beside it are found."""
-    for name in ('bag/metadata.yaml', 'bag/bag_0.mcap', 'run.csv'):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_text('')
-    handler = partial(SimpleHTTPRequestHandler, directory=tmp_path)
-    with ThreadingHTTPServer(('127.0.0.1', 0), handler) as server:
-        Thread(target=server.serve_forever, daemon=True).start()
-        url = f'http://127.0.0.1:{server.server_address[1]}'
-        faults = {source.url: source.fault for source in find_sources([url])}
-        bag, = find_sources([f'{url}/bag'])
-        file, = find_sources([f'{url}/bag/bag_0.mcap'])
-        server.shutdown()
-    assert set(faults) == {f'{url}/bag', f'{url}/run.csv'} and not faults[f'{url}/run.csv']
-    assert bag.fault == faults[bag.url] and bag.fault.startswith('is a bag on a web server')
-    assert not file.fault

@@ -7,10 +7,8 @@ from adxl_ros.errors import UserError
 from adxl_ros.investigate.diagnosis_round import Answer, Outcome
 from adxl_ros.investigate.investigation import Investigation, State
 from adxl_ros.investigate.manoeuvres import Pose, StageLimits
-from adxl_ros.investigate.output_folder import OutputFolder
 import numpy as np
 import pytest
-from units import nominal
 
 LIMITS = StageLimits((0.0, np.pi), (0.0, 2 * np.pi), 0.5)
 GO_ON = Answer((WeightedHypothesis((), 0.6),), Outcome.GO_ON, manoeuvre='rests_upright')
@@ -114,14 +112,6 @@ def test_the_time_is_a_limit():
     assert sum(d > 0 for d in np.abs(np.diff(stage.commands, axis=0)).max(axis=1)) < 60 / 0.02
 
 
-def test_a_stage_outside_its_limits_is_not_moved():
-    investigation, stage, _ = started(GO_ON)
-    stage.pose = Pose(-0.5, 0.0)
-    stage.run(lambda: investigation.has_ended)
-    assert 'limits.alpha_deg' in investigation.reason
-    assert not stage.commands
-
-
 @pytest.mark.parametrize('answer', [UserError('the bag is gone'), Answer(
     (), Outcome.INSEPARABLE, fault='axis x is inverted')])
 def test_a_failed_diagnosis_stops_it(answer):
@@ -129,19 +119,3 @@ def test_a_failed_diagnosis_stops_it(answer):
     stage.run(lambda: investigation.has_ended)
     assert investigation.state is State.STOPPED
     assert investigation.reason in ('the bag is gone', 'axis x is inverted')
-
-
-def test_an_answer_survives_its_file():
-    assert Answer.from_json(GO_ON.as_json()) == GO_ON
-    assert Answer.from_json(CERTAIN.as_json()) == CERTAIN
-
-
-def test_a_folder_without_a_diagnosis_is_used_again(tmp_path):
-    first = OutputFolder.free(tmp_path / 'found')
-    first.make(nominal())
-    first.bag.mkdir()
-    assert OutputFolder.free(tmp_path / 'found') == first
-    first.make(nominal())
-    assert not first.bag.exists()
-    (first.path / 'report.json').write_text('{}')
-    assert OutputFolder.free(tmp_path / 'found').path == tmp_path / 'found_2'

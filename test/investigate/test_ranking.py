@@ -60,19 +60,6 @@ def test_fast_turns_show_an_arm_better_than_rests_and_slow_turns():
     assert information['fast_turn_of_beta'] > information['slow_turn_of_beta']
 
 
-def test_a_level_turn_of_beta_does_not_show_the_force_along_the_axes():
-    names = ('level_turn_of_beta', 'rests_upright')
-    information = worth(rank(between(BEYOND, ('nonlinearity',)), SENSOR, planned(*names)))
-    assert information['rests_upright'] > 3 * information['level_turn_of_beta']
-
-
-def test_equal_hypotheses_cannot_be_separated():
-    ranking = Ranking(between((), ('saturation',)), (told_nothing(),), ())
-    decision = decide(ranking, FIRST, True)
-    assert decision.outcome is Outcome.NO_VISIBLE_GAP
-    assert decision.sentence == 'There is no gap that this stage can show: 100 %.'
-
-
 @pytest.mark.xdist_group('first_round')
 def test_a_manoeuvre_that_does_not_fit_in_the_time_is_not_chosen():
     pose = Pose(0.0, 0.0)

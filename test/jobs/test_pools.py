@@ -12,11 +12,8 @@ import sys
 from threading import Event, Thread
 import time
 
-from adxl_ros.errors import UserError
-from adxl_ros.jobs import pools
 from adxl_ros.jobs.pools import open_pool, TaskFuture, TaskLost, WorkerDied
 from adxl_ros.jobs.run import finished_tasks
-from adxl_ros.jobs.whole_files import write
 from job_tasks import children, dask_cluster, deadly, half_sent, numbered, SUPPORT
 import pytest
 
@@ -56,23 +53,6 @@ def test_a_worker_that_ends_while_it_sends_its_result():
         error = pool.submit(half_sent, 1_000_000).exception(timeout=_LONG_WAIT_S)
         assert isinstance(error, WorkerDied)
         assert pool.submit(numbered, 4).result(timeout=_LONG_WAIT_S) == 4
-
-
-def test_a_worker_that_ends_without_a_task_costs_none():
-    with open_pool(None, 1) as pool:
-        assert pool.submit(numbered, 1).result(timeout=_LONG_WAIT_S) == 1
-        pid, = children(os.getpid())
-        os.kill(pid, signal.SIGKILL)
-        # The next task is refused by the executor, and not only lost by it.
-        wait_for(lambda: pool._workers[0]._executor._broken)
-        end, = finished_tasks(pool, numbered, [(2,)])
-    assert (end.value, end.error) == (2, None)
-
-
-def test_an_error_of_the_user_is_not_repeated(tmp_path):
-    with open_pool(None, 1) as pool:
-        end, = finished_tasks(pool, write, [(tmp_path / 'no' / 'file', b'')])
-    assert isinstance(end.error, UserError) and end.attempts == 1
 
 
 def test_no_task_is_lost_while_workers_are_killed():
@@ -138,21 +118,6 @@ def test_a_cluster_loses_workers_and_its_scheduler(tmp_path):
     assert {end.arguments[0] for end in results} == set(range(400))
 
 
-def test_a_cluster_blames_no_task_that_only_waits(tmp_path):
-    """Dask blames all that a worker holds; the task that ends its worker each time is one."""
-    pytest.importorskip('distributed', reason='distributed is not installed: '
-                        'pip install distributed')
-    with dask_cluster(tmp_path, workers=1, failures=0) as cluster, cluster.kept(), \
-            open_pool(cluster.address) as pool:
-        results = {end.arguments[0]: end for end in finished_tasks(
-            pool, deadly, ((number, 3, 5) for number in range(12)), retries=0)}
-    assert set(results) == set(range(12))
-    assert isinstance(results[3].error, WorkerDied) and isinstance(results[5].error, ValueError)
-    for number, end in results.items():
-        if number not in (3, 5):
-            assert (end.value, end.error, end.attempts) == (number, None, 1)
-
-
 class DeadlyPool(Executor):
     """Ends a share of the attempts, and each one of task 7, with their worker."""
 
@@ -179,13 +144,3 @@ def test_workers_that_end_at_random_blame_no_task(share):
     failed, = (end for end in results if end.error is not None)
     assert failed.arguments == (7,) and isinstance(failed.error, WorkerDied)
     assert failed.attempts < 10 if share else failed.attempts == 2
-
-
-def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch):
-    monkeypatch.setattr(pools, '_CONNECT_S', 1.0)
-    pytest.importorskip('distributed', reason='distributed is not installed: '
-                        'pip install distributed')
-    with pytest.raises(UserError, match='no scheduler answers') as raised, \
-            open_pool('tcp://127.0.0.1:9'):
-        pass
-    assert '\n' not in str(raised.value)

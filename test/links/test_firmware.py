@@ -12,7 +12,6 @@ import time
 import tty
 
 from adxl_ros.links import serial
-from adxl_ros.links.support.base import samples_within
 from adxl_ros.links.support.wire_format import (
     AFTER_RESET,
     BoardInfo,
@@ -115,19 +114,6 @@ def received(library, raw, receiver=None):
                                      ctypes.byref(latency_us))]
 
 
-@pytest.mark.parametrize('latency_us', [0, 1, 2000, 0x01010101, 0x00ff0000, 2 ** 32 - 1])
-def test_commands_are_taken_from_any_stream(library, latency_us):
-    command = encode_command(0x80000001, latency_us)
-    assert received(library, command) == [latency_us]
-    noise = np.random.default_rng(latency_us).integers(0, 256, 3000).astype(np.uint8).tobytes()
-    assert received(library, noise + command + b'AT\r\n' * 40 + command) == [latency_us] * 2
-    for k in range(1, len(command) - 1):
-        damaged = bytearray(command)
-        damaged[k] ^= 0x10
-        assert received(library, damaged) == []
-    assert received(library, Encoder(BoardInfo(1e3, 16, 2, 5.0, '')).info_frame()) == []
-
-
 @settings(deadline=None)
 @given(st.lists(st.one_of(st.binary(max_size=40), st.binary(min_size=17, max_size=17))))
 def test_no_stream_breaks_the_receiver(library, parts):
@@ -136,14 +122,6 @@ def test_no_stream_breaks_the_receiver(library, parts):
         received(library, part.replace(b'\0', b'\1') + b'\0', receiver)
         assert receiver.length <= 18
     assert received(library, encode_command(0, 7), receiver) == [7]
-
-
-@pytest.mark.parametrize('rate_hz', [10.0, 333.3, 1000.0, 2000.0, 8000.0])
-def test_the_firmware_and_the_emulated_board_take_as_many_samples(library, rate_hz):
-    for latency_us in (0, 100, 900, 1000, 1001, 2000, 3000, 5000, 7000, 9990, 10_000, 2 ** 31):
-        assert library.frame_samples(ctypes.c_uint32(latency_us), ctypes.c_float(rate_hz),
-                                     ctypes.c_uint8(10)) == \
-            min(samples_within(latency_us * 1e-6, rate_hz), 10)
 
 
 @pytest.fixture(scope='module')
@@ -203,14 +181,3 @@ def test_the_sketch_obeys(sketch, tmp_path, latency_ms):
         assert link.sensor.serial == 'adxl-0001'
         assert link.status().text.startswith('streaming')
         assert 'obey' not in link.status().text
-
-
-def test_the_sketch_sends_longer_frames_on_a_slow_uart(sketch, tmp_path):
-    """At 115200 Bd frames of 2 ms would take twice the time there is; none is lost."""
-    with running_sketch(sketch, tmp_path, 115200) as link:
-        read_until(link, lambda: value(link, 'frames') > 30)
-        volts, missing = read_until(link, lambda: value(link, 'frames') > 300)
-        assert 2 < value(link, 'frame_ms') <= 10
-        assert value(link, 'device_overruns') == missing == 0
-        codes = np.rint(volts / nominal().lsb_v)
-        assert (np.diff(codes[:, 0]) == 1).all()

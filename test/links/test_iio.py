@@ -82,18 +82,6 @@ def test_every_format_gives_the_volts_of_its_codes(served, form):
     assert any(np.array_equal(other_codes, iiod.code(k + turn, 1, bits)) for turn in turns)
 
 
-def test_labels_choose_the_channels_and_the_third_is_the_supply(served):
-    _, link = served(adc={'channels': [
-        {'id': 'voltage0', 'label': 'supply', 'scale': 0.1}, {'id': 'voltage3', 'label': 'y'},
-        {'id': 'voltage5', 'label': 'x'}]}, supply_scale=2.0)
-    parts = read_samples(link, 500)
-    codes = np.concatenate([part.volts for part in parts]) / nominal().lsb_v
-    k = np.rint(codes[:, 0] - 2000).astype(int) - 1
-    assert np.array_equal(np.rint(codes[:, 1]), iiod.code(k // 5, 1, 16))
-    supply = column('supply_v', parts)
-    assert np.isfinite(supply).sum() >= 3
-
-
 @pytest.mark.parametrize('entries', ['voltage1,voltage0,voltage2', ['y=voltage0', 'x=voltage1',
                                                                     'supply=voltage2'],
                                      'right,left,voltage2'])
@@ -118,16 +106,6 @@ def test_the_rate_is_set_and_read_back(served):
     read_samples(link, 100)
     assert link.sensor.rate_hz == 860
     assert link.status().text == 'streaming at 860 Hz (900 Hz were asked for)'
-
-
-def test_a_thermometer_outside_the_buffer_is_read_once_a_second(served):
-    _, link = served(adc={'channels': [
-        {'id': 'voltage0', 'label': 'x'}, {'id': 'voltage1', 'label': 'y'},
-        {'id': 'temp', 'label': 'temperature', 'unbuffered': True, 'raw': 400, 'scale': 62.5,
-         'offset': -20}]})
-    temperature_c = column('temperature_c', read_samples(link, 400))
-    assert temperature_c[np.isfinite(temperature_c)] == pytest.approx((400 - 20) * 0.0625)
-    assert np.isfinite(temperature_c).any()
 
 
 def test_a_digital_sensor_gives_pseudo_volts(served):
@@ -168,23 +146,6 @@ def test_a_buffer_is_as_long_as_the_latency(served):
     assert 2.0 <= durations_ms[0] < 100.0 <= durations_ms[1]
 
 
-def test_a_device_far_away_has_longer_buffers(served):
-    """With 8 ms for each answer, buffers of 2 ms would lose three of four samples."""
-    _, link = served(adc={'answer_s': 0.008}, latency_ms=2.0)
-    parts = read_samples(link, 1000)
-    assert link.status().values()['buffer_ms'] >= 16
-    # A busy machine answers late, too, and then loses some.
-    assert sum(part.missing for part in parts) < 500
-
-
-def test_short_buffers_outlast_a_pause_of_the_reader(served):
-    _, link = served(latency_ms=0.0)
-    parts = read_samples(link, 100)
-    time.sleep(0.2)
-    parts += read_samples(link, 500)
-    assert sum(part.missing for part in parts) == 0
-
-
 @pytest.mark.parametrize('scatter_ns', [
     60_000,  # beside other tests
     pytest.param(20_000, marks=pytest.mark.perf)])
@@ -202,18 +163,6 @@ def test_stamps_are_those_of_the_devices_clock(served, scatter_ns):
         line = np.polyval(np.polyfit(periods, stamps - stamps[0], 1), periods)
         scatter = (stamps - stamps[0] - line).std()
     assert (np.diff(np.concatenate([part.stamp_ns for part in parts])) > 0).all()
-
-
-def test_a_server_that_is_not_there_is_waited_for(served):
-    link = iio.open_link(nominal(), iio.Settings(uri='ip:127.0.0.1:1'))
-    read_samples(link, 1, 0.3)
-    assert link.status().text == 'ip:127.0.0.1:1: Connection refused'
-
-
-def test_a_device_of_this_machine_that_is_absent_is_reported():
-    link = iio.open_link(nominal(), iio.Settings(uri='local:', device='no such device'))
-    read_samples(link, 1, 0.3)
-    assert link.status().text.startswith(('local: No such', "local: link.device: 'no such"))
 
 
 @pytest.mark.parametrize('uri', ['', 'ip:', 'xml:/etc/passwd', 'adc', 'ip:\u00e4'])

@@ -12,11 +12,10 @@ import tty
 
 from adxl_ros.errors import UserError
 from adxl_ros.links import serial
-from adxl_ros.links.support import base, emulated_board, serial_port
+from adxl_ros.links.support import base, emulated_board
 from adxl_ros.links.support.wire_format import (
     BoardInfo,
     decode_command,
-    encode_payload,
     Encoder,
     Splitter,
 )
@@ -169,19 +168,6 @@ def test_samples_are_volts_of_the_codes_at_the_rate_of_the_board(connect):
     assert missing(parts) == 0
 
 
-def test_data_before_the_first_info_is_held_back_and_counted(connect):
-    board = connect()
-    board.send_frames(7)
-    assert not board.read()
-    assert board.value('held_back') == 70
-    board.send_info()
-    board.send_frames(3)
-    parts = board.read_samples(30)
-    assert sample_count(parts) == 30
-    assert board.value('held_back') == 70
-    assert missing(parts) == 0
-
-
 def test_a_frame_that_was_lost_is_missing_exactly(connect):
     board = connect()
     board.send_info()
@@ -194,20 +180,6 @@ def test_a_frame_that_was_lost_is_missing_exactly(connect):
     stamps = stamps_of(parts)
     assert (np.diff(stamps) > 0).all()
     assert np.diff(stamps)[29] == pytest.approx(4.322e9, rel=0.06), 'the gap shows in the stamps'
-
-
-def test_a_repeated_frame_is_not_published_again(connect):
-    board = connect()
-    board.send_info()
-    raw = board.encoder.sample_frame(0, 0, board.codes)
-    board.send(raw + raw)
-    board.index = 10
-    board.send_frames(2)
-    board.send(raw)
-    board.send_frames(1)
-    parts = board.read_samples(40)
-    assert sample_count(parts) == 40
-    assert board.value('repeated') == 20
 
 
 def test_the_loss_of_a_reset_is_estimated(connect):
@@ -229,20 +201,6 @@ def test_the_loss_of_a_reset_is_estimated(connect):
     assert 450 < lost < (time.monotonic() - began_s) * 1000
 
 
-def test_another_board_on_the_port_is_another_sensor(connect):
-    board = connect()
-    board.send_info()
-    board.send_frames(3)
-    board.read_samples(30)
-    board.encoder, board.index = Encoder(BoardInfo(1000.0, 12, 2, 2.5, 'Z1')), 0
-    board.codes = np.full((10, 2), 2048)
-    board.send_info()
-    board.send_frames(3)
-    parts = board.read_samples(30)
-    assert board.link.sensor.serial == 'Z1'
-    assert volts_of(parts) == pytest.approx(1.25)
-
-
 @pytest.mark.parametrize('roles', ['x,y,supply,temperature', ['y', '-', 'x', 'supply']])
 def test_channels_are_what_the_parameter_states(connect, roles):
     board = connect(info=BoardInfo(1000.0, 16, 4, 5.0, ''), channels=roles, supply_scale=2.0)
@@ -262,16 +220,6 @@ def test_channels_are_what_the_parameter_states(connect, roles):
     assert board.link.sensor.serial == nominal().serial, 'the board states no serial number'
 
 
-def test_by_default_the_channels_are_x_y_z_supply(connect):
-    board = connect(info=BoardInfo(1000.0, 16, 4, 5.0, ''), sensor=nominal('xyz'))
-    board.send_info()
-    board.send_frames(30, 0.005)
-    parts = board.read_samples(300)
-    assert parts[0].volts.shape[1] == 3
-    assert reference('supply_v', parts) == pytest.approx(
-        board.codes[:, 3].mean() * 5 / 2 ** 16, rel=1e-3)
-
-
 @pytest.mark.parametrize('info, settings, reason', [
     (BoardInfo(1000.0, 16, 1, 5.0, ''), {}, 'no channel for y'),
     (INFO, {'channels': 'x,y,supply'}, '3 are named, the board has 2')])
@@ -284,15 +232,6 @@ def test_a_board_that_does_not_fit_states_why(connect, info, settings, reason):
     assert status.level == base.Level.ERROR
     assert reason in status.text
     assert board.value('held_back') == 50
-
-
-def test_a_channel_that_the_sensor_does_not_have_is_not_published(connect):
-    board = connect(info=BoardInfo(1000.0, 16, 3, 5.0, ''))
-    board.send_info()
-    board.send_frames(5)
-    parts = board.read_samples(50)
-    assert parts[0].volts.shape[1] == 2
-    assert 'the channel of z is not used' in board.link.status().text
 
 
 def test_frames_that_contradict_the_info_frame_are_not_published(connect):
@@ -312,17 +251,6 @@ def test_frames_that_contradict_the_info_frame_are_not_published(connect):
     assert board.value('bad_frames') == 2
 
 
-def test_another_version_of_the_format_is_reported(connect):
-    board = connect()
-    board.send(encode_payload(b'\1\2' + bytes(30)))
-    assert not board.read()
-    assert 'speaks wire format 2' in board.link.status().text
-    board.send_info()
-    board.send_frames(3)
-    board.read_samples(30)
-    assert board.link.status().text == 'streaming'
-
-
 def test_silence_and_bytes_without_a_frame_are_distinguished(connect):
     board = connect()
     board.send_info()
@@ -331,24 +259,6 @@ def test_silence_and_bytes_without_a_frame_are_distinguished(connect):
     board.wait_for('is link.baud (115200) that of the board?',
                    lambda: board.send(os.urandom(50).replace(b'\0', b'\1') + b'\0'))
     board.wait_for('streaming', board.send_frames)
-
-
-def test_frames_far_above_the_stated_rate_wait(connect):
-    board = connect()
-    board.send_info()
-    stop_s = time.monotonic() + 2.0
-
-    def flood():
-        while time.monotonic() < stop_s:
-            board.send_frames(10)
-    writer = threading.Thread(target=flood)
-    writer.start()
-    parts = board.read(5.0, lambda parts: time.monotonic() > stop_s)
-    while writer.is_alive():
-        parts += board.read()
-    writer.join()
-    assert sample_count(parts) < 2.5 * 20 * 1000 + 6000, 'twenty times the rate, and the credit'
-    assert (np.diff(stamps_of(parts)) > 0).all()
 
 
 def test_a_port_comes_back_and_the_count_goes_on(connect):
@@ -393,54 +303,6 @@ def test_a_board_is_asked_for_small_frames(connect, latency_ms, latency_us):
     assert board.commands() == [], 'the board obeys'
     assert board.value('frame_ms') == max(int(latency_ms), 1)
     assert 'obey' not in board.link.status().text
-
-
-def test_a_board_that_waits_for_its_info_is_asked_at_once(connect):
-    """It answers with its info frame, so that the first samples need not wait for a second."""
-    board = connect()
-    board.send_frames(1)
-    board.read(0.1)
-    assert board.commands() == [2000]
-
-
-def test_firmware_that_does_not_obey_is_read_and_reported(connect):
-    board = connect()
-    board.send_info()
-    commands, sent, end_s = [], 0, time.monotonic() + 100
-    while board.link.status().text == 'streaming' or not sent:
-        board.send_frames(1, 0.01)
-        sent += 1
-        sent -= sample_count(board.read_samples(1, 0.01)) / 10
-        commands += board.commands()
-        assert time.monotonic() < end_s
-    assert board.link.status().text == ('streaming in frames of 10 ms: the firmware does not obey '
-                                        'link.latency_ms')
-    assert board.link.status().level == base.Level.OK
-    assert 2 <= len(commands) <= 5, 'a board that does not obey is left alone'
-
-
-def test_a_slow_uart_gets_the_smallest_frames_that_it_carries(connect, tmp_path, monkeypatch):
-    """The kernel's list of devices says here that the terminal is a UART at a USB cable."""
-    board = connect(baud=115200)
-    number = os.stat(board.path).st_rdev
-    device = tmp_path / 'sys' / f'{os.major(number)}:{os.minor(number)}' / 'device'
-    device.mkdir(parents=True)
-    driver = tmp_path / 'ftdi_sio'
-    driver.mkdir()
-    (device / 'driver').symlink_to(driver)
-    monkeypatch.setattr(serial_port, '_SYSFS', tmp_path / 'sys')
-    board.link.close()
-    board.link.read(0)
-    board.send_info()
-    board.send_frames(1)
-    board.read_samples(10)
-    asked_us, = board.commands()
-    samples = asked_us // 1000
-    assert 2 < samples < 10
-    bytes_per_s = len(board.encoder.sample_frame(0, 0, board.codes[:samples])) * 1000 / samples
-    assert 0.6 < bytes_per_s / 11520 < 0.9, 'a margin for info frames'
-    assert board.link.status().text == (f'streaming in frames of {samples} ms: 115200 Bd carry '
-                                        'none of 2 ms')
 
 
 def test_a_socket_is_a_port():

@@ -76,14 +76,6 @@ def test_sim_samples_a_pose_with_the_stated_noise():
     assert volts.std(0) == pytest.approx(std_v, rel=0.15)
 
 
-def test_samples_of_sim_do_not_depend_on_the_number_of_reads():
-    often = read_until(simulated(), START + 1000 * MS, 3 * MS)
-    seldom = read_until(simulated(), START + 1000 * MS, 250 * MS)
-    assert np.array_equal(often[1][:1000], seldom[1][:1000])
-    other_seed = read_until(simulated(seed=1), START + 1000 * MS, 3 * MS)
-    assert not np.array_equal(often[1], other_seed[1])
-
-
 def turning(t):
     """Return a smooth motion at a time, s: positions and velocities by joint."""
     return ({'alpha': 0.5 + 0.4 * np.sin(3 * t), 'beta': -2 * np.cos(t),
@@ -133,37 +125,6 @@ def test_sim_waits_for_a_stage_and_holds_the_pose_of_a_lost_one(monkeypatch):
     assert link.read(START + 9000 * MS).until_ns == START + 1310 * MS
 
 
-def test_sim_follows_a_stage_that_has_started_again():
-    link = simulated(ideal())
-    for k in range(11):
-        link.sense_stage(START + k * 10 * MS, {'alpha': 0.3, 'beta': 0.0}, {})
-    for k in range(5, 9):
-        link.sense_stage(START + k * 10 * MS, {'alpha': 0.7, 'beta': 0.0}, {})
-    samples = link.read(START + 200 * MS)
-    assert samples.until_ns == START + 80 * MS
-    assert to_nominal_mps2(samples.volts, ideal())[-1, 2] == pytest.approx(9.80665 * np.cos(0.7))
-
-
-@pytest.mark.parametrize('stamp, alpha, reason', [
-    (START + 3600 * 1000 * MS, 0.1, 'another clock'), (START - 3000 * MS, 0.1, 'another clock'),
-    (START + 10 * MS, np.nan, 'not finite')])
-def test_sim_ignores_motion_that_cannot_be(stamp, alpha, reason):
-    link = simulated(ideal(), alpha=0.2)
-    link.sense_stage(stamp, {'alpha': alpha, 'beta': 0.0}, {'alpha': 0.0, 'beta': 0.0})
-    assert link.status().level == base.Level.WARN
-    assert reason in link.status().text
-    samples = link.read(START + 100 * MS)
-    assert len(samples.stamp_ns) == 101
-    assert to_nominal_mps2(samples.volts, ideal())[-1, 2] == pytest.approx(9.80665 * np.cos(0.2))
-
-
-def test_sim_counts_the_samples_that_a_jump_of_the_clock_skips():
-    link = simulated()
-    link.read(START + 100 * MS)
-    assert link.begin(START + 3100 * MS) == 3000
-    assert link.read(START + 3101 * MS).stamp_ns.tolist() == [START + 3100 * MS, START + 3101 * MS]
-
-
 def a_stage(**changes):
     settings = {'pose': np.zeros(3), 'slew': np.array([0.5, 0.5, 0.01]), 'settling_s': 0.3,
                 'resolution': np.array([1.5e-3, 1.5e-3, 0.0]), 'seed': 3} | changes
@@ -183,40 +144,6 @@ def test_stage_moves_at_the_slew_rate_to_the_commanded_encoder_step():
     difference = np.abs(stage.position - stage.encoder())[:2]
     assert (difference <= 0.75e-3).all()
     assert (difference > 1e-6).all(), 'the true pose differs from the reading of the encoder'
-
-
-def test_stage_rests_at_another_place_of_the_step_after_each_command():
-    stage, rests = a_stage(), []
-    for target in (0.3, 0.0, 0.3):
-        for _ in range(200):
-            stage.command({'alpha': target})
-            stage.step(0.01)
-        rests.append(stage.position[0])
-    assert rests[0] != rests[2]
-    assert abs(rests[0] - rests[2]) < 1.5e-3
-
-
-def test_a_command_that_is_repeated_changes_no_later_pose():
-    """How often a message arrives depends on the load of the machine; the poses must not."""
-    rests = []
-    for repeats in (1, 7):
-        stage = a_stage()
-        for alpha, beta in ((0.3, 0.0), (0.3, 0.6), (0.1, 0.6)):
-            for _ in range(repeats):
-                stage.command({'alpha': alpha, 'beta': beta})
-            stage.step(20.0)
-        rests.append(stage.position.tolist())
-    assert rests[0] == rests[1]
-
-
-def test_motion_of_the_stage_does_not_depend_on_the_time_step():
-    coarse, fine = a_stage(), a_stage()
-    for stage, count in ((coarse, 30), (fine, 3000)):
-        stage.command({'alpha': 0.3, 'shift': -0.5})
-        for _ in range(count):
-            stage.step(0.3 / count)
-    assert coarse.position == pytest.approx(fine.position, abs=1e-12)
-    assert coarse.velocity == pytest.approx(fine.velocity, abs=1e-11)
 
 
 @pytest.mark.parametrize('command', [
@@ -271,11 +198,6 @@ def test_replay_loops_without_a_gap(tmp_path):
     assert link.status().text == 'playing'
 
 
-def test_replay_counts_the_missing_rows_of_a_recording(tmp_path):
-    link = opened(written(tmp_path / 'r.csv', ROWS[:20] + ROWS[23:]))
-    assert link.read(START + 1000 * MS).missing == 3
-
-
 def test_replay_uses_what_the_recording_states(tmp_path):
     path = tmp_path / 'r.csv'
     path.write_text('# serial: 17\n# rate_hz: 200.0\n# nominal_zero_g_v: 1.5, 1.6\n'
@@ -304,10 +226,3 @@ def test_replay_reports_a_fault_in_one_line(tmp_path, text, reason):
     assert str(path) in str(error.value)
     assert reason in str(error.value)
     assert '\n' not in str(error.value)
-
-
-@pytest.mark.parametrize('recording, reason', [
-    ('', 'link.recording'), ('/no/such.csv', 'No such')])
-def test_replay_without_a_recording_is_refused(recording, reason):
-    with pytest.raises(UserError, match=reason):
-        replay.open_link(nominal(), replay.Settings(recording=recording))

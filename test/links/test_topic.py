@@ -4,14 +4,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.links import topic
 from adxl_ros.links.support.base import Level, Samples
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.simulate.sensor_model import SensorModel
 from adxl_ros.tools.effect_option import with_effects
 import numpy as np
 import pytest
@@ -73,31 +71,6 @@ def test_it_reads_what_simulate_records(run_tool, tmp_path: Path, seed: int) -> 
     assert np.abs(samples.volts - recorded)[:len(samples.volts)].max() < 1e-9
 
 
-def test_a_delay_is_that_of_the_sensor_model() -> None:
-    sensor = unit('time_offset:offset_s=0.0123', 'hysteresis')
-    index = np.arange(400)
-    accel = force(5e-3 * index)
-    model = SensorModel(replace(sensor, rate_hz=200.0))
-    expected = np.array([model(row, 5e-3) for row in accel])
-    link = topic.open_link(sensor, topic.Settings())
-    parts = [feed(link, START_NS + STEP_NS * rows, accel[rows]).volts
-             for rows in np.split(index, [70, 71, 200])]
-    assert to_nominal_mps2(np.concatenate(parts), sensor) == pytest.approx(expected, abs=1e-9)
-
-
-def test_the_temperature_is_that_of_its_topic() -> None:
-    link = topic.open_link(unit(rc_capacitance_f=0.0), topic.Settings())
-    link.sense_temperature(np.nan)
-    stamps = START_NS + STEP_NS * np.arange(400)
-    still = np.tile([0.0, 0.0, 9.80665], (200, 1))
-    cold = feed(link, stamps[:200], still)
-    link.sense_temperature(35.0)
-    warm = feed(link, stamps[200:], still)
-    change_g = (to_nominal_mps2(warm.volts[-1], unit())
-                - to_nominal_mps2(cold.volts[-1], unit())) / 9.80665
-    assert change_g == pytest.approx([4e-3, -3e-3, 2e-3], rel=0.02)
-
-
 def test_jitter_and_lost_samples_leave_the_chain_running() -> None:
     link = topic.open_link(unit(), topic.Settings())
     exact = topic.open_link(unit(), topic.Settings())
@@ -117,49 +90,6 @@ def test_jitter_and_lost_samples_leave_the_chain_running() -> None:
     assert statistics(link)['rate_changes'] == 0
 
 
-def host_stamps(kind: str, rng: np.random.Generator) -> np.ndarray:
-    """Return 20 s of stamps at 200 Hz as a host gives them on arrival, ns, (n,)."""
-    index = np.arange(4000)
-    due = 5e-3 * index
-    if kind == 'bursts':
-        arrival = 5e-3 * (index // 10 * 10)
-    elif kind == 'uneven bursts':
-        flushed = np.cumsum(rng.uniform(0.01, 0.05, 1000))
-        arrival = flushed[np.searchsorted(flushed, due)]
-    elif kind == 'stalls':
-        arrival = np.where(index % 150 < 20, due[index // 150 * 150] + 0.1, due)
-    else:
-        arrival = due + {'normal': rng.normal(0, 1.5e-3, len(index)),
-                         'delays': rng.exponential(5e-3, len(index))}[kind]
-    # A sample takes 40 µs to be handed on.
-    return START_NS + np.rint(1e9 * (
-        np.maximum.accumulate(arrival - 4e-5 * index) + 4e-5 * index)).astype(np.int64)
-
-
-@pytest.mark.parametrize('kind', ['normal', 'delays', 'bursts', 'uneven bursts', 'stalls'])
-def test_host_stamps_neither_mislead_the_rate_nor_restart_the_sensor(kind: str) -> None:
-    link = topic.open_link(unit(), topic.Settings())
-    stamps = host_stamps(kind, np.random.default_rng(1))
-    parts = [feed(link, part) for part in np.array_split(stamps, 200)]
-    assert link.sensor is not None
-    assert link.sensor.rate_hz == pytest.approx(200, rel=0.05)
-    assert statistics(link)['rate_changes'] == 0
-    assert sum(len(part.stamp_ns) for part in parts) == len(stamps)
-    assert sum(part.missing for part in parts) == 0 or kind == 'stalls'
-
-
-@pytest.mark.parametrize('step_ns', [STEP_NS // 2, STEP_NS * 2, STEP_NS * 11 // 10])
-def test_a_new_rate_is_measured(step_ns: int) -> None:
-    link = topic.open_link(unit(), topic.Settings())
-    feed(link, START_NS + STEP_NS * np.arange(300))
-    first_ns = START_NS + 300 * STEP_NS
-    feed(link, first_ns + step_ns * np.arange(600))
-    assert link.sensor is not None
-    assert link.sensor.rate_hz == pytest.approx(1e9 / step_ns, rel=1e-6)
-    assert statistics(link)['rate_changes'] == 1
-    assert link.status().level is Level.OK
-
-
 def test_a_reset_puts_the_sensor_at_its_power_on() -> None:
     link = topic.open_link(unit(), topic.Settings())
     stamps = STEP_NS * np.arange(1, 301)
@@ -168,20 +98,6 @@ def test_a_reset_puts_the_sensor_at_its_power_on() -> None:
     assert np.array_equal(before.stamp_ns, after.stamp_ns)
     assert np.array_equal(before.volts, after.volts), 'a unit without noise starts the same way'
     assert statistics(link)['resets'] == 1
-
-
-def test_late_samples_gaps_and_values_that_are_no_number() -> None:
-    link = topic.open_link(unit(), topic.Settings())
-    stamps = START_NS + STEP_NS * np.arange(200)
-    feed(link, stamps)
-    assert not len(feed(link, stamps[-2:]).stamp_ns)
-    assert statistics(link)['late'] == 2
-    assert not len(feed(link, stamps[-1:] + STEP_NS, np.full((1, 3), np.nan)).stamp_ns)
-    assert statistics(link)['not_finite'] == 1
-    after = feed(link, stamps[-1] + 7 * 10 ** 9 + STEP_NS * np.arange(200))
-    assert statistics(link)['gaps'] == 1
-    assert after.missing == 7 * 200 - 1
-    assert len(after.stamp_ns) == 200 and np.isfinite(after.volts).all()
 
 
 def test_gyroscope_and_orientation_pass_through() -> None:

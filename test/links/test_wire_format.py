@@ -13,10 +13,8 @@ from adxl_ros.links.support.wire_format import (
     encode_command,
     encode_payload,
     Encoder,
-    MAX_FRAME_BYTES,
     RAIL,
     SampleFrame,
-    samples_that_fit,
     Splitter,
     VersionError,
     WireError,
@@ -49,39 +47,6 @@ def test_the_vector_of_a_command():
     assert decode_command(frame[1:-1]) == 2000
 
 
-@pytest.mark.parametrize('damage', range(1, 17))
-def test_a_damaged_command_is_refused(damage):
-    made = bytearray(encode_command(7, 2000)[1:-1])
-    made[damage] ^= 0x55
-    with pytest.raises(WireError):
-        decode_command(bytes(made))
-    with pytest.raises(WireError):
-        decode_command(FRAME[:-1])
-    with pytest.raises(WireError):
-        decode(encode_command(7, 2000)[1:-1])
-
-
-def frame_load(samples, info, baud):
-    """Return which share of the time of a UART frames take."""
-    frame = Encoder(info).sample_frame(0, 0, np.full((samples, info.channels), 257))
-    return 10 * len(frame) * info.rate_hz / samples / baud
-
-
-@pytest.mark.parametrize('channels', [1, 2, 4])
-@pytest.mark.parametrize('baud', [57600, 115200, 230400, 500000, 2000000])
-def test_the_wire_carries_the_chosen_frames_and_no_smaller_ones(channels, baud):
-    info = BoardInfo(1000.0, 16, channels, 5.0, '')
-    samples = samples_that_fit(2, info, baud / 10)
-    assert samples >= 2
-    if samples < 255:
-        assert frame_load(samples, info, baud) < 0.9
-    if 2 < samples < 255:
-        assert frame_load(samples - 1, info, baud) > 0.8
-    if samples == 255:
-        assert frame_load(254, info, baud) > 0.8
-    assert samples_that_fit(2, info, np.inf) == 2
-
-
 def test_the_encoder_makes_the_vector_and_sets_flags():
     encoder = Encoder(INFO)
     for _ in range(7):
@@ -93,16 +58,6 @@ def test_the_encoder_makes_the_vector_and_sets_flags():
         replace(decode(FRAME[:-1]), check=0, codes=None)
 
 
-def test_info_is_decoded_and_the_reset_flag_lasts_until_the_first_samples():
-    encoder = Encoder(BoardInfo(333.25, 12, 3, 3.3, 'board 17'))
-    info = decode(encoder.info_frame()[:-1])
-    assert info == BoardInfo(333.25, 12, 3, pytest.approx(3.3, rel=1e-7), 'board 17')
-    assert info.flags == AFTER_RESET
-    assert decode(encoder.sample_frame(0, 0, np.full((2, 3), 7))[:-1]).flags == AFTER_RESET
-    assert decode(encoder.sample_frame(0, 2, np.full((2, 3), 7))[:-1]).flags == 0
-    assert decode(encoder.info_frame()[:-1]).flags == 0
-
-
 @pytest.mark.parametrize('change, reason', [
     (lambda p: p[:1] + b'\2' + p[2:], 'wire format 2'), (lambda p: b'\3' + p[1:], 'type 3'),
     (lambda p: p[:-1], '32 bytes|31 bytes'), (lambda p: p[:22] + b'\3' + p[23:], 'samples'),
@@ -112,15 +67,6 @@ def test_an_invalid_payload_is_refused(change, reason):
     kind = VersionError if 'format' in reason else WireError
     with pytest.raises(kind, match=reason):
         decode(encode_payload(change(PAYLOAD))[:-1])
-
-
-@pytest.mark.parametrize('info', [
-    replace(INFO, rate_hz=float('nan')), replace(INFO, rate_hz=0.0), replace(INFO, bits=0),
-    replace(INFO, bits=17), replace(INFO, channels=0), replace(INFO, channels=200),
-    replace(INFO, vref_v=float('inf')), replace(INFO, vref_v=-1.0), replace(INFO, serial='\n')])
-def test_an_info_frame_out_of_range_is_refused(info):
-    with pytest.raises(WireError, match='an info frame'):
-        decode(Encoder(info).info_frame()[:-1])
 
 
 def test_a_single_changed_lost_or_added_byte_never_decodes():
@@ -135,17 +81,6 @@ def test_a_single_changed_lost_or_added_byte_never_decodes():
                     continue
                 with pytest.raises(WireError):
                     decode(part)
-
-
-def test_a_stream_without_an_end_is_skipped_and_not_kept():
-    splitter = Splitter()
-    assert splitter.split(b'noise\0') == [b'noise']
-    for _ in range(100):
-        assert splitter.split(b'\x55' * 1000) == []
-        assert len(splitter._incomplete) <= MAX_FRAME_BYTES
-    assert splitter.split(b'tail\0' + FRAME + FRAME[:5]) == [FRAME[:-1]]
-    assert splitter.skipped == 100_004
-    assert splitter.split(FRAME[5:]) == [FRAME[:-1]]
 
 
 @settings(max_examples=300)

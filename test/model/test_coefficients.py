@@ -2,13 +2,11 @@
 
 """Names of coefficients, and the statements of an effect about its parameters."""
 
-from dataclasses import replace
 import json
 
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import ActsOn, Coefficient, Effect, Need, Parameter, Place, Role
-import numpy as np
+from adxl_ros.model.effects.base import Coefficient
 import pytest
 from units import nominal
 
@@ -38,30 +36,3 @@ def test_put_changes_a_copy() -> None:
     assert get(changed, names).tolist() == [0.1, 0.02]
     assert get(sensor, names).tolist() == [0.0, 0.0]
     assert changed.zero_g_v.tolist() == [2.5, 2.6]
-
-
-def test_a_covariance_is_removed_completely() -> None:
-    sensor = replace(nominal('x'), covariance=np.eye(1),
-                     covariance_names=(Coefficient('bias', 'offset_v', 'x'),))
-    bare = sensor.without_covariance()
-    assert bare.covariance.shape == (0, 0)
-    assert bare.covariance_names == ()
-
-
-def test_equal_numbers_do_not_change_a_role() -> None:
-    """A parameter keeps its role where the typical value is the neutral one, or a bound."""
-    size = Parameter('offset_v', 'V', -1.0, 0.0, 0.0, 'made', 'offset', typical=0.0)
-    assert size.role is Role.SIZE
-    assert size.is_size
-    shape = replace(size, role=Role.SHAPE)
-    assert not shape.is_size
-
-
-def test_an_effect_may_state_its_needs_as_text() -> None:
-    """Effects of other packages may use the texts."""
-    effect = Effect('made', Place.STAGE, (), lambda signals, p: None, 'Made.',
-                    acts_on='noise', needs=('stage', 'adc'))
-    assert effect.acts_on is ActsOn.NOISE
-    assert effect.needs == (Need.STAGE, Need.ADC)
-    with pytest.raises(ValueError, match='everything'):
-        replace(effect, needs=('everything',))

@@ -10,26 +10,24 @@ from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import (
     get,
     names_of,
-    neutral,
     parameter_of,
     put,
     typical,
     with_neutral,
 )
 from adxl_ros.model.effects import library
-from adxl_ros.model.effects.base import ActsOn, Coefficient, Need, NOMINAL_ENVIRONMENT, Place
-from adxl_ros.model.filters import low_pass, resonator
-from adxl_ros.model.kinematics import specific_force
+from adxl_ros.model.effects.base import ActsOn, Coefficient, Need, Place
+from adxl_ros.model.filters import resonator
 from adxl_ros.model.play_operator import play
 from adxl_ros.simulate.motion import Held, Knots, Motion
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.simulator import simulate
 from adxl_ros.simulate.smoothed_paths import ForcePath
-from adxl_ros.simulate.trajectories import Sine, Steps
+from adxl_ros.simulate.trajectories import Steps
 import numpy as np
 import pytest
 from scipy.signal import welch
-from units import Fed, nominal
+from units import nominal
 
 G = 9.80665
 NAMES = sorted(library())
@@ -109,18 +107,6 @@ def test_typical_values_change_a_recording_and_blocks_join(name, plain):
     np.testing.assert_array_equal(np.vstack(parts), all_at_once_v)
 
 
-@pytest.mark.parametrize('axes', ['x', 'xy', 'xyz'])
-@pytest.mark.parametrize('name', NAMES)
-def test_an_effect_acts_on_every_axis_of_the_sensor(name, axes):
-    """A typical effect changes each axis of a sensor with one, two or three."""
-    sensor = nominal(axes)
-    plain_v = volts(sensor, motion_of(name))
-    events = {'spikes': {'rate_hz': 20.0}, 'stuck': {'rate_hz': 3.0},
-              'saturation': {'limit_g': [0.3] * len(axes)}}
-    with_typical_v = volts(with_effect(name, sensor, **events.get(name, {})))
-    assert np.all(np.abs(with_typical_v - plain_v).max(axis=0) > 1e-5)
-
-
 @pytest.mark.parametrize('name', [n for n in NAMES if library()[n].smooth
                                   and library()[n].acts_on is ActsOn.MEAN])
 def test_tangents_do_not_depend_on_the_step(name):
@@ -144,15 +130,6 @@ def test_bounds_contain_neutral_and_typical_values(name):
         assert p.unit and p.source and p.doc and p.scale > 0
         for value in (p.neutral, p.scale if p.typical is None else p.typical):
             assert p.lower <= value <= p.upper
-
-
-def test_filter_at_10_hz():
-    """The RC filter of the paper has the gain 0.833 and the phase −33.6° at 10 Hz."""
-    time_s = np.arange(4000) / 1000
-    out = low_pass(np.sin(20 * np.pi * time_s), 32e3 * 0.33e-6, 1e-3, {})
-    wave = 2j * (out * np.exp(-20j * np.pi * time_s))[2000:].mean()
-    assert abs(wave) == pytest.approx(0.8333, abs=1e-4)
-    assert np.degrees(np.angle(wave)) == pytest.approx(-33.56, abs=0.01)
 
 
 def test_resonance():
@@ -185,27 +162,6 @@ def test_play_equals_its_recursion():
     np.testing.assert_array_equal(np.concatenate(parts), expected)
 
 
-def test_hysteresis_lags_by_its_half_width():
-    """Far from a reversal the output lags by half the width of the loop, in both directions."""
-    sweep = np.concatenate([np.linspace(-1, 1, 3000), np.linspace(1, -1, 3000)])
-    sensor = with_effect('hysteresis', nominal('x', rc_capacitance_f=0.0, adc_bits=0,
-                                               noise_density_g_per_rthz=np.zeros(1)))
-    out = Fed(sensor)([sweep * G, 0.0, 0.0])[:, 0] - 2.5
-    up, down = np.interp(0.0, sweep[:3000], out[:3000]), np.interp(0.0, sweep[:2999:-1],
-                                                                   out[:2999:-1])
-    assert (up, down) == pytest.approx((-2e-3, 2e-3), abs=1e-9)
-
-
-def test_backlash_lags_by_half_of_its_width():
-    """A turning joint lags its encoder by half of the dead band."""
-    swing = Motion(8.0, Held(np.pi / 2), Knots([0, 3, 4, 7, 8], [0, 2, 2, 0, 0]))
-    difference_v = (volts(with_effect('backlash', beta_rad=4e-3), swing)
-                    - volts(nominal('xyz', **CLEAN), swing))
-    # At beta = 2 and at beta = 0 of alpha 90°: df_x = −sin(beta)·d beta·g.
-    assert difference_v[3900, 0] == pytest.approx(-np.sin(2.0) * -2e-3, rel=2e-3)
-    assert difference_v[-1, 1] == pytest.approx(-2e-3, rel=1e-3)
-
-
 def test_lever_arm_is_centripetal_and_tangential():
     """The force is ω²·r towards the axis, and ω̇·r across it while the speed grows."""
     spin = Motion(9.0, Held(0.0), Knots([0, 2, 8, 9], [0, 3, 21, 22.5], [0, 3, 3, 0]))
@@ -219,24 +175,6 @@ def test_lever_arm_is_centripetal_and_tangential():
     difference_mps2 = (volts(slow, spin)
                        - volts(nominal('xyz', **CLEAN, rc_capacitance_f=0.0), spin)) * G
     assert difference_mps2[1000, 1] == pytest.approx(0.1 * growth, rel=1e-6)
-
-
-def test_supply_effect_has_the_values_of_the_datasheet():
-    """The ADXL203 gives 560 mV/g and 1.5 V at 3 V."""
-    respond = signal_chain.static_response(with_effect('supply'))
-    around = NOMINAL_ENVIRONMENT._replace(supply_v=3.0)
-    at_zero_v, at_1_g_v = (respond([f, 0.0, 0.0], around)[0] for f in (0.0, G))
-    assert at_zero_v == pytest.approx(1.5, abs=1e-12)
-    assert at_1_g_v - at_zero_v == pytest.approx(0.560, abs=2e-4)
-
-
-def test_temperature_moves_zero_g_and_scale():
-    """Zero-g changes by 0.1 mg/K from 25 °C on, and the scale factor by its coefficient."""
-    around = NOMINAL_ENVIRONMENT._replace(temperature_c=35.0)
-    bias, scale = (signal_chain.static_response(with_effect(name))
-                   for name in ('temperature_bias', 'temperature_scale'))
-    assert bias([0.0, 0.0, 0.0], around)[0] == pytest.approx(2.501, abs=1e-12)
-    assert scale([G, 0.0, 0.0], around)[0] == pytest.approx(3.501, abs=1e-12)
 
 
 def test_thermal_lag_makes_the_zero_g_follow_a_slower_temperature():
@@ -266,30 +204,13 @@ def test_thermal_hysteresis_depends_on_the_direction_and_not_on_the_speed():
     assert middles == pytest.approx([0.0, 4e-3] * 2, abs=1e-9)
 
 
-def test_vibration_shifts_by_its_mean_square():
-    """A vibration of 1 m/s² at 40 Hz shifts the zero-g by k·a²/2."""
-    shake = Motion(12.0, Held(np.pi / 2), Held(np.pi / 2), Sine(1 / (80 * np.pi) ** 2, 40.0))
-    difference_v = (volts(with_effect('vibration_rectification'), shake)
-                    - volts(nominal('xyz', **CLEAN), shake))
-    assert difference_v[-4000:, 0].mean() == pytest.approx(0.05 * (1 / G) ** 2 / 2, rel=1e-3)
-
-
-def test_variance_of_quantisation_follows_from_its_step():
-    """Rounding a slow ramp has the variance LSB²/12 of the remaining bits."""
-    sensor = nominal('x', noise_density_g_per_rthz=np.zeros(1))
-    ramp = [np.linspace(0, 1, 60000) * G, 0.0, 0.0]
-    exact = Fed(replace(sensor, adc_bits=0))(ramp)
-    for lost in (0, 3):
-        coarse = Fed(with_effect('quantisation', sensor, lost_bits=lost))(ramp)
-        lsb = sensor.lsb_v * 2 ** lost
-        assert np.var(coarse - exact) == pytest.approx(lsb ** 2 / 12, rel=0.01)
-
-
-def test_one_axis_may_have_coarser_codes_than_the_others():
-    """Bits that an axis loses add to those that all lose."""
-    sensor = with_effect('quantisation', nominal('xyz'), lost_bits=1, axis_lost_bits=[0, 3, 0])
-    steps = volts(sensor) / sensor.lsb_v
-    assert [np.gcd.reduce(np.rint(axis).astype(int)) for axis in steps.T] == [2, 16, 2]
+def flicker_theory(f, rate_hz):
+    """Return f times the sum of the densities of the sampled processes, for k = 1."""
+    from adxl_ros.model.effects.flicker import corners_hz
+    a = np.exp(-2 * np.pi * corners_hz(rate_hz) / rate_hz)[:, None]
+    step = np.log(10) / 2
+    each = 2 / rate_hz * (1 - a * a) / (1 - 2 * a * np.cos(2 * np.pi * f / rate_hz) + a * a)
+    return f * step * each.sum(axis=0)
 
 
 def test_flicker_is_one_over_f():
@@ -308,56 +229,12 @@ def test_flicker_is_one_over_f():
     assert flicker_theory(corners, 100.0) == pytest.approx(np.ones(7), abs=0.02)
 
 
-def test_flicker_is_stationary_from_the_first_sample_on():
-    """Over many units, the first second has the covariance of the sampled processes."""
-    from adxl_ros.model.effects.flicker import corners_hz
-    sensor = with_effect('flicker', nominal('xyz', **CLEAN, rate_hz=100.0),
-                         density_g_per_rthz=[1e-4] * 3)
-    rest = Motion(1.0, internal_rate_hz=10.0)
-    still_v = nominal('xyz').nominal_zero_g_v + [0, 0, nominal('xyz').nominal_scale_v_per_g[2]]
-    drawn = np.stack([volts(sensor, rest, seed) - still_v for seed in range(500)])
-    drawn = drawn[:, [0, 1, 10, 99]] / (1e-4 * sensor.nominal_scale_v_per_g)
-    measured = np.einsum('uid,ujd->ij', drawn, drawn) / (3 * len(drawn))
-    lag = np.abs(np.subtract.outer([0, 1, 10, 99], [0, 1, 10, 99]))
-    decay = np.exp(-2 * np.pi * corners_hz(100.0) / 100.0)[:, None, None]
-    assert measured == pytest.approx(np.log(10) / 2 * np.sum(decay ** lag, axis=0), rel=0.12)
-
-
-def flicker_theory(f, rate_hz):
-    """Return f times the sum of the densities of the sampled processes, for k = 1."""
-    from adxl_ros.model.effects.flicker import corners_hz
-    a = np.exp(-2 * np.pi * corners_hz(rate_hz) / rate_hz)[:, None]
-    step = np.log(10) / 2
-    each = 2 / rate_hz * (1 - a * a) / (1 - 2 * a * np.cos(2 * np.pi * f / rate_hz) + a * a)
-    return f * step * each.sum(axis=0)
-
-
 def test_bias_walks_with_the_root_of_time():
     """After the time t the variance over units is k²·t."""
     sensor = with_effect('bias_walk', nominal('xyz', **CLEAN, rate_hz=100.0))
     final_v = [volts(sensor, Motion(50.0, internal_rate_hz=10.0), seed)[-1] - [2.5, 2.5, 3.5]
                for seed in range(150)]
     assert np.std(final_v) == pytest.approx(2e-5 * np.sqrt(50), rel=0.1)
-
-
-def test_a_walk_that_returns_ends_in_bounds():
-    """Its rms is k/√(2·r), and its steps are those of the walk without bounds."""
-    sensor = put(with_effect('bias_walk', nominal('xyz', **CLEAN, rate_hz=10.0)),
-                 [Coefficient('bias_walk', 'return_per_s')], [0.1])
-    out_v = volts(sensor, Motion(10000.0, internal_rate_hz=10.0))[1000:] - [2.5, 2.5, 3.5]
-    assert np.std(out_v, axis=0) == pytest.approx(np.full(3, 2e-5 / np.sqrt(0.2)), rel=0.1)
-    assert np.std(np.diff(out_v, axis=0)) == pytest.approx(2e-5 * np.sqrt(0.1), rel=0.02)
-
-
-def test_time_offset_and_clock_skew_shift_the_samples():
-    """With a positive offset and skew, a sample was taken before its stamp."""
-    ramp = Motion(20.0, Held(np.pi / 2), Knots([0, 1, 19, 20], [0, .05, 1.85, 1.9],
-                                               [0, 0.1, 0.1, 0]))
-    clean = volts(nominal('xyz', **CLEAN), ramp)[:, 1]
-    late = volts(with_effect('time_offset', offset_s=0.02), ramp)[:, 1]
-    np.testing.assert_allclose(late[3020:15000], clean[3000:14980], atol=1e-12)
-    skewed = volts(with_effect('clock_skew', ratio=1e-3), ramp)[:, 1]
-    assert skewed[10000] == pytest.approx(clean[9990], abs=1e-7)
 
 
 def test_inverse_uses_temperature_supply_and_time():
@@ -374,15 +251,6 @@ def test_inverse_uses_temperature_supply_and_time():
     np.testing.assert_allclose(np.array(force), truth, atol=1e-9 * G)
 
 
-def test_local_gravity_is_used_by_equation_5():
-    """A two-axis sensor computes z from the corrected gravity."""
-    sensor = with_effect('gravity', nominal('xy'))
-    force = specific_force(0.6, 0.3, signal_chain.gravity_mps2(sensor))
-    recovered = signal_chain.inverse(sensor)(
-        signal_chain.static_response(sensor)([float(f) for f in force]))
-    assert recovered == pytest.approx([float(f) for f in force], abs=1e-9)
-
-
 @pytest.mark.parametrize('name, changes, motion', [
     ('quantisation', {'adc_bits': 0}, MOTION),
     ('noise_excess', {'noise_density_g_per_rthz': np.zeros(3)}, MOTION),
@@ -391,9 +259,3 @@ def test_an_effect_without_its_stage_of_the_chain_is_refused(name, changes, moti
     """The message names the effect if the sensor has no ADC, noise or stage."""
     with pytest.raises(UserError, match=f'^{name} acts on the '):
         Response(replace(with_effect(name, nominal('xyz')), **changes), motion, 0)
-
-
-def test_neutral_values_are_stated_by_axis():
-    """Values have one entry for each axis, or no axes."""
-    values = neutral(library()['mount_resonance'], 'xy')
-    assert values['gain'].tolist() == [0.0, 0.0] and values['frequency_hz'].shape == ()

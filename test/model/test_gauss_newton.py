@@ -4,7 +4,7 @@
 
 from collections.abc import Callable
 
-from adxl_ros.model.gauss_newton import gauss_newton, halve_until, Iterate, Solution
+from adxl_ros.model.gauss_newton import gauss_newton, Iterate, Solution
 import numpy as np
 import pytest
 
@@ -43,34 +43,6 @@ def test_certified_values(start):
     assert solution.last.cost == pytest.approx(1.2455138894e-1, rel=1e-9)
 
 
-def test_too_few_evaluations_are_reported():
-    solution = solve(misra, MISRA_STARTS[0], 3, 8)
-    assert not solution.converged and solution.evaluations <= 3
-
-
-def test_evaluations_include_those_of_halved_steps():
-    calls = []
-
-    def counted(values: np.ndarray) -> Iterate:
-        calls.append(values)
-        return misra(values)
-
-    solution = solve(counted, MISRA_STARTS[0], 50, 8)
-    assert solution.evaluations == len(calls)
-
-
-def arctangent(values: np.ndarray) -> Iterate:
-    """Find the root of arctan; the full step diverges from |x| > 1.39."""
-    x = values[0]
-    return Iterate(values, np.array([-np.arctan(x) * (1 + x * x)]), float(np.arctan(x) ** 2))
-
-
-def test_halving_makes_a_diverging_iteration_converge():
-    assert not solve(arctangent, [3.0], 8).converged
-    solution = solve(arctangent, [3.0], 50, 8)
-    assert solution.converged and abs(solution.last.values[0]) < 1e-9
-
-
 def test_no_share_of_a_step_that_lowers_the_cost_is_reported():
     def uphill(values: np.ndarray) -> Iterate:
         return Iterate(values, np.ones(1), float(values[0]))
@@ -78,8 +50,3 @@ def test_no_share_of_a_step_that_lowers_the_cost_is_reported():
     solution = solve(uphill, [1.0], 50, 3)
     assert not solution.converged and solution.evaluations == 5
     assert solution.last.values == [1.0]
-
-
-def test_halve_until_returns_the_first_accepted_share():
-    assert halve_until(lambda share: share, lambda share: share < 0.3, 5) == (0.25, True, 3)
-    assert halve_until(lambda share: share, lambda share: False, 2) == (0.25, False, 3)

@@ -63,26 +63,6 @@ def test_a_stranger_is_named_and_keeps_its_estimates():
     assert 'not used' in combined.line
 
 
-def test_a_unit_without_coefficients_takes_those_of_its_population():
-    unit = posterior(nominal('x'), POPULATION).sensor
-    assert unit.zero_g_v[0] == pytest.approx(2.52)
-    assert unit.scale_v_per_g[0] == pytest.approx(1.01)
-    np.testing.assert_allclose(np.sqrt(np.diag(unit.covariance)), [0.02, 0.01])
-
-
-def test_a_population_without_the_axes_is_not_used():
-    empty = Population('empty.yaml', {})
-    combined = posterior(nominal('x'), empty)
-    assert combined.sensor.effects == () and 'not used' in combined.line
-
-
-def test_the_file_keeps_a_population(tmp_path):
-    path = tmp_path / 'population.yaml'
-    population_file.write(path, POPULATION, [{'serial': 'A', 'coefficient': 'zero_g_x_v',
-                                              'value': 2.7, 'distance': 9.0}])
-    assert population_file.read(path) == POPULATION
-
-
 @pytest.mark.parametrize('text, words', [
     ('', 'no population of format 1'),
     ('format: 2\ncoefficients: {}\n', 'no population of format 1'),

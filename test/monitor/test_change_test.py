@@ -61,18 +61,3 @@ def test_motion_is_compared_with_motion() -> None:
     assert not run(test, rng.standard_normal((3000, 1)))
     assert not run(test, 30 * rng.standard_normal((40, 1)), moves=True)
     assert not run(test, rng.standard_normal((3000, 1)))
-
-
-def test_a_series_without_noise() -> None:
-    test = ChangeTest(ChangeSettings(1, 1 / 30))
-    assert not run(test, np.full((200, 1), 0.3))
-    assert len(run(test, np.full((200, 1), 0.4))) == 1
-
-
-def test_nothing_is_compared_over_a_restart() -> None:
-    rng = np.random.default_rng(1)
-    test = ChangeTest(ChangeSettings(1, 1 / 30))
-    assert not run(test, rng.standard_normal((2000, 1)))
-    test.restart()
-    assert not run(test, 1000 + rng.standard_normal((500, 1)))
-    assert len(run(test, 1020 + rng.standard_normal((500, 1)))) == 1

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.monitor.live_gap import AxisGap, GapChange, GapSettings, LiveGap
+from adxl_ros.monitor.live_gap import GapChange, GapSettings, LiveGap
 from adxl_ros.monitor.reference_stream import ReferenceKind
 from adxl_ros.simulate.motion import Held, Motion
 from adxl_ros.simulate.response import Response
@@ -102,28 +102,6 @@ def test_the_gap_of_the_right_parameters_is_the_floor(kind: ReferenceKind, ampli
     assert world.live.obstacle == ''
 
 
-def test_the_share_that_the_parameters_explain() -> None:
-    def explained(params: Sensor) -> list[float | None]:
-        world = World(with_effects(UNIT, ['bias:offset_v.x=0.02']), params)
-        world.run(30)
-        return [axis.explained for axis in world.live.report()]
-
-    assert explained(UNIT)[0] == 0
-    assert explained(UNIT)[1] is None, 'there is nothing to explain'
-    assert explained(with_effects(UNIT, ['bias:offset_v.x=0.02']))[0] == pytest.approx(1, abs=0.01)
-    assert explained(with_effects(UNIT, ['bias:offset_v.x=0.01']))[0] == pytest.approx(
-        0.75, abs=0.02)
-
-
-def test_the_steps_of_the_encoder_belong_to_the_floor() -> None:
-    unit = nominal('xyz', rate_hz=RATE_HZ, stage_resolution_rad=0.02)
-    world = World(unit, unit, amplitude=0.0, step_rad=0.02)
-    world.run(20)
-    axes = world.live.report()
-    assert max(axis.floor.value for axis in axes) > 4
-    assert not any(axis.is_open for axis in axes)
-
-
 def test_a_change_of_the_mean_and_of_the_noise() -> None:
     world = World(UNIT, UNIT)
     rng = np.random.default_rng(1)
@@ -135,15 +113,6 @@ def test_a_change_of_the_mean_and_of_the_noise() -> None:
     noise = world.run(60, lambda a: a + [0.0, 0.05, 0.0] + 0.03 * rng.standard_normal(a.shape))
     assert {(change.axis, change.quantity) for change in noise} >= {('z', 'noise')}
     assert all(change.size > 2 for change in noise if change.quantity == 'noise')
-
-
-def test_a_change_of_the_gain_in_motion_is_one_change_of_each_axis() -> None:
-    world = World(UNIT, UNIT)
-    assert not world.run(80)
-    changes = world.run(150, lambda a: 1.02 * a)
-    assert sorted(change.axis for change in changes) == ['x', 'y', 'z']
-    assert all((change.since_ns - ORIGIN_NS) * 1e-9 == pytest.approx(80, abs=2)
-               for change in changes)
 
 
 @pytest.mark.parametrize('mg_per_min', [0.02, 10.0])
@@ -178,33 +147,6 @@ def test_faults_of_the_samples_are_counted() -> None:
     assert not any(axis.is_open for axis in world.live.report())
 
 
-def test_a_reference_that_stops_is_named_and_comes_back() -> None:
-    world = World(UNIT, UNIT)
-    world.reference_until = 20
-    world.run(40)
-    assert 'behind the samples' in world.live.obstacle
-    assert world.live.counts.skipped > 10
-    world.reference_until = np.inf
-    assert not world.run(20)
-    assert world.live.obstacle == ''
-
-
-def test_no_reference() -> None:
-    world = World(UNIT, UNIT)
-    world.reference_until = 0
-    world.run(10)
-    assert world.live.report() == ()
-    assert world.live.obstacle == 'no reference has come'
-
-
-def test_the_rate_is_measured_where_it_is_not_stated() -> None:
-    wrong = nominal('xyz', rate_hz=1000.0)
-    world = World(UNIT, wrong)
-    world.run(20)
-    assert world.live.sensor.rate_hz == pytest.approx(RATE_HZ)
-    assert not any(axis.is_open for axis in world.live.report())
-
-
 def test_memory_is_bounded_and_the_recording_has_the_newest_samples() -> None:
     world = World(UNIT, UNIT)
     world.live = LiveGap(UNIT, ReferenceKind.STAGE, GapSettings(history_s=60.0))
@@ -214,17 +156,3 @@ def test_memory_is_bounded_and_the_recording_has_the_newest_samples() -> None:
     assert {'ax_mps2', 'alpha_rad', 'beta_rad'} <= set(recording.columns)
     assert np.isfinite(recording.columns['alpha_rad'][100:-100]).all()
     assert len(world.live._samples._stamps) < 5 * 60 * RATE_HZ
-
-
-def test_effects_of_the_stage_are_left_out_beside_a_simulator() -> None:
-    sensor = with_effects(UNIT, ['lever_arm', 'misalignment'])
-    live = LiveGap(sensor, ReferenceKind.IMU, GapSettings())
-    assert live.left_out == ('lever_arm',)
-
-
-def test_an_axis_of_the_report_is_complete() -> None:
-    world = World(UNIT, UNIT)
-    world.run(10)
-    axis = world.live.report()[0]
-    assert isinstance(axis, AxisGap)
-    assert (axis.axis, axis.floor_source) == ('x', 'parameters')

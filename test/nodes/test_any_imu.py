@@ -185,10 +185,3 @@ def test_a_moving_sensor_is_not_level(camera: Camera, start: Start) -> None:
     graph.spin_until(moved, 40, 'the answer of ~/level')
     assert not answer.result().success
     assert 'the sensor moves' in answer.result().message
-
-
-def test_a_mounting_in_degrees_is_refused(start: Start) -> None:
-    """The answer converts the angles."""
-    node = start('compensation', '--ros-args', '-p', 'mounting.rpy_rad:=[180.0, 0.0, 90.0]')
-    node.wait_for('more than a turn in rad; if it is in degrees, write [3.14159, 0, 1.5708]')
-    assert node.wait() == 1

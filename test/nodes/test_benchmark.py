@@ -5,16 +5,12 @@
 from functools import partial
 import re
 import sys
-import time
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import cdr
-from adxl_ros.nodes.support import live_benchmark, offline_jobs, rival_driver
+from adxl_ros.nodes.support import live_benchmark, offline_jobs
 from adxl_ros.nodes.support.benchmark_table import Job, print_table, rows_of
-from graph import Graph
 from processes import executable
 import pytest
-from sensor_msgs.msg import Imu
 from units import nominal
 
 
@@ -82,21 +78,3 @@ def test_a_long_recording_is_applied_with_its_memory_and_leaves_no_file(
     # More than any disk holds.
     with pytest.raises(UserError, match='GB free; recordings of 1e.09 h need .* set TMPDIR'):
         next(offline_jobs._long_applying(tmp_path, nominal(), kind, 1e9))
-
-
-@pytest.mark.skipif(not rival_driver.is_installed(), reason='witmotion is not installed')
-def test_the_driver_of_another_project_publishes_samples_with_their_own_time(start, tmp_path):
-    port = tmp_path / 'board'
-    start('bench', '--rival-board', port)
-    with Graph() as graph:
-        graph.spin_until(port.exists, 20, 'the board')
-        start('bench', '--rival-driver', port)
-        raws = graph.listen(Imu, rival_driver.TOPIC, raw=True)
-        graph.spin_until(lambda: len(raws) > 500, 30, 'samples')
-        now_ns = time.time_ns()
-    table, = cdr.tables(raws, cdr.imu)
-    stamps_ns = table.stamp_ns()
-    assert now_ns - 20e9 < stamps_ns[0] and stamps_ns[-1] < now_ns
-    assert (stamps_ns[1:] > stamps_ns[:-1]).all()
-    # The time is in the values, whose g is that of the library.
-    assert (abs(table.numbers('linear_acceleration')) < 16 * 9.81).all()

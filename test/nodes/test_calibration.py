@@ -4,24 +4,21 @@ from dataclasses import replace
 import time
 
 from adxl_ros.files import parameter_file, recording, sweep_journal
-from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.files.stream_unit import recorded_unit
 from adxl_ros.model.coefficients import with_neutral
-from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.simulate.motion import Held, Knots, Motion
 from adxl_ros.simulate.simulator import simulate
 from adxl_ros.tools.effect_option import with_effects
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus
 from graph import Graph, RELIABLE
 from lifecycle_msgs.msg import Transition
 import numpy as np
-from processes import wait_until
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Imu, JointState
 from setting_checks import check_all_agree
 from std_srvs.srv import Trigger
-from units import drawn, NOMINAL, nominal
+from units import drawn, nominal
 
 FAST = ('-p', 'use_sim_time:=true')
 # At many times real time a best-effort subscriber, or one with a short queue, loses samples on a
@@ -192,46 +189,6 @@ def test_the_node_can_end_with_its_calibration(start, tmp_path, output, status):
             assert graph.value('calibration', 'verdict') in node.output()
 
 
-def test_a_stage_that_never_arrives_is_reported(start, tmp_path):
-    """Without a stage the node continues, and its diagnostics state what is missing."""
-    truth, bare = _files(tmp_path)
-    with Graph() as graph:
-        start('driver', '--ros-args', '--params-file', truth, '-p', 'link.type:=sim')
-        node = start('calibration', '--ros-args', '--params-file', bare, *QUICK,
-                     '-p', 'autostart:=true', '-p', 'stage.timeout_s:=2.0')
-        graph.spin_until(lambda: graph.reports('calibration', 'nothing on stage/joint_states')
-                         and graph.diagnostics['calibration'].level == DiagnosticStatus.WARN,
-                         30, 'the warning')
-        graph.spin(3)
-        assert node.popen.poll() is None
-        assert node.output().count('the stage has not arrived') == 1
-
-
-def test_an_output_that_cannot_be_written_is_refused_at_the_start(start, tmp_path):
-    """The start of a sweep checks the folder of its output."""
-    truth, bare = _files(tmp_path)
-    with Graph() as graph:
-        _sweep(start, truth, bare, '-p', 'autostart:=true', '-p', 'output:=none/unit.yaml')
-        graph.spin_until(lambda: graph.reports('calibration', 'output: none/unit.yaml'), 30, 'why')
-
-
-def test_planes_and_step_are_set_in_degrees(start, tmp_path):
-    """The screen, too, is in degrees. Both units at once are refused."""
-    truth, bare = _files(tmp_path)
-    planes = ('-p', 'sweep.planes_deg:=[45.0, 90.0]', '-p', 'sweep.step_deg:=60.0')
-    both = start('calibration', '--ros-args', '--params-file', bare, *planes,
-                 '-p', 'sweep.planes_rad:=[0.5]')
-    assert both.wait() == 1
-    assert 'sweep.planes_deg: sweep.planes_rad is given, too; keep one' in both.output()
-    start('driver', '--ros-args', '--params-file', truth, '-p', 'link.type:=sim')
-    start('calibration', '--ros-args', '--params-file', bare, *planes, '-p', 'autostart:=true')
-    journal = tmp_path / 'calibration.yaml.journal'
-    wait_until(lambda: journal.exists() and journal.read_text().count('\n'), 30, 'the journal')
-    kind, _ = sweep_journal.read(journal)
-    assert kind['sweep.planes_rad'] == pytest.approx(np.radians([45.0, 90.0]))
-    assert kind['sweep.step_rad'] == pytest.approx(np.radians(60.0))
-
-
 @pytest.mark.parametrize('setting, words', [
     ('sweep.planes_deg:=[thirty]', 'sweep.planes_deg: '),
     ('sweep.step_rad:=0.0', 'sweep.step_rad'),
@@ -244,41 +201,6 @@ def test_settings_out_of_range_end_the_node(start, tmp_path, setting, words):
     assert node.wait() == 1
     assert words in node.output()
     assert 'Traceback' not in node.output()
-
-
-@pytest.mark.parametrize('name, most_mg', [('mpu9150_0', 0.26), ('xsens_multiposition', 0.12),
-                                           ('two_axis_stand', 0.15)])
-def test_a_real_sensor_through_the_live_graph(start, run_tool, tmp_path, shared_dir, name,
-                                              most_mg):
-    """
-    Replay, calibration in gravity mode and `fit` agree, and reach the known magnitudes.
-
-    The driver states the nominal sensor, which `fit` does not take for a recording in m/s².
-    """
-    source = shared_dir / 'real' / f'{name}.csv'
-    with Graph() as graph:
-        start('calibration', '--ros-args', *FAST, *LOSSLESS, '-p', 'mode:=gravity',
-              '-p', 'autostart:=true', '-p', 'output:=live.yaml')
-        graph.spin_until(lambda: graph.reports('calibration', 'waiting for sensor_info'), 30, 'up')
-        start('driver', '--ros-args', *FAST, '-p', 'link.type:=replay', '-p',
-              f'link.recording:={source}', '-p', 'link.speed:=30.0', '-p', 'autostart:=false',
-              *KEPT)
-        # The nodes are connected before the first sample, and the queue is long.
-        assert graph.change('driver', Transition.TRANSITION_CONFIGURE)
-        graph.spin_until(lambda: graph.node.count_publishers('imu/data_raw'), 30, 'a publisher')
-        assert graph.change('driver', Transition.TRANSITION_ACTIVATE)
-        graph.spin_until(lambda: 'driver' in graph.diagnostics
-                         and graph.value('driver', 'link_state') == 'ended', 120, 'the end')
-        answer = graph.call(Trigger, 'calibration/finish', Trigger.Request())
-        assert answer.success, answer.message
-    live = parameter_file.load(tmp_path / 'live.yaml')
-    assert float(live.provenance['residual_mg']) < most_mg
-    done = run_tool('fit', source, '--params', NOMINAL, '-o', 'offline.yaml')
-    assert done.returncode == 0, done.stderr
-    offline = parameter_file.load(tmp_path / 'offline.yaml')
-    for effect, values in live.values.items():
-        for parameter, value in values.items():
-            np.testing.assert_allclose(offline.values[effect][parameter], value, atol=1e-9)
 
 
 def test_a_resting_sensor_is_calibrated_over_temperature(start, tmp_path):
@@ -312,74 +234,3 @@ def test_a_resting_sensor_is_calibrated_over_temperature(start, tmp_path):
     assert warm.effects == ('bias', 'temperature_bias')
     np.testing.assert_allclose(warm.values['temperature_bias']['per_k'], 4e-4, atol=5e-5)
     assert len(warm.covariance_names) == 6
-
-
-def test_rests_before_the_info_of_the_driver_count(start, tmp_path):
-    """Topics connect in any order, and the first rest is not lost."""
-    base = nominal('xyz', serial='T5', rate_hz=100.0)
-    parameter_file.save(tmp_path / 'bare.yaml', base)
-    rng = np.random.default_rng(1)
-    with Graph() as graph:
-        raw = graph.node.create_publisher(Imu, 'imu/data_raw', QUEUE)
-        info = graph.node.create_publisher(DiagnosticStatus, 'sensor_info', QoSProfile(
-            depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
-        start('calibration', '--ros-args', '--params-file', tmp_path / 'bare.yaml', *LOSSLESS,
-              '-p', 'mode:=gravity', '-p', 'autostart:=true', '-p', 'output:=unit.yaml')
-        graph.spin_until(lambda: raw.get_subscription_count() and graph.reports(
-            'calibration', 'waiting for sensor_info'), 30, 'up')
-        assert not graph.node.count_subscribers('stage/command')
-        rests = [np.tile(G0_MPS2 * np.eye(3)[d], (300, 1)) for d in (2, 0)]
-        moving = 5 * rng.standard_normal((150, 3))
-        samples = np.vstack([rests[0], moving, rests[1], moving])
-
-        def publish(first, end):
-            for i, a in enumerate(samples[first:end], 10_000 + first):
-                message = Imu()
-                message.header.stamp.sec, number = divmod(i, 100)
-                message.header.stamp.nanosec = number * 10_000_000
-                accel = message.linear_acceleration
-                accel.x, accel.y, accel.z = (a + 0.005 * rng.standard_normal(3)).tolist()
-                raw.publish(message)
-
-        # From 2 s on the node would measure the sensor.
-        publish(0, 190)
-        # The node has received the samples.
-        graph.spin(1.0)
-        info.publish(DiagnosticStatus(values=[
-            KeyValue(key=k, value=v) for k, v in sensor_info(base).items()]))
-        graph.spin_until(lambda: not graph.reports('calibration', 'waiting for sensor_info'), 30,
-                         'the info')
-        publish(190, len(samples))
-        graph.spin_until(lambda: graph.value('calibration', 'accepted') == '2', 30, 'both rests')
-    _, entries = sweep_journal.read(tmp_path / 'unit.yaml.journal')
-    # The ends of a rest are excluded.
-    assert min(entry.samples for entry in sweep_journal.accepted_poses(entries)) > 250
-
-
-def test_a_pose_is_taken_after_the_capture_of_an_operator(start, tmp_path):
-    """Without a motor no pose is taken before ~/capture, which answers when it is on disk."""
-    truth, bare = _files(tmp_path, axes='x')
-    with Graph() as graph:
-        announced = graph.listen(DiagnosticStatus, 'calibration/next_pose', latched=True)
-        start('driver', '--ros-args', '--params-file', truth, '-p', 'link.type:=sim', '-p',
-              'link.speed:=4.0', *FAST, '-p', 'link.alpha_rad:=0.785', '-p', 'link.beta_rad:=0.0')
-        start('calibration', '--ros-args', '--params-file', bare, *FAST, *QUICK,
-              '-p', 'autostart:=true', '-p', 'stage.mode:=manual')
-        graph.spin_until(lambda: graph.reports('calibration', 'then capture'), 30, 'the request')
-        answer = graph.call(Trigger, 'calibration/capture', Trigger.Request(), 30)
-        assert answer.success and 'pose 1 is on disk' in answer.message
-        _, entries = sweep_journal.read(tmp_path / 'calibration.yaml.journal')
-        assert entries[0].alpha_rad == 0.785
-        # One axis determines no tilt: the value is absent, and not NaN.
-        graph.spin_until(lambda: graph.value('calibration', 'accepted') == '1', 10, 'the pose')
-        values = {p.key: p.value for p in graph.diagnostics['calibration'].values}
-        assert 'tilt_error_deg' not in values and 'nan' not in values.values()
-        wait_until(lambda: graph.call(Trigger, 'calibration/redo', Trigger.Request()).success,
-                   10, 'redo')
-        # The announcement is withdrawn, also for later subscribers.
-        graph.spin_until(lambda: announced[-1].message.startswith('pose 1 of'), 10, 'pose 1')
-        assert graph.call(Trigger, 'calibration/abort', Trigger.Request()).success
-        late = graph.listen(DiagnosticStatus, '/calibration/next_pose', latched=True)
-        graph.spin_until(lambda: late and late[-1].message.startswith(
-            'no pose: aborted; its poses stay in'), 10, 'the announcement')
-        assert not late[-1].values

@@ -8,19 +8,13 @@ from datetime import datetime, timedelta, timezone
 from pathlib import Path
 import signal
 
-from adxl_ros.calibrate.poses import Poses
-from adxl_ros.calibrate.provenance import envelope
-from adxl_ros.compensate import filter_inversion, paper_inverse
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model import signal_chain
-from adxl_ros.model.coefficients import put, with_neutral
 from adxl_ros.model.covariance import force_covariance
-from adxl_ros.model.effects.base import Coefficient, NOMINAL_ENVIRONMENT
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force
-from adxl_ros.model.scalar_or_array import FLOATS
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Vector3Stamped
 from graph import accel, Graph, RELIABLE, stamp_ns
@@ -30,8 +24,7 @@ import pytest
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import BatteryState, Imu, Temperature
+from sensor_msgs.msg import Imu
 from units import drawn, nominal
 
 G = 9.80665
@@ -194,43 +187,6 @@ def test_corrected_stream(robot: Robot, start: Start, tmp_path: Path) -> None:
     assert stamp_ns(message) == 10 ** 9
 
 
-def test_supply_and_temperature_are_corrected(robot: Robot, start: Start, tmp_path: Path) -> None:
-    """The inverse uses `supply` and `temperature`, and diagnostics name missing values."""
-    sensor = with_neutral(unit(), ['supply', 'temperature_bias'])
-    sensor = put(sensor, [Coefficient('temperature_bias', 'per_k', 'x'), *(
-        Coefficient('supply', f'{figure}_exponent', axis) for figure in ('zero_g', 'scale')
-        for axis in sensor.axes)], [1e-3, *[1.0] * 2, *[1.135] * 2])
-    started(start, tmp_path, sensor, '-p', 'use_sim_time:=true')
-    robot.inform(sensor)
-    robot.connected()
-    node = robot.graph.node
-    clock = node.create_publisher(Clock, '/clock', 10)
-    supply = node.create_publisher(BatteryState, 'supply', 1)
-    temperature = node.create_publisher(Temperature, 'temperature', 1)
-    force, around = pose(0.7, 0.4), NOMINAL_ENVIRONMENT._replace(temperature_c=35.0, supply_v=4.8)
-    volts = np.array([signal_chain.static_response(sensor)(force, around)])
-    nominal_accel = [*to_nominal_mps2(volts, sensor)[0].tolist(), 0.0]
-    robot.answer(nominal_accel)
-    robot.level(DiagnosticStatus.WARN, 'supply is taken at 5: nothing on /supply')
-
-    def corrected() -> bool:
-        supply.publish(BatteryState(voltage=4.8))
-        temperature.publish(Temperature(temperature=35.0))
-        return bool(np.abs(np.array(accel(robot.answer(nominal_accel))) - force).max() < 1e-5)
-
-    robot.graph.spin_until(corrected, 10.0, 'corrected for the surroundings')
-    robot.level(DiagnosticStatus.OK, 'compensating')
-
-    def old() -> bool:
-        clock.publish(Clock(clock=Time(sec=3600)))
-        temperature.publish(Temperature(temperature=35.0))
-        robot.answer(nominal_accel)
-        return robot.graph.reports(NODE, 'supply is taken at 4.8: nothing on /supply for 3600 s')
-    # A value of an hour ago does not count.
-    robot.graph.spin_until(old, 10.0, 'an hour later')
-    assert robot.graph.diagnostics[NODE].level == DiagnosticStatus.WARN
-
-
 def stored(folder: Path, sensor: Sensor, days_old: float) -> Path:
     """Put a calibration of a certain age into a store."""
     made = datetime.now(timezone.utc) - timedelta(days=days_old)
@@ -277,74 +233,6 @@ def test_the_newest_calibration_of_the_unit_is_taken(robot: Robot, start: Start,
     process.wait_for(f'compensating by {fresh}')
 
 
-def test_a_named_calibration_is_not_replaced(robot: Robot, start: Start, tmp_path: Path) -> None:
-    """The store does not replace it. Without a name the default store counts."""
-    sensor = unit(seed=1)
-    stored(calibration_store.default_folder(), unit(seed=2), 0.0)
-    process = started(start, tmp_path, sensor)
-    robot.inform(sensor)
-    robot.connected()
-    force = pose(0.7, -1.2)
-    np.testing.assert_allclose(accel(robot.answer(output_of(sensor, force))), force, atol=1e-7)
-    robot.level(DiagnosticStatus.OK, 'compensating')
-    assert process.output().count('compensating by') == 1
-    nominal_file = tmp_path / 'nominal.yaml'
-    parameter_file.save(nominal_file, nominal(serial='17'))
-    process.stop()
-    # Datasheet values without coefficients are not a calibration.
-    other = start(NODE, '--ros-args', '--params-file', nominal_file, '-r', '__node:=other')
-    other.wait_for(f'compensating by {calibration_store.default_folder()}')
-
-
-def test_the_covariance_is_raised_outside_of_the_validity_range(
-        robot: Robot, start: Start, tmp_path: Path) -> None:
-    """Temperature and pose raise it as documented, and diagnostics report it."""
-    sensor = unit(axes='xyz')
-    sensor = replace(sensor, covariance_names=tuple(
-        Coefficient(effect, parameter, axis) for effect, parameter in (
-            ('bias', 'offset_v'), ('scale_factor', 'offset_v_per_g')) for axis in 'xyz'),
-        covariance=np.diag([1e-8] * 3 + [1e-6] * 3))
-    force = np.array([pose(a, b) for a in np.radians([0, 15, 30]) for b in (0.0, 2.0, 4.0)])
-    nothing = np.zeros((9, 3))
-    poses = Poses(nothing, nothing, nothing[:, 0], nothing[:, 0], nothing[:, :2],
-                  nothing[:, 0] > 0, np.linspace(20, 25, 9))
-    # The poses reach 30° at most. A small force determines the scale factor less.
-    sensor = replace(sensor, envelope=envelope(sensor, force, poses, 0.02))
-    started(start, tmp_path, sensor)
-    robot.inform(sensor)
-    robot.connected()
-    temperature = robot.graph.node.create_publisher(Temperature, 'temperature', 1)
-    inside = output_of(sensor, pose(0.4, 0.4))
-
-    def variances(nominal_accel: list[float], at_c: float, validity: str) -> np.ndarray:
-        """Return the variances of a sample at a temperature, once the validity is reported."""
-        def there() -> bool:
-            temperature.publish(Temperature(temperature=at_c))
-            robot.answer(nominal_accel)
-            value = robot.graph.value(NODE, 'validity')
-            return value == validity or (validity != 'valid' and value.startswith(validity))
-        robot.graph.spin_until(there, 15, f'{at_c} degC: {validity}')
-        return np.array(robot.data[-1].linear_acceleration_covariance).reshape(3, 3).diagonal()
-
-    robot.answer(inside)
-    robot.graph.spin_until(lambda: robot.graph.value(NODE, 'validity')
-                           == 'valid, temperature not known', 10, 'what is not known')
-    before = variances(inside, 23.0, 'valid')
-    np.testing.assert_array_equal(variances(inside, 26.5, 'valid'), before)
-    warm = variances(inside, 40.0, 'outside: temperature 40.0 degC, calibrated at 20.0 to 25.0')
-    robot.level(DiagnosticStatus.WARN, 'covariance raised: temperature 40.0 degC')
-    # By the datasheet 0.1 mg/K and 3e-5/K of the force, over the 13 K beyond 25 + 2 degC.
-    added = (13 * 1e-4 * G) ** 2 + (13 * 3e-5 * np.array(pose(0.4, 0.4))) ** 2
-    np.testing.assert_allclose(warm - before, added, rtol=0.1)
-    tilted = variances(output_of(sensor, [2 * G, 0.0, 0.0]), 23.0,
-                       'outside: force near 19.5, 0.0, 0.0 m/s^2')
-    assert tilted[0] > before[0] + 0.02 ** 2 * 0.5
-    # No pose is near 85 deg either, although the force along x is in the range.
-    variances(output_of(sensor, pose(1.48, 0.4)), 23.0, 'outside: force near')
-    assert float(robot.graph.value(NODE, 'outside')) >= 3
-    np.testing.assert_allclose(variances(inside, 23.0, 'valid'), before)
-
-
 def test_without_a_file_the_nominal_sensor_applies(robot: Robot, start: Start) -> None:
     process = start(NODE, '--ros-args', *RELIABLE)
     robot.connected()
@@ -356,40 +244,6 @@ def test_without_a_file_the_nominal_sensor_applies(robot: Robot, start: Start) -
     robot.answer([3.0, 4.0, 0.0])
     robot.level(DiagnosticStatus.WARN, 'not calibrated')
     robot.level(DiagnosticStatus.WARN, 'no samples on /imu/data_raw')
-
-
-def test_an_unobservable_angle_keeps_its_value(robot: Robot, start: Start, tmp_path: Path) -> None:
-    """With x upright, roll keeps its last value with a very large variance."""
-    sensor = unit(axes='xyz')
-    started(start, tmp_path, sensor)
-    robot.connected()
-    robot.answer(output_of(sensor, pose(0.7, -1.2)))
-    roll = robot.tilt[-1].vector.x
-    message = robot.answer(output_of(sensor, [G, 0.0, 0.0]))
-    vector = robot.tilt[-1].vector
-    assert vector.x == roll
-    assert vector.y == pytest.approx(-np.pi / 2, abs=1e-3)
-    about = message.orientation_covariance.reshape(3, 3)
-    assert about[0, 0] == 1e6
-    assert about[0, 1] == about[1, 0] == 0
-    assert 0 < about[1, 1] < 1e-5
-
-
-def test_invalid_samples_are_not_published(robot: Robot, start: Start, tmp_path: Path) -> None:
-    sensor = unit()
-    started(start, tmp_path, sensor)
-    robot.inform(sensor)
-    robot.connected()
-    valid = output_of(sensor, pose(0.5, 0.5))
-    before = accel(robot.answer(valid))
-    for invalid in (float('nan'), float('inf'), 1e38, -1e300, 5e3):
-        robot.send([invalid, valid[1], 0.0])
-    np.testing.assert_array_equal(accel(robot.answer(valid)), before)
-    assert len(robot.data) == len(robot.tilt) == 2
-    robot.warned('samples dropped', 5)
-    assert robot.graph.value(NODE, 'dropped') == '5'
-    robot.answer([-2.5 * G, valid[1], 0.0])
-    robot.warned('samples with the ADC at its rail', 1)
 
 
 def test_samples_of_two_drivers_are_not_mixed(robot: Robot, start: Start) -> None:
@@ -408,65 +262,6 @@ def test_samples_of_two_drivers_are_not_mixed(robot: Robot, start: Start) -> Non
     second.stop()
     process.wait_for('publishing again')
     graph.spin_until(lambda: len(robot.data) > count, 10.0, 'corrected samples again')
-
-
-def test_another_unit_is_refused(robot: Robot, start: Start, tmp_path: Path) -> None:
-    """The policy of the compensation has tests of every other refusal."""
-    sensor = unit()
-    process = started(start, tmp_path, sensor)
-    robot.inform(sensor, serial='18')
-    robot.connected()
-    robot.level(DiagnosticStatus.ERROR, 'is of the sensor 18, but the parameters are of 17')
-    for _ in range(3):
-        robot.send(output_of(sensor, pose(0.5, 0.5)))
-    robot.graph.spin_until(lambda: robot.graph.value(NODE, 'received') == '3', 10.0, 'received')
-    assert not robot.data
-    assert not robot.tilt
-    robot.inform(sensor)
-    process.wait_for('publishing again')
-    robot.answer(output_of(sensor, pose(0.5, 0.5)))
-    robot.level(DiagnosticStatus.OK, 'compensating')
-    assert process.output().count('publishing nothing') == 1
-
-
-def test_coefficients_are_set_all_or_none(robot: Robot, start: Start, tmp_path: Path) -> None:
-    sensor = replace(nominal(), serial='17', effects=('bias', 'scale_factor'), values={
-        'bias': {'offset_v': np.zeros(2)}, 'scale_factor': {'offset_v_per_g': np.zeros(2)}})
-    started(start, tmp_path, sensor)
-    robot.inform(sensor)
-    robot.connected()
-    names = ('effects', 'bias.offset_v', 'scale_factor.offset_v_per_g', 'covariance')
-    assert accel(robot.answer([1.0, 2.0, 0.0]))[0] == pytest.approx(1.0, abs=1e-7)
-    assert robot.assign(bias__offset_v=[0.1, 0.0], scale_factor__offset_v_per_g=[0.25, 0.0]) == ''
-    after = accel(robot.answer([1.0, 2.0, 0.0]))[0]
-    assert after == pytest.approx((1.0 - 0.1 * G) / 1.25, abs=1e-7)
-    held = robot.get(*names[:3])
-    for values, reason in (
-            ({'bias__offset_v': [0.2, 0.0], 'scale_factor__offset_v_per_g': [99.0, 0.0]},
-             'scale_factor.offset_v_per_g: 99 V/g is outside -0.9 to 9'),
-            ({'bias__offset_v': [0.2]}, 'bias.offset_v: 1 values for 2 axes'),
-            ({'bias__offset_v': [float('nan'), 0.0]}, 'bias.offset_v: nan is not a finite'),
-            ({'misalignment__alpha_rad': [0.1, 0.1]}, 'effects does not list misalignment'),
-            ({'effects': ['bias', 'misalignment']}, 'missing'),
-            ({'effects': ['bias', 'none']}, "unknown effect 'none'"),
-            ({'covariance_names': ['bias.offset_v.x'], 'covariance': [-1.0]},
-             'the variance of bias.offset_v.x is -1'),
-            ({'sensor__serial': '18'}, 'sensor.serial: belongs to the parameter file'),
-            ({'bias__offset_v': [0.2, 0.0], 'sensor__axes': 'x'}, 'sensor.axes: belongs to'),
-            ({'format': 2}, 'format: belongs to the parameter file'),
-            ({'calibration': '/none.yaml'}, '/none.yaml: cannot be read'),
-            ({'calibration': '/none.yaml', 'bias__offset_v': [0.2, 0.0]}, 'cannot be set toget')):
-        assert reason in robot.assign(**values)
-        assert robot.get(*names[:3]) == held
-        assert accel(robot.answer([1.0, 2.0, 0.0]))[0] == after
-    # Effects that the file does not list have all their parameters.
-    assert not robot.assign(
-        effects=['bias', 'misalignment'], misalignment__alpha_rad=[0.0, 0.0],
-        misalignment__beta_rad=[0.0, 0.02], covariance=[1e-4],
-        covariance_names=['bias.offset_v.x'])
-    message = robot.answer([1.0, 2.0, 0.0])
-    assert accel(message)[0] == pytest.approx(1.0 - 0.1 * G, abs=1e-7)
-    assert message.linear_acceleration_covariance[0] == pytest.approx(1e-4 * G * G, rel=0.01)
 
 
 def test_calibration_loads_a_complete_file_or_nothing(robot: Robot, start: Start,
@@ -544,37 +339,3 @@ def test_a_bad_file_ends_it_with_one_line(start: Start, tmp_path: Path, right: s
         assert process.output().count('\n') == 1
         assert f'{path}:' in process.output()
         assert message in process.output()
-
-
-def test_the_inverse_of_the_filter_keeps_the_stamps(robot: Robot, start: Start,
-                                                    tmp_path: Path) -> None:
-    """With undo_filter the output is the zero-phase inverse, eight samples later."""
-    sensor = replace(unit().without_covariance(), rate_hz=1.0, rc_capacitance_f=3e-5)
-    started(start, tmp_path, sensor, '-p', 'undo_filter:=true')
-    robot.inform(sensor)
-    robot.connected()
-    values = {pair.key: pair.value for pair in robot.graph.diagnostics[NODE].values}
-    assert values['delay_s'] == '8.0'
-    alpha = 0.6 + 0.1 * np.sin(0.2 * np.arange(40))
-    volts = np.column_stack(signal_chain.static_response(sensor)(specific_force(alpha, 0.3, G)))
-    for row in to_nominal_mps2(volts, sensor):
-        robot.send([*row.tolist(), 0.0])
-    robot.graph.spin_until(lambda: len(robot.data) == 32, 10.0, '32 of 40 samples')
-    assert [stamp_ns(m) for m in robot.data] == [k * 10 ** 9 for k in range(1, 33)]
-    back = filter_inversion.undo(volts, np.arange(1.0, 41.0), np.full(2, sensor.rc_s), 1.0)
-    expected = np.transpose(signal_chain.inverse(sensor)(list(back.T)))[:32]
-    got = np.array([accel(m) for m in robot.data])
-    np.testing.assert_allclose(got[8:, :2], expected[8:, :2], atol=1e-5)
-
-
-def test_the_papers_inverse_is_an_option(robot: Robot, start: Start, tmp_path: Path) -> None:
-    """inverse:=paper gives equations 14 to 21, and another value is refused at the start."""
-    sensor = unit()
-    started(start, tmp_path, sensor, '-p', 'inverse:=paper')
-    robot.inform(sensor)
-    robot.connected()
-    values = output_of(sensor, pose(0.7, 0.4))
-    volts = [v[0] for v in signal_chain.static_response(
-        sensor)([np.array([f]) for f in pose(0.7, 0.4)])]
-    expected = paper_inverse.inverse(sensor, maths=FLOATS)([float(v) for v in volts])
-    assert accel(robot.answer(values)) == pytest.approx(expected, abs=1e-6)

@@ -2,14 +2,11 @@
 
 """The driver over DDS: its outputs, and its messages about faults."""
 
-import os
-import signal
 import time
 
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model import noise
 from adxl_ros.model.sensor import to_nominal_mps2, to_volts
-from adxl_ros.nodes.support.references import References
 from adxl_ros.nodes.support.sample_output import imu_message, ImuWriter
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -155,82 +152,6 @@ def test_beside_another_clock_the_driver_follows_it(start, option):
         driver = start('driver', ROS, '-p', 'link.type:=sim', '-p', option)
         graph.spin_until(tick, 30, '500 samples by the one clock')
     assert '/clock comes from /tester: this driver follows it' in driver.output()
-
-
-def test_replay_in_real_time_is_stamped_now(start, tmp_path):
-    written(tmp_path / 'r.csv', 300)
-    with Graph() as graph:
-        samples = graph.listen(Imu, 'imu/data_raw')
-        start('driver', ROS, '-p', 'link.type:=replay', '-p', 'link.recording:=r.csv', '-p',
-              'link.loop:=true')
-        graph.spin_until(lambda: len(samples) >= 200 and abs(
-            stamp_ns(samples[-1]) - graph.node.get_clock().now().nanoseconds) < 1e9, 30,
-            '200 samples, the newest of now')
-    stamps = np.array([stamp_ns(message) for message in samples])
-    assert np.diff(stamps) == pytest.approx(5e6, abs=2)
-
-
-def test_constant_references_are_published_at_a_low_rate(ros_env):
-    with Graph() as graph:
-        sent = []
-        references = References(graph.node, 'imu_link', ('alpha_rad', 'temperature_c'))
-        for publisher in references._publishers.values():
-            publisher.publish = sent.append
-        stamps = 1_000_000 * np.arange(3000)
-        columns = {'alpha_rad': np.full(3000, 0.5), 'temperature_c': np.full(3000, 20.0)}
-        columns['alpha_rad'][1:10] = np.nan
-        for part in np.split(np.arange(3000), 30):
-            references.publish(stamps[part],
-                               {name: values[part] for name, values in columns.items()})
-    joints = [m for m in sent if isinstance(m, JointState)]
-    assert len(joints) == 300
-    assert all(np.isfinite(m.position).all() for m in joints)
-    assert len(sent) - len(joints) == 3
-
-
-@pytest.mark.parametrize('text, why', [
-    (None, 'No such file'), ('', 'empty'), ('time_s,x_v\n0.0,1.0\n0.1,two\n', "x_v is 'two'")])
-def test_an_invalid_recording_ends_the_driver_with_one_line(start, tmp_path, text, why):
-    if text is not None:
-        (tmp_path / 'bad.csv').write_text(text)
-    driver = start('driver', ROS, '-p', 'link.type:=replay', '-p', 'link.recording:=bad.csv')
-    assert driver.wait() == 1
-    lines = [line for line in driver.output().splitlines() if line]
-    assert len(lines) == 1, lines
-    assert 'bad.csv' in lines[0]
-    assert why in lines[0]
-
-
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_driver_without_messages(start, number):
-    driver = start('driver')
-    with Graph() as graph:
-        samples = graph.listen(Imu, 'imu/data_raw')
-        graph.spin_until(lambda: samples and 'driver' in graph.diagnostics, 20, 'a sample')
-    before = driver.output()
-    os.kill(driver.popen.pid, number)
-    assert driver.wait() == 0
-    assert driver.output() == before
-
-
-@pytest.mark.parametrize('change, placed, why', [
-    (('1000.0', '1000'), True, 'DOUBLE'), (('[2.5, 2.5]', '[2.5, 2]'), True, '2 is not of'),
-    (('      rate_hz: 1000.0\n', ''), False, 'sensor.rate_hz: missing'),
-    (('format: 1', 'format: 2'), True, 'version 2'), (('axes: xy', 'axes: xyz'), False, '3 axes'),
-    (('axes: xy', 'axes: [xy'), False, 'not YAML'),
-    (('range_g: 1.7', 'range_g: -1.0'), True, '-1'),
-    (('model: nominal', 'model: nominal\n    effects: [bias]'), False, 'bias.offset_v: missing')])
-def test_an_invalid_parameter_file_is_refused_with_the_place(start, tmp_path, change, placed, why):
-    path = tmp_path / 'bad.yaml'
-    text = NOMINAL.read_text()
-    path.write_text(text.replace(*change))
-    assert path.read_text() != text
-    place = f':{text[:text.index(change[0])].count(chr(10)) + 1}:' if placed else ''
-    driver = start('driver', ROS, '--params-file', path)
-    assert driver.wait() == 1
-    assert len(driver.output().splitlines()) == 1, driver.output()
-    assert f'{path}{place}' in driver.output()
-    assert why in driver.output()
 
 
 @pytest.mark.parametrize('arguments, status', [

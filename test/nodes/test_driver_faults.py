@@ -6,9 +6,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 import os
 from pathlib import Path
-import re
 import socket
-import subprocess
 import threading
 import time
 
@@ -16,7 +14,6 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.links.support import emulated_board, iio_stream
 from adxl_ros.model.effects import effect_named
-from diagnostic_msgs.msg import DiagnosticStatus
 from faults import byte_fault, Fault, IIO_FAULTS, run_fault, SERIAL_FAULTS
 from graph import accel, Graph, stamp_ns
 from lifecycle_msgs.msg import Transition
@@ -110,30 +107,6 @@ def test_every_fault_of_an_iiod_is_survived(start, tmp_path):
     assert len(messages) <= 1 + 2 + (len(IIO_FAULTS) + 1) * 2, messages
 
 
-def test_a_late_device_is_opened_and_each_state_is_logged_once(start, tmp_path):
-    with Graph() as graph:
-        driver = start('driver', ROS, '-p', 'link.type:=serial', '-p',
-                       f'link.port:={tmp_path / "board"}')
-        graph.spin_until(lambda: graph.reports('driver', 'No such file'), 20, 'the reason')
-        assert graph.diagnostics['driver'].level == DiagnosticStatus.ERROR
-        graph.spin(1.5)
-        rig = SerialRig(graph, tmp_path)
-        rig.wait_for_samples(100, 20)
-        graph.spin_until(lambda: graph.reports('driver', 'streaming'), 5, 'streaming')
-        rig.end()
-        graph.spin_until(lambda: graph.reports('driver', 'No such file'), 5, 'the lost board')
-    assert driver.stop() == 0
-    messages = [re.sub(r'^\[(\w+)\] \[[\d.]+\] \[driver\]: ', r'\1 ', line)
-                for line in lines(driver)]
-    path = tmp_path / 'board'
-    start_line = 'INFO active: link serial, unit nominal, 1000 Hz, topic /imu/data_raw'
-    assert messages[:2].count(start_line) == messages.count(start_line) == 1
-    messages.remove(start_line)
-    assert messages[0] == f'ERROR {path}: No such file or directory'
-    assert [line.split(';')[0] for line in messages[1:3]] == ['INFO connecting', 'INFO streaming']
-    assert 4 <= len(messages) <= 5, messages
-
-
 def test_two_drivers_cannot_have_one_port(start, tmp_path):
     with board_rig(tmp_path, {'keeps': True}) as rig:
         first = start('driver', ROS, *rig.driver_parameters())
@@ -184,31 +157,6 @@ def test_a_hostile_stream_costs_no_memory_and_disturbs_no_other_link(start, tmp_
         assert after - before < 8, f'{before} MiB before, {after} MiB after'
         assert hurt.popen.poll() is None
         peer.close()
-
-
-def test_a_full_disk_for_the_log_does_not_stop_the_driver(start, ros_env, tmp_path, monkeypatch):
-    folder = tmp_path / 'full'
-    folder.mkdir()
-    mount = ['mount', '-t', 'tmpfs', '-o', 'size=4k', 'tmpfs', folder]
-    if os.getuid() or subprocess.run(mount, capture_output=True).returncode:
-        pytest.skip('cannot mount a small file system: run the tests as the superuser')
-    try:
-        (folder / 'fill').write_bytes(b'x' * 4096)
-        ros_env['ROS_LOG_DIR'] = str(folder)
-        with board_rig(tmp_path) as rig:
-            driver = start('driver', ROS, *rig.driver_parameters())
-            rig.wait_for_samples(500, 30)
-            rig.begin_report()
-            for _ in range(3):
-                rig.command('unplug 0.3')
-                rig.wait_for_samples(300, 20)
-            report = rig.report()
-            assert report.exact, report
-            assert driver.popen.poll() is None
-        assert driver.stop() == 0
-        assert 'Traceback' not in driver.output()
-    finally:
-        subprocess.run(['umount', '-l', folder], check=True)
 
 
 def test_a_system_manager_changes_the_state_of_the_driver(start, tmp_path):
@@ -290,27 +238,3 @@ def test_a_measured_supply_corrects_the_supply_effect(start, tmp_path):
     assert accel(raw[-1])[:2] == pytest.approx([-0.1 * 9.80665, 0.38 * 9.80665], abs=0.01)
     assert accel(corrected[-1])[:2] == pytest.approx([0, 0.5 * 9.80665], abs=0.01)
     assert newest_s < -0.0105, 'the delay of the filter is taken out of the stamps'
-
-
-def test_simulate_emulates_a_board(start, run_tool, tmp_path):
-    with Graph() as graph:
-        sender = start('simulate', 'tilt_alpha', '--port', 'bench', '--seed', '3')
-        sender.wait_for('link.port:=bench')
-        samples = graph.listen(Imu, 'imu/data_raw')
-        start('driver', ROS, '-p', 'link.type:=serial', '-p', 'link.port:=bench')
-
-        def steady():
-            """Return whether a thousand samples follow each other without a gap."""
-            steps_ns = np.diff([stamp_ns(m) for m in samples[-1000:]])
-            return len(steps_ns) == 999 and (np.rint(steps_ns * 1e-6) == 1).all()
-        # A busy machine may hold up either process, which then loses samples.
-        graph.spin_until(steady, 30, 'samples without a gap')
-        graph.spin_until(lambda: graph.value('driver', 'link_state') == 'streaming' and float(
-            graph.value('driver', 'rate_hz')) > 900, 5, 'the rate')
-    sender.stop()
-    assert not (tmp_path / 'bench').is_symlink()
-    (tmp_path / 'file').touch()
-    done = run_tool('simulate', 'tilt_alpha', '--port', 'file')
-    assert done.returncode == 1
-    assert 'file: is no terminal' in done.stderr
-    assert run_tool('simulate', 'tilt_alpha').returncode == 2

@@ -130,14 +130,3 @@ def test_a_pause_a_reset_and_half_speed_of_the_simulator(start) -> None:
     assert 'the simulation was reset' in driver.output()
     assert 'use_sim_time' not in driver.output(), 'a clock that begins later is the clock'
     assert 'Traceback' not in driver.output()
-
-
-def test_a_simulator_of_another_clock_is_reported(start) -> None:
-    with Graph() as graph:
-        simulator = Simulator(graph)
-        samples = graph.listen(Imu, 'imu/data_raw')
-        driver = start('driver', '--ros-args', '-p', 'link.type:=topic')
-        simulator.run_until(lambda: 'set use_sim_time:=true' in driver.output(), 'the warning')
-        count = len(samples)
-        simulator.run_until(lambda: len(samples) > count + 100, 'samples')
-    assert driver.output().count('set use_sim_time:=true') == 1

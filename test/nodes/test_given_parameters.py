@@ -10,12 +10,11 @@ from adxl_ros.nodes.support.sensor_parameters import sensor_keys
 from diagnostic_msgs.msg import DiagnosticStatus
 from graph import Graph
 from lifecycle_msgs.msg import Transition
-import numpy as np
 import pytest
-from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters
-from rclpy.parameter import parameter_dict_from_yaml_file, parameter_value_to_python
+from rcl_interfaces.srv import GetParameters, ListParameters
+from rclpy.parameter import parameter_value_to_python
 from sensor_msgs.msg import Imu
-from units import drawn, NOMINAL, nominal
+from units import NOMINAL, nominal
 
 ROS = '--ros-args'
 SIMULATED = 'SIMULATED sensor (link.type: sim)'
@@ -98,23 +97,6 @@ def test_the_error_of_an_argument_names_no_file(start, unit, rule, words):
     assert 'unit.yaml' not in line
 
 
-def test_a_text_with_a_colon_needs_quotes(start):
-    node = start('driver', ROS, '-p', 'link.uri:=local:')
-    assert node.wait() == 2
-    assert 'quotes of its own' in node.output()
-    assert '/src/' not in node.output()
-    line = refusal(start, 'driver', '-p', 'link.uri:="local:"')
-    assert 'link.type: is not set, but link.uri is given' in line
-
-
-def test_an_error_in_the_parameters_of_a_launch_file_names_no_temporary_file(start, tmp_path):
-    """launch_ros passes the parameters of a launch file on in a file of its own."""
-    (tmp_path / 'launch_params_x1').write_text('/**:\n  ros__parameters:\n    link.type: seral\n')
-    line = refusal(start, 'driver', '--params-file', NOMINAL, '--params-file',
-                   tmp_path / 'launch_params_x1')
-    assert line.startswith("driver: parameters of the launch file: link.type: 'seral' is not one")
-
-
 @pytest.mark.parametrize('node', [
     'stage', 'calibration', 'compensation', 'investigate', 'monitor'])
 def test_an_unknown_parameter_of_a_file_is_refused_at_its_line(start, tmp_path, node):
@@ -193,48 +175,6 @@ def check_dump(graph: Graph, node: str, names: list[str]) -> None:
         assert dumped['sensor.rate_hz'] == 1000.0
         assert dumped['format'] == 1
         assert dumped['effects'] == []
-
-
-def test_a_calibration_can_be_loaded_as_ros2_param_does(start, run_tool, tmp_path):
-    """`ros2 param load` sends all parameters of a file: all of them count, or none."""
-    rng = np.random.default_rng(1)
-    parameter_file.save(tmp_path / 'unit.yaml', drawn(rng, nominal(serial='L1')))
-    for arguments in (('simulate', 'sweep', '--params', 'unit.yaml', '--rate', '50', '-o',
-                       'sweep.csv'), ('fit', 'sweep.csv', '-o', 'fitted.yaml')):
-        done = run_tool(*arguments)
-        assert done.returncode == 0, done.stderr
-    fitted = parameter_file.load(tmp_path / 'fitted.yaml')
-    node = start('compensation', ROS, '--params-file', NOMINAL)
-    parameters = parameter_dict_from_yaml_file(str(tmp_path / 'fitted.yaml'), use_wildcard=True)
-    with Graph() as graph:
-        def load(names):
-            request = SetParameters.Request(parameters=[parameters[name] for name in names])
-            return graph.call(SetParameters, 'compensation/set_parameters', request).results
-
-        def effects():
-            answer = graph.call(GetParameters, 'compensation/get_parameters',
-                                GetParameters.Request(names=['effects']))
-            return parameter_value_to_python(answer.values[0])
-
-        incomplete = load([name for name in parameters if name != 'bias.offset_v'])
-        assert not any(result.successful for result in incomplete)
-        assert all('bias.offset_v' in result.reason for result in incomplete)
-        assert effects() == []
-        single = load(['sensor.rate_hz'])
-        assert 'set calibration to the path of another file' in single[0].reason
-        results = load(parameters)
-        assert all(result.successful for result in results), results
-        assert effects() == list(fitted.effects)
-    assert 'compensating by the file loaded: L1, model full' in node.output()
-
-
-def test_an_invalid_qos_policy_is_one_line(start):
-    override = 'qos_overrides./stage/joint_states.publisher.reliability'
-    line = refusal(start, 'stage', '-p', f'{override}:=relaible')
-    assert 'qos_overrides./stage/joint_states.publisher: ' in line
-    assert 'relaible' in line
-    line = refusal(start, 'driver', '-p', 'qos_overrides./imu/data_raw.publisher.depth:=deep')
-    assert 'qos_overrides./imu/data_raw' in line
 
 
 def test_an_inactive_driver_is_a_warning_and_each_transition_is_one_line(start):

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""A sweep that is killed at random moments; 200 times in `make soak`."""
+"""A sweep that is killed at random moments."""
 
 from kills import kill
 import pytest

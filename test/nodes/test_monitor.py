@@ -217,15 +217,6 @@ def test_a_killed_monitor_loses_no_change(monitor, graph, tmp_path) -> None:
     assert len(lines) >= 2
 
 
-def test_a_stream_of_another_unit_is_refused(monitor, graph) -> None:
-    streams = Streams(graph, nominal('xyz', serial='other', rate_hz=RATE_HZ))
-    node = monitor()
-    streams.run_until(lambda: graph.reports('monitor', 'is of the sensor other'), 'the refusal')
-    assert graph.diagnostics['monitor'].level == DiagnosticStatus.ERROR
-    assert node.stop() == 0
-    assert 'Traceback' not in node.output()
-
-
 def test_no_sample_at_1_khz_is_lost(start, graph) -> None:
     """The monitor counts every sample that the driver has published since it listens."""
     # A machine that is held up for seconds would drop messages between nodes.

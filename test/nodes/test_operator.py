@@ -8,13 +8,10 @@ import re
 import signal
 
 from adxl_ros.files import parameter_file, sweep_journal
-from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from graph import Graph, RELIABLE
 import numpy as np
-import pytest
-from sensor_msgs.msg import Imu, JointState, Temperature
-from std_msgs.msg import Header
+from sensor_msgs.msg import Imu, JointState
 from std_srvs.srv import Trigger
 from units import drawn, nominal
 
@@ -173,28 +170,6 @@ def test_a_calibration_with_mistakes_of_the_operator_is_right(start, tmp_path):
     assert (moved[1:] == turned[1:]).all()
 
 
-def test_by_hand_the_next_direction_is_announced_in_words(start, tmp_path):
-    """Without a stage, topic and log name the direction that must point up."""
-    base = nominal('xyz', serial='T3')
-    parameter_file.save(tmp_path / 'bare.yaml', base)
-    with Operator() as operator:
-        start('driver', '--ros-args', '--params-file', tmp_path / 'bare.yaml', '-p',
-              'link.type:=sim')
-        node = start('calibration', '--ros-args', '--params-file', tmp_path / 'bare.yaml', '-p',
-                     'mode:=gravity', '-p', 'autostart:=true')
-        operator.spin_until(lambda: operator.announced, 60, 'the first direction')
-        newest = operator.announced[-1]
-        assert newest.message == 'turn it so that +z points up, and hold it still'
-        direction = {pair.key: float(pair.value) for pair in newest.values}
-        assert [direction[f'up_{axis}'] for axis in 'xyz'] == [0.0, 0.0, 1.0]
-        assert operator.ask('skip') == (True, '+z up is left out')
-        operator.spin_until(lambda: '+z points up' not in operator.announced[-1].message, 20,
-                            'another direction')
-        node.wait_for(operator.announced[-1].message)
-        assert operator.ask() == (False, 'nothing to capture: hold the sensor still, and each '
-                                         'rest is taken by itself')
-
-
 def test_a_compensated_stream_and_a_wrong_rate_are_refused(start, tmp_path):
     """A stream of compensated samples or with missing samples is reported at once."""
     base = nominal(serial='T4')
@@ -228,34 +203,3 @@ def test_a_compensated_stream_and_a_wrong_rate_are_refused(start, tmp_path):
         dead.append('x')
         operator.spin_until(lambda: operator.reports('other', 'x is not a number in all samples'),
                             60, 'which axis')
-
-
-def test_a_changed_temperature_is_refused_until_it_is_back(start, tmp_path):
-    """The message has the change, and the journal has the temperature of each pose."""
-    with Operator() as operator:
-        warm = operator.node.create_publisher(Temperature, 'temperature', 10)
-        now = [23.0]
-        # The temperature has another clock than the samples.
-        stamped = Header(stamp=Time(sec=2_000_000_000))
-        operator.node.create_timer(0.05, lambda: warm.publish(Temperature(
-            header=stamped, temperature=now[0])))
-        _, node = _bench(start, tmp_path, 'commanded')
-        operator.spin_until(lambda: any(np.isfinite(pose.temperature_c)
-                                        for pose in _accepted_poses(tmp_path)),
-                            60, 'a pose with its temperature')
-        now[0] = 27.0
-        operator.spin_until(lambda: operator.reports(
-            'calibration', 'temperature moved 4.0 °C since the first pose'), 30, 'why')
-        now[0] = 23.5
-        operator.spin_until(lambda: operator.diagnostics.get('calibration') and int(
-            operator.value('calibration', 'accepted')) >= 4, 60, 'more poses')
-    assert node.popen.poll() is None
-    assert node.output().count('temperature is stamped ') == 1
-    measured = [e.temperature_c for e in _accepted_poses(tmp_path) if np.isfinite(e.temperature_c)]
-    assert measured[0] == pytest.approx(23.0) and max(measured) < 26.0
-
-
-def _accepted_poses(tmp_path):
-    path = tmp_path / 'unit.yaml.journal'
-    begun = path.exists() and path.stat().st_size
-    return sweep_journal.accepted_poses(sweep_journal.read(path)[1]) if begun else []

@@ -123,18 +123,6 @@ def test_a_signal_ends_a_screen_and_restores_its_terminal(screen, number):
     assert seen.restored()
 
 
-def test_a_screen_finds_the_terminal_of_a_launch(ros_env, tmp_path):
-    """A launch keeps stdin and stdout; the screen then uses the terminal that controls it."""
-    seen = Terminal(['sh', '-c', f'{executable("screen")} </dev/null >output.txt 2>&1'], ros_env,
-                    tmp_path)
-    seen.wait_for('waiting for /calibration', 'q  quit')
-    seen.press('q')
-    assert seen.wait() == 0
-    assert seen.restored()
-    assert (tmp_path / 'output.txt').read_text() == ''
-    seen.close()
-
-
 def test_a_screen_without_a_terminal_says_so(start):
     node = start('screen')
     assert node.wait() == 1

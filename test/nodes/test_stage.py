@@ -2,16 +2,11 @@
 
 """The stage over DDS, alone and in lockstep with the driver's simulated sensor."""
 
-from functools import partial
-import os
-import signal
 
 from adxl_ros.model.kinematics import specific_force
-from diagnostic_msgs.msg import DiagnosticStatus
 from graph import Graph, imu_table, stamp_ns
 import numpy as np
 import pytest
-from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, JointState
 
 ROS = '--ros-args'
@@ -67,35 +62,6 @@ def test_the_stage_reaches_its_command_and_publishes_its_encoder(start):
     assert 1e-6 < np.abs(error_rad).max() <= STEP / 2 + 1e-9
 
 
-BAD_COMMANDS = {
-    'alpha = nan': JointState(name=['alpha'], position=[np.nan]),
-    "no joint 'gamma'": JointState(name=['gamma'], position=[0.1]),
-    '2 names, but 1': JointState(name=['alpha', 'beta'], position=[0.1]),
-    'out of reach': JointState(name=['beta'], position=[1e38]),
-}
-
-
-def test_a_command_without_meaning_is_refused(start):
-    stage = start('stage')
-    with Commander() as graph:
-        graph.spin_until(lambda: graph.states and graph.command.get_subscription_count(), 20,
-                         'the stage')
-        graph.go(alpha=0.0)
-        for reason, command in BAD_COMMANDS.items():
-            graph.command.publish(command)
-            graph.spin_until(partial(graph.reports, 'stage', reason), 20, f'refusal: {reason}')
-            assert graph.diagnostics['stage'].level == DiagnosticStatus.WARN
-            assert '/stage/command' in graph.diagnostics['stage'].message
-            assert not np.abs(graph.states[-1].position).max() > STEP
-            graph.spin_until(lambda: graph.reports('stage', 'at rest'), 20, 'recovery')
-    assert stage.stop() == 0
-    start_line, first, *lines = stage.output().splitlines()
-    assert 'simulated stage at alpha' in start_line and 'slew_rate_rad_s 0.5' in start_line
-    assert "first command: {'alpha': 0.0}" in first
-    assert len(lines) == len(BAD_COMMANDS)
-    assert all(reason in line for reason, line in zip(BAD_COMMANDS, lines))
-
-
 @pytest.mark.parametrize('speed', [1.0, 5.0])
 def test_the_simulated_sensor_senses_the_true_angles(start, speed):
     clock = SIM_TIME if speed != 1 else (ROS,)
@@ -124,48 +90,3 @@ def test_the_simulated_sensor_senses_the_true_angles(start, speed):
     assert np.ptp(beta) > 1.1
     expected = np.column_stack(specific_force(alpha, beta, 9.80665))
     assert np.abs(measured[rows] - expected).max() < 1e-9
-
-
-@pytest.mark.kills
-def test_sensor_time_continues_without_the_stage_and_waits_for_it_again(start):
-    start('driver', *SIM_TIME, '-p', 'link.type:=sim', '-p', 'link.speed:=2.0', *IDEAL)
-    with Commander() as graph:
-        samples = graph.listen(Imu, 'imu/data_raw', raw=True)
-        clock = graph.listen(Clock, '/clock')
-        graph.spin_until(lambda: len(samples) > 100, 20, 'samples without a stage')
-        graph.spin_until(lambda: graph.reports('driver', 'no stage'), 20, 'the lack of a stage')
-        stage = start('stage', *SIM_TIME, '-p', 'alpha_rad:=0.5')
-        graph.spin_until(lambda: graph.reports('driver', 'on the stage'), 20, 'the stage')
-        os.kill(stage.popen.pid, signal.SIGKILL)
-        graph.spin_until(lambda: graph.reports('driver', 'stage lost'), 20, 'the loss')
-        assert graph.diagnostics['driver'].level == DiagnosticStatus.WARN
-        count = len(samples)
-        graph.spin_until(lambda: len(samples) > count + 1000, 20, 'samples after the loss')
-        assert imu_table(samples[-1:])[1][0, 2] == pytest.approx(9.80665 * np.cos(0.5), abs=0.01)
-        start('stage', *SIM_TIME, '-p', 'alpha_rad:=1.0')
-        graph.spin_until(lambda: graph.reports('driver', 'on the stage'), 20, 'the new stage')
-        count = len(samples)
-        graph.spin_until(lambda: len(samples) > count + 1000, 20, 'samples on the new stage')
-        assert imu_table(samples[-1:])[1][0, 2] == pytest.approx(9.80665 * np.cos(1.0), abs=0.02)
-    stamps, _ = imu_table(samples)
-    assert (np.diff(stamps) == 1_000_000).all()
-    ticks = [c.clock.sec * 10 ** 9 + c.clock.nanosec for c in clock]
-    assert ticks == sorted(ticks)
-
-
-def test_a_stage_on_another_clock_is_reported(start):
-    start('stage', ROS, '-p', 'alpha_rad:=0.5')
-    start('driver', ROS, '-p', 'link.type:=sim', '-p', 'link.speed:=30.0')
-    with Commander() as graph:
-        graph.spin_until(lambda: graph.reports('driver', 'another clock') or
-                         graph.reports('driver', 'on the stage'), 20, 'the driver')
-
-
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_stage_without_messages(start, number):
-    stage = start('stage')
-    with Commander() as graph:
-        graph.spin_until(lambda: graph.states, 20, 'joint states')
-    os.kill(stage.popen.pid, number)
-    assert stage.wait() == 0
-    assert len(stage.output().splitlines()) == 1, 'the line of the start'

@@ -106,21 +106,6 @@ def test_a_turn_beyond_half_a_turn_is_unwrapped(start):
                              20, f'beta {beta}')
 
 
-def test_a_stage_that_begins_beyond_half_a_turn_arrives(start):
-    """330 deg is -30 deg of the controller, so that the stage arrives without motion."""
-    with Controller('trajectory') as graph:
-        graph.angles['turn'] = np.radians(330)
-        start('stage', '--ros-args', '-p', 'stage.type:=trajectory', *NAMES, '-p',
-              'bridge.speed_rad_s:=10.0')
-        graph.spin_until(graph.at, 30, 'the stage')
-        graph.command_until(
-            0.0, np.radians(330), lambda: graph.at()['beta'] == pytest.approx(np.radians(330)),
-            'beta 330')
-        graph.angles['turn'] = np.radians(300)
-        graph.spin_until(lambda: graph.at()['beta'] == pytest.approx(np.radians(300)), 20,
-                         'beta 300, counted on')
-
-
 def test_a_command_that_is_lost_is_sent_again(start):
     """A controller that starts later or ignores a goal receives the command again."""
     with Controller('trajectory') as graph:

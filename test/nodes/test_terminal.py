@@ -13,9 +13,8 @@ import numpy as np
 from processes import children, executable
 import pytest
 from sensor_msgs.msg import JointState
-from std_srvs.srv import Trigger
 from terminal import Terminal
-from units import drawn, nominal, pose_record
+from units import drawn, nominal
 from without_extras import run_without_extras
 
 FAST = ('-p', 'use_sim_time:=true')
@@ -182,39 +181,6 @@ def test_the_terminal_is_restored(terminal, how):
     with Graph() as graph:
         graph.spin_until(lambda: seen.restored() and not Path(f'/proc/{screen}').exists(), 20,
                          'the terminal as it was')
-
-
-def test_a_terminal_of_another_process_has_a_screen(terminal):
-    """The screen also works in a terminal that does not control the node, as in a container."""
-    seen = terminal(controls=False)
-    seen.wait_for('press b to begin', 'q  quit')
-    # Without a driver the start can be aborted.
-    seen.press('b')
-    seen.wait_for('waiting for sensor_info', 'a  abort')
-    seen.press('a')
-    seen.wait_for('aborted', 'b  begin')
-    seen.press('q')
-    assert seen.wait() == 0
-    assert seen.restored()
-
-
-def test_a_change_of_settings_is_reported_with_a_question(start, terminal, tmp_path):
-    """The question names the difference. Only the key for it starts over."""
-    old = sweep_journal.Journal(tmp_path / 'unit.yaml.journal', {'mode': 'stage', 'serial': 'T0'})
-    old.append(pose_record(0))
-    old.close()
-    bench(start, tmp_path)
-    seen = terminal(*FAST, '-p', 'autostart:=true')
-    seen.wait_for('holds 1 poses of an interrupted calibration, which cannot go on',
-                  'serial was "T0", is "T1"', 'n  begin again')
-    with Graph() as graph:
-        # The answer of the service states that the operator at the screen decides.
-        answer = graph.call(Trigger, 'calibration/start', Trigger.Request())
-        assert not answer.success and 'which cannot go on' in answer.message
-    seen.press('n')
-    seen.wait_for('0 done, 22 left')
-    kept, = tmp_path.glob('unit.yaml.journal.2*')
-    assert sweep_journal.read(kept)[0]['serial'] == 'T0'
 
 
 def test_without_prompt_toolkit_there_are_plain_lines():

@@ -3,7 +3,7 @@
 
 from adxl_ros.files import parameter_file
 from adxl_ros.model.constants import Z_90
-from adxl_ros_validation import experiments, reproduction_report
+from adxl_ros_validation import experiments
 import numpy as np
 import pytest
 from units import NOMINAL
@@ -69,14 +69,6 @@ def test_intervals_have_their_stated_coverage(evaluations, stage):
     assert 0.7 < spread < 1.4
 
 
-def test_null_crossings_are_more_exact_than_the_maximum(evaluations):
-    """On a perfect stage null crossings give the direction of the x axis to 0.1°."""
-    error_deg = {name: np.degrees(rms([[getattr(u.directions, name) - u.directions.truth_rad]
-                                       for u in evaluations['perfect']]))
-                 for name in ('largest_rad', 'null_rad')}
-    assert error_deg['null_rad'] < 0.1 < error_deg['largest_rad']
-
-
 def test_the_command_writes_the_page_and_its_plots(run_tool, tmp_path):
     done = run_tool('reproduce', '--units', '1', '--seed', '5', '-o', tmp_path)
     page = (tmp_path / 'reproduction.md').read_text(encoding='utf-8')
@@ -85,14 +77,6 @@ def test_the_command_writes_the_page_and_its_plots(run_tool, tmp_path):
     for figure in ('sweep', 'misalignment', 'tilt', 'motion', 'components'):
         assert f'(reproduction/{figure}.png)' in page
         assert (tmp_path / 'reproduction' / f'{figure}.png').stat().st_size > 20_000
-
-
-def test_the_same_seed_gives_the_same_results(evaluations):
-    repeated = experiments.evaluate(parameter_file.load(NOMINAL), experiments.STAGES['paper'], 0)
-    page, again = (reproduction_report.page(
-        {'perfect': evaluations['perfect'], 'paper': [unit]}, 5.08, '')
-                   for unit in (evaluations['paper'][0], repeated))
-    assert page == again
 
 
 def test_the_command_on_a_recording(run_tool, tmp_path):

@@ -36,19 +36,6 @@ def test_equal_to_allantools(count: int, portion: int) -> None:
         assert measured.deviation[:, axis] == pytest.approx(expected, rel=1e-9)
 
 
-def test_long_times_from_cells(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Times beyond all overlaps are those of allantools within a thousandth."""
-    monkeypatch.setattr(allan_deviation, '_LONGEST', 1 << 10)
-    monkeypatch.setattr(allan_deviation, '_MOST_CELLS', 1 << 12)
-    rng = np.random.default_rng(2)
-    samples = still_samples(rng, 400_000, 100.0, 1e-3, 1e-4, 1e-4)[:, None]
-    measured = streamed(samples, 100.0, 65536)
-    _, expected, _, _ = allantools.oadev(samples[:, 0], 100.0, 'freq', measured.tau_s)
-    assert len(measured.tau_s) == 18
-    assert measured.deviation[:11, 0] == pytest.approx(expected[:11], rel=1e-9)
-    assert measured.deviation[11:, 0] == pytest.approx(expected[11:], rel=1e-2)
-
-
 def test_memory_does_not_grow_with_the_stream(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(allan_deviation, '_LONGEST', 1 << 12)
     monkeypatch.setattr(allan_deviation, '_MOST_CELLS', 1 << 10)
@@ -63,16 +50,3 @@ def test_memory_does_not_grow_with_the_stream(monkeypatch: pytest.MonkeyPatch) -
     tracemalloc.stop()
     assert peaks[2] < 1.05 * peaks[0]
     assert stream.count == 3 * 40 * 8192
-
-
-def test_cell_means_do_not_depend_on_the_portions(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(allan_deviation, '_MOST_CELLS', 64)
-    samples = np.random.default_rng(4).standard_normal((1000, 2))
-    cells = CellMeans(2)
-    for start in range(0, 1000, 7):
-        cells.feed(samples[start:start + 7])
-    assert cells.size == 16
-    assert cells.count == 62
-    expected = samples[:992].reshape(62, 16, 2)
-    assert cells.means == pytest.approx(expected.mean(axis=1))
-    assert cells.squares == pytest.approx(16 * expected.var(axis=1))

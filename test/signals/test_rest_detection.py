@@ -2,7 +2,6 @@
 
 """Rests in simulated and real streams, and equality of live and offline detection."""
 
-from adxl_ros.errors import UserError
 from adxl_ros.files import recording
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.signals.noise_limits import Noise
@@ -78,24 +77,6 @@ def test_rests_of_1_s_to_60_s(rate_hz):
     assert [r.time_stop_s for r in rests] == [time_s[r.stop - 1] for r in rests]
 
 
-@pytest.mark.parametrize('rate_hz', [1.0, 2.0, 5.0])
-def test_slow_streams(rate_hz):
-    rng = np.random.default_rng(2)
-    time_s, samples, bounds, poses = handled_stream(rng, rate_hz, [60.0] * 8, turn_s=10.0)
-    rests = find_rests(time_s, samples, rate_hz)
-    lost = lost_rows(rests, bounds + np.array([-1, 2]))
-    assert (lost <= 20).all() and np.median(lost) <= 12
-    mean, error = rest_means(time_s, samples, rests, rate_hz)
-    assert np.abs((mean - poses) / error).max() < 7
-
-
-def test_a_pause_of_1_s_by_hand_does_not_count_as_rest():
-    rng = np.random.default_rng(3)
-    time_s, samples, _, _ = handled_stream(rng, 100.0, [5.0, 1.0, 5.0, 1.0, 5.0])
-    assert len(find_rests(time_s, samples, 100.0)) == 3
-    assert len(find_rests(time_s, samples, 100.0, min_rest_s=0.6)) == 5
-
-
 def damaged(rng, time_s, samples):
     """Put NaN, gaps, a step back in time and very large spikes into a stream."""
     samples = samples.copy()
@@ -136,66 +117,6 @@ def test_live_equals_offline(seed, axes, rate_hz, known_noise, with_stage):
             assert (got == wanted).all()
 
 
-def test_rests_appear_while_the_stream_runs():
-    rng = np.random.default_rng(4)
-    time_s, samples, _, _ = handled_stream(rng, 100.0, [5.0] * 6)
-    finder, counts, still = RestFinder(100.0, 3), [], []
-    for row in range(0, len(samples), 50):
-        finder.feed(time_s[row:row + 50], samples[row:row + 50])
-        counts.append(len(finder.rests()))
-        judged = finder.stillness()
-        still.append(judged is not None and judged.at_rest)
-    assert counts[-1] == 6
-    assert counts[36] >= 2
-    # Half a second into a rest the newest second still contains the turn; at its end it does not.
-    assert still[9] and not still[11] and still[21]
-
-
-def test_means_of_a_rest_do_not_depend_on_other_rests():
-    rng = np.random.default_rng(5)
-    time_s, samples, _, _ = handled_stream(rng, 100.0, [5.0] * 6)
-    rests = find_rests(time_s, samples, 100.0)
-    together = rest_means(time_s, samples, rests, 100.0)
-    for k, rest in enumerate(rests):
-        for single, shared in zip(rest_means(time_s, samples, [rest], 100.0), together):
-            assert (single[0] == shared[k]).all()
-
-
-@pytest.mark.parametrize('rate_dps', [0.2, 0.5, 2.0])
-def test_slow_rotation_does_not_count_as_rest(rate_dps):
-    """A turn by 10° separates two rests, also if no window shows its motion."""
-    rng = np.random.default_rng(6)
-    rest, turn = 1000, round(10 / rate_dps * 100)
-    angle = np.radians(np.concatenate([np.zeros(rest), np.linspace(0, 10, turn),
-                                       np.full(rest, 10.0)]))
-    samples = G0_MPS2 * np.column_stack([np.sin(angle), 0 * angle, np.cos(angle)])
-    samples += SIGMA * rng.normal(size=samples.shape)
-    rests = find_rests(np.arange(len(samples)) / 100, samples, 100.0, min_rest_s=0.6)
-    assert len(rests) == 2
-    for detected, (start, stop) in zip(rests, ((0, rest), (rest + turn, 2 * rest + turn))):
-        # A rest contains half a degree of the turn at most.
-        assert detected.start > start - 100 * 0.5 / rate_dps
-        assert detected.stop < stop + 100 * 0.5 / rate_dps
-        assert detected.stop - detected.start > 0.6 * rest
-
-
-def test_a_stream_that_only_turns_slowly_has_no_rest():
-    rng = np.random.default_rng(7)
-    angle = np.radians(np.arange(0, 60, 0.005))
-    samples = G0_MPS2 * np.column_stack([np.sin(angle), np.cos(angle) * 0.6, np.cos(angle) * 0.8])
-    samples += SIGMA * rng.normal(size=samples.shape)
-    assert find_rests(np.arange(len(samples)) / 100, samples, 100.0) == []
-
-
-def test_a_slip_splits_a_rest():
-    """A slow change of the pose by 0.5° separates two rests."""
-    rng = np.random.default_rng(8)
-    samples = np.tile([0.0, 0.0, G0_MPS2], (2000, 1)) + SIGMA * rng.normal(size=(2000, 3))
-    samples[1000:, 0] += G0_MPS2 * np.radians(0.5)
-    first, second = find_rests(np.arange(2000) / 100, samples, 100.0)
-    assert 940 <= first.stop <= 1000 <= second.start <= 1060
-
-
 def test_a_knock_neither_ends_nor_moves_a_rest():
     rng = np.random.default_rng(9)
     samples = np.tile([0.0, 0.0, G0_MPS2], (1000, 1)) + SIGMA * rng.normal(size=(1000, 3))
@@ -208,67 +129,12 @@ def test_a_knock_neither_ends_nor_moves_a_rest():
     assert np.abs(mean[0] - still.mean(axis=0)).max() < 2 * error.max()
 
 
-def test_a_flicker_of_noise_does_not_cut_a_long_rest():
-    """A minute of a sensor with 1/f noise as strong as its white noise from 0.5 Hz down."""
-    rng = np.random.default_rng(10)
-    count = 6000
-    spectrum = np.fft.rfft(rng.normal(size=(count, 3)), axis=0)
-    frequency = np.fft.rfftfreq(count, 0.01)
-    spectrum *= np.sqrt(1 + 0.5 / np.maximum(frequency, 0.01))[:, None]
-    samples = G0_MPS2 / np.sqrt(3) + SIGMA * np.fft.irfft(spectrum, count, axis=0)
-    rests = find_rests(np.arange(count) / 100, samples, 100.0)
-    assert sum(rest.stop - rest.start for rest in rests) > 0.9 * count
-    assert len(rests) <= 2
-
-
-def test_long_gaps_end_rests_and_lost_samples_do_not():
-    rng = np.random.default_rng(11)
-    samples = np.tile([0.0, 0.0, G0_MPS2], (3000, 1)) + SIGMA * rng.normal(size=(3000, 3))
-    samples[::7, 1] = np.nan
-    time_s = np.arange(3000) / 100
-    time_s[500:] += 0.5
-    time_s[1000:] += 1.5
-    time_s[2000:] -= 5.0
-    rests = find_rests(time_s, samples, 100.0)
-    assert [(r.start // 100, -(-r.stop // 100)) for r in rests] == [(0, 10), (10, 20), (20, 30)]
-    mean, error = rest_means(time_s, samples, rests, 100.0)
-    assert np.isfinite(mean).all() and np.isfinite(error).all()
-    wanted = np.nanmean(np.where(np.isnan(samples).any(axis=1)[:, None], np.nan, samples)
-                        [rests[0].start:rests[0].stop], axis=0)
-    assert mean[0] == pytest.approx(wanted, abs=1e-12)
-
-
 @pytest.mark.parametrize('samples', [
     np.empty((0, 3)), np.zeros((3, 3)), np.full((5000, 3), np.nan), np.full((5000, 3), np.inf)])
 def test_streams_without_a_rest(samples):
     time_s = np.arange(len(samples)) / 100
     assert find_rests(time_s, samples, 100.0) == []
     assert RestFinder(100.0, 3).stillness() is None
-
-
-@pytest.mark.parametrize('noise', [0.02, 0.1, 0.3])
-def test_noise_below_the_step_of_the_adc(noise):
-    """Constant codes and alternating codes are part of one rest."""
-    rng = np.random.default_rng(12)
-    step = 0.04
-    time_s, samples, bounds, poses = handled_stream(rng, 100.0, [6.0] * 20, sigma=noise * step)
-    samples = np.round(samples / step) * step
-    rests = find_rests(time_s, samples, 100.0)
-    lost_rows(rests, bounds + np.array([-8, 8]))
-    mean, error = rest_means(time_s, samples, rests, 100.0)
-    assert (np.abs(mean - poses) < 0.5 * step + 3 * error).all()
-    # Rounding without noise has an error of up to half a step, and 1/√12 of a step rms.
-    if noise < 0.1:
-        assert np.median(error) == pytest.approx(step / np.sqrt(12), rel=1e-3)
-        assert (error > 0.99 * step / np.sqrt(12)).all()
-
-
-def test_a_stream_without_noise():
-    time_s, samples, bounds, poses = handled_stream(np.random.default_rng(13), 100.0, [4.0] * 5,
-                                                    sigma=0)
-    rests = find_rests(time_s, samples, 100.0)
-    lost_rows(rests, bounds + np.array([-8, 8]))
-    assert rest_means(time_s, samples, rests, 100.0)[0] == pytest.approx(poses, abs=1e-4)
 
 
 def test_known_noise_behind_its_filter():
@@ -291,42 +157,6 @@ def test_known_noise_behind_its_filter():
         assert 0.75 < np.sqrt((normalized ** 2).mean()) < 1.15
         # 5 s at 1 kHz count for 237 samples.
         assert np.median(error) == pytest.approx(0.535e-3 / np.sqrt(237), rel=0.15)
-
-
-def test_the_reason_for_motion_is_stated():
-    rng = np.random.default_rng(15)
-    scale = G0_MPS2
-    finder = RestFinder(1000.0, 3, ADXL)
-    time_s = np.arange(3000) / 1000
-    volts = 2.5 + filtered_noise(rng, 3000, 0.535e-3)
-    finder.feed(time_s[:1000], volts[:1000])
-    still = finder.stillness()
-    assert still.at_rest and still.describe('m/s²', scale).startswith('at rest: ')
-    volts[1000:, 1] += 0.3 / scale * np.sqrt(2) * np.sin(2 * np.pi * 40 * time_s[1000:])
-    finder.feed(time_s[1000:2000], volts[1000:2000])
-    moving = finder.stillness()
-    assert not moving.at_rest
-    assert (moving.axis, moving.statistic) == (1, 'rms')
-    assert moving.value * scale == pytest.approx(0.3, rel=0.1)
-    # 0.535 mg rms, times the quantile of chi-squared for the variance of 0.25 s.
-    assert 1.5 * 0.00525 < moving.limit * scale < 2 * 0.00525
-    assert moving.describe('m/s²', scale) == 'moving: 0.3 m/s² on y, must be below ' + \
-        f'{moving.limit * scale:.2g}'
-    volts[2000:] = 2.5 + filtered_noise(rng, 1000, 0.535e-3)
-    volts[2000:, 2] += np.radians(0.5) * (time_s[2000:] - 2)
-    finder.feed(time_s[2000:], volts[2000:])
-    drifting = finder.stillness()
-    assert not drifting.at_rest and (drifting.axis, drifting.statistic) == (2, 'drift')
-    assert drifting.value == pytest.approx(np.radians(0.25), rel=0.2)
-
-
-def test_a_unit_noisier_than_its_file():
-    rng = np.random.default_rng(16)
-    time_s, samples, bounds, _ = handled_stream(rng, 200.0, [4.0] * 8, sigma=2.5 * SIGMA)
-    stated = Noise(np.full(3, SIGMA))
-    assert find_rests(time_s, samples, 200.0, noise=stated) == []
-    rests = find_rests(time_s, samples, 200.0, noise=stated, learn=True)
-    lost_rows(rests, bounds + np.array([-15, 15]))
 
 
 @pytest.mark.parametrize('tau_s, amplitude', [(0.1, 0.2), (0.5, 0.02), (1.0, 0.01)])
@@ -368,23 +198,6 @@ def test_the_encoder_ends_a_rest_where_the_sensor_does_not_respond():
         assert k == 0 or rest.start >= 6000 * k - 500 + 8000 * TAU_S
 
 
-def test_an_encoder_that_flickers_between_two_codes_is_at_rest():
-    rng = np.random.default_rng(19)
-    angles = 1.45e-3 * rng.integers(0, 2, (5000, 2))
-    time_s, volts = stage_stream(rng, angles, lambda a: 2.5 + np.zeros((len(a), 3)))
-    rest, = find_rests(time_s, volts, 1000.0, angles, ADXL, angle_tolerance_rad=1.45e-3)
-    assert rest.stop - rest.start > 4800
-
-
-def test_a_sensor_that_moves_under_a_still_stage():
-    rng = np.random.default_rng(20)
-    angles = np.zeros((12000, 2))
-    time_s, volts = stage_stream(rng, angles, lambda a: 2.5 + np.zeros((len(a), 3)))
-    volts[5000:7000, 0] += 0.01 * np.sin(2 * np.pi * 7 * time_s[5000:7000])
-    rests = find_rests(time_s, volts, 1000.0, angles, ADXL, angle_tolerance_rad=1.45e-3)
-    assert [round(rest.time_start_s) for rest in rests] == [0, 7]
-
-
 def test_standard_errors_of_means_are_right():
     """The spectrum is unknown: white, filtered, or that of an anti-alias filter with overshoot."""
     rng = np.random.default_rng(21)
@@ -394,11 +207,6 @@ def test_standard_errors_of_means_are_right():
         rests = [Rest(i, i + 500, i / 100, (i + 499) / 100) for i in range(1000, 149000, 500)]
         mean, error = rest_means(np.arange(150000) / 100, samples, rests, 100.0)
         assert 0.9 < np.sqrt(((mean / error) ** 2).mean()) < 1.25
-
-
-def test_a_rest_without_samples_is_refused():
-    with pytest.raises(UserError, match=r'rest from 9\.000 s to 10\.000 s holds no samples'):
-        rest_means(np.arange(100) / 100, np.zeros((100, 3)), [Rest(900, 1000, 9.0, 10.0)], 100.0)
 
 
 @pytest.mark.perf

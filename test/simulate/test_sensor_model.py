@@ -5,8 +5,6 @@
 from time import process_time
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import parameter_file
-from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import to_nominal_mps2
@@ -78,30 +76,6 @@ def test_sensors_of_a_batch_are_those_alone(effect):
         assert batch[:, d] == pytest.approx(called(sensor, 3, force), abs=1e-12)
 
 
-@pytest.mark.parametrize('effect', sorted(NOISE - {'noise_excess'}))
-def test_effects_of_noise_differ_between_the_sensors_of_a_batch(effect):
-    readings = called(quiet(effect), 3, np.stack([swing()] * 64, axis=1))
-    assert np.ptp(readings, axis=1).max() > 0
-
-
-def test_noise_is_of_each_sensor_and_repeats_by_seed():
-    sensor, force = unit(), np.tile([0.0, 0.0, G0_MPS2], (1, 2000, 1))
-    first, again, others = (called(sensor, seed, force)[0] for seed in (1, 1, 2))
-    assert np.array_equal(first, again)
-    assert not np.array_equal(first, others)
-    std_mps2 = noise.sample_std_v(sensor) / sensor.nominal_scale_v_per_g * G0_MPS2
-    assert first.std(axis=0) == pytest.approx(std_mps2, rel=0.1)
-    assert abs(np.corrcoef(first[:, 0], first[:, 1])[0, 1]) < 0.1
-
-
-def test_an_axis_that_the_sensor_does_not_have_reads_0(tmp_path):
-    """The parameter file is read, too."""
-    parameter_file.save(tmp_path / 'unit.yaml', nominal('xy'))
-    readings = SensorModel(tmp_path / 'unit.yaml')([1.0, 2.0, 9.0], 0.005)
-    assert readings == pytest.approx([1.0, 2.0, 0.0], abs=0.1)
-    assert readings[2] == 0
-
-
 def test_effects_that_a_simulator_cannot_call_are_named():
     model = SensorModel(unit('bias', 'time_offset:offset_s=-0.01', 'clock_skew', *sorted(STAGE)))
     assert set(model.left_out) == STAGE | CLOCK
@@ -139,22 +113,6 @@ def test_wrong_calls_are_refused(force, dt_s, words):
     with pytest.raises(UserError) as error:
         model(force, dt_s)
     assert words in str(error.value)
-
-
-@pytest.mark.parametrize(('surroundings', 'words'), [
-    ({'temperature': np.zeros(3)}, 'temperature has the shape (3,)'),
-    ({'temperature': np.zeros((4, 1))}, 'expected a number or (4,)'),
-    ({'temperature': np.nan}, 'temperature is not finite'),
-    ({'supply': np.array([5.0, np.inf, 5.0, 5.0])}, 'supply is not finite')])
-def test_wrong_surroundings_are_refused_and_leave_no_trace(surroundings, words):
-    force = np.tile([0.0, 0.0, 9.8], (4, 1))
-    model, other = (SensorModel(unit('time_offset:offset_s=0.02', 'temperature_bias'))
-                    for _ in range(2))
-    for _ in range(2):
-        with pytest.raises(UserError) as error:
-            model(2 * force, 0.005, **surroundings)
-        assert words in str(error.value)
-        assert np.array_equal(model(force, 0.005), other(force, 0.005))
 
 
 @pytest.mark.perf

@@ -8,18 +8,16 @@ from adxl_ros.files import parameter_file, recording
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import put, typical, with_neutral
 from adxl_ros.model.effects import library
-from adxl_ros.model.effects.base import ActsOn, Coefficient, Need
+from adxl_ros.model.effects.base import ActsOn, Coefficient
 from adxl_ros.simulate.motion import Knots, Motion
-from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.simulator import simulate
 from adxl_ros.simulate.smoothed_paths import SmoothedPath
-from adxl_ros.simulate.trajectories import rich, sweep, TRAJECTORIES
+from adxl_ros.simulate.trajectories import rich, TRAJECTORIES
 import numpy as np
 from pace import within
 import pytest
 from scipy.signal import welch
-from scipy.special import ndtr
-from units import Fed, nominal
+from units import nominal
 
 pytestmark = pytest.mark.long
 
@@ -106,55 +104,6 @@ def allan_variance(variance, decay, length):
     return variance * (same - adjacent) / length ** 2
 
 
-def test_frequencies_of_codes_follow_from_the_noise():
-    """At rest the frequency of each code is the probability of its step, within 3 %."""
-    sensor = nominal('x', noise_density_g_per_rthz=np.full(1, 30e-6))
-    codes = np.rint(simulate(replace(sensor, rate_hz=50.0), Motion(
-        20000.0, internal_rate_hz=50.0), 0)['x_v'] / sensor.lsb_v)
-    sigma = noise.analog_std_v(sensor)[0]
-    for code in np.unique(codes):
-        edges = (code + np.array([-0.5, 0.5])) * sensor.lsb_v - 2.5
-        expected = np.diff(ndtr(edges / sigma))[0]
-        if expected > 0.05:
-            assert np.mean(codes == code) == pytest.approx(expected, rel=0.03)
-
-
-def test_samples_at_irregular_stamps_are_exact():
-    """Samples between the steps of the grid, and after gaps, equal those at 16 kHz."""
-    sensor, motion = nominal('xyz', **CLEAN), rich(np.random.default_rng(0))
-    rng = np.random.default_rng(1)
-    stamps = np.arange(60000) / 1000 + rng.uniform(-3e-4, 3e-4, 60000)
-    stamps = np.delete(stamps - stamps[0], slice(20000, 31000))
-    volts = Response(sensor, motion, 0)(stamps)
-    dense = simulate(replace(sensor, rate_hz=16000.0), replace(motion, duration_s=60.0), 0)
-    for d, axis in enumerate('xyz'):
-        dense_v = np.interp(stamps, dense['time_s'], dense[f'{axis}_v'])
-        assert np.abs(volts[:, d] - dense_v)[:-20].max() < 2e-6
-
-
-def test_joints_behind_an_encoder_are_smoothed():
-    """The smoothed path has the right acceleration, exactly if the encoder is exact."""
-    motion = sweep(np.random.default_rng(0))
-    time_s = np.arange(100000) / 250
-    for step, tolerance in ((1.4544e-3, 0.06), (1e-5, 0.01), (0.0, 1e-3)):
-        reading = motion.beta(time_s)
-        reading = np.rint(reading / step) * step if step else reading
-        smoothed, true = SmoothedPath(time_s, reading, step)(time_s, 2), motion.beta(time_s, 2)
-        assert np.sqrt(np.mean((smoothed - true) ** 2)) < tolerance * np.sqrt(np.mean(true ** 2))
-        position = SmoothedPath(time_s, reading, step)(time_s)
-        assert np.abs(position - motion.beta(time_s)).max() < step + 1e-9
-
-
-def test_a_seed_repeats_to_the_bit(run_tool, tmp_path):
-    """The same seed writes the same file, and another seed another file."""
-    for name, seed in (('a', 3), ('b', 3), ('c', 4)):
-        done = run_tool('simulate', 'tilt_alpha', '--rate', '50', '--seed', str(seed), '--effect',
-                        'flicker', '--effect', 'hysteresis', '-o', str(tmp_path / f'{name}.csv'))
-        assert done.returncode == 0, done.stderr
-    a, b, c = ((tmp_path / f'{name}.csv').read_bytes() for name in 'abc')
-    assert a == b != c
-
-
 def test_a_recording_is_simulated_again(run_tool, tmp_path):
     """A simulation of a recording has its stamps, its references and its volts."""
     first, second = tmp_path / 'first.csv', tmp_path / 'second.mcap'
@@ -204,33 +153,6 @@ def test_bad_input_is_one_line_and_no_file(run_tool, tmp_path, args, message):
     done = run_tool('simulate', *args, '-o', str(out))
     assert done.returncode == 1 and message in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1 and not out.exists()
-
-
-def test_a_stage_cannot_jump(run_tool, tmp_path):
-    """A recording with a jump of its angle is refused with the time and the size."""
-    path = tmp_path / 'jump.csv'
-    rows = [f'{i / 100!r},2.5,2.5,{0.0 if i < 50 else 3.0!r},0.0' for i in range(100)]
-    path.write_text('time_s,x_v,y_v,alpha_rad,beta_rad\n' + '\n'.join(rows) + '\n')
-    done = run_tool('simulate', str(path), '-o', str(tmp_path / 'out.csv'))
-    assert done.returncode == 1 and 'alpha_rad jumps by 3 rad' in done.stderr
-
-
-def test_effects_of_a_stage_need_a_stage(run_tool, tmp_path):
-    """Backlash on a recorded force is refused by name."""
-    path = tmp_path / 'ideal.csv'
-    path.write_text('time_s,ax_mps2,ay_mps2,az_mps2\n' + '\n'.join(
-        f'{i / 100!r},0.0,0.0,9.8' for i in range(100)) + '\n')
-    done = run_tool('simulate', 'imu', '--force', str(path), '--effect', 'backlash', '-o',
-                    str(tmp_path / 'out.csv'))
-    assert done.returncode == 1 and 'backlash acts on the stage' in done.stderr
-
-
-def test_neutral_effects_of_a_file_change_nothing(tmp_path):
-    """Effects with neutral values do not change a simulated sensor."""
-    sensor = nominal('xyz')
-    force = [np.linspace(0, G, 500), 0.0, G]
-    np.testing.assert_array_equal(Fed(sensor)(force), Fed(with_neutral(sensor, [
-        n for n, e in library().items() if Need.STAGE not in e.needs]))(force))
 
 
 def test_apply_corrects_for_temperature_and_supply(run_tool, tmp_path):

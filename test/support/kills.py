@@ -3,8 +3,6 @@
 """
 A sweep that is killed repeatedly, at random moments: no accepted pose is lost.
 
-    make soak ARGS='--minutes 0'     200 kills, a table for docs/guided.md
-
 Of five kills, two come within the first two seconds and one during the fit. One comes while a file
 is written, and one when the sweep has ended.
 """
@@ -25,8 +23,8 @@ from processes import executable
 from units import drawn, nominal
 
 SIM = ('-p', 'use_sim_time:=true')
-SWEEP = ('-p', 'autostart:=true', '-p', 'sweep.planes_rad:=[1.5707963267948966]',
-         '-p', 'sweep.step_rad:=1.5707963267948966', '-p', 'sweep.dwell_s:=0.5', '-p',
+SWEEP = ('-p', 'autostart:=true', '-p', 'sweep.planes_deg:=[90.0]',
+         '-p', 'sweep.step_deg:=90.0', '-p', 'sweep.dwell_s:=0.5', '-p',
          'sweep.check_poses:=2', '-p', 'output:=unit.yaml', '-p', 'store:=store', '-p',
          'report:=report', *RELIABLE)
 _TIMEOUT_S = 90.0

@@ -91,16 +91,6 @@ def test_force_and_angles_are_recovered(run_tool: RunTool, tmp_path: Path, axes:
     assert (numbers(table, 'ax_std_mps2') < 0.02).all()
 
 
-def test_z_sign_and_the_range_of_alpha(run_tool: RunTool, tmp_path: Path) -> None:
-    """Without z, alpha is in [0, π/2], even if z_sign states that the sensor is upside down."""
-    sensor = replace(unit(), z_sign=-1)
-    path = record(tmp_path, sensor, volts_of(sensor, np.pi - ALPHA))
-    table, _ = applied(run_tool, path)
-    np.testing.assert_allclose(numbers(table, 'az_mps2')[0], -G * np.cos(ALPHA), atol=1e-9)
-    np.testing.assert_allclose(numbers(table, 'alpha_rad')[0], ALPHA, atol=1e-9)
-    np.testing.assert_allclose(numbers(table, 'inclination_rad')[0], np.pi - ALPHA, atol=1e-9)
-
-
 def test_unobservable_angles_are_empty_cells(run_tool: RunTool, tmp_path: Path) -> None:
     sensor = unit()
     table, _ = applied(run_tool, record(tmp_path, sensor, volts_of(
@@ -111,14 +101,6 @@ def test_unobservable_angles_are_empty_cells(run_tool: RunTool, tmp_path: Path) 
     assert table['roll_std_rad'][1:] == ['inf', 'inf']
     # Angles are in (−π, π].
     assert numbers(table, 'beta_rad')[0, 2] == pytest.approx(np.pi, abs=1e-3)
-
-
-def test_one_axis(run_tool: RunTool, tmp_path: Path) -> None:
-    sensor = nominal('x', serial='17')
-    table, _ = applied(run_tool, record(tmp_path, sensor, np.array([[2.5], [3.0]])))
-    np.testing.assert_allclose(numbers(table, 'ax_mps2'), [[0, G / 2]], atol=1e-9)
-    assert table['az_mps2'] == ['', '']
-    assert table['az_std_mps2'] == table['pitch_std_rad'] == ['inf', 'inf']
 
 
 def test_samples_without_a_solution_are_kept_and_counted(run_tool: RunTool,
@@ -137,19 +119,6 @@ def test_samples_without_a_solution_are_kept_and_counted(run_tool: RunTool,
                         'apply: 1 of 10 samples have the ADC at its rail: their standard '
                         'deviations are inf\n')
     assert table['ax_mps2'][:4] == table['ax_mps2'][6:]
-
-
-def test_a_nominal_file_fits_any_axes_and_unit(run_tool: RunTool, tmp_path: Path) -> None:
-    made = nominal('xyz', serial='mpu')
-    path = record(tmp_path, made, volts_of(made), units='mps2')
-    parameter_file.save(tmp_path / 'nominal.yaml', nominal('xy'))
-    table, _ = applied(run_tool, path, tmp_path / 'nominal.yaml')
-    np.testing.assert_allclose(numbers(table, 'az_mps2')[0], G * np.cos(ALPHA), atol=1e-9)
-
-
-def test_a_recording_without_a_statement_of_its_unit(run_tool: RunTool, tmp_path: Path) -> None:
-    sensor = unit()
-    applied(run_tool, record(tmp_path, sensor, volts_of(sensor), info={}))
 
 
 def refused(run_tool: RunTool, path: Path, *options: object) -> str:
@@ -181,14 +150,6 @@ def test_another_unit_is_refused(run_tool: RunTool, tmp_path: Path, key: str, va
     assert str(path) in reason
 
 
-def test_other_axes_are_refused(run_tool: RunTool, tmp_path: Path) -> None:
-    made = unit('xyz')
-    path = record(tmp_path, made, volts_of(made))
-    parameter_file.save(tmp_path / 'unit.yaml', unit('xy'))
-    reason = refused(run_tool, path)
-    assert 'calibrated for the axes xy, not xyz' in reason or 'are for xy' in reason
-
-
 def test_bad_input_leaves_the_earlier_output(run_tool: RunTool, tmp_path: Path) -> None:
     sensor = unit()
     path = record(tmp_path, sensor, volts_of(sensor))
@@ -200,18 +161,6 @@ def test_bad_input_leaves_the_earlier_output(run_tool: RunTool, tmp_path: Path) 
     (tmp_path / 'unit.yaml').write_text('/**:\n  ros__parameters:\n    format: 1\n')
     path.write_text(text, encoding='utf-8')
     assert f'{tmp_path}/unit.yaml:3:5: ' in refused(run_tool, path)
-
-
-def test_an_output_that_cannot_be_written_is_refused(run_tool: RunTool, tmp_path: Path) -> None:
-    sensor = unit()
-    path = record(tmp_path, sensor, volts_of(sensor))
-    parameters = tmp_path / 'unit.yaml'
-    reason = refused(run_tool, path, '--params', parameters, '-o', tmp_path / 'none' / 'out.csv')
-    assert 'out.csv: cannot write' in reason
-    reason = refused(run_tool, path, '--params', parameters, '-o', path)
-    assert 'is the recording itself' in reason
-    assert 'cannot read' in refused(run_tool, tmp_path / 'none.csv', '--params', parameters,
-                                    '-o', tmp_path / 'out.csv')
 
 
 @pytest.mark.parametrize(('number', 'status', 'output'), [
@@ -232,11 +181,6 @@ def test_an_interruption_leaves_no_output(tmp_path: Path, number: int, status: i
     assert messages.count('\n') <= 1
     assert 'Traceback' not in messages
     assert sorted(p.name for p in tmp_path.iterdir()) == ['made.csv', 'unit.yaml']
-
-
-def test_wrong_usage(run_tool: RunTool, tmp_path: Path) -> None:
-    assert run_tool('apply').returncode == 2
-    assert run_tool('apply', 'a.csv').returncode == 2
 
 
 def test_the_output_does_not_depend_on_blocks(run_tool: RunTool, tmp_path: Path) -> None:
@@ -324,14 +268,3 @@ def test_a_bag_holds_the_estimates_of_the_table(run_tool: RunTool, tmp_path: Pat
             q = message.orientation
             assert 2 * np.arctan2(q.x, q.w) == pytest.approx(roll, abs=1e-9)
             assert 2 * (q.w * q.y - q.x * q.z) == pytest.approx(np.sin(pitch), abs=1e-9)
-
-
-def test_bad_input_leaves_the_earlier_bag(run_tool: RunTool, tmp_path: Path) -> None:
-    sensor = unit()
-    path = record(tmp_path, sensor, volts_of(sensor, *np.full((2, 30000), 0.5)))
-    (tmp_path / 'out.mcap').write_bytes(b'earlier')
-    with open(path, 'a', encoding='utf-8') as file:
-        file.write('99.0,nan,2.5\n')
-    reason = refused(run_tool, path, '--params', tmp_path / 'unit.yaml', '-o',
-                     tmp_path / 'out.mcap')
-    assert 'x_v is nan' in reason

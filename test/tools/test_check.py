@@ -149,14 +149,6 @@ def test_a_coarse_sensor_at_rest_is_sound(tmp_path: Path) -> None:
     assert checked(tmp_path, 'coarse.csv')['faults'] == []
 
 
-def test_a_smooth_peak_is_not_clipped(tmp_path: Path) -> None:
-    """A coarse sensor stays at the top of a slow swing for some samples."""
-    time_s, accel = samples()
-    accel[:, 0] = G * np.sin(2 * np.pi * time_s)
-    write_csv(tmp_path / 'swing.csv', time_s, np.round(accel / 0.1) * 0.1)
-    assert checked(tmp_path, 'swing.csv')['faults'] == []
-
-
 def test_zero_bytes_are_one_line(tmp_path: Path) -> None:
     """A cut of the power leaves zero bytes, which the message does not repeat."""
     write_csv(tmp_path / 'log.csv', *samples())
@@ -224,16 +216,6 @@ def test_the_mapping_of_a_foreign_log_is_one_line(tmp_path: Path) -> None:
     done = run(tmp_path, 'log.csv')
     line = next(line for line in done.stdout.splitlines() if '--columns' in line)
     assert checked(tmp_path, 'log.csv', *shlex.split(line))['sound']
-
-
-def test_a_foreign_log(tmp_path: Path) -> None:
-    time_s, accel = samples()
-    np.savetxt(tmp_path / 'log.csv', np.column_stack([1e3 * time_s, 1e3 * accel / G]),
-               fmt='%.6g', delimiter=';', header='t_ms;accX;accY;accZ', comments='')
-    result = checked(tmp_path, 'log.csv', '--columns',
-                     'time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg')
-    assert result['contents']['length_g'] == pytest.approx(1.0, abs=0.01)
-    assert result['sound']
 
 
 def test_effects_that_a_recording_could_show_are_listed(tmp_path: Path) -> None:

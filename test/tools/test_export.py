@@ -3,10 +3,7 @@
 """A sensor in the formats of other software: each file is read by its reader and compared."""
 
 from dataclasses import replace
-from glob import glob
 import json
-import os
-from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from xml.etree import ElementTree
 
@@ -15,7 +12,7 @@ from adxl_ros.files.exports import format_names
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 import numpy as np
-from processes import REPO, run_executable
+from processes import run_executable
 import pytest
 from units import nominal
 import yaml
@@ -86,20 +83,6 @@ def test_the_head_says_how_much_too_quiet_flat_noise_is(exported, name):
     assert ratio == pytest.approx(np.sqrt(density[0] / density.mean()), rel=0.01)
 
 
-def test_the_head_says_whose_figures_noise_and_rate_are(tmp_path):
-    """The rate of a diagnosed unit is that of its recording; its noise nobody measured."""
-    samples = np.random.default_rng(1).normal([0, 0, G0_MPS2], 0.01, (5000, 3))
-    np.savetxt(tmp_path / 'run.csv', np.column_stack([np.arange(5000) / 250, samples]),
-               fmt='%.6f', delimiter=',', header='time_s,ax_mps2,ay_mps2,az_mps2', comments='')
-    for arguments in (('diagnose', 'run.csv', '--params', str(REPO / 'params' / 'adxl355.yaml'),
-                       '-o', 'gap'),
-                      ('export', 'gap/params.yaml', '--to', 'kalibr', '-o', 'imu.yaml')):
-        run_executable(*arguments, cwd=tmp_path)
-    text = (tmp_path / 'imu.yaml').read_text().replace('\n# ', ' ')
-    assert '\nupdate_rate: 250.0' in text
-    assert 'nobody measured it. Rate: that of run.csv.' in text
-
-
 def test_sdf(exported):
     """The zero-g is in the mean: gz-sensors draws the sign of bias_mean."""
     imu = ElementTree.fromstring(exported['sdf'].text).find('model/link/sensor')
@@ -120,34 +103,6 @@ def test_sdf(exported):
         walk = unit().values['bias_walk']['density_g_per_rts'][d] * G0_MPS2
         assert values['dynamic_bias_stddev'] == pytest.approx(walk)
         assert (values['bias_mean'], values['bias_stddev']) == (0.0, 0.0)
-
-
-def check_described(element, description, folder):
-    """Check an element of an SDF file against the description of SDFormat, and all in it."""
-    children = {d.get('name'): d for d in description.findall('element')}
-    required = {name for name, d in children.items() if d.get('required') in ('1', '+')}
-    for include in description.findall('include'):
-        name = include.get('filename').removesuffix('.sdf')
-        required |= {name} if include.get('required') in ('1', '+') else set()
-        if element.find(name) is not None:
-            children[name] = ElementTree.parse(folder / include.get('filename')).getroot()
-    assert set(element.attrib) <= {a.get('name') for a in description.findall('attribute')}
-    tags = {child.tag for child in element}
-    assert required <= tags <= set(children), element.tag
-    if description.get('type') == 'double':
-        float(element.text)
-    for child in element:
-        check_described(child, children[child.tag], folder)
-
-
-def test_sdf_is_as_sdformat_describes_it(exported):
-    """Elements, attributes and numbers are those of the specification that sdformat installs."""
-    folders = [Path(folder) for folder in (os.environ.get('SDF_PATH', ''), *sorted(
-        glob('/usr/share/sdformat*/1.9'), reverse=True)) if folder]
-    if not folders:
-        pytest.skip('no specification of SDFormat: apt install sdformat-sdf')
-    check_described(ElementTree.fromstring(exported['sdf'].text),
-                    ElementTree.parse(folders[0] / 'root.sdf').getroot(), folders[0])
 
 
 def test_mujoco(exported):

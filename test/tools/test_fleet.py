@@ -2,7 +2,7 @@
 
 """`fleet` through its command: rows, refusals, resuming, kills, clusters and object stores."""
 
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
 import json
 import os
@@ -17,7 +17,7 @@ import urllib.request
 
 from adxl_ros.files import calibration_store, parameter_file
 from fleets import recording_text, row_files, table_of, without_timing, write_fleet
-from job_tasks import children, dask_cluster, free_port, SUPPORT
+from job_tasks import children, dask_cluster, free_port
 from processes import executable, run_executable
 import pytest
 from units import nominal
@@ -94,57 +94,6 @@ def test_a_second_run_computes_only_what_is_new(run_tool, tmp_path):
     assert {row['rate_hz'] for row in table_of(tmp_path / 'out')} == {25.0}
 
 
-def test_a_run_with_fewer_tasks_warns_of_what_it_takes_away(run_tool, tmp_path):
-    write_fleet(tmp_path / 'day', 1, 2)
-    words = ('fleet', 'day', '-o', 'out', '--jobs', 1, '--do')
-    assert run_tool(*words, 'check,noise').stderr == ''
-    check_only = run_tool(*words, 'check')
-    assert check_only.returncode == 0
-    assert '2 recordings will lose noise in table and page; --do check,noise keeps them' in \
-        ' '.join(check_only.stderr.split())
-    assert table_of(tmp_path / 'out')[0]['noise_n_x_mps2_per_rthz'] is None
-    # Both rows are on disk, and the wider run shows its own again.
-    again = run_tool(*words, 'check,noise')
-    assert (again.returncode, again.stderr) == (0, '')
-    assert table_of(tmp_path / 'out')[0]['noise_n_x_mps2_per_rthz'] is not None
-
-
-def test_a_recording_that_is_read_again_keeps_its_cost(run_tool, tmp_path):
-    """It costs what its tasks took, and not the time to see that nothing changed."""
-    path, = write_fleet(tmp_path / 'day', 1, 1)
-    words = ('fleet', 'day', '--do', 'check,noise', '-o', 'out', '--jobs', 1)
-    run_tool(*words)
-    before, = table_of(tmp_path / 'out')
-    for name in 'abcd':
-        shutil.copy(path, path.with_name(f'{name}.csv'))
-    run_tool(*words)
-    os.utime(path, (1e9, 1e9))
-    run_tool(*words)
-    after = by_name(table_of(tmp_path / 'out'))[path.name]
-    assert after['written'] > before['written'] and after['key'] == before['key']
-    assert after['seconds'] == before['seconds'] and after['worker'] == before['worker']
-
-
-def test_one_file_is_one_recording(run_tool, tmp_path):
-    """Another way to a file, and the results of a fleet, are no further recordings."""
-    write_fleet(tmp_path / 'day', 2, 1)
-    words = ('fleet', 'day', 'day/../day', 'day/u0000_0000.csv', str(tmp_path), '--do', 'check',
-             '--jobs', 1)
-    assert run_tool(*words, '-o', 'day').stdout.startswith('2 recordings: 2 done')
-    assert run_tool(*words, '-o', 'out').stdout.startswith('2 recordings: 2 done')
-    again = run_tool('fleet', 'day/*', *words[1:], '-o', 'day')
-    assert again.stdout.startswith('Nothing to do: 2 recordings')
-
-
-def test_since_counts_from_the_date_that_a_recording_states(run_tool, tmp_path):
-    """The file itself is of today; a manifest counts more than its recording."""
-    write_fleet(tmp_path / 'day', 1, 60)
-    words = ('fleet', 'day', '--do', 'check', '-o', 'out', '--since', '2026-11-28', '--dry-run')
-    assert run_tool(*words).stdout.startswith('5 recordings to do')
-    (tmp_path / 'list.csv').write_text('url,date\nday/u0000_0000.csv,2026-12-24\n')
-    assert run_tool(words[0], 'list.csv', *words[2:]).stdout.startswith('1 recording to do')
-
-
 def test_only_failed_since_and_limit(run_tool, tmp_path):
     old, *_ = write_fleet(tmp_path / 'day', 3, 1)
     os.utime(old, (1e9, 1e9))
@@ -157,20 +106,6 @@ def test_only_failed_since_and_limit(run_tool, tmp_path):
     done = run_tool(*words, '--only-failed')
     assert done.stdout.startswith('1 recording: 1 done')
     assert by_name(table_of(tmp_path / 'out'))['gone.csv']['serial'] == 'U7'
-
-
-def test_the_table_does_not_depend_on_the_workers(run_tool, tmp_path):
-    write_fleet(tmp_path / 'day', 4, 2)
-    (tmp_path / 'day' / 'cut.csv').write_text('time_s,x_v\n0,2.5\n1,oops\n')
-    run_tool('simulate', 'tilt_both', '--rate', 50, '-o', 'whole.mcap')
-    (tmp_path / 'day' / 'cut.mcap').write_bytes(
-        (tmp_path / 'whole.mcap').read_bytes()[:200_000])
-    for jobs in (1, 3):
-        run_tool('fleet', 'day', '--do', 'check,noise', '-o', f'out{jobs}', '--jobs', jobs)
-    assert without_timing(table_of(tmp_path / 'out1')) == \
-        without_timing(table_of(tmp_path / 'out3'))
-    fault, = by_name(table_of(tmp_path / 'out1'))['cut.mcap']['faults']
-    assert fault.startswith('cut off or damaged')
 
 
 def test_fit_and_diagnose_name_the_effect(run_tool, tmp_path):
@@ -259,108 +194,6 @@ def test_what_cannot_be_reached_or_read_is_a_row(run_tool, tmp_path):
     assert rows['empty.csv']['refusal'] == 'is empty'
     assert rows['list.csv']['refusal'].startswith('is a manifest')
     assert rows['u0000_0000.csv']['serial'] == 'U0'
-
-
-def test_a_name_that_is_not_utf_8_stops_nothing(tmp_path):
-    path, = write_fleet(tmp_path / 'day', 1, 1)
-    name = os.fsdecode(b'b\xe9.csv')
-    shutil.copy(path, tmp_path / 'day' / name)
-    words = ('fleet', path, path.with_name(name), '--do', 'check', '-o', 'out', '--jobs', 1)
-    dry, done = (run_executable(*words, *option, cwd=tmp_path) for option in (['--dry-run'], []))
-    assert (dry.returncode, done.returncode) == (0, 0), dry.stderr + done.stderr
-    assert done.stdout.startswith('2 recordings: 1 done, 1 refused')
-    assert 'its name is not UTF-8; rename it' in done.stdout
-
-
-def test_a_pipe_is_not_waited_for(tmp_path):
-    write_fleet(tmp_path / 'day', 1, 1)
-    os.mkfifo(tmp_path / 'day' / 'pipe.csv')
-    for name in ('day', 'day/pipe.csv'):
-        with start_fleet(tmp_path, name, '--do', 'check', '-o', 'out', '--dry-run') as dry:
-            try:
-                assert 'core hours' in dry.communicate(timeout=30)[0]
-            finally:
-                dry.kill()
-
-
-def test_copies_of_killed_workers_are_removed(run_tool, tmp_path, monkeypatch):
-    """A worker was killed while it made its folder, and another one with a copy in it."""
-    write_fleet(tmp_path / 'day', 1, 1)
-    monkeypatch.setenv('TMPDIR', str(tmp_path / 'temporary'))
-    root = tmp_path / 'temporary' / f'adxl_ros_fleet_{os.getuid()}'
-    (root / 'full' / 'recording').mkdir(parents=True)
-    (root / 'empty').mkdir()
-    os.utime(root / 'empty', (1e9, 1e9))
-    done = run_tool('fleet', 'day', '--do', 'check', '-o', 'out', '--jobs', 1)
-    assert done.returncode == 0 and not list(root.iterdir())
-
-
-def test_paths_outside_of_a_bag_are_refused(run_tool, tmp_path):
-    for name, metadata in (('linked', '{}'), ('named', """
-rosbag2_bagfile_information: {relative_file_paths: [../../../etc/passwd]}""")):
-        bag = tmp_path / 'bags' / name
-        bag.mkdir(parents=True)
-        (bag / 'metadata.yaml').write_text(metadata)
-    (tmp_path / 'bags' / 'linked' / 'a.mcap').symlink_to('/etc/passwd')
-    done = run_tool('fleet', 'bags', '--do', 'check', '-o', 'out', '--jobs', 1)
-    assert done.returncode == 1
-    reasons = {name: row['refusal'] for name, row in by_name(table_of(tmp_path / 'out')).items()}
-    assert reasons == {'linked': 'a.mcap leads outside of the folder',
-                       'named': 'metadata.yaml: ../../../etc/passwd leads outside of the folder'}
-
-
-def test_a_recording_that_grows_is_refused(run_tool, tmp_path):
-    path = tmp_path / 'growing.csv'
-    path.write_text(recording_text('U0', '2026-10-01', 0, 6000.0))
-    code = f"""
-import time
-with open({str(path)!r}, 'a') as file:
-    while True:
-        file.write('# more' * 100 + chr(10))
-        file.flush()
-        time.sleep(1e-4)
-"""
-    with subprocess.Popen([sys.executable, '-c', code]) as writer:
-        size = path.stat().st_size
-        while path.stat().st_size == size:
-            time.sleep(0.01)
-        run_tool('fleet', 'growing.csv', '--do', 'check', '-o', 'out', '--jobs', 1)
-        writer.kill()
-    row, = table_of(tmp_path / 'out')
-    assert row['refusal'] == 'changed while it was read; is it still being written?'
-    assert row['attempts'] == 3
-
-
-@contextmanager
-def tiny_disk(folder):
-    """Yield the begin of a command line that sees a disk of 1 MB at `folder/disk`."""
-    (folder / 'disk').mkdir()
-    begin = ['unshare', '-rm', 'sh', '-c',
-             f'mount -t tmpfs -o size=1m none {folder}/disk && exec "$@"', 'sh']
-    if shutil.which('unshare') is None or subprocess.run(
-            [*begin, 'true'], capture_output=True, check=False).returncode:
-        pytest.skip('no user namespaces: a small disk cannot be mounted')
-    yield begin
-
-
-def test_a_full_disk_is_one_line(tmp_path):
-    write_fleet(tmp_path / 'day', 2, 2)
-    with tiny_disk(tmp_path) as begin:
-        words = [executable('fleet'), 'day', '--do', 'check', '--jobs', '1', '-o']
-        staged = subprocess.run([*begin, *words, 'out'], cwd=tmp_path, text=True,
-                                capture_output=True, env=os.environ | {
-                                    'TMPDIR': str(tmp_path / 'disk')}, check=False)
-        fill = f'head -c 1048576 /dev/zero > {tmp_path}/disk/filler; exec "$@"'
-        written = subprocess.run([*begin, 'sh', '-c', fill, 'sh', *words, 'disk/out'],
-                                 cwd=tmp_path, text=True, capture_output=True, check=False)
-    assert staged.returncode == 1, staged.stderr
-    rows = table_of(tmp_path / 'out')
-    assert len(rows) == 4 and all('free; set TMPDIR' in row['refusal'] for row in rows)
-    assert all('MB beside 67.1 MB that stay free, but' in row['refusal'] for row in rows)
-    assert written.returncode == 1
-    assert len(written.stderr.splitlines()) == 1, written.stderr
-    line, = written.stderr.splitlines()
-    assert line.startswith('fleet: disk/out') and line.endswith('No space left on device')
 
 
 def test_kills_lose_and_repeat_nothing(tmp_path):
@@ -473,96 +306,6 @@ def test_an_object_store(bucket, tmp_path):
                       Body=recording_text('U5', '2026-10-01', 5).encode())
     changed = run_executable('fleet', *words, cwd=tmp_path)
     assert changed.stdout.startswith('1 recording: 1 done')
-
-
-@pytest.fixture
-def sftp_server(tmp_path):
-    """Yield the address of an SFTP server of a folder, without the password `secret`."""
-    for name in ('asyncssh', 'paramiko'):
-        pytest.importorskip(name, reason=f'{name} is not installed: pip install -r '
-                            'requirements/test.txt')
-    (tmp_path / 'served').mkdir()
-    with subprocess.Popen([sys.executable, SUPPORT / 'sftp_server.py', tmp_path / 'served'],
-                          stdout=subprocess.PIPE, text=True) as server:
-        yield f'robot@127.0.0.1:{server.stdout.readline().strip()}', tmp_path / 'served'
-        server.kill()
-
-
-def test_an_sftp_server(sftp_server, tmp_path):
-    server, folder = sftp_server
-    write_fleet(folder / 'day', 1, 2)
-    stated = f'sftp://{server.replace("@", ":secret@")}'
-    words = (f'{stated}/day', f'{stated}/gone.csv', '--do', 'check', '-o', 'out', '--jobs', 1)
-    done = run_executable('fleet', *words, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    rows = table_of(tmp_path / 'out')
-    assert {row['url']: row['refusal'] for row in rows} == {
-        f'sftp://{server}/day/u0000_0000.csv': None, f'sftp://{server}/day/u0000_0001.csv': None,
-        f'sftp://{server}/gone.csv': 'no such file'}
-    assert ':secret@' not in (tmp_path / 'out' / 'fleet.html').read_text()
-    again = run_executable('fleet', *words, cwd=tmp_path)
-    assert again.stdout.startswith('Nothing to do: 3 recordings had a row before')
-
-
-def test_a_web_server_without_parts_of_files(run_tool, tmp_path):
-    write_fleet(tmp_path / 'day', 1, 2)
-    port = free_port()
-    with subprocess.Popen([sys.executable, '-m', 'http.server', str(port), '--bind', '127.0.0.1'],
-                          cwd=tmp_path / 'day', stdout=subprocess.DEVNULL,
-                          stderr=subprocess.DEVNULL) as server:
-        url = f'http://127.0.0.1:{port}'
-        end_s = time.monotonic() + _LONG_WAIT_S
-        while True:
-            with suppress(OSError):
-                urllib.request.urlopen(url).close()
-                break
-            assert time.monotonic() < end_s and server.poll() is None
-            time.sleep(0.05)
-        run_tool('fleet', f'{url}/', f'{url}/u0000_0000.csv?signed=yes', f'{url}/gone.csv',
-                 f'{url}/u0000_0000.csv?token=SECRET&x=1',
-                 f'http://127.0.0.1:{free_port()}/a.csv', '--do', 'check', '-o', 'out',
-                 '--jobs', 1)
-        server.kill()
-    rows = by_name(table_of(tmp_path / 'out'))
-    assert rows['u0000_0000.csv']['hash'] == rows['u0000_0000.csv?signed=yes']['hash']
-    assert rows['u0000_0001.csv']['outcome'] == 'done'
-    assert rows['gone.csv']['refusal'] == 'no such file'
-    assert rows['a.csv']['refusal'].startswith('cannot be read: Cannot connect')
-    # An address with a token is the recording without it.
-    assert rows['u0000_0000.csv?x=1']['outcome'] == 'done'
-    assert not [path for path in tmp_path.rglob('*') if path.is_file()
-                and b'SECRET' in path.read_bytes()]
-
-
-def test_a_worker_needs_no_ros(tmp_path):
-    """A process that cannot import ROS, without its environment, fits with the default file."""
-    names = ['ament_index_python', 'rclpy', 'launch', 'sensor_msgs', 'std_msgs', 'geometry_msgs']
-    (tmp_path / 'block.py').write_text(f"""
-import sys
-class Blocker:
-    def find_spec(self, name, path=None, target=None):
-        if name.partition('.')[0] in {names!r}:
-            raise ModuleNotFoundError(f'No module named {{name!r}}', name=name)
-sys.meta_path.insert(0, Blocker())
-""")
-    (tmp_path / 'command.py').write_text("""
-import block
-from adxl_ros.tools.fleet import main
-if __name__ == '__main__':
-    raise SystemExit(main())
-""")
-    simulated = run_executable('simulate', 'tumble', '--rate', '50', '-o', 'tumble.csv',
-                               cwd=tmp_path)
-    assert simulated.returncode == 0, simulated.stderr
-    environment = {name: value for name, value in os.environ.items()
-                   if name not in ('AMENT_PREFIX_PATH', 'ROS_DISTRO')}
-    environment['PYTHONPATH'] = os.pathsep.join([str(tmp_path), *sys.path])
-    done = subprocess.run([sys.executable, str(tmp_path / 'command.py'), 'tumble.csv', '-o',
-                           'out', '--jobs', '1'], cwd=tmp_path, env=environment, text=True,
-                          capture_output=True, check=False)
-    assert done.returncode == 0, done.stderr
-    row, = table_of(tmp_path / 'out')
-    assert row['outcome'] == 'done' and row['status']
 
 
 def test_wrong_usage_is_one_line(run_tool, tmp_path):

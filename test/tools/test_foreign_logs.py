@@ -2,7 +2,6 @@
 
 """Logs of other software, from the file as it came to a calibrated parameter file."""
 
-import os
 from pathlib import Path
 import shlex
 
@@ -11,9 +10,8 @@ from adxl_ros.model.constants import G0_MPS2
 from bags import bag_of, EPOCH_NS, imu
 from foreign_logs import BIAS_G, FORMS, lines, SCALE, text_with_angles, Turned, turned, ulog
 import numpy as np
-from processes import executable, REPO
+from processes import REPO
 import pytest
-from terminal import Terminal
 from without_extras import run_without_extras
 
 XYZ_G = 'time=t:s,x=x:g,y=y:g,z=z:g'
@@ -61,16 +59,6 @@ def test_two_commands_from_a_log_to_a_calibration(run_tool, tmp_path, name) -> N
     assert done.returncode == 0, done.stderr
 
 
-def test_the_proposal_is_never_used_in_silence(run_tool, tmp_path) -> None:
-    """Without --columns a log is refused although its columns are certain."""
-    written(tmp_path, 'log.csv', FORMS['arduino.csv'](LOG))
-    done = run_tool('apply', 'log.csv', '-o', 'out.csv')
-    assert done.returncode == 1
-    assert done.stderr.startswith('apply: log.csv:1: no column time_s; the columns are t_ms, accX')
-    assert done.stderr.endswith("--columns 'time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg,"
-                                "temperature=temp:c'\n")
-
-
 def test_counts_about_an_offset(run_tool, tmp_path) -> None:
     """Counts of a 10 bit ADC, as an analog sensor on a board gives them."""
     counts = 512 + 102 * LOG.output_g
@@ -85,26 +73,6 @@ def test_counts_about_an_offset(run_tool, tmp_path) -> None:
                     '--lsb-per-g', 102, '--lsb-at-0g', 512)
     assert done.returncode == 0, done.stderr
     check_errors(tmp_path / 'unit.yaml')
-
-
-def test_an_estimated_attitude_is_no_reference(run_tool, tmp_path) -> None:
-    """Roll and pitch beside a yaw come from the readings themselves."""
-    zero = 0 * LOG.time_s
-    written(tmp_path, 'log.csv', 'Time,AccX,AccY,AccZ,Roll,Pitch,Yaw\n' + lines(
-        [LOG.time_s, *LOG.output_g.T, zero, zero, zero], ['%.3f'] + ['%.4f'] * 6))
-    options = proposed(run_tool('fit', 'log.csv', '-o', 'unit.yaml').stderr)
-    assert options == ['--columns', 'time=Time:s,x=AccX:g,y=AccY:g,z=AccZ:g']
-
-
-def test_two_axes_of_counts(run_tool, tmp_path) -> None:
-    """The middle of the readings is 0 g of a two-axis sensor that was turned."""
-    counts = 32768 + 13107 * LOG.output_g[:, :2]
-    written(tmp_path, 'log.csv', 'ms,adc_x,adc_y\n' + lines([1e3 * LOG.time_s, *counts.T],
-                                                            ['%.0f'] * 3))
-    options = proposed(run_tool('fit', 'log.csv', '-o', 'unit.yaml').stderr)
-    assert options[1] == 'time=ms:ms,x=adc_x:lsb,y=adc_y:lsb'
-    assert float(options[options.index('--lsb-at-0g') + 1]) == pytest.approx(32768, rel=0.02)
-    assert float(options[options.index('--lsb-per-g') + 1]) == pytest.approx(13107, rel=0.05)
 
 
 @pytest.mark.parametrize('name', ['log.npz', 'log.parquet', 'log.ulg'])
@@ -127,16 +95,6 @@ def test_tables_of_libraries(run_tool, tmp_path, name) -> None:
         assert done.returncode == 1
         done = run_tool('fit', name, '-o', 'unit.yaml', *proposed(done.stderr))
     assert done.returncode == 0, done.stderr
-    check_errors(tmp_path / 'unit.yaml')
-
-
-def test_a_damaged_log_is_read_to_its_damage(run_tool, tmp_path) -> None:
-    pytest.importorskip('pyulog', reason='no pyulog')
-    data = ulog(LOG)
-    (tmp_path / 'log.ulg').write_bytes(data[:-2000] + bytes(500) + data[-1500:])
-    done = run_tool('fit', 'log.ulg', '-o', 'unit.yaml')
-    assert done.returncode == 0, done.stderr
-    assert 'log.ulg: is damaged; what can be read of it is used' in done.stderr
     check_errors(tmp_path / 'unit.yaml')
 
 
@@ -282,48 +240,6 @@ def test_every_tool_refuses_stamps_in_another_unit(run_tool, tmp_path, tool, cou
     assert run_tool('check', 'log.csv', *options).returncode == 0
 
 
-def test_a_slow_log_is_read_by_its_rate(run_tool, tmp_path) -> None:
-    """A step of 10 s may be right; then the rate says so."""
-    written(tmp_path, 'log.csv', plain_text([1e3 * LOG.time_s, *LOG.output_g.T]))
-    assert run_tool('check', 'log.csv', '--columns', XYZ_G).returncode == 1
-    done = run_tool('check', 'log.csv', '--columns', XYZ_G, '--rate', '0.1')
-    assert done.returncode == 0 and ' 0.1 Hz ' in done.stdout
-
-
-def test_milliseconds_since_the_start_are_no_epoch(run_tool, tmp_path) -> None:
-    """After two weeks, milliseconds have as many digits as seconds since 1970."""
-    written(tmp_path, 'log.csv', 'timestamp,ax,ay,az\n' + lines(
-        [1.2e9 + 1e3 * LOG.time_s, *LOG.output_g.T], ['%.0f'] + ['%.4f'] * 3))
-    assert proposed(run_tool('fit', 'log.csv', '-o', 'u.yaml').stderr) == [
-        '--columns', 'time=timestamp:ms,x=ax:g,y=ay:g,z=az:g']
-
-
-def without_gravity() -> np.ndarray:
-    """Return acceleration without gravity: noise at rest, and more of it in motion."""
-    rng, moves = np.random.default_rng(4), np.isnan(LOG.angles_rad[:, :1])
-    return rng.normal(0, 0.02 + 2 * moves, LOG.output_g.shape)
-
-
-PRESSURE = np.array([101325.0, 24.0, 40.0])
-
-
-@pytest.mark.parametrize(('names', 'values'), [
-    ('mx,my,mz', 48 * LOG.output_g), ('x,y,z', 48.03 * LOG.output_g),
-    ('pressure,temp,humidity', PRESSURE + 0.1 * without_gravity()),
-    ('pos_x,pos_y,pos_z', LOG.output_g), ('x,y,z', 0.5 + np.cumsum(without_gravity(), axis=0)),
-    ('ax,ay,az', without_gravity()),
-    ('x (m/s^2),y (m/s^2),z (m/s^2)', without_gravity()),
-    ('x,y,z', 1.65 + 0.33 * LOG.output_g)],
-    ids=['magnetometer', 'microtesla', 'pressure', 'positions', 'path', 'linear', 'linear in m/s²',
-         'volts without a name'])
-def test_what_contradicts_gravity_is_no_guess(run_tool, tmp_path, names, values) -> None:
-    written(tmp_path, 'log.csv', f'time,{names}\n' + lines(
-        [LOG.time_s, *values.T], ['%.3f'] + ['%.4f'] * 3))
-    done = run_tool('fit', 'log.csv', '-o', 'unit.yaml')
-    assert 'none looks like an accelerometer: name the columns' in done.stderr
-    assert 'best guess' not in done.stderr and done.stderr.count('\n') == 1
-
-
 def test_numbered_columns_and_a_mapping_file(run_tool, tmp_path) -> None:
     """A header may be missing, and a file may hold the mapping; `apply` reads both alike."""
     text = lines([1e3 * LOG.time_s, *1e3 * LOG.output_g.T], ['%.0f'] + ['%.1f'] * 3, ';', ',')
@@ -384,14 +300,6 @@ def bag_with(folder: Path, topics: list[str], log: Turned = LOG) -> None:
                             for topic in topics])
 
 
-def test_any_imu_topic_of_a_bag(run_tool, tmp_path) -> None:
-    """The only Imu topic is read whatever its name is."""
-    bag_with(tmp_path, ['/camera/imu'])
-    done = run_tool('fit', 'bag', '-o', 'unit.yaml')
-    assert done.returncode == 0, done.stderr
-    check_errors(tmp_path / 'unit.yaml')
-
-
 def test_several_imu_topics_of_a_bag_are_named(run_tool, tmp_path) -> None:
     bag_with(tmp_path, ['/camera/imu', '/body/imu/data'])
     done = run_tool('fit', 'bag', '-o', 'unit.yaml')
@@ -402,30 +310,3 @@ def test_several_imu_topics_of_a_bag_are_named(run_tool, tmp_path) -> None:
     done = run_tool('fit', 'bag', '--topic', 'camera/imu', '-o', 'unit.yaml')
     assert done.returncode == 0, done.stderr
     check_errors(tmp_path / 'unit.yaml')
-
-
-def test_bad_stamps_of_a_bag(run_tool, tmp_path) -> None:
-    log = turned()
-    log.time_s[500] = log.time_s[499]
-    bag_with(tmp_path, ['/imu'], log)
-    done = run_tool('fit', 'bag', '-o', 'unit.yaml')
-    assert 'time stands still: message 501' in done.stderr
-    assert '--drop-bad-stamps' in done.stderr
-    done = run_tool('fit', 'bag', '--drop-bad-stamps', '-o', 'unit.yaml')
-    assert done.returncode == 0 and 'whose stamp does not increase: 1\n' in done.stderr
-    done = run_tool('fit', 'bag', '--rate', 100, '-o', 'unit.yaml')
-    assert done.returncode == 0, done.stderr
-    check_errors(tmp_path / 'unit.yaml')
-
-
-def test_a_terminal_gets_the_mapping_on_one_line(tmp_path) -> None:
-    """The message wraps between words; a name with blanks stays whole, to be pasted."""
-    written(tmp_path, 'log.csv', FORMS['phyphox.csv'](LOG))
-    terminal = Terminal([executable('fit'), 'log.csv', '-o', 'unit.yaml'], dict(os.environ),
-                        tmp_path, columns=300)
-    try:
-        rows = terminal.wait_for("Acceleration z (m/s^2):mps2'").splitlines()
-    finally:
-        terminal.close()
-    mapping = next(row for row in rows if row.startswith('--columns'))
-    assert shlex.split(mapping)[1].count('=') == 4

@@ -7,7 +7,6 @@ from pathlib import Path
 from adxl_ros.files import parameter_file
 from adxl_ros.model.signal_chain import static_response
 import numpy as np
-from processes import REPO
 import pytest
 from scipy.signal import lfilter
 
@@ -87,15 +86,6 @@ def test_stated_values_stand_and_readings_beyond_them_are_reported(run_tool, tmp
     assert 'beyond the stated range of ±1.2 g' in done.stderr
 
 
-def test_a_recording_without_a_calibration_has_the_noise_that_it_shows(run_tool, tmp_path) -> None:
-    """`apply` states the scatter of the recording, not that of another sensor."""
-    path = tumble(tmp_path / 'a.csv', 0.05)
-    done = run_tool('apply', path, '-o', tmp_path / 'o.csv')
-    assert done.returncode == 0, done.stderr
-    table = np.genfromtxt(tmp_path / 'o.csv', delimiter=',', names=True)
-    np.testing.assert_allclose(np.median(table['ax_std_mps2']), 0.05, rtol=0.2)
-
-
 def test_what_cannot_be_measured_is_refused(run_tool, tmp_path) -> None:
     """A simulation needs all values, and a recording must be long enough."""
     params = tmp_path / 'cam7.yaml'
@@ -108,14 +98,6 @@ def test_what_cannot_be_measured_is_refused(run_tool, tmp_path) -> None:
     done = run_tool('fit', tmp_path / 'short.csv', '-o', tmp_path / 'unit.yaml')
     assert done.returncode == 1
     assert '29 samples at 200 Hz do not show the noise of the sensor' in done.stderr
-
-
-def test_the_file_of_any_imu_leaves_out_what_is_measured() -> None:
-    """No figure of a particular sensor stands in it."""
-    unit = parameter_file.load(REPO / 'params' / 'any_imu.yaml', may_measure=True)
-    assert {'noise_density_g_per_rthz', 'rc_capacitance_f', 'range_g', 'adc_bits'} <= set(
-        unit.unstated)
-    assert not unit.datasheet
 
 
 FACES_DEG = {'+x': (90, 0), '-x': (90, 180), '+y': (90, -90), '-y': (90, 90), '+z': (0, 0),

@@ -2,7 +2,6 @@
 
 """The tool `noise`: its figures, its files, and recordings that are too short or not still."""
 
-from collections.abc import Callable
 import json
 from pathlib import Path
 import subprocess
@@ -10,7 +9,7 @@ import subprocess
 from adxl_ros.files import parameter_file
 import allantools
 import numpy as np
-from processes import run_executable, Started
+from processes import run_executable
 import pytest
 from still_noise import still_samples, write_csv
 import yaml
@@ -82,14 +81,6 @@ def test_diagnose_takes_the_measured_noise(tmp_path: Path) -> None:
     assert report['gap']['before'] == pytest.approx(report['gap']['floor'], rel=0.05)
 
 
-def test_compensation_takes_the_file(tmp_path: Path, start: Callable[..., Started]) -> None:
-    write_csv(tmp_path / 'still.csv', *samples(60.0))
-    run(tmp_path, 'still.csv', '-o', 'noise.yaml')
-    path = tmp_path / 'noise.yaml'
-    start('compensation', '--ros-args', '-p', f'calibration:={path}').wait_for(
-        f'compensating by {path}')
-
-
 def test_the_lines_to_paste_are_yaml(tmp_path: Path) -> None:
     write_csv(tmp_path / 'still.csv', *samples(60.0))
     text = run(tmp_path, 'still.csv').stdout
@@ -133,47 +124,6 @@ def test_noise_that_rounding_hides_is_not_written(tmp_path: Path) -> None:
     assert kept[1:] == pytest.approx(np.sqrt(2) * N / G, rel=0.1)
 
 
-def test_rounding_is_no_white_noise(tmp_path: Path) -> None:
-    time_s, accel = samples(200.0, terms=(N, 0.0, 0.0))
-    write_csv(tmp_path / 'codes.csv', time_s, np.round(accel / 0.01) * 0.01)
-    result = as_json(tmp_path, 'codes.csv')
-    for axis in result['axes'].values():
-        assert axis['white']['value'] == pytest.approx(N, rel=0.06)
-    assert result['settings']['kalibr, imu.yaml']['accelerometer_noise_density'] == pytest.approx(
-        np.hypot(N, 0.01 / np.sqrt(12 * RATE_HZ)), rel=0.06)
-
-
-def test_motion_is_left_out_and_named(tmp_path: Path) -> None:
-    time_s, accel = samples(600.0)
-    accel[(time_s > 400) & (time_s < 402), 0] += 3.0
-    accel[time_s > 401, 1] += 1.0
-    write_csv(tmp_path / 'moved.csv', time_s, accel)
-    result = as_json(tmp_path, 'moved.csv')
-    assert result['rest_s'][0] < 0.1
-    assert 380 < result['rest_s'][1] <= 400
-    assert result['axes']['y']['white']['value'] == pytest.approx(N, rel=0.05)
-    assert any('not still' in text for text in result['warnings'])
-
-
-def test_a_tone_is_one_warning(tmp_path: Path) -> None:
-    time_s, accel = samples(900.0, terms=(N, 0.0, 0.0))
-    accel[:, 0] += 5e-3 * np.sin(2 * np.pi * 0.3 * time_s)
-    write_csv(tmp_path / 'fan.csv', time_s, accel)
-    tones = [text for text in as_json(tmp_path, 'fan.csv')['warnings'] if 'the power is' in text]
-    assert len(tones) == 1
-    assert tones[0].startswith('x: from 0.')
-
-
-def test_temperature_is_named(tmp_path: Path) -> None:
-    time_s, accel = samples(1800.0, terms=(N, 0.0, 0.0))
-    temperature_c = 25 + 4 * (1 - np.exp(-time_s / 600))
-    accel[:, 2] += 2e-3 * temperature_c
-    write_csv(tmp_path / 'warm.csv', time_s, accel, temperature_c=temperature_c)
-    result = as_json(tmp_path, 'warm.csv')
-    warning = next(text for text in result['warnings'] if 'temperature' in text)
-    assert warning.startswith('z: ')
-
-
 def test_a_few_lost_samples_are_filled_and_a_long_gap_is_not(tmp_path: Path) -> None:
     time_s, accel = samples(600.0)
     kept = np.ones(len(time_s), bool)
@@ -205,13 +155,3 @@ def test_refusals_are_one_line(tmp_path: Path, change: str, reason: str) -> None
     assert reason in done.stderr
     assert done.stderr.count('\n') == 1
     assert not (tmp_path / 'noise.yaml').exists()
-
-
-def test_a_foreign_log_in_g_and_milliseconds(tmp_path: Path) -> None:
-    time_s, accel = samples(120.0)
-    table = np.column_stack([1e3 * time_s, accel / G])
-    np.savetxt(tmp_path / 'log.csv', table, fmt='%.9g', delimiter=';',
-               header='t_ms;accX;accY;accZ', comments='')
-    result = as_json(tmp_path, 'log.csv', '--columns', 'time=t_ms:ms,x=accX:g,y=accY:g,z=accZ:g')
-    assert result['rate_hz'] == pytest.approx(RATE_HZ)
-    assert result['axes']['z']['white']['value'] == pytest.approx(N, rel=0.05)

@@ -4,16 +4,13 @@
 from dataclasses import replace
 import json
 
-from adxl_ros.calibrate.calibration import calibrate, RecordedPoses
-from adxl_ros.calibrate.guided.pose_plan import sweep
-from adxl_ros.diagnose.linear_model import LinearModel
 from adxl_ros.files import parameter_file, population_file
 from adxl_ros.model.coefficients import get, put, with_neutral
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.population import PooledCoefficient, Population, posterior
+from adxl_ros.model.population import PooledCoefficient, Population
 import numpy as np
 import pytest
-from units import nominal, swept
+from units import nominal
 
 NAMES = [Coefficient(*effect, axis) for effect in (('bias', 'offset_v'), (
     'scale_factor', 'offset_v_per_g')) for axis in 'xy']
@@ -38,25 +35,6 @@ def drawn(rng):
     """Draw a unit of the population."""
     return put(with_neutral(nominal(), ['bias', 'scale_factor']), NAMES,
                MEAN + STD * rng.normal(size=4))
-
-
-def test_few_poses_give_smaller_intervals_that_hold():
-    """Over 60 units that are turned by hand, intervals shrink and hold 90 % of the truths."""
-    rng = np.random.default_rng(0)
-    poses = sweep(np.radians([60, 120]), np.radians(60), 0)[:10]
-    by_hand = nominal(stage_resolution_rad=np.radians(2.0))
-    widths, inside = [], []
-    for _ in range(60):
-        truth = replace(drawn(rng), stage_resolution_rad=by_hand.stage_resolution_rad)
-        few = [RecordedPoses('few', swept(rng, truth, targets=poses))]
-        fits = [calibrate(by_hand, few, 'linear', population=prior).fitted
-                for prior in (None, population())]
-        stds = [np.sqrt(np.diag(fit.covariance)) for fit in fits]
-        widths.append(stds[1] / stds[0])
-        error = get(fits[1], NAMES) - get(truth, NAMES)
-        inside += (np.abs(error) < 1.645 * stds[1]).tolist()
-    assert np.mean(widths) < 0.6 and np.max(widths) < 1
-    assert abs(np.mean(inside) - 0.9) < 3 * np.sqrt(0.09 / len(inside)) + 0.03
 
 
 def test_an_open_axis_takes_the_population(run_tool, tmp_path):
@@ -96,25 +74,6 @@ def test_a_stranger_is_named_by_fit(run_tool, tmp_path):
     np.testing.assert_array_equal(get(a, NAMES), get(b, NAMES))
 
 
-def test_the_prior_of_a_diagnosis_is_narrower():
-    """The tolerance of zero-g and scale factor about a poor calibration shrinks to the fleet."""
-    poor = replace(drawn(np.random.default_rng(3)), covariance=np.diag(100 * STD ** 2),
-                   covariance_names=tuple(NAMES))
-    sensors = poor, posterior(poor, population()).sensor
-    models = [LinearModel([], [], [], [], [], np.zeros(0), [], [], [], [], {})
-              for _ in sensors]
-    wide, narrow = ([_tolerance(model, sensor, name) for name in NAMES]
-                    for model, sensor in zip(models, sensors))
-    assert np.all(np.array(narrow) < 0.2 * np.array(wide))
-
-
-def _tolerance(model, sensor, name):
-    """Return the tolerance of a coefficient about a baseline with a reference."""
-    class AtBaseline(LinearModel):
-        baseline, pose_known = sensor, True
-    return AtBaseline(**vars(model)).tolerance(name)
-
-
 @pytest.mark.long
 def test_diagnose_takes_a_population(run_tool, tmp_path):
     """Without a prior a unit of the fleet has a bias; with it the unit is healthy."""
@@ -135,11 +94,3 @@ def test_diagnose_takes_a_population(run_tool, tmp_path):
             done.stdout.split())) == bool(prior)
     assert 'bias' in named['none'] and 'bias' not in named['right']
     assert 'bias' in named['wrong']
-
-
-def test_a_prior_that_is_none(run_tool, tmp_path):
-    (tmp_path / 'p.yaml').write_text('format: 9\n')
-    for tool in ('fit', 'diagnose'):
-        done = run_tool(tool, 'none.csv', '--prior', 'p.yaml', '-o', 'out')
-        assert done.returncode == 1
-        assert done.stderr.count('\n') == 1 and 'p.yaml: no population of format 1' in done.stderr

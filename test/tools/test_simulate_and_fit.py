@@ -77,14 +77,6 @@ def test_several_recordings_of_one_unit_are_fitted_together(run_tool, tmp_path):
     assert both.provenance['source'] == '1.csv, 2.csv'
 
 
-def test_the_same_seed_gives_the_same_bytes(run_tool, tmp_path):
-    """Recordings of one seed are equal to the bit, and those of different seeds differ."""
-    for name, seed in (('a', 4), ('b', 4), ('c', 5)):
-        run_tool('simulate', 'tilt_beta', '--rate', 100, '--seed', seed, '-o', f'{name}.csv')
-    a, b, c = ((tmp_path / f'{name}.csv').read_bytes() for name in 'abc')
-    assert a == b != c
-
-
 @pytest.mark.parametrize('arguments, words', [
     (['--effect', 'cros_axis'], "unknown effect 'cros_axis'; did you mean cross_axis?"),
     (['--effect', 'bias:ofset_v=0.1'], "bias has no parameter 'ofset_v'; did you mean offset_v?"),
@@ -134,14 +126,6 @@ def test_fit_refuses_another_unit_and_a_missing_folder(run_tool, tmp_path):
     assert done.returncode == 1 and 'A1' in done.stderr and 'B2' in done.stderr
     done = run_tool('fit', 'a.csv', '-o', 'none/unit.yaml')
     assert done.returncode == 1 and 'none/unit.yaml: cannot write into none' in done.stderr
-
-
-def test_wrong_usage(run_tool):
-    """Wrong usage is status 2."""
-    assert run_tool('fit').returncode == 2
-    assert run_tool('fit', 'a.csv', '--model', 'cubic', '-o', 'x').returncode == 2
-    unknown = run_tool('simulate', 'rihc', '-o', 'x')
-    assert unknown.returncode == 2 and 'did you mean rich?' in unknown.stderr
 
 
 @pytest.mark.parametrize('name, in_sample, left_out', [

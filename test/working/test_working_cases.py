@@ -42,14 +42,6 @@ def test_moves_reach_their_ends_without_a_jump(trapezoidal):
     assert np.abs(np.diff(joints['beta'])).max() < 4e-3
 
 
-def test_a_case_is_drawn_again_to_the_bit():
-    number = next(n for n in range(60) if world.draw_unit(np.random.default_rng(
-        [7_000_001, 2, n])) is not None)
-    case, again = (working_cases.draw(2, number, 'null') for _ in range(2))
-    assert case.recording == again.recording and case.label == again.label
-    assert case.label.group == 'none' and not case.label.faults
-
-
 def row(group, effects, status, named=(), probability=0.65, groups=()):
     """Return a case with a report; its effects have 0.03 m/s²."""
     faults = [{'effect': name, 'strength_mps2': 0.03, 'power': 1.0} for name in effects]
@@ -75,12 +67,3 @@ def row(group, effects, status, named=(), probability=0.65, groups=()):
     (row('none', [], 'explained', ['flicker']), True, True)])
 def test_exact_and_in_the_set(given, right, in_set):
     assert (working_cases.right(given), working_cases.in_set(given)) == (right, in_set)
-
-
-def test_the_table_has_shares_and_bins():
-    text = working_cases.table([row('single', ['supply'], 'explained', ['supply']),
-                                row('single', ['supply'], 'explained', ['bias']),
-                                row('none', [], 'no_gap', probability=0.97)])
-    assert '50 % ' in next(t for t in text.splitlines() if t.startswith('single effect, exactly'))
-    assert 'n = 2' in text.split('0.50 to 0.70')[1].splitlines()[0]
-    assert 'longest 1.0' in text

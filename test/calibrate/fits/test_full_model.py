@@ -8,11 +8,9 @@ from adxl_ros.calibrate import calibration
 from adxl_ros.calibrate.fits import full_fit_text, full_model, term_selection
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
-from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get, put, with_neutral
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.kinematics import specific_force
 import numpy as np
 from pace import within
 import pytest
@@ -51,20 +49,6 @@ def test_ninety_percent_intervals_cover_ninety_percent(axes, units, per_setting)
     assert 0.875 < np.mean(np.abs(z) < Z_90) < 0.93
 
 
-@pytest.mark.parametrize('per_setting', [True, False])
-def test_the_kind_of_the_stage_error_is_identifiable(per_setting):
-    """Errors by setting and by pose are separated, and their level is right."""
-    levels = []
-    for k in range(8):
-        sensor, _, poses = swept_unit(k, per_setting=per_setting)
-        stage = full_model.fit_full(sensor, poses).stage
-        levels.append((stage.setting_rad, stage.pose_rad))
-    setting, pose = np.degrees(np.median(levels, axis=0))
-    wanted, other = (setting, pose) if per_setting else (pose, setting)
-    assert wanted == pytest.approx(5 / 60 / np.sqrt(12), rel=0.1)
-    assert other < 0.4 * wanted
-
-
 @pytest.mark.parametrize('eccentric', [False, True])
 def test_an_eccentric_stage_is_identified_and_a_sound_one_has_no_such_term(eccentric):
     """An eccentricity of 20 µm is identified, and no other."""
@@ -79,31 +63,6 @@ def test_an_eccentric_stage_is_identified_and_a_sound_one_has_no_such_term(eccen
         assert np.sqrt(np.mean((error / std) ** 2)) < 2
 
 
-def test_each_axis_of_a_three_axis_unit_has_its_cross_axis_terms():
-    """A quadratic term of z is fitted to the noise, and does not appear as stage error."""
-    sensor, truth, poses = swept_unit(4, 'xyz', 0.0, check_poses=0,
-                                      planes_rad=np.radians(np.arange(0, 181, 30)))
-    fit, _ = term_selection.fit_selected(sensor, poses)
-    bent = truth.values['cross_axis']['quadratic_per_g'][2]
-    assert abs(bent) > 1e-3
-    assert fit.fitted.values['cross_axis']['quadratic_per_g'][2] == pytest.approx(bent, abs=2e-4)
-    assert np.degrees(fit.stage_std_rad) < 2e-3
-    error, std = errors(fit, truth)
-    assert np.sqrt(np.mean((error / std) ** 2)) < 1.4
-
-
-def test_a_fit_that_does_not_converge_is_reported(monkeypatch):
-    """The text of the fit contains the warning only if the fit does not converge."""
-    sensor, _, poses = swept_unit(2)
-    fit, terms = term_selection.fit_selected(sensor, poses)
-    assert fit.converged
-    assert full_fit_text.NOT_CONVERGED not in full_fit_text.report_lines(fit, poses, terms)
-    monkeypatch.setattr(full_model, '_MAX_ROUNDS', 1)
-    fit, terms = term_selection.fit_selected(sensor, poses)
-    assert not fit.converged
-    assert full_fit_text.NOT_CONVERGED in full_fit_text.report_lines(fit, poses, terms)
-
-
 def test_a_term_that_is_not_convex_is_fitted_from_several_starts():
     """The periods of an ADC's nonlinearity are right, far from the typical value."""
     sensor, truth, _ = swept_unit(3)
@@ -114,13 +73,6 @@ def test_a_term_that_is_not_convex_is_fitted_from_several_starts():
     fit = full_model.fit_full(sensor, poses, (*TERMS, 'adc_inl')).unit.values['adc_inl']
     assert fit['cycles'] == pytest.approx(17.3, rel=0.01)
     assert fit['amplitude_v'] == pytest.approx(1e-3, rel=0.15)
-
-
-def test_one_axis():
-    """A sensor of one axis is fitted as well."""
-    sensor, truth, poses = swept_unit(1, 'x')
-    error, std = errors(full_model.fit_full(sensor, poses), truth)
-    assert np.abs(error / std).max() < 4
 
 
 def test_the_gauge_is_fixed_where_only_the_sum_is_identifiable():
@@ -140,28 +92,6 @@ def test_the_gauge_is_fixed_where_only_the_sum_is_identifiable():
         truth.values['misalignment']['beta_rad'][0] + 0.012, abs=4e-4)
 
 
-def test_the_gauge_is_free_where_products_make_the_parts_identifiable():
-    """If the scale factor depends on z, the same terms are fitted to the noise."""
-    rng = np.random.default_rng(3)
-    truth = drawn(rng, nominal(), TERMS)
-    truth = put(truth, [Coefficient('cross_axis', 'linear', 'x'),
-                        Coefficient('cross_axis_z', 'linear', 'y'),
-                        Coefficient('scale_factor_z', 'linear_per_g', 'x'),
-                        Coefficient('scale_factor_z', 'quadratic_per_g2', 'y')],
-                [0.015, -0.02, 0.01, 0.01])
-    poses = swept(rng, replace(truth, stage_resolution_rad=0.0))
-    held = np.radians([[40, 10], [75, 200], [130, 300], [20, 100]])
-    force = specific_force(*held.T, truth.local_gravity_mps2)
-    volts = signal_chain.static_response(truth)(force)
-    worst = {}
-    for name, fit in (('fixed', full_model.fit_full(nominal(), poses)),
-                      ('judged', term_selection.fit_selected(nominal(), poses)[0])):
-        up = np.where(np.cos(held[:, 0]) < 0, -1, 1)
-        error = np.subtract(signal_chain.inverse(fit.fitted, up)(volts), force)[:2]
-        worst[name] = np.abs(error).max()
-    assert worst['judged'] < 3e-4 and worst['fixed'] > 2 * worst['judged']
-
-
 def test_outliers_are_named_and_excluded():
     """Three poses with a knock do not change the coefficients."""
     sensor, truth, poses = swept_unit(5, check_poses=0)
@@ -174,47 +104,6 @@ def test_outliers_are_named_and_excluded():
     assert np.sqrt(np.mean((error / std) ** 2)) < 1.6
     assert any('outliers, left out: pose 8 (alpha' in line
                for line in full_fit_text.report_lines(fit, poses, terms))
-
-
-@pytest.mark.parametrize('stage_deg', [1.0, 3.0])
-def test_a_large_stage_error_is_not_attributed_to_the_sensor(stage_deg):
-    """The stage error is estimated, and the magnitude of gravity determines zero-g."""
-    sensor, truth, poses = swept_unit(6, 'xyz', stage_deg * np.sqrt(12))
-    fit, terms = term_selection.fit_selected(sensor, poses)
-    assert np.degrees(fit.stage_std_rad) == pytest.approx(stage_deg, rel=0.15)
-    error, std = errors(fit, truth)
-    assert np.sqrt(np.mean((error / std) ** 2)) < 1.6
-    zero_g = [name.effect == 'bias' for name in fit.fitted.covariance_names]
-    assert np.abs(error[zero_g]).max() < 1e-4
-    assert any('the reference is worse than stated' in line
-               for line in full_fit_text.report_lines(fit, poses, terms))
-
-
-def test_terms_that_the_unit_lacks_are_not_selected():
-    """For a unit with zero-g, scale factor and misalignment, no other term is supported."""
-    rng = np.random.default_rng(8)
-    truth = drawn(rng, nominal(), ('bias', 'scale_factor', 'misalignment'))
-    terms = term_selection.fit_selected(nominal(), swept(rng, truth))[1]
-    assert [term.name for term in terms if term.is_supported] == ['misalignment']
-
-
-def test_suggested_poses_determine_more_than_others():
-    """Suggested poses reduce the covariance more than an equal number of poses of the sweep."""
-    sensor, _, poses = swept_unit(9, check_poses=0)
-    fit = full_model.fit_full(sensor, poses)
-    suggested = full_model.next_poses(fit.unit, poses, fit.names, fit.stage)
-
-    def volume(angles_rad):
-        added, settings = poses.subset(np.arange(len(angles_rad))), np.arange(len(angles_rad))
-        added = replace(added, alpha_rad=angles_rad[:, 0], beta_rad=angles_rad[:, 1],
-                        alpha_setting=settings, beta_setting=settings)
-        information = fit.information + full_model.fisher_information(
-            fit.unit, added, fit.names, fit.stage) - np.diag(
-            full_model.prior_precision(fit.names))
-        return -np.linalg.slogdet(information)[1]
-
-    others = np.column_stack([poses.alpha_rad, poses.beta_rad])[[5, 30, 60, 100]]
-    assert volume(np.array(suggested)) < volume(others)
 
 
 def test_a_change_of_temperature_is_reported_and_fitted():
@@ -248,17 +137,6 @@ def test_a_simpler_model_is_fitted_if_the_full_one_is_not_determined():
     assert fit.fitted.model == 'linear'
     assert fit.report_lines[0].startswith('not full: the full model is not determined')
     assert fit.report_lines[1].startswith('not physical: ')
-
-
-def test_recordings_of_one_unit_are_fitted_together():
-    """Two sweeps together determine the coefficients better than one."""
-    rng = np.random.default_rng(12)
-    truth = drawn(rng, nominal(), TERMS)
-    parts = [swept(rng, truth, check_poses=0) for _ in range(2)]
-    parts = [calibration.RecordedPoses(name, part) for name, part in zip('ab', parts)]
-    single = calibration.calibrate(nominal(), parts[:1], 'full')
-    both = calibration.calibrate(nominal(), parts, 'full')
-    assert np.trace(both.fitted.covariance) < 0.7 * np.trace(single.fitted.covariance)
 
 
 @pytest.mark.parametrize('change, words', [
@@ -302,18 +180,3 @@ def test_the_noise_determines_the_filter_time_constant(run_tool, tmp_path):
     assert ratio == pytest.approx([0.2, -0.15], abs=0.04)
     std = np.sqrt(np.diag(fitted.covariance))[-2:]
     assert np.abs((ratio - [0.2, -0.15]) / std).max() < 4
-
-
-def test_an_additional_effect_on_the_command_line(run_tool, tmp_path):
-    """--effect adds a term. A term that poses at rest cannot determine is refused by name."""
-    run_tool('simulate', 'sweep', '--params', NOMINAL, '-o', tmp_path / 'sweep.csv')
-    run_tool('fit', tmp_path / 'sweep.csv', '--effect', 'stage_eccentricity', '-o',
-             tmp_path / 'unit.yaml')
-    done = run_tool('fit', tmp_path / 'sweep.csv', '--effect', 'hysteresis', '-o',
-                    tmp_path / 'other.yaml')
-    assert done.returncode == 1
-    assert 'hysteresis' in done.stderr and 'Traceback' not in done.stderr
-    done = run_tool('fit', tmp_path / 'sweep.csv', '--effect', 'temprature_bias', '-o',
-                    tmp_path / 'other.yaml')
-    assert done.returncode == 1 and 'temperature_bias' in done.stderr
-    assert not (tmp_path / 'other.yaml').exists()

@@ -22,8 +22,6 @@ from units import nominal
 EFFECTS = ('bias', 'scale_factor', 'misalignment')
 MG = 1000 / G0_MPS2
 SIX = np.concatenate([np.eye(3), -np.eye(3)])
-EDGES = np.array([[1, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0], [0, 1, 1], [0, 1, -1],
-                  [0, -1, 1], [0, -1, -1], [1, 0, 1], [1, 0, -1], [-1, 0, 1], [-1, 0, -1]]) / 2**.5
 
 
 def rms(values):
@@ -113,41 +111,6 @@ def test_covariance_has_the_stated_coverage(count, error_v, excess_g):
     assert false <= 3
 
 
-def test_covariance_in_other_units():
-    """With half the scale factor the parameters in g are equal."""
-    rng = np.random.default_rng(3)
-    sensor, _ = unit(rng)
-    means, errors = rested(rng, sensor, directions(rng, 24))
-    first = fit_gravity(means, errors, bare(sensor))
-    half = replace(bare(sensor), nominal_zero_g_v=sensor.nominal_zero_g_v / 2,
-                   nominal_scale_v_per_g=sensor.nominal_scale_v_per_g / 2)
-    other = fit_gravity(means / 2, errors / 2, half)
-    units = np.array([0.5] * 6 + [1.0] * 3)
-    assert parameters(other) == pytest.approx(parameters(first) * units, abs=1e-9)
-    assert other.covariance == pytest.approx(first.covariance * np.outer(units, units), rel=1e-6)
-
-
-def test_the_result_does_not_depend_on_the_order_of_rests():
-    rng = np.random.default_rng(4)
-    sensor, _ = unit(rng)
-    means, errors = rested(rng, sensor, directions(rng, 24), 5e-5, 1e-4)
-    order = rng.permutation(24)
-    first, other = (fit_gravity(means[o], errors[o], bare(sensor), 24)
-                    for o in (np.arange(24), order))
-    assert parameters(other) == pytest.approx(parameters(first), abs=1e-7)
-    assert other.held_out_mps2 == pytest.approx(first.held_out_mps2[order], abs=1e-6)
-
-
-def test_excess_is_the_scatter_beyond_the_standard_errors():
-    rng = np.random.default_rng(5)
-    estimate = []
-    for _ in range(20):
-        sensor, _ = unit(rng)
-        fit = fit_gravity(*rested(rng, sensor, directions(rng, 30), 2e-5, 3e-4), bare(sensor))
-        estimate.append(fit.excess_mps2 * MG)
-    assert np.mean(estimate) == pytest.approx(0.3, rel=0.15)
-
-
 @pytest.mark.parametrize('stretches', [20, 5])
 def test_held_out_errors_equal_fits_without_the_stretch(stretches):
     rng = np.random.default_rng(6)
@@ -206,36 +169,6 @@ def test_undetermined_parameters_are_refused(poses, names, advice):
     assert f'{names}; add rests with ' in text
     assert advice in text.split('add rests with')[1]
     assert '\n' not in text
-
-
-def test_magnitudes_far_from_gravity_are_refused():
-    rng = np.random.default_rng(12)
-    sensor, _ = unit(rng)
-    means, errors = rested(rng, sensor, directions(rng, 24))
-    wrong = replace(bare(sensor), nominal_scale_v_per_g=np.full(3, 0.1))
-    with pytest.raises(UserError, match=r'rests read \d+ m/s², not 9\.8.*nominal_scale_v_per_g'):
-        fit_gravity(means, errors, wrong)
-
-
-def test_the_advised_poses_are_sufficient():
-    """With the poses that a refusal names the fit succeeds."""
-    rng = np.random.default_rng(9)
-    sensor, truth = unit(rng)
-    few = directions(rng, 24) * [1, 1, 0.02]
-    few[:, 2] = np.abs(few[:, 2])
-    for poses in (few / np.linalg.norm(few, axis=1, keepdims=True), SIX[:4], directions(rng, 9)):
-        with pytest.raises(UserError) as refused:
-            fit_gravity(*rested(rng, sensor, poses), bare(sensor))
-        added = []
-        for pose in str(refused.value).split('add rests with ')[1].split(', '):
-            vector = np.zeros(3)
-            for part in pose.split(' and '):
-                axis, way = part.split()
-                vector['xyz'.index(axis)] = 1 if way == 'up' else -1
-            added.append(vector / np.linalg.norm(vector))
-        poses = np.concatenate([poses, added])
-        fit = fit_gravity(*rested(rng, sensor, poses), bare(sensor))
-        assert np.abs(parameters(fit) - truth).max() < 0.02
 
 
 def unweighted_fit(means, errors, sensor):
@@ -313,30 +246,6 @@ def test_held_out_rests_of_a_real_recording(shared_dir):
     fitted = replace(sensor, effects=EFFECTS, values=fit.values)
     force = np.array(signal_chain.inverse(fitted)(list(means[24:].T)))
     assert MG * rms(np.linalg.norm(force, axis=0) - XSENS_MPS2) < 0.125
-
-
-def test_three_real_units_agree_in_their_change_of_tilt(shared_dir):
-    """On one body the changes of tilt between rests agree to about 0.04°."""
-    units = [real(shared_dir, f'mpu9150_{k}') for k in range(3)]
-    common = [(a, b, c) for a in units[0][1] for b in units[1][1] for c in units[2][1]
-              if min(a.stop, b.stop, c.stop) - max(a.start, b.start, c.start) > 100]
-    turned = []
-    for k, (sensor, rests, means, errors) in enumerate(units):
-        fit = fit_gravity(means, errors, sensor)
-        fitted = replace(sensor, effects=EFFECTS, values=fit.values)
-        force = np.array(signal_chain.inverse(fitted)(list(means.T)))[
-            :, [rests.index(same[k]) for same in common]]
-        along = force / np.linalg.norm(force, axis=0)
-        turned.append(np.degrees(np.arccos((along[:, 1:] * along[:, :-1]).sum(axis=0))))
-    for first, other in ((0, 1), (0, 2), (1, 2)):
-        assert rms(turned[first] - turned[other]) < 0.06
-
-
-def test_too_few_rests_are_refused_in_one_line(run_tool, shared_dir):
-    """A sensor in permanent motion by hand: the message names the missing poses."""
-    done = run_tool('fit', shared_dir / 'real' / 'broad_02_real.csv', '-o', 'unit.yaml')
-    assert done.returncode == 1
-    assert done.stderr.startswith('fit: gravity: ') and done.stderr.count('\n') == 1
 
 
 @pytest.mark.perf

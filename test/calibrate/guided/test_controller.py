@@ -6,8 +6,6 @@ from dataclasses import replace
 
 from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, Phase, StageMode
 from adxl_ros.calibrate.guided.controller import Controller, ControllerState, Resume, Severity
-from adxl_ros.calibrate.guided.display import live_reading, SessionDisplay
-from adxl_ros.calibrate.guided.screen_contents import KeyAction, ScreenContents
 from adxl_ros.calibrate.guided.session_settings import SessionSettings
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, sweep_journal
@@ -123,17 +121,6 @@ def rig(tmp_path):
         return made[-1]
     yield make
     made[-1].controller.close()
-
-
-def test_requests_without_a_calibration_are_refused(rig):
-    """Each request states that no calibration runs, and the state does not change."""
-    controller = rig().controller
-    for request in (controller.capture, controller.redo, controller.skip, controller.finish,
-                    controller.abort):
-        assert request() == (False, 'no calibration is running')
-    assert controller.state is ControllerState.IDLE
-    status = controller.status()
-    assert (status.phase, status.text, status.late) == (Phase.IDLE, 'idle; call ~/start', False)
 
 
 def test_a_sweep_goes_from_the_wait_for_its_sensor_to_its_file(rig, tmp_path):
@@ -275,41 +262,3 @@ def test_another_sensor_ends_the_session_and_a_restarted_driver_checks_the_mount
         'sensor_info: is of the sensor C2')
     bench.controller.start()
     assert bench.controller.status().phase is Phase.REFUSED
-
-
-def test_readings_on_another_clock_count_from_their_arrival(rig):
-    """A temperature with a stamp years away is reported once."""
-    bench = rig()
-    bench.say_info()
-    bench.controller.start()
-    bench.turn()
-    for _ in range(3):
-        bench.controller.read_temperature(2_000_000_000_000_000_000, 23.0)
-    bench.controller.read_supply(0, 5.0)
-    assert len([line for line in bench.lines() if line.startswith('temperature is stamped')]) == 1
-    bench.turn_until(lambda: bench.controller.session.accepted_count == 1)
-    record = bench.controller.session.guide.accepted[0]
-    assert (record.temperature_c, record.supply_v) == (23.0, 5.0)
-
-
-def test_contents_of_the_screen_are_equal_at_the_other_end_of_the_topic(rig):
-    """The contents of a sweep are equal after they were text."""
-    bench = rig()
-    bench.say_info()
-    bench.controller.shows_idle_stream = True
-    bench.turn(0.5)
-    newest = bench.controller.newest
-    idle = live_reading(newest, UNIT, newest.stillness())
-    assert [axis.axis for axis in idle.axes] == ['x', 'y'] and idle.rate_hz == 200.0
-    bench.controller.start()
-    bench.turn_until(lambda: bench.controller.session.accepted_count == 4)
-    display = SessionDisplay(bench.controller.session)
-    contents = ScreenContents('dwell', 'text', 'C1 (xy)', 'unit.yaml',
-                              (KeyAction('b', 'begin', 'start'),), display.live(),
-                              display.progress(), display.estimate())
-    assert ScreenContents.from_json(contents.to_json()) == contents
-    assert (contents.progress.accepted, contents.progress.total) == (4, 22)
-    assert {row.group: row.accepted for row in contents.estimate.coverage} == {
-        '45°': 2, '90°': 2, 'beta forth': 1, 'beta back': 0, 'check poses': 0}
-    assert display.estimate() is contents.estimate, 'computed once for each pose'
-    assert 0 < contents.estimate.final_tilt_error_deg < contents.estimate.tilt_error_deg

@@ -62,12 +62,3 @@ def test_fits_have_the_standard_deviations_that_a_plan_predicts(axes, kind):
         stds = dict(zip(promised.names, promised.std))
         ratios += [s / stds[name] for s, name in zip(spread, fit.fitted.covariance_names)]
     assert np.exp(np.mean(np.log(ratios))) == pytest.approx(1.0, abs=0.15)
-
-
-def test_a_z_axis_requires_level_planes():
-    """A three-axis unit measures 1 g on each axis. In level planes beta makes quarter turns."""
-    planes = pose_plan.default_planes_rad('xyz')
-    assert np.degrees(planes[0]) == 0 and np.degrees(planes[-1]) == pytest.approx(180)
-    targets = pose_plan.guided(planes, STEP, 0)
-    assert sum(t.alpha_rad == 0 for t in targets) == 10
-    assert len(targets) == 130 + 20

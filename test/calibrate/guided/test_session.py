@@ -8,7 +8,7 @@ from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, StageMod
 from adxl_ros.calibrate.guided.session import Session
 from adxl_ros.calibrate.guided.session_settings import SessionSettings
 from adxl_ros.errors import UserError
-from adxl_ros.files import atomic_write, parameter_file, sweep_journal
+from adxl_ros.files import atomic_write, sweep_journal
 from adxl_ros.model import signal_chain
 from adxl_ros.model.kinematics import specific_force
 import numpy as np
@@ -70,21 +70,6 @@ def test_a_pose_to_be_repeated_is_neither_fitted_nor_resumed(begin):
     assert session.resumed == 2 and poses_on_disk(session) == [0, 1]
 
 
-def test_an_early_fit_can_continue_to_the_end_of_the_plan(begin):
-    """The file contains the poses so far. The next start resumes with them."""
-    session = begin()
-    take(session, 12)
-    assert session.finish().fitted.provenance['poses'] == '12'
-    session.end()
-    session = begin()
-    assert session.resumed == 12 and session.guide.open_poses == 10
-    session.guide.skip()
-    take(session, 10)
-    assert session.guide.is_over and session.finish().fitted.provenance['check_poses'] == '2'
-    session.end()
-    assert begin().resumed == 0
-
-
 def test_a_repeated_finish_keeps_the_previous_calibration(begin, tmp_path, monkeypatch):
     """If the journal does not accept `done`, an equal fit does not replace the file."""
     (tmp_path / 'unit.yaml').write_text('the one before\n')
@@ -126,17 +111,6 @@ def test_incomplete_files_of_a_killed_process_are_removed(begin, tmp_path):
     assert {p.name for p in tmp_path.glob('.*')} == {'.unit.yaml.mine'}
 
 
-def test_check_poses_only_are_refused(begin):
-    """Without poses to fit a finish is refused, and the taken poses are kept."""
-    session = begin()
-    for _ in range(20):
-        session.skip()
-    take(session, 1)
-    with pytest.raises(UserError, match='only check poses are taken'):
-        session.finish()
-    assert poses_on_disk(session) == [20]
-
-
 @pytest.mark.parametrize('count', [1, 2, 3, 5, 8])
 def test_few_poses_are_fitted_or_refused(begin, count):
     """An early finish never causes a traceback."""
@@ -163,15 +137,3 @@ def test_a_calibration_resumes_only_with_equal_values_and_settings(begin, mode):
     before = settings.head(unit)
     for other, sensor in changed:
         assert len([key for key, value in other.head(sensor).items() if value != before[key]]) == 1
-
-
-def test_a_skipped_mounting_check_is_stated_in_the_file(begin, tmp_path):
-    """`skip` continues without the check, and the provenance states this."""
-    take(begin(), 12)
-    session = begin()
-    assert session.skip() == 'pose 12 is not taken again: the mounting is not checked'
-    session = begin()
-    session.skip()
-    assert session.finish().fitted.provenance['mounting'] == 'not checked after an interruption'
-    provenance = parameter_file.load(tmp_path / 'unit.yaml').provenance
-    assert provenance['mounting'].startswith('not checked')

@@ -3,14 +3,12 @@
 """The guided sweep without ROS: its waits, its messages and its accepted poses."""
 
 from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, Phase, StageMode
-from adxl_ros.calibrate.guided.hand_guide import HandGuide
 from adxl_ros.calibrate.guided.pose_plan import guided, sweep as plan_sweep, Target, travel_rad
 from adxl_ros.calibrate.guided.stage_guide import StageGuide
 from adxl_ros.errors import UserError
-from adxl_ros.model.kinematics import specific_force
 import numpy as np
 import pytest
-from units import Bench, Fed, nominal
+from units import Bench, nominal
 
 TARGETS = [Target(np.pi / 2, 0.0), Target(np.pi / 2, np.pi / 6)]
 
@@ -43,42 +41,6 @@ def test_no_pose_is_accepted_before_arrival_and_the_distance_is_stated():
     state = bench.sweep.status()
     assert state.late
     assert 'for 23 s' in state.text
-
-
-def test_a_missing_encoder_is_reported():
-    """Without joint states the text names the topic."""
-    bench = _bench()
-    bench.run(1, np.pi / 2, 0.0, encoder=False)
-    assert 'nothing on stage/joint_states' in bench.sweep.status().text
-
-
-def test_a_vibrating_sensor_is_not_at_rest():
-    """Motion is reported with its value and limit, and no pose is accepted."""
-    bench = _bench()
-    assert bench.run(8, np.pi / 2, 0.0, shake_mps2=0.3) is None
-    state = bench.sweep.status()
-    assert state.phase is Phase.REST
-    assert 'moving: 0.' in state.text and 'm/s² on x, must be below 0.0' in state.text
-
-
-def test_motion_during_the_dwell_restarts_it():
-    """After a knock at 3 s the dwell begins again."""
-    bench = _bench()
-    assert bench.run(3, np.pi / 2, 0.0) is None
-    assert bench.run(0.2, np.pi / 2, 0.0, shake_mps2=1.0) is None
-    knocked_ns = bench.now_ns
-    entry = bench.run(10, np.pi / 2, 0.0)
-    assert entry.start_ns >= knocked_ns
-
-
-def test_a_stage_that_leaves_and_returns_restarts_the_dwell():
-    """Samples before a motion of the stage do not count."""
-    bench = _bench()
-    bench.run(4, np.pi / 2, 0.0)
-    bench.run(1, np.pi / 2, 0.05)
-    returned_ns = bench.now_ns
-    entry = bench.run(10, np.pi / 2, 0.0)
-    assert entry.start_ns > returned_ns
 
 
 @pytest.mark.parametrize('mode, beta', [('encoder', 0.02), ('manual', 0.0)])
@@ -133,46 +95,3 @@ def test_the_guided_order_saves_travel_and_reaches_angles_from_both_sides():
         inner = sorted(sides)[1:-1]
         assert all(sides[angle] == {1.0, -1.0} for angle in inner), joint
     assert {round(t.alpha_rad, 6) for t in grid[:65]} == set(np.round(planes, 6))
-
-
-def test_rests_by_hand_are_announced_as_they_end():
-    """The guide counts its rests."""
-    guide, volts = _hand_calibration()
-    rests = _rests(guide, volts, 10 ** 18)
-    assert len(rests) == 5
-    results = guide.poses_to_fit()
-    assert len(results) == 6
-    assert all(2.0 < e.samples / 1000 < 3.1 for e in results)
-    assert '5 rests (5 more at least)' in guide.status().text
-
-
-def test_a_clock_that_goes_back_does_not_end_a_calibration_by_hand():
-    """After a restart of the driver or a step of NTP, earlier rests stay in the fit."""
-    guide, volts = _hand_calibration()
-    assert len(_rests(guide, volts, 10 ** 18)) == 5
-    assert len(_rests(guide, volts, 10 ** 15)) == 5
-    assert sorted(guide.accepted) == list(range(10)) and len(guide.poses_to_fit()) == 11
-    guide.drop(guide.accepted[0])
-    assert len(guide.poses_to_fit()) == 10
-    guide.retry()
-    assert len(_rests(guide, volts, 10 ** 15 + 25 * 10 ** 9)) >= 5
-
-
-def _hand_calibration():
-    """Return a guide by hand, and the volts of six rests of 3 s with motion between them."""
-    sensor = nominal('xyz', noise_density_g_per_rthz=np.full(3, 300e-6))
-    alphas = np.repeat(np.linspace(0, 2.5, 6), 4000) + np.concatenate(
-        [np.concatenate([np.zeros(3000), 0.2 * np.sin(np.linspace(0, 40, 1000))])
-         for _ in range(6)])
-    return HandGuide(sensor, 3.0), Fed(sensor, 2)(specific_force(alphas, 0 * alphas, 9.80665))
-
-
-def _rests(guide, volts, begin_ns):
-    """Feed volts at 1 kHz; return the accepted rests."""
-    rests = []
-    for i in range(0, len(volts), 100):
-        guide.feed(np.arange(i, i + 100) * 1_000_000 + begin_ns, volts[i:i + 100])
-        while (entry := guide.accept()) is not None:
-            rests.append(entry)
-            guide.take(entry)
-    return rests

@@ -8,8 +8,6 @@ from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, StageMod
 from adxl_ros.calibrate.guided.session import Session
 from adxl_ros.calibrate.guided.session_settings import SessionSettings
 from adxl_ros.calibrate.guided.thermal_guide import ThermalSettings
-from adxl_ros.calibrate.thermal_coverage import passed
-from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, sweep_journal
 from adxl_ros.model.coefficients import with_neutral
 from adxl_ros.model.effects.base import Coefficient
@@ -140,35 +138,3 @@ def test_an_interrupted_calibration_keeps_its_blocks(begin):
     resumed = begin()
     assert resumed.resumed == resumed.accepted_count == count
     assert resumed.guide.destination() == session.guide.destination()
-
-
-def test_a_block_without_temperature_is_refused(begin):
-    """The reason names the topic; too few blocks are no calibration."""
-    session = begin()
-    stamps_ns, volts, _ = recorded(seconds=30.0)
-    play(session, stamps_ns, volts, np.full(len(stamps_ns), np.nan))
-    assert session.accepted_count == 0
-    assert 'topic temperature' in session.guide.new_refusal()
-    with pytest.raises(UserError, match='no pose is taken'):
-        session.finish()
-
-
-def test_motion_is_no_block(begin):
-    """Samples that move are forgotten, and later rests count."""
-    session = begin()
-    stamps_ns, volts, temperatures_c = recorded(seconds=60.0)
-    volts = volts.copy()
-    volts[:300] += 0.2 * np.sin(np.arange(300))[:, None]
-    play(session, stamps_ns, volts, temperatures_c)
-    assert 1 <= session.accepted_count <= 8
-    assert min(r.start_ns for r in session.guide.accepted.values()) >= stamps_ns[290]
-
-
-def test_advice_follows_the_temperature():
-    """What is open in the present direction comes first."""
-    path = [20, 30, 52, 30]
-    assert passed(np.array([20.0]), (0, 50)).advice() == 'warm it to 50 °C'
-    assert passed(np.array(path), (0, 50)).advice() == 'cool it to 0 °C'
-    assert passed(np.array([*path, -2, 10]), (0, 50)).advice() == 'warm it to 20 °C'
-    done = passed(np.array([*path, -2, 52]), (0, 50))
-    assert done.complete and 'covered' in done.advice()

@@ -108,23 +108,6 @@ def test_a_linear_model_fails_because_of_its_model():
     assert max(map(len, [*result.summary_lines[:2], *models])) < 80
 
 
-def test_a_unit_beyond_the_datasheet_is_named():
-    """The complete interval is beyond the largest zero-g offset, 100 mV."""
-    _, result = calibrated(2, effects=())
-    assert acceptance.beyond_datasheet(result.fitted) == []
-    changed = replace(result.fitted, values={**result.fitted.values, 'bias': {
-        'offset_v': np.array([0.02, -0.11])}})
-    message, = acceptance.beyond_datasheet(changed)
-    assert message.startswith('bias.offset_v.y is -0.11')
-
-
-def test_without_a_datasheet_there_is_no_limit():
-    """The datasheet values of the ADXL203 are no limits of another sensor."""
-    _, result = calibrated(3, datasheet={}, datasheet_name='')
-    assert {row.accel_datasheet for row in result.assessments} == {''}
-    assert 'no limit by a datasheet' in '\n'.join(result.report_lines)
-
-
 @pytest.mark.parametrize(('parts', 'outcome'), [
     ((1.0, 0.0, 0.9, 0.1, 0.0, 0.2), 'PASS'), ((9.0, 0.0, 8.9, 0.1, 0.0, 2.0), 'NOT SHOWN'),
     ((9.0, 0.0, 0.1, 0.1, 8.8, 12.0), 'FAIL'), ((9.0, 0.0, 0.1, 0.1, 8.8, 12.0, False),

@@ -44,17 +44,6 @@ def report_folder(tmp_path_factory):
     return folder
 
 
-def test_the_browser_reports_faults_of_a_page(opened, tmp_path):
-    """The messages contain faults of each kind, so that the other tests can fail."""
-    path = tmp_path / 'bad.html'
-    path.write_text('<script>console.error("ouch"); nowhere();</script><img src="gone.png">')
-    page, messages = opened(path)
-    page.wait_for_timeout(200)
-    text = '\n'.join(messages)
-    assert 'error: ouch' in text and 'nowhere is not defined' in text
-    assert 'gone.png' in text
-
-
 def test_the_report_has_its_contents(opened, report_folder):
     """It has acceptance by model, coefficients with the datasheet, drift and plots, offline."""
     page, messages = opened(report_folder / 'report' / 'report.html')
@@ -100,15 +89,6 @@ def test_layout(opened, report_folder, width):
     assert path.stat().st_size < 5_000_000
 
 
-def test_the_parameter_file_is_in_the_page(opened, report_folder):
-    """The button gives the file that `fit` writes."""
-    page, _ = opened(report_folder / 'report' / 'report.html')
-    with page.expect_download() as download:
-        page.get_by_text('download _U_7_.yaml').click()
-    with open(download.value.path(), encoding='utf-8') as file:
-        assert file.read() == (report_folder / 'unit.yaml').read_text()
-
-
 def test_the_sphere_turns(opened, report_folder):
     """Mouse, wheel and keys turn it. A text names the pose below the pointer."""
     page, messages = opened(report_folder / 'report' / 'report.html')
@@ -150,31 +130,3 @@ def test_the_sphere_turns(opened, report_folder):
     assert re.match(r'pose \d+, alpha [\d.]+°, beta [\d.]+°: -?[\d.]+ mg',
                     pose_text.inner_text())
     assert messages == []
-
-
-def test_the_report_is_printable(opened, report_folder, tmp_path):
-    """The print on A4 contains the sphere, without its selection boxes."""
-    page, messages = opened(report_folder / 'report' / 'report.html')
-    page.emulate_media(media='print')
-    assert not page.locator('#sphere-model').is_visible()
-    assert page.locator('#sphere').is_visible()
-    page.pdf(path=tmp_path / 'page.pdf', format='A4')
-    pages = (tmp_path / 'page.pdf').read_bytes().count(b'/Type /Page\n')
-    assert 4 <= pages <= 12
-    assert messages == []
-
-
-def test_reports_without_history_and_without_a_stage(opened, report_folder, run_tool, shared_dir,
-                                                     tmp_path):
-    """The page names a missing history, and the report by hand has its plots."""
-    page, messages = opened(report_folder / 'first' / 'report.html')
-    wait_until_drawn(page)
-    assert 'No earlier calibration of this unit' in page.locator('body').inner_text()
-    done = run_tool('fit', shared_dir / 'real' / 'mpu9150_0.csv', '-o', 'u.yaml', '--report',
-                    'by_hand')
-    assert done.returncode == 0, done.stderr
-    by_hand, messages_by_hand = opened(tmp_path / 'by_hand' / 'report.html')
-    assert layout_faults(by_hand) == []
-    text = by_hand.locator('body').inner_text()
-    assert 'magnitude minus gravity, mg' in text and 'magnitude of gravity over 23 rests' in text
-    assert messages == messages_by_hand == []

@@ -87,13 +87,6 @@ def test_search(page):
 
 
 @NEEDS_CHROMIUM
-def test_reasons_are_counted_without_names_and_numbers(page):
-    page.get_by_role('tab', name='refusals').click()
-    cells = page.locator('.panel[data-tab=refusals] tbody td').all_inner_texts()
-    assert len(cells) == 5 and cells[2] == 'FILE: line #: no time stamp'
-
-
-@NEEDS_CHROMIUM
 @pytest.mark.parametrize('name, width', [
     *(('bad', width) for width in WIDTHS), ('sound', 1280), ('single', 480), ('refused', 480)])
 def test_layout(opened, folders, name, width):
@@ -103,56 +96,10 @@ def test_layout(opened, folders, name, width):
     assert messages == []
 
 
-@NEEDS_CHROMIUM
-def test_print(page, tmp_path):
-    """The paper holds all tabs, and nothing is wider than it."""
-    page.emulate_media(media='print')
-    page.set_viewport_size({'width': 703, 'height': 1000})
-    assert page.locator('.panel').filter(visible=True).count() == 6
-    assert page.evaluate('document.documentElement.scrollWidth') <= 703
-    page.pdf(path=tmp_path / 'page.pdf', format='A4')
-    assert (tmp_path / 'page.pdf').stat().st_size > 50_000
-
-
 def test_a_sound_fleet_is_in_order(folders):
     text = (folders['sound'] / 'fleet.html').read_text()
     assert 'OF 8 OLD CALIBRATION' in text and 'bad batch.' not in text
     assert text.count('in order</span>') > 2 * 2
-
-
-def test_what_was_not_measured_is_not_within_the_tolerance(tmp_path):
-    """As of a fleet that is only checked."""
-    path = FLEETS['sound'].write(tmp_path)
-    table = pq.read_table(path)
-    dropped = {name: None for name in table.column_names
-               if name.startswith(('gap_', 'zero_g_', 'scale_'))}
-    pq.write_table(pa.Table.from_pylist(
-        [row | dropped for row in table.to_pylist()], table.schema), path)
-    report_html.write(tmp_path)
-    text = (tmp_path / 'fleet.html').read_text()
-    assert 'NOT MEASURED' in text and 'tolerance, but' not in text
-
-
-def test_a_single_unit_that_drifts_is_singular(folders):
-    text = (folders['drift'] / 'fleet.html').read_text()
-    assert '1 OF 8 DRIFTS' in text and 'but one is on its way.' in text
-
-
-def test_a_drift_without_gaps_leaves_the_tolerance(tmp_path):
-    """A fleet that is only fitted has no gap; its drift since the calibration counts."""
-    fleet = MadeUpFleet(units=8, per_unit=12, drifting_mg=25.0)
-    text = page_without('gap_before_mps2', fleet, tmp_path)
-    assert '1 OF 8 OUT OF TOLERANCE' in text
-    assert 'mg since its calibration; the tolerance is 3.5 mg.' in text
-    assert 'in 0 days' not in text
-
-
-def test_recordings_without_a_serial_number_are_listed(tmp_path):
-    text = page_without('serial', MadeUpFleet(units=1, per_unit=6, refused=0.5), tmp_path)
-    assert 'NO UNITS' in text and 'Units by urgency' not in text
-    listed = text[text.index('Recordings without a unit'):text.index('role="tablist"')]
-    assert listed.count('data-label="recording"') == 6
-    assert 'data-label="verdict">no gap' in listed and 'data-label="verdict">refused' in listed
 
 
 def test_files_beside_the_page(folders):
@@ -168,18 +115,6 @@ def test_files_beside_the_page(folders):
     assert all(min(float(row['estimate']), pooled.mean) - 1e-9 <= float(row['shrunken'])
                <= max(float(row['estimate']), pooled.mean) + 1e-9 for row in rows)
     assert population_file.read(folders['single'] / 'population.yaml').coefficients == {}
-
-
-@NEEDS_CHROMIUM
-def test_a_year_of_200_units(opened, tmp_path):
-    """A page of 73 000 recordings is small, and has a row for each unit."""
-    MadeUpFleet(units=200, per_unit=365, batch=40, refused=0.02).write(tmp_path)
-    report_html.write(tmp_path)
-    path = tmp_path / 'fleet.html'
-    assert path.stat().st_size < 5_000_000
-    page, messages = opened(path, 1280)
-    wait_until_drawn(page)
-    assert page.locator('#all-units tbody tr').count() == 200 and messages == []
 
 
 @pytest.mark.parametrize('batch', [6, 10])
