@@ -299,12 +299,15 @@ def _answer(evidence: Evidence, minimal: Sequence[frozenset[str]], rest: Rest,
         groups |= {frozenset(drifts)}
     else:
         certain |= set(drifts)
-    if groups:
-        return _Answer('inseparable', certain, groups)
     left = left if material else 0.0
     if best and above > drift ** 2 + evidence.material_power(1.0):
         left = max(left, above)
     partly = left > _SHARE_OF_FORM * (explained + left)
+    if groups and partly and not certain:
+        # Nothing is named for certain, and none of the rivals explains what repeats.
+        return _Answer('unknown', frozenset(), frozenset())
+    if groups:
+        return _Answer('inseparable', certain, groups)
     return _Answer('partly' if partly else 'explained', certain, groups)
 
 
