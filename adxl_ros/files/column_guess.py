@@ -22,7 +22,7 @@ from adxl_ros.files.column_units import (
 )
 from adxl_ros.files.mapped_recording import likely_unit, listed
 from adxl_ros.files.stamp_bursts import burst_samples, stamped_rate_hz
-from adxl_ros.files.tables.base import Table
+from adxl_ros.files.tables import Table
 from adxl_ros.model.constants import AXES, G0_MPS2
 import numpy as np
 

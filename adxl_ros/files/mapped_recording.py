@@ -30,7 +30,7 @@ from adxl_ros.files.recording_columns import (
     VOLTS,
 )
 from adxl_ros.files.stamp_bursts import describe_bursts
-from adxl_ros.files.tables.base import Table, TableBlock
+from adxl_ros.files.tables import Table, TableBlock
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.kinematics import stage_angles
 import numpy as np

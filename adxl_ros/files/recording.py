@@ -20,13 +20,11 @@ from adxl_ros.files.bag_writer import BagWriter
 from adxl_ros.files.column_guess import describe, is_sensor_step, shell_quoted, time_unit_of_step
 from adxl_ros.files.column_mapping import ColumnMapping, parse_mapping, Source
 from adxl_ros.files.column_units import Quantity, unit_in_name, UNITS
-from adxl_ros.files.csv_header import HeaderError
-from adxl_ros.files.csv_writer import CsvWriter, recording_columns, recording_info
+from adxl_ros.files.csv_file import csv_writer, HeaderError
 from adxl_ros.files.mounted_axes import mounted
 from adxl_ros.files.reading_options import AS_IT_IS, ReadingOptions
 from adxl_ros.files.recording_columns import ACCEL, concatenate, Recording, TIME
-from adxl_ros.files.tables import is_text, open_table
-from adxl_ros.files.tables.base import Table
+from adxl_ros.files.tables import is_text, open_table, Table
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -243,13 +241,17 @@ def writer(path: str | os.PathLike, sensor: Sensor) -> Iterator[Callable[[Record
 
     """
     if Path(path).suffix == '.csv':
-        with CsvWriter(path) as file:
-            def append(block: Recording) -> None:
-                file.write(recording_columns(block), recording_info(block))
-            yield append
+        with csv_writer(path) as append:
+            yield lambda block: append({TIME: block.time_s, **block.columns}, _csv_info(block))
     else:
         with BagWriter(path, sensor) as bag:
             yield bag.write
+
+
+def _csv_info(recording: Recording) -> dict[str, str]:
+    """Return the `# key: value` lines of a recording's CSV file."""
+    info = {key: value for key, value in recording.info.items() if key != 'epoch_ns'}
+    return {**info, 'epoch_ns': str(recording.epoch_ns)} if recording.epoch_ns else info
 
 
 def write(path: str | os.PathLike, recording: Recording, sensor: Sensor) -> None:

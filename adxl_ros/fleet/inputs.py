@@ -27,7 +27,7 @@ from adxl_ros.files import recording
 from adxl_ros.files.plain_address import as_utf_8, without_secrets
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import NO_UNIT
-from adxl_ros.files.tables import table_endings
+from adxl_ros.files.tables import TABLE_ENDINGS
 from adxl_ros.fleet.row import PAGE, POPULATION, TABLE, UNITS
 
 _ENDINGS = ('.csv', '.mcap', '.db3')
@@ -203,7 +203,7 @@ def _listed(text: str, look: Any) -> Any:
 
 def _is_recording_name(path: str) -> bool:
     """Return whether the name of a file is that of a recording, for folders and manifests."""
-    return PurePosixPath(file_name(path)).suffix.lower() in (*_ENDINGS, *table_endings())
+    return PurePosixPath(file_name(path)).suffix.lower() in (*_ENDINGS, *TABLE_ENDINGS)
 
 
 def _is_of_fleet(fs: Any, name: str) -> bool:

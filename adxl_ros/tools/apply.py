@@ -14,7 +14,7 @@ from adxl_ros.compensate.imu_fields import ImuFields
 from adxl_ros.compensate.recordings import effects_left, Estimates, RecordingEstimator
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.csv_writer import CsvWriter
+from adxl_ros.files.csv_file import csv_writer
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_unit import check_unit
 from adxl_ros.files.tilt_bag import TiltBag
@@ -104,8 +104,8 @@ def apply(options: argparse.Namespace) -> int:
 @contextmanager
 def _table(path: str) -> Iterator[Callable[[Recording, Estimates], None]]:
     """Open a CSV file, and yield a function that appends a block with its estimates."""
-    with CsvWriter(path, _DIGITS) as table:
-        yield lambda block, estimates: table.write(
+    with csv_writer(path, _DIGITS) as append:
+        yield lambda block, estimates: append(
             {'time_s': block.epoch_ns * 1e-9 + block.time_s, **_columns(estimates)})
 
 

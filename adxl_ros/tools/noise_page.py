@@ -9,7 +9,7 @@ from typing import Any
 
 from adxl_ros.files import html_page
 from adxl_ros.files.atomic_write import write_text
-from adxl_ros.files.csv_writer import CsvWriter
+from adxl_ros.files.csv_file import csv_writer
 from adxl_ros.files.plot_file import pyplot, write_plot
 from adxl_ros.signals.axis_noise import RecordingNoise, TERMS
 from adxl_ros.tools import noise_text
@@ -27,10 +27,10 @@ def write(folder: Path, result: RecordingNoise) -> list[Path]:
     figure = _plot(result)
     write_text(page, _page(result, figure))
     write_plot(figure, plot)
-    with CsvWriter(curve) as file:
-        file.write({'tau_s': result.rest.allan.tau_s, 'averages': result.rest.allan.averages,
-                    **{f'{noise.axis}_mps2': result.rest.allan.deviation[:, i]
-                       for i, noise in enumerate(result.axes)}})
+    with csv_writer(curve) as append:
+        append({'tau_s': result.rest.allan.tau_s, 'averages': result.rest.allan.averages,
+                **{f'{noise.axis}_mps2': result.rest.allan.deviation[:, i]
+                   for i, noise in enumerate(result.axes)}})
     return [page, plot, curve]
 
 

@@ -3,10 +3,11 @@
 """Recordings as CSV: round trips, real files, invalid files, memory, speed."""
 
 from pathlib import Path
+import sys
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import csv_lines, csv_numbers, csv_text, recording
-from adxl_ros.files.csv_writer import CsvWriter
+from adxl_ros.files import delimited_text, recording
+from adxl_ros.files.csv_file import csv_writer
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.files.stream_unit import check_unit
@@ -20,14 +21,13 @@ HEADER = 'time_s,x_v,y_v,alpha_rad,beta_rad'
 GOOD = '0.0,2.5,2.6,1.5,0.1\n0.001,2.51,2.61,,\n0.002,2.52,2.62,1.6,0.2\n'
 
 
-@pytest.fixture(autouse=True, params=['pyarrow', 'numpy'])
+@pytest.fixture(autouse=True, params=['large', 'small'])
 def parser(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Read and write small files as large ones, and as without pyarrow and orjson."""
-    if request.param == 'pyarrow':
-        monkeypatch.setattr(csv_numbers, '_ARROW_BYTES', 0)
+    """Read small files as large ones, by pandas; write the others as without pyarrow."""
+    if request.param == 'large':
+        monkeypatch.setattr(delimited_text, '_PANDAS_BYTES', 0)
     else:
-        monkeypatch.setattr(csv_numbers, '_arrow', lambda: None)
-        monkeypatch.setattr(csv_text, '_dumps', lambda: None)
+        monkeypatch.setitem(sys.modules, 'pyarrow.csv', None)
 
 
 def written(tmp_path: Path, text: str | bytes, name: str = 'run.csv') -> Path:
@@ -168,7 +168,7 @@ def test_invalid_files_are_refused_in_one_line(tmp_path: Path, text: str | bytes
 @pytest.mark.parametrize('place', [0, 1600, 2999])
 def test_faults_in_late_lines_are_reported(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: int) -> None:
-    monkeypatch.setattr(csv_lines, '_CHUNK_BYTES', 10_000)
+    monkeypatch.setattr(delimited_text, '_CHUNK_BYTES', 10_000)
     lines = [f'{i / 1000!r},2.5,2.5,{i % 7},0.1' for i in range(3000)]
     lines[place] = lines[place].replace('2.5,2.5', '2.5,x')
     path = written(tmp_path, f'{HEADER}\n' + '\n'.join(lines) + '\n')
@@ -185,7 +185,7 @@ def test_the_result_does_not_depend_on_the_blocks(
     rows = GOOD.replace('\n', '\r\n')
     path = written(tmp_path, f'\ufeff# serial: A17\r\n{HEADER}\n{rows}# end: 1\n0.1,1,2,3,4')
     complete = recording.read(path)
-    monkeypatch.setattr(csv_lines, '_CHUNK_BYTES', size)
+    monkeypatch.setattr(delimited_text, '_CHUNK_BYTES', size)
     cut = recording.read(path)
     assert cut.info == complete.info == {'serial': 'A17', 'end': '1'}
     assert cut.time_s.tolist() == complete.time_s.tolist() == [0.0, 0.001, 0.002, 0.1]
@@ -193,7 +193,7 @@ def test_the_result_does_not_depend_on_the_blocks(
 
 
 def test_text_columns_are_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(csv_lines, '_CHUNK_BYTES', 10_000)
+    monkeypatch.setattr(delimited_text, '_CHUNK_BYTES', 10_000)
     text = ['far out', '', '"q"', 'ä', '7', '"a,b"']
     lines = [f'{text[i % 5]},{text[i // 5 % 5]}, {i / 1000!r} ,{text[i % 3]},{1 / (i + 1)!r},,'
              f'{text[i // 1000]}' for i in range(3000)]
@@ -220,10 +220,10 @@ def long_csv(tmp_path: Path) -> Path:
     """Write a tenth of 3 million rows, which may need 15 s for reading."""
     path = tmp_path / 'long.csv'
     rng = np.random.default_rng(6)
-    with CsvWriter(path) as file:
+    with csv_writer(path) as append:
         for start in range(0, 300_000, 50_000):
             columns = {name: rng.normal(2.5, 0.3, 50_000) for name in ('x_v', 'y_v', 'z_v')}
-            file.write({'time_s': np.arange(start, start + 50_000) / 1000, **columns})
+            append({'time_s': np.arange(start, start + 50_000) / 1000, **columns})
     return path
 
 
