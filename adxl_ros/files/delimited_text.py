@@ -45,7 +45,7 @@ _DELIMITERS = {'\t': 'tabs', ';': 'semicolons', ',': 'commas', ' ': 'blanks'}
 _INFO = re.compile(r'#+\s*([A-Za-z_][\w.]*)\s*:(?:\s+(.*))?$')
 """A comment line with key and value."""
 _NO_MARKS = bytes(set(range(256)) - set(b',\n#\0'))
-"""Bytes besides the ends of fields and lines, comments, and the zero at which pandas ends a text."""
+"""Bytes besides the ends of fields and lines, comments, and zeros, at which pandas ends a text."""
 _FIELD = re.compile(r'\s*([-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?(nan|inf|infinity))?\s*',
                     re.ASCII | re.IGNORECASE)
 """A field that is a number, or empty."""
