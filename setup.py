@@ -51,11 +51,10 @@ setup(
         'console_scripts': [
             *scripts('nodes', ('driver', 'stage', 'calibration', 'screen', 'compensation',
                                'investigate', 'monitor', 'demo')),
-            f'bench = {PACKAGE}.nodes.benchmark:main',
             *scripts('tools', ('simulate', 'fit', 'apply', 'noise', 'check', 'diagnose', 'export',
                                'fleet')),
             *(f'{name} = {PACKAGE}_validation.{name}_command:main'
-              for name in ('blind', 'reproduce')),
+              for name in ('bench', 'blind', 'reproduce')),
         ],
     },
 )

@@ -21,44 +21,22 @@ launch with an error.
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.nodes.support import launch_nodes
-from adxl_ros.nodes.support.launch_nodes import (
-    Argument,
-    BRIDGE,
-    given_anywhere,
-    LINK_TYPE,
-    make_node,
-    SPEED,
-    STAGE_TYPE,
-    text,
-)
+from adxl_ros.nodes import launch_nodes
+from adxl_ros.nodes.launch_nodes import arguments, given_anywhere, LINK, make_node, STAGE, text
+from adxl_ros.nodes.settings import CalibrationSettings
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
 from launch.actions import DeclareLaunchArgument, LogInfo
 
-STAGE_MODE = Argument('stage_mode', 'stage.mode', 'who turns the stage: commanded turns itself, '
-                      'encoder and manual are turned by hand', str,
-                      ('commanded', 'encoder', 'manual'))
-SWEEP = (
-    Argument('report', 'report', 'directory for the report, a page of plots'),
-    Argument('resume', 'resume', 'what to do with an interrupted calibration', str,
-             ('ask', 'continue', 'anew')),
-    Argument('sweep_plan', 'sweep.plan', 'poses: full takes 25 minutes, quick about 38 poses',
-             str, ('auto', 'full', 'quick')),
-    Argument('sweep_planes_deg', 'sweep.planes_deg', 'planes alpha of the plan full, deg, with '
-             'commas', list),
-    Argument('sweep_step_deg', 'sweep.step_deg', 'step of beta of the plan full, deg', float),
-    Argument('sweep_dwell_s', 'sweep.dwell_s', 'time at rest in each pose, s', float),
-    Argument('sweep_check_poses', 'sweep.check_poses', 'poses kept out of the fit', int),
-    Argument('sweep_tilt_error_deg', 'sweep.tilt_error_deg', 'rms tilt error that the plan quick '
-             'is to reach, deg', float),
-)
+SWEEP = arguments(
+    CalibrationSettings, 'stage.mode', 'report', 'resume', 'sweep.plan', 'sweep.planes_deg',
+    'sweep.step_deg', 'sweep.dwell_s', 'sweep.check_poses', 'sweep.tilt_error_deg')
 RESUMES = 'its line above says why; accepted poses are kept, and the same command resumes'
 
 
 def generate_launch_description() -> LaunchDescription:
     return launch_nodes.describe([
-        *launch_nodes.common_arguments(),
+        *launch_nodes.common_arguments(*LINK, *STAGE, *SWEEP, *launch_nodes.SPEED),
         DeclareLaunchArgument('output', default_value='calibrated.yaml',
                               description='parameter file that the calibration writes'),
         DeclareLaunchArgument('mode', default_value='stage',
@@ -67,26 +45,23 @@ def generate_launch_description() -> LaunchDescription:
                                           'rest over temperature'),
         DeclareLaunchArgument('screen', default_value='false', choices=['true', 'false'],
                               description='show the calibration screen in this terminal; logs '
-                              'then go to files'),
-        *(argument.declared() for argument in (
-            STAGE_TYPE, STAGE_MODE, *BRIDGE, *SWEEP, SPEED))], make_nodes)
+                              'then go to files')], make_nodes)
 
 
 def make_nodes(context: LaunchContext) -> list[Action]:
     """Return the nodes."""
-    speed = launch_nodes.given_parameters(context, [SPEED])
+    speed = launch_nodes.given_parameters(context, launch_nodes.SPEED)
     sim_time = {'use_sim_time': True} if speed else {}
     shows_screen = text(context, 'screen') == 'true'
     # A line on the terminal would tear the screen.
     log = {'output': 'log'} if shows_screen else {}
     respawn = {'respawn': True, 'respawn_delay': 2.0, **log}
-    stage = [make_node(context, 'stage', sim_time | launch_nodes.given_parameters(
-        context, [STAGE_TYPE, *BRIDGE]), **respawn, on_exit=launch_nodes.GiveUp())] \
-        if has_stage(context) else []
+    stage = [make_node(context, 'stage', sim_time | launch_nodes.given_parameters(context, STAGE),
+                       **respawn, on_exit=launch_nodes.GiveUp())] if has_stage(context) else []
     output, report = text(context, 'output'), text(context, 'report')
     files = ' and '.join(filter(None, (output, report and f'{report}/report.html')))
     success = f'wrote {files}; next: ros2 launch adxl_ros robot.launch.py params_file:={output}'
-    sweep: dict[str, Any] = launch_nodes.given_parameters(context, [STAGE_MODE, *SWEEP])
+    sweep: dict[str, Any] = launch_nodes.given_parameters(context, SWEEP)
     return [
         show_screen(context, shows_screen),
         make_node(context, 'driver', launch_nodes.simulated_link(context, speed) | sim_time,
@@ -111,10 +86,10 @@ def has_stage(context: LaunchContext) -> bool:
     """Return whether there is a stage node; a real sensor never gets a simulated stage unasked."""
     if text(context, 'mode') in ('gravity', 'thermal'):
         return False
-    link = given_anywhere(context, LINK_TYPE, 'driver')
+    link = given_anywhere(context, 'link.type', 'driver')
     is_real = link not in ('', 'sim')
-    stage = given_anywhere(context, STAGE_TYPE, 'stage')
-    by_hand = given_anywhere(context, STAGE_MODE, 'calibration') in ('encoder', 'manual')
+    stage = given_anywhere(context, 'stage.type', 'stage')
+    by_hand = given_anywhere(context, 'stage.mode', 'calibration') in ('encoder', 'manual')
     if is_real and not stage and not by_hand:
         raise UserError(
             f'link_type is {link}, but the stage would be simulated; set stage_type:=trajectory '

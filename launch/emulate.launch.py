@@ -13,23 +13,20 @@ parameter file appears on imu/data_raw with the stamps of the simulator. A drive
 started again. The launch ends with an error when the driver refuses to start three times.
 """
 
-from adxl_ros.nodes.support import launch_nodes
-from adxl_ros.nodes.support.launch_nodes import Argument, text
+from adxl_ros.nodes import launch_nodes
+from adxl_ros.nodes.launch_nodes import arguments, text
+from adxl_ros.nodes.settings import DriverSettings
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
 from launch.actions import DeclareLaunchArgument
 
-LINK = (
-    Argument('in_topic', 'link.topic', 'topic of the ideal sensor_msgs/Imu'),
-    Argument('temperature_topic', 'link.temperature_topic', 'topic of the temperature'),
-    Argument('seed', 'link.seed', 'seed of the noise', int),
-)
+LINK = arguments(DriverSettings, in_topic='link.topic', temperature_topic='link.temperature_topic',
+                 seed='link.seed')
 
 
 def generate_launch_description() -> LaunchDescription:
     return launch_nodes.describe([
-        *launch_nodes.common_arguments(link=(), frame_id=''),
-        *(argument.declared() for argument in LINK),
+        *launch_nodes.common_arguments(*LINK, frame_id=''),
         DeclareLaunchArgument('rpy_rad', default_value='0,0,0',
                               description='roll, pitch and yaw of the case in the frame of the '
                               'ideal samples, rad'),

@@ -14,48 +14,38 @@ investigation: status 0 with a verdict, else 1. Ctrl-C leaves the stage at rest.
 """
 
 from adxl_ros.errors import UserError
-from adxl_ros.nodes.support import launch_nodes
-from adxl_ros.nodes.support.launch_nodes import (
-    Argument,
-    BRIDGE,
+from adxl_ros.nodes import launch_nodes
+from adxl_ros.nodes.launch_nodes import (
+    arguments,
     given_anywhere,
     given_parameters,
-    LINK_TYPE,
+    LINK,
     make_node,
     SPEED,
-    STAGE_TYPE,
+    STAGE,
     text,
 )
+from adxl_ros.nodes.settings import InvestigateSettings
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
 from launch.actions import DeclareLaunchArgument
 
-INVESTIGATION = (
-    Argument('output', 'output', 'folder of bag, report and parameters'),
-    Argument('limits_alpha_deg', 'limits.alpha_deg', 'lowest and highest angle alpha, deg, with '
-             'a comma', list),
-    Argument('limits_beta_deg', 'limits.beta_deg', 'lowest and highest angle beta, deg, with a '
-             'comma', list),
-    Argument('limits_rate_deg_s', 'limits.rate_deg_s', 'largest rate of each joint, deg/s', float),
-    Argument('limits_minutes', 'limits.minutes', 'largest time of all manoeuvres together, min',
-             float),
-)
+INVESTIGATION = arguments(InvestigateSettings, 'output', 'limits.alpha_deg', 'limits.beta_deg',
+                          'limits.rate_deg_s', 'limits.minutes')
 RESULT = 'the lines above have the result'
 
 
 def generate_launch_description() -> LaunchDescription:
     return launch_nodes.describe([
-        *launch_nodes.common_arguments(),
+        *launch_nodes.common_arguments(*LINK, *STAGE, *INVESTIGATION, *SPEED),
         DeclareLaunchArgument('unit_file', default_value='',
                               description='parameter file of the unit that the driver simulates; '
-                              'empty: params_file'),
-        *(argument.declared() for argument in (
-            STAGE_TYPE, *BRIDGE, *INVESTIGATION, SPEED))], make_nodes)
+                              'empty: params_file')], make_nodes)
 
 
 def make_nodes(context: LaunchContext) -> list[Action]:
     """Return the nodes."""
-    speed = given_parameters(context, [SPEED])
+    speed = given_parameters(context, SPEED)
     sim_time = {'use_sim_time': True} if speed else {}
     respawn = {'respawn': True, 'respawn_delay': 2.0}
     check_stage(context)
@@ -63,7 +53,7 @@ def make_nodes(context: LaunchContext) -> list[Action]:
         make_node(context, 'driver', launch_nodes.simulated_link(context, speed) | sim_time,
                   params_file=text(context, 'unit_file'), **respawn,
                   on_exit=launch_nodes.GiveUp()),
-        make_node(context, 'stage', sim_time | given_parameters(context, [STAGE_TYPE, *BRIDGE]),
+        make_node(context, 'stage', sim_time | given_parameters(context, STAGE),
                   **respawn, on_exit=launch_nodes.GiveUp()),
         make_node(context, 'investigate',
                   sim_time | loses_nothing(context) | given_parameters(context, INVESTIGATION),
@@ -78,8 +68,8 @@ def loses_nothing(context: LaunchContext) -> dict[str, str]:
 
 def check_stage(context: LaunchContext) -> None:
     """Refuse a simulated stage beside a real sensor, unless it is asked for."""
-    link = given_anywhere(context, LINK_TYPE, 'driver')
-    if link not in ('', 'sim') and not given_anywhere(context, STAGE_TYPE, 'stage'):
+    link = given_anywhere(context, 'link.type', 'driver')
+    if link not in ('', 'sim') and not given_anywhere(context, 'stage.type', 'stage'):
         raise UserError(
             f'link_type is {link}, but the stage would be simulated; set stage_type:=trajectory '
             'or joint_state with bridge_alpha_joint and bridge_beta_joint, or '

@@ -19,18 +19,19 @@ times, or once without `respawn`.
 """
 
 from adxl_ros.errors import UserError
-from adxl_ros.nodes.support import launch_nodes
-from adxl_ros.nodes.support.launch_nodes import Argument, LINK_TYPE, text
+from adxl_ros.nodes import launch_nodes
+from adxl_ros.nodes.launch_nodes import arguments, LINK, text
+from adxl_ros.nodes.settings import CompensationSettings
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
 from launch.actions import DeclareLaunchArgument
 
-OUTPUT_RATE = Argument('output_rate_hz', 'output_rate_hz', 'rate of imu/data and tilt, Hz', float)
+OUTPUT_RATE = arguments(CompensationSettings, 'output_rate_hz')
 
 
 def generate_launch_description() -> LaunchDescription:
     return launch_nodes.describe([
-        *launch_nodes.common_arguments(), *launch_nodes.TRANSFORM, OUTPUT_RATE.declared(),
+        *launch_nodes.common_arguments(*LINK, *OUTPUT_RATE), *launch_nodes.TRANSFORM,
         DeclareLaunchArgument('imu_topic', default_value='', description='topic of another '
                               "driver's sensor_msgs/Imu, such as /camera/imu, which is corrected "
                               'in place of that of our driver; empty: start our driver'),
@@ -43,9 +44,9 @@ def generate_launch_description() -> LaunchDescription:
 def make_nodes(context: LaunchContext) -> list[Action]:
     """Return the nodes."""
     imu_topic, respawn = text(context, 'imu_topic'), text(context, 'respawn') == 'true'
-    if imu_topic and text(context, LINK_TYPE.name):
+    if imu_topic and text(context, 'link_type'):
         raise UserError(f'imu_topic:={imu_topic} starts no driver; leave link_type out')
-    nodes = {'compensation': launch_nodes.given_parameters(context, [OUTPUT_RATE])}
+    nodes = {'compensation': launch_nodes.given_parameters(context, OUTPUT_RATE)}
     if not imu_topic:
         nodes = {'driver': {}} | nodes
     sim_time = {'use_sim_time': True} if text(context, 'use_sim_time') == 'true' else {}

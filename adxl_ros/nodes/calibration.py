@@ -9,7 +9,10 @@ from dataclasses import replace
 from functools import partial
 import math
 import os
+from pathlib import Path
 
+from adxl_ros.calibrate.guided import pose_plan
+from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, StageMode
 from adxl_ros.calibrate.guided.controller import (
     Answer,
     Controller,
@@ -18,22 +21,20 @@ from adxl_ros.calibrate.guided.controller import (
     Severity,
 )
 from adxl_ros.calibrate.guided.guide import NextPose
+from adxl_ros.calibrate.guided.session_settings import SessionSettings
+from adxl_ros.calibrate.guided.thermal_guide import ThermalSettings
 from adxl_ros.files.stream_info import StreamInfo
-from adxl_ros.nodes.support.calibration_parameters import declare_settings
-from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
-from adxl_ros.nodes.support.display_publisher import DisplayPublisher
-from adxl_ros.nodes.support.given_parameters import check_given_parameters
-from adxl_ros.nodes.support.imu_subscription import Samples
-from adxl_ros.nodes.support.joint_states import joint_readings
-from adxl_ros.nodes.support.link_parameters import given_link
-from adxl_ros.nodes.support.next_pose import Announcer
-from adxl_ros.nodes.support.node_help import NodeHelp
-from adxl_ros.nodes.support.parameters import declare
-from adxl_ros.nodes.support.polled_subscription import PolledSubscription
-from adxl_ros.nodes.support.run_node import run
-from adxl_ros.nodes.support.sensor_parameters import anonymous_sensor, declare_sensor, make_sensor
-from adxl_ros.nodes.support.topics import create_subscription
+from adxl_ros.nodes.diagnostics import DiagnosticsReporter, Level, Status
+from adxl_ros.nodes.display import Announcer, DisplayPublisher
+from adxl_ros.nodes.node_help import NodeHelp
+from adxl_ros.nodes.parameters import declare_all, low_and_high, numbers, parameter_error
+from adxl_ros.nodes.run_node import run
+from adxl_ros.nodes.samples_in import joint_readings, Samples
+from adxl_ros.nodes.sensor_parameters import anonymous_sensor, declare_sensor, make_sensor
+from adxl_ros.nodes.settings import CalibrationSettings, check_given_parameters, given_link
+from adxl_ros.nodes.topics import create_subscription, PolledSubscription
 from diagnostic_msgs.msg import DiagnosticStatus
+import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -52,6 +53,8 @@ _QUEUE = 100
 """Messages that wait while the node fits; chosen: some seconds of slow topics."""
 _STAGE_QUEUE = 1000
 """Messages of the stage that wait meanwhile; more, because its angles come faster."""
+_CHECK_POSES = {'full': 16, 'quick': 8}
+"""Check poses by kind of the pose plan; chosen: about a tenth, or a fifth, of the poses."""
 _EXAMPLES = {
     'a sweep on a stage, with a screen': '--ros-args -p output:=unit.yaml',
     'a stage that is turned by hand':
@@ -74,27 +77,20 @@ class Calibration(Node):
         flat, link = declare_sensor(self), given_link(self)
         sensor = replace(make_sensor(flat, may_measure=True), link=link)
         anonymous = replace(anonymous_sensor(self, flat), link=link)
-        autostart = declare(self, 'autostart', False, 'start without a call of ~/start')
-        resume = Resume(declare(
-            self, 'resume', 'ask', 'go on with an interrupted calibration; ask where there is a '
-            'screen, else go on', choices=tuple(choice.value for choice in Resume)))
-        settings = declare_settings(self)
+        self._own = own = declare_all(self, CalibrationSettings)
+        settings = _session_settings(own)
         self._has_stage = settings.mode == 'stage'
         self._captures: list[Future] = []
         self._announcer = Announcer(self, self._has_stage)
         self._samples = Samples(self)
-        self._controller = Controller(settings, sensor, resume, self._samples, self, anonymous)
-        if autostart:
+        self._controller = Controller(settings, sensor, Resume(own.resume), self._samples, self,
+                                      anonymous)
+        if own.autostart:
             self._controller.wait_for_sensor()
         self._connect()
-        self._exits = declare(
-            self, 'exit_when_done', False, 'end the node after a calibration: status 0 where it '
-            'wrote its file, else 1')
         self._has_run = False
         self._idle_since_ns: int | None = None
-        starts_screen = declare(self, 'screen', True,
-                                'show a screen, where the node runs in a terminal')
-        self._display = DisplayPublisher(self, self._controller, starts_screen)
+        self._display = DisplayPublisher(self, self._controller, own.screen)
 
     def log(self, severity: Severity, text: str) -> None:
         """Log a line."""
@@ -158,7 +154,7 @@ class Calibration(Node):
         # A poll may begin a calibration and end it at once.
         self._has_run |= self._controller.state is not ControllerState.IDLE
         self._controller.poll()
-        if self._exits:
+        if self._own.exit_when_done:
             self._exit_when_done()
 
     def _notice(self) -> None:
@@ -225,6 +221,37 @@ class Calibration(Node):
         return response
 
 
+def _session_settings(own: CalibrationSettings) -> SessionSettings:
+    """Return what a calibration is to do."""
+    output = Path(own.output)
+    journal = Path(own.journal or f'{output}.journal')
+    if own.mode == 'thermal' and own.report:
+        raise parameter_error('report', 'mode thermal writes no page; leave it empty')
+    for name, path in (('output', output), ('journal', journal)):
+        if path.is_dir():
+            raise parameter_error(name, f'{path} is a directory; name a file')
+    planes_rad = tuple(np.radians(numbers('sweep.planes_deg', own.planes_deg or [],
+                                          '[30.0, 60.0, 90.0]')).tolist())
+    step_rad = float(np.radians(own.step_deg))
+    capture = CaptureSettings(own.dwell_s, own.tolerance_rad, own.timeout_s,
+                              StageMode(own.stage_mode), float(np.radians(own.near_deg)),
+                              own.temperature_span_c)
+    kind = own.plan
+    if kind == 'auto':
+        by_hand = capture.stage_mode is not StageMode.COMMANDED
+        is_default = not planes_rad and step_rad == pose_plan.STEP_RAD
+        kind = 'quick' if by_hand and is_default else 'full'
+    # A bad plan is refused before there is a sensor.
+    pose_plan.guided(planes_rad or pose_plan.default_planes_rad('xy'), step_rad, 0)
+    return SessionSettings(
+        mode=own.mode, plan_kind=kind, planes_rad=planes_rad, step_rad=step_rad,
+        tilt_error_rad=float(np.radians(own.tilt_error_deg)),
+        check_poses=_CHECK_POSES[kind] if own.check_poses < 0 else own.check_poses,
+        capture=capture, output=output, journal=journal, report=own.report, store=own.store,
+        thermal=ThermalSettings(
+            low_and_high('thermal.range_c', own.range_c, ThermalSettings.range_c), own.block_s))
+
+
 def _angles(position_rad: dict[str, float]) -> tuple[float, float]:
     """Return the angles alpha and beta, rad; NaN for a joint that is not named."""
     return position_rad.get('alpha', math.nan), position_rad.get('beta', math.nan)
@@ -239,4 +266,4 @@ def main() -> int:
     # Through shared memory, Fast DDS does not reach a process again that was killed and started
     # again (eProsima/Fast-DDS issues 2811, 5053 and 5469): a sweep could not be resumed.
     os.environ.setdefault('FASTDDS_BUILTIN_TRANSPORTS', 'UDPv4')
-    return run(Calibration, NodeHelp(__doc__, _EXAMPLES))
+    return run(Calibration, NodeHelp(__doc__, _EXAMPLES, (CalibrationSettings,)))

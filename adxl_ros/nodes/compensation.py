@@ -9,6 +9,7 @@ The topic tilt has three angles in a Vector3Stamped, so tf2 must not transform i
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from math import isfinite
 from typing import Any
 
@@ -16,28 +17,155 @@ from adxl_ros.compensate import filter_inversion
 from adxl_ros.compensate.compensation_policy import CompensationPolicy, Interval, State, Topics
 from adxl_ros.compensate.live_stream import COUNTS, LiveStream
 from adxl_ros.errors import UserError
-from adxl_ros.files import calibration_store, imu_message
+from adxl_ros.files import imu_message
 from adxl_ros.files.stream_info import StreamInfo
+from adxl_ros.model import noise
+from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.mounting import Mounting
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
-from adxl_ros.nodes.support.exchangeable_sensor import ExchangeableSensor
-from adxl_ros.nodes.support.given_parameters import check_given_parameters
-from adxl_ros.nodes.support.imu_subscription import finite_samples
-from adxl_ros.nodes.support.mounting_parameters import MountingParameters
-from adxl_ros.nodes.support.node_help import NodeHelp
-from adxl_ros.nodes.support.parameters import declare
-from adxl_ros.nodes.support.receive_thread import ReceiveTurn, RepeatingThread
-from adxl_ros.nodes.support.run_node import run
-from adxl_ros.nodes.support.sample_ages import SampleAges
-from adxl_ros.nodes.support.sensor_parameters import is_from_file
-from adxl_ros.nodes.support.topics import create_publisher, create_subscription
+from adxl_ros.nodes.diagnostics import DiagnosticsReporter, Level, Status
+from adxl_ros.nodes.node_help import NodeHelp
+from adxl_ros.nodes.parameters import declare_all, parameter_error
+from adxl_ros.nodes.run_node import run
+from adxl_ros.nodes.sample_output import SampleAges
+from adxl_ros.nodes.samples_in import finite_samples
+from adxl_ros.nodes.sensor_parameters import ExchangeableSensor, is_from_file
+from adxl_ros.nodes.settings import check_given_parameters, CompensationSettings
+from adxl_ros.nodes.topics import (
+    create_publisher,
+    create_subscription,
+    ReceiveTurn,
+    RepeatingThread,
+)
 from adxl_ros.signals.measured_values import unit_of_stream
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
+import numpy as np
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.task import Future
 from sensor_msgs.msg import BatteryState, Imu, Temperature
+from std_srvs.srv import Trigger
+
+_RPY = 'mounting.rpy_rad'
+"""Parameter of the rotation."""
+_LEVEL_S = 1.0
+"""Time over which a rest is averaged, s; chosen: the noise of a sample then is negligible."""
+_FEWEST_SAMPLES = 10
+"""Smallest number of samples of that rest; chosen: they show whether the sensor moves."""
+_MAX_NOISE = 3.0
+"""Largest scatter of a rest, in standard deviations of a sample's noise; chosen."""
+_MAX_GRAVITY_ERROR = 0.1
+"""Largest relative departure of a rest from gravity; chosen: beyond an uncalibrated sensor."""
+
+
+class MountingParameters:
+    """The parameters `mounting.*` and the service `~/level` of a node."""
+
+    def __init__(self, node: Node, stream: LiveStream, settings: CompensationSettings) -> None:
+        self._node, self._stream = node, stream
+        self._frame_id = settings.mounting_frame_id
+        self._mounting = _mounting(settings.rpy_rad)
+        self._waiting: Future | None = None
+        stream.mount(self._mounting, self._frame_id)
+        node.add_on_set_parameters_callback(_check)
+        node.add_post_set_parameters_callback(self._apply)
+        # The answer comes after a second of samples, which the node takes meanwhile.
+        node.create_service(Trigger, '~/level', self._on_level,
+                            callback_group=ReentrantCallbackGroup())
+
+    def _apply(self, parameters: Sequence[Parameter]) -> None:
+        for parameter in parameters:
+            if parameter.name == _RPY:
+                self._mounting = _mounting(parameter.value)
+                self._stream.mount(self._mounting, self._frame_id)
+
+    async def _on_level(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._waiting is not None:
+            response.message = 'a rest is being averaged; wait for its answer'
+            return response
+        self._waiting = Future()
+        self._stream.collect()
+        timer = self._node.create_timer(_LEVEL_S, self._waiting_ends,
+                                        clock=Clock(clock_type=ClockType.STEADY_TIME))
+        await self._waiting
+        self._node.destroy_timer(timer)
+        forces_mps2, self._waiting = self._stream.collected(), None
+        self._stream.stop_collecting()
+        try:
+            levelled = level(self._mounting, forces_mps2, self._stream.sensor)
+        except UserError as error:
+            response.message = f'{error}'
+            return response
+        rpy_rad = [round(angle, 6) for angle in levelled.rpy_rad]
+        self._node.set_parameters([Parameter(_RPY, value=rpy_rad)])
+        degrees = ', '.join(f'{np.degrees(angle):.2f}' for angle in rpy_rad)
+        response.success = True
+        yaml = f'[{", ".join(f"{angle:.6f}" for angle in rpy_rad)}]'
+        response.message = (
+            f'level: roll, pitch, yaw of the case are {degrees} deg, until this node ends; to '
+            f"keep them, start it with -p '{_RPY}:={yaml}', or write '/**: {{ros__parameters: "
+            f"{{{_RPY}: {yaml}}}}}' into a file and start it with --params-file")
+        self._node.get_logger().info(response.message)
+        return response
+
+    def _waiting_ends(self) -> None:
+        if self._waiting is not None and not self._waiting.done():
+            self._waiting.set_result(True)
+
+
+def level(mounting: Mounting, forces_mps2: np.ndarray, sensor: Sensor) -> Mounting:
+    """
+    Return the mounting that makes the force of a rest vertical.
+
+    forces_mps2: corrected samples in the frame of the case, m/s², (n, 3).
+    """
+    if len(forces_mps2) < _FEWEST_SAMPLES:
+        raise UserError(f'{len(forces_mps2)} samples in {_LEVEL_S:g} s; at least '
+                        f'{_FEWEST_SAMPLES} are needed')
+    mean_mps2 = forces_mps2.mean(axis=0)
+    scatter_mps2 = forces_mps2.std(axis=0)[:len(sensor.axes)]
+    noise_mps2 = noise.sample_std_v(sensor) / sensor.scale_v_per_g * G0_MPS2
+    worst = int(np.argmax(scatter_mps2 / noise_mps2))
+    if scatter_mps2[worst] > _MAX_NOISE * noise_mps2[worst]:
+        raise UserError(f'the sensor moves: {sensor.axes[worst]} scatters by '
+                        f'{scatter_mps2[worst]:.2g} m/s², and its noise is '
+                        f'{noise_mps2[worst]:.2g} m/s²; let the robot rest on level ground')
+    magnitude_mps2 = float(np.linalg.norm(mean_mps2))
+    if abs(magnitude_mps2 / sensor.local_gravity_mps2 - 1) > _MAX_GRAVITY_ERROR:
+        raise UserError(f'the sensor reads {magnitude_mps2:.2f} m/s², and gravity is '
+                        f'{sensor.local_gravity_mps2:.2f} m/s²; calibrate it first')
+    return mounting.levelled(mean_mps2.tolist())
+
+
+def _mounting(rpy_rad: Sequence[float]) -> Mounting:
+    if _fault(rpy_rad):
+        raise parameter_error(_RPY, _fault(rpy_rad))
+    roll, pitch, yaw = rpy_rad
+    return Mounting((float(roll), float(pitch), float(yaw)))
+
+
+def _fault(rpy_rad: Sequence[float]) -> str:
+    """Return why a rotation is not three angles in rad; empty where it is."""
+    if len(rpy_rad) != 3 or not np.isfinite(rpy_rad).all():
+        return f'{list(rpy_rad)} is not roll, pitch and yaw in rad'
+    if np.abs(rpy_rad).max() > 2 * np.pi:
+        in_rad = ', '.join(f'{angle:.6g}' for angle in np.radians(rpy_rad))
+        return f'{list(rpy_rad)} is more than a turn in rad; if it is in degrees, write [{in_rad}]'
+    return ''
+
+
+def _check(parameters: Sequence[Parameter]) -> SetParametersResult:
+    """Refuse a rotation that is not three angles in rad."""
+    for parameter in parameters:
+        fault = _fault(parameter.value) if parameter.name == _RPY else ''
+        if fault:
+            return SetParametersResult(successful=False, reason=f'{_RPY}: {fault}')
+    return SetParametersResult(successful=True)
+
 
 _DEPTH = 100
 """Samples that are kept while the node is busy: 0.1 s at 1 kHz."""
@@ -65,19 +193,8 @@ class Compensation(Node):
     def __init__(self) -> None:
         super().__init__('compensation')
         check_given_parameters(self)
-        paper = declare(
-            self, 'inverse', 'exact', "inverse of the model: exact, or the paper's approximation",
-            choices=('exact', 'paper')) == 'paper'
-        self._undo_filter = declare(
-            self, 'undo_filter', False, 'take the RC filter out, amplitude and phase; a sample '
-            f'is published {filter_inversion.HALF} samples late, with its own stamp')
-        keeps_orientation = declare(
-            self, 'orientation', 'keep', 'keep: a sample that states an orientation keeps it; '
-            'tilt: imu/data has that of the tilt', choices=('keep', 'tilt')) == 'keep'
-        store = declare(
-            self, 'store', str(calibration_store.default_folder()),
-            'folder of calibrations, of which the newest of the unit is taken where none is '
-            'named; empty: none')
+        self._settings = settings = declare_all(self, CompensationSettings)
+        paper = settings.inverse == 'paper'
         self._heard_ns: dict[str, int] = {}
         self._named: tuple[Sensor, str]
         self._obstacle = ''
@@ -88,26 +205,21 @@ class Compensation(Node):
         self._ages = SampleAges()
         self._data = create_publisher(self, Imu, 'imu/data', _DEPTH)
         tilt = create_publisher(self, Vector3Stamped, 'tilt', _DEPTH)
-        output_rate_hz = declare(
-            self, 'output_rate_hz', 0.0, 'rate of imu/data and tilt: one sample of so many is '
-            'published as it is, so that vibration above half of this rate folds into it; 0: '
-            'every sample', 'Hz', 0.0, 1e5)
-        publishes_free = declare(
-            self, 'free_acceleration', False, 'publish imu/linear_acceleration_free: the '
-            'acceleration without gravity of samples that state an orientation')
         free = create_publisher(self, Vector3Stamped, 'imu/linear_acceleration_free', _DEPTH) \
-            if publishes_free else None
-        self._stream = LiveStream(paper, self._undo_filter, self._publish, tilt.publish,
-                                  keeps_orientation, free.publish if free else None,
-                                  output_rate_hz)
-        self._policy = CompensationPolicy(paper, store, Topics(
+            if settings.free_acceleration else None
+        self._stream = LiveStream(
+            paper, settings.undo_filter, self._publish, tilt.publish,
+            settings.orientation == 'keep', free.publish if free else None,
+            settings.output_rate_hz)
+        self._policy = CompensationPolicy(paper, settings.store, Topics(
             data_raw=self.resolve_topic_name('imu/data_raw'),
             sensor_info=self.resolve_topic_name('sensor_info'),
             temperature=self.resolve_topic_name('temperature'),
             supply=self.resolve_topic_name('supply')))
         self._samples = ReceiveTurn(self, Imu, 'imu/data_raw', self._stream, _DEPTH)
-        self._sensor = ExchangeableSensor(self, self._policy.check, self._use)
-        MountingParameters(self, self._stream)
+        self._sensor = ExchangeableSensor(
+            self, settings.calibration, self._policy.check, self._use)
+        MountingParameters(self, self._stream, settings)
         self.create_timer(_LOOK_S, self._look, clock=self._steady)
         create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
         create_subscription(self, Temperature, 'temperature', self._on_temperature, 1)
@@ -214,12 +326,13 @@ class Compensation(Node):
         newer = self._policy.newer()
         state, text = self._policy.status(interval, newer, self._calibration())
         counts, duration_s = interval.counts, interval.duration_s
-        delay_s = filter_inversion.HALF / self._policy.rate_hz if self._undo_filter else 0.0
+        late = filter_inversion.HALF if self._settings.undo_filter else 0
         values: dict[str, Any] = {
             'rate_in_hz': round(counts['received'] / duration_s, 1),
             'rate_out_hz': round(counts['published'] / duration_s, 1),
             **{name: self._reported[name] for name in COUNTS},
-            'delay_s': delay_s, **self._ages.report(), **self._policy.values(interval, newer)}
+            'delay_s': late / self._policy.rate_hz, **self._ages.report(),
+            **self._policy.values(interval, newer)}
         return Status(_LEVELS.get(state, Level.WARN), text, self._policy.sensor.serial, values)
 
     def _interval(self) -> Interval:
@@ -239,4 +352,4 @@ class Compensation(Node):
 
 def main() -> int:
     """Run the node."""
-    return run(Compensation, NodeHelp(__doc__, _EXAMPLES))
+    return run(Compensation, NodeHelp(__doc__, _EXAMPLES, (CompensationSettings,)))

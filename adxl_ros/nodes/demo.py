@@ -4,11 +4,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 import math
 import os
 from pathlib import Path
+import subprocess
 import sys
+import time
 
 from adxl_ros.calibrate.fits import gravity_fit, linear
 from adxl_ros.calibrate.guided import pose_plan
@@ -26,11 +30,118 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording, sweep_journal
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.nodes.support.demo_graph import DemoGraph, FIT_S, open_graph
-from adxl_ros.nodes.support.node_help import program_parser
-from adxl_ros.nodes.support.processes import use_own_graph
-from adxl_ros.nodes.terminal import steps
+from adxl_ros.nodes import steps
+from adxl_ros.nodes.node_help import program_parser
+from adxl_ros.nodes.run_node import executable, stop, use_own_graph
+from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+FIT_S = 600.0
+"""Longest time of a fit, s; chosen: far above the seconds that a fit takes."""
+_POLL_S = 0.2
+"""Time between two looks at the progress, s."""
+_SILENT_S = 60.0
+"""Longest time without progress while poses are taken, s; chosen: a pose takes 1 s."""
+
+
+class Watcher(Node):
+    """Reads the diagnostics of the nodes that the demonstration runs, and calls ~/finish."""
+
+    def __init__(self) -> None:
+        super().__init__('demo')
+        # Newest message and values, by the name of the diagnostic status
+        self.reports: dict[str, dict[str, str]] = {}
+        self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
+        self._finish = self.create_client(Trigger, 'calibration/finish')
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = {pair.key: pair.value for pair in status.values}
+            self.reports[status.name] = {'message': status.message, **values}
+
+    def report_of(self, node: str) -> dict[str, str]:
+        """Return the newest diagnostics of a node."""
+        return next((values for name, values in self.reports.items() if name.startswith(node)), {})
+
+    def watch(self, seconds: float) -> None:
+        """Listen for some time, s."""
+        self._executor.spin_once(timeout_sec=seconds)
+
+    def finish(self) -> str:
+        """Let the calibration fit what it has; return its answer."""
+        future = self._finish.call_async(Trigger.Request())
+        self._executor.spin_until_future_complete(future, timeout_sec=FIT_S)
+        answer = future.result() if future.done() else None
+        if answer is None:
+            raise UserError(f'calibration/finish: no answer for {FIT_S:g} s')
+        return answer.message
+
+
+class DemoGraph:
+    """The nodes that the demonstration runs, each in a process of its own."""
+
+    def __init__(self, log: Path) -> None:
+        self._log = log
+        self._processes: dict[str, subprocess.Popen] = {}
+        self.watcher = Watcher()  # Receives what they report
+
+    def start(self, name: str, params_file: Path, *arguments: str) -> None:
+        """Start a node."""
+        command = [executable(name), '--ros-args', '--log-level', 'warn', '--params-file',
+                   str(params_file), *arguments]
+        with self._log.open('ab') as log:
+            self._processes[name] = subprocess.Popen(command, stdout=log, stderr=log)
+
+    def close(self) -> None:
+        """End the nodes."""
+        stop(list(self._processes.values()))
+        self._processes.clear()
+
+    def wait(self, finished: Callable[[], bool], progress: Callable[[], object],
+             silent_s: float = _SILENT_S) -> None:
+        """Wait until a condition holds."""
+        newest: object = None
+        changed_s = time.monotonic()
+        while not finished():
+            self.watcher.watch(_POLL_S)
+            message = self._check_nodes()
+            news = (progress(), message)
+            if news != newest:
+                newest, changed_s = news, time.monotonic()
+            if time.monotonic() - changed_s > silent_s:
+                raise UserError(f'no progress for {silent_s:g} s; the calibration reported: '
+                                f'{message or "nothing"}; see {self._log}')
+
+    def _check_nodes(self) -> str:
+        """Return what the calibration reports; refuse a node that has ended or a failed fit."""
+        message = self.watcher.report_of('calibration').get('message', '')
+        ended = [name for name, process in self._processes.items() if process.poll() is not None]
+        if ended:
+            raise UserError(f'the node {ended[0]} has ended; see {self._log}')
+        if message.startswith('cannot finish'):
+            raise UserError(f'{message}; see {self._log}')
+        return message
+
+
+@contextmanager
+def open_graph(log: Path) -> Iterator[DemoGraph]:
+    """Yield a graph without nodes, and end the nodes that were started in it."""
+    log.unlink(missing_ok=True)
+    rclpy.init(args=[])
+    graph = DemoGraph(log)
+    try:
+        yield graph
+    finally:
+        graph.watcher.destroy_node()
+        rclpy.try_shutdown()
+        graph.close()
+
 
 _SPEED = 40.0
 """Default sensor time per real time of the simulated sweep; chosen: two cores can follow."""
@@ -40,12 +151,15 @@ _SWEEP_S = 1060.0
 """Sensor time of the sweep, s; measured."""
 _OVERHEAD_S = 15.0
 """Real time of start, fit and report, s; measured."""
-_PLANES_RAD = tuple(np.radians([30.0, 60.0, 90.0, 120.0, 150.0]).tolist())
-"""Planes alpha of the sweep, rad."""
-_STEP_RAD = float(np.radians(30))
-"""Step of beta in each plane, rad."""
+_PLANES_DEG = [30.0, 60.0, 90.0, 120.0, 150.0]
+"""Planes alpha of the sweep, degrees."""
+_STEP_DEG = 30.0
+"""Step of beta in each plane, degrees."""
 _CHECK_POSES = 16
 """Number of poses that are kept out of the fit."""
+_PLAN = ('-p', f'sweep.planes_deg:={_PLANES_DEG}', '-p', f'sweep.step_deg:={_STEP_DEG}',
+         '-p', f'sweep.check_poses:={_CHECK_POSES}')
+"""Arguments of the calibration for these poses."""
 _SEED = 203
 """Default seed of the demonstrated unit and its stage; chosen."""
 _UNIT_EFFECTS = {'bias': 0.5, 'scale_factor': 0.5, 'misalignment': 0.7, 'cross_axis': 0.7,
@@ -135,7 +249,7 @@ def _run_sweep(folder: Path, speed: float, seed: int) -> None:
                     *_SIM_TIME, *_KEEPING)
         graph.start('stage', nominal, *_SIM_TIME, *_DELAY, '-p', f'seed:={seed}')
         graph.start('calibration', nominal, *_SIM_TIME, *_LOSSLESS, *_UNATTENDED,
-                    *_plan_arguments(), *_output_arguments(output, report))
+                    *_PLAN, *_output_arguments(output, report))
         poses = _show_sweep(graph, output)
     fitted = parameter_file.load(output)
     _print('', *error_table(_held_out_errors(sensor, fitted, poses)), '',
@@ -170,7 +284,8 @@ def _held_out_errors(nominal: Sensor, fitted: Sensor, poses: Poses
 def _show_sweep(graph: DemoGraph, output: Path) -> Poses:
     """Show the sweep, the fit and the check while they run; return the poses."""
     journal = _journal(output)
-    total = len(pose_plan.guided(_PLANES_RAD, _STEP_RAD, _CHECK_POSES))
+    total = len(pose_plan.guided(np.radians(_PLANES_DEG).tolist(), float(np.radians(_STEP_DEG)),
+                                  _CHECK_POSES))
     with steps.step('1/3 sweep', 'starting', total) as step:
         def show_poses() -> int:
             count = len(_accepted_poses(journal))
@@ -255,13 +370,6 @@ def _print(*lines: str) -> None:
         if word in _COLOURS and steps.drawable() and 'NO_COLOR' not in os.environ:
             line = line.replace(word, f'{_COLOURS[word]}{word}{_NO_COLOUR}', 1)
         print(line, flush=True)
-
-
-def _plan_arguments() -> tuple[str, ...]:
-    """Return the arguments of the node for the pose plan."""
-    planes = ', '.join(str(alpha) for alpha in _PLANES_RAD)
-    return ('-p', f'sweep.planes_rad:=[{planes}]', '-p', f'sweep.step_rad:={_STEP_RAD}',
-            '-p', f'sweep.check_poses:={_CHECK_POSES}')
 
 
 def _output_arguments(output: Path, report: Path) -> tuple[str, ...]:

@@ -9,16 +9,13 @@ import traceback
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.links.support import base
-from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
-from adxl_ros.nodes.support.given_parameters import check_given_parameters
-from adxl_ros.nodes.support.link_parameters import declare_link
-from adxl_ros.nodes.support.link_reader import LinkReader
-from adxl_ros.nodes.support.node_help import NodeHelp
-from adxl_ros.nodes.support.parameters import declare
-from adxl_ros.nodes.support.run_node import run
-from adxl_ros.nodes.support.sample_output import SampleOutput
-from adxl_ros.nodes.support.sample_tally import Tally
-from adxl_ros.nodes.support.sensor_parameters import declare_sensor, make_sensor
+from adxl_ros.nodes.diagnostics import DiagnosticsReporter, Level, Status
+from adxl_ros.nodes.link_reader import LinkReader
+from adxl_ros.nodes.node_help import NodeHelp
+from adxl_ros.nodes.run_node import run
+from adxl_ros.nodes.sample_output import SampleOutput, Tally
+from adxl_ros.nodes.sensor_parameters import declare_sensor, make_sensor
+from adxl_ros.nodes.settings import check_given_parameters, declare_driver, DriverSettings
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
@@ -48,19 +45,11 @@ class Driver(LifecycleNode):
         super().__init__('driver')
         check_given_parameters(self)
         self._sensor = make_sensor(declare_sensor(self))
-        self._delay_ns = round(1e9 * declare(
-            self, 'stamp_offset', 0.0, 'delay of the sensor, such as that of its RC filter, that '
-            'is taken out of the stamps: they are earlier by this', 's', -10.0, 10.0))
-        self._link = declare_link(self, self._sensor.serial)
+        own, self._link = declare_driver(self, self._sensor.serial)
+        self._delay_ns = round(1e9 * own.stamp_offset_s)
         settings = self._link.settings
         has_frame = isinstance(settings, base.SimulatorSettings) and not settings.turns_case
-        frame_id = '' if has_frame else _FRAME
-        self._frame_id = declare(
-            self, 'frame_id', frame_id, "frame of the case; '': that of the simulator's samples"
-            ) or frame_id
-        autostart = declare(
-            self, 'autostart', True, 'configure and activate at the start; else a system manager '
-            'does')
+        self._frame_id = own.frame_id or ('' if has_frame else _FRAME)
         paced = isinstance(settings, base.PacedSettings)
         # All nodes must share a sensor time that is not real time: this node then publishes it,
         # unless another node does.
@@ -73,11 +62,11 @@ class Driver(LifecycleNode):
         self._tally = Tally(self._steady.now().nanoseconds)
         self._fault = ''
         self._refusal: UserError | None = None
-        self._announces = not autostart
+        self._announces = not own.autostart
         self._output: SampleOutput | None = None
         self._reader: LinkReader | None = None
         self._diagnostics = DiagnosticsReporter(self, {'link': self._status})
-        if not autostart:
+        if not own.autostart:
             self._announce('unconfigured')
         elif self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
             self.trigger_activate()
@@ -228,4 +217,4 @@ class Driver(LifecycleNode):
 
 def main() -> int:
     """Run the node."""
-    return run(Driver, NodeHelp(__doc__, _EXAMPLES))
+    return run(Driver, NodeHelp(__doc__, _EXAMPLES, (DriverSettings,)))

@@ -5,29 +5,114 @@
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
 import signal
 
+from adxl_ros.files.live_bag import LiveBag
 from adxl_ros.investigate.background import BackgroundDiagnoser
 from adxl_ros.investigate.investigation import Investigation, State
-from adxl_ros.investigate.manoeuvres import Pose
+from adxl_ros.investigate.manoeuvres import Pose, StageLimits
 from adxl_ros.investigate.output_folder import OutputFolder
 from adxl_ros.links.support.watchdog import Watchdog
-from adxl_ros.nodes.support.bag_recorder import BagRecorder
-from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
-from adxl_ros.nodes.support.given_parameters import check_given_parameters
-from adxl_ros.nodes.support.investigate_parameters import declare_settings
-from adxl_ros.nodes.support.node_help import NodeHelp
-from adxl_ros.nodes.support.run_node import run
-from adxl_ros.nodes.support.sensor_parameters import declare_sensor, make_sensor
-from adxl_ros.nodes.support.topics import create_publisher, create_subscription
-from adxl_ros.nodes.terminal.investigation_lines import closing_lines, InvestigationScreen
+from adxl_ros.nodes.diagnostics import DiagnosticsReporter, Level, Status
+from adxl_ros.nodes.investigation_lines import closing_lines, InvestigationScreen
+from adxl_ros.nodes.node_help import NodeHelp
+from adxl_ros.nodes.parameters import declare_all, low_and_high
+from adxl_ros.nodes.run_node import run
+from adxl_ros.nodes.sensor_parameters import declare_sensor, make_sensor
+from adxl_ros.nodes.settings import check_given_parameters, InvestigateSettings
+from adxl_ros.nodes.topics import (
+    create_publisher,
+    create_subscription,
+    ReceiveTurn,
+    RepeatingThread,
+)
+from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import Executor
 from rclpy.node import Node
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
+
+_SAMPLES = 'imu/data_raw'
+"""Topic of the samples."""
+_SAMPLES_QUEUE = 20000
+"""Samples that are kept while the thread is busy: 20 s at 1 kHz."""
+_SLOW_QUEUE = 1000
+"""Messages of a slow topic that wait meanwhile; chosen: 10 s of a stage."""
+_KINDS = {'stage/joint_states': (JointState, 'sensor_msgs/msg/JointState'),
+          'stage/command': (JointState, 'sensor_msgs/msg/JointState'),
+          'temperature': (Temperature, 'sensor_msgs/msg/Temperature'),
+          'supply': (BatteryState, 'sensor_msgs/msg/BatteryState'),
+          'sensor_info': (DiagnosticStatus, 'diagnostic_msgs/msg/DiagnosticStatus')}
+"""Class and name of the type of each topic beside the samples."""
+
+
+class BagRecorder:
+    """Writes the topics of the package into a bag. A thread of its own takes the samples."""
+
+    def __init__(self, node: Node, watchdog: Watchdog) -> None:
+        """Subscribe; nothing is kept before `start`."""
+        self._node = node
+        self.has_samples = False  # Whether a sample has come
+        self._bag: LiveBag | None = None
+        self._thread: RepeatingThread | None = None
+        self._system = Clock(clock_type=ClockType.SYSTEM_TIME)
+        self._watchdog = watchdog
+        # Its message comes once, perhaps before the bag is open.
+        self._early: list[tuple[str, str, bytes]] = []
+        for topic, (kind, name) in _KINDS.items():
+            create_subscription(node, kind, topic, partial(self._write, topic, name), _SLOW_QUEUE,
+                                latched=topic == 'sensor_info', raw=True)
+        self._samples = ReceiveTurn(node, Imu, _SAMPLES, self._write_sample, _SAMPLES_QUEUE)
+
+    @property
+    def is_writing(self) -> bool:
+        """Return whether there is a bag."""
+        return self._bag is not None
+
+    def listen(self) -> None:
+        """Take samples, so that `has_samples` shows them."""
+        self._thread = RepeatingThread(self._node, self._samples, _SAMPLES)
+
+    def start(self, path: Path) -> None:
+        """Begin to write."""
+        self._bag = LiveBag(path)
+        for topic, kind, data in self._early:
+            self._write(topic, kind, data)
+
+    def fault(self) -> str:
+        """Return that several nodes publish samples, so that none is written, or ''."""
+        return self._samples.fault()
+
+    def flush(self) -> None:
+        """Write the messages so far to the file."""
+        if self._bag is not None:
+            self._bag.flush()
+
+    def close(self) -> None:
+        """End the thread, and write the end of the bag."""
+        if self._thread is not None:
+            self._thread.close()
+            self._thread = None
+        if self._bag is not None:
+            self._bag.close()
+
+    def _write_sample(self, data: bytes) -> None:
+        self.has_samples = True
+        self._watchdog.feed()
+        self._write(_SAMPLES, 'sensor_msgs/msg/Imu', data)
+
+    def _write(self, topic: str, kind: str, data: bytes) -> None:
+        if self._bag is None:
+            if topic == 'sensor_info':
+                self._early = [(topic, kind, data)]
+            return
+        self._bag.write(self._node.resolve_topic_name(topic), kind, data,
+                        self._system.now().nanoseconds)
+
 
 _POLL_S = 0.02
 """Time between two commands, s; chosen: a tenth of the largest step."""
@@ -61,7 +146,11 @@ class Investigate(Node):
         super().__init__('investigate')
         check_given_parameters(self)
         self._sensor = make_sensor(declare_sensor(self))
-        self._settings = declare_settings(self)
+        self._settings = own = declare_all(self, InvestigateSettings)
+        alpha_deg = low_and_high('limits.alpha_deg', own.alpha_deg, (0.0, 180.0))
+        beta_deg = low_and_high('limits.beta_deg', own.beta_deg, (0.0, 360.0))
+        self._limits = StageLimits(_radians(alpha_deg), _radians(beta_deg),
+                                   float(np.radians(own.rate_deg_s)))
         self._commands = create_publisher(self, JointState, 'stage/command', _COMMAND_QUEUE)
         self.create_service(Trigger, '~/abort', self._on_abort)
         create_subscription(self, JointState, 'stage/joint_states', self._on_stage, _STAGE_QUEUE)
@@ -83,11 +172,11 @@ class Investigate(Node):
     def begin(self) -> None:
         """Wait for sensor and stage; the files are made when both are there."""
         settings = self._settings
-        self._folder = OutputFolder.free(settings.output)
-        self._screen = InvestigationScreen(self._folder.path, settings)
+        self._folder = OutputFolder.free(Path(settings.output))
+        self._screen = InvestigationScreen(self._folder.path, self._limits, settings.minutes)
         self._investigation = Investigation(
-            settings.limits, settings.minutes,
-            BackgroundDiagnoser(self._folder, settings.limits, settings.seed),
+            self._limits, settings.minutes,
+            BackgroundDiagnoser(self._folder, self._limits, settings.seed),
             self._screen.show_answer, self._recorder.flush)
         self._recorder.listen()
         self.create_timer(_POLL_S, self._poll, clock=self._steady)
@@ -176,6 +265,11 @@ class Investigate(Node):
         return Status(level, status.text, self._sensor.serial, values)
 
 
+def _radians(range_deg: tuple[float, float]) -> tuple[float, float]:
+    low_rad, high_rad = np.radians(range_deg).tolist()
+    return low_rad, high_rad
+
+
 def _work(node: Investigate, executor: Executor) -> None:
     """Run the node; a signal stops the stage before the node ends."""
     # A handler of rclpy would end the graph before the stage has its last command.
@@ -191,4 +285,4 @@ def _stop_by_signal(node: Investigate, name: str, *_: object) -> None:
 
 def main() -> int:
     """Run the node."""
-    return run(Investigate, NodeHelp(__doc__, _EXAMPLES), _work)
+    return run(Investigate, NodeHelp(__doc__, _EXAMPLES, (InvestigateSettings,)), _work)

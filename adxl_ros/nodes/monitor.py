@@ -4,35 +4,190 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime, UTC
 from pathlib import Path
 import time
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import calibration_store
+from adxl_ros.files import cdr
 from adxl_ros.files.stream_info import NO_UNIT, StreamInfo
 from adxl_ros.files.stream_unit import check_unit, unit_of
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.monitor import change_record
+from adxl_ros.monitor.change_record import iso_time
 from adxl_ros.monitor.diagnosis_run import DiagnosisResult, DiagnosisRun
-from adxl_ros.monitor.live_gap import GapSettings, LiveGap
+from adxl_ros.monitor.live_gap import AxisGap, GapChange, GapSettings, LiveGap
 from adxl_ros.monitor.reference_stream import ReferenceKind
-from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
-from adxl_ros.nodes.support.gap_messages import axis_values, GapState
-from adxl_ros.nodes.support.given_parameters import check_given_parameters
-from adxl_ros.nodes.support.monitor_streams import MonitorStreams
-from adxl_ros.nodes.support.node_help import NodeHelp
-from adxl_ros.nodes.support.parameters import declare
-from adxl_ros.nodes.support.processes import executable
-from adxl_ros.nodes.support.rclpy_internals import NotForExecutors, take_request
-from adxl_ros.nodes.support.run_node import run
-from adxl_ros.nodes.support.sensor_parameters import declare_sensor, make_sensor
-from adxl_ros.nodes.support.topics import create_publisher, create_subscription
+from adxl_ros.nodes.diagnostics import DiagnosticsReporter, Level, Status, status_message
+from adxl_ros.nodes.node_help import NodeHelp
+from adxl_ros.nodes.parameters import declare_all
+from adxl_ros.nodes.rclpy_internals import NotForExecutors, take_request
+from adxl_ros.nodes.run_node import executable, run
+from adxl_ros.nodes.samples_in import joint_readings
+from adxl_ros.nodes.sensor_parameters import declare_sensor, make_sensor
+from adxl_ros.nodes.settings import check_given_parameters, MonitorSettings
+from adxl_ros.nodes.topics import create_publisher, create_subscription, PolledSubscription, stamp
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
 from std_srvs.srv import Trigger
+
+_TOGETHER_NS = 120_000_000_000
+"""Time within which changes are one event, ns; chosen: slow axes are found later."""
+
+
+@dataclass(frozen=True)
+class GapState:
+    """What the monitor knows at one moment."""
+
+    serial: str  # Serial number of the sensor
+    stamp_ns: int  # Stamp of the newest sample, ns; 0 before the first
+    obstacle: str  # Why nothing is compared; empty where it is
+    axes: Sequence[AxisGap]  # The gap by axis; empty before the first seconds
+    changes: Sequence[GapChange]  # Changes so far
+    likely: DiagnosisResult | None  # The newest diagnosis; None before it
+    window_s: float  # Time over which the gap is taken, s
+
+    @property
+    def event(self) -> list[GapChange]:
+        """Return the changes of the newest event, the earliest first."""
+        if not self.changes:
+            return []
+        newest_ns = max(change.since_ns for change in self.changes)
+        event = [change for change in self.changes if newest_ns - change.since_ns < _TOGETHER_NS]
+        return sorted(event, key=lambda change: change.since_ns)
+
+    @property
+    def level(self) -> Level:
+        """Return OK where the gap is no larger than the floor, and nothing has changed."""
+        fine = not self.obstacle and self.axes and not self.changes
+        return Level.OK if fine and not any(gap.is_open for gap in self.axes) else Level.WARN
+
+    def text(self) -> str:
+        """Return the state in one line."""
+        if self.obstacle:
+            return self.obstacle
+        if not self.axes:
+            return 'comparing; the first result takes some seconds'
+        gaps = ', '.join(f'{gap.axis} {gap.gap.value:.3g}' for gap in self.axes)
+        floors = ', '.join(f'{gap.axis} {gap.floor.value:.3g}' for gap in self.axes)
+        parts = [f'gap {gaps} mg, floor {floors} mg']
+        event = self.event
+        if event:
+            latest = {(change.axis, change.quantity): change.text() for change in event}
+            parts.append(f'changed since {iso_time(event[0].since_ns)}: '
+                         f'{", ".join(latest.values())}')
+        if self.likely is not None:
+            parts.append(f'likely {self.likely.text}' if self.likely.effects
+                         else self.likely.text)
+        return '; '.join(parts)
+
+    def values(self) -> dict[str, object]:
+        """Return the values of the summary by key."""
+        values: dict[str, object] = {'window_s': self.window_s, 'changes': len(self.changes)}
+        event = self.event
+        if event:
+            values |= {'changed_since': iso_time(event[0].since_ns),
+                       'changed_since_s': event[0].since_ns * 1e-9,
+                       'detected_s': event[0].detected_ns * 1e-9}
+        if self.likely is not None:
+            values |= {'likely_effect': ', '.join(self.likely.effects),
+                       'probability': self.likely.probability, 'report': self.likely.report}
+        return values
+
+    def message(self) -> DiagnosticArray:
+        """Return the message of the topic `gap`: the summary, then one status for each axis."""
+        array = DiagnosticArray()
+        array.header.stamp = stamp(self.stamp_ns)
+        array.status.append(status_message('gap', Status(
+            self.level, self.text(), self.serial, self.values())))
+        for gap in () if self.obstacle else self.axes:
+            array.status.append(status_message(f'gap: {gap.axis}', Status(
+                Level.WARN if gap.is_open else Level.OK, _axis_text(gap), self.serial,
+                axis_values(gap))))
+        return array
+
+
+def axis_values(gap: AxisGap) -> dict[str, object]:
+    """Return the values of an axis by key; `explained` is absent where nothing is to explain."""
+    values: dict[str, object] = {
+        'gap_mg': gap.gap.value, 'gap_low_mg': gap.gap.low, 'gap_high_mg': gap.gap.high,
+        'floor_mg': gap.floor.value, 'floor_low_mg': gap.floor.low,
+        'floor_high_mg': gap.floor.high, 'offset_mg': gap.offset_mg,
+        'floor_source': gap.floor_source}
+    return values if gap.explained is None else values | {'explained': gap.explained}
+
+
+def _axis_text(gap: AxisGap) -> str:
+    """Return the gap of an axis in words."""
+    share = '' if gap.explained is None else \
+        f'; the parameters explain {100 * gap.explained:.0f} %'
+    return (f'gap {gap.gap.value:.3g} mg ({gap.gap.low:.3g} to {gap.gap.high:.3g}), floor '
+            f'{gap.floor.value:.3g} mg{share}')
+
+
+_INPUT_QUEUE = 10000
+"""Messages that are kept while the node is busy: 10 s at 1 kHz."""
+
+
+class MonitorStreams:
+    """Takes samples, reference and surroundings."""
+
+    def __init__(self, node: Node, kind: ReferenceKind, reference_topic: str) -> None:
+        self._kind = kind
+        reference = JointState if kind is ReferenceKind.STAGE else Imu
+        self._samples, self._reference, self._temperature, self._supply = (
+            PolledSubscription(node, message, topic, _INPUT_QUEUE) for message, topic in (
+                (Imu, 'imu/data_raw'), (reference, reference_topic),
+                (Temperature, 'temperature'), (BatteryState, 'supply')))
+
+    def take_samples(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the samples that wait: stamps, ns, (n,), and acceleration, m/s², (n, 3)."""
+        return _imu(self._samples)
+
+    def fault(self) -> str:
+        """Return that several nodes publish samples or reference, so that none count, or ''."""
+        return self._samples.fault() or self._reference.fault()
+
+    def take_others(self, live: LiveGap) -> int:
+        """Give reference and surroundings that wait to a comparison; return how many came."""
+        reference = live.reference
+        for name, field, subscription, layout in (
+                ('temperature_c', 'temperature', self._temperature, cdr.temperature),
+                ('supply_v', 'voltage', self._supply, cdr.battery_state)):
+            stamps_ns, values = _table(subscription, layout, field, 1)
+            for stamp_ns, value in zip(stamps_ns.tolist(), values[:, 0].tolist()):
+                reference.add_surroundings(name, stamp_ns, value)
+        if self._kind is ReferenceKind.IMU:
+            stamps_ns, force = _imu(self._reference)
+            reference.add_readings(stamps_ns, force)
+            return len(stamps_ns)
+        raws = self._reference.take()
+        for reading in joint_readings(raws):
+            if reading.position:
+                reference.add_joints(reading.stamp_ns, reading.position)
+        return len(raws)
+
+
+def _imu(subscription: PolledSubscription) -> tuple[np.ndarray, np.ndarray]:
+    """Return stamps, ns, (n,), and acceleration, m/s², (n, 3), of the messages that wait."""
+    return _table(subscription, cdr.imu, 'linear_acceleration', 3)
+
+
+def _table(subscription: PolledSubscription, layout: Callable[[bytes], cdr.Layout], field: str,
+           count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return stamps, ns, (n,), and a field, (n, count), of the messages that wait."""
+    raws = subscription.take()
+    stamps_ns, values = np.empty(len(raws), np.int64), np.empty((len(raws), count))
+    for table in cdr.tables(raws, layout):
+        stamps_ns[table.rows] = table.stamp_ns()
+        values[table.rows] = table.numbers(field)
+    return stamps_ns, values
+
 
 _TURN_S = 0.05
 """Time between two looks at the topics, s; chosen: a turn costs as much as ten messages."""
@@ -68,30 +223,13 @@ class Monitor(Node):
         super().__init__('monitor')
         check_given_parameters(self)
         self._file_sensor = make_sensor(declare_sensor(self))
-        self._kind = ReferenceKind(declare(
-            self, 'reference', 'stage', 'what the sensor is compared with: the joints of a stage, '
-            'or the ideal Imu of a simulator', choices=[kind.value for kind in ReferenceKind]))
-        default_topic = 'stage/joint_states' if self._kind is ReferenceKind.STAGE else 'imu/ideal'
-        self._reference_topic = declare(
-            self, 'reference_topic', default_topic, 'topic of the reference')
-        self._settings = GapSettings(
-            window_s=declare(self, 'window_s', 60.0, 'time over which gap and floor are taken',
-                             's', 5.0, 3600.0),
-            false_alarms_per_day=declare(
-                self, 'false_alarms_per_day', round(1 / 30, 4), 'largest rate of reported changes '
-                'that are none', '1/day', 1e-5, 10.0),
-            history_s=declare(self, 'history_s', 600.0, 'time that is kept for a diagnosis', 's',
-                              60.0, 3600.0),
-            wait_s=declare(self, 'diagnose.wait_s', 120.0, 'time of samples that an automatic '
-                           'diagnosis needs; changes of an axis within it are one', 's',
-                           _SHORTEST_S, 3600.0))
-        self._output = Path(declare(
-            self, 'output', str(calibration_store.default_folder().with_name('monitor')),
-            'folder of the record of changes and of the diagnoses')).expanduser()
-        self._automatic = declare(
-            self, 'diagnose.automatic', True, 'diagnose a change, or a gap, once enough is seen')
-        self._budget_s = declare(self, 'diagnose.budget_s', 300.0, 'longest time of a diagnosis',
-                                 's', 1.0, 3600.0)
+        self._own = own = declare_all(self, MonitorSettings)
+        self._kind = ReferenceKind(own.reference)
+        self._reference_topic = own.reference_topic or (
+            'stage/joint_states' if self._kind is ReferenceKind.STAGE else 'imu/ideal')
+        self._settings = GapSettings(own.window_s, own.false_alarms_per_day, own.history_s,
+                                     own.wait_s)
+        self._output = Path(own.output).expanduser()
         self._live: LiveGap | None = None
         self._info: StreamInfo | None = None
         self._refusal = ''
@@ -185,7 +323,7 @@ class Monitor(Node):
 
     def _diagnose_if_due(self, live: LiveGap) -> None:
         """Diagnose a change, or the first open gap, once there are enough samples."""
-        if not self._automatic or self._run is not None \
+        if not self._own.automatic or self._run is not None \
                 or time.monotonic() - self._diagnosed_s < _PAUSE_S \
                 or live.span_s(self._changed_ns or 0) < self._settings.wait_s:
             return
@@ -198,7 +336,7 @@ class Monitor(Node):
         """Begin a diagnosis of the samples since a stamp, ns."""
         name = datetime.now(UTC).strftime('diagnosis_%Y%m%dT%H%M%S_%fZ')
         self._run = DiagnosisRun(self._output / name, live.diagnosis_input(begin_ns),
-                                 [executable('diagnose')], self._budget_s)
+                                 [executable('diagnose')], self._own.budget_s)
 
     def _serve(self) -> None:
         """Take requests of ~/diagnose, and answer them when the diagnosis ends."""
@@ -274,4 +412,4 @@ class Monitor(Node):
 
 def main() -> int:
     """Run the node."""
-    return run(Monitor, NodeHelp(__doc__, _EXAMPLES))
+    return run(Monitor, NodeHelp(__doc__, _EXAMPLES, (MonitorSettings,)))

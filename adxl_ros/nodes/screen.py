@@ -1,24 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
+
 """Show a guided calibration in this terminal, and pass its keys on; on any machine."""
 
 from __future__ import annotations
 
 import asyncio
 from collections import deque
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 import os
 import signal
+import sys
 import time
+from typing import TextIO, TYPE_CHECKING
 
 from adxl_ros.calibrate.guided.screen_contents import ScreenContents
-from adxl_ros.nodes.support.held_output import held_output
-from adxl_ros.nodes.support.node_help import NodeHelp
-from adxl_ros.nodes.support.parameters import declare
-from adxl_ros.nodes.support.run_node import run
-from adxl_ros.nodes.support.topics import create_subscription
-from adxl_ros.nodes.terminal.draw import draw, Line, LogLine
-from adxl_ros.nodes.terminal.full_screen import full_screen
+from adxl_ros.errors import UserError
+from adxl_ros.nodes.draw import draw, Line, LogLine
+from adxl_ros.nodes.node_help import NodeHelp
+from adxl_ros.nodes.parameters import declare_all
+from adxl_ros.nodes.run_node import held_output, run
+from adxl_ros.nodes.settings import ScreenSettings
+from adxl_ros.nodes.topics import create_subscription
 from rcl_interfaces.msg import Log
 import rclpy
 from rclpy.executors import Executor
@@ -26,6 +30,61 @@ from rclpy.node import Node
 from rclpy.task import Future
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
+
+if TYPE_CHECKING:
+    from prompt_toolkit.application import Application
+    from prompt_toolkit.formatted_text import StyleAndTextTuples
+    from prompt_toolkit.key_binding import KeyPressEvent
+
+_REFRESH_S = 0.2
+"""Time between two drawings, s: the node publishes contents five times a second."""
+
+
+def full_screen(lines: Callable[[int, int], list[Line]], press: Callable[[str], None],
+                leave: Callable[[], None]) -> Application[None]:
+    """Make the application of a full screen."""
+    try:
+        from prompt_toolkit.application import Application
+        from prompt_toolkit.input import create_input
+        from prompt_toolkit.key_binding import KeyBindings
+        from prompt_toolkit.layout import FormattedTextControl, Layout, Window
+        from prompt_toolkit.output import create_output
+    except ImportError:
+        raise UserError('the screen needs prompt_toolkit; pip install prompt_toolkit') from None
+    stdin, stdout = _terminal()
+    output, keys = create_output(stdout), KeyBindings()
+
+    def fragments() -> StyleAndTextTuples:
+        rows, columns = output.get_size()
+        drawn: StyleAndTextTuples = []
+        for line in lines(columns, rows):
+            drawn += [*line, ('', '\n')]
+        return drawn[:-1]
+
+    def end(event: KeyPressEvent) -> None:
+        leave()
+        event.app.exit()
+
+    keys.add('<any>')(lambda event: press(event.data.lower()))
+    # A key with Alt comes as Escape and the key.
+    keys.add('escape', '<any>')(lambda _: None)
+    for key in ('q', 'Q', 'c-c'):
+        keys.add(key)(end)
+    return Application(Layout(Window(FormattedTextControl(fragments, show_cursor=False))),
+                       key_bindings=keys, full_screen=True, refresh_interval=_REFRESH_S,
+                       input=create_input(stdin), output=output)
+
+
+def _terminal() -> tuple[TextIO, TextIO]:
+    """Return the terminal to read from and to write to."""
+    if sys.stdin.isatty() and sys.stdout.isatty():
+        return sys.stdin, open(os.dup(sys.stdout.fileno()), 'w', encoding='utf-8')
+    try:
+        # A launch keeps stdin and stdout to itself.
+        return open('/dev/tty', encoding='utf-8'), open('/dev/tty', 'w', encoding='utf-8')
+    except OSError:
+        raise UserError('the screen needs a terminal; run it in one') from None
+
 
 _SERVICES = ('start', 'resume', 'start_over', 'capture', 'redo', 'skip', 'finish', 'abort')
 """Services of the calibration node that keys call."""
@@ -51,9 +110,8 @@ class Screen(Node):
 
     def __init__(self) -> None:
         super().__init__('screen')
-        name = declare(self, 'node', 'calibration', 'name of the calibration node')
-        self._node_pid = declare(self, 'node_pid', 0, 'process of the node, if it has started '
-                                 'this screen: both end together; 0: it has not')
+        own = declare_all(self, ScreenSettings)
+        name, self._node_pid = own.node, own.node_pid
         self._target = self.resolve_topic_name(name)
         self._contents, self._received_s = ScreenContents('info', ''), 0.0
         self._log: deque[LogLine] = deque(maxlen=_MESSAGES)
@@ -167,4 +225,5 @@ class Screen(Node):
 
 def main() -> int:
     """Run the screen."""
-    return run(Screen, NodeHelp(__doc__, _EXAMPLES), Screen.show)
+    return run(Screen, NodeHelp(__doc__, _EXAMPLES, (ScreenSettings,), has_sensor=False),
+               Screen.show)

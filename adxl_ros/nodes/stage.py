@@ -4,13 +4,339 @@
 
 from __future__ import annotations
 
-from adxl_ros.nodes.support.given_parameters import check_given_parameters
-from adxl_ros.nodes.support.node_help import NodeHelp
-from adxl_ros.nodes.support.parameters import declare
-from adxl_ros.nodes.support.run_node import run
-from adxl_ros.nodes.support.simulated_stage_node import SimulatedStageNode
-from adxl_ros.nodes.support.stage_bridge import StageBridge
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+from adxl_ros.errors import UserError
+from adxl_ros.nodes.diagnostics import DiagnosticsReporter, Level, Status
+from adxl_ros.nodes.node_help import NodeHelp
+from adxl_ros.nodes.parameters import declare_all, parameter_error
+from adxl_ros.nodes.run_node import run
+from adxl_ros.nodes.samples_in import JointStateWriter
+from adxl_ros.nodes.settings import (
+    BridgeSettings,
+    check_given_parameters,
+    SimulatedStageSettings,
+    StageSettings,
+)
+from adxl_ros.nodes.topics import create_publisher, create_subscription
+from adxl_ros.simulate.simulated_stage import JOINTS, SimulatedStage
+from builtin_interfaces.msg import Duration
+import numpy as np
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+_STEP_NS = 10_000_000
+"""Step of the simulation, ns; chosen: 100 poses a second, as a controller of a stage sends."""
+_JUMP_NS = 1_000_000_000
+"""Smallest jump of ROS time after which the motion goes on from there, ns; chosen."""
+_QUEUE = 1000
+"""Poses that are kept for a slow subscriber: 10 s of ROS time."""
+_LIMITS = ('slew_rate_rad_s', 'slew_rate_m_s', 'settling_time_s', 'stage.resolution_rad')
+"""Parameters that the log states at the start."""
+
+
+class SimulatedStageNode:
+    """
+    The simulated stage: its encoders' readings on `stage/joint_states`, at 100 Hz of ROS time.
+
+    A command takes effect after the delay of the controller. The true motion is thus known before
+    it happens: `stage/true_joint_states` has it ahead of time, for a simulated sensor.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        own = declare_all(node, SimulatedStageSettings)
+        self._stage = SimulatedStage(
+            np.array([own.alpha_rad, own.beta_rad, own.shift_m]),
+            np.array([own.slew_rate_rad_s, own.slew_rate_rad_s, own.slew_rate_m_s]),
+            own.settling_time_s, np.array([own.resolution_rad, own.resolution_rad, 0.0]), own.seed)
+        self._delay_ns = round(1e9 * own.delay_s)
+        self._unshown: deque[tuple[int, bytes]] = deque()
+        self._writer = JointStateWriter(JOINTS)
+        self._simulated_ns = 0
+        self._is_commanded = False
+        self._refusal_count = 0
+        self._refusal = ''
+        self._encoders = create_publisher(node, JointState, 'stage/joint_states', _QUEUE)
+        self._true = create_publisher(node, JointState, 'stage/true_joint_states', _QUEUE)
+        self._diagnostics = DiagnosticsReporter(node, {'stage': self._status})
+        create_subscription(node, JointState, 'stage/command', self._on_command,
+                            _COMMAND_QUEUE)
+        limits = (f'{name} {node.get_parameter(name).value:g}' for name in _LIMITS)
+        pose = ', '.join(f'{name} {p:.4g}' for name, p in zip(JOINTS, self._stage.encoder()))
+        node.get_logger().info(
+            f'simulated stage at {pose} (rad, rad, m): {", ".join(limits)}; waiting for '
+            f'{node.resolve_topic_name("stage/command")}')
+        # The timer runs on ROS time: each message of a faster clock wakes the node.
+        node.create_timer(_STEP_NS * 1e-9, self._tick)
+
+    def _on_command(self, message: JointState) -> None:
+        try:
+            if len(message.name) != len(message.position):
+                raise UserError(f'{len(message.name)} names, but {len(message.position)} '
+                                'positions')
+            positions = dict(zip(message.name, message.position))
+            self._stage.command(positions, dict(zip(message.name, message.velocity)))
+            if not self._is_commanded:
+                self._is_commanded = True
+                self._node.get_logger().info(f'first command: {positions}')
+        except UserError as error:
+            self._refusal_count += 1
+            self._refusal = f'{self._node.resolve_topic_name("stage/command")}: {error}'
+            self._node.get_logger().warning(
+                f'{self._refusal}; the stage stays with the command before')
+            self._diagnostics.notice('stage', Level.WARN)
+
+    def _tick(self) -> None:
+        """Simulate up to the time at which a new command may take effect; show what is due."""
+        now_ns = self._node.get_clock().now().nanoseconds
+        if not now_ns:
+            return
+        if not -_JUMP_NS < now_ns + self._delay_ns - self._simulated_ns < _JUMP_NS:
+            self._simulated_ns = now_ns // _STEP_NS * _STEP_NS
+            self._unshown.clear()
+        self._simulate(now_ns + self._delay_ns)
+        while self._unshown and self._unshown[0][0] <= now_ns:
+            self._encoders.publish(self._unshown.popleft()[1])
+
+    def _simulate(self, until_ns: int) -> None:
+        """Simulate the steps up to a ROS time, ns; publish the true motion, keep the encoders."""
+        stamps_ns = np.arange(self._simulated_ns + _STEP_NS, until_ns + 1, _STEP_NS)
+        if not len(stamps_ns):
+            return
+        self._simulated_ns = int(stamps_ns[-1])
+        position, velocity, encoder = (np.empty((len(stamps_ns), len(JOINTS))) for _ in range(3))
+        for i in range(len(stamps_ns)):
+            self._stage.step(_STEP_NS * 1e-9)
+            position[i], velocity[i] = self._stage.position, self._stage.velocity
+            encoder[i] = self._stage.encoder()
+        for message in self._writer.messages(stamps_ns, position, velocity):
+            self._true.publish(message)
+        self._unshown.extend(zip(stamps_ns.tolist(),
+                                 self._writer.messages(stamps_ns, encoder, velocity)))
+
+    def _status(self) -> Status:
+        level, text = Level.OK, 'moving' if self._stage.moving() else 'at rest'
+        if self._refusal:
+            level, text = Level.WARN, f'refused {self._refusal}'
+        self._refusal = ''
+        values = {name: float(p) for name, p in zip(JOINTS, self._stage.encoder())}
+        return Status(level, text, 'simulated', {**values, 'refused': self._refusal_count})
+
+
+_SILENT_NS = 2_000_000_000
+"""Time without joint states after which diagnostics warn, ns; chosen."""
+_GRACE_NS = 2_000_000_000
+"""Time that a motion may take beyond its duration before its command is sent again, ns; chosen."""
+_ARRIVED_RAD = 0.01
+"""Largest distance from the goal of a joint that has arrived, rad; chosen."""
+_SHORTEST_S = 0.2
+"""Shortest duration of a trajectory, s; chosen."""
+_TURN_RAD = 2 * np.pi
+"""One turn, rad."""
+_BRIDGE_QUEUE = 100
+"""Positions that are kept for a slow subscriber; chosen: 1 s of a usual controller."""
+_COMMAND_QUEUE = 10
+"""Commands that are kept, of the calibration and for the controller; chosen."""
+_STATES_QUEUE = 1000
+"""Joint states of the controller that are kept: 1 s of the fastest controllers."""
+_DEFAULT_COMMANDS = {'trajectory': '/joint_trajectory_controller/joint_trajectory',
+                     'joint_state': '/joint_commands'}
+"""Usual topics of the controllers' commands, by kind."""
+
+
+@dataclass
+class _Joint:
+    """One joint of the stage, and how the controller counts its angle."""
+
+    name: str  # The controller's name of the joint
+    sign: int  # 1 or -1: the direction in which the controller counts
+    offset_rad: float  # Stage angle where the controller's joint is at 0, rad
+    angle_rad: float | None = None  # Stage angle, rad; None before the first joint state
+
+    def to_controller(self, stage_rad: float) -> float:
+        """Convert a stage angle to the controller's, rad."""
+        return self.sign * (stage_rad - self.offset_rad)
+
+    def update(self, position_rad: float) -> None:
+        """Take an angle of the controller, rad, and unwrap it."""
+        angle = self.sign * position_rad + self.offset_rad
+        if self.angle_rad is not None:
+            # A controller that counts from −π to π jumps where the stage turns on.
+            angle += _TURN_RAD * np.round((self.angle_rad - angle) / _TURN_RAD)
+        self.angle_rad = float(angle)
+
+    def unwrap_to(self, goal_rad: float) -> None:
+        """
+        Add whole turns to the angle where the joint then is at its goal, rad.
+
+        The first angle of a controller that counts from −π to π does not determine how many turns
+        it has made, and such a controller may take the shorter way round.
+        """
+        if self.angle_rad is not None:
+            turns_rad = _TURN_RAD * round((goal_rad - self.angle_rad) / _TURN_RAD)
+            if abs(self.angle_rad + turns_rad - goal_rad) < _ARRIVED_RAD:
+                self.angle_rad += turns_rad
+
+
+class StageBridge:
+    """The way from this package's topics to the controller of a stage, and back."""
+
+    def __init__(self, node: Node, kind: str) -> None:
+        self._node, self._kind = node, kind
+        own = declare_all(node, BridgeSettings)
+        self._joints = {'alpha': _Joint(own.alpha_joint, own.alpha_sign, own.alpha_offset_rad),
+                        'beta': _Joint(own.beta_joint, own.beta_sign, own.beta_offset_rad)}
+        for name, joint in self._joints.items():
+            if not joint.name:
+                raise parameter_error(f'bridge.{name}.joint',
+                                      "is not set; name the controller's joint")
+            if joint.sign == 0:
+                raise parameter_error(f'bridge.{name}.sign', '0 is not 1 or -1')
+        self._states_topic, self._speed_rad_s = own.joint_states, own.speed_rad_s
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._goal: dict[str, float] = {}
+        self._heard_ns = 0
+        self._resend_ns = 0
+        self._commanded_ns = 0
+        self._late_ns = 0
+        self._controller_joints: set[str] = set()
+        self._refusal = ''
+        self._positions = create_publisher(node, JointState, 'stage/joint_states', _BRIDGE_QUEUE)
+        self._commands = create_publisher(
+            node, JointTrajectory if kind == 'trajectory' else JointState,
+            own.command or _DEFAULT_COMMANDS[kind],
+            _COMMAND_QUEUE)
+        self._diagnostics = DiagnosticsReporter(node, {'stage': self._status})
+        create_subscription(node, JointState, 'stage/command', self._on_command,
+                            _COMMAND_QUEUE)
+        create_subscription(node, JointState, self._states_topic, self._on_states,
+                            _STATES_QUEUE)
+        joints = ', '.join(f'{name} is {joint.name}' for name, joint in self._joints.items())
+        speed = f' at most {self._speed_rad_s:g} rad/s' if kind == 'trajectory' else ''
+        node.get_logger().info(
+            f'bridge ({kind}){speed}: {joints}; commands go to {self._commands.topic_name}, '
+            f'positions come from {node.resolve_topic_name(self._states_topic)}; waiting for '
+            f'{node.resolve_topic_name("stage/command")}')
+
+    def _on_command(self, message: JointState) -> None:
+        positions = dict(zip(message.name, message.position))
+        if set(positions) - set(self._joints) or len(message.name) != len(message.position) \
+                or not np.isfinite(list(positions.values())).all():
+            self._refuse(f'stage/command: {positions}: expected finite positions of alpha and '
+                         'beta')
+            return
+        goal: dict[str, Any] = {
+            name: positions.get(name, self._goal.get(name, joint.angle_rad))
+            for name, joint in self._joints.items()}
+        if any(angle_rad is None for angle_rad in goal.values()):
+            self._refuse('stage/command: the position of the stage is not known yet')
+            return
+        now_ns = self._steady.now().nanoseconds
+        # The calibration repeats its command: a controller would begin its trajectory each time.
+        if goal == self._goal and (self._arrived() or now_ns < self._resend_ns):
+            return
+        if not self._goal:
+            self._node.get_logger().info(f'first command: {positions}')
+        duration_s = self._duration_s(goal)
+        self._resend_ns = now_ns + round(duration_s * 1e9) + _GRACE_NS
+        if goal != self._goal:
+            self._commanded_ns, self._late_ns = now_ns, self._resend_ns
+        self._goal, self._refusal = goal, ''
+        self._send(duration_s)
+
+    def _send(self, duration_s: float) -> None:
+        """Send the goal to the controller, as a motion of a duration, s."""
+        names = [joint.name for joint in self._joints.values()]
+        positions = [float(joint.to_controller(self._goal[name]))
+                     for name, joint in self._joints.items()]
+        if self._kind == 'joint_state':
+            message = JointState(name=names, position=positions)
+            message.header.stamp = self._node.get_clock().now().to_msg()
+        else:
+            sec, nanosec = divmod(round(duration_s * 1e9), 10 ** 9)
+            # A trajectory with the stamp 0 begins at once.
+            message = JointTrajectory(joint_names=names, points=[JointTrajectoryPoint(
+                positions=positions, time_from_start=Duration(sec=sec, nanosec=nanosec))])
+        self._commands.publish(message)
+
+    def _duration_s(self, goal: dict[str, float]) -> float:
+        """Return the time that the longer way to a goal takes; half a turn if it is unknown."""
+        ways_rad = [abs(goal[name] - joint.angle_rad) for name, joint in self._joints.items()
+                    if joint.angle_rad is not None]
+        return max(max(ways_rad, default=np.pi) / self._speed_rad_s, _SHORTEST_S)
+
+    def _late(self) -> bool:
+        """Return whether the stage has not reached its goal in time."""
+        return bool(self._goal) and self._steady.now().nanoseconds > self._late_ns \
+            and not self._arrived()
+
+    def _arrived(self) -> bool:
+        return all(joint.angle_rad is not None
+                   and abs(joint.angle_rad - self._goal[name]) < _ARRIVED_RAD
+                   for name, joint in self._joints.items())
+
+    def _on_states(self, message: JointState) -> None:
+        positions = dict(zip(message.name, message.position))
+        self._controller_joints |= set(positions)
+        joints = [joint for joint in self._joints.values() if joint.name in positions
+                  and np.isfinite(positions[joint.name])]
+        for joint in joints:
+            joint.update(positions[joint.name])
+        if self._late():
+            for name, joint in self._joints.items():
+                joint.unwrap_to(self._goal[name])
+        if not joints or any(joint.angle_rad is None for joint in self._joints.values()):
+            return
+        self._heard_ns = self._steady.now().nanoseconds
+        stage = JointState(name=list(self._joints),
+                           position=[joint.angle_rad for joint in self._joints.values()])
+        stage.header.stamp = message.header.stamp
+        self._positions.publish(stage)
+
+    def _refuse(self, reason: str) -> None:
+        """Report why a command is refused."""
+        if reason != self._refusal:
+            self._node.get_logger().warning(reason)
+        self._refusal = reason
+        self._diagnostics.notice('stage', Level.WARN)
+
+    def _status(self) -> Status:
+        values = {name: joint.angle_rad for name, joint in self._joints.items()
+                  if joint.angle_rad is not None}
+        return Status(*self._state(), self._kind, values)
+
+    def _state(self) -> tuple[Level, str]:
+        """Return the level and one line: the motion, or why there is none."""
+        topic = self._node.resolve_topic_name(self._states_topic)
+        missing = [joint.name for joint in self._joints.values() if joint.angle_rad is None]
+        if self._refusal:
+            return Level.WARN, f'refused {self._refusal}'
+        if missing and self._controller_joints:
+            return Level.ERROR, (
+                f'{topic}: no joint {", ".join(missing)}; it has '
+                f'{", ".join(sorted(self._controller_joints))}; correct bridge.alpha.joint and '
+                'bridge.beta.joint')
+        if self._steady.now().nanoseconds - self._heard_ns > _SILENT_NS:
+            return Level.WARN, f'nothing on {topic}; is the controller running?'
+        if not self._node.count_subscribers(self._commands.topic_name):
+            return Level.WARN, f'nobody listens to {self._commands.topic_name}'
+        if self._late():
+            return Level.WARN, self._delay_text()
+        return Level.OK, 'on the way' if self._goal and not self._arrived() else 'at rest'
+
+    def _delay_text(self) -> str:
+        late_s = (self._steady.now().nanoseconds - self._commanded_ns) * 1e-9
+        angles = ', '.join(f'{name} is at {np.degrees(joint.angle_rad):.1f}° of '
+                           f'{np.degrees(self._goal[name]):.1f}°'
+                           for name, joint in self._joints.items()
+                           if joint.angle_rad is not None)
+        return f'the controller has not followed for {late_s:.0f} s: {angles}'
+
 
 _EXAMPLES = {
     'the simulated stage': '',
@@ -19,9 +345,6 @@ _EXAMPLES = {
         '-p bridge.alpha.joint:=tilt -p bridge.beta.joint:=turn',
 }
 """Examples of arguments, by their purpose."""
-_VARIANTS = {'stage.type:=trajectory, or joint_state': (
-    'stage.type:=trajectory', 'bridge.alpha.joint:=alpha', 'bridge.beta.joint:=beta')}
-"""Parameters of a bridge, with those that have no default."""
 
 
 class Stage(Node):
@@ -30,13 +353,12 @@ class Stage(Node):
     def __init__(self) -> None:
         super().__init__('stage')
         check_given_parameters(self)
-        kind = declare(
-            self, 'stage.type', 'simulated', 'the simulated stage, or the bridge to a controller '
-            'that takes joint states or trajectories',
-            choices=('simulated', 'joint_state', 'trajectory'))
+        kind = declare_all(self, StageSettings).kind
         self._stage = SimulatedStageNode(self) if kind == 'simulated' else StageBridge(self, kind)
 
 
 def main() -> int:
     """Run the node."""
-    return run(Stage, NodeHelp(__doc__, _EXAMPLES, _VARIANTS))
+    return run(Stage, NodeHelp(
+        __doc__, _EXAMPLES, (StageSettings, SimulatedStageSettings), has_sensor=False,
+        variants={'stage.type:=trajectory, or joint_state': BridgeSettings}))

@@ -7,8 +7,8 @@ import re
 import sys
 
 from adxl_ros.errors import UserError
-from adxl_ros.nodes.support import live_benchmark, offline_jobs
-from adxl_ros.nodes.support.benchmark_table import Job, print_table, rows_of
+from adxl_ros.nodes.support import bench_command, offline_jobs
+from adxl_ros.nodes.bench_jobs import Job, print_table, rows_of
 from processes import executable
 import pytest
 from units import nominal
@@ -41,16 +41,16 @@ def refuse(*_: object) -> float:
 
 
 def test_a_row_that_fails_is_named_and_the_others_stand(monkeypatch, capsys) -> None:
-    def measure(subject: live_benchmark._Subject, seconds: float) -> live_benchmark._Result:
-        return refuse() if 'iio' in subject.label else live_benchmark._Result(
+    def measure(subject: bench_command._Subject, seconds: float) -> bench_command._Result:
+        return refuse() if 'iio' in subject.label else bench_command._Result(
             1000.0, 0, 0.5, 1.0, (0.1,))
 
     labels = 'bare publisher and relay', 'driver, iio, compensation', 'driver, sim, compensation'
-    monkeypatch.setattr(live_benchmark, '_subjects', lambda *_: [
-        live_benchmark._Subject(label, 'imu/data', []) for label in labels])
-    monkeypatch.setattr(live_benchmark, '_measure', measure)
-    monkeypatch.setattr(live_benchmark, '_first_sample_s', refuse)
-    live_benchmark.measure_live(1.0, 3, None)
+    monkeypatch.setattr(bench_command, '_subjects', lambda *_: [
+        bench_command._Subject(label, 'imu/data', []) for label in labels])
+    monkeypatch.setattr(bench_command, '_measure', measure)
+    monkeypatch.setattr(bench_command, '_first_sample_s', refuse)
+    bench_command.measure_live(1.0, 3, None)
     table = capsys.readouterr().out.splitlines()[2:]
     assert table[1] == f'{labels[1]:27} failed in 3 of 3 rounds: no messages for 20 s'
     assert [line[:34].split()[-1] for line in table[0:3:2]] == ['1000', '1000']
@@ -68,7 +68,7 @@ def test_a_long_recording_is_applied_with_its_memory_and_leaves_no_file(
         monkeypatch, tmp_path, kind):
     # The other executables stand beside the running one.
     monkeypatch.setattr(sys, 'argv', [executable('bench')])
-    jobs = offline_jobs._long_applying(tmp_path, nominal(), kind, 0.01)
+    jobs = bench_jobs._long_applying(tmp_path, nominal(), kind, 0.01)
     row, = rows_of(next(jobs), 1)
     format_ = kind.upper()
     assert re.match(rf'\| apply, 0.01 h at 1 kHz, {format_} to {format_} '
@@ -77,4 +77,4 @@ def test_a_long_recording_is_applied_with_its_memory_and_leaves_no_file(
     assert [path.name for path in tmp_path.iterdir()] == ['unit.yaml']
     # More than any disk holds.
     with pytest.raises(UserError, match='GB free; recordings of 1e.09 h need .* set TMPDIR'):
-        next(offline_jobs._long_applying(tmp_path, nominal(), kind, 1e9))
+        next(bench_jobs._long_applying(tmp_path, nominal(), kind, 1e9))

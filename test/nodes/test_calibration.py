@@ -27,8 +27,8 @@ QUEUE = 100000
 LOSSLESS = (*RELIABLE, '-p', f'qos_overrides./imu/data_raw.subscription.depth:={QUEUE}',
             '-p', 'qos_overrides./stage/command.publisher.depth:=1000')
 KEPT = ('-p', f'qos_overrides./imu/data_raw.publisher.depth:={QUEUE}')
-QUICK = ('-p', 'sweep.planes_rad:=[0.785, 1.5707963267948966, 2.356]', '-p',
-         'sweep.step_rad:=0.7853981633974483', '-p', 'sweep.dwell_s:=1.0', '-p',
+QUICK = ('-p', 'sweep.planes_deg:=[45.0, 90.0, 135.0]', '-p',
+         'sweep.step_deg:=45.0', '-p', 'sweep.dwell_s:=1.0', '-p',
          'sweep.check_poses:=6')
 
 
@@ -191,7 +191,7 @@ def test_the_node_can_end_with_its_calibration(start, tmp_path, output, status):
 
 @pytest.mark.parametrize('setting, words', [
     ('sweep.planes_deg:=[thirty]', 'sweep.planes_deg: '),
-    ('sweep.step_rad:=0.0', 'sweep.step_rad'),
+    ('sweep.step_deg:=0.0', 'sweep.step_deg'),
     ('thermal.range_c:=[50.0, 0.0]', 'thermal.range_c: [50.0, 0.0] is no lowest'),
     ('output:=.', 'output: . is a directory; name a')])
 def test_settings_out_of_range_end_the_node(start, tmp_path, setting, words):

@@ -12,8 +12,7 @@ import time
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import sweep_journal
-from adxl_ros.nodes import demo
-from adxl_ros.nodes.terminal import steps
+from adxl_ros.nodes import demo, steps
 from processes import children, executable, REPO
 import pytest
 from terminal import Terminal

@@ -5,7 +5,7 @@
 from collections.abc import Iterator
 import threading
 
-from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
+from adxl_ros.nodes.diagnostics import DiagnosticsReporter, Level, Status
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from graph import Graph
 import pytest

@@ -7,7 +7,7 @@ import time
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model import noise
 from adxl_ros.model.sensor import to_nominal_mps2, to_volts
-from adxl_ros.nodes.support.sample_output import imu_message, ImuWriter
+from adxl_ros.nodes.sample_output import imu_message, ImuWriter
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from graph import accel, Graph, stamp_ns

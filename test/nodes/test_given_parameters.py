@@ -5,8 +5,9 @@
 from pathlib import Path
 
 from adxl_ros.files import parameter_file
-from adxl_ros.nodes.support.given_parameters import OWN_PARAMETERS
-from adxl_ros.nodes.support.sensor_parameters import sensor_keys
+from adxl_ros.nodes.parameters import specs_of
+from adxl_ros.nodes.sensor_parameters import sensor_keys
+from adxl_ros.nodes.settings import NODES
 from diagnostic_msgs.msg import DiagnosticStatus
 from graph import Graph
 from lifecycle_msgs.msg import Transition
@@ -16,6 +17,8 @@ from rclpy.parameter import parameter_value_to_python
 from sensor_msgs.msg import Imu
 from units import NOMINAL, nominal
 
+OWN_PARAMETERS = {node: [spec.name for part in parts for spec in specs_of(part)]
+                  for node, parts in NODES.items()}
 ROS = '--ros-args'
 SIMULATED = 'SIMULATED sensor (link.type: sim)'
 CHOICES = 'set it to iio, replay, serial, topic, or to sim for a simulated sensor'

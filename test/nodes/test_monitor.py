@@ -15,7 +15,7 @@ import time
 from adxl_ros.files import parameter_file
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.nodes.support.processes import cpu_time_s
+from adxl_ros.nodes.run_node import cpu_time_s
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
 from adxl_ros.tools.effect_option import with_effects

@@ -8,13 +8,13 @@ import re
 import subprocess
 
 from adxl_ros.links.support import base
-from adxl_ros.nodes.support.given_parameters import OWN_PARAMETERS
+from adxl_ros.nodes.parameters import specs_of
+from adxl_ros.nodes.settings import NODES
 from graph import Graph
 from processes import executable, run_executable
 import pytest
 from terminal import Terminal
 
-NODES = ('driver', 'stage', 'calibration', 'compensation', 'investigate', 'monitor')
 PROGRAMS = (*NODES, 'screen', 'demo', 'bench')
 
 
@@ -53,7 +53,7 @@ def test_help_lists_each_parameter_with_type_default_and_meaning(
     entries = re.findall(r'^  ([\w.]+)  (float|floats|int|bool|text|texts)(?:, .+)?\n {6}\S',
                          text, re.MULTILINE)
     listed = {entry[0] for entry in entries}
-    missing = set(OWN_PARAMETERS[name]) - listed
+    missing = {spec.name for part in NODES[name] for spec in specs_of(part)} - listed
     assert not missing
     assert '/parameter_events' not in text and 'qos_overrides' not in text
 

@@ -12,8 +12,8 @@ from units import drawn, nominal
 FAST = ('-p', 'use_sim_time:=true')
 RATE_HZ = 200.0
 SPEED = ('-p', 'link.speed:=10.0')
-PLAN = ('-p', 'sweep.planes_rad:=[0.785, 1.5707963267948966, 2.356]', '-p',
-        'sweep.step_rad:=0.7853981633974483', '-p', 'sweep.dwell_s:=1.0', '-p',
+PLAN = ('-p', 'sweep.planes_deg:=[45.0, 90.0, 135.0]', '-p',
+        'sweep.step_deg:=45.0', '-p', 'sweep.dwell_s:=1.0', '-p',
         'sweep.check_poses:=4', '-p', 'output:=unit.yaml', '-p', 'autostart:=true', *RELIABLE)
 
 

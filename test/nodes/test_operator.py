@@ -16,8 +16,8 @@ from std_srvs.srv import Trigger
 from units import drawn, nominal
 
 FAST = ('-p', 'use_sim_time:=true')
-PLAN = ('-p', 'sweep.planes_rad:=[0.7853981633974483, 1.5707963267948966]', '-p',
-        'sweep.step_rad:=1.5707963267948966', '-p', 'sweep.dwell_s:=2.0', '-p',
+PLAN = ('-p', 'sweep.planes_deg:=[45.0, 90.0]', '-p',
+        'sweep.step_deg:=90.0', '-p', 'sweep.dwell_s:=2.0', '-p',
         'sweep.check_poses:=0', '-p', 'output:=unit.yaml', '-p', 'autostart:=true')
 
 

@@ -18,8 +18,8 @@ from units import drawn, nominal
 from without_extras import run_without_extras
 
 FAST = ('-p', 'use_sim_time:=true')
-PLAN = ('-p', 'sweep.planes_rad:=[0.7853981633974483, 1.5707963267948966]', '-p',
-        'sweep.step_rad:=1.5707963267948966', '-p', 'sweep.dwell_s:=1.5', '-p',
+PLAN = ('-p', 'sweep.planes_deg:=[45.0, 90.0]', '-p',
+        'sweep.step_deg:=90.0', '-p', 'sweep.dwell_s:=1.5', '-p',
         'sweep.check_poses:=2', '-p', 'output:=unit.yaml', *RELIABLE)
 OTHERS = '\x1b[A\x1b[1;5A\x1bOA\x1bOS\x1b[[A\x1b[M af\x1b[<65;10;10M\x1b[15~\x1bq'
 """Arrow up, with Ctrl, of keypad mode; F4; F1 of a console; a mouse's wheel twice; F5; Alt-q."""
@@ -187,7 +187,7 @@ def test_without_prompt_toolkit_there_are_plain_lines():
     """The screen is an extra, and one line names its missing package."""
     done = run_without_extras("""
 import os
-from adxl_ros.nodes.support.own_screen import open_screen
+from adxl_ros.nodes.display import open_screen
 sys.stdin.isatty = sys.stdout.isatty = lambda: True
 os.tcgetpgrp = lambda fd: os.getpgrp()
 print(open_screen('/calibration'))

@@ -23,7 +23,7 @@ modules = [m.name for m in walk_packages(adxl_ros.__path__, 'adxl_ros.')
            if m.name.split('.')[1] in wanted]
 if not find_spec('launch'):
     # The wheels of ROS 2 have no ros2 launch, for which this module is.
-    modules.remove('adxl_ros.nodes.support.launch_nodes')
+    modules.remove('adxl_ros.nodes.launch_nodes')
 for name in modules:
     import_module(name)
 print(json.dumps({'modules': modules, 'blocked': sorted(blocked & set(sys.modules))}))

@@ -94,9 +94,9 @@ def travel_rad(targets: Sequence[Target]) -> float:
 def _turn(planes_rad: Sequence[float], step_rad: float) -> np.ndarray:
     """Return the angles beta of a turn, rad; refuse a plan without planes or with a wrong step."""
     if not len(planes_rad) or not np.all(np.isfinite(planes_rad)):
-        raise UserError('sweep.planes_rad: names no plane; give at least one angle alpha')
+        raise UserError('sweep.planes_deg: names no plane; give at least one angle alpha')
     if not 2 * np.pi / 720 <= step_rad <= np.pi / 2 + 1e-9:
-        raise UserError(f'sweep.step_rad: {step_rad:g} rad is not between 0.0087 and 1.5708')
+        raise UserError(f'sweep.step_deg: {np.degrees(step_rad):g} is not between 0.5 and 90')
     return np.arange(round(2 * np.pi / step_rad) + 1) * step_rad
 
 

@@ -89,9 +89,10 @@ class SessionSettings:
                     'thermal.block_s': self.thermal.block_s}
         return {**head, 'stage.mode': self.capture.stage_mode.value,
                 'stage.tolerance_rad': self.capture.tolerance_rad,
-                'stage.near_rad': self.capture.near_rad,
+                'stage.near_deg': _degrees(self.capture.near_rad),
                 'sweep.dwell_s': self.capture.dwell_s, 'sweep.plan': self.plan_kind,
-                'sweep.planes_rad': self.planes_rad, 'sweep.step_rad': self.step_rad,
+                'sweep.planes_deg': [_degrees(plane) for plane in self.planes_rad],
+                'sweep.step_deg': _degrees(self.step_rad),
                 'sweep.tilt_error_rad': self.tilt_error_rad,
                 'sweep.check_poses': self.check_poses, 'order': pose_plan.ORDER}
 
@@ -106,3 +107,7 @@ class SessionSettings:
                     'the file is kept), or abort (a) and restore the old setting?')
         return (f'{self.journal} holds {interrupted.poses} poses of an interrupted calibration '
                 'of this unit. Go on with them (y), or begin again (n; they are kept)?')
+
+
+def _degrees(angle_rad: float) -> float:
+    return round(float(np.degrees(angle_rad)), 9)

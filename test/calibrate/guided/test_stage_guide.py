@@ -65,7 +65,7 @@ def test_the_plan_of_the_paper_and_refused_settings():
     assert [t.check for t in targets].count(True) == 8
     with pytest.raises(UserError, match='names no plane'):
         plan_sweep([], 0.5, 0)
-    with pytest.raises(UserError, match='sweep.step_rad: 0 rad'):
+    with pytest.raises(UserError, match='sweep.step_deg: 0 is'):
         plan_sweep([1.0], 0.0, 0)
 
 

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Publishers and subscriptions with the QoS of this package, and stamps."""
+"""Publishers and subscriptions with the QoS of this package, and threads that receive."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+import threading
 import time
 from typing import Any
 
 from adxl_ros.errors import one_line, UserError
-from adxl_ros.nodes.support.rclpy_internals import take_messages
+from adxl_ros.nodes.rclpy_internals import MessageWait, NotForExecutors, take_messages
 from builtin_interfaces.msg import Time
 from rclpy.callback_groups import CallbackGroup
 from rclpy.exceptions import ParameterException
@@ -19,6 +20,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
+from sensor_msgs.msg import Imu
 
 _OVERRIDING = QoSOverridingOptions((QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH,
                                     QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY))
@@ -108,3 +110,86 @@ def stamp(time_ns: int) -> Time:
     """Make the stamp of a ROS time, ns."""
     sec, nanosec = divmod(int(time_ns), 10 ** 9)
     return Time(sec=sec, nanosec=nanosec)
+
+
+class RepeatingThread:
+    """Calls a function again and again until closed; an exception from it ends the node."""
+
+    def __init__(self, node: Node, turn: Callable[[], None], name: str) -> None:
+        self._turn, self._context = turn, node.context
+        self._open = True
+        self._failure: Exception | None = None
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread; raise the exception that has ended it before."""
+        self._open = False
+        self._thread.join()
+        if self._failure is not None:
+            raise self._failure
+
+    def _run(self) -> None:
+        try:
+            while self._open and self._context.ok():
+                self._turn()
+        except Exception as error:
+            # After the signal nothing can be published: a failure then belongs to the end.
+            if self._context.ok():
+                self._failure = error
+                self._context.try_shutdown()
+
+
+class ReceiveTurn:
+    """
+    A turn of a thread: waits for the samples of one topic, and gives each to a callback.
+
+    Subscribes best effort, so that both kinds of publisher connect. Samples of several publishers
+    are withheld.
+    """
+
+    def __init__(self, node: Node, kind: Any, topic: str, callback: Callable[[bytes], None],
+                 depth: int) -> None:
+        self._node = node
+        self._subscription = create_subscription(node, kind, topic, callback, depth, raw=True,
+                                                 group=NotForExecutors())
+        self._wait = MessageWait(self._subscription, node)
+        self._kind, self._callback, self._depth = kind, callback, depth
+        self._publishers = OnePublisher(node, topic)
+
+    def __call__(self) -> None:
+        """Wait for a message, and take all that have come."""
+        self._wait(self._kind, self._callback, self._depth, self._publishers)
+
+    def fault(self) -> str:
+        """Return that several nodes publish on the topic, so that nothing is taken, or ''."""
+        return self._publishers.fault()
+
+    def destroy(self) -> None:
+        """Remove the subscription; the thread must have ended."""
+        self._node.destroy_subscription(self._subscription)
+
+
+class PolledSubscription:
+    """
+    Keeps the serialized messages of a topic until a node takes them, without waking it.
+
+    Samples (sensor_msgs/Imu) of several publishers are withheld.
+
+    At 1 kHz an executor that wakes for each message takes a tenth of a core.
+    """
+
+    def __init__(self, node: Node, kind: Any, topic: str, depth: int) -> None:
+        self._kind, self._depth = kind, depth
+        self._publishers = OnePublisher(node, topic)
+        self._subscription = create_subscription(
+            node, kind, topic, lambda _: None, depth, raw=True, group=NotForExecutors())
+
+    def take(self) -> list[bytes]:
+        """Return the messages since the last call, at most as many as are kept."""
+        accept = (self._publishers,) if self._kind is Imu else ()
+        return list(take_messages(self._subscription, self._kind, True, self._depth, *accept))
+
+    def fault(self) -> str:
+        """Return that several nodes publish on the topic, so that nothing is taken, or ''."""
+        return self._publishers.fault()

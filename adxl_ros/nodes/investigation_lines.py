@@ -9,13 +9,13 @@ from pathlib import Path
 import shlex
 import sys
 from textwrap import wrap
-from typing import Any, Protocol
+from typing import Any
 
 from adxl_ros.investigate.diagnosis_round import Answer, hypothesis_text, Outcome
 from adxl_ros.investigate.investigation import Investigation, State, Status
 from adxl_ros.investigate.manoeuvres import description, StageLimits
 from adxl_ros.investigate.output_folder import OutputFolder
-from adxl_ros.nodes.terminal.steps import drawable
+from adxl_ros.nodes.steps import drawable
 import numpy as np
 
 _COLUMNS = 79
@@ -26,17 +26,10 @@ _SMALLEST_SHOWN = 0.01
 """Probability below which a hypothesis is not named. Chosen: the smallest number that is shown."""
 
 
-class Settings(Protocol):
-    """The settings that are shown."""
-
-    limits: StageLimits
-    minutes: float
-
-
 class InvestigationScreen:
     """Prints lines; in a terminal that can draw, the last line shows what happens now."""
 
-    def __init__(self, folder: Path, settings: Any) -> None:
+    def __init__(self, folder: Path, limits: StageLimits, minutes: float) -> None:
         """Print what is about to happen."""
         self._live: Any = None
         self._text = ''
@@ -46,7 +39,7 @@ class InvestigationScreen:
             self._live = Live('', console=Console(file=sys.stdout, highlight=False,
                                                   markup=False, emoji=False), transient=True)
             self._live.start()
-        for line in opening_lines(folder, settings):
+        for line in opening_lines(folder, limits, minutes):
             self._print(line)
 
     def show_answer(self, minutes: float, answer: Answer) -> None:
@@ -77,12 +70,11 @@ class InvestigationScreen:
             self._live.console.print(line, soft_wrap=True)
 
 
-def opening_lines(folder: Path, settings: Any) -> list[str]:
+def opening_lines(folder: Path, limits: StageLimits, minutes: float) -> list[str]:
     """Return what is about to happen."""
-    limits = settings.limits
     ranges = ', '.join(f'{joint} {low:.0f} to {high:.0f}°' for joint, (low, high) in (
         ('alpha', np.degrees(limits.alpha_rad)), ('beta', np.degrees(limits.beta_rad))))
-    return [f'Investigation into {folder}, {settings.minutes:g} minutes at most',
+    return [f'Investigation into {folder}, {minutes:g} minutes at most',
             f'Stage within {ranges}, {np.degrees(limits.rate_rad_s):.3g}°/s', '']
 
 

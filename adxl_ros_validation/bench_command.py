@@ -1,31 +1,124 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The part of the benchmark on a graph: age, loss and processor time of nodes at 1 kHz."""
+"""Measure the live nodes and the reading of recordings, beside a bare baseline."""
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, ExitStack, suppress
 from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
 import os
 from pathlib import Path
+import struct
 import subprocess
 import sys
 import tempfile
 import time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from adxl_ros.closed_output import ended_by_closed_output
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
-from adxl_ros.nodes.support import rival_driver
-from adxl_ros.nodes.support.processes import cpu_time_s, executable, running
-from adxl_ros.nodes.support.rclpy_internals import MessageWait, NotForExecutors
+from adxl_ros.links.support.emulated_board import open_terminal
+from adxl_ros.nodes.node_help import program_parser
+from adxl_ros.nodes.rclpy_internals import MessageWait, NotForExecutors
+from adxl_ros.nodes.run_node import cpu_time_s, executable, running, use_own_graph
+from adxl_ros_validation.bench_jobs import offline_jobs, print_table
 import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data, QoSProfile
 from sensor_msgs.msg import Imu
+
+RIVAL_TOPIC = 'rival'
+"""Topic of the node."""
+_RIVAL_HEAD = b'\x55\x51'
+"""Begin of a frame of acceleration (manual of WitMotion WT901: 0x55, then the kind)."""
+_RIVAL_FIELDS = struct.Struct('<hhhh')
+"""Its fields: three accelerations and a temperature; a byte with the sum of all follows."""
+_MPS2_PER_CODE = 16 * 9.8 / 32768
+"""Acceleration by its code, m/s²: the library takes 9.8 m/s² for g."""
+_CLOCK_BITS = 48
+"""Bits of the clock that the three accelerations carry."""
+_BAUD = 115200
+"""Baud rate, which a pseudo-terminal ignores."""
+
+
+def rival_is_installed() -> bool:
+    """Return whether the library is there."""
+    return find_spec('witmotion') is not None
+
+
+def run_rival_board(port: str, rate_hz: float) -> int:
+    """
+    Send samples until a signal ends it: one a frame, as these boards do.
+
+    The accelerations of a sample are its time, because the frame has no field for it.
+    """
+    with suppress(KeyboardInterrupt), open_terminal(port) as fd:
+        began_s = time.monotonic()
+        count = 0
+        while True:
+            count += 1
+            time.sleep(max(began_s + count / rate_hz - time.monotonic(), 0))
+            # A frame that nobody reads is lost.
+            with suppress(BlockingIOError):
+                os.write(fd, _rival_frame(time.time_ns() // 1000))
+    return 0
+
+
+def _rival_frame(time_us: int) -> bytes:
+    """Return the frame whose accelerations are a time, µs."""
+    clock = (time_us % 2 ** _CLOCK_BITS).to_bytes(_CLOCK_BITS // 8, 'little')
+    frame = _RIVAL_HEAD + clock + b'\0\0'
+    return frame + bytes([sum(frame) % 256])
+
+
+def _time_us(accel_mps2: tuple[float, ...], now_us: int) -> int:
+    """Return the time that accelerations are, µs; it is before now."""
+    codes = (round(value / _MPS2_PER_CODE) for value in accel_mps2)
+    clock = int.from_bytes(_RIVAL_FIELDS.pack(*codes, 0)[:_CLOCK_BITS // 8], 'little')
+    return now_us - (now_us - clock) % 2 ** _CLOCK_BITS
+
+
+class RivalDriver(Node):
+    """The smallest node on the library: it publishes each sample, stamped by its time."""
+
+    def __init__(self, port: str, depth: int) -> None:
+        super().__init__('rival')
+        witmotion = import_module('witmotion')
+        self._message = Imu()
+        self._publisher = self.create_publisher(Imu, RIVAL_TOPIC, QoSProfile(depth=depth))
+        self._imu = witmotion.IMU(port, _BAUD)
+        self._imu.subscribe(self._on_sample, witmotion.protocol.AccelerationMessage)
+
+    def close(self) -> None:
+        """End the thread of the library."""
+        self._imu.close()
+
+    def _on_sample(self, sample: Any) -> None:
+        accel, stamp = self._message.linear_acceleration, self._message.header.stamp
+        accel.x, accel.y, accel.z = sample.a
+        stamp.sec, time_us = divmod(_time_us(sample.a, time.time_ns() // 1000), 10 ** 6)
+        stamp.nanosec = 1000 * time_us
+        self._publisher.publish(self._message)
+
+
+def run_rival_driver(port: str, depth: int) -> int:
+    """Run the node until a signal ends it."""
+    rclpy.init()
+    node = RivalDriver(port, depth)
+    try:
+        with suppress(KeyboardInterrupt, ExternalShutdownException):
+            rclpy.spin(node)
+    finally:
+        node.close()
+    return 0
+
 
 RATE_HZ = 1000.0
 """Sample rate of all measurements, Hz."""
@@ -210,10 +303,10 @@ def _subjects(stack: ExitStack, iiod: str | None) -> list[_Subject]:
         uri = stack.enter_context(_iio_server(iiod))
         drivers['iio'] = [driver, '--ros-args', '-p', 'link.type:=iio', '-p', f'link.uri:={uri}']
     rivals = []
-    if rival_driver.is_installed():
+    if rival_is_installed():
         bench = [sys.executable, sys.argv[0]]
         rival_port = stack.enter_context(_emulated_board([*bench, '--rival-board']))
-        rivals.append(_Subject('driver of another project', rival_driver.TOPIC,
+        rivals.append(_Subject('driver of another project', RIVAL_TOPIC,
                                [[*bench, '--rival-driver', rival_port]]))
     return [
         _Subject('bare publisher', 'bare', bare[:1]), _Subject(_RELAY, 'relayed', bare),
@@ -314,3 +407,56 @@ def _row(label: str, results: Sequence[_Result]) -> str:
 def _spread(values: Sequence[float]) -> str:
     """Return the median of some values, and their range."""
     return f'{np.median(values):.2f} ({min(values):.2f}-{max(values):.2f})'
+
+
+_SECONDS = 10.0
+"""Default duration of one live measurement, s."""
+_ROUNDS = 3
+"""Default number of measurements of each row; chosen: a median needs three."""
+_HOURS = 8.0
+"""Default duration of the long recordings, h."""
+_EXAMPLES = {'all measurements, ten minutes': '',
+             'with recordings of 10 minutes, not 8 hours': '--hours 0.17',
+             'only the live nodes': '--live',
+             'a short look': '--live --seconds 5 --rounds 1'}
+"""Examples of arguments, by their purpose."""
+
+
+@ended_by_closed_output()
+def main() -> int:
+    """Run the benchmark; return the exit status."""
+    parser = program_parser('bench', __doc__, _EXAMPLES)
+    parser.add_argument('--seconds', type=float, default=_SECONDS,
+                        help=f'duration of each live measurement, s (default {_SECONDS:g})')
+    parser.add_argument('--rounds', type=int, default=_ROUNDS,
+                        help=f'measurements of each row (default {_ROUNDS})')
+    parser.add_argument('--hours', type=float, default=_HOURS,
+                        help='duration of the recordings of the rows "apply, … h" (default '
+                             f'{_HOURS:g}: 30 GB of disk)')
+    parser.add_argument('--live', action='store_true', help='measure only the live nodes')
+    parser.add_argument('--iiod', metavar='FILE', help="the tests' IIOD, for the link iio")
+    parser.add_argument('--bare', choices=list(BARE_NODES),
+                        help=argparse.SUPPRESS)
+    parser.add_argument('--read', metavar='PORT', help=argparse.SUPPRESS)
+    parser.add_argument('--rival-board', metavar='PORT', help=argparse.SUPPRESS)
+    parser.add_argument('--rival-driver', metavar='PORT', help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.bare:
+        return run_bare_node(BARE_NODES[options.bare])
+    if options.read:
+        return run_bare_reader(options.read)
+    if options.rival_board:
+        return run_rival_board(options.rival_board, RATE_HZ)
+    if options.rival_driver:
+        return run_rival_driver(options.rival_driver, BARE_QUEUE)
+    use_own_graph()
+    try:
+        measure_live(options.seconds, options.rounds, options.iiod)
+        if not options.live:
+            print_table(offline_jobs(options.hours), options.rounds)
+    except UserError as error:
+        print(f'bench: {error}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    return 0

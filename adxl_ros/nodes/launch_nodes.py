@@ -13,7 +13,14 @@ from typing import Any, NamedTuple
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.links.support.base import link_names
-from adxl_ros.nodes.support.params_files import given_text, has_section
+from adxl_ros.nodes.parameters import given_text, has_section, Spec, specs_of
+from adxl_ros.nodes.settings import (
+    BridgeSettings,
+    DriverSettings,
+    link_specs,
+    links_by_parameter,
+    StageSettings,
+)
 from launch.action import Action
 from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction, Shutdown
 from launch.events.process import ProcessExited
@@ -39,63 +46,56 @@ class Argument(NamedTuple):
     """An argument of a launch that gives a parameter of a node."""
 
     name: str  # Its name
-    parameter: str  # The parameter
-    description: str  # Its meaning
-    kind: type = str  # Type of the parameter: str, int, float, or list for a list of float
-    choices: tuple[str, ...] = ()  # The values that it may have; empty for any
+    spec: Spec  # The parameter
 
     def declared(self) -> DeclareLaunchArgument:
         """Return the action that declares it; an empty value leaves the parameter as it is."""
+        links = links_by_parameter().get(self.spec.name)
+        used_by = f'{" and ".join(links)}: ' if links else ''
         return DeclareLaunchArgument(
-            self.name, default_value='', description=f'{self.description}; empty: as in '
-            'params_file, or the default', choices=['', *self.choices] if self.choices else None)
+            self.name, default_value='', description=f'{used_by}{self.spec.meaning}; empty: as in '
+            'params_file, or the default',
+            choices=['', *self.spec.choices] if self.spec.choices else None)
 
     def value(self, text: str) -> Any:
         """Return the value of the parameter."""
+        default = self.spec.default
         try:
-            if self.kind is list:
-                return [float(part) for part in text.strip('[]').split(',')]
-            return self.kind(text)
+            if default == ():
+                # A list of numbers has a unit; names with commas stay one text.
+                return _numbers(text) if self.spec.unit else text
+            return type(default)(text) if isinstance(default, int | float) else text
         except ValueError:
             expected = {int: 'a whole number', float: 'a number'}.get(
-                self.kind, 'numbers with commas, such as 30,60,90')
+                type(default), 'numbers with commas, such as 30,60,90')
             raise UserError(f'{self.name}:={text}: expected {expected}') from None
 
 
-LINK = (
-    Argument('link_type', 'link.type', 'link of the driver; sim is a simulated sensor', str,
-             link_names()),
-    Argument('link_port', 'link.port', 'serial: device path, such as /dev/ttyACM0, or a pyserial '
-             'URL'),
-    Argument('link_baud', 'link.baud', 'serial: baud rate of a UART', int),
-    Argument('link_uri', 'link.uri', 'iio: URI of libiio, such as local: or ip:HOST'),
-    Argument('link_device', 'link.device', 'iio: name, id or label of the ADC'),
-    Argument('link_channels', 'link.channels', 'serial and iio: roles of the channels, with '
-             'commas'),
-    Argument('link_recording', 'link.recording', 'replay: the recording to play'),
-)
+def _numbers(text: str) -> list[float]:
+    return [float(part) for part in text.strip('[]').split(',')]
+
+
+def arguments(settings: type, *parameters: str, **renamed: str) -> tuple[Argument, ...]:
+    """
+    Return arguments for parameters of a dataclass; those of the driver may be of any link.
+
+    Dots in the name of a parameter become underscores, unless it is renamed.
+    """
+    specs = {spec.name: spec for spec in specs_of(settings)}
+    if settings is DriverSettings:
+        for link in link_names():
+            specs = {spec.name: spec for spec in link_specs(link)} | specs
+    names = {parameter.replace('.', '_'): parameter for parameter in parameters} | renamed
+    return tuple(Argument(name, specs[parameter]) for name, parameter in names.items())
+
+
+LINK = arguments(DriverSettings, 'link.type', 'link.port', 'link.baud', 'link.uri', 'link.device',
+                 'link.channels', 'link.recording')
 """Arguments of the link."""
-LINK_TYPE = LINK[0]
-"""Type of the link."""
-STAGE_TYPE = Argument('stage_type', 'stage.type', 'the simulated stage, or the type of command '
-                      'that the controller of a real stage takes', str,
-                      ('simulated', 'joint_state', 'trajectory'))
-"""Argument of the stage."""
-BRIDGE = (
-    Argument('bridge_joint_states', 'bridge.joint_states', "topic of the controller's joint "
-             'states'),
-    Argument('bridge_command', 'bridge.command', 'topic on which the controller listens'),
-    Argument('bridge_speed_rad_s', 'bridge.speed_rad_s', 'speed of the real stage, rad/s', float),
-    *(argument for joint in ('alpha', 'beta') for argument in (
-        Argument(f'bridge_{joint}_joint', f'bridge.{joint}.joint',
-                 f"the controller's name of the joint {joint}"),
-        Argument(f'bridge_{joint}_sign', f'bridge.{joint}.sign',
-                 f'direction in which it counts {joint}: 1 or -1', int),
-        Argument(f'bridge_{joint}_offset_rad', f'bridge.{joint}.offset_rad',
-                 f"{joint} where the controller's joint is at 0, rad", float))))
-"""Arguments of the bridge to a real stage."""
-SPEED = Argument('speed', 'link.speed', 'simulated sensor: its time by real time, such as 10',
-                 float)
+STAGE = (*arguments(StageSettings, 'stage.type'),
+         *arguments(BridgeSettings, *(spec.name for spec in specs_of(BridgeSettings))))
+"""Arguments of the stage."""
+SPEED = arguments(DriverSettings, speed='link.speed')
 """Speed of a simulated sensor."""
 
 
@@ -111,8 +111,7 @@ TRANSFORM = (
 """Arguments of the static transform."""
 
 
-def common_arguments(link: Sequence[Argument] = LINK, frame_id: str = 'imu_link'
-                     ) -> list[DeclareLaunchArgument]:
+def common_arguments(*own: Argument, frame_id: str = 'imu_link') -> list[DeclareLaunchArgument]:
     """Return the arguments that all launch files have."""
     return [
         DeclareLaunchArgument('params_file', default_value=str(parameter_file.nominal_path()),
@@ -127,7 +126,7 @@ def common_arguments(link: Sequence[Argument] = LINK, frame_id: str = 'imu_link'
         DeclareLaunchArgument('enclave', default_value='', description='folder of the enclaves of '
                               'SROS 2, such as /adxl_ros; each node has one of its name there; '
                               'empty: none'),
-        *(argument.declared() for argument in link)]
+        *(argument.declared() for argument in own)]
 
 
 def describe(arguments: Sequence[DeclareLaunchArgument],
@@ -201,10 +200,11 @@ def static_transform(context: LaunchContext) -> list[Action]:
 def three_numbers(context: LaunchContext, name: str) -> list[float]:
     """Return the three numbers of an argument."""
     given = text(context, name)
-    values: list[float] = Argument(name, '', '', list).value(given)
-    if len(values) != 3:
-        raise UserError(f'{name}:={given}: expected three numbers')
-    return values
+    try:
+        x, y, z = _numbers(given)
+    except ValueError:
+        raise UserError(f'{name}:={given}: expected three numbers') from None
+    return [x, y, z]
 
 
 def text(context: LaunchContext, name: str) -> str:
@@ -215,7 +215,7 @@ def text(context: LaunchContext, name: str) -> str:
 def given_parameters(context: LaunchContext, arguments: Sequence[Argument]) -> dict[str, Any]:
     """Return the parameters that the arguments of a launch give."""
     texts = {argument: text(context, argument.name) for argument in arguments}
-    return {argument.parameter: argument.value(given) for argument, given in texts.items()
+    return {argument.spec.name: argument.value(given) for argument, given in texts.items()
             if given}
 
 
@@ -224,15 +224,15 @@ def full_name(context: LaunchContext, name: str) -> str:
     return '/'.join(('', *filter(None, text(context, 'namespace').split('/')), name))
 
 
-def given_anywhere(context: LaunchContext, argument: Argument, executable: str) -> str:
+def given_anywhere(context: LaunchContext, parameter: str, executable: str) -> str:
     """Return a parameter that an argument or the parameter file gives."""
-    return text(context, argument.name) or given_text(
-        text(context, 'params_file'), full_name(context, executable), argument.parameter)
+    return text(context, parameter.replace('.', '_')) or given_text(
+        text(context, 'params_file'), full_name(context, executable), parameter)
 
 
 def simulated_link(context: LaunchContext, speed: Mapping[str, Any]) -> dict[str, Any]:
     """Return the parameters of a driver with a speed; a sensor without a link is simulated."""
-    link = given_anywhere(context, LINK_TYPE, 'driver')
+    link = given_anywhere(context, 'link.type', 'driver')
     return {'link.type': link or 'sim', **speed} if speed else {}
 
 

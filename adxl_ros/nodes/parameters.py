@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Parameters of nodes: each is described once, by a `Spec`.
+
+Descriptors, `--help`, launch arguments and the known names all come from it. `settings.py` has
+the parameters of each node, `links` those of each link, and a parameter file those of a sensor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import field, fields
+from difflib import get_close_matches
+from itertools import pairwise
+from pathlib import Path
+import re
+import sys
+from typing import Any, NamedTuple, TypeVar
+
+from adxl_ros.errors import UserError
+from adxl_ros.files.parameter_file import compose
+from adxl_ros.nodes.rclpy_internals import given_parameters, store_empty
+import numpy as np
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.exceptions import ParameterException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+import yaml
+
+T = TypeVar('T')
+Kind = Parameter.Type
+"""Types of ROS parameters."""
+_FILE_FLAG = '--params-file'
+"""Argument of rcl before a parameter file."""
+_RULE_FLAGS = ('-p', '--param')
+"""Arguments of rcl before one parameter."""
+_LARGEST = 3600.0
+"""Largest number of a range; chosen: ten turns in degrees, and hotter than any sensor."""
+
+
+class Spec(NamedTuple):
+    """One parameter."""
+
+    name: str
+    # Its type is that of the parameter. An empty tuple stands for a list, or one text with commas,
+    # and a `Kind` for a parameter without default.
+    default: Any
+    doc: str
+    unit: str = ''
+    lower: float | None = None  # In `unit`; None without limits
+    upper: float | None = None
+    choices: Sequence[str] = ()  # Values of a text
+    live: bool = False  # Whether it can be set while the node runs
+    empty: float = 0.0  # Number that stands for no value, where there is no default
+
+    @property
+    def kind(self) -> Kind:
+        """Return the type of the parameter."""
+        if isinstance(self.default, Kind):
+            return self.default
+        return Kind.from_parameter_value('' if self.default == () else self.default)
+
+    @property
+    def meaning(self) -> str:
+        """Return the meaning with the unit."""
+        return ', '.join(filter(None, (self.doc, self.unit)))
+
+    @property
+    def limits(self) -> str:
+        """Return what values are permitted, '' for any."""
+        if self.choices:
+            return f'one of {", ".join(self.choices)}'
+        return '' if self.lower is None else f'{self.lower:.10g} to {self.upper:.10g}'
+
+
+def parameter(*spec: Any, **options: Any) -> Any:
+    """Declare one field of a dataclass of parameters; the arguments are those of `Spec`."""
+    return field(metadata={'spec': Spec(*spec, **options)})
+
+
+def specs_of(settings: type) -> list[Spec]:
+    """Return the parameters of a dataclass."""
+    return [f.metadata['spec'] for f in fields(settings)]
+
+
+def declare_all(node: Node, settings: type[T]) -> T:
+    """Declare the parameters of a dataclass, and return it with their values."""
+    return settings(**{f.name: declare(node, f.metadata['spec'])
+                       for f in fields(settings)})  # type: ignore[arg-type]
+
+
+def declare(node: Node, spec: Spec) -> Any:
+    """Declare one parameter with its descriptor and return its value."""
+    name, kind = spec.name, spec.kind
+    descriptor = ParameterDescriptor(
+        description=spec.meaning, read_only=not spec.live, dynamic_typing=spec.default == (),
+        additional_constraints=spec.limits)
+    if spec.lower is not None and spec.upper is not None:
+        # ROS has no range for lists.
+        if kind == Kind.DOUBLE:
+            descriptor.floating_point_range = [FloatingPointRange(
+                from_value=float(spec.lower), to_value=float(spec.upper))]
+        elif kind == Kind.INTEGER:
+            descriptor.integer_range = [IntegerRange(
+                from_value=int(spec.lower), to_value=int(spec.upper))]
+    try:
+        value = node.declare_parameter(
+            name, '' if spec.default == () else spec.default, descriptor).value
+    except ParameterException:
+        given = dict(given_parameters(node)).get(name)
+        unit = spec.unit and f' {spec.unit}'
+        raise parameter_error(name, _type_error(given, kind) or f'{given!r} is out of range; it '
+                              f'must be {spec.limits}{unit}') from None
+    if value is None:
+        store_empty(node, name, kind, spec.empty)
+    elif spec.choices and value not in spec.choices:
+        raise parameter_error(name, f'{value!r} is not {spec.limits}')
+    return value
+
+
+def _type_error(given: Any, expected: Kind) -> str:
+    """Return why a given value has a wrong type; '' where its type is right."""
+    kind = Kind.from_parameter_value(given)
+    if kind == expected:
+        return ''
+    if (kind, expected) == (Kind.INTEGER, Kind.DOUBLE):
+        return f'{given} is a whole number (INTEGER); a DOUBLE is expected: write {given}.0'
+    return f'{given!r} is of the type {kind.name}; expected {expected.name}'
+
+
+def numbers(name: str, given: Any, example: str) -> list[float]:
+    """Return the numbers of a parameter that is a list; one number alone is one, too."""
+    try:
+        return [float(value) for value in np.atleast_1d(given)]
+    except (TypeError, ValueError):
+        raise parameter_error(name, f'{given!r} is no list of numbers; write {example}') from None
+
+
+def low_and_high(name: str, given: Any, default: tuple[float, float]) -> tuple[float, float]:
+    """Return the lowest and the highest number of a parameter, by default where it is empty."""
+    example = '[{:.1f}, {:.1f}]'.format(*default)
+    values = numbers(name, given or default, example)
+    if len(values) != 2 or not -_LARGEST <= values[0] < values[1] <= _LARGEST:
+        raise parameter_error(name, f'{values} is no lowest and highest value within '
+                              f'{_LARGEST:g}; write {example}')
+    return values[0], values[1]
+
+
+def nearest(name: str, names: Iterable[str]) -> str:
+    """Return the name that is most like a misspelled one."""
+    return get_close_matches(name, sorted(names), 1, 0.0)[0]
+
+
+def parameter_error(key: str, reason: str) -> UserError:
+    """Make the error of a parameter, with its place where it comes from a file."""
+    return UserError(f'{_place_of(key)}{key}: {reason}')
+
+
+def _place_of(key: str) -> str:
+    """
+    Return the place of a parameter in the files: 'file:line:column: ', or ''.
+
+    The last argument that gives a parameter counts. A parameter that none gives belongs to the
+    last file of a sensor, which has a format.
+    """
+    for flag, value in reversed(list(pairwise(sys.argv))):
+        # A rule is [NODE:]NAME:=VALUE.
+        if flag in _RULE_FLAGS and value.split(':=')[0].rsplit(':')[-1] == key:
+            return ''
+        marks = [found.start_mark for _, name, found in _entries(value) if name == key] \
+            if flag == _FILE_FLAG else []
+        if marks:
+            return 'parameters of the launch file: ' if _is_of_launch(value) else \
+                f'{value}:{marks[0].line + 1}:{marks[0].column + 1}: '
+    files = [path for path in reversed(_paths()) if not _is_of_launch(path)]
+    return next((f'{path}: ' for path in files
+                 if any(name == 'format' for _, name, _ in _entries(path))),
+                f'{files[0]}: ' if files else '')
+
+
+def _is_of_launch(path: str) -> bool:
+    """Return whether launch_ros wrote a file for the parameters of a launch file."""
+    return Path(path).name.startswith('launch_params_')
+
+
+def _paths() -> list[str]:
+    """Return the files of `--params-file` in the order of the command line."""
+    return [path for flag, path in pairwise(sys.argv) if flag == _FILE_FLAG]
+
+
+def _entries(path: str) -> Iterator[tuple[str, str, yaml.Node]]:
+    """Yield the pattern of the node's name, the parameter's name and its value in a file."""
+    def inside(tree: yaml.Node | None, section: str, key: str | None
+               ) -> Iterator[tuple[str, str, yaml.Node]]:
+        if not isinstance(tree, yaml.MappingNode):
+            if key is not None and tree is not None:
+                yield section, key, tree
+            return
+        for name, value in tree.value:
+            if key is not None:
+                yield from inside(value, section, f'{key}.{name.value}'.lstrip('.'))
+            elif name.value == 'ros__parameters':
+                yield from inside(value, section, '')
+            else:
+                yield from inside(value, f'{section}/{name.value.strip("/")}', None)
+    return inside(compose(path), '', None)
+
+
+def check_params_files() -> None:
+    """Check syntax and lists of all parameter files; rcl would name neither line nor column."""
+    for path in _paths():
+        for _, _, value in _entries(path):
+            items = value.value if isinstance(value, yaml.SequenceNode) else []
+            for item in items[1:]:
+                if item.tag != items[0].tag:
+                    mark = item.start_mark
+                    raise UserError(
+                        f'{path}:{mark.line + 1}:{mark.column + 1}: {item.value} is not of the '
+                        f'type of {items[0].value} before it; a list has one type (1.0, never 1)')
+
+
+def has_section(path: str, node_name: str) -> bool:
+    """Return whether a parameter file has a section for a node."""
+    return any(_matches(section, node_name) for section, _, _ in _entries(path))
+
+
+def given_text(path: str, node_name: str, key: str) -> str:
+    """Return the text of a parameter in the sections of a file for a node."""
+    return next((str(value.value) for section, name, value in _entries(path)
+                 if name == key and _matches(section, node_name)), '')
+
+
+def refuse_files_of_others(node_name: str) -> None:
+    """Refuse a file whose sections name other nodes only: the node would run without it."""
+    for path in _paths():
+        sections = dict.fromkeys(section for section, _, _ in _entries(path))
+        if sections and not any(_matches(section, node_name) for section in sections):
+            raise UserError(f'{path}: has parameters of {", ".join(sections)}, but none of the '
+                            f'node {node_name}; begin the file with /**: or {node_name}:')
+
+
+def _matches(pattern: str, node_name: str) -> bool:
+    """Return whether a pattern means a node; * is one part of a name, and ** any number."""
+    wild = {'*': r'/[^/]+', '**': r'(/[^/]+)*'}
+    parts = [wild.get(part, f'/{re.escape(part)}') for part in pattern.strip('/').split('/')]
+    return bool(re.fullmatch(''.join(parts), node_name))
