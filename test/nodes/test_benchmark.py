@@ -7,8 +7,8 @@ import re
 import sys
 
 from adxl_ros.errors import UserError
-from adxl_ros.nodes.support import bench_command, offline_jobs
-from adxl_ros.nodes.bench_jobs import Job, print_table, rows_of
+from adxl_ros_validation import bench_command, bench_jobs
+from adxl_ros_validation.bench_jobs import Job, print_table, rows_of
 from processes import executable
 import pytest
 from units import nominal
