@@ -18,9 +18,8 @@ from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.package_version import package_version
 from adxl_ros.files.stream_unit import recorded_unit
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.tools.closing_lines import print_end, quoted
 from adxl_ros.tools.command_line import argument_parser, command
-from adxl_ros.tools.common import make_folder, progress, report_reading, run
+from adxl_ros.tools.output import make_folder, print_end, progress, quoted, report_reading, run
 from adxl_ros_validation import coverage, experiments, reproduction_report as report
 from adxl_ros_validation.reproduction_report import FIGURES
 import numpy as np

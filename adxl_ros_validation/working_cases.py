@@ -26,7 +26,7 @@ from adxl_ros.jobs.pools import open_pool
 from adxl_ros.jobs.run import for_each
 from adxl_ros.jobs.whole_files import make_folder, write
 from adxl_ros.tools.command_line import argument_parser
-from adxl_ros.tools.common import run
+from adxl_ros.tools.output import run
 from adxl_ros_validation import working_world as world
 from adxl_ros_validation.blind import diagnosis_runs, grading, real_sensors, scores, trials
 from adxl_ros_validation.blind.grading import Answer

@@ -24,14 +24,14 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import NOMINAL_ENVIRONMENT
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.signals.recorded_sensor import BeyondRange, listed, load_sensor, measure_unstated
-from adxl_ros.tools.closing_lines import print_end, quoted
-from adxl_ros.tools.command_line import argument_parser, command
-from adxl_ros.tools.common import note, progress, report_reading, run
-from adxl_ros.tools.recording_options import (
+from adxl_ros.tools.command_line import (
     add_recording_options,
+    argument_parser,
+    command,
     reading_options,
     RECORDING_HELP,
 )
+from adxl_ros.tools.output import note, print_end, progress, quoted, report_reading, run
 import numpy as np
 
 _BLOCK_ROWS = 8192

@@ -1,16 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The argument parsers of the tools: examples, list of effects, and version in each help text."""
+"""The command lines of the tools: parsers, how recordings are read, effects."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from difflib import get_close_matches
+import math
+import shlex
 import shutil
 import textwrap
 from typing import Any
 
-from adxl_ros.model.effects.base import Effect
+from adxl_ros.errors import UserError
+from adxl_ros.files.column_mapping import parse_mapping, parse_mounting
+from adxl_ros.files.reading_options import ReadingOptions
+from adxl_ros.model import coefficients
+from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Coefficient, Effect, Parameter
+from adxl_ros.model.sensor import Sensor
+import numpy as np
 
 COLUMNS = 79
 """Columns of a terminal that a tool uses."""
@@ -77,3 +88,151 @@ def entry_list(title: str, entries: Mapping[str, str]) -> str:
     return '\n'.join([f'{title}:', *(
         textwrap.fill(f'  {name:{width}}{meaning}', COLUMNS, subsequent_indent=(width + 2) * ' ')
         for name, meaning in entries.items())])
+
+
+RECORDING_HELP = 'rosbag2 directory, .mcap, CSV or another table'
+"""Help text of the argument that names a recording."""
+
+_HIGHEST_RATE_HZ = 1e5
+"""Largest sample rate, Hz: that of a parameter file."""
+
+
+def add_recording_options(parse: argparse.ArgumentParser) -> None:
+    """Add the options that state topic, columns, units, stamps and mounting of a recording."""
+    group = parse.add_argument_group(
+        'recordings of other software', 'docs/recordings.md has units and examples.')
+    group.add_argument('--topic', metavar='NAME', default='',
+                       help='topic of type sensor_msgs/Imu (default: imu/data_raw, or the only '
+                            'one)')
+    group.add_argument('--columns', metavar='MAPPING',
+                       help='columns and units of a table, for example '
+                            'time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg; or a file that holds '
+                            'them')
+    group.add_argument('--lsb-per-g', metavar='COUNTS', default='',
+                       help='counts of 1 g of columns in LSB: one number, or one for each axis')
+    group.add_argument('--lsb-at-0g', metavar='COUNTS', default='',
+                       help='counts at 0 g of columns in LSB (default: 0), as 512 of a 10 bit ADC')
+    group.add_argument('--rate', metavar='HZ', type=float, default=None,
+                       help='stamp the samples by their index at this rate')
+    group.add_argument('--drop-bad-stamps', action='store_true',
+                       help='leave out samples whose stamp does not increase, and count them')
+    group.add_argument('--axes', metavar='x=-y,y=x,z=z',
+                       help='axes of the sensor by those of the file, for a documented mounting')
+
+
+def reading_options(options: argparse.Namespace) -> ReadingOptions:
+    """Return how recordings are to be read."""
+    if options.rate is not None and not 0 < options.rate <= _HIGHEST_RATE_HZ:
+        raise UserError(f'--rate {options.rate:g}: expected samples a second, at most '
+                        f'{_HIGHEST_RATE_HZ:g}')
+    return ReadingOptions(
+        options.topic, parse_mapping(options.columns) if options.columns else None,
+        _counts('--lsb-per-g', options.lsb_per_g, True),
+        _counts('--lsb-at-0g', options.lsb_at_0g, False), options.rate, options.drop_bad_stamps,
+        parse_mounting(options.axes) if options.axes else None)
+
+
+def reading_text(options: argparse.Namespace) -> str:
+    """Return the given options for a command line that reads the same recording."""
+    values = {'--topic': options.topic, '--columns': options.columns,
+              '--lsb-per-g': options.lsb_per_g, '--lsb-at-0g': options.lsb_at_0g,
+              '--rate': '' if options.rate is None else f'{options.rate:g}',
+              '--axes': options.axes}
+    words = [word for option, value in values.items() if value for word in (option, value)]
+    words += ['--drop-bad-stamps'] * options.drop_bad_stamps
+    return f' {shlex.join(words)}' if words else ''
+
+
+def _counts(option: str, text: str, is_positive: bool) -> tuple[float, ...]:
+    """Return the numbers of a list."""
+    try:
+        values = tuple(float(word) for word in text.split(',')) if text else ()
+    except ValueError:
+        values = (math.nan,)
+    if not all(math.isfinite(value) and (value > 0 or not is_positive) for value in values):
+        raise UserError(f'{option} {text}: expected counts, for example 16384 or '
+                        '16384,16384,16500')
+    return values
+
+
+SYNTAX = ('NAME alone has typical values, KEY=VALUE sets a parameter for all its axes, '
+          'KEY.AXIS=VALUE for one; parameters without a value are neutral')
+"""What an option may be, for help texts."""
+_SIMILARITY = 0.4
+"""Smallest similarity of a suggested name, as `difflib` counts it; chosen."""
+
+
+def with_effects(sensor: Sensor, texts: Sequence[str]) -> Sensor:
+    """Add effects to a sensor, or change their parameters."""
+    stated: dict[Coefficient, str] = {}
+    for text in texts:
+        name, _, rest = text.partition(':')
+        effect = _effect(name, text)
+        if not rest:
+            values = coefficients.typical(effect, sensor.axes)
+            sensor = _with_values(sensor, effect, values)
+        for part in filter(None, rest.split(',')):
+            key, _, number = part.partition('=')
+            coefficient = Coefficient(name, *key.strip().split('.', 1))
+            if coefficient in stated:
+                raise UserError(f'--effect {text}: {key} of {name} is stated twice, also in '
+                                f'{stated[coefficient]}; keep one')
+            stated[coefficient] = text
+            sensor = _with_value(sensor, effect, key.strip(), number.strip(), text)
+    return sensor
+
+
+def _effect(name: str, text: str) -> Effect:
+    try:
+        return effect_named(name)
+    except UserError as error:
+        raise UserError(f'--effect {text}: {error}') from None
+
+
+def _with_values(sensor: Sensor, effect: Effect, values: dict[str, np.ndarray]) -> Sensor:
+    """Return the sensor with an effect that has these values by parameter."""
+    effects = sensor.effects if effect.name in sensor.effects else (*sensor.effects, effect.name)
+    return replace(sensor, effects=effects, values={**sensor.values, effect.name: values})
+
+
+def _with_value(sensor: Sensor, effect: Effect, key: str, number: str, text: str) -> Sensor:
+    """Set one parameter, for all its axes or one; `text` is the option, for messages."""
+    name, _, axis = key.partition('.')
+    parameter = _parameter(effect, name, text)
+    value = _number(parameter, number, text)
+    values = dict(sensor.values.get(effect.name) or coefficients.neutral(effect, sensor.axes))
+    if not parameter.axes:
+        if axis:
+            raise UserError(f'--effect {text}: {name} is one number without axes; write '
+                            f'{name}={number}')
+        return _with_values(sensor, effect, {**values, name: np.array(value)})
+    chosen = [i for i, a in enumerate(sensor.axes) if a in parameter.axes and axis in ('', a)]
+    if not chosen:
+        raise UserError(f'--effect {text}: no axis {axis!r} to act on; the sensor has '
+                        f'{sensor.axes}, {name} acts on {parameter.axes}')
+    changed = np.array(values[name], float)
+    changed[chosen] = value
+    return _with_values(sensor, effect, {**values, name: changed})
+
+
+def _parameter(effect: Effect, name: str, text: str) -> Parameter:
+    by_name = {p.name: p for p in effect.parameters}
+    if name not in by_name:
+        near = get_close_matches(name, by_name, 1, _SIMILARITY) or list(by_name)
+        raise UserError(f'--effect {text}: {effect.name} has no parameter {name!r}; did you mean '
+                        f'{near[0]}?')
+    return by_name[name]
+
+
+def _number(parameter: Parameter, number: str, text: str) -> float:
+    """Read the value of a parameter, within its bounds; `text` is the option, for messages."""
+    try:
+        value = float(number)
+    except ValueError:
+        raise UserError(f'--effect {text}: {number!r} is not a number; {parameter.name} is in '
+                        f'{parameter.unit}, written without the unit') from None
+    if not parameter.lower <= value <= parameter.upper:
+        raise UserError(f'--effect {text}: {value:g} {parameter.unit} is outside '
+                        f'{parameter.lower:g} to {parameter.upper:g} {parameter.unit}; a typical '
+                        f'{parameter.name} is {parameter.scale:g}')
+    return value

@@ -26,13 +26,23 @@ from adxl_ros.model.population import posterior
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
 from adxl_ros.simulate.from_recording import motion_from_force
-from adxl_ros.tools.closing_lines import NextStep, print_end, quoted
-from adxl_ros.tools.command_line import argument_parser, command, effect_list
-from adxl_ros.tools.common import make_folder, note, progress, report_reading, run
-from adxl_ros.tools.recording_options import (
+from adxl_ros.tools.command_line import (
     add_recording_options,
+    argument_parser,
+    command,
+    effect_list,
     reading_options,
     RECORDING_HELP,
+)
+from adxl_ros.tools.output import (
+    make_folder,
+    NextStep,
+    note,
+    print_end,
+    progress,
+    quoted,
+    report_reading,
+    run,
 )
 
 _NO_VERDICT = ('bad_data', 'insufficient')

@@ -15,9 +15,8 @@ from adxl_ros.files.exports import base, format_named, format_names
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.part_sizes import PartSizes
-from adxl_ros.tools.closing_lines import print_end, quoted
 from adxl_ros.tools.command_line import argument_parser, command, entry_list
-from adxl_ros.tools.common import progress, run
+from adxl_ros.tools.output import print_end, progress, quoted, run
 import numpy as np
 
 _EXAMPLES = {

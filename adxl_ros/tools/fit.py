@@ -30,14 +30,23 @@ from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Place
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.signals.recorded_sensor import BeyondRange, listed, load_sensor, measure_unstated
-from adxl_ros.tools.closing_lines import print_end, quoted
-from adxl_ros.tools.command_line import argument_parser, command, effect_list
-from adxl_ros.tools.common import make_folder, note, report_reading, run, staged_progress
-from adxl_ros.tools.recording_options import (
+from adxl_ros.tools.command_line import (
     add_recording_options,
+    argument_parser,
+    command,
+    effect_list,
     reading_options,
     reading_text,
     RECORDING_HELP,
+)
+from adxl_ros.tools.output import (
+    make_folder,
+    note,
+    print_end,
+    quoted,
+    report_reading,
+    run,
+    staged_progress,
 )
 
 _EXAMPLES = {

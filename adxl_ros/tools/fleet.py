@@ -23,14 +23,14 @@ from adxl_ros.fleet.row import reason_kind, Row
 from adxl_ros.fleet.run import Plan, plan, Selection, since_text, work
 from adxl_ros.jobs.pools import open_pool
 from adxl_ros.jobs.run import RETRIES
-from adxl_ros.tools.closing_lines import print_end, wrapped
-from adxl_ros.tools.command_line import argument_parser, command
-from adxl_ros.tools.common import make_folder, note, progress, run
-from adxl_ros.tools.recording_options import (
+from adxl_ros.tools.command_line import (
     add_recording_options,
+    argument_parser,
+    command,
     reading_options,
     reading_text,
 )
+from adxl_ros.tools.output import make_folder, note, print_end, progress, run, wrapped
 
 PROG = 'fleet'
 """Name of the command, for messages."""

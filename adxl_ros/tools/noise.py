@@ -9,25 +9,335 @@ from collections.abc import Iterator
 from dataclasses import replace
 import json
 from pathlib import Path
+from typing import Any
 
+from adxl_ros.calibrate.value_text import duration
 from adxl_ros.errors import UserError
 from adxl_ros.files import html_page, parameter_file, recording
+from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files.csv_file import csv_writer
+from adxl_ros.files.plot_file import pyplot, write_plot
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_unit import unit_of
+from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.axis_noise import recording_noise, RecordingNoise, with_noise
+from adxl_ros.signals.axis_noise import (
+    AxisNoise,
+    density_g_per_rthz,
+    recording_noise,
+    RecordingNoise,
+    TERMS,
+    with_noise,
+)
+from adxl_ros.signals.noise_drift import Drift, DriftKind
+from adxl_ros.signals.noise_names import settings
+from adxl_ros.signals.noise_parameters import Estimate
 from adxl_ros.signals.recorded_sensor import load_sensor
-from adxl_ros.signals.still_stretch import longest_rest
-from adxl_ros.tools import noise_page, noise_text
-from adxl_ros.tools.closing_lines import print_end, quoted
-from adxl_ros.tools.command_line import argument_parser, command
-from adxl_ros.tools.common import make_folder, progress, report_reading, run, ShowDone
-from adxl_ros.tools.recording_options import (
+from adxl_ros.signals.still_stretch import longest_rest, StillStretch
+from adxl_ros.tools.command_line import (
     add_recording_options,
+    argument_parser,
+    command,
     reading_options,
     reading_text,
     RECORDING_HELP,
 )
+from adxl_ros.tools.output import (
+    make_folder,
+    print_end,
+    progress,
+    quoted,
+    report_reading,
+    run,
+    ShowDone,
+)
+import numpy as np
+
+MICRO_G = 1e6 / G0_MPS2
+"""1 m/s² in µg."""
+
+_LARGEST_STD_MPS2 = 0.3
+"""Noise of a sample from which a sensor vibrates, m/s². Chosen: three times that of a low-cost
+IMU at 1 kHz."""
+
+_LARGEST_RATIO = 1.25
+"""Ratio of measured and fitted power from which it is reported. Chosen: less changes N by 10 %."""
+
+_LARGEST_FILLED = 0.01
+"""Share of missing samples from which white noise changes visibly. Chosen."""
+
+NAMES = {'white': 'white noise N', 'instability': 'bias instability B', 'walk': 'random walk K'}
+"""Names of the terms."""
+
+_UNITS = {'white': 'm/s^2/sqrt(Hz)', 'instability': 'm/s^2', 'walk': 'm/s^2/sqrt(s)'}
+"""Units of the terms in JSON."""
+
+
+def _head(result: RecordingNoise) -> list[str]:
+    """Return which samples are used."""
+    rest, axes = result.rest, ' '.join(noise.axis for noise in result.axes)
+    return [result.path, f'{duration(rest.span_s)} at rest, {rest.rate_hz:.5g} Hz, axes {axes}']
+
+
+def _tables(result: RecordingNoise) -> list[str]:
+    """Return the terms with intervals, then in SI units and by sample, 79 columns at most."""
+    rows = [f' {"axis":5}' + ''.join(f'{name:25}' for name in (
+            f'{NAMES[term]}' for term in TERMS)).rstrip(),
+            f' {"":5}{"µg/√Hz (90 %)":25}{"µg (90 %)":25}µg/√s (90 %)']
+    for noise in result.axes:
+        cells = [_interval(estimate.scaled(MICRO_G)) for estimate in noise.estimates]
+        rows.append(f' {noise.axis:5}' + ''.join(f'{cell:25}' for cell in cells).rstrip())
+    rows += _walk_lines(result)
+    rows += ['', f' {"":5}{"N":12}{"B":12}{"K":12}{"N by sample":13}{"K by sample":13}'
+             'datasheet',
+             f' {"axis":5}{"m/s²/√Hz":12}{"m/s²":12}{"m/s²/√s":12}{"m/s²":13}{"m/s²":13}µg/√Hz']
+    rate = np.sqrt(result.rest.rate_hz)
+    for noise in result.axes:
+        white, instability, walk = noise.estimates
+        cells = [_value(white), _value(instability), _value(walk), _value(white.scaled(rate)),
+                 _value(walk.scaled(1 / rate)),
+                 _value(white.scaled(1e6 * ONE_SIDED / G0_MPS2))]
+        widths = (12, 12, 12, 13, 13, 0)
+        rows.append(f' {noise.axis:5}' + ''.join(f'{cell:{width}}' for cell, width
+                                                 in zip(cells, widths)).rstrip())
+    return rows
+
+
+def _walk_lines(result: RecordingNoise) -> list[str]:
+    """Return the bounds of the walks, and for which times K holds."""
+    rows = []
+    for noise in result.axes:
+        time_s, walk = noise.fit.correlation, noise.fit.walk
+        if time_s is not None:
+            std = MICRO_G * walk.value * np.sqrt(time_s.value / 2)
+            rows.append(f' {noise.axis}: the walk has bounds, {std:.3g} µg rms; correlation time '
+                        f'{_interval(time_s)} s')
+    if any(noise.fit.walk.is_seen for noise in result.axes):
+        rows.append(f' K holds for times up to {duration(result.rest.span_s)}, those of the '
+                    'recording.')
+    return rows
+
+
+def _interval(estimate: Estimate) -> str:
+    """Return an estimate with its interval, or its upper limit."""
+    if not estimate.is_seen:
+        return f'below {estimate.high:.3g}'
+    return f'{estimate.value:.3g} ({estimate.low:.3g} to {estimate.high:.3g})'
+
+
+def _value(estimate: Estimate) -> str:
+    """Return an estimate, or its upper limit."""
+    return f'{estimate.value:.3g}' if estimate.is_seen else f'< {estimate.high:.3g}'
+
+
+def _paste_lines(result: RecordingNoise) -> list[str]:
+    """Return the settings of other programs, ready to paste."""
+    lines = []
+    for program, entries in settings(result.axes, result.rest.rate_hz).items():
+        lines.append(f'# {program}')
+        for setting in entries:
+            lines += setting.lines()
+    return lines
+
+
+def _comments(result: RecordingNoise) -> list[str]:
+    """Return the comments of the parameter file."""
+    return [f'Noise measured in {duration(result.rest.span_s)} at rest of {result.path}.',
+            'Density: over positive frequencies, as datasheets state it.',
+            *_tables(result)]
+
+
+def _warnings(result: RecordingNoise) -> list[str]:
+    """Return what limits the result, and what to do about it."""
+    rest, texts = result.rest, []
+    if rest.motion_s:
+        texts.append(f'{_motion(rest)} Used is the longest rest, {duration(rest.span_s)} of '
+                     f'{duration(rest.recorded_s)}. Record again without touching the sensor.')
+    if rest.filled > _LARGEST_FILLED * rest.count:
+        texts.append(f'{rest.filled} samples ({100 * rest.filled / rest.count:.2g} %) are '
+                     'missing. They are filled by straight lines, which lowers N.')
+    texts += _too_short(result)
+    for noise in result.axes:
+        if noise.drift is not None:
+            texts.append(_drift_text(rest, noise, noise.drift))
+        else:
+            texts += _unexplained(noise)
+        if noise.is_coarse:
+            texts.append(f'{noise.axis}: samples change in steps of '
+                         f'{noise.resolution * MICRO_G:.3g} µg, which hide the noise. N, B and K '
+                         'are upper limits. Choose a smaller range.')
+        if not noise.fit.white.is_seen:
+            texts.append(f'{noise.axis}: N is not determined. A parameter file keeps the figure '
+                         'of --params, or states no white noise.')
+        if noise.sample_std > _LARGEST_STD_MPS2:
+            texts.append(f'{noise.axis}: one sample has a noise of {noise.sample_std:.2g} m/s², '
+                         f'expected less than {_LARGEST_STD_MPS2:g}. The sensor seems to '
+                         'vibrate.')
+    return texts
+
+
+def _motion(rest: StillStretch) -> str:
+    """Return when the sensor moves."""
+    first = rest.motion_s[0]
+    others = len(rest.motion_s) - 1
+    repeated = {0: '', 1: ' and once again'}.get(others, f' and at {others} further times')
+    return f'not still or interrupted from {first[0]:.5g} s to {first[1]:.5g} s{repeated}.'
+
+
+def _too_short(result: RecordingNoise) -> list[str]:
+    """Return which terms the time does not show, and how long it must be."""
+    texts = []
+    for name in TERMS:
+        needed_s = {noise.axis: noise.needed_s[name] for noise in result.axes
+                    if name in noise.needed_s}
+        if needed_s:
+            longest_s = max(needed_s.values())
+            further = 'To see half of the limit above, record about ' \
+                f'{duration(_two_digits(longest_s))}.' if np.isfinite(longest_s) else \
+                'The other terms hide it, in longer recordings, too.'
+            texts.append(f'{duration(result.rest.span_s)} is too short to see the {NAMES[name]} '
+                         f'of {", ".join(needed_s)}. {further}')
+    return texts
+
+
+def _two_digits(seconds: float) -> float:
+    """Round a time to two digits of its unit."""
+    unit_s = next((unit_s for unit_s in (86400.0, 3600.0, 60.0) if seconds >= 2 * unit_s), 1.0)
+    return float(f'{seconds / unit_s:.2g}') * unit_s
+
+
+def _unexplained(noise: AxisNoise) -> list[str]:
+    """Return at which frequencies N, B and K do not describe the noise."""
+    texts = []
+    octaves = [octave for octave in noise.fit.octaves
+               if abs(np.log(octave.ratio)) > np.log(_LARGEST_RATIO)]
+    for is_excess, advice in ((True, 'Look for a fan, mains or a person nearby.'),
+                              (False, 'The noise is none of these three there.')):
+        part = [octave for octave in octaves if (octave.ratio > 1) == is_excess]
+        if part:
+            ratio = max(part, key=lambda octave: abs(np.log(octave.ratio))).ratio
+            texts.append(f'{noise.axis}: from {part[0].low_hz:.3g} to {part[-1].high_hz:.3g} Hz '
+                         f'the power is {"up" if is_excess else "down"} to {ratio:.2g} times that '
+                         f'of N, B and K. {advice}')
+    return texts
+
+
+def _micro_or_milli_g(size_mps2: float, unit: str) -> str:
+    """Return a drift with its sign in µg or mg."""
+    size = size_mps2 * MICRO_G
+    return f'{size:+.3g} µg{unit}' if abs(size) < 1000 else f'{size / 1000:+.3g} mg{unit}'
+
+
+def _drift_text(rest: StillStretch, noise: AxisNoise, drift: Drift) -> str:
+    """Return what the axis follows, and the random walk without it."""
+    if drift.kind is DriftKind.TEMPERATURE:
+        assert rest.temperature_c is not None
+        text = (f'follows the temperature by {_micro_or_milli_g(drift.size, "/K")} '
+                f'({np.ptp(rest.temperature_c):.2g} K in all)')
+    elif drift.kind is DriftKind.TREND:
+        text = f'drifts by {_micro_or_milli_g(3600 * drift.size, "/h")} throughout'
+    else:
+        at_s = rest.start_s + drift.cell * rest.step_s
+        text = f'has a step of {_micro_or_milli_g(drift.size, "")} at {at_s:.6g} s'
+    without = [_interval(estimate.scaled(MICRO_G))
+               for estimate in (drift.without.instability, drift.without.walk)]
+    return (f'{noise.axis}: {text}. B and K contain this drift. Without it B is {without[0]} µg, '
+            f'and K is {without[1]} µg/√s.')
+
+
+def _as_json(result: RecordingNoise) -> dict[str, Any]:
+    """Return the result for programs, in SI units."""
+    return {
+        'schema': 1,
+        'recording': result.path,
+        'rate_hz': result.rest.rate_hz,
+        'samples': result.rest.count,
+        'filled_samples': result.rest.filled,
+        'rest_s': [result.rest.start_s, result.rest.stop_s],
+        'recorded_s': result.rest.recorded_s,
+        'axes': {noise.axis: _axis_json(noise) for noise in result.axes},
+        'allan_deviation': {
+            'tau_s': result.rest.allan.tau_s.tolist(),
+            **{noise.axis: result.rest.allan.deviation[:, i].tolist()
+               for i, noise in enumerate(result.axes)}},
+        'settings': {program: {setting.name: setting.values[0] if len(setting.values) == 1
+                               else list(setting.values) for setting in entries}
+                     for program, entries in settings(result.axes, result.rest.rate_hz).items()},
+        'warnings': _warnings(result),
+    }
+
+
+def _axis_json(noise: AxisNoise) -> dict[str, Any]:
+    """Return the noise of an axis for programs."""
+    terms = {name: {'value': estimate.value if estimate.is_seen else None,
+                    'ci': [estimate.low, estimate.high], 'unit': _UNITS[name]}
+             for name, estimate in zip(TERMS, noise.estimates)}
+    time_s = noise.fit.correlation
+    return {**terms, 'correlation_s': time_s and {'value': time_s.value,
+                                                  'ci': [time_s.low, time_s.high]},
+            'rounding': noise.rounding, 'density_g_per_rthz': density_g_per_rthz(noise),
+            'sample_std_mps2': noise.sample_std, 'resolution_mps2': noise.resolution,
+            'lowest': {'tau_s': noise.lowest_s, 'deviation_mps2': noise.lowest},
+            'fitted_below_hz': noise.fit.highest_hz}
+
+
+_INCHES = (5.0, 4.4)
+"""Width and height of the plot of an axis, inches. Chosen: three fit beside each other."""
+_COLUMNS = ('axis', 'white noise N, µg/√Hz', 'bias instability B, µg', 'random walk K, µg/√s',
+            'lowest Allan deviation, µg', 'noise of a sample, m/s²', 'fitted below, Hz')
+"""Head of the table."""
+
+
+def _write_page(folder: Path, result: RecordingNoise) -> list[Path]:
+    """Write the page, the plot and the curve."""
+    page, plot, curve = (folder / name for name in ('report.html', 'allan.png', 'allan.csv'))
+    figure = _plot(result)
+    write_text(page, _page(result, figure))
+    write_plot(figure, plot)
+    with csv_writer(curve) as append:
+        append({'tau_s': result.rest.allan.tau_s, 'averages': result.rest.allan.averages,
+                **{f'{noise.axis}_mps2': result.rest.allan.deviation[:, i]
+                   for i, noise in enumerate(result.axes)}})
+    return [page, plot, curve]
+
+
+def _page(result: RecordingNoise, figure: Any) -> str:
+    """Return the page."""
+    rows = [[noise.axis, *(_interval(estimate.scaled(MICRO_G))
+                           for estimate in noise.estimates),
+             f'{noise.lowest * MICRO_G:.3g} at {noise.lowest_s:.3g} s',
+             f'{noise.sample_std:.3g}', f'{noise.fit.highest_hz:.3g}'] for noise in result.axes]
+    return html_page.render('adxl_ros.tools', 'noise.html', {
+        'title': 'Noise at rest', 'about': _head(result), 'badge': None, 'figures': {},
+        'warnings': _warnings(result), 'columns': _COLUMNS, 'rows': rows,
+        'picture': html_page.picture_url(figure),
+        'paste_lines': _paste_lines(result)})
+
+
+def _plot(result: RecordingNoise) -> Any:
+    """Return the plot of the Allan deviation by axis."""
+    figure, axes = pyplot().subplots(1, len(result.axes), squeeze=False, sharey=True,
+                                     figsize=(_INCHES[0] * len(result.axes), _INCHES[1]),
+                                     layout='constrained')
+    tau_s, error = result.rest.allan.tau_s, result.rest.allan.relative_error
+    for i, (noise, plot) in enumerate(zip(result.axes, axes[0])):
+        measured = result.rest.allan.deviation[:, i] * MICRO_G
+        plot.errorbar(tau_s, measured, yerr=measured * error.clip(max=0.9), fmt='o', ms=4,
+                      color='#36c', label='measured')
+        for name, line, estimate in zip(TERMS, noise.fit.lines(tau_s), noise.estimates):
+            if estimate.is_seen:
+                plot.plot(tau_s, line * MICRO_G, '--', lw=1,
+                          label=f'{NAMES[name]}')
+        plot.plot(tau_s, noise.fit.allan_deviation(tau_s) * MICRO_G, color='#222',
+                  lw=1, label='all three')
+        plot.set(xscale='log', yscale='log', title=f'axis {noise.axis}',
+                 xlabel='averaging time τ, s', ylim=(measured.min() / 3, measured.max() * 2))
+        plot.grid(True, which='both', alpha=0.3)
+        plot.legend(fontsize=8)
+    axes[0][0].set_ylabel('Allan deviation, µg')
+    return figure
+
 
 _BLOCK_ROWS = 65536
 """Samples that are read at a time (chosen: some MB)."""
@@ -70,16 +380,16 @@ def noise(options: argparse.Namespace) -> int:
     files: list[Path] = []
     if options.report:
         make_folder(Path(options.report))
-        files += noise_page.write(Path(options.report), result)
+        files += _write_page(Path(options.report), result)
     if options.output:
         fresh = with_noise(source.sensor(rest.rate_hz), result.axes)
         name = Path(options.recording).name
         provenance = {**fresh.provenance, 'noise_from': name, 'rate_from': name}
         parameter_file.save(options.output, replace(fresh, provenance=provenance),
-                            noise_text.comments(result))
+                            _comments(result))
         files.insert(0, Path(options.output))
     if options.json:
-        print(json.dumps(noise_text.as_json(result), indent=1))
+        print(json.dumps(_as_json(result), indent=1))
         return 0
     _print(options, result, files)
     return 0
@@ -128,10 +438,10 @@ class _Source:
 
 def _print(options: argparse.Namespace, result: RecordingNoise, files: list[Path]) -> None:
     """Print the result, the files and the next command."""
-    for line in [*noise_text.head(result), '', *noise_text.tables(result), '',
-                 *noise_text.paste_lines(result), '']:
+    for line in [*_head(result), '', *_tables(result), '',
+                 *_paste_lines(result), '']:
         print(line)
-    warnings = noise_text.warnings(result)
+    warnings = _warnings(result)
     following = command('diagnose', f'RECORDING --params {quoted(options.output)} -o gap') \
         if options.output else command(
             'noise', f'{quoted(options.recording)}{reading_text(options)} -o noise.yaml')

@@ -24,10 +24,15 @@ from adxl_ros.simulate import simulator
 from adxl_ros.simulate.from_recording import motion_from_force, motion_from_references
 from adxl_ros.simulate.motion import INTERNAL_RATE_HZ
 from adxl_ros.simulate.trajectories import TRAJECTORIES
-from adxl_ros.tools.closing_lines import print_end, quoted
-from adxl_ros.tools.command_line import argument_parser, command, effect_list, entry_list
-from adxl_ros.tools.common import progress, report_reading, run
-from adxl_ros.tools.effect_option import SYNTAX, with_effects
+from adxl_ros.tools.command_line import (
+    argument_parser,
+    command,
+    effect_list,
+    entry_list,
+    SYNTAX,
+    with_effects,
+)
+from adxl_ros.tools.output import print_end, progress, quoted, report_reading, run
 import numpy as np
 
 _SHORTEST_S = 1e-9

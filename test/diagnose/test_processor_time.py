@@ -12,7 +12,7 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.simulate.simulator import simulate
 from adxl_ros.simulate.trajectories import rich
-from adxl_ros.tools.effect_option import with_effects
+from adxl_ros.tools.command_line import with_effects
 import numpy as np
 from pace import STANDARD_S, standard_work
 import pytest

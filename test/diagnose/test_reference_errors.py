@@ -12,7 +12,7 @@ from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.smoothed_paths import ForcePath
-from adxl_ros.tools.effect_option import with_effects
+from adxl_ros.tools.command_line import with_effects
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d

@@ -11,7 +11,7 @@ from adxl_ros.monitor.live_gap import GapChange, GapSettings, LiveGap
 from adxl_ros.monitor.reference_stream import ReferenceKind
 from adxl_ros.simulate.motion import Held, Motion
 from adxl_ros.simulate.response import Response
-from adxl_ros.tools.effect_option import with_effects
+from adxl_ros.tools.command_line import with_effects
 import numpy as np
 import pytest
 from units import nominal

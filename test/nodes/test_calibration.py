@@ -8,7 +8,7 @@ from adxl_ros.files.stream_unit import recorded_unit
 from adxl_ros.model.coefficients import with_neutral
 from adxl_ros.simulate.motion import Held, Knots, Motion
 from adxl_ros.simulate.simulator import simulate
-from adxl_ros.tools.effect_option import with_effects
+from adxl_ros.tools.command_line import with_effects
 from diagnostic_msgs.msg import DiagnosticStatus
 from graph import Graph, RELIABLE
 from lifecycle_msgs.msg import Transition

@@ -18,7 +18,7 @@ from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.nodes.run_node import cpu_time_s
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
-from adxl_ros.tools.effect_option import with_effects
+from adxl_ros.tools.command_line import with_effects
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from graph import Graph, RELIABLE

@@ -8,7 +8,7 @@ import sys
 
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.simulate.sensor_model import SensorModel
-from adxl_ros.tools.effect_option import with_effects
+from adxl_ros.tools.command_line import with_effects
 import numpy as np
 from processes import REPO
 import pytest

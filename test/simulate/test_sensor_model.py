@@ -11,7 +11,7 @@ from adxl_ros.model.sensor import to_nominal_mps2
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.sensor_model import SensorModel
-from adxl_ros.tools.effect_option import with_effects
+from adxl_ros.tools.command_line import with_effects
 import numpy as np
 import pytest
 from units import nominal

@@ -14,7 +14,7 @@ from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Envelope
 from adxl_ros.simulate.motion import Held, Motion
 from adxl_ros.simulate.simulator import simulate
-from adxl_ros.tools.effect_option import with_effects
+from adxl_ros.tools.command_line import with_effects
 import numpy as np
 import pytest
 from units import nominal
