@@ -8,21 +8,17 @@ import argparse
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, ExitStack, suppress
 from dataclasses import dataclass
-from importlib import import_module
-from importlib.util import find_spec
 import os
 from pathlib import Path
-import struct
 import subprocess
 import sys
 import tempfile
 import time
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from adxl_ros.closed_output import ended_by_closed_output
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
-from adxl_ros.links.support.emulated_board import open_terminal
 from adxl_ros.nodes.node_help import program_parser
 from adxl_ros.nodes.rclpy_internals import MessageWait, NotForExecutors
 from adxl_ros.nodes.run_node import cpu_time_s, executable, running, use_own_graph
@@ -33,92 +29,6 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data, QoSProfile
 from sensor_msgs.msg import Imu
-
-RIVAL_TOPIC = 'rival'
-"""Topic of the node."""
-_RIVAL_HEAD = b'\x55\x51'
-"""Begin of a frame of acceleration (manual of WitMotion WT901: 0x55, then the kind)."""
-_RIVAL_FIELDS = struct.Struct('<hhhh')
-"""Its fields: three accelerations and a temperature; a byte with the sum of all follows."""
-_MPS2_PER_CODE = 16 * 9.8 / 32768
-"""Acceleration by its code, m/s²: the library takes 9.8 m/s² for g."""
-_CLOCK_BITS = 48
-"""Bits of the clock that the three accelerations carry."""
-_BAUD = 115200
-"""Baud rate, which a pseudo-terminal ignores."""
-
-
-def rival_is_installed() -> bool:
-    """Return whether the library is there."""
-    return find_spec('witmotion') is not None
-
-
-def run_rival_board(port: str, rate_hz: float) -> int:
-    """
-    Send samples until a signal ends it: one a frame, as these boards do.
-
-    The accelerations of a sample are its time, because the frame has no field for it.
-    """
-    with suppress(KeyboardInterrupt), open_terminal(port) as fd:
-        began_s = time.monotonic()
-        count = 0
-        while True:
-            count += 1
-            time.sleep(max(began_s + count / rate_hz - time.monotonic(), 0))
-            # A frame that nobody reads is lost.
-            with suppress(BlockingIOError):
-                os.write(fd, _rival_frame(time.time_ns() // 1000))
-    return 0
-
-
-def _rival_frame(time_us: int) -> bytes:
-    """Return the frame whose accelerations are a time, µs."""
-    clock = (time_us % 2 ** _CLOCK_BITS).to_bytes(_CLOCK_BITS // 8, 'little')
-    frame = _RIVAL_HEAD + clock + b'\0\0'
-    return frame + bytes([sum(frame) % 256])
-
-
-def _time_us(accel_mps2: tuple[float, ...], now_us: int) -> int:
-    """Return the time that accelerations are, µs; it is before now."""
-    codes = (round(value / _MPS2_PER_CODE) for value in accel_mps2)
-    clock = int.from_bytes(_RIVAL_FIELDS.pack(*codes, 0)[:_CLOCK_BITS // 8], 'little')
-    return now_us - (now_us - clock) % 2 ** _CLOCK_BITS
-
-
-class RivalDriver(Node):
-    """The smallest node on the library: it publishes each sample, stamped by its time."""
-
-    def __init__(self, port: str, depth: int) -> None:
-        super().__init__('rival')
-        witmotion = import_module('witmotion')
-        self._message = Imu()
-        self._publisher = self.create_publisher(Imu, RIVAL_TOPIC, QoSProfile(depth=depth))
-        self._imu = witmotion.IMU(port, _BAUD)
-        self._imu.subscribe(self._on_sample, witmotion.protocol.AccelerationMessage)
-
-    def close(self) -> None:
-        """End the thread of the library."""
-        self._imu.close()
-
-    def _on_sample(self, sample: Any) -> None:
-        accel, stamp = self._message.linear_acceleration, self._message.header.stamp
-        accel.x, accel.y, accel.z = sample.a
-        stamp.sec, time_us = divmod(_time_us(sample.a, time.time_ns() // 1000), 10 ** 6)
-        stamp.nanosec = 1000 * time_us
-        self._publisher.publish(self._message)
-
-
-def run_rival_driver(port: str, depth: int) -> int:
-    """Run the node until a signal ends it."""
-    rclpy.init()
-    node = RivalDriver(port, depth)
-    try:
-        with suppress(KeyboardInterrupt, ExternalShutdownException):
-            rclpy.spin(node)
-    finally:
-        node.close()
-    return 0
-
 
 RATE_HZ = 1000.0
 """Sample rate of all measurements, Hz."""
@@ -294,7 +204,7 @@ def measure_live(seconds: float, rounds: int, iiod: str | None) -> None:
 def _subjects(stack: ExitStack, iiod: str | None) -> list[_Subject]:
     """Return what is measured; `stack` ends the devices."""
     bare = [[sys.executable, sys.argv[0], '--bare', kind] for kind in BARE_NODES]
-    port = stack.enter_context(_emulated_board([executable('simulate'), 'soak', '--port']))
+    port = stack.enter_context(_emulated_board())
     driver, compensation = executable('driver'), executable('compensation')
     drivers = {'sim': [driver], 'serial': [
         driver, '--ros-args', '-p', 'link.type:=serial', '-p', f'link.port:={port}', '-p',
@@ -302,17 +212,10 @@ def _subjects(stack: ExitStack, iiod: str | None) -> list[_Subject]:
     if iiod is not None:
         uri = stack.enter_context(_iio_server(iiod))
         drivers['iio'] = [driver, '--ros-args', '-p', 'link.type:=iio', '-p', f'link.uri:={uri}']
-    rivals = []
-    if rival_is_installed():
-        bench = [sys.executable, sys.argv[0]]
-        rival_port = stack.enter_context(_emulated_board([*bench, '--rival-board']))
-        rivals.append(_Subject('driver of another project', RIVAL_TOPIC,
-                               [[*bench, '--rival-driver', rival_port]]))
     return [
         _Subject('bare publisher', 'bare', bare[:1]), _Subject(_RELAY, 'relayed', bare),
         _Subject('bare reader of the port', '',
                  [[sys.executable, sys.argv[0], '--read', port]]),
-        *rivals,
         *(_Subject(f'driver, {link}', 'imu/data_raw', [command])
           for link, command in drivers.items()),
         *(_Subject(f'driver, {link}, compensation', 'imu/data', [command, [compensation]])
@@ -320,11 +223,11 @@ def _subjects(stack: ExitStack, iiod: str | None) -> list[_Subject]:
 
 
 @contextmanager
-def _emulated_board(command: Sequence[str]) -> Iterator[str]:
-    """Give the port of a board, which a command makes where its last argument says."""
+def _emulated_board() -> Iterator[str]:
+    """Give the port of an emulated board."""
     with tempfile.TemporaryDirectory() as folder:
         port = Path(folder, 'board')
-        with running([[*command, str(port)]]):
+        with running([[executable('simulate'), 'soak', '--port', str(port)]]):
             end_s = time.monotonic() + _START_S
             while not port.exists():
                 if time.monotonic() > end_s:
@@ -435,20 +338,13 @@ def main() -> int:
                              f'{_HOURS:g}: 30 GB of disk)')
     parser.add_argument('--live', action='store_true', help='measure only the live nodes')
     parser.add_argument('--iiod', metavar='FILE', help="the tests' IIOD, for the link iio")
-    parser.add_argument('--bare', choices=list(BARE_NODES),
-                        help=argparse.SUPPRESS)
+    parser.add_argument('--bare', choices=list(BARE_NODES), help=argparse.SUPPRESS)
     parser.add_argument('--read', metavar='PORT', help=argparse.SUPPRESS)
-    parser.add_argument('--rival-board', metavar='PORT', help=argparse.SUPPRESS)
-    parser.add_argument('--rival-driver', metavar='PORT', help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.bare:
         return run_bare_node(BARE_NODES[options.bare])
     if options.read:
         return run_bare_reader(options.read)
-    if options.rival_board:
-        return run_rival_board(options.rival_board, RATE_HZ)
-    if options.rival_driver:
-        return run_rival_driver(options.rival_driver, BARE_QUEUE)
     use_own_graph()
     try:
         measure_live(options.seconds, options.rounds, options.iiod)
