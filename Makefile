@@ -12,7 +12,6 @@
 # make noise    how often the intervals of noise hold the truth: docs/noise.md
 # make investigate  minutes to a verdict of `investigate` over 60 simulated units: docs/investigate.md, an hour
 # make nulls    recordings without any effect through diagnose: docs/nulls.md, 90 minutes
-# make fleet    10 000 recordings while workers, scheduler and client are killed: docs/fleet.md
 # make blind    the blind check of diagnose, 600 trials, into blind_output/ (make blind ARGS='--seed 1')
 # make working  working cases of diagnose, one line each, then the scores (make working ARGS='--count 20 --seed 3')
 # make lint     the linters alone
@@ -163,10 +162,6 @@ investigate: developed
 nulls: developed
 	OPENBLAS_NUM_THREADS=1; export OPENBLAS_NUM_THREADS; \
 	$(python_in_test) long/nulls.py ../docs/nulls.md $(ARGS)
-
-fleet: developed
-	OPENBLAS_NUM_THREADS=1; export OPENBLAS_NUM_THREADS; \
-	$(python_in_test) long/fleet_kills.py $(ARGS)
 
 # Goes on where it was cut short; with a seed of its own in ARGS, into another folder.
 blind: build

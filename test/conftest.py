@@ -12,10 +12,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
+import fcntl
 from importlib.metadata import entry_points
 from io import StringIO
 import os
 from pathlib import Path
+import shutil
 import signal
 import subprocess
 import sys
@@ -48,7 +50,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         fixtures = set(getattr(item, 'fixturenames', ()))
         if 'ros_env' in fixtures:
             item.add_marker(pytest.mark.live)
-        if {'committed_check', 'evaluations', 'report_folder'} & fixtures:
+        if {'committed_check', 'evaluations'} & fixtures:
             item.add_marker(pytest.mark.xdist_group(item.path.stem))
 
 
@@ -145,6 +147,25 @@ def run_tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
                 signal.signal(signal.SIGTERM, on_sigterm)
         return subprocess.CompletedProcess(sys.argv, status, out.getvalue(), err.getvalue())
     return run
+
+
+@pytest.fixture(scope='session')
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Give a function that fills a folder once for all workers of xdist, and returns its path."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if 'PYTEST_XDIST_WORKER' in os.environ else base
+
+    def make(name: str, fill: Callable[[Path], object]) -> Path:
+        folder, done = shared / name, shared / f'{name}.done'
+        with open(shared / f'{name}.lock', 'w') as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not done.exists():
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir()
+                fill(folder)
+                done.touch()
+        return folder
+    return make
 
 
 @pytest.fixture(scope='session')

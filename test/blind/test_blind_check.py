@@ -3,7 +3,6 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import replace
 import json
 import shutil
 import sys
@@ -14,7 +13,6 @@ from adxl_ros_validation.blind import (
     check,
     diagnosis_runs,
     grading,
-    real_sensors,
     report_html,
     scores,
     trials,
@@ -273,61 +271,6 @@ def test_ideal_observer():
     spread = observer.project(noise * scene.unit.volts_to_mps2)
     # Whitened noise has variance 1, because the oracle uses the spectrum of the noise.
     assert np.var(spread) == pytest.approx(1, abs=0.05)
-
-
-@pytest.fixture
-def real_rest():
-    """Return the later part of a recording with a simulator: 60 s at 50 Hz, 5 mg of noise."""
-    rng, t = np.random.default_rng(0), np.arange(3000) / 50
-    force = 9.8 * np.stack([np.sin(t), np.cos(t), 0.1 * np.sin(3 * t)])
-    names = [f'a{d}_mps2' for d in 'xyz']
-    noisy = dict(zip(names, force + 0.05 * rng.normal(size=force.shape)))
-    half = real_sensors.Half('unit', 'simulator', {'time_s': t, **noisy},
-                             dict.fromkeys(['time_s', *names], 5), 'parameters: 1\n',
-                             {'time_s': t, **dict(zip(names, force))}, 0.0)
-    return replace(half, noise_mps2=real_sensors._noise(half))
-
-
-def test_a_defect_in_a_real_recording_has_the_strength_of_its_label(real_rest):
-    """Every kind that is offered acts; nothing else of the recording changes."""
-    assert real_rest.noise_mps2 == pytest.approx(0.05, rel=0.3)
-    kinds = real_rest.kinds(fault_table.KINDS)
-    assert {'bias', 'time_offset', 'jump', 'spikes'} <= set(kinds)
-    assert not {'temperature_bias', 'lever_arm', 'supply', 'cogging'} & set(kinds)
-    for i, name in enumerate(kinds):
-        drawn = real_sensors.draw([real_rest], fault_table.KINDS, trials.Plan(
-            'r0', 'single', (name,), (1, 2, i, 0)))
-        strength = drawn.label.faults[0]['strength_mps2']
-        assert 0 < strength < 25 * real_rest.noise_mps2, name
-    plain = real_sensors.draw([real_rest], fault_table.KINDS, trials.Plan(
-        'r0', 'none', (), (1, 2, 3, 0)))
-    rows = np.loadtxt(plain.recording.splitlines()[1:], delimiter=',')
-    assert rows[:, 1].tolist() == [round(v, 5) for v in real_rest.columns['ax_mps2']
-                                   if round(v, 5) in rows[:, 1]][:len(rows)]
-    assert plain.sim and plain.parameters == 'parameters: 1\n'
-
-
-def test_only_what_was_put_in_may_be_new():
-    """What the verdict of the untouched part names is there already."""
-    base = said('explained', 'gravity')
-    for status, named, group, right in (
-            ('explained', ['gravity'], 'none', True), ('no_gap', [], 'none', True),
-            ('explained', ['gravity', 'supply'], 'none', False),
-            ('explained', ['gravity', 'bias'], 'single', True),
-            ('explained', ['gravity'], 'single', False),
-            ('partly', ['bias'], 'single', True),
-            ('unknown', ['unknown'], 'outside', True),
-            ('explained', ['supply'], 'outside', False)):
-        label = trials.Label('r0', group, ('bias',) if group != 'none' else (), (1,), (1.0, 2.0),
-                             'unit by stage', 'xyz', 0.05, [] if group == 'none' else [
-                                 {'effect': 'bias', 'strength_mps2': 0.1}])
-        assert real_sensors.right(said(status, *named), base, label)[0] == right
-
-
-def said(status, *effects):
-    """Return an answer that names effects for certain."""
-    return grading.Answer(status, frozenset(effects), (), 0.8, ((frozenset(effects), 0.8),), {},
-                          1.0)
 
 
 def test_the_command_commits_and_scores(run_tool, tmp_path):

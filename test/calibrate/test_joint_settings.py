@@ -2,30 +2,19 @@
 
 """Settings of a joint: the rule, and equal numbers from sweep, journal, bag and CSV."""
 
-from dataclasses import replace
 
-from adxl_ros.calibrate import joint_settings, pose_extraction
+from adxl_ros.calibrate import joint_settings
 from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, StageMode
 from adxl_ros.calibrate.guided.pose_plan import Target
 from adxl_ros.calibrate.guided.stage_guide import StageGuide
 from adxl_ros.calibrate.joint_settings import recorded_settings, SettingTracker
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.files import recording
-from adxl_ros.files.recording_columns import COMMANDS
-from adxl_ros.files.stream_info import sensor_info
-from adxl_ros.files.stream_unit import recorded_unit
-from adxl_ros.model.kinematics import specific_force
-from adxl_ros.model.sensor import to_nominal_mps2
-from adxl_ros.simulate.simulated_stage import SimulatedStage
 import numpy as np
 import pytest
 from setting_checks import (
     as_read,
-    by_rests,
-    check_all_agree,
-    same_partition,
 )
-from units import Bench, Fed, nominal
+from units import Bench, nominal
 
 NAN = float('nan')
 STEP = 1e-3
@@ -173,104 +162,3 @@ def test_after_an_interruption_both_joints_have_moved():
         assert on.run(3, target.alpha_rad, target.beta_rad) is None
     entries.append(take(on))
     assert numbers(entries) == ([0, 0, 0], [0, 1, 2])
-
-
-class Run:
-    """A commanded sweep on the simulated stage, with the messages of a bag."""
-
-    def __init__(self, targets, seed=2, rate_hz=200.0):
-        self.sensor = nominal(serial='S1', rate_hz=rate_hz)
-        step = self.sensor.stage_resolution_rad
-        self.stage = SimulatedStage(np.zeros(3), np.array([2.0, 2.0, 0.01]), 0.2,
-                                    np.array([step, step, 0.0]), seed)
-        self.sweep = StageGuide(self.sensor, targets, CaptureSettings(
-            1.0, np.radians(0.2), 20.0, StageMode.COMMANDED))
-        self.fed = Fed(self.sensor, seed)
-        self.now_ns, self.commanded = 1_750_000_000_000_000_000, None
-        self.samples, self.joints, self.commands, self.entries = [], [], [], []
-
-    def turn(self):
-        """Advance the time by 10 ms."""
-        target = self.sweep.target
-        if target != self.commanded or self.now_ns % 500_000_000 == 0:
-            self.commanded = target
-            self.stage.command({'alpha': target.alpha_rad, 'beta': target.beta_rad})
-            self.commands.append((self.now_ns, target.alpha_rad, target.beta_rad))
-        before = self.stage.position.copy()
-        self.stage.step(0.01)
-        count = round(self.sensor.rate_hz / 100)
-        stamps = self.now_ns + np.arange(count) * round(1e9 / self.sensor.rate_hz)
-        way = np.linspace(before, self.stage.position, count, endpoint=False).T
-        volts = self.fed(specific_force(way[0], way[1], 9.80665))
-        self.samples += zip(stamps.tolist(), volts)
-        alpha, beta, _ = self.stage.encoder()
-        self.joints.append((self.now_ns + 3_000_000, alpha, beta))
-        self.sweep.read_encoder(*self.joints[-1])
-        self.sweep.feed(stamps, volts)
-        self.now_ns += 10_000_000
-        entry = self.sweep.accept()
-        if entry is not None:
-            self.entries.append(as_read(entry))
-            self.sweep.take(entry)
-
-    def pose(self):
-        """Advance the time until a pose is taken."""
-        done = len(self.entries)
-        while len(self.entries) == done:
-            self.turn()
-
-    def bag(self, path):
-        """Write the messages to a bag, in the order of arrival."""
-        bags = pytest.importorskip('bags', reason='rosbags is not installed: pip install rosbags')
-        sent = [bags.imu(t, [*to_nominal_mps2(v[None], self.sensor)[0], 0.0])
-                for t, v in self.samples]
-        sent += [bags.joints(t, alpha=a, beta=b) for t, a, b in self.joints]
-        sent += [bags.joints(t, '/stage/command', alpha=a, beta=b) for t, a, b in self.commands]
-        return bags.bag_of(path, [bags.info(**sensor_info(self.sensor)),
-                                  *sorted(sent, key=lambda message: message.stamp_ns)])
-
-
-def test_sweep_journal_bag_and_csv_give_the_same_settings(tmp_path):
-    """The sweep has repeated and skipped poses, and commands below the encoder step."""
-    tiny = nominal().stage_resolution_rad / 10
-    targets = [Target(a, b) for a in (0.5, 1.0) for b in (0.0, 0.8, 1.6)]
-    targets += [Target(1.3, 1.6 + tiny), Target(1.0, 1.6 + tiny), Target(1.0, 1.6 + tiny),
-                Target(1.0, 0.3)]
-    run = Run(targets)
-    for _ in range(3):
-        run.pose()
-    # The stage moves to the next pose when the operator repeats the previous one.
-    for _ in range(20):
-        run.turn()
-    run.sweep.redo()
-    for _ in range(2):
-        run.pose()
-    run.turn()
-    run.sweep.skip()
-    while run.sweep.target is not None:
-        run.pose()
-    entries = [run.sweep.accepted[number] for number in sorted(run.sweep.accepted)]
-    assert len(entries) == 9
-    live = Poses.from_records(entries)
-    assert live.alpha_setting.tolist() == [0, 0, 1, 2, 2, 3, 4, 4, 4]
-    assert live.beta_setting.tolist() == [0, 1, 3, 4, 5, 6, 6, 6, 7]
-    read = recording.read(run.bag(tmp_path / 'bag'))
-    unit = recorded_unit(run.sensor, read)
-    check_all_agree(read, unit, entries)
-    recording.write(tmp_path / 'run.csv', read, unit)
-    of_csv = recording.read(tmp_path / 'run.csv')
-    check_all_agree(of_csv, unit, entries)
-    # The CSV is converted to a bag again.
-    recording.write(tmp_path / 'again.mcap', of_csv, unit)
-    again = recording.read(tmp_path / 'again.mcap')
-    check_all_agree(again, unit, entries)
-    for name in COMMANDS.values():
-        assert np.array_equal(again.columns[name], read.columns[name], equal_nan=True)
-    # Without commands, only the encoder shows moves.
-    for name in COMMANDS.values():
-        del read.columns[name]
-    poses = pose_extraction.extract_poses(
-        read, unit, [replace(e, alpha_setting=-1) for e in entries])
-    assert (poses.alpha_setting == -1).all(), 'the numbers of a journal are kept'
-    _, beta = by_rests(read, unit, entries)
-    assert same_partition(beta.tolist(), [0, 1, 3, 4, 5, 5, 5, 5, 7])

@@ -2,7 +2,6 @@
 
 """Pools of workers that end, raise, or lose their scheduler or their parent."""
 
-from concurrent.futures import Executor
 from contextlib import suppress
 import os
 import random
@@ -12,9 +11,9 @@ import sys
 from threading import Event, Thread
 import time
 
-from adxl_ros.jobs.pools import open_pool, TaskFuture, TaskLost, WorkerDied
+from adxl_ros.jobs.pools import open_pool, WorkerDied
 from adxl_ros.jobs.run import finished_tasks
-from job_tasks import children, dask_cluster, deadly, half_sent, numbered, SUPPORT
+from job_tasks import children, deadly, half_sent, numbered, SUPPORT
 import pytest
 
 _LONG_WAIT_S = 300.0
@@ -99,48 +98,3 @@ if __name__ == '__main__':
         parent.send_signal(sent)
     wait_for(lambda: not any(map(is_alive, pids)))
     assert [path.name for path in tmp_path.iterdir()] == ['program']
-
-
-def test_a_cluster_loses_workers_and_its_scheduler(tmp_path):
-    pytest.importorskip('distributed', reason='distributed is not installed: '
-                        'pip install distributed')
-    results = []
-    with dask_cluster(tmp_path) as cluster, \
-            open_pool(cluster.address, shared=(7,)) as pool:
-        for end in finished_tasks(pool, max, ((number,) for number in range(400)), retries=20):
-            results.append(end)
-            if len(results) in (50, 150):
-                cluster.kill_worker(len(results) % 2)
-            if len(results) == 250:
-                cluster.kill_scheduler()
-    assert not [end.error for end in results if end.error]
-    assert sorted(end.value for end in results) == sorted(max(7, n) for n in range(400))
-    assert {end.arguments[0] for end in results} == set(range(400))
-
-
-class DeadlyPool(Executor):
-    """Ends a share of the attempts, and each one of task 7, with their worker."""
-
-    def __init__(self, share):
-        self.chance, self.share = random.Random(2), share
-
-    def submit(self, fn, /, number):
-        """Return a task that has ended."""
-        future = TaskFuture()
-        if number == 7 or self.chance.random() < self.share:
-            future.deaths = 1
-            future.set_exception(WorkerDied())
-        elif self.chance.random() < self.share:
-            future.set_exception(TaskLost())
-        else:
-            future.set_result(fn(number))
-        return future
-
-
-@pytest.mark.parametrize('share', [0.0, 0.05, 0.2])
-def test_workers_that_end_at_random_blame_no_task(share):
-    results = list(finished_tasks(DeadlyPool(share), int, ((n,) for n in range(5000)), retries=1))
-    assert sorted(end.arguments[0] for end in results) == list(range(5000))
-    failed, = (end for end in results if end.error is not None)
-    assert failed.arguments == (7,) and isinstance(failed.error, WorkerDied)
-    assert failed.attempts < 10 if share else failed.attempts == 2

@@ -6,16 +6,12 @@ from dataclasses import replace
 
 from adxl_ros.model import analog_stages, noise, signal_chain
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
-from adxl_ros.model.covariance import force_covariance, prepared_covariance
+from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import (
     Coefficient,
     Need,
-    NOMINAL_ENVIRONMENT,
-    Parameters,
-    Place,
     Role,
-    Signals,
 )
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.scalar_or_array import ARRAYS, FLOATS
@@ -144,64 +140,6 @@ def test_intervals_have_their_stated_coverage(axes: str) -> None:
 
 def assert_coverage(error: np.ndarray, std: np.ndarray) -> None:
     assert 0.88 < np.mean(np.abs(error) < 1.6449 * std) < 0.92
-
-
-def many_forces(axes: str, count: int = 3000) -> list[np.ndarray]:
-    """Return forces all around; at rest and upright where z is derived, up to the vertical."""
-    vectors = np.random.default_rng(12).normal(size=(3, count))
-    force = G * vectors / np.linalg.norm(vectors, axis=0)
-    return list(force if axes == 'xyz' else np.array([force[0], force[1], np.abs(force[2])]))
-
-
-def of_effects(sensor: Sensor, effects: tuple[str, ...]) -> Sensor:
-    """Return the sensor with some of its effects, and their coefficients."""
-    kept = tuple(n for n in sensor.covariance_names if n.effect in effects)
-    mixed = np.random.default_rng(4).normal(size=(len(kept), len(kept)))
-    scale = np.array([parameter_of(name).scale for name in kept])
-    return replace(sensor, effects=effects, covariance_names=kept,
-                   covariance=1e-4 * mixed @ mixed.T * np.outer(scale, scale))
-
-
-@pytest.mark.parametrize('axes', AXES)
-@pytest.mark.parametrize('case', ['all', 'at rest', 'no polynomial', 'with force'])
-def test_many_samples_get_the_force_and_covariance_of_few(
-        axes: str, case: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Polynomials replace the chain for many samples, if the effects are polynomials."""
-    def rippled(signals: Signals, p: Parameters) -> None:
-        for d, k in enumerate(p['quadratic_per_g']):
-            signals.output[d] = signals.output[d] + k * np.sin(3 * signals.sensed[d])
-
-    def following(signals: Signals, p: Parameters) -> None:
-        for d, k in enumerate(p['quadratic_per_g']):
-            signals.zero_g_v[d] = signals.zero_g_v[d] + k * signals.sensed[d] ** 2
-
-    shapes = {'no polynomial': rippled, 'with force': following}
-    if case in shapes:
-        monkeypatch.setitem(library(), 'quadratic', replace(
-            library()['quadratic'], apply=shapes[case],
-            place=Place.ELEMENT if case == 'no polynomial' else Place.ELECTRONICS))
-    drawn = drawn_sensor(axes, 7)
-    sensor = of_effects(drawn, drawn.effects if case == 'all' else tuple(
-        name for name in drawn.effects if name != 'adc_inl' and not library()[name].follows))
-    volts = np.array(signal_chain.static_response(sensor)(many_forces(axes)))
-    volts += np.random.default_rng(3).normal(size=volts.shape) * noise.sample_std_v(
-        sensor)[:, None]
-    count = volts.shape[1]
-    surroundings = NOMINAL_ENVIRONMENT._replace(
-        temperature_c=np.linspace(0, 60, count), time_s=np.arange(count) * 1.0)
-    parts = [slice(begin, begin + 500) for begin in range(0, count, 500)]
-    invert, covariance = signal_chain.inverse(sensor), prepared_covariance(sensor)
-    around = [surroundings._replace(temperature_c=surroundings.temperature_c[part],
-                                    time_s=surroundings.time_s[part]) for part in parts]
-    few = np.hstack([invert(list(volts[:, part]), e) for part, e in zip(parts, around)])
-    many = invert(list(volts), surroundings)
-    # Where z is derived and 0, it is a root of rounding.
-    np.testing.assert_allclose(many, few, rtol=0, atol=1e-9 if axes == 'xyz' else 1e-7)
-    of_few = np.concatenate([covariance(list(few[:, part]), e)[0]
-                             for part, e in zip(parts, around)], axis=2)
-    of_many = covariance(list(few), surroundings)[0]
-    scale = np.sqrt(np.einsum('iin,jjn->ijn', of_few, of_few))
-    assert (np.abs(of_many - of_few) <= 1e-7 * scale).all()
 
 
 def test_angles_of_known_poses() -> None:

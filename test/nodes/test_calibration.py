@@ -234,3 +234,34 @@ def test_a_resting_sensor_is_calibrated_over_temperature(start, tmp_path):
     assert warm.effects == ('bias', 'temperature_bias')
     np.testing.assert_allclose(warm.values['temperature_bias']['per_k'], 4e-4, atol=5e-5)
     assert len(warm.covariance_names) == 6
+
+
+def test_a_compensated_stream_and_a_wrong_rate_are_refused(start, tmp_path):
+    """A stream of compensated samples or with missing samples is reported at once."""
+    _, bare = _files(tmp_path)
+    common = ('--ros-args', '--params-file', bare, '-p', 'autostart:=true')
+    with Graph() as graph:
+        start('driver', '--ros-args', '--params-file', bare, '-p', 'link.type:=sim')
+        start('compensation', '--ros-args', '--params-file', bare)
+        start('calibration', *common, '-r', 'imu/data_raw:=imu/data')
+        start('calibration', *common, '-r', '__node:=other', '-r', 'imu/data_raw:=half', '-p',
+              'journal:=other.journal')
+        raw = graph.listen(Imu, 'imu/data_raw')
+        half = graph.node.create_publisher(Imu, 'half', 1000)
+        dead = []
+
+        def feed_half():
+            for message in raw[::2]:
+                if dead:
+                    message.linear_acceleration.x = float('nan')
+                half.publish(message)
+            raw.clear()
+
+        graph.node.create_timer(0.1, feed_half)
+        graph.spin_until(lambda: graph.reports('calibration', 'this stream is already '
+                                               'compensated'), 60, 'why')
+        graph.spin_until(lambda: graph.reports('other', 'samples are 100 a second'), 60,
+                         'the reason')
+        dead.append('x')
+        graph.spin_until(lambda: graph.reports('other', 'x is not a number in all samples'), 60,
+                         'which axis')

@@ -4,11 +4,10 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from datetime import datetime, timedelta, timezone
 from pathlib import Path
 import signal
 
-from adxl_ros.files import calibration_store, parameter_file
+from adxl_ros.files import parameter_file
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model import signal_chain
 from adxl_ros.model.covariance import force_covariance
@@ -185,52 +184,6 @@ def test_corrected_stream(robot: Robot, start: Start, tmp_path: Path) -> None:
     assert process.wait() == 0
     assert 'Traceback' not in process.output()
     assert stamp_ns(message) == 10 ** 9
-
-
-def stored(folder: Path, sensor: Sensor, days_old: float) -> Path:
-    """Put a calibration of a certain age into a store."""
-    made = datetime.now(timezone.utc) - timedelta(days=days_old)
-    path = calibration_store.put(folder, replace(sensor, provenance={
-        'date': made.isoformat(timespec='seconds'), 'data_sha256': f'{days_old:064.3f}'}))
-    assert path is not None
-    return path
-
-
-def test_the_newest_calibration_of_the_unit_is_taken(robot: Robot, start: Start, tmp_path: Path
-                                                     ) -> None:
-    """Serial number and date decide. Other files are ignored, and a newer file is announced."""
-    folder = tmp_path / 'calibrations'
-    old, newest = unit(seed=1), unit(seed=2)
-    stored(folder, old, 30.0)
-    path = stored(folder, newest, 10.0)
-    stored(folder, unit('18', seed=3), 1.0)
-    three = stored(folder, unit(axes='xyz', seed=4), 5.0)
-    (folder / '17' / '17-29990101T000000Z-0.yaml').write_text('half of a fi')
-    process = start(NODE, '--ros-args', '-p', f'store:={folder}', *RELIABLE)
-    robot.connected()
-    robot.level(DiagnosticStatus.WARN, 'no samples')
-    assert robot.graph.value(NODE, 'validity') == 'not calibrated'
-    robot.inform(newest)
-    process.wait_for(f'compensating by {path}')
-    process.wait_for(f'passed over: {three}: ')
-    process.wait_for('17-29990101T000000Z-0.yaml:1:1: ')
-    force = pose(0.7, -1.2)
-    np.testing.assert_allclose(accel(robot.answer(output_of(newest, force))), force, atol=1e-7)
-    robot.graph.spin_until(lambda: robot.graph.value(NODE, 'validity')
-                           == 'valid, temperature not known', 10, 'validity')
-    assert robot.graph.value(NODE, 'calibration_id') == path.stem
-    assert float(robot.graph.value(NODE, 'age_days')) == pytest.approx(10.0, abs=0.01)
-    (folder / '17' / '17-29990101T000000Z-0.yaml').unlink()
-    fresh = stored(folder, unit(seed=5), 0.0)
-
-    def announced() -> bool:
-        robot.send(output_of(newest, force))
-        return robot.graph.reports(NODE, f'a newer calibration is in the store: {fresh}')
-    robot.graph.spin_until(announced, 10, 'the newer one')
-    # The node loads it when the driver starts again, not during a run.
-    np.testing.assert_allclose(accel(robot.answer(output_of(newest, force))), force, atol=1e-7)
-    robot.inform(newest)
-    process.wait_for(f'compensating by {fresh}')
 
 
 def test_without_a_file_the_nominal_sensor_applies(robot: Robot, start: Start) -> None:

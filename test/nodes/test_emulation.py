@@ -97,36 +97,3 @@ def test_a_withheld_effect_shows_in_the_stream_of_the_robot(start, tmp_path: Pat
     assert newest.angular_velocity_covariance[8] == 1e-4
     assert driver.stop() == 0
     assert 'Traceback' not in driver.output()
-
-
-def test_a_pause_a_reset_and_half_speed_of_the_simulator(start) -> None:
-    with Graph() as graph:
-        simulator = Simulator(graph)
-        samples = graph.listen(Imu, 'imu/data_raw')
-        driver = start_driver(start)
-        graph.spin_until(lambda: graph.reports('driver', 'imu/ideal: no samples'), 20, 'silence')
-        simulator.now_ns, simulator.has_clock = 500 * 10 ** 9, False
-        simulator.run_until(lambda: samples, 'samples before /clock')
-        simulator.has_clock = True
-        simulator.run_until(lambda: len(samples) > 200, 'samples')
-        graph.spin_until(lambda: graph.reports('driver', 'paused'), 20, 'the pause')
-        assert graph.diagnostics['driver'].level == DiagnosticStatus.WARN
-        before = len(samples)
-        simulator.run_until(lambda: len(samples) > before + 100, 'samples after the pause')
-        simulator.now_ns = 0
-        count = len(samples)
-        simulator.run_until(lambda: len(samples) > count + 100, 'samples after the reset')
-        graph.diagnostics.clear()
-        simulator.run_until(lambda: 'driver' in graph.diagnostics
-                            and graph.value('driver', 'resets') == '1', 'the count of resets')
-        simulator.run_until(lambda: 0.3 < float(graph.value('driver', 'speed')) < 0.6,
-                            'half of real time', 0.5)
-    stamps = np.array([stamp_ns(message) for message in samples])
-    assert (np.diff(stamps) < 0).sum() == 1
-    assert stamps[np.argmin(np.diff(stamps)) + 1] < 10 ** 9, 'the first sample after the reset'
-    assert all(np.isfinite(accel(message)).all() for message in samples)
-    assert {message.header.frame_id for message in samples} == {'robot/imu'}
-    assert driver.stop() == 0
-    assert 'the simulation was reset' in driver.output()
-    assert 'use_sim_time' not in driver.output(), 'a clock that begins later is the clock'
-    assert 'Traceback' not in driver.output()

@@ -15,7 +15,6 @@ import time
 from adxl_ros.files import parameter_file
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.nodes.run_node import cpu_time_s
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
 from adxl_ros.tools.command_line import with_effects
@@ -26,7 +25,7 @@ import numpy as np
 from processes import PATIENCE, Started
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from sensor_msgs.msg import Imu, JointState
+from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 from units import nominal
 
@@ -176,30 +175,6 @@ def test_a_change_is_diagnosed_and_a_report_is_on_disk(monitor, graph, tmp_path)
     assert node.stop() == 0
 
 
-def test_faults_of_the_streams_are_reported(monitor, graph) -> None:
-    streams = Streams(graph)
-    gaps = graph.listen(DiagnosticArray, 'gap')
-    node = monitor('-p', 'diagnose.automatic:=false')
-    graph.spin_until(lambda: graph.reports('monitor', 'nothing on /imu/data_raw'), 20, 'silence')
-    streams.has_reference = False
-    streams.run_until(lambda: graph.reports('monitor', 'nothing on /imu/ideal'), 'no reference')
-    streams.has_reference = True
-    streams.run_until(lambda: graph.reports('monitor', 'gap x'), 'the gap')
-    streams.has_reference = False
-    streams.run_until(lambda: graph.reports('monitor', 'behind the samples')
-                      or graph.reports('monitor', 'no reference'), 'a reference that stopped')
-    streams.has_reference = True
-    streams.run_until(lambda: graph.reports('monitor', 'gap x'), 'the gap again')
-    streams.origin_ns -= 500 * 10 ** 9
-    graph.diagnostics.clear()
-    streams.run_until(lambda: 'monitor' in graph.diagnostics
-                      and int(graph.value('monitor', 'jumps')) == 1, 'the jump')
-    streams.run_until(lambda: graph.reports('monitor', 'gap x'), 'the gap after the jump')
-    assert np.isfinite(numbers(gaps)).all()
-    assert node.stop() == 0
-    assert 'Traceback' not in node.output()
-
-
 def test_a_killed_monitor_loses_no_change(monitor, graph, tmp_path) -> None:
     streams = Streams(graph)
     record = tmp_path / 'kept' / 'changes.jsonl'
@@ -230,20 +205,3 @@ def test_no_sample_at_1_khz_is_lost(start, graph) -> None:
     assert (graph.value('monitor', 'missing'), graph.value('monitor', 'dropped')) == ('0', '0')
     assert 0.5 < float(graph.value('monitor', 'x_gap_mg')) / float(
         graph.value('monitor', 'x_floor_mg')) < 1.1, 'the floor includes steps of the encoder'
-
-
-@pytest.mark.perf
-def test_the_load_at_1_khz(start, graph) -> None:
-    node = start('monitor', '--ros-args', '-p', 'diagnose.automatic:=false')
-    start('stage')
-    start('driver', '--ros-args', '-p', 'link.type:=sim')
-    graph.spin_until(lambda: graph.reports('monitor', 'gap x'), 40, 'the gap')
-    command = graph.node.create_publisher(JointState, 'stage/command', 10)
-    before_s, begin_s = cpu_time_s(node.popen.pid), time.monotonic()
-    for k in range(10):
-        command.publish(JointState(name=['alpha', 'beta'], position=[0.3 + 0.1 * k, 0.5 * k]))
-        graph.spin(2.0)
-    load = (cpu_time_s(node.popen.pid) - before_s) / (time.monotonic() - begin_s)
-    print(f'monitor at 1 kHz: {100 * load:.1f} % of a core, '
-          f'{graph.value("monitor", "missing")} samples missing')
-    assert load < 0.2

@@ -10,7 +10,6 @@ import signal
 import socket
 import subprocess
 import sys
-from threading import Event, Thread
 import time
 
 SUPPORT = Path(__file__).resolve().parent
@@ -71,18 +70,16 @@ def free_port():
 class DaskCluster:
     """A scheduler and workers, each a process that a test may kill."""
 
-    def __init__(self, folder, workers=2, failures=3):
+    def __init__(self, folder):
         self.address = f'tcp://127.0.0.1:{free_port()}'
         self._log = (Path(folder) / 'dask.log').open('ab')
         self._folder = folder
-        self._failures = failures
         self.scheduler = self._scheduler()
-        self.workers = [self._worker() for _ in range(workers)]
+        self.workers = [self._worker() for _ in range(2)]
 
     def _start(self, module, *words):
         environment = os.environ | {
-            'PYTHONPATH': os.pathsep.join([str(SUPPORT), *sys.path]),
-            'DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES': str(self._failures)}
+            'PYTHONPATH': os.pathsep.join([str(SUPPORT), *sys.path])}
         return subprocess.Popen([sys.executable, '-m', f'distributed.cli.{module}', *words,
                                  '--no-dashboard'], env=environment, cwd=self._folder,
                                 stdout=self._log, stderr=self._log)
@@ -107,25 +104,6 @@ class DaskCluster:
         for number in range(len(self.workers)):
             self.kill_worker(number)
 
-    @contextmanager
-    def kept(self):
-        """Start another worker for each that ends, until the block ends."""
-        stop = Event()
-
-        def keep():
-            while not stop.wait(0.02):
-                for number, process in enumerate(self.workers):
-                    if process.poll() is not None:
-                        self.workers[number] = self._worker()
-
-        keeper = Thread(target=keep)
-        keeper.start()
-        try:
-            yield
-        finally:
-            stop.set()
-            keeper.join()
-
     @staticmethod
     def _end(process):
         process.kill()
@@ -139,9 +117,9 @@ class DaskCluster:
 
 
 @contextmanager
-def dask_cluster(folder, workers=2, failures=3):
-    """Yield a cluster of this machine that repeats a task after some deaths of its worker."""
-    cluster = DaskCluster(folder, workers, failures)
+def dask_cluster(folder):
+    """Yield a cluster of this machine with two workers."""
+    cluster = DaskCluster(folder)
     try:
         yield cluster
     finally:

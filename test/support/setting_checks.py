@@ -15,11 +15,6 @@ def as_read(record):
     return PoseRecord.from_json(json.loads(json.dumps(record.to_json())))
 
 
-def without_settings(records):
-    """Return records of an earlier version, without the numbers of settings."""
-    return [replace(record, alpha_setting=None, beta_setting=None) for record in records]
-
-
 def same_partition(first, second):
     """Return whether two lists of numbers put the same poses together."""
     pairs = set(zip(first, second))
@@ -43,7 +38,8 @@ def check_all_agree(read, unit, entries):
                    for joint in ('alpha', 'beta'))
     by_journal = pose_extraction.extract_poses(read, unit, entries)
     assert (by_journal.alpha_setting == alpha).all() and (by_journal.beta_setting == beta).all()
-    bare = without_settings(entries)
+    # Records of an earlier version have no numbers of settings.
+    bare = [replace(e, alpha_setting=None, beta_setting=None) for e in entries]
     named = pose_extraction.extract_poses(read, unit, bare)
     for settings in ((named.alpha_setting, named.beta_setting), by_rests(read, unit, entries)):
         assert same_partition(settings[0].tolist(), alpha.tolist())

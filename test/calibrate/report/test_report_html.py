@@ -17,10 +17,13 @@ from units import NOMINAL
 pytestmark = [pytest.mark.long, NEEDS_CHROMIUM]
 
 
-@pytest.fixture(scope='module')
-def report_folder(tmp_path_factory):
+@pytest.fixture
+def report_folder(made_once):
     """Return the folder of a report of a unit that has drifted since its last calibration."""
-    folder = tmp_path_factory.mktemp('reported')
+    return made_once('reported', fill_report)
+
+
+def fill_report(folder):
     text = NOMINAL.read_text().replace('serial: nominal', "serial: '<U&7>'")
     (folder / 'u7.yaml').write_text(text)
 
@@ -41,7 +44,6 @@ def report_folder(tmp_path_factory):
         'data_sha256': '0' * 64, 'temperature_c': '25.00'})
     calibration_store.put(folder / 'store', old)
     run('fit', 'sweep.csv', '-o', 'unit.yaml', '--store', 'store', '--report', 'report')
-    return folder
 
 
 def test_the_report_has_its_contents(opened, report_folder):
