@@ -16,7 +16,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.package_version import package_version
-from adxl_ros.files.stream_unit import recorded_unit
+from adxl_ros.files.recording_columns import recorded_unit
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.tools.command_line import argument_parser, command
 from adxl_ros.tools.output import make_folder, print_end, progress, quoted, report_reading, run

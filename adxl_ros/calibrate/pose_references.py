@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
-from adxl_ros.files.pose_table import PoseTable
+from adxl_ros.files.tables import PoseTable
 import numpy as np
 
 _SHARE = 0.5

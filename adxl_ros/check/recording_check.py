@@ -10,10 +10,9 @@ from dataclasses import replace
 from adxl_ros.check.findings import assess, Findings
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import recording
-from adxl_ros.files.log_times import has_log_times, log_times
-from adxl_ros.files.reading_options import ReadingOptions
-from adxl_ros.files.recording_columns import Recording
-from adxl_ros.files.stream_unit import uncalibrated
+from adxl_ros.files.bag_reader import has_log_times, log_times
+from adxl_ros.files.column_mapping import ReadingOptions
+from adxl_ros.files.recording_columns import Recording, uncalibrated
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.recorded_sensor import load_sensor
 from adxl_ros.signals.recording_contents import examine, log_delay

@@ -49,8 +49,7 @@ from adxl_ros.diagnose.verdict import (
     Verdict,
 )
 from adxl_ros.diagnose.visibility import could_show, CouldShow, noise_could_show
-from adxl_ros.files.recording_columns import Recording
-from adxl_ros.files.stream_unit import check_unit
+from adxl_ros.files.recording_columns import check_unit, Recording
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
 from adxl_ros.model.constants import G0_MPS2

@@ -8,23 +8,23 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 import os
 from pathlib import Path
+import threading
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
-from adxl_ros.files.atomic_write import atomic_path
-from adxl_ros.files.bag_messages import import_rosbags
-from adxl_ros.files.bag_topics import (
+from adxl_ros.files.atomic_write import atomic_path, release_written
+from adxl_ros.files.bag_messages import (
     BATTERY_STATE,
     DIAGNOSTIC_STATUS,
+    import_rosbags,
     IMU,
     JOINT_STATE,
     TEMPERATURE,
     typestore,
 )
-from adxl_ros.files.mcap_chunks import Batch, write_messages
-from adxl_ros.files.page_cache import release_written
+from adxl_ros.files.mcap_file import Batch, write_messages
 from adxl_ros.files.recording_columns import COMMANDS, JOINTS, Recording
 from adxl_ros.files.stream_info import converted_info
 from adxl_ros.model.constants import G0_MPS2
@@ -306,3 +306,94 @@ _SCALARS = (
             cdr.battery_state),
 )
 """References that are one number."""
+
+
+_VECTOR = 'geometry_msgs/msg/Vector3Stamped'
+"""Type of the tilt."""
+
+
+class TiltBag(OpenBag):
+    """Writes corrected samples block by block: a message of `imu/data` and `tilt` for each."""
+
+    def __init__(self, path: str | os.PathLike) -> None:
+        """Prepare to write to `path`, which is replaced if it exists."""
+        super().__init__(path)
+        self._imu = imu_template(self.types, np.zeros(9))
+        kinds = self.types.types
+        zero = kinds['geometry_msgs/msg/Vector3'](x=0.0, y=0.0, z=0.0)
+        self._tilt = bytes(self.types.serialize_cdr(
+            kinds[_VECTOR](header=message_header(self.types, FRAME), vector=zero), _VECTOR))
+
+    def write(self, stamp_ns: np.ndarray, imu_fields: Mapping[str, np.ndarray],
+              tilt_rad: np.ndarray) -> None:
+        """
+        Append samples.
+
+        stamp_ns: stamps, ns, (n,), rising; imu_fields: fields of sensor_msgs/Imu by name, (n, k)
+        each; tilt_rad: roll, pitch and inclination, rad, (n, 3).
+        """
+        data, tilt = self.connection('/imu/data', IMU), self.connection('/tilt', _VECTOR)
+        if not len(stamp_ns):
+            return
+        self.check_stamps(stamp_ns)
+        rows = np.arange(len(stamp_ns))
+        self.write_messages(stamp_ns, [
+            Batch(data, rows, cdr.fill(self._imu, cdr.imu(self._imu), stamp_ns, imu_fields)),
+            Batch(tilt, rows, cdr.fill(self._tilt, cdr.vector3_stamped(self._tilt), stamp_ns,
+                                       {'vector': tilt_rad}))])
+
+
+_FLUSH_NS = 500_000_000
+"""Time after which messages are written to the file, ns. Chosen: what a kill loses."""
+
+
+class LiveBag:
+    """
+    Writes serialized messages of any topics into a rosbag2 directory, as they come.
+
+    A reader, or a kill, finds all messages but those of the last half second. Threads may share
+    it. Unlike `BagWriter`, it appears under its name at once.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open a new bag."""
+        rosbag2 = import_rosbags()
+        self._types = typestore()
+        self._writer = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
+        self._writer.open()
+        self._connections: dict[str, Any] = {}
+        self._flushed_ns = 0
+        self._lock = threading.Lock()
+        self._is_open = True
+
+    def write(self, topic: str, kind: str, data: bytes, time_ns: int) -> None:
+        """Append a message; one that comes after the end is left out."""
+        with self._lock:
+            if not self._is_open:
+                return
+            if topic not in self._connections:
+                self._connections[topic] = self._writer.add_connection(topic, kind,
+                                                                       typestore=self._types)
+            self._writer.write(self._connections[topic], time_ns, data)
+            if time_ns - self._flushed_ns > _FLUSH_NS:
+                self._flush()
+                self._flushed_ns = time_ns
+
+    def close(self) -> None:
+        """Write the end of the bag."""
+        with self._lock:
+            if self._is_open:
+                self._is_open = False
+                self._writer.close()
+
+    def flush(self) -> None:
+        """Write the messages so far to the file."""
+        with self._lock:
+            if self._is_open:
+                self._flush()
+
+    def _flush(self) -> None:
+        storage = self._writer.storage
+        if storage.chunk.bio.tell():
+            storage.close_chunk()
+        storage.bio.flush()

@@ -11,7 +11,7 @@ the date inside.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from datetime import datetime, timezone
 from functools import lru_cache
@@ -191,3 +191,34 @@ def _date_inside(path: Path, _: int, serial: str) -> datetime:
 def _second_of(sensor: Sensor) -> datetime:
     """Return the date of a calibration in whole seconds, as in file names."""
     return (date_of(sensor) or _OLDEST).replace(microsecond=0)
+
+
+_READ_BYTES = 1 << 20
+"""Bytes that are read at a time (chosen: bounds the memory for files of any size)."""
+
+
+def sha256(paths: Sequence[str | os.PathLike]) -> str:
+    """
+    Return the SHA-256 of recordings, hexadecimal; for one file, that of `sha256sum`.
+
+    For several files it is the SHA-256 of their own checksums, one a line, in the given order.
+    The files of a bag's directory are in the order of their names. Paths do not enter.
+    """
+    files: list[Path] = []
+    for path in map(Path, paths):
+        files += sorted(p for p in path.rglob('*') if p.is_file()) if path.is_dir() else [path]
+    checksums = [_file_sha256(path) for path in files]
+    if len(checksums) == 1:
+        return checksums[0]
+    return hashlib.sha256(''.join(f'{line}\n' for line in checksums).encode()).hexdigest()
+
+
+def _file_sha256(path: Path) -> str:
+    try:
+        with open(path, 'rb') as file:
+            checksum = hashlib.sha256()
+            while block := file.read(_READ_BYTES):
+                checksum.update(block)
+    except OSError as error:
+        raise UserError(f'{path}: cannot be read: {error.strerror}') from None
+    return checksum.hexdigest()

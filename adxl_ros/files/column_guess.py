@@ -10,18 +10,19 @@ from itertools import combinations
 import re
 import shlex
 
-from adxl_ros.files.column_mapping import ColumnMapping, Source
-from adxl_ros.files.column_units import (
+from adxl_ros.files.column_mapping import (
+    ColumnMapping,
     LSB,
     Quantity,
     ROLES,
     signed,
+    Source,
     unit_in_name,
     UNITS,
     UNSIGNED,
 )
 from adxl_ros.files.mapped_recording import likely_unit, listed
-from adxl_ros.files.stamp_bursts import burst_samples, stamped_rate_hz
+from adxl_ros.files.recording_columns import burst_samples, stamped_rate_hz
 from adxl_ros.files.tables import Table
 from adxl_ros.model.constants import AXES, G0_MPS2
 import numpy as np

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which column of a foreign file holds which quantity in which unit, and the mounting."""
+"""How a recording is read: columns of foreign files, their units, stamps and the mounting."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Generator, Iterable, Mapping
+from dataclasses import dataclass, replace
+from enum import Enum
 from pathlib import Path
 import re
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.column_units import ROLES, unit_name, UNITS
-from adxl_ros.model.constants import AXES
+from adxl_ros.files.recording_columns import ACCEL, Recording, VOLTS
+from adxl_ros.model.constants import AXES, G0_MPS2
 import numpy as np
 
 _EXAMPLE = 'time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg'
@@ -151,3 +152,185 @@ def parse_mounting(text: str) -> Mounting:
                         'write for example x=-y,y=x,z=z')
     return Mounting(tuple(entries[axis][0] for axis in axes),
                     tuple(entries[axis][1] for axis in axes))
+
+
+class Quantity(Enum):
+    """
+    What a column measures.
+
+    The value names the unit of the package, as `--columns` writes it.
+    """
+
+    TIME = 's'
+    OUTPUT = 'mps2'
+    ANGLE = 'rad'
+    LENGTH = 'm'
+    TEMPERATURE = 'c'
+    VOLTAGE = 'v'
+
+
+ROLES: Mapping[str, Quantity] = {
+    'time': Quantity.TIME,
+    **dict.fromkeys(AXES, Quantity.OUTPUT),
+    **dict.fromkeys(('alpha', 'beta', 'roll', 'pitch'), Quantity.ANGLE),
+    'shift': Quantity.LENGTH,
+    'temperature': Quantity.TEMPERATURE,
+    'supply': Quantity.VOLTAGE,
+}
+"""Quantity of each role that a column can have."""
+
+LSB = 'lsb'
+"""Unit of counts, which need the counts of 1 g."""
+
+UNSIGNED = 'u16'
+"""Unit of counts of 16 bits whose sign was lost: 65535 is −1."""
+
+
+def signed(values: np.ndarray) -> np.ndarray:
+    """Return counts of 16 bits with their sign, (n,)."""
+    return np.where(values >= 1 << 15, values - (1 << 16), values)
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit: value in the unit of the package = value · factor / divisor + offset."""
+
+    quantity: Quantity  # What it measures
+    # divisor, factor, offset: The conversion. A division by a power of ten is exact where a
+    # product is not.
+    divisor: float = 1.0
+    factor: float = 1.0
+    offset: float = 0.0
+    is_volts: bool = False  # Whether the output of a sensor stays in volts
+
+    def convert(self, values: np.ndarray) -> np.ndarray:
+        """Return values in the unit of the package."""
+        with np.errstate(over='ignore'):  # such a value is refused afterwards
+            return values * self.factor / self.divisor + self.offset
+
+
+UNITS: Mapping[Quantity, Mapping[str, Unit]] = {
+    Quantity.TIME: {
+        's': Unit(Quantity.TIME),
+        'ms': Unit(Quantity.TIME, 1e3),
+        'us': Unit(Quantity.TIME, 1e6),
+        'ns': Unit(Quantity.TIME, 1e9),
+        'epoch': Unit(Quantity.TIME),
+    },
+    Quantity.OUTPUT: {
+        'g': Unit(Quantity.OUTPUT, factor=G0_MPS2),
+        'mg': Unit(Quantity.OUTPUT, 1e3, G0_MPS2),
+        'mps2': Unit(Quantity.OUTPUT),
+        LSB: Unit(Quantity.OUTPUT, factor=G0_MPS2),
+        UNSIGNED: Unit(Quantity.OUTPUT, factor=G0_MPS2),
+        'v': Unit(Quantity.OUTPUT, is_volts=True),
+        'mv': Unit(Quantity.OUTPUT, 1e3, is_volts=True),
+    },
+    Quantity.ANGLE: {
+        'rad': Unit(Quantity.ANGLE),
+        'deg': Unit(Quantity.ANGLE, 180.0, np.pi),
+    },
+    Quantity.LENGTH: {
+        'm': Unit(Quantity.LENGTH),
+        'mm': Unit(Quantity.LENGTH, 1e3),
+    },
+    Quantity.TEMPERATURE: {
+        'c': Unit(Quantity.TEMPERATURE),
+        'k': Unit(Quantity.TEMPERATURE, offset=-273.15),
+        'f': Unit(Quantity.TEMPERATURE, 9.0, 5.0, -160.0 / 9.0),
+    },
+    Quantity.VOLTAGE: {
+        'v': Unit(Quantity.VOLTAGE),
+        'mv': Unit(Quantity.VOLTAGE, 1e3),
+    },
+}
+"""Units by quantity and name."""
+
+_ALIASES = {
+    'µs': 'us', 'μs': 'us', 'usec': 'us', 'micros': 'us', 'microseconds': 'us',
+    'sec': 's', 'secs': 's', 'second': 's', 'seconds': 's',
+    'msec': 'ms', 'millis': 'ms', 'milliseconds': 'ms', 'nsec': 'ns', 'nanoseconds': 'ns',
+    'unix': 'epoch', 'posix': 'epoch',
+    'm/s^2': 'mps2', 'm/s²': 'mps2', 'm/s2': 'mps2', 'ms2': 'mps2', 'ms^2': 'mps2',
+    'm/s/s': 'mps2', 'ms-2': 'mps2', 'ms^-2': 'mps2', 'm_s2': 'mps2', 'mss': 'mps2',
+    'm·s⁻²': 'mps2', 'm.s-2': 'mps2', 'm s^-2': 'mps2', 'm s-2': 'mps2',
+    'millig': 'mg', 'gs': 'g',
+    'counts': LSB, 'count': LSB, 'raw': LSB, 'digits': LSB,
+    'volt': 'v', 'volts': 'v', 'millivolt': 'mv', 'millivolts': 'mv',
+    '°': 'deg', 'degree': 'deg', 'degrees': 'deg', 'radian': 'rad', 'radians': 'rad',
+    '°c': 'c', 'degc': 'c', 'celsius': 'c', 'deg_c': 'c', 'deg c': 'c',
+    '°f': 'f', 'degf': 'f', 'fahrenheit': 'f', 'kelvin': 'k',
+}
+"""Other spellings of units, in lower case."""
+
+_BRACKETS = re.compile(r'[(\[{]\s*([^()\[\]{}]+?)\s*[)\]}]')
+"""A part of a column's name in brackets."""
+
+_WORD_ENDS = re.compile(r'[_\s.]+|\[\d+\]|[(\[{].*[)\]}]|(?<=[a-z])(?=[A-Z])')
+"""Ends of the words in a column's name; an index or a part in brackets is none."""
+
+
+def unit_name(text: str, quantity: Quantity) -> str | None:
+    """Return the name of a unit that is written in any way."""
+    word = text.strip().lower()
+    name = _ALIASES.get(word, word)
+    return name if name in UNITS[quantity] else None
+
+
+def unit_in_name(column: str, quantity: Quantity) -> str | None:
+    """Return the unit that the name of a column states: in brackets, or as one of its words."""
+    parts = [part for part in _WORD_ENDS.split(column.strip()) if part]
+    # The first word names the quantity: a column `g` or `C` may be anything.
+    words = [*_BRACKETS.findall(column), '_'.join(parts[-2:]), *reversed(parts[1:])]
+    if quantity is Quantity.TIME:
+        words += parts
+    return next((name for name in (unit_name(word, quantity) for word in words) if name), None)
+
+
+@dataclass(frozen=True)
+class ReadingOptions:
+    """How a recording is to be read."""
+
+    # Topic of the samples in a bag, or message of a ULog file; empty for the only one
+    topic: str = ''
+    mapping: ColumnMapping | None = None  # Columns of a table; None for those of the package
+    # Counts of 1 g by axis, for columns in LSB: one for all axes, or one each
+    lsb_per_g: tuple[float, ...] = ()
+    lsb_at_0g: tuple[float, ...] = ()  # Counts at 0 g by axis, for columns in LSB; none for 0
+    rate_hz: float | None = None  # Sample rate, Hz, that replaces the stamps; None keeps them
+    drop_bad_stamps: bool = False  # Whether samples are left out whose stamp does not increase
+    # How the axes of the file are those of the sensor frame; None where they are
+    mounting: Mounting | None = None
+
+    @property
+    def changes_columns(self) -> bool:
+        """Return whether the columns of a table are converted."""
+        return self != ReadingOptions(topic=self.topic, mounting=self.mounting)
+
+
+AS_IT_IS = ReadingOptions()
+"""Nothing is replaced."""
+
+
+def mounted(blocks: Iterable[Recording], mounting: Mounting) -> Generator[Recording, None, None]:
+    """Turn the blocks of a recording."""
+    for block in blocks:
+        names = block.sensor_columns
+        if len(names) != len(mounting.signs):
+            raise UserError(f'--axes: names the axes {AXES[:len(mounting.signs)]}, but '
+                            f'{block.path} has {block.axes}')
+        outputs = np.column_stack([block.columns[name] for name in names])
+        turned = mounting.turn(outputs - _zero(block, mounting)) + _zero(block, mounting)
+        yield replace(block, columns={**block.columns, **dict(zip(names, turned.T.copy()))})
+
+
+def _zero(block: Recording, mounting: Mounting) -> float:
+    """Return the output at zero specific force, in the unit of the output."""
+    if block.sensor_columns[0] in ACCEL or min(mounting.signs) > 0:
+        return 0.0
+    zeros = block.stream_info.nominal_values(block.axes).get('nominal_zero_g_v', np.zeros(0))
+    if not len(zeros) or np.ptp(zeros) > 0:
+        raise UserError(f'--axes: inverts an axis of {block.path}, whose {VOLTS[0]} is in volts '
+                        'about an unknown zero; write a line "# nominal_zero_g_v: ..." with the '
+                        'same value for each axis, or state the mounting in the parameter file')
+    return float(zeros[0])

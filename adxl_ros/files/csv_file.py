@@ -12,9 +12,8 @@ import re
 from typing import NoReturn
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.atomic_write import atomic_path
+from adxl_ros.files.atomic_write import atomic_path, release_written
 from adxl_ros.files.delimited_text import after, Layout, Lines, parse_numbers, read_lines
-from adxl_ros.files.page_cache import release_written
 from adxl_ros.files.recording_columns import (
     ACCEL,
     LIMIT,

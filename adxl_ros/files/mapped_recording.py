@@ -8,28 +8,29 @@ from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass, field
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.column_mapping import ColumnMapping, Source
-from adxl_ros.files.column_units import (
+from adxl_ros.files.column_mapping import (
+    ColumnMapping,
     LSB,
+    ReadingOptions,
     ROLES,
     signed,
+    Source,
     Unit,
     unit_in_name,
     UNITS,
     UNSIGNED,
 )
 from adxl_ros.files.csv_file import epoch_ns, TIME_LIMIT_S
-from adxl_ros.files.reading_options import ReadingOptions
 from adxl_ros.files.recording_columns import (
     ACCEL,
     BadStamps,
+    describe_bursts,
     JOINTS,
     LIMIT,
     Recording,
     TIME,
     VOLTS,
 )
-from adxl_ros.files.stamp_bursts import describe_bursts
 from adxl_ros.files.tables import Table, TableBlock
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.kinematics import stage_angles

@@ -18,11 +18,18 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import bag_reader, csv_file, mapped_recording
 from adxl_ros.files.bag_writer import BagWriter
 from adxl_ros.files.column_guess import describe, is_sensor_step, shell_quoted, time_unit_of_step
-from adxl_ros.files.column_mapping import ColumnMapping, parse_mapping, Source
-from adxl_ros.files.column_units import Quantity, unit_in_name, UNITS
+from adxl_ros.files.column_mapping import (
+    AS_IT_IS,
+    ColumnMapping,
+    mounted,
+    parse_mapping,
+    Quantity,
+    ReadingOptions,
+    Source,
+    unit_in_name,
+    UNITS,
+)
 from adxl_ros.files.csv_file import csv_writer, HeaderError
-from adxl_ros.files.mounted_axes import mounted
-from adxl_ros.files.reading_options import AS_IT_IS, ReadingOptions
 from adxl_ros.files.recording_columns import ACCEL, concatenate, Recording, TIME
 from adxl_ros.files.tables import is_text, open_table, Table
 from adxl_ros.model.sensor import Sensor

@@ -26,9 +26,8 @@ from adxl_ros.check.recording_check import BLOCK_ROWS, check_recording
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.package_version import package_version
-from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.recording_columns import recorded_unit, Recording, unit_of
 from adxl_ros.files.stream_info import NO_UNIT
-from adxl_ros.files.stream_unit import recorded_unit, unit_of
 from adxl_ros.files.tables import NoNumbers
 from adxl_ros.fleet.inputs import begin_of, is_manifest, Source
 from adxl_ros.fleet.recipe import age_days, code_version, key_of, ParameterText, Recipe

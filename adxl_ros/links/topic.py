@@ -11,7 +11,7 @@ from math import ceil, inf
 import time
 from typing import NamedTuple
 
-from adxl_ros.files.stamp_bursts import is_even, stamped_rate_hz
+from adxl_ros.files.recording_columns import is_even, stamped_rate_hz
 from adxl_ros.links.support.base import (
     Event,
     Level,

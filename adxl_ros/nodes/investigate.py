@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 import signal
 
-from adxl_ros.files.live_bag import LiveBag
+from adxl_ros.files.bag_writer import LiveBag
 from adxl_ros.investigate.background import BackgroundDiagnoser
 from adxl_ros.investigate.investigation import Investigation, State
 from adxl_ros.investigate.manoeuvres import Pose, StageLimits

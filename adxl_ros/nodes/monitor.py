@@ -12,8 +12,8 @@ import time
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
+from adxl_ros.files.recording_columns import check_unit, unit_of
 from adxl_ros.files.stream_info import NO_UNIT, StreamInfo
-from adxl_ros.files.stream_unit import check_unit, unit_of
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.monitor import change_record
 from adxl_ros.monitor.change_record import iso_time

@@ -9,7 +9,7 @@ from math import ceil, log2
 from typing import NamedTuple
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.stamp_bursts import stamped_rate_hz
+from adxl_ros.files.recording_columns import stamped_rate_hz
 from adxl_ros.model.constants import AXES, MEASURED_AXES
 from adxl_ros.model.sensor import Sensor, to_volts, with_axes
 from adxl_ros.signals.block_statistics import block_samples, BlockCutter, Blocks

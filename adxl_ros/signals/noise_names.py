@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from adxl_ros.files.exports import kalibr
+from adxl_ros.files.exports import kalibr_settings
 from adxl_ros.signals.axis_noise import AxisNoise
 import numpy as np
 
@@ -76,7 +76,7 @@ def settings(noises: list[AxisNoise], rate_hz: float) -> dict[str, list[Setting]
     return {
         'kalibr, imu.yaml': [
             Setting(name, (value,), unit + note) for (name, value, unit), note
-            in zip(kalibr.settings(white, k, rate_hz), (white_limit, limit, ''))],
+            in zip(kalibr_settings(white, k, rate_hz), (white_limit, limit, ''))],
         f'VINS-Fusion, at {rate_hz:.4g} Hz': [
             Setting('acc_n', (white * np.sqrt(rate_hz),), f'm/s^2{white_limit}'),
             Setting('acc_w', (k * np.sqrt(rate_hz),), f'm/s^3{limit}')],

@@ -8,8 +8,13 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.recording_columns import BadStamps, Recording, REFERENCES
-from adxl_ros.files.stamp_bursts import burst_samples, period_s
+from adxl_ros.files.recording_columns import (
+    BadStamps,
+    burst_samples,
+    period_s,
+    Recording,
+    REFERENCES,
+)
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.signals.rest_detection import RecordedRests

@@ -14,10 +14,9 @@ from adxl_ros.compensate.imu_fields import ImuFields
 from adxl_ros.compensate.recordings import effects_left, Estimates, RecordingEstimator
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
+from adxl_ros.files.bag_writer import TiltBag
 from adxl_ros.files.csv_file import csv_writer
-from adxl_ros.files.recording_columns import Recording
-from adxl_ros.files.stream_unit import check_unit
-from adxl_ros.files.tilt_bag import TiltBag
+from adxl_ros.files.recording_columns import check_unit, Recording
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.effects import effect_named

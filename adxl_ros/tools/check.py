@@ -21,7 +21,7 @@ from adxl_ros.diagnose.visibility import by_effect
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import html_page, recording
 from adxl_ros.files.atomic_write import write_text
-from adxl_ros.files.reading_options import ReadingOptions
+from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
 from adxl_ros.signals.recording_contents import RecordingContents
 from adxl_ros.tools.command_line import (

@@ -15,8 +15,7 @@ import textwrap
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.column_mapping import parse_mapping, parse_mounting
-from adxl_ros.files.reading_options import ReadingOptions
+from adxl_ros.files.column_mapping import parse_mapping, parse_mounting, ReadingOptions
 from adxl_ros.model import coefficients
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Effect, Parameter

@@ -18,7 +18,7 @@ from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.errors import UserError
 from adxl_ros.files import html_page, parameter_file, population_file, recording
 from adxl_ros.files.atomic_write import write_text
-from adxl_ros.files.reading_options import ReadingOptions
+from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.model.effects import library

@@ -9,9 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import parameter_file
+from adxl_ros.files import exports, parameter_file
 from adxl_ros.files.atomic_write import write_text
-from adxl_ros.files.exports import base, format_named, format_names
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.part_sizes import PartSizes
@@ -26,26 +25,17 @@ _EXAMPLES = {
 }
 """Examples of arguments, by their purpose."""
 
-_FORMATS = {
-    'broadcaster': 'parameters of imu_sensor_broadcaster (ros2_controllers)',
-    'isaaclab': 'Python module with configurations of Isaac Lab',
-    'json': 'all values with units, for any program',
-    'kalibr': 'the part of the accelerometer in imu.yaml of Kalibr',
-    'mujoco': 'site and accelerometer of MuJoCo (MJCF)',
-    'sdf': 'imu of gz-sensors, Gazebo (SDFormat)',
-}
-"""Meaning of the formats for the help text."""
-
 _NAMED_PARTS = 3
 """Number of parts that the screen names; chosen: the file lists all."""
 
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = argument_parser('export', __doc__, _EXAMPLES, lambda: entry_list('formats', _FORMATS))
+    parse = argument_parser('export', __doc__, _EXAMPLES, lambda: entry_list(
+        'formats', {name: each.meaning for name, each in exports.FORMATS.items()}))
     parse.add_argument('params', metavar='PARAMS', help='parameter file of the sensor')
-    parse.add_argument('--to', dest='format', required=True, choices=format_names(),
-                       metavar='FORMAT', help=f'{", ".join(format_names())}')
+    parse.add_argument('--to', dest='format', required=True, choices=list(exports.FORMATS),
+                       metavar='FORMAT', help=f'{", ".join(exports.FORMATS)}')
     parse.add_argument('-o', dest='output', required=True, metavar='FILE', help='the new file')
     return parse
 
@@ -55,30 +45,30 @@ def export(options: argparse.Namespace) -> int:
     if Path(options.params).resolve() == Path(options.output).resolve():
         raise UserError(f'{options.output}: is the input itself; choose another output')
     sensor = parameter_file.load(options.params)
-    exporter = format_named(options.format)
+    exporter = exports.FORMATS[options.format]
     with progress('sizes of the effects') as show:
-        exported = _sized(sensor, options, set(exporter.HOLDS), show)
+        exported = _sized(sensor, options, set(exporter.holds), show)
     write_text(options.output, exporter.text(exported))
-    held = [name for name in exported.sizes_mg if name in exporter.HOLDS]
+    held = [name for name in exported.sizes_mg if name in exporter.holds]
     print_end(_result_lines(exported, options.format, held), [options.output], command(
         'simulate', f'rich --params {quoted(options.params)} -o rich.csv'))
     return 0
 
 
 def _sized(sensor: Sensor, options: argparse.Namespace, held: set[str],
-           show: Callable[[float], None]) -> base.Export:
+           show: Callable[[float], None]) -> exports.Export:
     """Simulate the sizes of all parts of a sensor."""
     parts = PartSizes(sensor)
-    stage = base.stage_effects(sensor)
+    stage = exports.stage_effects(sensor)
     sizes_mg = parts.effects_mg([name for name in sensor.effects if name not in stage], show)
-    axes = base.axes(sensor)
-    sizes_mg[base.WHITE_NOISE] = _rms_mg([axis.noise_std_mps2 for axis in axes])
+    axes = exports.axes(sensor)
+    sizes_mg[exports.WHITE_NOISE] = _rms_mg([axis.noise_std_mps2 for axis in axes])
     if sensor.adc_bits:
-        sizes_mg[base.STEPS] = _rms_mg([axis.step_mps2 / np.sqrt(12) for axis in axes])
+        sizes_mg[exports.STEPS] = _rms_mg([axis.step_mps2 / np.sqrt(12) for axis in axes])
     if sensor.rc_s:
-        sizes_mg[base.FILTER] = parts.filter_mg()
-    return base.Export(sensor, Path(options.params).name, sizes_mg,
-                       parts.remaining_mg({*held, *stage}, base.FILTER in held))
+        sizes_mg[exports.FILTER] = parts.filter_mg()
+    return exports.Export(sensor, Path(options.params).name, sizes_mg,
+                       parts.remaining_mg({*held, *stage}, exports.FILTER in held))
 
 
 def _rms_mg(values_mps2: list[float]) -> float:
@@ -86,18 +76,18 @@ def _rms_mg(values_mps2: list[float]) -> float:
     return float(1e3 / G0_MPS2 * np.sqrt(np.mean(np.square(values_mps2))))
 
 
-def _result_lines(exported: base.Export, format_name: str, held: list[str]) -> list[str]:
+def _result_lines(exported: exports.Export, format_name: str, held: list[str]) -> list[str]:
     """Return what the file holds, and the size of what it does not hold."""
     lost = sorted((name for name in exported.sizes_mg if name not in held),
                   key=lambda name: -exported.sizes_mg[name])
     lines = [f'Sensor {exported.sensor.serial} for {format_name}. '
              f'The file holds: {", ".join(held)}.']
     if lost:
-        named = [f'{name} {base.size_text(exported.sizes_mg[name])}'
+        named = [f'{name} {exports.size_text(exported.sizes_mg[name])}'
                  for name in lost[:_NAMED_PARTS]]
         further = f' and {len(lost) - _NAMED_PARTS} more' if len(lost) > _NAMED_PARTS else ''
         lines += [f'Its model lacks, mg rms in the manoeuvre rich: {", ".join(named)}{further}.',
-                  f'Together {base.size_text(exported.remaining_mg)} mg rms, without noise and '
+                  f'Together {exports.size_text(exported.remaining_mg)} mg rms, without noise and '
                   'steps of the ADC.']
     return lines
 

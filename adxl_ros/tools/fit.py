@@ -22,10 +22,9 @@ from adxl_ros.files import (
     recording,
     sweep_journal,
 )
-from adxl_ros.files.checksum import sha256
-from adxl_ros.files.pose_table import read_pose_table
-from adxl_ros.files.recording_columns import Recording
-from adxl_ros.files.stream_unit import recorded_unit
+from adxl_ros.files.calibration_store import sha256
+from adxl_ros.files.recording_columns import recorded_unit, Recording
+from adxl_ros.files.tables import read_pose_table
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Place
 from adxl_ros.model.sensor import Sensor, with_axes

@@ -17,8 +17,7 @@ from adxl_ros.files import html_page, parameter_file, recording
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.csv_file import csv_writer
 from adxl_ros.files.plot_file import pyplot, write_plot
-from adxl_ros.files.recording_columns import Recording
-from adxl_ros.files.stream_unit import unit_of
+from adxl_ros.files.recording_columns import Recording, unit_of
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor

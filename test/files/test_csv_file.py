@@ -8,9 +8,8 @@ import sys
 from adxl_ros.errors import UserError
 from adxl_ros.files import delimited_text, recording
 from adxl_ros.files.csv_file import csv_writer
-from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.recording_columns import check_unit, Recording
 from adxl_ros.files.stream_info import sensor_info
-from adxl_ros.files.stream_unit import check_unit
 import numpy as np
 from pace import within
 import pytest

@@ -4,7 +4,7 @@ from dataclasses import replace
 import time
 
 from adxl_ros.files import parameter_file, recording, sweep_journal
-from adxl_ros.files.stream_unit import recorded_unit
+from adxl_ros.files.recording_columns import recorded_unit
 from adxl_ros.model.coefficients import with_neutral
 from adxl_ros.simulate.motion import Held, Knots, Motion
 from adxl_ros.simulate.simulator import simulate

@@ -8,7 +8,7 @@ from types import ModuleType, SimpleNamespace
 from xml.etree import ElementTree
 
 from adxl_ros.files import parameter_file
-from adxl_ros.files.exports import format_names
+from adxl_ros.files.exports import FORMATS
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 import numpy as np
@@ -42,7 +42,7 @@ def exported(tmp_path_factory):
     folder = tmp_path_factory.mktemp('export')
     parameter_file.save(folder / 'unit.yaml', unit())
     results = {}
-    for name in format_names():
+    for name in list(FORMATS):
         done = run_executable('export', 'unit.yaml', '--to', name, '-o', f'out.{name}', cwd=folder)
         assert done.returncode == 0, done.stderr
         path = folder / f'out.{name}'
@@ -55,7 +55,7 @@ def zero_g_mps2(sensor):
 
 
 def test_the_formats_are_there():
-    assert set(format_names()) == {'broadcaster', 'isaaclab', 'json', 'kalibr', 'mujoco', 'sdf'}
+    assert set(FORMATS) == {'broadcaster', 'isaaclab', 'json', 'kalibr', 'mujoco', 'sdf'}
 
 
 @pytest.mark.parametrize('name', ['broadcaster', 'isaaclab', 'kalibr', 'mujoco', 'sdf'])

@@ -24,8 +24,8 @@ from adxl_ros.calibrate.guided.session_settings import SessionSettings
 from adxl_ros.calibrate.guided.stage_guide import MountingError
 from adxl_ros.calibrate.report import report_html
 from adxl_ros.errors import UserError
+from adxl_ros.files.recording_columns import unit_of
 from adxl_ros.files.stream_info import StreamInfo
-from adxl_ros.files.stream_unit import unit_of
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals import measured_values
 import numpy as np

@@ -7,7 +7,7 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from collections import deque
 
-from adxl_ros.files.stamp_bursts import stamped_rate_hz
+from adxl_ros.files.recording_columns import stamped_rate_hz
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.signals.noise_limits import datasheet_noise
 from adxl_ros.signals.rest_detection import RestFinder, Stillness
