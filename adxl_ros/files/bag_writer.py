@@ -10,7 +10,7 @@ import os
 from pathlib import Path
 import threading
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
@@ -32,6 +32,9 @@ from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.noise import sample_std_v
 from adxl_ros.model.sensor import Sensor
 import numpy as np
+
+if TYPE_CHECKING:
+    from typing import Self  # since Python 3.11
 
 FRAME = 'imu_link'
 """Frame of the sensor's messages (REP-145)."""

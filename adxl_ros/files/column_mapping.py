@@ -34,7 +34,7 @@ class Source:
 class ColumnMapping:
     """Which columns of a file hold a recording."""
 
-    sources: Mapping[str, Source]  # Column and unit by role, a key of `column_units.ROLES`
+    sources: Mapping[str, Source]  # Column and unit by role, a key of `ROLES`
     where: str = '--columns'  # What states the mapping, for messages
 
     def __str__(self) -> str:
