@@ -20,14 +20,14 @@ from adxl_ros.closed_output import ended_by_closed_output
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.nodes.node_help import program_parser
-from adxl_ros.nodes.rclpy_internals import MessageWait, NotForExecutors
 from adxl_ros.nodes.run_node import cpu_time_s, executable, running, use_own_graph
+from adxl_ros.nodes.topics import Inbox
 from adxl_ros_validation.bench_jobs import offline_jobs, print_table
 import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import qos_profile_sensor_data, QoSProfile
+from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Imu
 
 RATE_HZ = 1000.0
@@ -55,12 +55,8 @@ class Listener(Node):
         super().__init__('listener')
         self.raw: list[bytes] = []  # Serialized messages
         self.arrived_ns: list[int] = []  # Their arrival times, ns
-        subscription = self.create_subscription(
-            Imu, topic, self._on_message,
-            QoSProfile(depth=_QUEUE, reliability=qos_profile_sensor_data.reliability), raw=True,
-            callback_group=NotForExecutors())
         # An executor of rclpy would take as much of a core as the nodes that are measured.
-        self._wait = MessageWait(subscription, self)
+        self._inbox = Inbox(self, Imu, topic, _QUEUE)
 
     def _on_message(self, raw: bytes) -> None:
         self.arrived_ns.append(time.time_ns())
@@ -74,7 +70,7 @@ class Listener(Node):
         """
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s and len(self.raw) < limit:
-            self._wait(Imu, self._on_message, _QUEUE)
+            self._inbox.receive(self._on_message)
         if not self.raw:
             raise UserError(f'no messages for {seconds:g} s')
 

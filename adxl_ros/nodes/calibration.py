@@ -32,11 +32,10 @@ from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.samples_in import joint_readings, Samples
 from adxl_ros.nodes.sensor_parameters import anonymous_sensor, declare_sensor, make_sensor
 from adxl_ros.nodes.settings import CalibrationSettings, check_given_parameters, given_link
-from adxl_ros.nodes.topics import create_subscription, PolledSubscription
+from adxl_ros.nodes.topics import create_subscription, Inbox, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.task import Future
 from sensor_msgs.msg import BatteryState, JointState, Temperature
@@ -130,7 +129,7 @@ class Calibration(Node):
         self._diagnostics = DiagnosticsReporter(self, {'calibration': self._status})
         create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
         if self._has_stage:
-            self._stage = PolledSubscription(self, JointState, 'stage/joint_states', _STAGE_QUEUE)
+            self._stage = Inbox(self, JointState, 'stage/joint_states', _STAGE_QUEUE)
             create_subscription(self, JointState, 'stage/command', self._on_command, _QUEUE)
         create_subscription(self, Temperature, 'temperature', self._on_temperature, _QUEUE)
         create_subscription(self, BatteryState, 'supply', self._on_supply, _QUEUE)
@@ -145,9 +144,8 @@ class Calibration(Node):
         # The answer comes when the pose is on disk. Until then the node must take samples.
         self.create_service(Trigger, '~/capture', self._on_capture,
                             callback_group=ReentrantCallbackGroup())
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(_POLL_S, self._poll, clock=self._steady)
-        self.create_timer(_NOTICE_S, self._notice, clock=self._steady)
+        self.create_timer(_POLL_S, self._poll, clock=STEADY)
+        self.create_timer(_NOTICE_S, self._notice, clock=STEADY)
 
     def _poll(self) -> None:
         self._read_stage()
@@ -162,7 +160,7 @@ class Calibration(Node):
 
     def _exit_when_done(self) -> None:
         """End the node after a calibration, when its last report has been received."""
-        now_ns = self._steady.now().nanoseconds
+        now_ns = STEADY.now().nanoseconds
         if self._controller.state is not ControllerState.IDLE:
             self._idle_since_ns = None
         elif self._has_run and self._idle_since_ns is None:

@@ -34,8 +34,9 @@ from adxl_ros.nodes.settings import check_given_parameters, CompensationSettings
 from adxl_ros.nodes.topics import (
     create_publisher,
     create_subscription,
-    ReceiveTurn,
+    Inbox,
     RepeatingThread,
+    STEADY,
 )
 from adxl_ros.signals.measured_values import unit_of_stream
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -43,7 +44,6 @@ from geometry_msgs.msg import Vector3Stamped
 import numpy as np
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.task import Future
@@ -90,7 +90,7 @@ class MountingParameters:
         self._waiting = Future()
         self._stream.collect()
         timer = self._node.create_timer(_LEVEL_S, self._waiting_ends,
-                                        clock=Clock(clock_type=ClockType.STEADY_TIME))
+                                        clock=STEADY)
         await self._waiting
         self._node.destroy_timer(timer)
         forces_mps2, self._waiting = self._stream.collected(), None
@@ -199,8 +199,7 @@ class Compensation(Node):
         self._named: tuple[Sensor, str]
         self._obstacle = ''
         self._reported: Counter[str] = Counter()
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._reported_ns = self._steady.now().nanoseconds
+        self._reported_ns = STEADY.now().nanoseconds
         self._diagnostics = DiagnosticsReporter(self, {'compensation': self._status})
         self._ages = SampleAges()
         self._data = create_publisher(self, Imu, 'imu/data', _DEPTH)
@@ -216,15 +215,16 @@ class Compensation(Node):
             sensor_info=self.resolve_topic_name('sensor_info'),
             temperature=self.resolve_topic_name('temperature'),
             supply=self.resolve_topic_name('supply')))
-        self._samples = ReceiveTurn(self, Imu, 'imu/data_raw', self._stream, _DEPTH)
+        self._samples = Inbox(self, Imu, 'imu/data_raw', _DEPTH)
         self._sensor = ExchangeableSensor(
             self, settings.calibration, self._policy.check, self._use)
         MountingParameters(self, self._stream, settings)
-        self.create_timer(_LOOK_S, self._look, clock=self._steady)
+        self.create_timer(_LOOK_S, self._look, clock=STEADY)
         create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
         create_subscription(self, Temperature, 'temperature', self._on_temperature, 1)
         create_subscription(self, BatteryState, 'supply', self._on_supply, 1)
-        self._thread = RepeatingThread(self, self._samples, 'imu/data_raw')
+        self._thread = RepeatingThread(self, lambda: self._samples.receive(self._stream),
+                                       'imu/data_raw')
 
     def close(self) -> None:
         """End the thread that receives."""
@@ -337,7 +337,7 @@ class Compensation(Node):
 
     def _interval(self) -> Interval:
         """Return what the stream has shown since the last report, and begin a new interval."""
-        steady_ns, ros_ns = self._steady.now().nanoseconds, self.get_clock().now().nanoseconds
+        steady_ns, ros_ns = STEADY.now().nanoseconds, self.get_clock().now().nanoseconds
         counts = Counter({name: self._stream.counts[name] for name in COUNTS})
         interval = Interval(
             duration_s=(steady_ns - self._reported_ns) * 1e-9,

@@ -8,9 +8,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 
-from adxl_ros.nodes.topics import create_publisher
+from adxl_ros.nodes.topics import create_publisher, STEADY
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 _PERIOD_S = 1.0
@@ -45,7 +44,7 @@ class DiagnosticsReporter:
         self._levels: dict[str, Level] = {}
         self._publisher = create_publisher(node, DiagnosticArray, '/diagnostics', _QUEUE)
         self._timer = node.create_timer(_PERIOD_S, self._report,
-                                        clock=Clock(clock_type=ClockType.STEADY_TIME))
+                                        clock=STEADY)
         self._at_once = node.create_guard_condition(self._report)
 
     def notice(self, task: str, level: Level) -> None:

@@ -20,9 +20,8 @@ from adxl_ros.calibrate.guided.screen_contents import KeyAction, LiveReading, Sc
 from adxl_ros.calibrate.guided.session import Session
 from adxl_ros.nodes.diagnostics import Level, Status, status_message
 from adxl_ros.nodes.run_node import executable, held_output
-from adxl_ros.nodes.topics import create_publisher
+from adxl_ros.nodes.topics import create_publisher, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.time import Time
 from sensor_msgs.msg import JointState
@@ -108,7 +107,6 @@ class Announcer:
         self._command = create_publisher(node, JointState, 'stage/command', _COMMAND_QUEUE) \
             if has_stage else None
         self._next = create_publisher(node, DiagnosticStatus, '~/next_pose', 1, latched=True)
-        self._clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._announced = ''
         self._commanded, self._commanded_ns = '', 0
 
@@ -118,7 +116,7 @@ class Announcer:
             self._node.get_logger().info(pose.text)
             self._publish(pose.text, pose.values)
         self._announced = pose.text
-        now_ns = self._clock.now().nanoseconds
+        now_ns = STEADY.now().nanoseconds
         if self._command and pose.command_rad is not None and (
                 pose.text != self._commanded or now_ns - self._commanded_ns >= _REPEAT_NS):
             self._commanded, self._commanded_ns = pose.text, now_ns
@@ -171,7 +169,7 @@ class DisplayPublisher:
         self._session: Session | None = None
         self._display: SessionDisplay | None = None
         self._publisher = create_publisher(node, String, '~/display', 1, latched=True)
-        node.create_timer(_PERIOD_S, self.update, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        node.create_timer(_PERIOD_S, self.update, clock=STEADY)
 
     def update(self) -> None:
         """Notice who looks, and publish the contents for them."""

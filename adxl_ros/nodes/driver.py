@@ -16,6 +16,7 @@ from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.sample_output import SampleOutput, Tally
 from adxl_ros.nodes.sensor_parameters import declare_sensor, make_sensor
 from adxl_ros.nodes.settings import check_given_parameters, declare_driver, DriverSettings
+from adxl_ros.nodes.topics import STEADY
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
@@ -55,11 +56,10 @@ class Driver(LifecycleNode):
         # unless another node does.
         self._is_clock = paced and (settings.speed != 1
                                     or self.get_parameter('use_sim_time').value)
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         # A real device lives in real time, whatever the clock of the graph is.
         self._stamp_clock = self.get_clock() if paced or isinstance(
             settings, base.SimulatorSettings) else Clock(clock_type=ClockType.SYSTEM_TIME)
-        self._tally = Tally(self._steady.now().nanoseconds)
+        self._tally = Tally(STEADY.now().nanoseconds)
         self._fault = ''
         self._refusal: UserError | None = None
         self._announces = not own.autostart
@@ -181,7 +181,7 @@ class Driver(LifecycleNode):
         if sensor_ns and not (self._output and self._output.is_clock):
             # A simulator may publish no /clock, although the node waits for one.
             sensor_ns = self._stamp_clock.now().nanoseconds or sensor_ns
-        values, warning = self._tally.report(self._steady.now().nanoseconds, sensor_ns)
+        values, warning = self._tally.report(STEADY.now().nanoseconds, sensor_ns)
         topic = self.resolve_topic_name('imu/data_raw')
         publishers = self.count_publishers(topic)
         if publishers > 1:

@@ -24,8 +24,9 @@ from adxl_ros.nodes.settings import check_given_parameters, InvestigateSettings
 from adxl_ros.nodes.topics import (
     create_publisher,
     create_subscription,
-    ReceiveTurn,
+    Inbox,
     RepeatingThread,
+    STEADY,
 )
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
@@ -66,7 +67,7 @@ class BagRecorder:
         for topic, (kind, name) in _KINDS.items():
             create_subscription(node, kind, topic, partial(self._write, topic, name), _SLOW_QUEUE,
                                 latched=topic == 'sensor_info', raw=True)
-        self._samples = ReceiveTurn(node, Imu, _SAMPLES, self._write_sample, _SAMPLES_QUEUE)
+        self._samples = Inbox(node, Imu, _SAMPLES, _SAMPLES_QUEUE)
 
     @property
     def is_writing(self) -> bool:
@@ -75,7 +76,8 @@ class BagRecorder:
 
     def listen(self) -> None:
         """Take samples, so that `has_samples` shows them."""
-        self._thread = RepeatingThread(self._node, self._samples, _SAMPLES)
+        self._thread = RepeatingThread(
+            self._node, lambda: self._samples.receive(self._write_sample), _SAMPLES)
 
     def start(self, path: Path) -> None:
         """Begin to write."""
@@ -154,7 +156,6 @@ class Investigate(Node):
         self._commands = create_publisher(self, JointState, 'stage/command', _COMMAND_QUEUE)
         self.create_service(Trigger, '~/abort', self._on_abort)
         create_subscription(self, JointState, 'stage/joint_states', self._on_stage, _STAGE_QUEUE)
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._pose: Pose | None = None
         self._watchdogs = {topic: Watchdog(_LONGEST_TURN_S)
                            for topic in ('imu/data_raw', 'stage/joint_states')}
@@ -179,7 +180,7 @@ class Investigate(Node):
             BackgroundDiagnoser(self._folder, self._limits, settings.seed),
             self._screen.show_answer, self._recorder.flush)
         self._recorder.listen()
-        self.create_timer(_POLL_S, self._poll, clock=self._steady)
+        self.create_timer(_POLL_S, self._poll, clock=STEADY)
 
     def stop(self, reason: str) -> None:
         """Stop the investigation; the stage holds its pose."""
@@ -212,7 +213,7 @@ class Investigate(Node):
 
     def _end(self, investigation: Investigation) -> None:
         """End the node when the stage has its last command."""
-        now_ns = self._steady.now().nanoseconds
+        now_ns = STEADY.now().nanoseconds
         if self._ended_ns is None:
             self._ended_ns = now_ns
         elif now_ns - self._ended_ns > _FAREWELL_S * 1e9:

@@ -16,7 +16,7 @@ from adxl_ros.links.support.watchdog import Watchdog
 from adxl_ros.nodes.rclpy_internals import NotForExecutors, take_messages
 from adxl_ros.nodes.sample_output import References, SampleOutput
 from adxl_ros.nodes.samples_in import joint_readings
-from adxl_ros.nodes.topics import create_subscription, ReceiveTurn, RepeatingThread
+from adxl_ros.nodes.topics import create_subscription, Inbox, RepeatingThread
 import numpy as np
 from rclpy.clock import ROSClock
 from rclpy.node import Node
@@ -55,26 +55,26 @@ class SimulatorInput:
         self._foreign = Watchdog(_LONGEST_TURN_S)
         self._is_warned = False
         self._due_s = self._counted_s = time.monotonic()
-        self._turn = ReceiveTurn(node, Imu, link.imu_topic, self._raw.append, _SIMULATOR_QUEUE)
+        self._inbox = Inbox(node, Imu, link.imu_topic, _SIMULATOR_QUEUE)
         self._temperature = create_subscription(
             node, Temperature, link.temperature_topic,
             lambda message: link.sense_temperature(message.temperature), 1)
 
     def destroy(self) -> None:
         """Remove the subscriptions; the thread that waits must have ended."""
-        self._turn.destroy()
+        self._inbox.destroy()
         self._node.destroy_subscription(self._temperature)
 
     def wait(self) -> None:
         """Pause after the last samples, wait for others for up to 0.1 s, give all to the link."""
         time.sleep(max(self._due_s - time.monotonic(), 0))
-        self._turn()
+        self._inbox.receive(self._raw.append)
         self._due_s = time.monotonic() + _PAUSE_S
         raws = self._raw[:]
         self._raw.clear()
         if not raws or self._due_s > self._counted_s + _COUNT_S:
             topic = self._node.resolve_topic_name(self._link.imu_topic)
-            self._link.sense_publishers(self._node.count_publishers(topic), self._turn.fault())
+            self._link.sense_publishers(self._node.count_publishers(topic), self._inbox.fault())
             self._counted_s = self._due_s
         if not raws:
             return

@@ -28,10 +28,9 @@ from adxl_ros.nodes.run_node import executable, run
 from adxl_ros.nodes.samples_in import joint_readings
 from adxl_ros.nodes.sensor_parameters import declare_sensor, make_sensor
 from adxl_ros.nodes.settings import check_given_parameters, MonitorSettings
-from adxl_ros.nodes.topics import create_publisher, create_subscription, PolledSubscription, stamp
+from adxl_ros.nodes.topics import create_publisher, create_subscription, Inbox, stamp, STEADY
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import numpy as np
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
 from std_srvs.srv import Trigger
@@ -141,7 +140,7 @@ class MonitorStreams:
         self._kind = kind
         reference = JointState if kind is ReferenceKind.STAGE else Imu
         self._samples, self._reference, self._temperature, self._supply = (
-            PolledSubscription(node, message, topic, _INPUT_QUEUE) for message, topic in (
+            Inbox(node, message, topic, _INPUT_QUEUE) for message, topic in (
                 (Imu, 'imu/data_raw'), (reference, reference_topic),
                 (Temperature, 'temperature'), (BatteryState, 'supply')))
 
@@ -173,12 +172,12 @@ class MonitorStreams:
         return len(raws)
 
 
-def _imu(subscription: PolledSubscription) -> tuple[np.ndarray, np.ndarray]:
+def _imu(subscription: Inbox) -> tuple[np.ndarray, np.ndarray]:
     """Return stamps, ns, (n,), and acceleration, m/s², (n, 3), of the messages that wait."""
     return _table(subscription, cdr.imu, 'linear_acceleration', 3)
 
 
-def _table(subscription: PolledSubscription, layout: Callable[[bytes], cdr.Layout], field: str,
+def _table(subscription: Inbox, layout: Callable[[bytes], cdr.Layout], field: str,
            count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return stamps, ns, (n,), and a field, (n, count), of the messages that wait."""
     raws = subscription.take()
@@ -239,15 +238,14 @@ class Monitor(Node):
         self._changed_ns: int | None = None
         self._diagnosed_s = -_PAUSE_S
         self._begun_s = self._sampled_s = self._referenced_s = self._heard_s = 0.0
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._streams = MonitorStreams(self, self._kind, self._reference_topic)
         self._publisher = create_publisher(self, DiagnosticArray, 'gap', _QUEUE)
         self._service = self.create_service(Trigger, '~/diagnose', lambda _, answer: answer,
                                             callback_group=NotForExecutors())
         self._diagnostics = DiagnosticsReporter(self, {'gap': self._status})
         create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
-        self.create_timer(_TURN_S, self._turn, clock=self._steady)
-        self.create_timer(_PERIOD_S, self._publish, clock=self._steady)
+        self.create_timer(_TURN_S, self._turn, clock=STEADY)
+        self.create_timer(_PERIOD_S, self._publish, clock=STEADY)
 
     def close(self) -> None:
         """End a diagnosis that runs."""

@@ -10,8 +10,6 @@ import sys
 from typing import Any
 
 from adxl_ros.errors import one_line
-from rcl_interfaces.msg import SetParametersResult
-from rcl_interfaces.srv import SetParameters
 from rclpy.callback_groups import CallbackGroup
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
@@ -88,9 +86,8 @@ class MessageWait:
         self._subscription, self._context = subscription, node.context
         self._wait_set: Any = None
 
-    def __call__(self, kind: Any, callback: Callable[[bytes], None], limit: int,
-                 accept: Callable[[int | None], bool] = lambda _: True) -> None:
-        """Wait for a message for up to 0.1 s, and give all that have come to a function."""
+    def __call__(self) -> None:
+        """Wait for a message for up to 0.1 s."""
         handle, context = self._subscription.handle, self._context.handle
         assert context is not None, 'a node has a context'
         with handle, context:
@@ -99,12 +96,6 @@ class MessageWait:
             self._wait_set.clear_entities()
             self._wait_set.add_subscription(handle)
             self._wait_set.wait(_LONGEST_WAIT_NS)
-            for _ in range(limit):
-                message_and_info = handle.take_message(kind, True)
-                if message_and_info is None:
-                    break
-                if accept(message_and_info[1]['publication_sequence_number']):
-                    callback(message_and_info[0])
 
 
 def store_empty(node: Node, name: str, kind: Parameter.Type, number: float) -> None:
@@ -128,22 +119,6 @@ def given_parameters(node: Node) -> Iterable[tuple[str, Any]]:
     that no declaration can know their names.
     """
     return ((name, parameter.value) for name, parameter in node._parameter_overrides.items())
-
-
-def on_set_request(node: Node,
-                   take: Callable[[list[Parameter]], SetParametersResult | None]) -> None:
-    """Let a function take a request of ~/set_parameters, which rclpy carries out one by one."""
-    service = next(s for s in node.services if s.service_name.endswith('/set_parameters'))
-    set_one_by_one = service.callback
-
-    def respond(request: SetParameters.Request, response: SetParameters.Response
-                ) -> SetParameters.Response:
-        result = take([Parameter.from_parameter_msg(p) for p in request.parameters])
-        if result is None:
-            return set_one_by_one(request, response)
-        response.results = [result] * len(request.parameters)
-        return response
-    service.callback = respond
 
 
 def is_rclpy_error(error: BaseException) -> bool:

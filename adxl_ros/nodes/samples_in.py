@@ -14,9 +14,8 @@ from typing import NamedTuple
 from adxl_ros.compensate.live_stream import UNKNOWN_ANGLE_RAD2
 from adxl_ros.files import cdr
 from adxl_ros.model.sensor import Sensor, to_volts
-from adxl_ros.nodes.topics import PolledSubscription
+from adxl_ros.nodes.topics import Inbox, STEADY
 import numpy as np
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Imu, JointState
@@ -37,14 +36,13 @@ class Samples:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._raw: list[bytes] = []
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.fault = ''  # Why the newest samples cannot be used, or ''
         self.restart_silence()
-        self._subscription = PolledSubscription(node, Imu, _TOPIC, _QUEUE)
+        self._subscription = Inbox(node, Imu, _TOPIC, _QUEUE)
 
     def restart_silence(self) -> None:
         """Restart the time without samples."""
-        self._heard_ns = self._steady.now().nanoseconds
+        self._heard_ns = STEADY.now().nanoseconds
 
     def clear(self) -> None:
         """Forget all samples so far."""
@@ -96,7 +94,7 @@ class Samples:
         """Return in words why or for how long no sample has come; '' while samples come."""
         if self.is_mixed:
             return self._subscription.fault()
-        silent_s = (self._steady.now().nanoseconds - self._heard_ns) * 1e-9
+        silent_s = (STEADY.now().nanoseconds - self._heard_ns) * 1e-9
         if silent_s < _SILENT_S:
             return ''
         topic = self._node.resolve_topic_name(_TOPIC)

@@ -20,11 +20,10 @@ from adxl_ros.nodes.settings import (
     SimulatedStageSettings,
     StageSettings,
 )
-from adxl_ros.nodes.topics import create_publisher, create_subscription
+from adxl_ros.nodes.topics import create_publisher, create_subscription, STEADY
 from adxl_ros.simulate.simulated_stage import JOINTS, SimulatedStage
 from builtin_interfaces.msg import Duration
 import numpy as np
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -198,7 +197,6 @@ class StageBridge:
             if joint.sign == 0:
                 raise parameter_error(f'bridge.{name}.sign', '0 is not 1 or -1')
         self._states_topic, self._speed_rad_s = own.joint_states, own.speed_rad_s
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._goal: dict[str, float] = {}
         self._heard_ns = 0
         self._resend_ns = 0
@@ -236,7 +234,7 @@ class StageBridge:
         if any(angle_rad is None for angle_rad in goal.values()):
             self._refuse('stage/command: the position of the stage is not known yet')
             return
-        now_ns = self._steady.now().nanoseconds
+        now_ns = STEADY.now().nanoseconds
         # The calibration repeats its command: a controller would begin its trajectory each time.
         if goal == self._goal and (self._arrived() or now_ns < self._resend_ns):
             return
@@ -272,7 +270,7 @@ class StageBridge:
 
     def _late(self) -> bool:
         """Return whether the stage has not reached its goal in time."""
-        return bool(self._goal) and self._steady.now().nanoseconds > self._late_ns \
+        return bool(self._goal) and STEADY.now().nanoseconds > self._late_ns \
             and not self._arrived()
 
     def _arrived(self) -> bool:
@@ -292,7 +290,7 @@ class StageBridge:
                 joint.unwrap_to(self._goal[name])
         if not joints or any(joint.angle_rad is None for joint in self._joints.values()):
             return
-        self._heard_ns = self._steady.now().nanoseconds
+        self._heard_ns = STEADY.now().nanoseconds
         stage = JointState(name=list(self._joints),
                            position=[joint.angle_rad for joint in self._joints.values()])
         stage.header.stamp = message.header.stamp
@@ -321,7 +319,7 @@ class StageBridge:
                 f'{topic}: no joint {", ".join(missing)}; it has '
                 f'{", ".join(sorted(self._controller_joints))}; correct bridge.alpha.joint and '
                 'bridge.beta.joint')
-        if self._steady.now().nanoseconds - self._heard_ns > _SILENT_NS:
+        if STEADY.now().nanoseconds - self._heard_ns > _SILENT_NS:
             return Level.WARN, f'nothing on {topic}; is the controller running?'
         if not self._node.count_subscribers(self._commands.topic_name):
             return Level.WARN, f'nobody listens to {self._commands.topic_name}'
@@ -330,7 +328,7 @@ class StageBridge:
         return Level.OK, 'on the way' if self._goal and not self._arrived() else 'at rest'
 
     def _delay_text(self) -> str:
-        late_s = (self._steady.now().nanoseconds - self._commanded_ns) * 1e-9
+        late_s = (STEADY.now().nanoseconds - self._commanded_ns) * 1e-9
         angles = ', '.join(f'{name} is at {np.degrees(joint.angle_rad):.1f}° of '
                            f'{np.degrees(self._goal[name]):.1f}°'
                            for name, joint in self._joints.items()

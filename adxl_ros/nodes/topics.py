@@ -14,6 +14,7 @@ from adxl_ros.errors import one_line, UserError
 from adxl_ros.nodes.rclpy_internals import MessageWait, NotForExecutors, take_messages
 from builtin_interfaces.msg import Time
 from rclpy.callback_groups import CallbackGroup
+from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -25,6 +26,8 @@ from sensor_msgs.msg import Imu
 _OVERRIDING = QoSOverridingOptions((QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH,
                                     QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY))
 """Policies that parameters can override."""
+STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+"""The clock of intervals."""
 _MIXED_S = 3.0
 """Time within which sequence numbers step back twice where two publishers mix, s; chosen: longer
 than the period of slow samples, shorter than two starts of a driver."""
@@ -140,56 +143,39 @@ class RepeatingThread:
                 self._context.try_shutdown()
 
 
-class ReceiveTurn:
+class Inbox:
     """
-    A turn of a thread: waits for the samples of one topic, and gives each to a callback.
+    Keeps the serialized messages of a topic until they are taken, without waking an executor.
 
-    Subscribes best effort, so that both kinds of publisher connect. Samples of several publishers
-    are withheld.
+    At 1 kHz an executor that wakes for each message takes a tenth of a core. It subscribes best
+    effort. Samples (sensor_msgs/Imu) of several publishers are withheld.
     """
 
-    def __init__(self, node: Node, kind: Any, topic: str, callback: Callable[[bytes], None],
-                 depth: int) -> None:
-        self._node = node
-        self._subscription = create_subscription(node, kind, topic, callback, depth, raw=True,
-                                                 group=NotForExecutors())
-        self._wait = MessageWait(self._subscription, node)
-        self._kind, self._callback, self._depth = kind, callback, depth
+    def __init__(self, node: Node, kind: Any, topic: str, depth: int) -> None:
+        self._node, self._kind, self._depth = node, kind, depth
         self._publishers = OnePublisher(node, topic)
+        self._subscription = create_subscription(
+            node, kind, topic, lambda _: None, depth, raw=True, group=NotForExecutors())
+        self._wait = MessageWait(self._subscription, node)
 
-    def __call__(self) -> None:
-        """Wait for a message, and take all that have come."""
-        self._wait(self._kind, self._callback, self._depth, self._publishers)
+    def take(self) -> list[bytes]:
+        """Return the messages since the last call, at most as many as are kept."""
+        return list(self._waiting())
+
+    def receive(self, callback: Callable[[bytes], object]) -> None:
+        """Wait for a message for up to 0.1 s, and give all that have come to a function."""
+        self._wait()
+        for message in self._waiting():
+            callback(message)
+
+    def _waiting(self) -> Iterator[bytes]:
+        accept = (self._publishers,) if self._kind is Imu else ()
+        return take_messages(self._subscription, self._kind, True, self._depth, *accept)
 
     def fault(self) -> str:
         """Return that several nodes publish on the topic, so that nothing is taken, or ''."""
         return self._publishers.fault()
 
     def destroy(self) -> None:
-        """Remove the subscription; the thread must have ended."""
+        """Remove the subscription; a thread that waits must have ended."""
         self._node.destroy_subscription(self._subscription)
-
-
-class PolledSubscription:
-    """
-    Keeps the serialized messages of a topic until a node takes them, without waking it.
-
-    Samples (sensor_msgs/Imu) of several publishers are withheld.
-
-    At 1 kHz an executor that wakes for each message takes a tenth of a core.
-    """
-
-    def __init__(self, node: Node, kind: Any, topic: str, depth: int) -> None:
-        self._kind, self._depth = kind, depth
-        self._publishers = OnePublisher(node, topic)
-        self._subscription = create_subscription(
-            node, kind, topic, lambda _: None, depth, raw=True, group=NotForExecutors())
-
-    def take(self) -> list[bytes]:
-        """Return the messages since the last call, at most as many as are kept."""
-        accept = (self._publishers,) if self._kind is Imu else ()
-        return list(take_messages(self._subscription, self._kind, True, self._depth, *accept))
-
-    def fault(self) -> str:
-        """Return that several nodes publish on the topic, so that nothing is taken, or ''."""
-        return self._publishers.fault()
