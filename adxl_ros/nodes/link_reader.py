@@ -15,9 +15,8 @@ from adxl_ros.links.support.base import ImuLink, Level, Link, LinkStatus, StageL
 from adxl_ros.links.support.watchdog import Watchdog
 from adxl_ros.nodes.rclpy_internals import NotForExecutors, take_messages
 from adxl_ros.nodes.sample_output import References, SampleOutput
-from adxl_ros.nodes.samples_in import joint_readings
+from adxl_ros.nodes.samples_in import decoded, joint_readings
 from adxl_ros.nodes.topics import create_subscription, Inbox, RepeatingThread
-import numpy as np
 from rclpy.clock import ROSClock
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -27,9 +26,9 @@ from sensor_msgs.msg import Imu, JointState, Temperature
 
 _SIMULATOR_QUEUE = 1000
 """Samples that are kept while the node is busy: 1 s at 1 kHz."""
-_FIELDS = ('orientation', 'orientation_covariance', 'angular_velocity',
-           'angular_velocity_covariance', 'linear_acceleration')
-"""Number fields of sensor_msgs/Imu."""
+_FIELDS = {'orientation': 4, 'orientation_covariance': 9, 'angular_velocity': 3,
+           'angular_velocity_covariance': 9, 'linear_acceleration': 3}
+"""Number fields of sensor_msgs/Imu with their counts."""
 _PAUSE_S = 0.004
 """Time between two looks at the samples, s. At 1 kHz four of them then share a run of the chain,
 which costs as much as ten samples."""
@@ -78,15 +77,8 @@ class SimulatorInput:
             self._counted_s = self._due_s
         if not raws:
             return
-        stamps_ns = np.empty(len(raws), np.int64)
-        fields: dict[str, np.ndarray] = {}
-        for table in cdr.tables(raws, cdr.imu):
-            stamps_ns[table.rows] = table.stamp_ns()
-            for name in _FIELDS:
-                numbers = table.numbers(name)
-                fields.setdefault(name, np.empty((len(raws), numbers.shape[1])))[table.rows] = \
-                    numbers
-            self.frame_id = table.layout.texts['frame_id']
+        stamps_ns, fields = decoded(raws, cdr.imu, **_FIELDS)
+        self.frame_id = cdr.imu(raws[-1]).texts['frame_id']
         self._warn_of_clock(int(stamps_ns[-1]))
         self._link.sense_imu(stamps_ns, fields)
 

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, UTC
 from pathlib import Path
@@ -25,7 +25,7 @@ from adxl_ros.nodes.node_help import NodeHelp
 from adxl_ros.nodes.parameters import declare_all
 from adxl_ros.nodes.rclpy_internals import NotForExecutors, take_request
 from adxl_ros.nodes.run_node import executable, run
-from adxl_ros.nodes.samples_in import joint_readings
+from adxl_ros.nodes.samples_in import decoded, imu_samples, joint_readings
 from adxl_ros.nodes.sensor_parameters import declare_sensor, make_sensor
 from adxl_ros.nodes.settings import check_given_parameters, MonitorSettings
 from adxl_ros.nodes.topics import create_publisher, create_subscription, Inbox, stamp, STEADY
@@ -146,7 +146,7 @@ class MonitorStreams:
 
     def take_samples(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the samples that wait: stamps, ns, (n,), and acceleration, m/s², (n, 3)."""
-        return _imu(self._samples)
+        return imu_samples(self._samples.take())
 
     def fault(self) -> str:
         """Return that several nodes publish samples or reference, so that none count, or ''."""
@@ -158,11 +158,11 @@ class MonitorStreams:
         for name, field, subscription, layout in (
                 ('temperature_c', 'temperature', self._temperature, cdr.temperature),
                 ('supply_v', 'voltage', self._supply, cdr.battery_state)):
-            stamps_ns, values = _table(subscription, layout, field, 1)
-            for stamp_ns, value in zip(stamps_ns.tolist(), values[:, 0].tolist()):
+            stamps_ns, fields = decoded(subscription.take(), layout, **{field: 1})
+            for stamp_ns, value in zip(stamps_ns.tolist(), fields[field][:, 0].tolist()):
                 reference.add_surroundings(name, stamp_ns, value)
         if self._kind is ReferenceKind.IMU:
-            stamps_ns, force = _imu(self._reference)
+            stamps_ns, force = imu_samples(self._reference.take())
             reference.add_readings(stamps_ns, force)
             return len(stamps_ns)
         raws = self._reference.take()
@@ -170,22 +170,6 @@ class MonitorStreams:
             if reading.position:
                 reference.add_joints(reading.stamp_ns, reading.position)
         return len(raws)
-
-
-def _imu(subscription: Inbox) -> tuple[np.ndarray, np.ndarray]:
-    """Return stamps, ns, (n,), and acceleration, m/s², (n, 3), of the messages that wait."""
-    return _table(subscription, cdr.imu, 'linear_acceleration', 3)
-
-
-def _table(subscription: Inbox, layout: Callable[[bytes], cdr.Layout], field: str,
-           count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return stamps, ns, (n,), and a field, (n, count), of the messages that wait."""
-    raws = subscription.take()
-    stamps_ns, values = np.empty(len(raws), np.int64), np.empty((len(raws), count))
-    for table in cdr.tables(raws, layout):
-        stamps_ns[table.rows] = table.stamp_ns()
-        values[table.rows] = table.numbers(field)
-    return stamps_ns, values
 
 
 _TURN_S = 0.05

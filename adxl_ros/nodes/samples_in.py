@@ -8,7 +8,7 @@ This takes a tenth of the time of filling messages.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from adxl_ros.compensate.live_stream import UNKNOWN_ANGLE_RAD2
@@ -63,7 +63,10 @@ class Samples:
         """Return the samples since the last call: stamps, ns, (n,), and volts, (n, m), finite."""
         self._receive()
         batch, self._raw = self._raw, []
-        stamps, accel, yaw_rad2 = _decoded(batch)
+        stamps, fields = decoded(batch, cdr.imu, linear_acceleration=3, orientation_covariance=9)
+        accel, covariance = fields['linear_acceleration'], fields['orientation_covariance']
+        # -1 in the first place means that a message has no orientation.
+        yaw_rad2 = np.where(covariance[:, 0] >= 0, covariance[:, _YAW_VARIANCE], 0.0)
         accel = accel[:, :len(unit.axes)]
         finite = np.isfinite(accel)
         if batch:
@@ -102,24 +105,29 @@ class Samples:
         return f'nothing on {topic} for {silent_s:.0f} s{publishers}'
 
 
-def finite_samples(batch: list[bytes]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the samples of serialized messages: stamps, ns, (n,), and m/s², (n, 3), finite."""
-    stamps, accel, _ = _decoded(batch)
+def imu_samples(batch: Sequence[bytes]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the samples of serialized messages: stamps, ns, (n,), and m/s², (n, 3)."""
+    stamps, fields = decoded(batch, cdr.imu, linear_acceleration=3)
+    return stamps, fields['linear_acceleration']
+
+
+def finite_samples(batch: Sequence[bytes]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the samples of serialized messages whose numbers are finite."""
+    stamps, accel = imu_samples(batch)
     finite = np.isfinite(accel).all(axis=1)
     return stamps[finite], accel[finite]
 
 
-def _decoded(batch: list[bytes]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return stamps, ns, (n,), m/s², (n, 3), and the variances of yaw, rad², of n messages."""
-    stamps, accel = np.empty(len(batch), np.int64), np.empty((len(batch), 3))
-    yaw_rad2 = np.zeros(len(batch))
-    for table in cdr.tables(batch, cdr.imu):
-        stamps[table.rows] = table.stamp_ns()
-        accel[table.rows] = table.numbers('linear_acceleration')
-        covariance = table.numbers('orientation_covariance')
-        # -1 in the first place means that a message has no orientation.
-        yaw_rad2[table.rows] = np.where(covariance[:, 0] >= 0, covariance[:, _YAW_VARIANCE], 0.0)
-    return stamps, accel, yaw_rad2
+def decoded(messages: Sequence[bytes], layout: Callable[[bytes], cdr.Layout], **counts: int
+            ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return stamps, ns, (n,), and fields of a count of numbers, (n, k), of n messages."""
+    stamps_ns = np.empty(len(messages), np.int64)
+    fields = {name: np.empty((len(messages), count)) for name, count in counts.items()}
+    for table in cdr.tables(messages, layout):
+        stamps_ns[table.rows] = table.stamp_ns()
+        for name, values in fields.items():
+            values[table.rows] = table.numbers(name)
+    return stamps_ns, fields
 
 
 def _why_not_finite(finite: np.ndarray, unit: Sensor) -> str:
