@@ -24,7 +24,6 @@ from adxl_ros.calibrate.guided.guide import NextPose
 from adxl_ros.calibrate.guided.session_settings import SessionSettings
 from adxl_ros.calibrate.guided.thermal_guide import ThermalSettings
 from adxl_ros.files.stream_info import StreamInfo
-from adxl_ros.nodes.diagnostics import DiagnosticsReporter, Level, Status
 from adxl_ros.nodes.display import Announcer, DisplayPublisher
 from adxl_ros.nodes.node_help import NodeHelp
 from adxl_ros.nodes.parameters import declare_all, low_and_high, numbers, parameter_error
@@ -32,7 +31,14 @@ from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.samples_in import joint_readings, Samples
 from adxl_ros.nodes.sensor_parameters import anonymous_sensor, declare_sensor, make_sensor
 from adxl_ros.nodes.settings import CalibrationSettings, check_given_parameters, given_link
-from adxl_ros.nodes.topics import create_subscription, Inbox, STEADY
+from adxl_ros.nodes.topics import (
+    create_subscription,
+    DiagnosticsReporter,
+    Inbox,
+    Level,
+    Status,
+    STEADY,
+)
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup

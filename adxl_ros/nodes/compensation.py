@@ -23,7 +23,6 @@ from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.mounting import Mounting
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.nodes.diagnostics import DiagnosticsReporter, Level, Status
 from adxl_ros.nodes.node_help import NodeHelp
 from adxl_ros.nodes.parameters import declare_all, parameter_error
 from adxl_ros.nodes.run_node import run
@@ -34,8 +33,11 @@ from adxl_ros.nodes.settings import check_given_parameters, CompensationSettings
 from adxl_ros.nodes.topics import (
     create_publisher,
     create_subscription,
+    DiagnosticsReporter,
     Inbox,
+    Level,
     RepeatingThread,
+    Status,
     STEADY,
 )
 from adxl_ros.signals.measured_values import unit_of_stream

@@ -18,9 +18,8 @@ from adxl_ros.calibrate.guided.display import live_reading, SessionDisplay
 from adxl_ros.calibrate.guided.guide import NextPose
 from adxl_ros.calibrate.guided.screen_contents import KeyAction, LiveReading, ScreenContents
 from adxl_ros.calibrate.guided.session import Session
-from adxl_ros.nodes.diagnostics import Level, Status, status_message
 from adxl_ros.nodes.run_node import executable, held_output
-from adxl_ros.nodes.topics import create_publisher, STEADY
+from adxl_ros.nodes.topics import create_publisher, Level, Status, status_message, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 from rclpy.time import Time

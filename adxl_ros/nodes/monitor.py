@@ -20,7 +20,6 @@ from adxl_ros.monitor.change_record import iso_time
 from adxl_ros.monitor.diagnosis_run import DiagnosisResult, DiagnosisRun
 from adxl_ros.monitor.live_gap import AxisGap, GapChange, GapSettings, LiveGap
 from adxl_ros.monitor.reference_stream import ReferenceKind
-from adxl_ros.nodes.diagnostics import DiagnosticsReporter, Level, Status, status_message
 from adxl_ros.nodes.node_help import NodeHelp
 from adxl_ros.nodes.parameters import declare_all
 from adxl_ros.nodes.rclpy_internals import NotForExecutors, take_request
@@ -28,7 +27,17 @@ from adxl_ros.nodes.run_node import executable, run
 from adxl_ros.nodes.samples_in import decoded, imu_samples, joint_readings
 from adxl_ros.nodes.sensor_parameters import declare_sensor, make_sensor
 from adxl_ros.nodes.settings import check_given_parameters, MonitorSettings
-from adxl_ros.nodes.topics import create_publisher, create_subscription, Inbox, stamp, STEADY
+from adxl_ros.nodes.topics import (
+    create_publisher,
+    create_subscription,
+    DiagnosticsReporter,
+    Inbox,
+    Level,
+    stamp,
+    Status,
+    status_message,
+    STEADY,
+)
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import numpy as np
 from rclpy.node import Node

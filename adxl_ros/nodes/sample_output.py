@@ -17,8 +17,7 @@ from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.nodes.diagnostics import Level, Status, status_message
-from adxl_ros.nodes.topics import create_publisher, stamp
+from adxl_ros.nodes.topics import create_publisher, Level, stamp, Status, status_message
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.clock import Clock as StampClock

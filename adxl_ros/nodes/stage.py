@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.nodes.diagnostics import DiagnosticsReporter, Level, Status
 from adxl_ros.nodes.node_help import NodeHelp
 from adxl_ros.nodes.parameters import declare_all, parameter_error
 from adxl_ros.nodes.run_node import run
@@ -20,7 +19,14 @@ from adxl_ros.nodes.settings import (
     SimulatedStageSettings,
     StageSettings,
 )
-from adxl_ros.nodes.topics import create_publisher, create_subscription, STEADY
+from adxl_ros.nodes.topics import (
+    create_publisher,
+    create_subscription,
+    DiagnosticsReporter,
+    Level,
+    Status,
+    STEADY,
+)
 from adxl_ros.simulate.simulated_stage import JOINTS, SimulatedStage
 from builtin_interfaces.msg import Duration
 import numpy as np
