@@ -14,7 +14,6 @@ import shlex
 import signal
 import sys
 import textwrap
-from time import monotonic
 from types import FrameType
 from typing import NamedTuple, Protocol
 
@@ -117,8 +116,6 @@ def _coloured(line: str) -> str:
 
 _UNITS = {'rad': 'rad', 'm': 'm', 'c': 'degC', 'v': 'V'}
 """Units of references by the end of their columns' names."""
-_FIRST_ESTIMATE = 0.2
-"""Fraction from which the run time is estimated. Chosen: begin and reading count little then."""
 _BAR_COLUMNS = 24
 """Columns of a progress bar: names of stages and times stand beside it in 80 columns."""
 
@@ -183,28 +180,6 @@ def _show_nothing(done: float, stage: str = '') -> None:
     """Show nothing; see `ShowDone`."""
 
 
-class _Clock:
-    """The elapsed and the expected run time, by the fraction that is done."""
-
-    def __init__(self) -> None:
-        self._begin_s, self._total_s = monotonic(), 0.0
-
-    def set_done(self, done: float) -> None:
-        """Estimate the run time from the fraction that is done."""
-        if done >= _FIRST_ESTIMATE:
-            self._total_s = self._elapsed_s() / min(done, 1.0)
-
-    def text(self) -> str:
-        """Return both times; the expected one as soon as it is known."""
-        elapsed_s = self._elapsed_s()
-        if not self._total_s:
-            return _minutes(elapsed_s)
-        return f'{_minutes(elapsed_s)} of about {_minutes(max(self._total_s, elapsed_s))}'
-
-    def _elapsed_s(self) -> float:
-        return monotonic() - self._begin_s
-
-
 @contextmanager
 def progress(title: str) -> Iterator[ShowDone]:
     """Show a progress bar on a terminal where rich is installed, else nothing."""
@@ -213,32 +188,23 @@ def progress(title: str) -> Iterator[ShowDone]:
         from rich.progress import (
             BarColumn,
             Progress,
-            ProgressColumn,
-            TaskProgressColumn,
             TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
         )
-        from rich.text import Text
     except ImportError:
         yield _show_nothing
         return
-    clock = _Clock()
-
-    class ClockColumn(ProgressColumn):
-        """The elapsed and the expected run time; rich draws it ten times a second."""
-
-        def render(self, task: object) -> Text:
-            return Text(clock.text())
-
     console = Console(stderr=True)
-    columns = (TextColumn('{task.description}'), BarColumn(_BAR_COLUMNS), TaskProgressColumn(),
-               ClockColumn())
+    columns = (TextColumn('{task.description}'), BarColumn(_BAR_COLUMNS),
+               TextColumn('{task.percentage:3.0f} %'), TimeElapsedColumn(),
+               TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True,
                   disable=not console.is_terminal) as bar:
         task = bar.add_task(title, total=1.0)
 
         def show(done: float, stage: str = '') -> None:
             """Show a fraction; see `ShowDone`."""
-            clock.set_done(done)
             # A plan that grows does not take the bar back.
             bar.update(task, completed=max(done, bar.tasks[task].completed),
                        description=stage or title)
@@ -258,9 +224,3 @@ def staged_progress(work: Mapping[str, float]) -> Iterator[Callable[[str, float]
                  f'{number + 1}/{len(names)} {stage}')
 
         yield show_stage
-
-
-def _minutes(seconds: float) -> str:
-    """Return a duration as minutes and seconds."""
-    minutes, seconds = divmod(round(seconds), 60)
-    return f'{minutes}:{seconds:02d}'
