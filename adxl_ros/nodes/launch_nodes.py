@@ -53,8 +53,8 @@ class Argument(NamedTuple):
         links = links_by_parameter().get(self.spec.name)
         used_by = f'{" and ".join(links)}: ' if links else ''
         return DeclareLaunchArgument(
-            self.name, default_value='', description=f'{used_by}{self.spec.meaning}; empty: as in '
-            'params_file, or the default',
+            self.name, default_value='', description=f'{used_by}{self.spec.meaning}; not given: '
+            'as in params_file, or the default',
             choices=['', *self.spec.choices] if self.spec.choices else None)
 
     def value(self, text: str) -> Any:
