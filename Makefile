@@ -4,20 +4,22 @@
 # make test     every test, in 18 minutes        (make test ARGS='-k fit')
 # make perf     limits of processor time, for a quiet machine
 # make bench    latency and CPU of the live nodes, and each job beside its rivals
-# make gallery  docs/effects.md and its plots, from the library of effects
+# make reference  docs/reference, and figures in the pages, from the package and the measurements
+# make gallery  the pictures of the effects
+# make site     the documentation as a site in site/, with search
 # make screenshots  docs/screenshots: terminals and pages from real runs, six minutes
-# make reproduction  docs/reproduction.md and its plots: the paper's experiments on simulated units
+# make reproduction  docs/measurements/reproduction.md and its plots: the paper's experiments on simulated units
 # make coverage do the intervals hold? 300 drawn units and stages, as a table
 # make faults   the links under every fault, as a table
-# make noise    how often the intervals of noise hold the truth: docs/noise.md
-# make investigate  minutes to a verdict of `investigate` over 60 simulated units: docs/investigate.md, an hour
-# make nulls    recordings without any effect through diagnose: docs/nulls.md, 90 minutes
+# make noise    how often the intervals of noise hold the truth
+# make investigate  minutes to a verdict of `investigate` over 60 simulated units, an hour
+# make nulls    recordings without any effect through diagnose: docs/measurements/nulls.md, 90 minutes
 # make blind    the blind check of diagnose, 600 trials, into blind_output/ (make blind ARGS='--seed 1')
 # make working  working cases of diagnose, one line each, then the scores (make working ARGS='--count 20 --seed 3')
 # make lint     the linters alone
 # make clean    remove what these made
 
-.PHONY: build developed help demo check test perf bench gallery screenshots reproduction coverage faults noise nulls investigate blind working lint clean \
+.PHONY: build developed help demo check test perf bench reference gallery site screenshots reproduction coverage faults noise nulls investigate blind working lint clean \
     FORCE
 .DEFAULT_GOAL := build
 
@@ -131,7 +133,7 @@ bench: build
 	    --requirement requirements/bench.txt
 	./run bench --iiod test/support/iiod.py $(ARGS)
 
-# Each of the next takes long: its table goes into docs/links.md, docs/guided.md or docs/recordings.md.
+# Each of the next takes long: its table goes into docs/measurements.
 python_in_test = cd test && ../run --exec sh -c 'PYTHONPATH="support:$$PYTHONPATH" exec python "$$@"' -
 
 faults: developed
@@ -141,14 +143,26 @@ noise: developed
 	$(python_in_test) long/noise_coverage.py $(ARGS)
 
 gallery: build
-	./run --exec python docs/gallery.py docs
+	./run --exec python docs/gallery.py
+
+reference: build
+	./run --exec python docs/reference.py
+
+site: .venv/.documented
+	.venv/bin/python -m sphinx -W --keep-going -q -E -c docs . site
+	@echo '<meta http-equiv="refresh" content="0; url=docs/index.html">' > site/index.html
+	@echo 'wrote site/index.html'
+
+.venv/.documented: .venv/.ready requirements/docs.txt
+	@$(call install,requirements/docs.txt)
+	@touch $@
 
 # One of them: make screenshots ARGS=diagnose. Pages need Chromium: apt install chromium.
 screenshots: developed
 	OPENBLAS_NUM_THREADS=1 ./run --exec python docs/screenshots.py docs $(ARGS)
 
 reproduction: build
-	OPENBLAS_NUM_THREADS=1 ./run reproduce --units 40 --draws 300 -o docs $(ARGS)
+	OPENBLAS_NUM_THREADS=1 ./run reproduce --units 40 --draws 300 -o docs/measurements $(ARGS)
 
 coverage: build
 	OPENBLAS_NUM_THREADS=1 ./run reproduce --units 0 --draws 300 -o coverage_output $(ARGS)
@@ -161,7 +175,7 @@ investigate: developed
 # Goes on where it was cut short.
 nulls: developed
 	OPENBLAS_NUM_THREADS=1; export OPENBLAS_NUM_THREADS; \
-	$(python_in_test) long/nulls.py ../docs/nulls.md $(ARGS)
+	$(python_in_test) long/nulls.py ../docs/measurements/nulls.md $(ARGS)
 
 # Goes on where it was cut short; with a seed of its own in ARGS, into another folder.
 blind: build
@@ -171,5 +185,5 @@ working: build
 	OPENBLAS_NUM_THREADS=1 ./run --exec python -m adxl_ros_validation.working_cases $(ARGS)
 
 clean:
-	rm -rf .venv build install log demo_output blind_output working_output coverage_output .*_cache .hypothesis
+	rm -rf .venv build install log demo_output blind_output working_output coverage_output site .*_cache .hypothesis
 	find adxl_ros adxl_ros_validation launch test -name __pycache__ -prune -exec rm -rf {} +

@@ -145,7 +145,7 @@ NOTES = """\
 - **Tilt run (b)** turns beta "at alpha = 0", where beta has no effect. It must have been 90°,
   and is here.
 - **p1, q1 and Θ** are the same to first order. The sequential fit and the separate search count
-  them twice. Here they are one (docs/calibration.md, "The gauge").
+  them twice. Here they are one (docs/explain/calibration.md, "The gauge").
 - **The offset of the motion experiment** is the stage's: 0.1° of level are 17 mm/s². `full` fits
   the level and keeps it out of the sensor. `linear` and `physical` include it in the sensor, where
   it cancels on the same base only.

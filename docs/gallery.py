@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Write docs/effects.md: each effect of the library with a plot of what it does."""
+"""Draw what each effect of the library does: the pictures of docs/reference/effects.md."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
 import sys
-from textwrap import wrap
 
 from adxl_ros.files import parameter_file
 from adxl_ros.model.coefficients import put, typical
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.effects import library
-from adxl_ros.model.effects.base import Coefficient, Effect, Need, Place
+from adxl_ros.model.effects.base import Coefficient, Effect, Need
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.simulate.motion import Held, Knots, Motion
 from adxl_ros.simulate.simulator import Columns, simulate
@@ -114,45 +113,15 @@ LOUDER = {Coefficient('stuck', 'rate_hz'): 1.0, Coefficient('stuck', 'duration_s
 
 
 def main(output: Path) -> None:
-    """Draw every effect and write the page."""
+    """Draw every effect."""
     nominal = with_axes(parameter_file.load(DOCS.parent / 'params' / 'adxl203.yaml'), AXES)
     nominal = replace(nominal, rate_hz=500.0)
-    (output / 'effects').mkdir(parents=True, exist_ok=True)
-    lines = ['# Gallery of effects', '', 'Each plot shows the output without and with one effect '
-             'at its typical values, unless the caption states others.', 'The program '
-             '`make gallery` writes this page from the library.', '']
-    place = None
-    for effect in sorted(library().values(), key=lambda e: (e.place, e.name)):
-        if effect.place is not place:
-            place = effect.place
-            lines += [f'## {TITLES[place]}', '']
-        caption = draw(nominal, effect, output / 'effects' / f'{effect.name}.png')
-        lines += section(effect, caption)
-    (output / 'effects.md').write_text('\n'.join(lines), encoding='utf-8')
+    output.mkdir(parents=True, exist_ok=True)
+    for effect in library().values():
+        draw(nominal, effect, output / f'{effect.name}.png')
 
 
-TITLES = {Place.REFERENCE: 'Reference', Place.STAGE: 'Stage',
-          Place.FORCE: 'Specific force', Place.MOUNTING: 'Mounting',
-          Place.ELEMENT: 'Sensing element', Place.ELECTRONICS: 'Electronics and RC filter',
-          Place.ADC: 'Input of the ADC', Place.CODE: 'Codes and link', Place.CLOCK: 'Clock'}
-
-
-def section(effect: Effect, caption: str) -> list[str]:
-    """Return the section of an effect."""
-    facts = [f'Acts on the {effect.acts_on.value}',
-             'smooth in its parameters' if effect.smooth else 'not smooth in its parameters',
-             'undone by the inverse' if effect.invertible else 'not undone by the inverse']
-    facts += [f'needs: {need.value}' for need in effect.needs]
-    facts += [f'follows `{name}`' for name in effect.follows]
-    rows = [f'| `{p.name}` | {p.unit} | {p.neutral:g} | {p.lower:g} to {p.upper:g} | {p.scale:g} '
-            f'| {", ".join(p.axes) or "-"} | {p.doc} | {p.source} |' for p in effect.parameters]
-    return [f'### {effect.name}', '', *wrap(effect.cause, 119), '', f'![{effect.name}](effects/'
-            f'{effect.name}.png)', '', caption, '', f'{"; ".join(facts)}.', '',
-            '| parameter | unit | neutral | bounds | typical | axes | meaning | source |',
-            '|---|---|---|---|---|---|---|---|', *rows, '']
-
-
-def draw(nominal: Sensor, effect: Effect, path: Path) -> str:
+def draw(nominal: Sensor, effect: Effect, path: Path) -> None:
     """Draw one effect."""
     scene = SCENES.get(effect.name, plane(90))
     sensor = nominal if scene.noisy else replace(
@@ -169,9 +138,6 @@ def draw(nominal: Sensor, effect: Effect, path: Path) -> str:
     above.set_title(effect.name, loc='left', fontweight='bold')
     figure.savefig(path, dpi=85)
     plt.close(figure)
-    stated = ', '.join(f'`{str(name).removeprefix(f"{effect.name}.")}` = {value:g}'
-                       for name, value in louder.items())
-    return f'Here with {stated}.' if stated else 'Typical values.'
 
 
 def draw_lines(above: plt.Axes, below: plt.Axes, scene: Scene, pair: Pair) -> None:
@@ -237,4 +203,4 @@ def draw_codes(above: plt.Axes, below: plt.Axes, _: Scene, pair: Pair) -> None:
 
 
 if __name__ == '__main__':
-    main(Path(sys.argv[1]) if len(sys.argv) > 1 else DOCS)
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else DOCS / 'reference' / 'effects')

@@ -63,7 +63,7 @@ class Row(NamedTuple):
 
 
 def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Return the report as the objects of JSON; docs/interfaces.md lists its keys."""
+    """Return the report as the objects of JSON; docs/reference/report_json.md lists its keys."""
     fault, report = diagnosis.fault, diagnosis.report
     if fault is not None:
         return {'schema': 1, 'verdict': {

@@ -190,7 +190,7 @@ _NO_COLOUR = '\x1b[0m'
 _EXAMPLES = {'the simulated sensor': '-o demo_output',
              'a real recording, too': '--real imu.csv -o demo_output'}
 """Examples of arguments, by their purpose."""
-NEXT_PAGE = 'docs/guided.md'
+NEXT_PAGE = 'docs/start/tilt.md'
 """Page that a user reads next."""
 
 

@@ -99,7 +99,7 @@ _HIGHEST_RATE_HZ = 1e5
 def add_recording_options(parse: argparse.ArgumentParser) -> None:
     """Add the options that state topic, columns, units, stamps and mounting of a recording."""
     group = parse.add_argument_group(
-        'recordings of other software', 'docs/recordings.md has units and examples.')
+        'recordings of other software', 'docs/howto/logs.md has units and examples.')
     group.add_argument('--topic', metavar='NAME', default='',
                        help='topic of type sensor_msgs/Imu (default: imu/data_raw, or the only '
                             'one)')

@@ -90,7 +90,7 @@ def _details() -> str:
                     'az_mps2 or sensor_msgs/Imu.')
     about['RECORDING'] = 'Follow the stage angles of a recording, at its stamps.'
     return '\n\n'.join([entry_list('trajectories', about), effect_list(library().values()),
-                        'docs/effects.md has the parameters of each effect.'])
+                        'docs/reference/effects.md has the parameters of each effect.'])
 
 
 def simulate(options: argparse.Namespace) -> int:

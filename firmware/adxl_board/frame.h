@@ -3,7 +3,7 @@
 /* Frames of the serial wire format of adxl_ros, version 1: plain C99, no heap, no globals.
  *
  * A frame is COBS(payload, CRC-32) and one 0x00. All numbers are little-endian on every processor.
- * docs/links.md has the fields. */
+ * docs/reference/wire_format.md has the fields. */
 
 #ifndef ADXL_FRAME_H
 #define ADXL_FRAME_H

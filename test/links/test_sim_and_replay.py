@@ -51,7 +51,7 @@ def test_every_link_can_be_opened_by_its_name():
 
 
 def test_the_example_of_the_documentation_is_a_link(tmp_path, monkeypatch):
-    text = (REPO / 'docs' / 'links.md').read_text(encoding='utf-8')
+    text = (REPO / 'docs' / 'howto' / 'own_link.md').read_text(encoding='utf-8')
     (tmp_path / 'constant.py').write_text(text.split('```python\n')[1].split('```')[0])
     monkeypatch.setattr(adxl_ros.links, '__path__', [*adxl_ros.links.__path__, str(tmp_path)])
     monkeypatch.delitem(sys.modules, 'adxl_ros.links.constant', raising=False)

@@ -230,7 +230,7 @@ def row_of(unit, base, strategy):
 
 
 def table(rows):
-    """Return the lines of the table of docs/investigate.md."""
+    """Return the lines of the table of docs/measurements/investigate.md."""
     lines = ['| strategy | units | with a verdict | wrong | median minutes | mean minutes |',
              '|---|---|---|---|---|---|']
     for strategy in STRATEGIES:

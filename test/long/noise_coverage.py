@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-How often the 90 % intervals of `noise` hold the truth: the table of docs/noise.md.
+How often the 90 % intervals of `noise` hold the truth: docs/measurements/noise_coverage.md.
 
 Run as `make noise`; 200 draws take some minutes.
 """

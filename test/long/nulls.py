@@ -3,7 +3,7 @@
 """
 Nulls: recordings without any effect, by manoeuvre, rate, axes and encoder, through diagnose.
 
-    make nulls                      writes docs/nulls.md; goes on where it was cut short
+    make nulls         writes docs/measurements/nulls.md; goes on where it was cut short
     make nulls ARGS='--minutes 5 --seed 3'
 
 The cases run in a random order, so that a part of them is a fair sample.

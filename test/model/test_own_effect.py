@@ -14,7 +14,7 @@ import numpy as np
 from processes import REPO, run_executable
 from units import nominal
 
-PAGE = REPO / 'docs' / 'own_effect.md'
+PAGE = REPO / 'docs' / 'howto' / 'own_effect.md'
 
 
 def test_the_documented_package_works(tmp_path, monkeypatch):

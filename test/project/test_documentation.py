@@ -1,19 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the documentation shows works: parameter files load, and ROS parses the arguments."""
+"""What the documentation shows is so: commands, links, figures, and the reference."""
 
-import math
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 import re
 import shlex
+import subprocess
 
 from adxl_ros.files import parameter_file
-from processes import REPO
+from processes import REPO, run_executable
 import pytest
 import rclpy
 from rclpy.context import Context
 
-PAGES = [REPO / 'README.md', *sorted((REPO / 'docs').glob('*.md'))]
+DOCS = REPO / 'docs'
+PAGES = [REPO / 'README.md', REPO / 'CONTRIBUTING.md', *sorted(DOCS.glob('**/*.md'))]
+BY_HAND = [page for page in PAGES if 'measurements' not in page.parts
+           and 'Made by `make reference`' not in page.read_text('utf-8')]
+MOST_WORDS = 26_000
+"""Words of the pages by hand that a reader can be asked to maintain; the aim is 24 000."""
+TOOLS = ('simulate', 'fit', 'apply', 'check', 'noise', 'diagnose', 'export', 'fleet', 'blind',
+         'reproduce', 'demo', 'bench')
+NODES = ('driver', 'compensation', 'calibration', 'stage', 'monitor', 'investigate', 'screen')
+OPTIONS_OF_ALL = {'--help', '--version', '--ros-args'}
+
+
+def name_of(page: Path) -> str:
+    """Return the name of a page for the test's title."""
+    return str(page.relative_to(REPO))
 
 
 def blocks(page: Path, language: str) -> list[str]:
@@ -22,16 +37,23 @@ def blocks(page: Path, language: str) -> list[str]:
                       re.DOTALL | re.MULTILINE)
 
 
-def ros_arguments(page: Path) -> list[list[str]]:
-    """Return what stands after `--ros-args` in the commands of a page, without files."""
+def commands(page: Path) -> list[list[str]]:
+    """Return the commands of a page as words; comments do not count."""
     lines = '\n'.join(blocks(page, 'sh')).replace('\\\n', ' ').splitlines()
-    words = [shlex.split(line, comments=True) for line in lines if '--ros-args' in line]
-    return [line[line.index('--ros-args'):] for line in words if '--params-file' not in line]
+    return [words for line in lines if (words := shlex.split(line, comments=True))]
+
+
+def reference():
+    """Return the program that makes the reference."""
+    spec = spec_from_file_location('reference', DOCS / 'reference.py')
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def test_own_sensor_loads(tmp_path: Path) -> None:
-    """The file of docs/sensor.md has eight lines below its head; its additions fit."""
-    head, *additions = blocks(REPO / 'docs' / 'sensor.md', 'yaml')
+    """The file of the page has eight lines below its head; its additions fit."""
+    head, *additions = blocks(DOCS / 'howto' / 'sensor.md', 'yaml')
     path = tmp_path / 'my_sensor.yaml'
     path.write_text(head)
     assert len(head.splitlines()) == 2 + 8
@@ -40,12 +62,13 @@ def test_own_sensor_loads(tmp_path: Path) -> None:
     assert parameter_file.load(path).effects == ('supply',)
 
 
-@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize('page', BY_HAND, ids=name_of)
 def test_ros_parses_the_arguments(page: Path) -> None:
-    for arguments in ros_arguments(page):
-        context = Context()
-        rclpy.init(args=['node', *arguments], context=context)
-        context.shutdown()
+    for words in commands(page):
+        if '--ros-args' in words and '--params-file' not in words:
+            context = Context()
+            rclpy.init(args=['node', *words[words.index('--ros-args'):]], context=context)
+            context.shutdown()
 
 
 def test_an_argument_that_ros_does_not_parse() -> None:
@@ -53,35 +76,102 @@ def test_an_argument_that_ros_does_not_parse() -> None:
         rclpy.init(args=['node', '--ros-args', '-p', 'link.uri:=local:'], context=Context())
 
 
-def sensor_row(path: Path) -> str:
-    """Return the row of docs/sensor.md for a parameter file: values with three digits."""
-    sensor = parameter_file.load(path)
-    noise = dict.fromkeys(f'{density * 1e6:.3g}' for density in sensor.noise_density_g_per_rthz)
-    filter_hz = 1 / (2 * math.pi * sensor.rc_s)
-    step_mg = 1e3 * sensor.lsb_v / sensor.nominal_scale_v_per_g[0]
-    cells = (f'[{path.stem}](../params/{path.name})', sensor.axes, f'±{sensor.range_g:.3g}',
-             ', z '.join(noise), f'{float(f"{filter_hz:.3g}"):g}',
-             f'{sensor.rate_hz:g}', f'{step_mg:.3g}')
-    return f'| {" | ".join(cells)} |'
+@pytest.fixture(scope='module')
+def helps() -> dict[str, str]:
+    """Return the help of each executable."""
+    return {name: run_executable(name, '--help').stdout for name in TOOLS + NODES}
 
 
-def test_the_table_of_sensors_has_their_values() -> None:
-    """docs/sensor.md lists every complete file of `params/` with its values, and no other."""
-    text = (REPO / 'docs' / 'sensor.md').read_text('utf-8')
-    rows = [line for line in text.splitlines() if '(../params/' in line and line.startswith('|')]
-    files = [path for path in sorted((REPO / 'params').glob('*.yaml'))
-             if not parameter_file.load(path, may_measure=True).unstated]
-    assert rows == [sensor_row(path) for path in files]
+@pytest.mark.parametrize('page', BY_HAND, ids=name_of)
+def test_options_and_parameters_exist(page: Path, helps: dict[str, str]) -> None:
+    """Each executable exists, and has the options and parameters with which it is called."""
+    for words in commands(page):
+        if words[:3] != ['ros2', 'run', 'adxl_ros']:
+            continue
+        name, *rest = words[3:]
+        assert name in helps, f'{name_of(page)}: {name} is no executable'
+        cut = rest.index('--ros-args') if '--ros-args' in rest else len(rest)
+        for word in rest[:cut]:
+            if re.match('--[a-z]', word):
+                assert word in helps[name], f'{name_of(page)}: {name} has no {word}'
+        if name != 'screen':
+            for flag, rule in zip(rest[cut:], rest[cut + 1:]):
+                key = rule.split(':=')[0]
+                assert flag != '-p' or key in helps[name] + ' use_sim_time', \
+                    f'{name_of(page)}: {name} has no parameter {key}'
 
 
-@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize('page', BY_HAND, ids=name_of)
+def test_launch_files_have_the_arguments(page: Path) -> None:
+    declared = ''.join(path.read_text('utf-8') for path in [
+        *(REPO / 'launch').glob('*.py'), *(REPO / 'adxl_ros' / 'nodes').glob('**/*launch*.py')])
+    for words in commands(page):
+        if words[:3] == ['ros2', 'launch', 'adxl_ros']:
+            assert (REPO / 'launch' / words[3]).exists()
+            for word in words[4:]:
+                argument = word.split(':=')[0]
+                known = argument.replace('alpha', '{joint}').replace('beta', '{joint}')
+                assert argument == '-s' or argument in declared or known in declared, \
+                    f'{name_of(page)}: {words[3]} has no argument {argument}'
+
+
+@pytest.mark.parametrize('page', PAGES, ids=name_of)
 def test_links_lead_somewhere(page: Path) -> None:
     """Links to files and to headings of pages."""
-    for target, anchor in re.findall(r'\]\((?!https?:)([^)#\s]*)(#[^)\s]*)?\)',
+    for target, anchor in re.findall(r'\]\(\s*(?!https?:)([^)#\s]*)(#[^)\s]*)?\)',
                                      page.read_text('utf-8')):
         linked = page.parent / target if target else page
-        assert linked.exists(), f'{page.name} links to {target}'
+        assert linked.exists(), f'{name_of(page)} links to {target}'
         if anchor and linked.suffix == '.md':
             headings = re.findall(r'^#+ (.*)$', linked.read_text('utf-8'), re.MULTILINE)
             assert anchor in {'#' + re.sub(r'[^\w\- ]', '', heading).lower().replace(' ', '-')
-                              for heading in headings}, f'{page.name} links to {target}{anchor}'
+                              for heading in headings}, f'{name_of(page)}: {target}{anchor}'
+
+
+def test_pages_that_messages_name_exist() -> None:
+    listed = subprocess.run(['git', 'ls-files', '-z'], cwd=REPO, text=True, capture_output=True,
+                            check=True).stdout.split('\0')
+    sources = [REPO / name for name in listed if name.endswith(
+        ('.py', '.html', '.xml', '.h', '.c', 'Makefile', '.ino'))]
+    for path in filter(Path.exists, sources):
+        for page in re.findall(r'\bdocs/[\w/]+\.(?:md|txt|yaml)', path.read_text('utf-8')):
+            assert (REPO / page).exists(), f'{name_of(path)} names {page}'
+
+
+def test_each_page_names_the_next() -> None:
+    """The last line of a page leads on; index pages are lists of pages."""
+    for page in BY_HAND:
+        if page.parent != REPO and page.name != 'index.md':
+            text = page.read_text('utf-8').strip()
+            assert 'Next: ' in text.rsplit('\n\n', 1)[-1], name_of(page)
+
+
+def test_the_pages_by_hand_stay_short() -> None:
+    words = sum(len(page.read_text('utf-8').split()) for page in BY_HAND)
+    assert words <= MOST_WORDS
+
+
+@pytest.mark.parametrize('page', BY_HAND, ids=name_of)
+def test_tables_are_narrow(page: Path) -> None:
+    for line in re.sub('```.*?```', '', page.read_text('utf-8'), flags=re.DOTALL).splitlines():
+        if line.startswith('|--'):
+            assert line.count('|') <= 6, f'{name_of(page)}: {line}'
+
+
+def test_figures_are_those_of_the_measurements() -> None:
+    for page, made in reference().figures().items():
+        assert page.read_text('utf-8') == made, f'{name_of(page)}: run make reference'
+
+
+def test_reference_is_that_of_the_package(tmp_path: Path) -> None:
+    reference().main(tmp_path)
+    for page in tmp_path.glob('*.md'):
+        assert (DOCS / 'reference' / page.name).read_text('utf-8') == page.read_text('utf-8'), \
+            f'{page.name}: run make reference'
+
+
+def test_every_effect_has_a_picture() -> None:
+    text = (DOCS / 'reference' / 'effects.md').read_text('utf-8')
+    pictures = re.findall(r'!\[\w+\]\((.*?)\)', text)
+    assert {DOCS / 'reference' / name for name in pictures} \
+        == set((DOCS / 'reference' / 'effects').glob('*.png'))

@@ -19,7 +19,7 @@ from rig import IioRig, private_graph, SampleReport, SerialRig, suspend
 
 TABLE_HEAD = ('| fault | published | wrong | missing | counted | recovered in '
               '| worst stamp, ms |\n|---|---|---|---|---|---|---|')
-"""Head of the tables in docs/links.md."""
+"""Head of the tables in docs/measurements/links.md."""
 
 
 @dataclass(frozen=True)

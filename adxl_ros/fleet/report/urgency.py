@@ -3,7 +3,7 @@
 """
 The order of units by urgency.
 
-The rule is that of the table in docs/fleet.md. A unit has the first state that fits:
+The rule is that of the table in docs/howto/fleet.md. A unit has the first state that fits:
 
 1. Out of tolerance: its gap exceeds the tolerance now, or without a gap its drift since the
    calibration. The largest comes first.

@@ -4,7 +4,8 @@
 The serial wire format, version 1: frames of samples, encoded and decoded.
 
 A frame is COBS(payload, CRC-32 of the payload) and one 0x00; all numbers are little-endian. The
-format is the contract with the board: docs/links.md has its table, firmware/ its encoder in C.
+format is the contract with the board: docs/reference/wire_format.md has its table, firmware/ its
+encoder in C.
 """
 
 from __future__ import annotations

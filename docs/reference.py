@@ -1,0 +1,380 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Write docs/reference from the package: tools, nodes, effects, files and the library.
+
+    make reference                     every page
+    docs/reference.py FOLDER           the same into another folder, for the test that compares
+"""
+
+from collections.abc import Iterable, Iterator
+import dataclasses
+import html
+import importlib
+import inspect
+import json
+import math
+import os
+from pathlib import Path
+import re
+import subprocess
+import sys
+import tempfile
+from typing import Any
+
+from adxl_ros.files import parameter_file
+from adxl_ros.fleet.row import COLUMNS
+from adxl_ros.model.effects import library
+from adxl_ros.model.sensor import Sensor
+
+DOCS = Path(__file__).resolve().parent
+MADE = '<!-- Made by `make reference`: change the package, not this page. -->'
+TOOLS = ('simulate', 'fit', 'apply', 'check', 'noise', 'diagnose', 'export', 'fleet', 'blind',
+         'reproduce')
+NODES = ('driver', 'compensation', 'calibration', 'stage', 'monitor', 'investigate', 'screen')
+PICTURED = {'stuck': '`rate_hz` = 1, `duration_s` = 0.2', 'saturation': '`limit_g` = 0.9',
+            'clock_skew': '`ratio` = 0.001', 'mount_resonance': '`frequency_hz` = 25'}
+"""Values of parameters in the pictures, where the typical one would not show."""
+TOPICS = {
+    'imu/data_raw': 'samples by the nominal conversion, m/s²; an absent axis has variance 1e6',
+    'imu/data': 'corrected specific force, m/s², and orientation, with covariance',
+    'tilt': 'roll, pitch, inclination, rad: three angles, which tf2 must not turn',
+    'imu/linear_acceleration_free': 'without gravity, m/s²; only with `free_acceleration`',
+    'sensor_info': 'serial, axes, nominal zero-g and scale factor, rate, format; latched',
+    'temperature': 'temperature of the sensor, °C, where the link measures it',
+    'supply': 'supply voltage, V, where the link measures it',
+    'stage/command': 'where the stage shall go: names alpha and beta, rad, with the largest speed',
+    'stage/joint_states': 'what the encoders show: alpha, beta, rad, and shift, m',
+    'stage/true_joint_states': 'true position of the simulated stage, for the simulated sensor',
+    'calibration/next_pose': 'the next pose in words and numbers; latched',
+    'calibration/display': 'what the screen shows, as JSON; latched',
+    'gap': 'gap, noise floor and changes, mg; once a second',
+    'diagnostics': 'state of each node, once a second and at each change',
+    'imu/ideal': 'ideal samples of your simulator, for the link `topic`'}
+"""Meaning of the topics."""
+FURTHER = [('driver', 'publishes', name) for name in ('sensor_info', 'temperature', 'supply')] + [
+    ('driver', 'publishes', 'stage/joint_states'), ('driver', 'subscribes', 'imu/ideal'),
+    ('compensation', 'publishes', 'imu/linear_acceleration_free'),
+    ('screen', 'subscribes', 'calibration/display')]
+"""Ends of topics that a node makes only with some parameters, links or recordings."""
+KINDS = {'imu/linear_acceleration_free': 'geometry_msgs/Vector3Stamped',
+         'imu/ideal': 'sensor_msgs/Imu'}
+LIBRARY = ('adxl_ros.simulate.sensor_model:SensorModel', 'adxl_ros.model.effects.base:Effect',
+           'adxl_ros.model.effects.base:Parameter', 'adxl_ros.links.support.base:Link',
+           'adxl_ros.diagnose.diagnosis:diagnose')
+"""The import paths that stay."""
+REPORT = {
+    'schema': 'version of the format: 1', 'summary': 'the sentence of terminal and page',
+    'verdict.status': 'no_gap, explained, partly, inseparable, unknown, insufficient or bad_data',
+    'verdict.effects': 'effects that are named for certain; empty for no_gap and unknown',
+    'verdict.groups': 'sets of effects; in each, the data cannot choose one',
+    'verdict.of': 'what they are errors of: sensor, stage, reference; joined by "and", "or"',
+    'verdict.data_fault': 'with bad_data its fault: axis_swapped, unit, clock_jump; else null',
+    'verdict.probability': 'how often such verdicts were right in the working cases',
+    'hypotheses': 'sets with probabilities that sum to 1; `[]` is no gap; `["unknown"]`',
+    'gap': 'rms of recording minus simulation over samples and axes; null for bad_data',
+    'gap.before': 'before any effect is added; `before_ci` is its 90 % interval',
+    'gap.after': 'with the named effects, on blocks that were not fitted; `after_ci`',
+    'gap.floor': 'noise, which no model predicts; `floor_ci`',
+    'gap.floor_source': 'still, repeats or assumed',
+    'gap.upper_limit': 'amplitude above which a gap of any kind would have shown',
+    'gap.reference': 'rms error of the reference that returns with each pose',
+    'gap.closed': '(before² − after²)/(before² − floor²), held out; `closed_ci`',
+    'gap.not_in_reference': 'rms of motion that a smooth reference lacks',
+    'gap.noise': 'by recording: spectrum and Allan deviation of what is left, over the noise',
+    'explained': 'by how much the named effects lower the held-out mean square',
+    'rest': 'by how much flexible functions lower it further',
+    'rest_follows': 'what that rest follows, the strongest first',
+    'material': 'amplitude that counts as a gap, m/s²',
+    'lost_without': 'by effect: what of `explained` is lost without it',
+    'where': 'cells of the residual that noise does not explain, with share of the gap and p',
+    'not_covered': 'what the recordings do not vary', 'notes': 'what was left out or corrected',
+    'could_show': 'by parameter: the smallest size that would have shown; null where none',
+    'candidates': 'by effect: probability, closed share, p, visibility, rivals, parameters',
+    'candidates.parameters': 'value, 90 % interval, unit; null and not `determined` if not seen',
+    'noise_remainders': 'by noise-like effect: a statistic recorded, simulated and left',
+    'next_experiment': 'manoeuvre, why and command of what to record next; or null'}
+"""Meaning of the keys of report.json; those that are not listed stand within one that is."""
+
+
+def main(target: Path) -> None:
+    """Write every page that is made; the other pages of the folder are by hand."""
+    target.mkdir(parents=True, exist_ok=True)
+    pages = {'tools': tools, 'nodes': nodes, 'effects': effects, 'parameter_file': file_keys,
+             'sensors': sensors, 'report_json': report_keys, 'fleet_columns': fleet_columns,
+             'library': documented_classes}
+    for name, make in pages.items():
+        text = '\n'.join([*make()])
+        text = re.sub(r'\n{3,}', '\n\n', text).strip()
+        title, _, body = text.partition('\n')
+        (target / f'{name}.md').write_text(f'{title}\n\n{MADE}\n{body}\n', 'utf-8')
+
+
+def help_of(name: str) -> str:
+    """Return the help of an executable, which does not depend on the home of its user."""
+    home = Path('/tmp/adxl_ros_reference')
+    home.mkdir(exist_ok=True)
+    environment = {key: value for key, value in os.environ.items() if key != 'ROS_HOME'}
+    made = subprocess.run([DOCS.parent / 'install/adxl_ros/lib/adxl_ros' / name, '--help'],
+                          text=True, capture_output=True, stdin=subprocess.DEVNULL,
+                          env={**environment, 'HOME': str(home), 'COLUMNS': '80'})
+    if made.returncode:
+        sys.exit(f'{name} --help: {made.stderr}')
+    return made.stdout.replace(str(home), '~')
+
+
+def without(text: str, *begins: str) -> str:
+    """Leave out the paragraphs that begin with one of some lines, to the next title."""
+    kept, leaves_out = [], False
+    for line in text.splitlines():
+        if line and not line.startswith(' '):
+            leaves_out = line.startswith(begins)
+        if not leaves_out:
+            kept.append(line)
+    return '\n'.join(kept)
+
+
+def block(text: str) -> list[str]:
+    """Return a text as a block of a page."""
+    return ['', '```text', text.strip('\n'), '```', '']
+
+
+def table(head: str, rows: Iterable[Iterable[object]]) -> list[str]:
+    """Return a table with a line for each row; bars in cells are escaped."""
+    lines = ['| ' + ' | '.join(str(cell).replace('|', '\\|') for cell in row) + ' |'
+             for row in rows]
+    return ['', f'| {head} |', '|' + '---|' * (head.count('|') + 1), *lines, '']
+
+
+def tools() -> Iterator[str]:
+    """Describe the command-line tools by their own help."""
+    yield from ['# Tools', '', 'What `ros2 run adxl_ros NAME --help` prints. After `make build`, '
+                '`./run NAME` does the same. The exit status is 0 when it is done. It is 1 where '
+                'the tool ran but could not do the task: one line on stderr names file, line and '
+                'column or the topic. It is 2 after wrong usage. A failed run leaves no half '
+                'written file and does not damage an earlier one.', '']
+    shared = ''
+    for name in TOOLS:
+        text = help_of(name)
+        found = re.search(r'\n(recordings of other software:\n.*?)(?=\n\S|\Z)', text, re.DOTALL)
+        shared = shared or (found[1] if found else '')
+        yield from [f'## {name}', *block(without(text, 'recordings of other', 'effects:')), '']
+    yield from ['## Recordings of other software', '', 'Tools that read recordings share these '
+                'options. [Read any log](../howto/logs.md) explains them.', *block(shared)]
+
+
+def nodes() -> Iterator[str]:
+    """Describe topics and nodes by the nodes' own help."""
+    texts = {name: help_of(name) for name in NODES}
+    ends: dict[str, dict[str, list[str]]] = {
+        topic: {'publishes': [], 'subscribes': []} for topic in TOPICS}
+    kinds = dict(KINDS)
+    for name, text in texts.items():
+        for end in ('publishes', 'subscribes'):
+            found = re.search(rf'^{end}\n((?:  .*\n)*)', text, re.MULTILINE)
+            for line in (found[1] if found else '').splitlines():
+                topic, kind = line.split()
+                ends.setdefault(topic, {'publishes': [], 'subscribes': []})[end].append(name)
+                kinds[topic] = kind
+    for name, end, topic in FURTHER:
+        if name not in ends[topic][end]:
+            ends[topic][end].append(name)
+    yield from ['# Nodes', '', 'Topics with both ends, then each node as its `--help` states it: '
+                'parameters, topics and services. Names without a leading `/` are in the '
+                'namespace of the node. Publishers are reliable and subscribers best effort, so '
+                'that they hear both kinds; `qos_overrides.*` changes it. "ros2 launch adxl_ros '
+                'robot.launch.py -s" lists the arguments of a launch file.', '', '## Topics']
+    yield from table('topic (type) | content | from | to', (
+        (f'`{topic}` ({kinds[topic]})', TOPICS.get(topic, ''),
+         *(', '.join(names) or 'you' for names in both.values())) for topic, both in ends.items()))
+    sensor = ''
+    for name, text in texts.items():
+        found = re.search(r'\n(parameters of the sensor.*?)(?=\n\n)', text, re.DOTALL)
+        sensor = sensor or (found[1] if found else '')
+        yield from [f'## {name}', *block(without(text, 'parameters of the sensor')), '']
+    yield from ['## Parameters of the sensor', '', 'Each node that knows the sensor has these, '
+                'usually from its [parameter file](parameter_file.md).', *block(sensor)]
+
+
+def effects() -> Iterator[str]:
+    """Describe the effects of the library."""
+    yield from ['# Gallery of effects', '', 'Each picture shows the output without and with one '
+                'effect at its typical values, unless the caption states others. '
+                '`simulate --effect NAME:key=value` takes the names of the parameters.', '']
+    place = None
+    for effect in sorted(library().values(), key=lambda e: (e.place, e.name)):
+        if effect.place is not place:
+            place = effect.place
+            yield from [f'## Place in the chain: {place.name}', '']
+        facts = [f'Acts on the {effect.acts_on.value}',
+                 f'{"" if effect.invertible else "not "}undone by the inverse',
+                 *(f'needs: {need.value}' for need in effect.needs),
+                 *(f'follows `{name}`' for name in effect.follows)]
+        yield from [f'### {effect.name}', '', effect.cause, '',
+                    f'![{effect.name}](effects/{effect.name}.png)', '']
+        if effect.name in PICTURED:
+            yield from [f'Here with {PICTURED[effect.name]}.', '']
+        yield f'{"; ".join(facts)}.'
+        yield from table('parameter | bounds | typical | axes | meaning', (
+            (f'`{p.name}`, {p.unit}', f'{p.lower:g} to {p.upper:g}', f'{p.scale:g}',
+             ', '.join(p.axes) or '–', f'{p.doc} ({p.source})') for p in effect.parameters))
+
+
+def file_keys() -> Iterator[str]:
+    """Describe the parameter file."""
+    yield from ['# The parameter file', '', 'All keys stand under `/**: ros__parameters:`, as '
+                'flat typed arrays with one entry for each axis: `1.0`, never `1`. [Describe your '
+                'sensor](../howto/sensor.md) shows how to write one.']
+    values = [field.metadata for field in dataclasses.fields(Sensor) if 'key' in field.metadata]
+    yield from table('key | unit | bounds | meaning', (
+        (f'`{v["key"]}`', v['unit'] or '–',
+         '–' if v['lower'] is None else f'{v["lower"]:g} to {v["upper"]:g}',
+         v['doc'] + (f': {", ".join(v["choices"])}' if v['choices'] else '')) for v in values))
+    yield from table('key | meaning', [
+        ('`format`, `units`', 'version of the format: 1; units of the coefficients'),
+        ('`effects`', 'names of the effects; under each name its [parameters](effects.md)'),
+        ('`covariance`, `covariance_names`', 'of the coefficients, row after row; names of rows'),
+        ('`datasheet.*`', 'typical and largest departures, for the comparison in reports'),
+        ('`envelope.*`', 'range of force, temperature and supply of the calibration'),
+        ('`link.*`', 'how the driver reaches the unit'),
+        ('`provenance.*`', 'id, date, source, hash of the data, errors and verdicts')])
+
+
+def sensors() -> Iterator[str]:
+    """List the sensors with a file."""
+    yield from ['# Sensors with a file', '', '`--params NAME` takes such a sensor. The head of '
+                'each file names the datasheet, its pages, and what it assumes: supply, capacitor '
+                'and ADC of an analog sensor, the settings after a reset of a digital one. '
+                '`any_imu` is for a stream in m/s² of which nothing else is known.']
+    paths = sorted((DOCS.parent / 'params').glob('*.yaml'))
+    yield from table('file | axes, range | noise, µg/√Hz | filter, rate | step, mg',
+                     filter(None, map(sensor_row, paths)))
+
+
+def sensor_row(path: Path) -> list[str] | None:
+    """Return the row of a parameter file; None where it leaves values out."""
+    sensor = parameter_file.load(path, may_measure=True)
+    if sensor.unstated:
+        return None
+    noise = dict.fromkeys(f'{density * 1e6:.3g}' for density in sensor.noise_density_g_per_rthz)
+    filter_hz = float(f'{1 / (2 * math.pi * sensor.rc_s):.3g}')
+    step_mg = 1e3 * sensor.lsb_v / sensor.nominal_scale_v_per_g[0]
+    return [f'[{path.stem}](../../params/{path.name})', f'{sensor.axes}, ±{sensor.range_g:.3g} g',
+            ', z '.join(noise), f'{filter_hz:g} Hz, {sensor.rate_hz:g} Hz', f'{step_mg:.3g}']
+
+
+def report_keys() -> Iterator[str]:
+    """Describe report.json by a diagnosis of a simulated recording."""
+    with tempfile.TemporaryDirectory() as folder:
+        for words in (['simulate', 'tilt_both', '--rate', '50', '--effect', 'bias', '-o', 'a.csv'],
+                      ['diagnose', 'a.csv', '-o', 'gap']):
+            subprocess.run([DOCS.parent / 'install/adxl_ros/lib/adxl_ros' / words[0], *words[1:]],
+                           check=True, capture_output=True, cwd=folder)
+        report = json.loads((Path(folder) / 'gap' / 'report.json').read_text('utf-8'))
+    paths = [*keys_of(report)]
+    unknown = [path for path in paths if path not in REPORT and not path.endswith('_ci')]
+    missing = [path for path in REPORT if path not in paths]
+    if unknown or missing:
+        sys.exit(f'report.json: keys without a meaning {unknown}, or gone {missing}')
+    yield from ['# report.json', '', 'What `diagnose` writes for programs. Accelerations are in '
+                'm/s², squares in (m/s²)². Intervals hold 90 %. [How the diagnosis decides]'
+                '(../explain/diagnosis.md) defines the figures.']
+    yield from table('key | meaning', ((f'`{path}`', REPORT[path]) for path in paths
+                                       if path in REPORT))
+
+
+def keys_of(report: dict[str, Any]) -> Iterator[str]:
+    """Yield the keys of a report, those of `verdict` and `gap` one by one."""
+    for key, value in report.items():
+        yield key if key != 'verdict' else 'verdict.status'
+        if key in ('verdict', 'gap'):
+            yield from (f'{key}.{name}' for name in value if name not in ('status', 'unit'))
+        if key == 'candidates':
+            yield 'candidates.parameters'
+
+
+def fleet_columns() -> Iterator[str]:
+    """List the columns of a fleet's table."""
+    yield from ['# Columns of fleet.parquet', '', 'One row a recording. Columns with `_x_` exist '
+                'for y and z, too. Unit and meaning are metadata of the file. [Run a fleet]'
+                '(../howto/fleet.md) has questions in SQL.']
+    yield from table('column | unit | meaning', (
+        (f'`{column.name}`', column.unit or '–', column.meaning) for column in COLUMNS
+        if not re.search('_[yz]_', column.name)))
+
+
+def documented_classes() -> Iterator[str]:
+    """Show the fields of documented classes, and signature and docstring of what is called."""
+    yield from ['# Library', '', 'What other programs import; these paths stay. [Add an effect]'
+                '(../howto/own_effect.md) and [add a link](../howto/own_link.md) use them.', '']
+    for path in LIBRARY:
+        module, name = path.split(':')
+        item = getattr(importlib.import_module(module), name)
+        lines = [f'from {module} import {name}', '']
+        if dataclasses.is_dataclass(item) or getattr(item, '_is_protocol', False):
+            # The fields have their meaning beside them; the functions follow.
+            lines += inspect.getsource(item).split('\n    def ')[0].rstrip().splitlines()
+        else:
+            signature = re.sub(r'<function \S+ at 0x\w+>', '...', str(inspect.signature(item)))
+            lines += [f'{name}{signature}', '', inspect.getdoc(item) or '']
+        yield from [f'## {name}', *block('\n'.join(lines).rstrip().removesuffix('@property'))]
+        for part, member in inspect.getmembers(item, inspect.isfunction):
+            if (part == '__call__' or not part.startswith('_')) and member.__doc__:
+                yield from block(f'{name}.{part}{inspect.signature(member)}\n\n'
+                                 f'{inspect.getdoc(member)}')
+
+
+def figures() -> dict[Path, str]:
+    """Return the pages with figures between marks, as the measurements have them now."""
+    made = {'demo': demo_table(), 'working cases': working_cases(), 'hand held': hand_held()}
+    pages = {}
+    for path in [DOCS.parent / 'README.md', *DOCS.glob('*/*.md')]:
+        text = path.read_text('utf-8')
+        for mark, lines in made.items():
+            begin, end = f'<!-- {mark} -->', f'<!-- /{mark} -->'
+            if end in text:
+                text = '\n'.join([text.split(begin)[0] + begin, *lines, end + text.split(end)[1]])
+        pages[path] = text
+    return pages
+
+
+def demo_table() -> list[str]:
+    """Return the rows of errors in the picture of `make demo`."""
+    picture = (DOCS / 'screenshots' / 'demo.svg').read_text('utf-8')
+    text = html.unescape(re.sub('<[^>]*>', ' ', picture)).replace('\xa0', ' ')
+    names = ('datasheet values', 'linear calibration', 'full calibration')
+    found = (re.search(rf'{name}\s+([\d.]+)\s+°\s+([\d.]+)\s+mg', text) for name in names)
+    rows = [(match[0].split('  ')[0], f'{match[1]}°', f'{match[2]} mg')
+            for match in found if match]
+    if len(rows) != len(names):
+        sys.exit('screenshots/demo.svg: has no table of errors')
+    return table('calibration | tilt error | acceleration error', rows)[1:-1]
+
+
+def working_cases() -> list[str]:
+    """Return the scores of the working cases with their command and date."""
+    first, *lines = (DOCS / 'measurements' / 'working_cases.txt').read_text('utf-8').splitlines()
+    command, date, *remarks = first.removeprefix('# ').split(', ')
+    rows = [match.groups() for line in lines
+            if (match := re.match(r'(\w.*?) {2,}(\d+ % \(.*\)), (n = \d+)$', line))
+            and not line.startswith(('tracebacks', 'no verdict', '0.'))]
+    return [f'`{command}`, {date}; {", ".join(remarks)}. In brackets 90 % intervals.',
+            *table('verdict | share | cases', rows)[:-1]]
+
+
+def hand_held() -> list[str]:
+    """Return the tilt error by the number of rests."""
+    text = (DOCS / 'measurements' / 'hand_held.txt').read_text('utf-8').splitlines()
+    command, what = (line.removeprefix('# ') for line in text[:2])
+    rows = [line.split(',') for line in text[3:]]
+    return [f'{what[0].upper()}{what[1:]} (`{command.split(", ")[0]}`, {command.split(", ")[1]}):',
+            *table('rests | median of the units | worst', (
+                [rests if rests != '0' else 'not calibrated', f'{median}°', f'{worst}°']
+                for rests, median, worst in rows))[:-1]]
+
+
+if __name__ == '__main__':
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else DOCS / 'reference')
+    if len(sys.argv) == 1:
+        for page, made in figures().items():
+            page.write_text(made, 'utf-8')
