@@ -96,7 +96,7 @@ def draw(seed: int, number: int, only: str | None = None) -> Case:
         calibrated = kind.at_rest and bool(rng.random() < _AT_REST_SHARE)
         if calibrated:
             left = _strength(unit, world.recalibrated(unit, [fault]), change, force)
-            fault = replace(fault, size=min(fault.size * min(strength / left, 5.0),
+            fault = replace(fault, size=min(fault.size * min(strength / max(left, 1e-9), 5.0),
                                             kind.largest))
             change = scene.response([fault], coarse=True)
             at_rest.append(fault)

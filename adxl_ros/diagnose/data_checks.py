@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 from adxl_ros.diagnose.comparison import (
+    align_force,
     at_search_rate,
     BaselineComparison,
     compare,
@@ -22,7 +23,7 @@ from adxl_ros.diagnose.comparison import (
     SHORTEST_S,
     SMALLEST_MOTION_G,
 )
-from adxl_ros.diagnose.noise_detectors import (
+from adxl_ros.diagnose.noise_effects import (
     coarse_codes,
     code_step_v,
     Detection,
@@ -37,7 +38,6 @@ from adxl_ros.diagnose.reference import (
     too_coarse,
     without_reading,
 )
-from adxl_ros.diagnose.sim_alignment import align_force
 from adxl_ros.files.recording_columns import JOINTS, Recording
 from adxl_ros.model import noise
 from adxl_ros.model.kinematics import specific_force

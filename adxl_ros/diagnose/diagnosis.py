@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from adxl_ros.diagnose import data_checks, noise_detectors, noise_floor
+from adxl_ros.diagnose import data_checks, noise_effects, noise_model
 from adxl_ros.diagnose.comparison import BaselineComparison, Reference
 from adxl_ros.diagnose.data_checks import CheckedRecording, compare_checked, DataFault
 from adxl_ros.diagnose.evidence import bridged
@@ -32,11 +32,17 @@ from adxl_ros.diagnose.next_experiment import (
     propose_next_experiment,
     RecordedEvidence,
 )
-from adxl_ros.diagnose.noise_comparison import compare_noise, NoiseComparison
-from adxl_ros.diagnose.noise_detectors import Detection, NoiseSamples, UNKNOWN
-from adxl_ros.diagnose.noise_floor import NoiseFloor
-from adxl_ros.diagnose.noise_remainder import floor_without, noise_remainders, NoiseRemainder
-from adxl_ros.diagnose.noise_whitening import drift_effects
+from adxl_ros.diagnose.noise_effects import (
+    compare_noise,
+    Detection,
+    floor_without,
+    noise_remainders,
+    NoiseComparison,
+    NoiseRemainder,
+    NoiseSamples,
+    UNKNOWN,
+)
+from adxl_ros.diagnose.noise_model import drift_effects, NoiseFloor
 from adxl_ros.diagnose.residual_map import not_covered, residual_map, ResidualCell
 from adxl_ros.diagnose.search import Search
 from adxl_ros.diagnose.verdict import (
@@ -172,7 +178,7 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     search = Search(model)
     search.run(lambda share: show('effects', share))
     show('held-out figures', 0.0)
-    floor = noise_floor.estimate([c.comparison for c in checked])
+    floor = noise_model.estimate([c.comparison for c in checked])
     fits = _held_out(model, search, floor)
     evidence = Evidence(
         {effects: candidate for effects, (candidate, _) in fits.items()}, used_counts(model),
@@ -282,10 +288,10 @@ def _detections(checked: Sequence[CheckedRecording], best: Hypothesis, baseline:
         spikes = c.possible_spikes
         # In motion, a smooth reference lacks knocks that look like spikes.
         regular = used | ~comparison.at_rest if comparison.reference_fades else used
-        if spikes is not None and noise_detectors.residual_shows_spikes(spikes, residual_v,
+        if spikes is not None and noise_effects.residual_shows_spikes(spikes, residual_v,
                                                                         regular, sensor):
             detections.append(spikes)
-        by_sensor = [noise_detectors.residual_detections(NoiseSamples(
+        by_sensor = [noise_effects.residual_detections(NoiseSamples(
             time_s=comparison.time_s, residual_v=bridged(residual_v, used),
             simulated_v=comparison.simulated_noise_v(s, 0),
             at_rest=comparison.at_rest & used, used=used), s)
@@ -424,7 +430,7 @@ def what_shows(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | No
         return checked.fault
     model = build_linear_model([c.search_comparison for c in checked])
     comparisons = [c.comparison for c in checked]
-    floor = noise_floor.estimate(comparisons)
+    floor = noise_model.estimate(comparisons)
     return shown(model, comparisons, floor, material_mps2(model, floor))
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
-from adxl_ros.diagnose.noise_whitening import before_filters, Series, Whitener
+from adxl_ros.diagnose.noise_model import before_filters, Series, Whitener
 import numpy as np
 import scipy
 

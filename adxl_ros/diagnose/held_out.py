@@ -17,7 +17,7 @@ from adxl_ros.diagnose import evidence
 from adxl_ros.diagnose.evidence import BLOCKS, LinearFit
 from adxl_ros.diagnose.hypothesis_fit import Hypothesis, LinearisedHypothesis
 from adxl_ros.diagnose.linear_model import LinearModel
-from adxl_ros.diagnose.noise_whitening import expected_drift_g
+from adxl_ros.diagnose.noise_model import expected_drift_g
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.diagnosis_hints import FormDimension
 from adxl_ros.model.sensor import Sensor

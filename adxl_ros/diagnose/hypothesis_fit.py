@@ -15,13 +15,15 @@ from adxl_ros.diagnose.evidence import LinearFit, WhitenedChannel
 from adxl_ros.diagnose.linear_model import (
     calibration_takes_up,
     hints_of,
+    limits,
     LinearModel,
     NumberedColumn,
     parts_at_rest,
+    PRIOR_WIDTH,
     rests_by_channel,
+    sensitivities_at,
 )
-from adxl_ros.diagnose.noise_whitening import drifts_among, Whitener
-from adxl_ros.diagnose.sensitivities import limits, PRIOR_WIDTH, sensitivities_at
+from adxl_ros.diagnose.noise_model import drifts_among, Whitener
 from adxl_ros.model.coefficients import fitted_of, get, parameter_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Role

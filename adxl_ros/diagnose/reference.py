@@ -1,34 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-What is known of the reference: empty cells, too coarse sampling, fading, and errors as noise.
-
-Errors of followed angles, and rounding to codes coarser than the noise, are constant at rest and
-new after each move (errors in variables; Fuller 1987). The model is y = n + g·u. Here n is noise
-behind the RC filter, AR(1) with pole a, u has variance 1, u_t = φ_t·u_(t−1) + √(1 − φ_t²)·ξ_t, and
-g is its standard deviation in V. A Kalman filter predicts g·u; its innovations, scaled and
-filtered by 1/(1 − aL), have the spectrum of n. Where g is 0, samples stay as they are.
-
-Motion that a smooth reference lacks adds to the noise in motion. Its spectrum is that of the part
-of the recording that no linear filter of the reference predicts (multiple coherence; Bendat and
-Piersol 2010, section 7.3). A filter of the smallest phase gives such noise the spectrum of noise
-alone.
-"""
+"""What is known of the reference: empty cells, too coarse sampling, and fading."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
-from math import sqrt
 
 from adxl_ros.diagnose.comparison import (
     BaselineComparison,
-    CachedPath,
     Reference,
     SMALLEST_MOTION_G,
 )
-from adxl_ros.diagnose.noise_detectors import code_step_v
-from adxl_ros.diagnose.noise_floor import gravity_slopes
+from adxl_ros.diagnose.noise_effects import code_step_v
 from adxl_ros.files.recording_columns import JOINTS, Recording
 from adxl_ros.files.reference_alignment import LONGEST_MOVE_NS, USUAL_GAPS
 from adxl_ros.model import noise
@@ -127,26 +109,6 @@ _GAIN = 1.5
 has. Chosen: a third of the motion is then missing."""
 _FADED = 0.5
 """Power of the reference, divided by the recorded one, below which it has faded."""
-_LOWEST_NOISE_V = 1e-7
-"""Smallest standard deviation of the noise, V, because the filter divides by it. Chosen: below
-that of any ADC."""
-_SMALLEST_HELD_SHARE = 0.01
-"""Share of the rounding that is held, below which all of it is white. Chosen: the noise is then
-a third of a step, as in any unit whose ADC suits it."""
-_SERIES = 16
-"""Series that are filtered together. Chosen: little memory beside all series."""
-_LOST_S = 2.0
-"""Length of the windows of the spectra, s. Chosen: a filter of an optical tracker is shorter."""
-_FEWEST_MOVING = 12
-"""Fewest windows in motion. Chosen: three axes of a reference then predict a quarter by chance."""
-_OVERLAP_SHARE = 0.6
-"""Independent windows divided by the windows, which overlap by half. Chosen: that of a Hann
-window."""
-_RESTORING_ERROR = 0.1
-"""Error of restored motion, divided by what the reference lacks of it. Chosen: the forms of
-filters differ by some per cent, and the reference has noise."""
-_RIDGE = 1e-9
-"""Ridge on the spectra of the reference, divided by their mean. Chosen: above rounding errors."""
 
 
 @dataclass(frozen=True)
@@ -412,206 +374,6 @@ def _bands(values: np.ndarray) -> np.ndarray:
     """Return means of neighbouring frequencies without the lowest one."""
     count = (len(values) - 1) // _BAND
     return values[1:1 + count * _BAND].reshape(count, _BAND).mean(axis=1)
-
-
-@dataclass(frozen=True)
-class AngleErrorFilter:
-    """A filter that gives noise with errors of angles the spectrum of noise without them."""
-
-    rms_v: float  # Rms of the errors, V
-    pole: float  # Pole a of the noise
-    transition: np.ndarray  # Factor of the estimate of u from sample to sample, (n,)
-    gain: np.ndarray  # Gain of the estimate of u, 1/V, (n,)
-    weight: np.ndarray  # Change of the predicted sample by the estimate of u, V, (n,)
-    scale: np.ndarray  # Standard deviation of the noise divided by that of the innovation, (n,)
-
-    def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Filter k series, (k, n)."""
-        lower = np.ones((2, len(self.gain)))
-        lower[1, :-1] = -self.transition[1:]
-        filtered = np.empty_like(values)
-        for first in range(0, len(values), _SERIES):
-            part = values[first:first + _SERIES]
-            changes = part.copy()
-            changes[:, 1:] -= self.pole * part[:, :-1]
-            changes[:, 0] = 0.0
-            estimates = scipy.linalg.lapack.dtbtrs(lower, (changes * self.gain).T, uplo='L',
-                                                   diag='U')[0].T
-            changes[:, 1:] -= self.weight[1:] * estimates[:, :-1]
-            changes *= self.scale
-            changes[:, 0] = part[:, 0]
-            filtered[first:first + _SERIES] = scipy.signal.lfilter(
-                [1.0], [1.0, -self.pole], changes)
-        return filtered
-
-
-def angle_error_filter(comparison: BaselineComparison, axis: int) -> AngleErrorFilter | None:
-    """Return the filter for one axis of a recording."""
-    sensor = comparison.sensor
-    rounding = noise.rounding(sensor, axis)
-    variance_v2, remembered_v2 = np.zeros(len(comparison)), np.zeros(len(comparison))
-    for part_v2, memory in (*_angle_errors(comparison, axis),
-                            *_rounding_errors(comparison, axis, rounding.held_v2)):
-        variance_v2 += part_v2
-        remembered_v2 += part_v2 * memory
-    if not variance_v2.any():
-        return None
-    rc_s = float(noise.electronics(sensor).rc_s[axis])
-    pole = float(np.exp(-comparison.dt_s / rc_s)) if rc_s else 0.0
-    std_v = max(float(noise.analog_std_v(sensor)[axis]), _LOWEST_NOISE_V)
-    noise_v2 = std_v ** 2 * (1 - pole ** 2) + rounding.white_v2 * (1 + pole ** 2)
-    return _filter(np.sqrt(variance_v2),
-                   np.divide(remembered_v2, variance_v2, where=variance_v2 > 0,
-                             out=np.ones(len(comparison))), pole, noise_v2)
-
-
-def _angle_errors(comparison: BaselineComparison, axis: int
-                  ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield variance, V², (n,), and memory from sample to sample, (n,), of each joint's error."""
-    if comparison.reference is not Reference.STAGE:
-        return
-    time_s, motion, sensor = comparison.time_s, comparison.motion, comparison.sensor
-    slopes = gravity_slopes(motion.alpha(time_s), motion.beta(time_s))[:, axis]
-    v_per_rad = slopes * sensor.scale_v_per_g[axis] * sensor.local_gravity_mps2 / G0_MPS2
-    for joint, slope in zip((motion.alpha, motion.beta), v_per_rad):
-        errors = joint.errors(time_s) if isinstance(joint, CachedPath) else None
-        if errors is not None:
-            # An error that grows, after a move, is a new one.
-            grown = np.minimum(errors.std[:-1] / errors.std[1:], 1.0)
-            memory = np.exp(-errors.forgetting_per_s * comparison.dt_s)
-            memory[1:] *= grown
-            yield (slope * errors.std) ** 2, memory
-
-
-def _rounding_errors(comparison: BaselineComparison, axis: int, held_v2: float
-                     ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """
-    Yield variance, V², (n,), and memory from sample to sample, (n,), of the held rounding error.
-
-    Rounding errors of two outputs that differ by a small share x of a step have the correlation
-    1 − 6·x.
-    """
-    if held_v2 < _SMALLEST_HELD_SHARE * comparison.sensor.lsb_v ** 2 / 12 or not held_v2:
-        return
-    simulated_v = comparison.simulated_v(comparison.sensor)[:, axis]
-    steps = np.abs(np.diff(simulated_v, prepend=simulated_v[:1])) / comparison.sensor.lsb_v
-    yield np.full(len(comparison), held_v2), np.exp(-6 * steps)
-
-
-def _filter(std_v: np.ndarray, memory: np.ndarray, pole: float, noise_v2: float
-            ) -> AngleErrorFilter:
-    """
-    Run the Riccati recursion of the Kalman filter.
-
-    `std_v` is g, V, (n,), `memory` is φ, (n,), and `noise_v2` the variance of (1 − aL)·n, V².
-    """
-    rows, variance, previous_v = [], 1.0, float(std_v[0])
-    for g, phi in zip(std_v.tolist(), memory.tolist()):
-        renewal2 = 1 - phi * phi
-        weight = g * phi - pole * previous_v
-        total_v2 = weight * weight * variance + g * g * renewal2 + noise_v2
-        gain = (phi * weight * variance + g * renewal2) / total_v2
-        rows.append((phi - gain * weight, gain, weight, sqrt(noise_v2 / total_v2)))
-        variance = phi * phi * variance + renewal2 - gain * gain * total_v2
-        previous_v = g
-    rms_v = float(np.sqrt(np.mean(std_v ** 2)))
-    return AngleErrorFilter(rms_v, pole, *np.array(rows).T)
-
-
-@dataclass(frozen=True)
-class LostMotionFilter:
-    """A filter that gives noise with lost motion the spectrum of noise without it."""
-
-    moves: np.ndarray  # Samples in motion, (n,) bool; at rest nothing is lost
-    taps: np.ndarray  # Impulse response of the filter, (k,)
-    lost_rms_v: float  # Rms of the lost motion over all samples, V
-    # Filter for errors of angles and rounding, which comes first; None without any
-    before: AngleErrorFilter | None = None
-
-    @property
-    def rms_v(self) -> float:
-        """Return the rms of the errors, V."""
-        return float(np.hypot(self.lost_rms_v, self.before.rms_v if self.before else 0.0))
-
-    @cached_property
-    def scale(self) -> np.ndarray:
-        """Return the standard deviation of the noise over that of the innovation, (n,)."""
-        scale = np.where(self.moves, self.taps[0], 1.0)
-        return scale if self.before is None else scale * self.before.scale
-
-    def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Filter k series, (k, n)."""
-        before = values if self.before is None else self.before(values)
-        return np.where(self.moves, scipy.signal.lfilter(self.taps, [1.0], before), before)
-
-
-def lost_motion_filter(comparison: BaselineComparison, axis: int, before: AngleErrorFilter | None
-                       ) -> LostMotionFilter | None:
-    """Return the filter for one axis of a recording."""
-    if not comparison.reference_fades:
-        return None
-    moves = ~comparison.at_rest
-    size = round(_LOST_S * comparison.sensor.rate_hz) // 2 * 2
-    usable = comparison.used & moves
-    starts = [i for i in range(0, len(usable) - size + 1, size // 2) if usable[i:i + size].all()]
-    if len(starts) < _FEWEST_MOVING:
-        return None
-    rows = np.array(starts)[:, None] + np.arange(size)
-    recorded = _spectra(comparison.volts[:, axis:axis + 1], rows)[:, :, 0]
-    stated = _spectra(comparison.simulated_v(comparison.sensor), rows)
-    lacking = np.mean(np.abs(recorded) ** 2 - np.abs(stated[:, :, axis]) ** 2, axis=1)
-    density_v2 = 2 * comparison.dt_s * (_unpredicted(recorded, stated) + _RESTORING_ERROR ** 2
-                                        * np.maximum(lacking, 0.0))
-    noise_v2 = _noise_density_v2(comparison, axis, size)
-    lost_v2 = np.maximum(density_v2 - noise_v2, 0.0)
-    step_hz = 1 / (size * comparison.dt_s)
-    lost_rms_v = float(np.sqrt(lost_v2.sum() * step_hz * (usable.sum() / comparison.used.sum())))
-    return LostMotionFilter(moves, _minimum_phase(np.sqrt(noise_v2 / (noise_v2 + lost_v2))),
-                            lost_rms_v, before)
-
-
-def _spectra(volts: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return the spectra of windows by frequency, (frequencies, windows, m), of unit power."""
-    taper = np.hanning(rows.shape[1])
-    windows = scipy.signal.detrend(volts[rows], axis=1) * taper[None, :, None]
-    return np.moveaxis(np.fft.rfft(windows, axis=1), 1, 0) / np.sqrt(np.sum(taper ** 2))
-
-
-def _unpredicted(recorded: np.ndarray, stated: np.ndarray) -> np.ndarray:
-    """
-    Return the power of a recording that no linear filter of the reference predicts.
-
-    `recorded` is (frequencies, windows), `stated` (frequencies, windows, m). What the reference
-    predicts by chance is made up for.
-    """
-    windows, inputs = stated.shape[1:]
-    gram = np.einsum('fwi,fwj->fij', stated.conj(), stated)
-    cross = np.einsum('fwi,fw->fi', stated.conj(), recorded)
-    ridge = _RIDGE * np.trace(gram, axis1=1, axis2=2).real.mean() * np.eye(inputs)
-    gain = np.linalg.solve(gram + ridge, cross[:, :, None])
-    rest = recorded - np.einsum('fwi,fi->fw', stated, gain[:, :, 0])
-    free = max(_OVERLAP_SHARE * windows - inputs, 1.0)
-    return np.mean(np.abs(rest) ** 2, axis=1) * _OVERLAP_SHARE * windows / free
-
-
-def _noise_density_v2(comparison: BaselineComparison, axis: int, size: int) -> np.ndarray:
-    """Return the one-sided density of noise and rounding by frequency, V²/Hz."""
-    sensor = comparison.sensor
-    rc_s = float(noise.electronics(sensor).rc_s[axis])
-    pole = float(np.exp(-comparison.dt_s / rc_s)) if rc_s else 0.0
-    std_v = max(float(noise.analog_std_v(sensor)[axis]), _LOWEST_NOISE_V)
-    angle = 2 * np.pi * np.arange(size // 2 + 1) / size
-    coloured = std_v ** 2 * (1 - pole ** 2) / np.abs(1 - pole * np.exp(-1j * angle)) ** 2
-    return 2 * comparison.dt_s * (coloured + noise.rounding(sensor, axis).white_v2)
-
-
-def _minimum_phase(gain: np.ndarray) -> np.ndarray:
-    """Return the impulse response of the smallest phase with a gain, by its cepstrum."""
-    cepstrum = np.fft.irfft(np.log(gain))
-    half = len(cepstrum) // 2
-    cepstrum[1:half] *= 2
-    cepstrum[half + 1:] = 0.0
-    return np.fft.irfft(np.exp(np.fft.rfft(cepstrum)))[:half]
 
 
 def seen_step_rad(recording: Recording, stated_rad: float) -> float:

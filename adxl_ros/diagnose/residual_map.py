@@ -1,19 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
+
 """
-Where the gap lies, and what shows each effect.
+What a residual follows: a map over dimensions, and flexible functions of them.
 
 The map has the mean residual over axis and dimension. Each mean is compared with the largest of
 all under random signs of whole blocks (max-T; Westfall and Young 1993), because separate tests at
 5 % would report ten of 200 cells by chance. The power in bands of frequency is compared with that
-of the stated noise. The proof of an effect is the recording minus a simulation with all other
-effects, over the effect's own variable, or spectra and histograms with and without it.
+of the stated noise.
+
+The functions stand for what no effect of the library describes, and for the difference between
+the form of an effect and that of a real sensor (Kennedy and O'Hagan 2001, J. R. Stat. Soc. B 63).
+Each axis has functions of its own, by dimension.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
 from itertools import pairwise
+from math import prod
 from typing import NamedTuple
 
 from adxl_ros.diagnose.comparison import (
@@ -22,15 +26,13 @@ from adxl_ros.diagnose.comparison import (
     Reference,
     time_since_move_s,
 )
-from adxl_ros.diagnose.evidence import bridged
+from adxl_ros.diagnose.noise_model import gravity_slopes
 from adxl_ros.model import noise
-from adxl_ros.model.coefficients import with_neutral
-from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
-from adxl_ros.model.diagnosis_hints import ProofVariable
-from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import ActsOn
+from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.diagnosis_hints import FormDimension
 from adxl_ros.model.filters import low_pass
 from adxl_ros.model.kinematics import specific_force
+from adxl_ros.model.play_operator import loop
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 import scipy
@@ -39,7 +41,7 @@ RANGES = 8
 """Number of ranges of a dimension, with equally many samples. Chosen: a row of the page."""
 _DRAWS = 500
 """Number of draws of random signs. Chosen: probabilities down to 0.002."""
-_BLOCK_S = 2.0
+BLOCK_S = 2.0
 """Length of the blocks that change sign together, s. Chosen: beyond the correlation of noise."""
 _FEWEST_BLOCKS = 3
 """Fewest blocks of a cell that is tested. Chosen: the signs of two blocks have four patterns."""
@@ -64,24 +66,223 @@ _COVERAGE = {
 """Dimensions that recordings should cover, and how the report names them."""
 _STAGE_ONLY = {'alpha_rad', 'beta_rad', 'rate_rad_s', 'direction_beta'}
 """Dimensions of a stage, which another simulator does not have."""
+_CREEP_S = (2.0, 10.0, 50.0)
+"""Time constants of low-pass filtered force (creep), s. Chosen: a factor of five apart."""
+_RELAXATION_S = (1, 4, 16)
+"""Time constants of relaxation after a move, s. Chosen: a factor of four apart."""
+_LAG_S = (0.05, 0.5)
+"""Time constants of fast lags of the force, s. Chosen: slower than the filter of the sensor,
+faster than creep."""
+_THERMAL_LAG_S = (20.0, 100.0, 500.0)
+"""Time constants of lags of the temperature, s. Chosen: a factor of five apart."""
+_THERMAL_REACH = (0.05, 0.25)
+"""Reach of loops over temperature, divided by its range. Chosen: a factor of five apart."""
+_FORCE_MODES = 12
+"""Number of cosines over the force along the axis. Chosen: a tenth of the range each."""
+_MODES = 8
+"""Number of cosines over an angle. Chosen: smooth laws."""
+_CROSS_MODES = 6
+"""Number of cosines over a force across the axis. Chosen: smooth laws."""
+_SURROUNDING_MODES = 4
+"""Number of cosines over temperature or supply. Chosen: smooth laws."""
+_HARMONICS = 6
+"""Number of harmonics of beta. Chosen: periods of 60° and more."""
+_CODE_HARMONICS = 8
+"""Number of harmonics over the range of codes. Chosen: the library's curve has eight periods."""
+_BITS = 6
+"""Number of heaviest bits of the ADC that have a wrong weight. Chosen: that of the library."""
+_TIME_MODES = 16
+"""Number of cosines over time. Chosen: a third of the blocks."""
+_AGEING_MODES = 4
+"""Number of cosines over time that multiply the force. Chosen: a scale factor changes slowly."""
+_PRODUCT_DEGREE = 3
+"""Highest degree of the products of force. Chosen: that of the library."""
+_SMALLEST_RATE_RAD_S = 1e-3
+"""Largest rate of a joint below which it has no functions, rad/s. Chosen: it rests."""
+_SMALLEST_CHANGE = {FormDimension.TEMPERATURE: 0.5, FormDimension.SUPPLY: 0.01}
+"""Range of temperature, °C, and supply, V, below which they have no functions. Chosen: less is
+noise."""
+_SMALLEST_SPREAD = 1e-6
+"""Range of a quantity below which it is a point. Chosen: above rounding errors."""
+_SMALLEST_RMS = 1e-9
+"""Rms of a function about its mean below which it is constant. Chosen: above rounding errors."""
+
+_TIMES_FORCE = (FormDimension.TEMPERATURE, FormDimension.SUPPLY)
+"""Dimensions whose functions also multiply the force, because they change the scale factor."""
+_TIMES_SLOPE = (FormDimension.ALPHA, FormDimension.BETA)
+"""Dimensions whose functions also multiply the slope of the force over the angle, because they are
+errors of the angle."""
+
+Basis = dict[FormDimension, np.ndarray]
+"""Functions of one axis of one recording by dimension, (n, k) each, about their mean. A random
+combination with coefficients of standard deviation 1 has an rms of 1."""
 
 
-_BINS = 10
-"""Ranges of equal width, and of equal counts, of a proof. Chosen: a curve is visible."""
-_RATE_S = 20.0
-"""Time over which a temperature changes, s. Chosen: beyond the noise of a thermometer."""
-_FEWEST_SAMPLES = 20
-"""Fewest samples of a range. Chosen: their mean is worth a point."""
-_SMALLEST_SHARE = 0.5
-"""Share of the effect's variance that the variable must show. Chosen: half of it."""
-_CONTRIBUTION = 'what the model of the effect predicts, mg'
-"""Variable of an effect that none of its own variables shows."""
-_SEGMENT = 4096
-"""Samples in a segment of a spectrum. Chosen: 0.06 Hz at 250 Hz."""
-_POINTS_PER_OCTAVE = 12
-"""Points of a plotted spectrum in an octave. Chosen: lines stay visible."""
-_HISTOGRAM_BINS, _HISTOGRAM_QUANTILE = 81, 0.9999
-"""Bins, and share of the samples within. Chosen: a bin at 0, and spikes of 0.1 %."""
+def flexible_bases(comparison: BaselineComparison, baseline_v: np.ndarray) -> list[Basis]:
+    """
+    Compute the flexible functions of a recording.
+
+    baseline_v: simulated output of its baseline, V, (n, m).
+    """
+    force_g = ((baseline_v - comparison.sensor.zero_g_v) / comparison.sensor.scale_v_per_g).T
+    common, used = _common(comparison), comparison.used
+    fixed = {dimension: _normalised(values, used) for dimension, values in common.items()
+             if dimension not in (*_TIMES_FORCE, *_TIMES_SLOPE)}
+    slopes = _slopes(comparison)
+    bases = []
+    for axis, along_g in enumerate(force_g):
+        of_axis = _of_axis(comparison, force_g, axis, baseline_v[:, axis])
+        factors = dict.fromkeys(_TIMES_FORCE, along_g) | {
+            dimension: slope[axis] for dimension, slope in slopes.items()}
+        of_axis |= {dimension: np.concatenate([common[dimension], common[dimension] * factor])
+                    for dimension, factor in factors.items() if dimension in common}
+        basis = fixed | {dimension: _normalised(values, used)
+                         for dimension, values in of_axis.items()}
+        bases.append({dimension: basis[dimension] for dimension in (*common, *of_axis)
+                      if basis[dimension].shape[1]})
+    return bases
+
+
+def _slopes(comparison: BaselineComparison) -> Basis:
+    """Return by angle how gravity along each axis changes with it, (3, n) each."""
+    if comparison.reference is not Reference.STAGE:
+        return {}
+    joints = (comparison.motion.alpha, comparison.motion.beta)
+    return dict(zip(_TIMES_SLOPE, gravity_slopes(*(q(comparison.time_s) for q in joints))))
+
+
+def _normalised(functions: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """
+    Return functions about their mean, so that a random combination has an rms of 1.
+
+    `functions` are (k, n), the result (n, k).
+    """
+    count = max(int(used.sum()), 1)
+    centred = functions - (functions @ used / count)[:, None]
+    squares = np.einsum('kn,kn,n->k', centred, centred, used.astype(float)) / count
+    varying = squares > _SMALLEST_RMS ** 2
+    size = np.sqrt(max(squares[varying].sum(), _SMALLEST_RMS ** 2))
+    return (centred[varying] / size).T
+
+
+def _common(comparison: BaselineComparison) -> Basis:
+    """Return functions that are the same for all axes, (k, n) each, not yet normalised."""
+    time_s, motion = comparison.time_s, comparison.motion
+    basis: Basis = {FormDimension.TIME: _modes(time_s, _TIME_MODES, 1.0)}
+    surroundings = {FormDimension.TEMPERATURE: motion.temperature_c,
+                    FormDimension.SUPPLY: motion.supply_v}
+    for dimension, path in surroundings.items():
+        values = None if path is None else path(time_s)
+        if values is not None and np.ptp(values) > _SMALLEST_CHANGE[dimension]:
+            basis[dimension] = _modes(values, _SURROUNDING_MODES)
+            if dimension is FormDimension.TEMPERATURE:
+                basis[FormDimension.WARMING] = _history(values, comparison.dt_s)
+    if comparison.reference is not Reference.STAGE:
+        return basis
+    beta_rad = motion.beta(time_s)
+    basis[FormDimension.ALPHA] = _modes(motion.alpha(time_s), _MODES)
+    basis[FormDimension.BETA] = np.array([
+        function(k * beta_rad) / k for k in range(1, _HARMONICS + 1)
+        for function in (np.sin, np.cos)])
+    return basis
+
+
+def _of_axis(comparison: BaselineComparison, force_g: np.ndarray, axis: int, volts: np.ndarray
+             ) -> Basis:
+    """Return functions of the force along and across one axis and of its history, (k, n) each."""
+    along_g, across_g = force_g[axis], np.delete(force_g, axis, axis=0)
+    if np.ptp(along_g) < _SMALLEST_SPREAD:
+        return {}
+    time_s, dt_s = comparison.time_s, comparison.dt_s
+    slope = np.gradient(along_g, dt_s)
+    lagging = [low_pass(along_g, tau_s, dt_s, {}) - along_g for tau_s in _LAG_S]
+    # The level of a vibration: squares of the slope and of the fast force, smoothed.
+    levels = [low_pass(fast ** 2, tau_s, dt_s, {}) for fast in (slope, lagging[-1])
+              for tau_s in _LAG_S]
+    basis = {
+        FormDimension.FORCE: _modes(along_g, _FORCE_MODES),
+        FormDimension.CROSS_FORCE: np.concatenate([
+            _products(force_g), *(_modes(f, _CROSS_MODES) for f in across_g)]),
+        FormDimension.AGEING: along_g * _modes(time_s, _AGEING_MODES),
+        FormDimension.CODE: _code_functions(volts, comparison.sensor.adc_vref_v),
+        FormDimension.LAG: _same_size([
+            slope, np.gradient(slope, dt_s), slope * along_g, slope ** 2, *lagging, *levels,
+            *(np.sqrt(np.abs(level)) for level in levels)])}
+    if comparison.reference is not Reference.STAGE:
+        return basis
+    rates = [joint(time_s, 1) for joint in (comparison.motion.alpha, comparison.motion.beta)]
+    moving = [r / np.abs(r).max() for r in rates if np.abs(r).max() > _SMALLEST_RATE_RAD_S]
+    if not moving:
+        return basis
+    factors = (np.ones_like(along_g), along_g)
+    basis[FormDimension.RATE] = np.array([
+        column for r in moving for column in (r, r * r, r * along_g, np.abs(r))])
+    directions = [*map(direction_of_last_move, rates), _direction(along_g)]
+    basis[FormDimension.DIRECTION] = np.array([
+        direction * factor for direction in directions for factor in factors])
+    since_s = time_since_move_s(time_s, rates)
+    turning = np.sum([np.abs(r) * (np.abs(r) > _SMALLEST_RATE_RAD_S) for r in moving], axis=0)
+    basis[FormDimension.SINCE_MOVE] = _same_size([
+        *(np.exp(-since_s / tau_s) for tau_s in _RELAXATION_S),
+        *(low_pass(past, tau_s, dt_s, {}) for tau_s in _RELAXATION_S
+          for past in (turning, np.sign(turning))),
+        *(low_pass(along_g, tau_s, dt_s, {}) - along_g for tau_s in _CREEP_S)])
+    return basis
+
+
+def _history(temperature_c: np.ndarray, dt_s: float) -> np.ndarray:
+    """Return lags of the temperature and branches of loops, plain and times it, (k, n)."""
+    lags = [low_pass(temperature_c, tau_s, dt_s, {}) - temperature_c for tau_s in _THERMAL_LAG_S]
+    branches = [loop(temperature_c, share * np.ptp(temperature_c), {})
+                for share in _THERMAL_REACH]
+    history = _same_size([*lags, *branches])
+    middle_c = (temperature_c.min() + temperature_c.max()) / 2
+    return np.concatenate([history, _same_size(list(history * (temperature_c - middle_c)))])
+
+
+def _same_size(columns: Sequence[np.ndarray]) -> np.ndarray:
+    """Return functions of different units, each divided by its rms about its mean, (k, n)."""
+    return np.array([c / max(float(np.std(c)), _SMALLEST_RMS) for c in columns])
+
+
+def _direction(values: np.ndarray) -> np.ndarray:
+    """Return the direction of the last change of a quantity, −1 or 1, 0 before the first, (n,)."""
+    change = np.diff(values, prepend=values[0])
+    changing = np.abs(change) > np.abs(change).max() * _SMALLEST_RATE_RAD_S
+    last = np.maximum.accumulate(np.where(changing, np.arange(len(values)), -1))
+    return np.where(last >= 0, np.sign(change[np.maximum(last, 0)]), 0.0)
+
+
+def _code_functions(volts: np.ndarray, vref_v: float) -> np.ndarray:
+    """Return harmonics over the range of the volts, and square waves of the heaviest bits."""
+    turn = 2 * np.pi * (volts - volts.min()) / np.ptp(volts)
+    waves = [function(k * turn) for k in range(1, _CODE_HARMONICS + 1)
+             for function in (np.sin, np.cos)]
+    bits = [np.floor(volts / vref_v * 2 ** bit) % 2 for bit in range(1, _BITS + 1)]
+    return np.array(waves + bits)
+
+
+def _products(force_g: np.ndarray) -> np.ndarray:
+    """Return the products of the components of force from degree two on, (k, n)."""
+    count, degrees = len(force_g), range(_PRODUCT_DEGREE + 1)
+    powers = [p for p in np.ndindex(*[_PRODUCT_DEGREE + 1] * count)
+              if 2 <= sum(p) <= degrees[-1]]
+    return np.array([prod(f for f, power in zip(force_g, p) for _ in range(power))
+                     for p in powers])
+
+
+def _modes(values: np.ndarray, count: int, decay: float = 1.5) -> np.ndarray:
+    """
+    Return cosines over the range of a quantity, (count, n); the j-th has the size j^(−decay).
+
+    A random combination is a smooth curve; with a decay of 1 it is rough like a random walk.
+    """
+    low, high = float(values.min()), float(values.max())
+    if high - low < _SMALLEST_SPREAD:
+        return np.zeros((0, len(values)))
+    order = np.arange(1, count + 1)
+    phase = np.pi * (values - low) / (high - low)
+    return np.cos(order[:, None] * phase) * order[:, None] ** -decay
 
 
 class ResidualCell(NamedTuple):
@@ -98,36 +299,6 @@ class ResidualCell(NamedTuple):
     mean_mps2: float
     share: float
     p: float
-
-
-class BinnedAxis(NamedTuple):
-    """One axis of a proof over a variable: means of the ranges, with half of 90 % intervals."""
-
-    axis: str
-    variable: np.ndarray
-    residual_mg: np.ndarray
-    half_width_mg: np.ndarray
-    model_mg: np.ndarray
-
-
-class Curve(NamedTuple):
-    """A spectrum or a histogram of one axis."""
-
-    axis: str
-    label: str
-    x: np.ndarray
-    y: np.ndarray
-
-
-@dataclass(frozen=True)
-class EffectProof:
-    """What shows an effect: means over a variable, or spectra, mg/√Hz, or histograms."""
-
-    effect: str
-    variable: str
-    is_spectrum: bool = False
-    binned: tuple[BinnedAxis, ...] = ()
-    curves: tuple[Curve, ...] = ()
 
 
 def dimensions(comparison: BaselineComparison) -> dict[str, np.ndarray]:
@@ -186,7 +357,7 @@ def _levelled(comparison: BaselineComparison) -> np.ndarray:
 def _cells_over_dimensions(comparison: BaselineComparison, residual: np.ndarray, seed: int
                            ) -> Iterator[ResidualCell]:
     """Test the means over all dimensions together."""
-    number = np.arange(len(residual)) // max(round(_BLOCK_S * comparison.sensor.rate_hz), 2)
+    number = np.arange(len(residual)) // max(round(BLOCK_S * comparison.sensor.rate_hz), 2)
     blocks, used, total = int(number[-1]) + 1, comparison.used, float(np.sum(residual ** 2))
     places, sums, counts = [], [], []
     for name, values in dimensions(comparison).items():
@@ -233,181 +404,3 @@ def _cells_over_frequency(sensor: Sensor, residual: np.ndarray) -> Iterator[Resi
             yield ResidualCell(axis, 'frequency_hz', low, high, excess ** 0.5,
                                min(excess / max(total, 1e-300), 1.0),
                                float(np.clip(p, 1e-12, 1.0)))
-
-
-def prove(effect: str, comparison: BaselineComparison, full_rate: BaselineComparison,
-          sensor: Sensor) -> EffectProof:
-    """Show an effect of a sensor, which has all effects of the verdict, in a recording."""
-    library_effect = effect_named(effect)
-    variables = library_effect.diagnosis.proof
-    without = replace(sensor, values={**sensor.values, effect: with_neutral(
-        comparison.sensor, [effect]).values[effect]})
-    if ProofVariable.STEP in variables:
-        return EffectProof(effect, ProofVariable.STEP.value,
-                           curves=_histograms(full_rate, sensor, without))
-    if library_effect.acts_on is ActsOn.NOISE or ProofVariable.FREQUENCY in variables:
-        is_noise = library_effect.acts_on is ActsOn.NOISE
-        curves = _noise_spectra if is_noise else _mean_spectra
-        return EffectProof(effect, ProofVariable.FREQUENCY.value, True,
-                           curves=curves(full_rate, sensor, without))
-    return _binned(effect, variables, comparison, sensor, without)
-
-
-def _binned(effect: str, variables: Sequence[ProofVariable], comparison: BaselineComparison,
-            sensor: Sensor, without: Sensor) -> EffectProof:
-    """Average the residual without the effect over the variable that shows the effect best."""
-    to_mg = 1e3 / (G0_MPS2 * comparison.scale_v_per_mps2)
-    used = comparison.used
-    residual_mg = (comparison.residual_v(without) * to_mg)[used]
-    model_mg = residual_mg - (comparison.residual_v(sensor) * to_mg)[used]
-    best, values, largest = _CONTRIBUTION, model_mg, _SMALLEST_SHARE
-    for variable in variables:
-        candidate = _values(comparison, variable)
-        if candidate is None:
-            continue
-        share = _share(candidate[used], model_mg)
-        if share > largest:
-            best, values, largest = variable.value, candidate[used], share
-    block = np.flatnonzero(used) // max(round(_BLOCK_S * comparison.sensor.rate_hz), 1)
-    axes = tuple(_bin(axis, values[:, d], residual_mg[:, d], model_mg[:, d], block)
-                 for d, axis in enumerate(comparison.sensor.axes))
-    return EffectProof(effect, best, binned=axes)
-
-
-def _places(values: np.ndarray) -> np.ndarray:
-    """Return the range of each value, (n,); quantiles and equal widths divide the ranges."""
-    shares = np.linspace(0, 1, _BINS + 1)
-    low, high = float(values.min()), float(values.max())
-    edges = np.unique([*np.quantile(values, shares), *(low + (high - low) * shares)])
-    return np.clip(np.searchsorted(edges, values, 'right') - 1, 0, max(len(edges) - 2, 0))
-
-
-def _share(values: np.ndarray, model_mg: np.ndarray) -> float:
-    """Return the share of the variance of the model that lies between the ranges of a variable."""
-    between = total = 0.0
-    for d in range(model_mg.shape[1]):
-        place = _places(values[:, d])
-        count = np.maximum(np.bincount(place), 1)
-        mean = np.bincount(place, model_mg[:, d]) / count
-        between += float(np.sum(count * mean ** 2))
-        total += float(np.sum(model_mg[:, d] ** 2))
-    return between / total if total else 0.0
-
-
-def _bin(axis: str, values: np.ndarray, residual_mg: np.ndarray, model_mg: np.ndarray,
-         block: np.ndarray) -> BinnedAxis:
-    """Average one axis over the ranges of the variable."""
-    place = _places(values)
-    count = np.bincount(place)
-    filled = count >= min(_FEWEST_SAMPLES, int(count.max()))
-    count = np.maximum(count, 1)
-    means = [np.bincount(place, v) / count for v in (values, residual_mg, model_mg)]
-    # The noise is correlated, so that the sums of whole blocks give the error of a mean.
-    noise_mg = residual_mg - model_mg - (means[1] - means[2])[place]
-    cell = place * (int(block.max()) + 1) + block
-    sums = np.bincount(cell, noise_mg)
-    owner = np.arange(len(sums)) // (int(block.max()) + 1)
-    std = np.sqrt(np.bincount(owner, sums ** 2, minlength=len(count))) / count
-    return BinnedAxis(axis, *(v[filled] for v in (means[0], means[1], Z_90 * std, means[2])))
-
-
-def _values(comparison: BaselineComparison, variable: ProofVariable) -> np.ndarray | None:
-    """Return a variable at the samples of each axis, (n, m); None where it is not known."""
-    time_s, motion, axes = comparison.time_s, comparison.motion, comparison.sensor.axes
-    if variable is ProofVariable.OUTPUT:
-        return comparison.volts
-    by_time = {ProofVariable.TIME: time_s - time_s[0]}
-    if motion.temperature_c is not None:
-        temperature_c = motion.temperature_c(time_s)
-        late_k = temperature_c - low_pass(temperature_c, _RATE_S, comparison.dt_s, {})
-        by_time |= {ProofVariable.TEMPERATURE: temperature_c,
-                    ProofVariable.TEMPERATURE_RATE: late_k * 60 / _RATE_S}
-    if motion.supply_v is not None:
-        by_time[ProofVariable.SUPPLY] = motion.supply_v(time_s)
-    if comparison.reference is Reference.STAGE:
-        by_time |= {
-            ProofVariable.ALPHA: np.degrees(motion.alpha(time_s)),
-            ProofVariable.BETA: np.degrees(motion.beta(time_s)) % 360,
-            ProofVariable.ALPHA_RATE: np.degrees(motion.alpha(time_s, 1)),
-            ProofVariable.BETA_RATE: np.degrees(motion.beta(time_s, 1)),
-            ProofVariable.ALPHA_ACCELERATION: np.degrees(motion.alpha(time_s, 2)),
-            ProofVariable.BETA_ACCELERATION: np.degrees(motion.beta(time_s, 2))}
-    if variable in by_time:
-        return np.repeat(by_time[variable][:, None], len(axes), axis=1)
-    force_g = _force_g(comparison)
-    if force_g is None:
-        return None
-    places = [AXES.index(axis) for axis in axes]
-    if variable is ProofVariable.OWN_FORCE:
-        return force_g[:, places]
-    if variable is ProofVariable.CROSS_FORCE:
-        return force_g[:, [1 if d == 0 else 0 for d in places]]
-    if variable is ProofVariable.FORCE_Z:
-        return force_g[:, [2] * len(axes)]
-    if variable is ProofVariable.FORCE_RATE:
-        return np.gradient(force_g, time_s, axis=0)[:, places]
-    return None
-
-
-def _force_g(comparison: BaselineComparison) -> np.ndarray | None:
-    """Return the specific force of the reference, g, (n, 3); None without a reference."""
-    time_s, motion = comparison.time_s, comparison.motion
-    if comparison.reference is Reference.STAGE:
-        return np.column_stack(specific_force(motion.alpha(time_s), motion.beta(time_s), 1.0))
-    if comparison.reference is Reference.SIMULATOR and motion.force is not None:
-        return np.column_stack(motion.force(time_s)) / G0_MPS2
-    return None
-
-
-def _mean_spectra(comparison: BaselineComparison, sensor: Sensor, without: Sensor
-                  ) -> tuple[Curve, ...]:
-    """Return spectra of recording minus simulation, without and with an effect on the mean."""
-    residuals = {'without the effect': without, 'with the effect': sensor}
-    return tuple(curve for label, simulated in residuals.items()
-                 for curve in spectra(comparison, comparison.residual_v(simulated), label))
-
-
-def _noise_spectra(comparison: BaselineComparison, sensor: Sensor, without: Sensor
-                   ) -> tuple[Curve, ...]:
-    """Return the spectrum of the recorded noise, and of simulated noise with and without."""
-    signals_v = {'recorded': comparison.residual_v(sensor),
-                 'without the effect': comparison.simulated_noise_v(without, 0),
-                 'with the effect': comparison.simulated_noise_v(sensor, 0)}
-    return tuple(curve for label, signal_v in signals_v.items()
-                 for curve in spectra(comparison, signal_v, label))
-
-
-def spectra(comparison: BaselineComparison, signal_v: np.ndarray, label: str) -> list[Curve]:
-    """Estimate spectra, mg/√Hz, by axis, with equally dense points per octave."""
-    signal_mg = bridged(signal_v, comparison.used) * 1e3 / (G0_MPS2 * comparison.scale_v_per_mps2)
-    frequency_hz, power = scipy.signal.welch(
-        np.nan_to_num(signal_mg), comparison.sensor.rate_hz, axis=0,
-        nperseg=min(_SEGMENT, len(signal_mg)))
-    frequency_hz, power = frequency_hz[1:], power[1:]
-    place = np.floor(np.log2(frequency_hz / frequency_hz[0]) * _POINTS_PER_OCTAVE).astype(int)
-    _, place = np.unique(place, return_inverse=True)
-    count = np.bincount(place)
-    mean_hz = np.bincount(place, frequency_hz) / count
-    return [Curve(axis, label, mean_hz, np.sqrt(np.bincount(place, power[:, d]) / count))
-            for d, axis in enumerate(comparison.sensor.axes)]
-
-
-def _histograms(comparison: BaselineComparison, sensor: Sensor, without: Sensor
-                ) -> tuple[Curve, ...]:
-    """Return histograms of the changes from one sample to the next, recorded and simulated."""
-    to_mg = 1e3 / (G0_MPS2 * comparison.scale_v_per_mps2)
-    at_rate = replace(without, rate_hz=comparison.sensor.rate_hz)
-    mean_v = comparison.simulated_v(at_rate)
-    signals_v = {'recorded': comparison.volts,
-                 'without the effect': mean_v + comparison.simulated_noise_v(without, 0),
-                 'with the effect': mean_v + comparison.simulated_noise_v(sensor, 0)}
-    steps = {label: np.diff(v * to_mg, axis=0) for label, v in signals_v.items()}
-    curves = []
-    for d, axis in enumerate(comparison.sensor.axes):
-        finite = steps['recorded'][:, d][np.isfinite(steps['recorded'][:, d])]
-        reach = float(np.quantile(np.abs(finite), _HISTOGRAM_QUANTILE))
-        edges = np.linspace(-reach, reach, _HISTOGRAM_BINS + 1)
-        for label, values in steps.items():
-            count, _ = np.histogram(values[:, d], edges)
-            curves.append(Curve(axis, label, (edges[1:] + edges[:-1]) / 2, count))
-    return tuple(curves)

@@ -17,8 +17,7 @@ from typing import NamedTuple
 
 from adxl_ros.diagnose.evidence import FlexibleColumns, LinearFit
 from adxl_ros.diagnose.hypothesis_fit import fit_hypothesis, Hypothesis
-from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
-from adxl_ros.diagnose.sensitivities import Variant
+from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel, Variant
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import parameter_of, with_neutral
 from adxl_ros.model.effects import effect_named

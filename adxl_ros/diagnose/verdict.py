@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from adxl_ros.diagnose.held_out import HeldOut, POSE, Rest
 from adxl_ros.diagnose.hypothesis_fit import Hypothesis
-from adxl_ros.diagnose.noise_detectors import UNKNOWN
+from adxl_ros.diagnose.noise_effects import UNKNOWN
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Concern
 import numpy as np

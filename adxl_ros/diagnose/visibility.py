@@ -8,16 +8,15 @@ from dataclasses import dataclass
 
 from adxl_ros.diagnose.comparison import BaselineComparison
 from adxl_ros.diagnose.evidence import fit_columns
-from adxl_ros.diagnose.linear_model import LinearModel
-from adxl_ros.diagnose.noise_detectors import (
+from adxl_ros.diagnose.linear_model import candidates, LinearModel
+from adxl_ros.diagnose.noise_effects import (
     COARSE_STEPS,
     LINE_LOG_EXCESS,
     NOISE_EXCESS,
     shortest_repeat,
     SPIKE_STDS,
 )
-from adxl_ros.diagnose.noise_whitening import expected_drift_g
-from adxl_ros.diagnose.sensitivities import candidates
+from adxl_ros.diagnose.noise_model import expected_drift_g
 from adxl_ros.model.coefficients import parameter_of
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.diagnosis_hints import Detector, Manoeuvre

@@ -320,7 +320,7 @@ class _Job:
 
     def _diagnose(self) -> None:
         """Compare the recording with its simulation."""
-        from adxl_ros.diagnose import report_html
+        from adxl_ros.diagnose import page
         from adxl_ros.diagnose.diagnosis import diagnose
         from adxl_ros.diagnose.report import as_json
         read = self._recording()
@@ -336,7 +336,7 @@ class _Job:
         if report['verdict']['status'] in _PAGES:
             params = ['--params', self.parameters.name] if self.parameters.text else []
             again = ['ros2', 'run', 'adxl_ros', 'diagnose', self.source.url, *params, '-o', 'gap']
-            self.files['report.html'] = report_html.page(diagnosis, report_html.Run(
+            self.files['report.html'] = page.page(diagnosis, page.Run(
                 self.source.url, self.parameters.name, [], parameters, shlex.join(again)
             )).encode('utf-8')
 

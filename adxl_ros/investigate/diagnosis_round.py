@@ -10,15 +10,15 @@ from enum import Enum
 from typing import Any
 
 from adxl_ros.diagnose.diagnosis import diagnose, Diagnosis
-from adxl_ros.diagnose.expectation import (
+from adxl_ros.diagnose.linear_model import candidates
+from adxl_ros.diagnose.next_experiment import (
     leading,
     ManoeuvreWorth,
     predict,
     rank_responses,
     unknown_dimensions,
 )
-from adxl_ros.diagnose.noise_detectors import UNKNOWN
-from adxl_ros.diagnose.sensitivities import candidates
+from adxl_ros.diagnose.noise_effects import UNKNOWN
 from adxl_ros.diagnose.verdict import normalised, WeightedHypothesis
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.investigate.manoeuvres import KIND_OF, plan_all, PlannedManoeuvre, Pose, StageLimits

@@ -11,9 +11,9 @@ from pathlib import Path
 import shlex
 import shutil
 
-from adxl_ros.diagnose import report_html, report_text
+from adxl_ros.diagnose import page
 from adxl_ros.diagnose.diagnosis import Diagnosis
-from adxl_ros.diagnose.report import as_json
+from adxl_ros.diagnose.report import as_json, screen_lines
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.files.atomic_write import write_text
@@ -89,13 +89,13 @@ def write_diagnosis(folder: OutputFolder, diagnosis: Diagnosis, recording: Recor
         as_json(diagnosis), indent=1, allow_nan=False) + '\n')
     parameters = ''
     if diagnosis.report is not None:
-        lines = report_text.screen_lines(diagnosis, subject)
+        lines = screen_lines(diagnosis, subject)
         parameters = parameter_file.as_text(diagnosis.report.sensor, lines)
         write_text(folder.parameters, parameters)
     if with_page:
         steps = [('simulate with these parameters', 'ros2 run adxl_ros simulate rich --params '
                   f'{folder.parameters} -o sim.csv')] if parameters else []
-        write_text(folder.report, report_html.page(diagnosis, report_html.Run(
+        write_text(folder.report, page.page(diagnosis, page.Run(
             subject, folder.baseline.name, steps, parameters, shlex.join(
                 ['ros2', 'run', 'adxl_ros', 'diagnose', str(folder.bag), '--params',
                  str(folder.baseline), '-o', f'{folder.path}_again']))))

@@ -10,9 +10,9 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from adxl_ros.diagnose import report_html, report_text
+from adxl_ros.diagnose import page
 from adxl_ros.diagnose.diagnosis import diagnose as diagnose_recordings, Diagnosis
-from adxl_ros.diagnose.report import as_json
+from adxl_ros.diagnose.report import as_json, screen_lines
 from adxl_ros.diagnose.self_check import self_check
 from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.errors import UserError
@@ -122,7 +122,7 @@ def diagnose(options: argparse.Namespace) -> int:
                                         lambda stage, done: show(done, stage), options.align,
                                         options.material)
         subject = _subject(recordings, sensor, options.sim)
-        lines = [*report_text.screen_lines(diagnosis, subject), *prior_lines]
+        lines = [*screen_lines(diagnosis, subject), *prior_lines]
         if options.self_check and diagnosis.report is not None:
             lines += ['', ' ' + self_check(diagnosis, recordings, sim, options.self_check,
                                            options.seed, lambda done: show(
@@ -162,7 +162,7 @@ def _write(options: argparse.Namespace, diagnosis: Diagnosis, subject: str, line
     steps = _next_steps(options, diagnosis)
     if isinstance(steps, str):
         steps = [NextStep('simulate with these parameters', steps)] if steps else []
-    write_text(folder / 'report.html', report_html.page(diagnosis, report_html.Run(
+    write_text(folder / 'report.html', page.page(diagnosis, page.Run(
         subject, Path(options.params or parameter_file.nominal_path()).name, steps, parameters)))
     return report
 

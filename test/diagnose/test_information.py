@@ -2,7 +2,7 @@
 
 """The expected information in cases with a closed form."""
 
-from adxl_ros.diagnose.information import Belief, bhattacharyya, entropy, expected_information
+from adxl_ros.diagnose.next_experiment import Belief, bhattacharyya, entropy, expected_information
 import numpy as np
 import pytest
 
