@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the diagnosis needs to know about an effect, declared in the file of the effect."""
+"""What the diagnosis needs to know about an effect, declared beside the effect."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 """The model compared with values of the paper, of the datasheet and of closed forms."""
 
 from adxl_ros.model import noise
-from adxl_ros.model.effects.misalignment import direction
+from adxl_ros.model.effects.mounting import direction
 from adxl_ros.model.kinematics import specific_force
 import numpy as np
 import pytest

@@ -11,9 +11,9 @@ from adxl_ros.calibrate.fits import full_model
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
 from adxl_ros.model.constants import AXES, Z_90
-from adxl_ros.model.effects import cross_axis, cross_axis_z, scale_factor_cross, scale_factor_z
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.effects.misalignment import direction
+from adxl_ros.model.effects.element import OTHER_AXIS
+from adxl_ros.model.effects.mounting import direction
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -37,9 +37,6 @@ _LABELS = {
     'nonlinearity.cubic_per_g2': 'cubic',
 }
 """Parameters in words; {other} is the axis that acts on the measured axis."""
-_OTHER = {effect.EFFECT.name: effect.OTHER
-          for effect in (cross_axis, cross_axis_z, scale_factor_cross, scale_factor_z)}
-"""By effect: index of the axis that acts on x, y and z."""
 _ANGLES = (Coefficient('misalignment', 'alpha_rad'), Coefficient('misalignment', 'beta_rad'))
 """Parameters of the direction of an axis."""
 _LINEAR = (Coefficient('cross_axis', 'linear'), Coefficient('cross_axis_z', 'linear'))
@@ -90,8 +87,8 @@ def added_effects(fitted: Sensor, truth: Sensor) -> list[str]:
 def _compared(name: Coefficient, fitted: float, half_width: float, truth: float) -> Comparison:
     """Compare one coefficient, with its label in words and angles in degrees."""
     key = str(name.without_axis)
-    acts = name.axis and name.effect in _OTHER
-    other = AXES[_OTHER[name.effect][AXES.index(name.axis)]] if acts else ''
+    acts = name.axis and name.effect in OTHER_AXIS
+    other = AXES[OTHER_AXIS[name.effect][AXES.index(name.axis)]] if acts else ''
     unit, scale = parameter_of(name).unit, 1.0
     if unit == 'rad':
         unit, scale = '°', float(np.degrees(1.0))
@@ -138,7 +135,7 @@ def _as_misalignment(truth: Sensor, axis: str, moved: list[Coefficient]
     along = _direction(truth, case_axis)
     for name in moved:
         linear, = get(truth, [name])
-        along = along + linear * _direction(truth, _OTHER[name.effect][case_axis])
+        along = along + linear * _direction(truth, OTHER_AXIS[name.effect][case_axis])
     length = float(np.linalg.norm(along))
     d = truth.axes.index(axis)
     scale = truth.scale_v_per_g[d] * length - truth.nominal_scale_v_per_g[d]

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The library of effects: each file of this folder holds one."""
+"""The library of effects: each file of this folder holds those of one place."""
 
 from __future__ import annotations
 
@@ -22,8 +22,11 @@ def library() -> dict[str, Effect]:
     A package adds an effect by an entry point in the group `adxl_ros.effects` that names an
     `Effect`.
     """
-    collected = [import_module(f'{__name__}.{module.name}').EFFECT
-                 for module in pkgutil.iter_modules(__path__) if module.name != 'base']
+    modules = [import_module(f'{__name__}.{module.name}')
+               for module in pkgutil.iter_modules(__path__)]
+    own = [value for module in modules for value in vars(module).values()
+           if isinstance(value, Effect)]
+    collected = sorted(own, key=lambda effect: effect.name)
     collected += [point.load() for point in entry_points(group='adxl_ros.effects')]
     effects: dict[str, Effect] = {}
     for effect in collected:

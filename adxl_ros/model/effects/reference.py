@@ -1,18 +1,65 @@
 # SPDX-License-Identifier: Apache-2.0
 
+"""The reference: another instrument or simulator that states the specific force."""
 
-"""Filter of the reference: it is smoother than the motion, as optical tracking is."""
+from math import cos, sin
 
+from adxl_ros.model.constants import AXES
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
-from adxl_ros.model.effects.base import (
-    Effect,
-    Parameter,
-    Parameters,
-    Place,
-    Role,
-    Signals,
-)
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
 import numpy as np
+
+
+def _reference_frame(signals: Signals, p: Parameters) -> None:
+    """Turn the force of the reference about its x, then about y, then about z."""
+    x, y, z = signals.force
+    c, s = cos(p['x_rad']), sin(p['x_rad'])
+    y, z = y * c - z * s, y * s + z * c
+    c, s = cos(p['y_rad']), sin(p['y_rad'])
+    x, z = x * c + z * s, z * c - x * s
+    c, s = cos(p['z_rad']), sin(p['z_rad'])
+    signals.force = [x * c - y * s, x * s + y * c, z]
+
+
+REFERENCE_FRAME = Effect(
+    name='reference_frame',
+    place=Place.REFERENCE,
+    parameters=tuple(
+        Parameter(f'{axis}_rad', 'rad', -0.5, 0.5, 0.0175,
+                  'physics: markers are placed to some 1 deg',
+                  f'turn of the specific force about {axis}, from the reference to the sensor', '')
+        for axis in AXES),
+    apply=_reference_frame,
+    exact=True,
+    cause='The frame of the reference is turned against that of the sensor; state the rotation, '
+          'or align the two.',
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, imitated_by='misalignment',
+                             proof=(ProofVariable.CROSS_FORCE, ProofVariable.FORCE_Z)),
+)
+"""Rotation between the frame of the reference and that of the sensor."""
+
+
+def _reference_delay(signals: Signals, p: Parameters) -> None:
+    """Put each sample of the reference earlier than its stamp."""
+    signals.time_s = signals.time_s - p['delay_s']
+
+
+REFERENCE_DELAY = Effect(
+    name='reference_delay',
+    place=Place.REFERENCE,
+    parameters=(
+        Parameter('delay_s', 's', 0.0, 1.0, 5e-3, 'physics: filters and transport of a tracker',
+                  'delay of the stamps of the reference behind its motion', ''),
+    ),
+    apply=_reference_delay,
+    exact=True,
+    cause='The reference is late, or the stamps of the sensor are early; synchronise the clocks, '
+          'or state the delay.',
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS, imitated_by='time_offset',
+                             proof=(ProofVariable.FORCE_RATE,)),
+)
+"""Delay of the reference: its stamps are late."""
+
 
 _ORDER = 3.0
 """Number of equal filters, between a Butterworth filter, 1, and a Gaussian, many. Chosen: the
@@ -22,7 +69,7 @@ _MARGIN = 10.0
 kernel."""
 
 
-def apply(signals: Signals, p: Parameters) -> None:
+def _reference_filter(signals: Signals, p: Parameters) -> None:
     """Undo a filter of the gain (1 + (ω·σ)^n/6)^(−3), as far as motion is left."""
     step_s = signals.dt_s
     first_s, last_s = float(signals.time_s[0]), float(signals.time_s[-1])
@@ -66,7 +113,7 @@ def _smallest_phase(log_gain: np.ndarray) -> np.ndarray:
     return np.fft.rfft(cepstrum).imag[:len(log_gain)]
 
 
-EFFECT = Effect(
+REFERENCE_FILTER = Effect(
     name='reference_filter',
     place=Place.REFERENCE,
     parameters=(
@@ -87,9 +134,10 @@ EFFECT = Effect(
                   'phase divided by that of a causal filter', '', neutral=1.0, role=Role.SHAPE,
                   starts=(0.0, 1.0)),
     ),
-    apply=apply,
+    apply=_reference_filter,
     cause='The reference is smoother than the motion; use it with less smoothing, or compare '
           'slow motion only.',
     diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS, form=(FormDimension.LAG,),
                              smooths_reference=True, proof=(ProofVariable.FREQUENCY,)),
 )
+"""Filter of the reference: it is smoother than the motion, as optical tracking is."""

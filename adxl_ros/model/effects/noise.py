@@ -1,15 +1,55 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Flicker noise: 1/f noise as a sum of Ornstein-Uhlenbeck processes, drawn by one filter."""
+"""Noise: white, 1/f and random walk, and the mains."""
 
 from __future__ import annotations
 
 from functools import lru_cache
 from typing import NamedTuple
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, DriftSpectrum, Manoeuvre, ProofVariable
-from adxl_ros.model.effects.base import ActsOn, Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.diagnosis_hints import (
+    Detector,
+    DiagnosisHints,
+    DriftSpectrum,
+    Manoeuvre,
+    ProofVariable,
+)
+from adxl_ros.model.effects.base import (
+    ActsOn,
+    Effect,
+    Need,
+    Parameter,
+    Parameters,
+    Place,
+    Role,
+    Signals,
+)
 import numpy as np
+
+
+def _noise_excess(signals: Signals, p: Parameters) -> None:
+    """Multiply the noise density by 1 + r."""
+    for d, ratio in enumerate(p['ratio']):
+        signals.noise_ratio[d] = signals.noise_ratio[d] * (1 + ratio)
+
+
+NOISE_EXCESS = Effect(
+    name='noise_excess',
+    place=Place.ELECTRONICS,
+    parameters=(
+        Parameter('ratio', '1', -0.99, 100.0, 0.3,
+                  'ADXL203 datasheet: 190 instead of 110 ug/sqrt(Hz) at 3 V',
+                  'noise density divided by the stated one, minus 1'),
+    ),
+    apply=_noise_excess,
+    acts_on=ActsOn.NOISE,
+    needs=(Need.NOISE,),
+    cause='The noise is not the stated one; check the supply, its decoupling and the cable.',
+    diagnosis=DiagnosisHints(detector=Detector.NOISE_LEVEL,
+                             proof=(ProofVariable.FREQUENCY,)),
+)
+"""White noise beyond the stated density."""
+
 
 _LOWEST_HZ = 1e-5
 """Lowest corner, Hz; chosen: the density is 1/f from ten times this."""
@@ -33,7 +73,7 @@ class _Shaping(NamedTuple):
     stationary: np.ndarray
 
 
-def apply(signals: Signals, p: Parameters) -> None:
+def _flicker(signals: Signals, p: Parameters) -> None:
     """
     Add noise of the one-sided density k²/f, g²/Hz, from 10⁻⁴ Hz up to a fifth of the rate.
 
@@ -119,7 +159,7 @@ def _stationary(poles: np.ndarray, zeros: np.ndarray) -> np.ndarray:
     return states @ single
 
 
-EFFECT = Effect(
+FLICKER = Effect(
     name='flicker',
     place=Place.ADC,
     parameters=(
@@ -127,7 +167,7 @@ EFFECT = Effect(
                   'physics: corner near 1 Hz at 110 ug/sqrt(Hz)',
                   'density at 1 Hz; it falls with the root of the frequency'),
     ),
-    apply=apply,
+    apply=_flicker,
     acts_on=ActsOn.NOISE,
     cause='The electronics have 1/f noise; average shorter and take the zero more often.',
     # A healthy unit has 0.2 mg rms over five decades of frequency at most (tuned by hand on
@@ -136,3 +176,83 @@ EFFECT = Effect(
                              revealed_by=Manoeuvre.HEAT,
                              proof=(ProofVariable.FREQUENCY,)),
 )
+"""Flicker noise: 1/f noise as a sum of Ornstein-Uhlenbeck processes, drawn by one filter."""
+
+
+def _bias_walk(signals: Signals, p: Parameters) -> None:
+    """
+    Add the sum of independent steps, g; after a time t its rms is k·√t.
+
+    A walk that returns at the rate r is a Gauss-Markov process: its rms ends at k/√(2·r).
+    """
+    assert signals.rng is not None
+    density = np.array(p['density_g_per_rts'])
+    drawn = signals.rng.standard_normal((*np.shape(signals.environment.time_s), len(density)))
+    if not density.any():
+        return
+    last = signals.memory.get('walked', np.zeros(drawn.shape[1:]))
+    returns = np.broadcast_to(p.get('return_per_s', 0.0), density.shape) * signals.dt_s
+    if returns.any():
+        # scipy.signal takes 0.5 s to import.
+        from scipy.signal import lfilter
+        shrink = -np.expm1(-2 * returns) / np.where(returns, 2 * returns, 1.0)
+        drawn *= density * np.sqrt(np.where(returns, shrink, 1.0) * signals.dt_s)
+        walk = np.stack([lfilter([1.0], [1.0, -a], drawn[..., d], 0, a * last[None, ..., d])[0]
+                         for d, a in enumerate(np.exp(-returns))], axis=-1)
+    else:
+        drawn *= density * np.sqrt(signals.dt_s)
+        drawn[:1] += last
+        walk = np.cumsum(drawn, axis=0)
+    signals.memory['walked'] = walk[-1] if len(walk) else drawn.sum(axis=0)
+    for d, scale in enumerate(signals.nominal_scale_v_per_g):
+        signals.volts[d] = signals.volts[d] + walk[..., d] * scale
+
+
+BIAS_WALK = Effect(
+    name='bias_walk',
+    place=Place.ADC,
+    parameters=(
+        Parameter('density_g_per_rts', 'g/sqrt(s)', 0.0, 0.1, 2e-5,
+                  'physics: slow stress in package and solder',
+                  'rms of the wandering zero-g divided by the root of time'),
+        Parameter('return_per_s', '1/s', 0.0, 1.0, 1e-2, 'physics: bounds of the stress',
+                  'inverse correlation time of a walk that has bounds', typical=0.0,
+                  role=Role.OPTIONAL),
+    ),
+    apply=_bias_walk,
+    acts_on=ActsOn.NOISE,
+    cause='The zero-g wanders; take the zero again more often, or choose a quieter sensor.',
+    # A healthy unit drifts by 0.3 mg within 100 s at most (tuned by hand on simulated
+    # recordings).
+    diagnosis=DiagnosisHints(drift=DriftSpectrum.RANDOM_WALK, healthy_density=3e-5,
+                             revealed_by=Manoeuvre.HEAT,
+                             proof=(ProofVariable.FREQUENCY,)),
+)
+"""Random walk of the zero-g: acceleration random walk, rate noise of an Allan deviation."""
+
+
+def _mains_hum(signals: Signals, p: Parameters) -> None:
+    """Add A·sin(2π·f·t + φ) to the volts of each axis."""
+    wave = np.sin(2 * np.pi * p['frequency_hz'] * signals.environment.time_s + p['phase_rad'])
+    for d, amplitude in enumerate(p['amplitude_v']):
+        signals.volts[d] = signals.volts[d] + amplitude * wave
+
+
+MAINS_HUM = Effect(
+    name='mains_hum',
+    place=Place.ADC,
+    parameters=(
+        Parameter('amplitude_v', 'V', -1.0, 1.0, 1e-3, 'physics: unshielded cable',
+                  'amplitude of the sine'),
+        Parameter('frequency_hz', 'Hz', 1.0, 1000.0, 50.0, 'mains: 50 or 60 Hz',
+                  'frequency of the sine', '', neutral=50.0, role=Role.SHAPE),
+        Parameter('phase_rad', 'rad', -7.0, 7.0, 1.0, 'chosen: any', 'phase at time 0', '',
+                  typical=0.0, role=Role.OPTIONAL),
+    ),
+    apply=_mains_hum,
+    acts_on=ActsOn.NOISE,
+    cause='The mains couple into the signal; shield and twist the cable, and ground one end.',
+    diagnosis=DiagnosisHints(detector=Detector.MAINS_LINE,
+                             proof=(ProofVariable.FREQUENCY,)),
+)
+"""Mains hum: a sine at the input of the ADC."""
