@@ -22,6 +22,7 @@ from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.diagnosis_hints import FormDimension
 from adxl_ros.model.sensor import Sensor
 import numpy as np
+import scipy
 
 FOLDS = 4
 """Parts of a recording, each of which is held out once. Chosen: run time."""
@@ -37,6 +38,10 @@ POSE = (FormDimension.FORCE, FormDimension.CROSS_FORCE, FormDimension.ALPHA, For
 """Dimensions that only change with the pose."""
 _POSES = 2000
 """Samples that show whether an effect follows the pose. Chosen: run time."""
+_FIRST_MEAN_S = 0.1
+"""Shortest mean in which a drift is looked for, s. Chosen: noise of sensors is white there."""
+_FEWEST_MEANS, _FEWEST_STEPS = 16, 12
+"""Fewest means of a recording, and of increments, that show a form."""
 _ALL, _STEADY = 'all', 'all but time'
 """Choices of functions."""
 _SMALLEST_LEVEL = 1e-4
@@ -79,6 +84,8 @@ class Rest:
     steady_log_likelihood: np.ndarray
     # Decrease of the squares by the functions of one dimension alone, by block
     by_dimension: dict[str, np.ndarray]
+    # Probability that a drift has increments with such jumps or lines; 1 beside a healthy unit
+    drift_p: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -172,7 +179,49 @@ def reproducible_rest(fits: HeldOutFits, model: LinearModel) -> Rest:
                     squares[held_out] += flat.gain(values)
                 else:
                     by_dimension.setdefault(name, np.zeros(BLOCKS))[held_out] += flat.gain(values)
-    return Rest(squares, steady_squares, steady, by_dimension)
+    return Rest(squares, steady_squares, steady, by_dimension, _drift_p(fits, model))
+
+
+def _drift_p(fits: HeldOutFits, model: LinearModel) -> float:
+    """Return the smallest p of the increments beside a drift, for the number of axes."""
+    linearised = fits.linearised
+    p = [increments_p(columns.values @ np.concatenate([[1.0], -fits.departures[columns.places]]),
+                      comparison.used, comparison.sensor.rate_hz)
+         for number, columns in enumerate(linearised.columns) if fits.drifts
+         for comparison in [model.comparisons[model.place_of_channel(number)[0]]]]
+    return min(1.0, len(p) * min(p, default=1.0))
+
+
+def increments_p(values: np.ndarray, used: np.ndarray, rate_hz: float) -> float:
+    """
+    Return how probable the increments of a residual are if they are those of a random drift.
+
+    The means are those over the time from which the drift exceeds the noise: twice that of the
+    smallest Allan deviation. A drift has Gaussian increments (test of Anscombe and Glynn 1983)
+    without a line (test of Fisher 1929); jumps between levels and slow oscillations have not.
+    """
+    longest = int(used.sum()) // _FEWEST_MEANS
+    lengths = np.unique(np.geomspace(max(1.0, _FIRST_MEAN_S * rate_hz), max(longest, 1), 12
+                                     ).astype(int))
+    if len(lengths) < 2:
+        return 1.0
+    kept = np.where(used, values, np.nan)
+
+    def increments(length: int) -> np.ndarray:
+        parts = kept[:len(kept) // length * length].reshape(-1, length)
+        known = np.isfinite(parts).mean(axis=1) > 0.5
+        means = np.full(len(parts), np.nan)
+        means[known] = np.nanmean(parts[known], axis=1)
+        steps = np.diff(means)
+        return steps[np.isfinite(steps)]
+
+    quietest = min(lengths, key=lambda n: np.mean(increments(n) ** 2))
+    steps = increments(min(2 * int(quietest), longest))
+    if len(steps) < _FEWEST_STEPS or not np.ptp(steps):
+        return 1.0
+    power = np.abs(np.fft.rfft(steps - steps.mean())[1:(len(steps) + 1) // 2]) ** 2
+    line = min(1.0, len(power) * (1 - power.max() / power.sum()) ** (len(power) - 1))
+    return min(1.0, 2 * min(line, float(scipy.stats.kurtosistest(steps).pvalue)))
 
 
 class _Products:

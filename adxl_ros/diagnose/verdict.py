@@ -36,6 +36,9 @@ _SHARE_OF_LOST = 0.5
 """Error of a smooth reference in slower motion, as a share of the motion that it lacks. Chosen."""
 _NATS = 3.0
 """Held-out log likelihood that a further effect must gain."""
+_SMALLEST_P = 0.001
+"""Probability of the increments of a drift below which they are of something else. Chosen: one
+error in 1000."""
 _DRIFT_REACH = 10.0
 """95 % quantile of the mean square of a random walk about its start, divided by the one expected
 about its mean. Derived: 1.66·T and T/6."""
@@ -175,7 +178,7 @@ class Evidence:
 
     def interval(self, draws: np.ndarray) -> Interval:
         """Return the value of all blocks with the interval of the draws."""
-        low, high = np.quantile(draws[1:], [_LOWEST, _HIGHEST])
+        low, high = np.quantile(draws[1:], [_LOWEST, _HIGHEST], method='nearest')
         return Interval(float(draws[0]), float(min(low, draws[0])), float(max(high, draws[0])))
 
 
@@ -282,9 +285,10 @@ def _answer(evidence: Evidence, minimal: Sequence[frozenset[str]], rest: Rest,
     material = _low(all_left) > rest_material
     drift = evidence.candidates[best].drift_mps2.get(drifts[0], 0.0) if drifts else 0.0
     above = float(evidence.left(best, rows)[0])
-    if drifts and _low(steady_left) > rest_material \
-            and float(steady_left[0]) > _SHARE_OF_FORM * drift ** 2:
-        # A drift follows time alone; it takes up what follows something else, too.
+    follows = _low(steady_left) > rest_material \
+        and float(steady_left[0]) > _SHARE_OF_FORM * drift ** 2
+    if drifts and (follows or rest.drift_p < _SMALLEST_P):
+        # A drift follows time alone, and at random; its fit takes up what does not, too.
         drifts, drift, material, left = (), 0.0, True, max(left, above)
     if material and left > explained + drift ** 2:
         return _Answer('unknown', frozenset(), frozenset())
