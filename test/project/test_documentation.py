@@ -18,8 +18,8 @@ DOCS = REPO / 'docs'
 PAGES = [REPO / 'README.md', REPO / 'CONTRIBUTING.md', *sorted(DOCS.glob('**/*.md'))]
 BY_HAND = [page for page in PAGES if 'measurements' not in page.parts
            and 'Made by `make reference`' not in page.read_text('utf-8')]
-MOST_WORDS = 26_000
-"""Words of the pages by hand that a reader can be asked to maintain; the aim is 24 000."""
+MOST_WORDS = 24_000
+"""Words of the pages by hand: what they have more, somebody has to read and to keep true."""
 TOOLS = ('simulate', 'fit', 'apply', 'check', 'noise', 'diagnose', 'export', 'fleet', 'blind',
          'reproduce', 'demo', 'bench')
 NODES = ('driver', 'compensation', 'calibration', 'stage', 'monitor', 'investigate', 'screen')
@@ -147,8 +147,9 @@ def test_each_page_names_the_next() -> None:
 
 
 def test_the_pages_by_hand_stay_short() -> None:
-    words = sum(len(page.read_text('utf-8').split()) for page in BY_HAND)
-    assert words <= MOST_WORDS
+    texts = (re.sub(r'<!-- ([\w ]+) -->\n.*?<!-- /\1 -->', '', page.read_text('utf-8'),
+                    flags=re.DOTALL) for page in BY_HAND if 'reference' not in page.parts)
+    assert sum(len(text.split()) for text in texts) <= MOST_WORDS
 
 
 @pytest.mark.parametrize('page', BY_HAND, ids=name_of)
