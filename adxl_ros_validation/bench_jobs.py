@@ -39,7 +39,7 @@ from adxl_ros.simulate.trajectories import rich, sweep
 import numpy as np
 import scipy
 
-_PACKAGES = ('numpy', 'scipy', 'pyarrow', 'polars', 'orjson', 'rosbags', 'allantools', 'imucal',
+_PACKAGES = ('numpy', 'scipy', 'pyarrow', 'polars', 'pandas', 'rosbags', 'allantools', 'imucal',
              'mujoco')
 """Libraries whose versions the table states."""
 

@@ -26,7 +26,7 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Components
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.tilt import tilt
-from adxl_ros.signals import filter_time_constant
+from adxl_ros.signals import recorded_sensor
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Held, Motion
 from adxl_ros.simulate.simulator import simulate
@@ -308,7 +308,7 @@ def calibrated(truth: Sensor, seed: int, models: Sequence[str] = tuple(MODELS)) 
     fitted = {name: MODELS[name](nominal, poses) for name in models}
     if 'full' in fitted:
         noise = pose_extraction.estimate_filters(recording, nominal, poses)
-        fitted['full'], _ = filter_time_constant.with_filter(fitted['full'], [noise])
+        fitted['full'], _ = recorded_sensor.with_filter(fitted['full'], [noise])
     return Run(truth, fitted, poses, true)
 
 

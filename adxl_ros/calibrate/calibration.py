@@ -42,7 +42,7 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.population import Population, posterior
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.filter_time_constant import FilterNoise, with_filter
+from adxl_ros.signals.recorded_sensor import FilterNoise, with_filter
 import numpy as np
 
 STAGE_FITS = {'linear': linear.fit, 'physical': paper_regression.fit, 'full': term_selection.fit}

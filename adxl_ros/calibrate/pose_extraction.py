@@ -12,7 +12,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import COMMANDS, JOINTS, Recording
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals import filter_time_constant
+from adxl_ros.signals import recorded_sensor
 from adxl_ros.signals.noise_limits import datasheet_noise
 from adxl_ros.signals.rest_detection import recording_finder, Rest, rest_means
 import numpy as np
@@ -104,7 +104,7 @@ def _rest_means(values: np.ndarray | None, rests: Sequence[Rest]) -> np.ndarray:
 
 
 def estimate_filters(recording: Recording, sensor: Sensor, poses: Poses
-                     ) -> list[filter_time_constant.FilterNoise | None]:
+                     ) -> list[recorded_sensor.FilterNoise | None]:
     """Estimate the output filter of each axis from the noise of the poses."""
     volts = recording.volts(sensor)
     first, last = np.searchsorted(recording.time_s, poses.time_s.T)
@@ -116,6 +116,6 @@ def estimate_filters(recording: Recording, sensor: Sensor, poses: Poses
     filters = []
     for d in range(len(sensor.axes)):
         rests = [rest[:, d] for rest in gapless]
-        filters.append(filter_time_constant.estimate_filter(
+        filters.append(recorded_sensor.estimate_filter(
             rests, sensor.rate_hz, sensor.rc_s, sensor.lsb_v))
     return filters

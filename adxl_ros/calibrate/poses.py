@@ -13,7 +13,7 @@ from adxl_ros.model.constants import AXES
 from adxl_ros.model.effects.base import Components, Environment, NOMINAL_ENVIRONMENT, Value
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.axis_polarity import CERTAIN_CORRELATION, find_polarity_fault
+from adxl_ros.signals.recorded_sensor import CERTAIN_CORRELATION, find_polarity_fault
 from adxl_ros.signals.rest_detection import SAME_ANGLE_RAD
 import numpy as np
 

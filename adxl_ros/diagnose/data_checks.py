@@ -42,7 +42,7 @@ from adxl_ros.files.recording_columns import JOINTS, Recording
 from adxl_ros.model import noise
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.axis_polarity import find_polarity_fault
+from adxl_ros.signals.recorded_sensor import find_polarity_fault
 from adxl_ros.simulate.motion import Motion
 import numpy as np
 

@@ -23,7 +23,7 @@ from adxl_ros.model.constants import MAD_TO_STD
 from adxl_ros.model.diagnosis_hints import Detector
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.runs import true_runs
+from adxl_ros.signals.block_statistics import true_runs
 from adxl_ros.simulate.response import Response
 import numpy as np
 import scipy

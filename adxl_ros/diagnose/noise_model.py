@@ -40,7 +40,7 @@ from adxl_ros.model.diagnosis_hints import DriftSpectrum
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.runs import true_runs
+from adxl_ros.signals.block_statistics import true_runs
 import numpy as np
 import scipy
 

@@ -16,7 +16,7 @@ from adxl_ros.files.reference_alignment import LONGEST_MOVE_NS, USUAL_GAPS
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.runs import true_runs
+from adxl_ros.signals.block_statistics import true_runs
 from adxl_ros.simulate.smoothed_paths import BAND_LIMITED_DEGREE, ForcePath, KNOT_S
 import numpy as np
 import scipy

@@ -40,7 +40,7 @@ from adxl_ros.nodes.topics import (
     Status,
     STEADY,
 )
-from adxl_ros.signals.measured_values import unit_of_stream
+from adxl_ros.signals.recorded_sensor import unit_of_stream
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 import numpy as np

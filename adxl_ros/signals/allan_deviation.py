@@ -4,8 +4,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
+from adxl_ros.errors import UserError
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.signals.block_statistics import gap_s
+from adxl_ros.signals.rest_detection import RecordedRests, Rest
 import numpy as np
 
 _LONGEST = 1 << 20
@@ -192,3 +198,227 @@ def _from_cells(cells: CellMeans, size: int, axes: int) -> np.ndarray:
     phase = np.cumsum(np.vstack([np.zeros(axes), means - means[0]]), axis=0)
     differences = phase[2 * size:] - 2 * phase[size:-size] + phase[:-2 * size]
     return (differences ** 2).mean(axis=0) / (2 * size ** 2)
+
+
+_WINDOW_S = 2.0
+"""Window of the standard deviation of a sample, s. Chosen: noise at low frequency is slower."""
+_LARGEST_END_S = 0.2
+"""Longest time before the first rest or after the last that is no motion, s. Chosen: rests are
+found in blocks of 0.05 s, of which one is left out."""
+_FILLED_GAPS = 20
+"""Longest gap that is filled by a straight line, in smallest gaps. Chosen: no rest has longer
+ones, and a line of days would fill the memory."""
+_FEWEST_SAMPLES = 512
+"""Fewest samples at rest. Chosen: fewer do not show white noise within 10 %."""
+SHORTEST_S = 10.0
+"""Shortest rest, s. Chosen: fewer seconds hold no average of one second."""
+
+
+@dataclass(frozen=True)
+class StillStretch:
+    """The samples of the longest rest."""
+
+    # start_s, stop_s: Its first and last stamp, s
+    start_s: float
+    stop_s: float
+    rate_hz: float  # Sample rate by its stamps, Hz
+    count: int  # Number of its samples
+    filled: int  # Samples among them that were missing, and lie on a line between their neighbours
+    allan: AllanDeviation  # Their Allan deviation, m/s²
+    step_s: float  # Length of a cell, s
+    means: np.ndarray  # Means of the cells by axis, m/s², (k, m)
+    # Mean temperature of the cells, °C, (k,); None where it is not measured throughout
+    temperature_c: np.ndarray | None
+    # Standard deviation of a sample within some seconds by axis, m/s², (m,)
+    sample_std: np.ndarray
+    resolution: np.ndarray  # Smallest change of a sample by axis, m/s², (m,)
+    recorded_s: float  # Time of the whole recording, s
+    motion_s: list[tuple[float, float]]  # Times at which it moves or has long gaps, s, (j, 2)
+
+    @property
+    def span_s(self) -> float:
+        """Time of the rest, s."""
+        return self.count / self.rate_hz
+
+
+def shortest_rest_s(rate_hz: float) -> float:
+    """Return the shortest rest that shows noise, from its first to its last sample, s."""
+    return max(SHORTEST_S, _FEWEST_SAMPLES / rate_hz) - 1 / rate_hz
+
+
+def longest_rest(read: Callable[[], Iterable[Recording]], unit_of: Callable[[Recording], Sensor]
+                 ) -> StillStretch:
+    """
+    Find the longest rest of a recording.
+
+    A recording at rest throughout is read once. Any other is read twice, and the memory is
+    bounded in both cases.
+    """
+    survey = _read(read, unit_of, None)
+    rests = [rest for rest, _ in survey.rests.detected]
+    rest = max(rests, key=lambda rest: rest.span_s, default=Rest(0, 0, 0.0, 0.0))
+    shortest_s = shortest_rest_s(survey.segment.nominal_hz)
+    if rest.span_s < shortest_s:
+        raise UserError(f'{survey.path}: rests for {rest.span_s:.4g} s at most, expected '
+                        f'{shortest_s:.3g} s at least; record longer, and do not touch the sensor')
+    edges_s = np.array([survey.start_s, *(time_s for each in rests for time_s in
+                                          (each.time_start_s, each.time_stop_s)), survey.stop_s])
+    motion_s = [(start_s, stop_s) for start_s, stop_s in edges_s.reshape(-1, 2).tolist()
+                if stop_s - start_s > _LARGEST_END_S]
+    if not motion_s and not rest.disturbed_s:
+        _check_axes(survey)
+        return _stretch(survey, survey, motion_s)
+    rest_only = _read(read, unit_of, rest)
+    _check_axes(rest_only, f' from {rest.time_start_s:.4g} s to {rest.time_stop_s:.4g} s')
+    return _stretch(survey, rest_only, motion_s)
+
+
+class _Segment:
+    """Samples of a rest, as far as they have been read; gaps are filled by straight lines."""
+
+    def __init__(self, columns: int, rate_hz: float) -> None:
+        self.nominal_hz = rate_hz
+        self.allan = AllanStream(columns - 1)
+        self.cells = CellMeans(columns)
+        self.resolution = np.full(columns - 1, np.inf)
+        self.filled = 0
+        self.start_s = self.stop_s = np.nan
+        self.is_whole = True
+        self._last: np.ndarray | None = None
+
+    @property
+    def count(self) -> int:
+        """Count of the samples."""
+        return self.allan.count
+
+    @property
+    def rate_hz(self) -> float:
+        """Sample rate by the stamps, Hz."""
+        return (self.count - 1) / (self.stop_s - self.start_s)
+
+    def feed(self, time_s: np.ndarray, rows: np.ndarray) -> None:
+        """Add rows, (n, c), whose gaps are to be filled; the last column is the temperature."""
+        # Nothing is added after a gap that is too long to be filled.
+        steps_s = np.diff(time_s, prepend=time_s[0] if self._last is None else self.stop_s)
+        self.is_whole &= bool((steps_s <= _FILLED_GAPS * gap_s(self.nominal_hz)).all())
+        if not self.is_whole:
+            return
+        is_first = self._last is None
+        if self._last is None:
+            self.start_s = float(time_s[0])
+        else:
+            time_s, rows = np.append(self.stop_s, time_s), np.vstack([self._last, rows])
+        changes = np.abs(np.diff(rows[:, :-1], axis=0))
+        self.resolution = np.minimum(self.resolution, np.where(changes > 0, changes, np.inf).min(
+            axis=0, initial=np.inf))
+        self._last, self.stop_s = rows[-1], float(time_s[-1])
+        rows = self._evenly(time_s, rows)[0 if is_first else 1:]
+        self.allan.feed(rows[:, :-1])
+        self.cells.feed(rows)
+
+    def _evenly(self, time_s: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Return the rows with gaps filled."""
+        steps_s = np.diff(time_s)
+        gaps = steps_s > gap_s(self.nominal_hz)
+        if not gaps.any():
+            return rows
+        advance = np.where(gaps, np.maximum(np.rint(steps_s * self.nominal_hz), 1), 1)
+        number = np.concatenate([[0], np.cumsum(advance)])
+        full = np.arange(number[-1] + 1)
+        self.filled += len(full) - len(rows)
+        return np.column_stack([np.interp(full, number, column) for column in rows.T])
+
+
+@dataclass
+class _Survey:
+    """What a pass over a recording, or over one of its rests, has found."""
+
+    path: str
+    names: tuple[str, ...]
+    start_s: float
+    stop_s: float
+    segment: _Segment
+    rests: RecordedRests
+
+
+def _read(read: Callable[[], Iterable[Recording]], unit_of: Callable[[Recording], Sensor],
+          rest: Rest | None) -> _Survey:
+    """Read the undisturbed samples of a rest; those of the whole recording where it is None."""
+    survey: _Survey | None = None
+    held = np.nan
+    for block in read():
+        inside = np.ones(len(block), bool) if rest is None else _is_inside(block.time_s, rest)
+        temperature, held = _held(block, held)
+        unit = unit_of(block)
+        rows = np.column_stack([block.accel_mps2(unit), temperature])[inside]
+        if not len(rows):
+            continue
+        time_s = block.time_s[inside]
+        if survey is None:
+            if len(block) < 2:
+                raise UserError(f'{block.path}: {len(block)} samples; record longer')
+            survey = _Survey(block.path, block.sensor_columns, float(time_s[0]), 0.0,
+                             _Segment(rows.shape[1], block.rate_hz), RecordedRests(unit, block))
+        survey.segment.feed(time_s, rows)
+        if rest is None:
+            survey.rests.feed(block)
+        survey.stop_s = float(time_s[-1])
+    if survey is None:
+        raise UserError('the recording holds no samples')
+    if rest is None:
+        survey.rests.take()
+    return survey
+
+
+def _is_inside(time_s: np.ndarray, rest: Rest) -> np.ndarray:
+    """Return which samples belong to a rest and are not disturbed, (n,) bool."""
+    inside = (time_s >= rest.time_start_s) & (time_s <= rest.time_stop_s)
+    for start_s, stop_s in rest.disturbed_s:
+        inside &= (time_s <= start_s) | (time_s >= stop_s)
+    return inside
+
+
+def _held(block: Recording, last: float) -> tuple[np.ndarray, float]:
+    """Return the temperature, °C, (n,), which holds between its readings, and the newest one."""
+    values = block.columns.get('temperature_c')
+    if values is None:
+        return np.full(len(block), np.nan), np.nan
+    is_read = np.isfinite(values)
+    if not is_read.any():
+        return np.full(len(block), last), last
+    place = np.maximum.accumulate(np.where(is_read, np.arange(len(values)), -1))
+    first = last if np.isfinite(last) else float(values[is_read][0])
+    return np.where(place < 0, first, values[place]), float(values[is_read][-1])
+
+
+def _check_axes(survey: _Survey, span: str = '') -> None:
+    """Refuse an axis that never changes; `span` names the part of the recording."""
+    for name, resolution in zip(survey.names, survey.segment.resolution):
+        if not np.isfinite(resolution):
+            raise UserError(f'{survey.path}: {name} never changes{span}; the axis is stuck, or '
+                            'not connected')
+
+
+def _window_variance(cells: CellMeans, width: int, first: int = 0) -> np.ndarray:
+    """Return the variance of the samples in windows of cells from the first by axis, (w, m)."""
+    count = (cells.count - first) // width
+    part = slice(first, first + count * width)
+    means = cells.means[part, :-1].reshape(count, width, -1)
+    squares = cells.squares[part, :-1].reshape(count, width, -1).sum(axis=1)
+    between = ((means - means.mean(axis=1, keepdims=True)) ** 2).sum(axis=1) * cells.size
+    return (squares + between) / max(width * cells.size - 1, 1)
+
+
+def _stretch(survey: _Survey, rest: _Survey, motion_s: list[tuple[float, float]]
+             ) -> StillStretch:
+    """Return the rest that a pass has read."""
+    segment = rest.segment
+    cells, rate_hz = segment.cells, segment.rate_hz
+    width = max(int(np.ceil(_WINDOW_S * rate_hz / cells.size)), 1)
+    temperature = cells.means[:, -1]
+    return StillStretch(
+        segment.start_s, segment.stop_s, rate_hz, segment.count, segment.filled,
+        segment.allan.result(rate_hz, cells), cells.size / rate_hz, cells.means[:, :-1],
+        temperature if np.isfinite(temperature).all() else None,
+        np.sqrt(_window_variance(cells, min(width, cells.count)).mean(axis=0)),
+        segment.resolution, survey.stop_s - survey.start_s, motion_s)

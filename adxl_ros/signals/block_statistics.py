@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from itertools import pairwise
 
 import numpy as np
 
@@ -156,3 +157,15 @@ def angle_bounds(blocks: Blocks) -> np.ndarray:
     after = np.minimum.accumulate(np.where(has_angle, place, last)[::-1])[::-1]
     return np.fmax(bounds, np.fmax(bounds[before[np.maximum(place - 1, 0)]],
                                    bounds[after[np.minimum(place + 1, last)]]))
+
+
+def true_runs(mask: np.ndarray, group: np.ndarray | None = None) -> list[tuple[int, int]]:
+    """
+    List the runs of True in a mask.
+
+    mask: booleans, (k,); group: numbers, not negative, (k,). A run ends where the number changes.
+    None for one group.
+    """
+    number = np.where(mask, 0 if group is None else group, -1)
+    edges = np.flatnonzero(np.diff(number, prepend=-2, append=-2))
+    return [(int(first), int(stop)) for first, stop in pairwise(edges) if mask[first]]

@@ -4,14 +4,29 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from math import ceil, log2
 from pathlib import Path
+from typing import NamedTuple
 
+from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
-from adxl_ros.files.recording_columns import Recording, VOLTS
-from adxl_ros.model.sensor import Sensor, with_axes
-from adxl_ros.signals import measured_values
+from adxl_ros.files.recording_columns import Recording, stamped_rate_hz, VOLTS
+from adxl_ros.model.coefficients import names_of, put, with_neutral
+from adxl_ros.model.constants import AXES, MEASURED_AXES
+from adxl_ros.model.effects import effect_named
+from adxl_ros.model.sensor import Sensor, to_volts, with_axes
+from adxl_ros.signals.block_statistics import block_samples, BlockCutter, Blocks, true_runs
+from adxl_ros.signals.noise_limits import (
+    adc_step,
+    quiet_blocks,
+    quiet_variance,
+    Spans,
+    window_variance,
+)
 import numpy as np
+import scipy
 
 
 def load_sensor(params: str | None, read: Recording) -> Sensor:
@@ -35,9 +50,9 @@ def measure_unstated(sensor: Sensor, read: Recording) -> tuple[Sensor, list[str]
     unit = sensor if sensor.effects else with_axes(sensor, read.axes)
     if 'noise_density_g_per_rthz' in sensor.unstated:
         unit = replace(unit, provenance={**unit.provenance, 'noise_from': name})
-    values = measured_values.measure(read.time_s, read.volts(unit), unit)
-    return (measured_values.with_measured_values(unit, values),
-            measured_values.describe(unit, values))
+    values = measure(read.time_s, read.volts(unit), unit)
+    return (with_measured_values(unit, values),
+            describe(unit, values))
 
 
 def listed(measured: list[str]) -> list[str]:
@@ -71,3 +86,333 @@ class BeyondRange:
             return ''
         return (f'{self._samples} samples are beyond the stated range of ±{sensor.range_g:g} g '
                 f'(largest reading {self._largest_g:.3g} g); check sensor.range_g')
+
+
+SHORTEST_S = 2.0
+"""Shortest time that shows the noise of a sensor, s. Chosen: some windows of a quarter second."""
+_FEWEST_SAMPLES = 64
+"""Smallest number of samples that shows it. Chosen: the variance then scatters by a fifth."""
+_SMALLEST_RANGE_G = 2.0
+"""Smallest measuring range that is taken, g: the smallest one of common digital sensors."""
+_FILTER_START_SAMPLES = 2.0
+"""Time constant with which the search for a filter begins, sample periods. Chosen: a filter that
+is much faster does not show, and one that is slower is reached from there."""
+_MAX_NOISE_G_PER_RTHZ = 0.1
+"""Largest density of a parameter file, g/√Hz."""
+_RESISTANCE_OHM = 1.0e4
+"""Resistor that a measured filter is written with, Ω: only its product with C has a meaning."""
+
+
+class MeasuredValues(NamedTuple):
+    """What samples show of their sensor."""
+
+    noise_v: np.ndarray  # Standard deviation of one sample at rest by axis, V, (m,)
+    step_v: np.ndarray  # Smallest change of the samples by axis, V, (m,)
+    rc_s: float  # Time constant of the filter, s; 0 where the noise shows none
+    largest_g: float  # Magnitude of the largest reading of an axis, g
+
+    @property
+    def range_g(self) -> float:
+        """Return the next power of two above the largest reading, g: a common range."""
+        return max(_SMALLEST_RANGE_G, 2.0 ** ceil(log2(max(self.largest_g, _SMALLEST_RANGE_G))))
+
+
+def measure(time_s: np.ndarray, volts: np.ndarray, sensor: Sensor) -> MeasuredValues:
+    """
+    Measure noise, step, filter and largest reading.
+
+    The noise is that of the quietest quarter seconds, so that the samples may hold motion.
+
+    time_s: stamps, s, (n,); volts: samples, V, (n, m).
+    """
+    cutter = BlockCutter(sensor.rate_hz, len(sensor.axes))
+    blocks, spans = cutter.feed(time_s, volts), Spans.for_rate(sensor.rate_hz)
+    windows = window_variance(blocks, spans)
+    if len(time_s) < _FEWEST_SAMPLES or not np.isfinite(windows).any():
+        raise UserError(f'{len(time_s)} samples at {sensor.rate_hz:g} Hz do not show the noise of '
+                        f'the sensor; record at least {SHORTEST_S:g} s, or state '
+                        'sensor.noise_density_g_per_rthz in the parameter file')
+    step_v = adc_step(blocks)
+    variance_v2, limit_v2 = quiet_variance(blocks, windows, step_v)
+    quiet = quiet_blocks(blocks, windows, limit_v2, spans.window)
+    readings_g = np.abs(volts - sensor.nominal_zero_g_v) / sensor.nominal_scale_v_per_g
+    return MeasuredValues(np.sqrt(variance_v2), step_v,
+                          _filter_s(volts, blocks, quiet, sensor, float(np.max(step_v))),
+                          float(np.nanmax(readings_g)))
+
+
+def _filter_s(volts: np.ndarray, blocks: Blocks, quiet: np.ndarray, sensor: Sensor,
+              step_v: float) -> float:
+    """Return the mean time constant of the axes, s; 0 where the noise of one shows no filter."""
+    size = block_samples(sensor.rate_hz)
+    rests = [volts[blocks.start[begin]:blocks.start[end - 1] + size]
+             for begin, end in true_runs(quiet, blocks.run)]
+    time_constants = []
+    for axis in range(volts.shape[1]):
+        estimate = estimate_filter([rest[:, axis] for rest in rests], sensor.rate_hz,
+                                   _FILTER_START_SAMPLES / sensor.rate_hz, step_v)
+        if estimate is None or not estimate.credible:
+            return 0.0
+        time_constants.append(estimate.rc_s)
+    return float(np.mean(time_constants))
+
+
+def with_measured_values(sensor: Sensor, values: MeasuredValues) -> Sensor:
+    """Fill in what the parameter file of a sensor leaves out."""
+    rc_s = sensor.rc_s if _states_filter(sensor) else values.rc_s
+    bandwidth_hz = 0.25 / rc_s if rc_s else sensor.rate_hz / 2
+    density = values.noise_v / sensor.nominal_scale_v_per_g / np.sqrt(bandwidth_hz)
+    measured = {
+        'noise_density_g_per_rthz': np.minimum(density, _MAX_NOISE_G_PER_RTHZ),
+        'range_g': values.range_g}
+    if not _states_filter(sensor):
+        measured |= {'rc_resistance_ohm': _RESISTANCE_OHM,
+                     'rc_capacitance_f': rc_s / _RESISTANCE_OHM}
+    used = {name: value for name, value in measured.items() if name in sensor.unstated}
+    return replace(sensor, unstated=(), measured=sensor.unstated, **used)
+
+
+def unit_of_stream(sensor: Sensor, stamps_ns: np.ndarray, accel_mps2: np.ndarray
+                   ) -> tuple[Sensor, list[str]]:
+    """
+    Return the unit of a live stream that states nothing of itself.
+
+    stamps_ns: stamps, ns, (n,); accel_mps2: specific force, m/s², (n, 3); an axis that is always 0
+    is not measured.
+    """
+    steps_s = np.diff(stamps_ns) * 1e-9
+    if steps_s.sum() < SHORTEST_S:
+        raise UserError(f'{len(stamps_ns)} samples in {max(steps_s.sum(), 0):.1f} s; '
+                        f'{SHORTEST_S:g} s show rate and noise')
+    rate_hz = stamped_rate_hz((stamps_ns - stamps_ns[0]) * 1e-9)
+    if not rate_hz > 0:
+        raise UserError(f'the stamps of {len(stamps_ns)} samples do not advance; the driver must '
+                        'stamp each sample')
+    present = ''.join(axis for axis, values in zip(AXES, accel_mps2.T) if values.any())
+    axes = present if present in MEASURED_AXES else AXES
+    unit = sensor if sensor.effects else with_axes(sensor, axes)
+    unit = replace(unit, rate_hz=round(rate_hz, 3))
+    volts = to_volts(accel_mps2[:, :len(unit.axes)], unit)
+    values = measure((stamps_ns - stamps_ns[0]) * 1e-9, volts, unit)
+    unit, lines = with_measured_values(unit, values), describe(unit, values)
+    return (replace(unit, measured=(*unit.measured, 'rate_hz')),
+            [f'rate: {unit.rate_hz:.4g} Hz, axes: {unit.axes}', *lines])
+
+
+def _states_filter(sensor: Sensor) -> bool:
+    """Return whether the file states resistor and capacitor."""
+    return not {'rc_resistance_ohm', 'rc_capacitance_f'} & set(sensor.unstated)
+
+
+def describe(sensor: Sensor, values: MeasuredValues) -> list[str]:
+    """Return what is measured in place of the file, for people."""
+    lines = []
+    scale_v_per_g = sensor.nominal_scale_v_per_g
+    if 'noise_density_g_per_rthz' in sensor.unstated:
+        lines.append('noise of a sample: ' + _by_axis(sensor, values.noise_v / scale_v_per_g))
+    if 'adc_bits' in sensor.unstated:
+        lines.append('resolution: ' + _by_axis(sensor, values.step_v / scale_v_per_g))
+    if not _states_filter(sensor):
+        lines.append(f'filter: {values.rc_s * 1e3:.3g} ms' if values.rc_s else
+                     'filter: the noise at rest shows none')
+    if 'range_g' in sensor.unstated:
+        lines.append(f'range: ±{values.range_g:g} g (largest reading {values.largest_g:.3g} g)')
+    return lines
+
+
+def _by_axis(sensor: Sensor, values_g: np.ndarray) -> str:
+    return ', '.join(f'{axis} {value * 1e3:.2g} mg' for axis, value in zip(sensor.axes, values_g))
+
+
+_SEGMENT_S = 1.0
+"""Length of a segment of the periodogram, s. Chosen: several fit into a rest."""
+_MIN_SEGMENT_SAMPLES = 16
+"""Smallest number of samples in a segment. Chosen: fewer ordinates do not show a filter."""
+_LOWEST_BINS = 2
+"""Highest bin that is left out: mean, drift and flicker dominate in bins 0 to 2."""
+_INDEPENDENT_SEGMENTS = 0.95
+"""Independent periodograms per segment, for a Hann window that overlaps by half."""
+_CORRELATED_ORDINATES = 35 / 18
+"""Ordinates per degree of freedom: neighbours are correlated behind a Hann window."""
+_ADC_NOISE_PRIOR_STD = 0.7
+"""Prior standard deviation of the logarithm of the ADC's noise variance about LSB²/12. Chosen:
+a factor of two."""
+_LINE_STD = 6.0
+"""Excess from which an ordinate is a line (hum), standard deviations of the ordinates."""
+_FIT_ROUNDS = 2
+"""Number of fits: the second one leaves out the lines that the first one shows."""
+_MIN_VARIANCE_V2 = 1e-18
+"""Lower bound of the start value of the noise variance, V²."""
+_MIN_LSB_V = 1e-9
+"""Lower bound of the ADC's step, V, for samples without rounding."""
+_LOG_STEP = 1e-4
+"""Step of the central differences, in the logarithm of a parameter."""
+_MAX_LOG = 80.0
+"""Largest magnitude of a parameter's logarithm, so that its exponential stays finite."""
+_MIN_EXPECTED_V2 = 1e-300
+"""Lower bound of an expected ordinate, V², so that its logarithm is finite."""
+_MAX_CONDITION = 1e12
+"""Largest condition number of the information matrix that can be inverted."""
+_MAX_RATIO_STD = 0.1
+"""Largest relative standard deviation of a credible estimate. Chosen: well below the ±25 % of the
+datasheet."""
+_MAX_SCATTER = 2.0
+"""Largest scatter of the ordinates, relative to that of filtered white noise. Chosen: flicker and
+hum exceed it."""
+
+
+@dataclass(frozen=True)
+class FilterNoise:
+    """Estimate of the filter of one axis."""
+
+    rc_s: float  # Time constant, s
+    ratio_std: float  # Relative standard deviation of the time constant
+    # Mean square of the ordinates' deviations, relative to that of filtered white noise
+    scatter: float
+
+    @property
+    def credible(self) -> bool:
+        """Return whether the noise fits filtered white noise and determines the filter."""
+        return self.scatter < _MAX_SCATTER and self.ratio_std < _MAX_RATIO_STD
+
+
+def estimate_filter(rests: Iterable[np.ndarray], rate_hz: float, rc_s: float, lsb_v: float
+                    ) -> FilterNoise | None:
+    """
+    Estimate the time constant of one axis.
+
+    rests: volts of each rest without gaps, (n,) each.
+    """
+    # scipy.signal takes 0.3 s to import, which a calibration needs only at its end.
+    from scipy.signal.windows import hann
+    size = max(_MIN_SEGMENT_SAMPLES, round(_SEGMENT_S * rate_hz))
+    window = hann(size, sym=False)
+    window /= np.sqrt(np.sum(window ** 2))
+    power, count = _mean_periodogram(rests, window)
+    if count < 2 or not rc_s or not np.any(power):
+        return None
+    weight = _INDEPENDENT_SEGMENTS * count
+    lags = np.correlate(window, window, 'full')[size - 1:]
+    used = np.arange(len(power)) > _LOWEST_BINS
+    start = np.log([max(float(np.mean(power[used])) / size, lsb_v ** 2, _MIN_VARIANCE_V2),
+                    rc_s * rate_hz, max(lsb_v, _MIN_LSB_V) ** 2 / 12])
+    log_adc_variance = float(start[2])
+
+    def cost(x: np.ndarray) -> float:
+        """Return the negative log posterior for the parameters of `_expected`."""
+        expected = np.maximum(_expected(x, lags)[used], _MIN_EXPECTED_V2)
+        prior = ((x[2] - log_adc_variance) / _ADC_NOISE_PRIOR_STD) ** 2
+        return float(np.sum(power[used] / expected + np.log(expected)) + prior / (2 * weight))
+
+    for _ in range(_FIT_ROUNDS):
+        fit = scipy.optimize.minimize(cost, start, method='Nelder-Mead',
+                                      options={'xatol': 1e-5, 'fatol': 1e-6, 'maxiter': 2000})
+        deviation = power / _expected(fit.x, lags) - 1
+        used &= deviation < _LINE_STD / np.sqrt(weight)
+        if used.sum() < _MIN_SEGMENT_SAMPLES // 2:
+            return None
+        start = fit.x
+    scatter = float(np.mean(deviation[used] ** 2) * weight)
+    information = _information(fit.x, used, lags) * weight / _CORRELATED_ORDINATES
+    information += np.diag([0.0, 0.0, _ADC_NOISE_PRIOR_STD ** -2])
+    # White noise does not show a filter.
+    if np.linalg.cond(information) > _MAX_CONDITION:
+        return None
+    ratio_std = float(np.sqrt(np.linalg.inv(information)[1, 1] * max(scatter, 1.0)))
+    return FilterNoise(float(np.exp(fit.x[1]) / rate_hz), ratio_std, scatter)
+
+
+def _mean_periodogram(rests: Iterable[np.ndarray], window: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return the mean periodogram of all segments, V², and their number."""
+    size = len(window)
+    total, count = np.zeros(size // 2 + 1), 0
+    for volts in rests:
+        for begin in range(0, len(volts) - size + 1, size // 2):
+            part = volts[begin:begin + size]
+            total += np.abs(np.fft.rfft(window * (part - part.mean()))) ** 2
+            count += 1
+    return total / max(count, 1), count
+
+
+def _expected(x: np.ndarray, lags: np.ndarray) -> np.ndarray:
+    """Return the expected periodogram, V², for the logarithms of σ², RC/dt and the ADC's σ²."""
+    variance_v2, rc_samples, adc_variance_v2 = np.exp(np.clip(x, -_MAX_LOG, _MAX_LOG))
+    covariance = variance_v2 * np.exp(-np.arange(len(lags)) / rc_samples)
+    covariance[0] += adc_variance_v2
+    terms = covariance * lags
+    return 2 * np.fft.rfft(terms).real - terms[0]
+
+
+def _information(x: np.ndarray, used: np.ndarray, lags: np.ndarray) -> np.ndarray:
+    """Return the expected information of one periodogram, (3, 3): Σ ∂log S·∂log Sᵀ."""
+    slopes = np.array([(np.log(_expected(x + _LOG_STEP * unit, lags)[used])
+                        - np.log(_expected(x - _LOG_STEP * unit, lags)[used])) / (2 * _LOG_STEP)
+                       for unit in np.eye(3)])
+    return slopes @ slopes.T
+
+
+def with_filter(fitted: Sensor, estimates: Sequence[Sequence[FilterNoise | None]]
+                ) -> tuple[Sensor, list[str]]:
+    """Add the effect `bandwidth` with its variance to a fitted unit."""
+    if not fitted.rc_s or not estimates:
+        return fitted, []
+    ratios, variances = [], []
+    for axis, axis_estimates in zip(fitted.axes, zip(*estimates)):
+        credible = [estimate for estimate in axis_estimates
+                    if estimate is not None and estimate.credible]
+        if not credible:
+            return fitted, [f'{axis}: the noise at rest does not fit white noise behind the '
+                            'stated filter; the fit keeps the stated resistor']
+        weights = np.array([estimate.ratio_std ** -2 for estimate in credible])
+        rc_s = np.average([estimate.rc_s for estimate in credible], weights=weights)
+        ratios.append(rc_s / fitted.rc_s - 1)
+        variances.append((rc_s / fitted.rc_s) ** 2 / weights.sum())
+    names = names_of(effect_named('bandwidth'), fitted.axes)
+    unit = put(with_neutral(fitted, ['bandwidth']), names, ratios)
+    return replace(unit, covariance=scipy.linalg.block_diag(fitted.covariance, np.diag(variances)),
+                   covariance_names=(*fitted.covariance_names, *names)), []
+
+
+CERTAIN_CORRELATION = 0.9
+"""Correlation with the reference from which an axis is identified. Chosen: noise, misalignment and
+cross-axis terms of real sensors lower the correlation by a few percent only."""
+
+
+@dataclass(frozen=True)
+class PolarityFault:
+    """An axis that does not follow its reference."""
+
+    axis: int  # Index of the measured axis
+    # Index of the reference axis that it follows: its own reference if it is inverted
+    follows: int
+    correlation: float  # Correlation with that reference, −1 to 1
+
+    def describe(self, axis: str, reference: str) -> str:
+        """Return the fault and its remedy as one line."""
+        if axis == reference:
+            return (f'{axis} reads against its reference (correlation {self.correlation:.2f}): '
+                    'the axis is inverted; correct its sign or the mounting')
+        sign = 'against' if self.correlation < 0 else 'with'
+        return (f'{axis} moves {sign} the reference of {reference} (correlation '
+                f'{self.correlation:.2f}): axes are swapped; correct the wiring or the mounting')
+
+
+def find_polarity_fault(correlation: np.ndarray, references: list[int],
+                        swap_limit: float) -> PolarityFault | None:
+    """
+    Find the first axis that is inverted or follows the reference of another axis.
+
+    correlation: correlation of m measured axes with r reference axes, (m, r). NaN where an axis is
+    constant.; references: index of the reference of each measured axis, (m,). An axis whose own
+    correlation is NaN is skipped.
+    """
+    for axis, (row, reference) in enumerate(zip(correlation, references)):
+        if not np.isfinite(row[reference]):
+            continue
+        if row[reference] < -CERTAIN_CORRELATION:
+            return PolarityFault(axis, reference, float(row[reference]))
+        other = int(np.nanargmax(np.abs(row)))
+        if other != reference and abs(row[other]) > CERTAIN_CORRELATION \
+                and abs(row[reference]) < swap_limit:
+            return PolarityFault(axis, other, float(row[other]))
+    return None

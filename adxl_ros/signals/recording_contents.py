@@ -17,8 +17,8 @@ from adxl_ros.files.recording_columns import (
 )
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
+from adxl_ros.signals.block_statistics import true_runs
 from adxl_ros.signals.rest_detection import RecordedRests
-from adxl_ros.signals.runs import true_runs
 import numpy as np
 
 _SCATTER_QUANTILE = 0.9

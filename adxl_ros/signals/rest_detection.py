@@ -23,7 +23,7 @@ from adxl_ros.files.recording_columns import JOINTS, Recording
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.noise import effective_samples
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.block_statistics import angle_bounds, BlockCutter, Blocks
+from adxl_ros.signals.block_statistics import angle_bounds, BlockCutter, Blocks, true_runs
 from adxl_ros.signals.noise_limits import (
     adc_step,
     batch_scatter,
@@ -42,7 +42,6 @@ from adxl_ros.signals.noise_limits import (
     undithered,
     window_variance,
 )
-from adxl_ros.signals.runs import true_runs
 import numpy as np
 
 SAME_ANGLE_RAD = 1e-5

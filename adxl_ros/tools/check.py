@@ -12,8 +12,7 @@ import textwrap
 from typing import Any
 
 from adxl_ros.calibrate.value_text import duration
-from adxl_ros.check.findings import Findings
-from adxl_ros.check.recording_check import check_recording
+from adxl_ros.check.findings import check_recording, Findings
 from adxl_ros.diagnose.data_checks import DataFault
 from adxl_ros.diagnose.diagnosis import what_shows
 from adxl_ros.diagnose.report import shows_row

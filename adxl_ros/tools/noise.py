@@ -21,19 +21,18 @@ from adxl_ros.files.recording_columns import Recording, unit_of
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.signals.allan_deviation import longest_rest, StillStretch
 from adxl_ros.signals.axis_noise import (
     AxisNoise,
     density_g_per_rthz,
     recording_noise,
     RecordingNoise,
+    settings,
     TERMS,
     with_noise,
 )
-from adxl_ros.signals.noise_drift import Drift, DriftKind
-from adxl_ros.signals.noise_names import settings
-from adxl_ros.signals.noise_parameters import Estimate
+from adxl_ros.signals.noise_parameters import Drift, DriftKind, Estimate
 from adxl_ros.signals.recorded_sensor import load_sensor
-from adxl_ros.signals.still_stretch import longest_rest, StillStretch
 from adxl_ros.tools.command_line import (
     add_recording_options,
     argument_parser,

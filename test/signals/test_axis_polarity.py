@@ -2,7 +2,7 @@
 
 """Inverted and swapped axes, and runs of a mask."""
 
-from adxl_ros.signals.axis_polarity import find_polarity_fault, PolarityFault
+from adxl_ros.signals.recorded_sensor import find_polarity_fault, PolarityFault
 import numpy as np
 import pytest
 

@@ -2,9 +2,10 @@
 
 """White noise, bias instability and random walk of simulated signals, and their intervals."""
 
-from adxl_ros.signals.noise_drift import DriftKind, find_drift
 from adxl_ros.signals.noise_parameters import (
     coefficient_variances,
+    DriftKind,
+    find_drift,
     fit_noise,
 )
 import numpy as np

@@ -27,7 +27,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import unit_of
 from adxl_ros.files.stream_info import StreamInfo
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals import measured_values
+from adxl_ros.signals import recorded_sensor
 import numpy as np
 
 IDLE_TEXT = 'idle; call ~/start'
@@ -417,10 +417,10 @@ class Controller:
     def _measure_unit(self) -> None:
         """Measure the sensor of a stream that states nothing of itself."""
         stamps_ns, accel_mps2 = self._samples.waiting()
-        if not len(stamps_ns) or np.ptp(stamps_ns) < measured_values.SHORTEST_S * 1e9:
+        if not len(stamps_ns) or np.ptp(stamps_ns) < recorded_sensor.SHORTEST_S * 1e9:
             return
         try:
-            unit, lines = measured_values.unit_of_stream(self._anonymous, stamps_ns, accel_mps2)
+            unit, lines = recorded_sensor.unit_of_stream(self._anonymous, stamps_ns, accel_mps2)
         except UserError as error:
             self._log_unless_repeated(Severity.WARNING, f'imu/data_raw: {error}')
             return
