@@ -28,8 +28,8 @@ import yaml
 TASKS = ('check', 'noise', 'fit', 'diagnose')
 """All tasks, in the order in which they run."""
 
-_NOT_OF_TASKS = ('jobs', 'links', 'nodes', 'tools')
-"""Folders of the package whose code changes no row."""
+_NOT_OF_TASKS = ('links', 'nodes', 'tools', 'workers.py')
+"""Folders and files of the package whose code changes no row."""
 _CODE_OF_TASKS = ('recipe', 'row', 'staging', 'task')
 """Files of this folder whose code changes a row."""
 _CACHED_CALIBRATIONS = 8192

@@ -1,112 +1,154 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The diagnosis of an investigation in a process of its own, so that no sample is lost meanwhile.
+The files of an investigation, and its diagnosis in a process of its own.
 
-The process reads the bag as far as it is written, and writes its answer and the files of the
-diagnosis into the folder of the investigation. It ends when its parent does.
+No sample is lost meanwhile. The process reads the bag as far as it is written, and writes its
+answer and the files of the diagnosis into the folder of the investigation. It ends when its parent
+does.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from concurrent.futures import Future
+from dataclasses import dataclass
+from itertools import chain, count
 import json
 import os
 from pathlib import Path
-import subprocess
-import sys
-import tempfile
-import threading
-from typing import IO
+import shlex
+import shutil
 
+from adxl_ros.diagnose import page
+from adxl_ros.diagnose.diagnosis import Diagnosis
+from adxl_ros.diagnose.report import as_json, screen_lines
 from adxl_ros.errors import one_line, UserError
-from adxl_ros.files import parameter_file, recording
+from adxl_ros.files import parameter_file, recording as recording_files
+from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files.recording_columns import Recording
 from adxl_ros.investigate.diagnosis_round import Answer, Outcome, Question, run_round
-from adxl_ros.investigate.manoeuvres import Pose, StageLimits
-from adxl_ros.investigate.output_folder import OutputFolder, write_diagnosis
+from adxl_ros.investigate.manoeuvres import StageLimits
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.workers import Processes
 
 _NICENESS = 10
 """Niceness of the process. Chosen: the node that records comes first."""
+_WITHOUT_DIAGNOSIS = {'bag', 'baseline.yaml', 'answer.json'}
+"""Files of an investigation that was stopped before its first diagnosis of samples."""
+
+
+@dataclass(frozen=True)
+class OutputFolder:
+    """The folder of an investigation."""
+
+    path: Path  # The folder
+
+    @property
+    def bag(self) -> Path:
+        """Return the recording, a rosbag2 directory."""
+        return self.path / 'bag'
+
+    @property
+    def baseline(self) -> Path:
+        """Return the parameter file that the recording is compared with."""
+        return self.path / 'baseline.yaml'
+
+    @property
+    def parameters(self) -> Path:
+        """Return the parameter file with the effects that were found."""
+        return self.path / 'params.yaml'
+
+    @property
+    def report(self) -> Path:
+        """Return the page of the diagnosis."""
+        return self.path / 'report.html'
+
+    @property
+    def answer(self) -> Path:
+        """Return the newest answer, JSON."""
+        return self.path / 'answer.json'
+
+    @staticmethod
+    def free(path: Path) -> OutputFolder:
+        """Return the first of `path`, `path_2`, ... that has nothing, or no diagnosis yet."""
+        candidates = chain([path], (path.with_name(f'{path.name}_{n}') for n in count(2)))
+        return next(OutputFolder(p) for p in candidates if not p.exists() or (
+            p.is_dir() and {child.name for child in p.iterdir()} <= _WITHOUT_DIAGNOSIS))
+
+    def make(self, sensor: Sensor) -> None:
+        """Make the folder, and write the baseline; an investigation without diagnosis goes."""
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            if self.bag.exists():
+                shutil.rmtree(self.bag)
+        except OSError as error:
+            raise UserError(f'{self.path}: cannot make the folder: {error.strerror}; set output '
+                            'to another one') from None
+        parameter_file.save(self.baseline, sensor)
+
+
+def _write_diagnosis(folder: OutputFolder, diagnosis: Diagnosis, recording: Recording,
+                     with_page: bool) -> None:
+    """Write report and parameters of a diagnosis."""
+    subject = (f'{folder.bag.name} ({recording.time_s[-1] - recording.time_s[0]:.0f} s, '
+               f'{recording.rate_hz:.4g} Hz, {" ".join(recording.axes)})  minus  simulation of '
+               f'{folder.baseline.name}')
+    write_text(folder.path / 'report.json', json.dumps(
+        as_json(diagnosis), indent=1, allow_nan=False) + '\n')
+    parameters = ''
+    if diagnosis.report is not None:
+        lines = screen_lines(diagnosis, subject)
+        parameters = parameter_file.as_text(diagnosis.report.sensor, lines)
+        write_text(folder.parameters, parameters)
+    if with_page:
+        steps = [('simulate with these parameters', 'ros2 run adxl_ros simulate rich --params '
+                  f'{folder.parameters} -o sim.csv')] if parameters else []
+        write_text(folder.report, page.page(diagnosis, page.Run(
+            subject, folder.baseline.name, steps, parameters, shlex.join(
+                ['ros2', 'run', 'adxl_ros', 'diagnose', str(folder.bag), '--params',
+                 str(folder.baseline), '-o', f'{folder.path}_again']))))
 
 
 class BackgroundDiagnoser:
-    """Diagnoses in a process of its own."""
+    """Diagnoses the bag of a folder in a process of its own."""
 
     def __init__(self, folder: OutputFolder, limits: StageLimits, seed: int) -> None:
-        """Diagnose the bag of a folder."""
         self._folder, self._limits, self._seed = folder, limits, seed
-        self._process: subprocess.Popen | None = None
-        self._errors: IO[bytes] | None = None
+        self._pool: Processes | None = None
+        self._answer: Future | None = None
 
     def ask(self, question: Question) -> None:
         """Start the process."""
         self._folder.answer.unlink(missing_ok=True)
-        task = {'folder': str(self._folder.path), 'question': asdict(question),
-                'limits': asdict(self._limits), 'seed': self._seed}
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 (the process writes into it)
-        # A session of its own: Ctrl-C in the terminal is for the node alone.
-        self._process = subprocess.Popen(
-            [sys.executable, '-m', __name__, json.dumps(task)], stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL, stderr=self._errors, start_new_session=True)
+        self._pool = Processes(1)
+        self._answer = self._pool.submit(_diagnose, self._folder, question, self._limits,
+                                         self._seed)
+        self._pool.shutdown(wait=False)
 
     def answer(self) -> Answer | None:
         """Return the answer, or None while the process runs."""
-        process = self._process
-        if process is None or process.poll() is None:
+        if self._answer is None or not self._answer.done():
             return None
-        last_error = self._close()
-        if process.returncode:
-            raise UserError(f'the diagnosis failed: {last_error}')
-        return Answer.from_json(json.loads(self._folder.answer.read_text(encoding='utf-8')))
+        ended, self._answer = self._answer, None
+        try:
+            return ended.result()
+        except Exception as error:
+            raise UserError(f'the diagnosis failed: {one_line(error)}') from error
 
     def cancel(self) -> None:
-        """Kill the process."""
-        if self._process is not None:
-            self._process.kill()
-            self._process.wait()
-            self._close()
-
-    def _close(self) -> str:
-        """Close the pipes of the process, and return the last line of its errors."""
-        assert self._process is not None and self._process.stdin and self._errors is not None
-        self._process.stdin.close()
-        self._errors.seek(0)
-        lines = self._errors.read().decode(errors='replace').strip().splitlines()
-        self._errors.close()
-        self._process = None
-        return lines[-1] if lines else 'no message'
+        """End the process."""
+        if self._pool is not None and self._answer is not None:
+            self._pool.kill()
 
 
-def _end_with_parent() -> None:
-    """End the process when its parent does, whose end of the pipe is then closed."""
-    # A buffered read would hold a lock that the end of the process needs.
-    while os.read(0, 1):
-        pass
-    os._exit(1)
-
-
-def main() -> int:
-    """Answer one question; the task is the argument."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+def _diagnose(folder: OutputFolder, question: Question, limits: StageLimits, seed: int) -> Answer:
+    """Answer one question, and write the answer and the files of its diagnosis."""
     os.nice(_NICENESS)
-    task = json.loads(sys.argv[1])
-    folder = OutputFolder(Path(task['folder']))
-    question = Question(**{**task['question'], 'pose': Pose(*task['question']['pose'])})
-    limits = StageLimits(**{**task['limits'], 'alpha_rad': tuple(task['limits']['alpha_rad']),
-                            'beta_rad': tuple(task['limits']['beta_rad'])})
-    try:
-        sensor = parameter_file.load(folder.baseline)
-        recordings = [recording.read(folder.bag)] if question.has_samples else []
-        answer, diagnosis = run_round(question, recordings, sensor, limits, task['seed'])
-        if diagnosis is not None:
-            write_diagnosis(folder, diagnosis, recordings[0],
-                            with_page=answer.outcome is not Outcome.GO_ON)
-        folder.write_answer(answer)
-    except UserError as error:
-        print(one_line(error), file=sys.stderr)
-        return 1
-    return 0
-
-
-if __name__ == '__main__':
-    sys.exit(main())
+    sensor = parameter_file.load(folder.baseline)
+    recordings = [recording_files.read(folder.bag)] if question.has_samples else []
+    answer, diagnosis = run_round(question, recordings, sensor, limits, seed)
+    if diagnosis is not None:
+        _write_diagnosis(folder, diagnosis, recordings[0],
+                         with_page=answer.outcome is not Outcome.GO_ON)
+    write_text(folder.answer, json.dumps(answer.as_json(), indent=1, allow_nan=False) + '\n')
+    return answer

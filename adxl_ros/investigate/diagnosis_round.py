@@ -82,14 +82,6 @@ class Answer:
         return {**vars(self), 'outcome': self.outcome.value,
                 'hypotheses': [[list(h.effects), h.probability] for h in self.hypotheses]}
 
-    @staticmethod
-    def from_json(values: dict[str, Any]) -> Answer:
-        """Return the answer of values of JSON."""
-        return Answer(**{**values, 'outcome': Outcome(values['outcome']),
-                         'hidden': tuple(values['hidden']),
-                         'hypotheses': tuple(WeightedHypothesis(tuple(effects), probability)
-                                             for effects, probability in values['hypotheses'])})
-
 
 @dataclass(frozen=True)
 class Assessment:

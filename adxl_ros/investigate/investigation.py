@@ -19,9 +19,8 @@ from enum import Enum
 from typing import Protocol
 
 from adxl_ros.errors import UserError
-from adxl_ros.investigate.command_stream import CommandStream
 from adxl_ros.investigate.diagnosis_round import Answer, Outcome, Question
-from adxl_ros.investigate.manoeuvres import description, plan, Pose, StageLimits
+from adxl_ros.investigate.manoeuvres import CommandStream, description, plan, Pose, StageLimits
 import numpy as np
 
 _FIRST_REST_S = 1.0

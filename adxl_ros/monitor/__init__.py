@@ -1,3 +1,3 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Where samples come from: one file a link."""
+"""The gap of a running sensor against its prediction, and changes of it; free of ROS."""

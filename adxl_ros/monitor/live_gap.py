@@ -14,11 +14,11 @@ from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.monitor.block_residuals import Block, Prediction
 from adxl_ros.monitor.change_test import ChangeSettings, ChangeTest
-from adxl_ros.monitor.diagnosis_run import DiagnosisInput
 from adxl_ros.monitor.reference_stream import (
     AFTER_NS,
+    Block,
+    Prediction,
     ReferenceKind,
     ReferenceStream,
     StreamBuffer,
@@ -115,6 +115,16 @@ class GapSettings:
     false_alarms_per_day: float = 1 / 30  # Largest rate of changes that are none
     history_s: float = 600.0  # Time that is kept for a diagnosis, s
     wait_s: float = 120.0  # Time after a change of an axis in which further ones belong to it, s
+
+
+@dataclass(frozen=True)
+class DiagnosisInput:
+    """What a diagnosis compares."""
+
+    recording: Recording  # Samples, with the references of a stage
+    sensor: Sensor  # The baseline
+    # Times, s, (k,), and force of a simulator, m/s², (k, 3); None with a stage
+    force: tuple[np.ndarray, np.ndarray] | None = None
 
 
 @dataclass(frozen=True)

@@ -15,15 +15,14 @@ from adxl_ros.files import cdr
 from adxl_ros.files.recording_columns import check_unit, unit_of
 from adxl_ros.files.stream_info import NO_UNIT, StreamInfo
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.monitor import change_record
-from adxl_ros.monitor.change_record import iso_time
-from adxl_ros.monitor.diagnosis_run import DiagnosisResult, DiagnosisRun
+from adxl_ros.monitor import records
 from adxl_ros.monitor.live_gap import AxisGap, GapChange, GapSettings, LiveGap
+from adxl_ros.monitor.records import DiagnosisResult, DiagnosisRun, iso_time
 from adxl_ros.monitor.reference_stream import ReferenceKind
 from adxl_ros.nodes.node_help import NodeHelp
 from adxl_ros.nodes.parameters import declare_all
 from adxl_ros.nodes.rclpy_internals import NotForExecutors, take_request
-from adxl_ros.nodes.run_node import executable, run
+from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.samples_in import decoded, imu_samples, joint_readings
 from adxl_ros.nodes.sensor_parameters import declare_sensor, make_sensor
 from adxl_ros.nodes.settings import check_given_parameters, MonitorSettings
@@ -301,10 +300,10 @@ class Monitor(Node):
         changes = live.advance()
         for change in changes:
             self.get_logger().warning(
-                f'changed since {change_record.iso_time(change.since_ns)}: {change.text()}')
+                f'changed since {records.iso_time(change.since_ns)}: {change.text()}')
             try:
                 self._output.mkdir(parents=True, exist_ok=True)
-                change_record.append(self._output, change, live.sensor.serial)
+                records.append(self._output, change, live.sensor.serial)
             except (UserError, OSError) as error:
                 self.get_logger().error(f'{self._output}: the change is not on disk: {error}')
         if changes:
@@ -327,7 +326,7 @@ class Monitor(Node):
         """Begin a diagnosis of the samples since a stamp, ns."""
         name = datetime.now(UTC).strftime('diagnosis_%Y%m%dT%H%M%S_%fZ')
         self._run = DiagnosisRun(self._output / name, live.diagnosis_input(begin_ns),
-                                 [executable('diagnose')], self._own.budget_s)
+                                 'adxl_ros.tools.diagnose', self._own.budget_s)
 
     def _serve(self) -> None:
         """Take requests of ~/diagnose, and answer them when the diagnosis ends."""

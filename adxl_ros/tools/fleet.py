@@ -16,13 +16,10 @@ from adxl_ros.errors import install_hint, UserError
 from adxl_ros.files import calibration_store
 from adxl_ros.files.plain_address import as_utf_8, without_secrets
 from adxl_ros.files.stream_info import NO_UNIT
-from adxl_ros.fleet.inputs import find_sources, stated_by
-from adxl_ros.fleet.recipe import make_recipe, task_names, TASKS
-from adxl_ros.fleet.results import Results
+from adxl_ros.fleet.inputs import find_sources, Source, stated_by
+from adxl_ros.fleet.recipe import make_recipe, Recipe, task_names, TASKS
 from adxl_ros.fleet.row import reason_kind, Row
-from adxl_ros.fleet.run import Plan, plan, Selection, since_text, work
-from adxl_ros.jobs.pools import open_pool
-from adxl_ros.jobs.run import RETRIES
+from adxl_ros.fleet.run import only_client, Plan, plan, Results, Selection, since_text, work
 from adxl_ros.tools.command_line import (
     add_recording_options,
     argument_parser,
@@ -30,7 +27,8 @@ from adxl_ros.tools.command_line import (
     reading_options,
     reading_text,
 )
-from adxl_ros.tools.output import make_folder, note, print_end, progress, run, wrapped
+from adxl_ros.tools.output import note, print_end, progress, run, wrapped
+from adxl_ros.workers import open_pool, RETRIES
 
 PROG = 'fleet'
 """Name of the command, for messages."""
@@ -96,13 +94,28 @@ def fleet(options: argparse.Namespace) -> int:
     recipe = make_recipe(tasks, options.params, (source.params for source in sources),
                          options.store, reading_options(options))
     folder = Path(options.output)
-    results = Results(folder)
-    to_do = plan(sources, recipe, results, selection)
-    _warn_of_replaced(to_do, results, tasks)
     if options.dry_run:
+        to_do = _planned(sources, recipe, Results(folder), selection)
         print_end(_plan_lines(to_do, len(sources)), [], _command(options, options.only_failed))
         return 0
-    make_folder(folder)
+    with only_client(folder):
+        return _worked(options, sources, recipe, selection, begin_s)
+
+
+def _planned(sources: Sequence[Source], recipe: Recipe, results: Results, selection: Selection
+             ) -> Plan:
+    """Plan a run; warn of what is replaced."""
+    to_do = plan(sources, recipe, results, selection)
+    _warn_of_replaced(to_do, results, recipe.tasks)
+    return to_do
+
+
+def _worked(options: argparse.Namespace, sources: Sequence[Source], recipe: Recipe,
+            selection: Selection, begin_s: float) -> int:
+    """Work on all that there is to do, and write table and page."""
+    folder = Path(options.output)
+    results = Results(folder)
+    to_do = _planned(sources, recipe, results, selection)
     rows: list[Row] = []
     reason = ''
     try:

@@ -14,8 +14,7 @@ import secrets
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.jobs.run import for_each
-from adxl_ros.jobs.whole_files import make_folder, write
+from adxl_ros.workers import for_each, make_folder, write
 from adxl_ros_validation.blind import diagnosis_runs, grading, scores, trials
 from adxl_ros_validation.blind.grading import Answer
 from adxl_ros_validation.blind.scores import Trial

@@ -23,8 +23,7 @@ from typing import Any, NamedTuple
 
 import adxl_ros
 from adxl_ros.errors import UserError
-from adxl_ros.jobs.run import for_each
-from adxl_ros.jobs.whole_files import make_folder, write
+from adxl_ros.workers import for_each, make_folder, write
 from adxl_ros_validation.blind import trials
 from adxl_ros_validation.blind.trials import Label
 from adxl_ros_validation.blind.world import ideal_observer

@@ -18,8 +18,7 @@ import shutil
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
-from adxl_ros.jobs.run import for_each
-from adxl_ros.jobs.whole_files import make_folder, write
+from adxl_ros.workers import for_each, make_folder, write
 from adxl_ros_validation.blind.world import ideal_observer, motion, simulator
 from adxl_ros_validation.blind.world.fault_table import KINDS, KNOWN, UNLISTED
 from adxl_ros_validation.blind.world.simulator import Fault, G0, references, render, stamps

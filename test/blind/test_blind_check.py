@@ -8,7 +8,7 @@ import shutil
 import sys
 
 from adxl_ros.files.plot_file import pyplot
-from adxl_ros.jobs.pools import open_pool
+from adxl_ros.workers import open_pool
 from adxl_ros_validation.blind import (
     check,
     diagnosis_runs,

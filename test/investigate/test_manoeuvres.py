@@ -2,8 +2,14 @@
 
 """Manoeuvres and their commands keep the limits of the stage."""
 
-from adxl_ros.investigate.command_stream import CommandStream, LONGEST_STEP_S
-from adxl_ros.investigate.manoeuvres import CATALOGUE, plan, Pose, StageLimits
+from adxl_ros.investigate.manoeuvres import (
+    CATALOGUE,
+    CommandStream,
+    LONGEST_STEP_S,
+    plan,
+    Pose,
+    StageLimits,
+)
 from adxl_ros.simulate.simulated_stage import SimulatedStage
 from adxl_ros.simulate.trajectories import RUN_UP_S
 import numpy as np

@@ -16,6 +16,7 @@ import time
 import urllib.request
 
 from adxl_ros.files import calibration_store, parameter_file
+from adxl_ros.fleet.run import only_client
 from fleets import recording_text, row_files, table_of, without_timing, write_fleet
 from job_tasks import children, dask_cluster, free_port
 from processes import executable, run_executable
@@ -229,16 +230,17 @@ def test_kills_lose_and_repeat_nothing(tmp_path):
     assert without_timing(rows) == without_timing(table_of(tmp_path / 'calm'))
 
 
-def test_two_clients_share_a_folder(tmp_path):
-    write_fleet(tmp_path / 'day', 10, 6)
+def test_a_folder_has_one_client_at_a_time(run_tool, tmp_path):
+    write_fleet(tmp_path / 'day', 2, 2)
     words = ('day', '--do', 'check', '-o', 'out', '--jobs', 1)
-    clients = [start_fleet(tmp_path, *words) for _ in range(2)]
-    for client in clients:
-        _, error = client.communicate(timeout=_LONG_WAIT_S)
-        assert (client.returncode, error) == (0, '')
-    rows = table_of(tmp_path / 'out')
-    assert len(rows) == len(row_files(tmp_path / 'out')) == 60
-    assert {row['outcome'] for row in rows} == {'done'}
+    with only_client(tmp_path / 'out'):
+        second = run_tool('fleet', *words)
+    assert second.returncode == 1
+    assert second.stderr == (
+        f'fleet: out: process {os.getpid()} on {os.uname().nodename} works on it; '
+        'wait for its end, or name another folder\n')
+    assert run_tool('fleet', *words).returncode == 0
+    assert len(table_of(tmp_path / 'out')) == 4
 
 
 def test_a_cluster_makes_the_same_table(tmp_path):

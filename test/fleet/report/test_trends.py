@@ -1,8 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Slopes of units: least squares, the share of false claims, weak drifts, and recalibrations."""
 
-from adxl_ros.fleet.report.outliers import are_outliers, outlier_distances
-from adxl_ros.fleet.report.trends import claimed, fit_trends, interval_factor, Recordings
+from adxl_ros.fleet.report.trends import (
+    are_outliers,
+    claimed,
+    fit_trends,
+    interval_factor,
+    outlier_distances,
+    Recordings,
+)
 import numpy as np
 import pytest
 from scipy.stats import false_discovery_control, linregress

@@ -1,31 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Pools of workers: processes of this machine, or a Dask cluster.
+Many tasks in parallel: workers on this machine or a Dask cluster, retries, and what tasks write.
 
 A pool is an `Executor`. Its futures raise three further exceptions. `WorkerDied` is for a task
 that ran when its worker ended. `TaskLost` is for a task that only waited there, and `PoolLost`
 stands for all tasks. A future has the number of workers that ended while they ran its task.
+Nothing here knows what a task computes.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable, Iterator
-from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import CancelledError, Executor, Future
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import lru_cache, partial
 import logging
 from multiprocessing import get_context, parent_process
+from multiprocessing.connection import Connection
 import os
+from pathlib import Path
 import pickle
+from queue import Empty, SimpleQueue
 import signal
 import sys
-from threading import RLock, Thread
+from threading import Thread
 from time import monotonic, sleep
+import traceback
 from types import FrameType
-from typing import Any
+from typing import Any, NamedTuple
 from uuid import uuid4
 
 from adxl_ros.errors import install_hint, one_line, UserError
@@ -53,6 +58,20 @@ _TOPIC = 'adxl_ros-tasks'
 """Topic of a scheduler on which workers state that they begin or end a task."""
 _CLIENTS = 4
 """Clients whose shared values a worker of a cluster keeps. Chosen: some MB each."""
+_SLOTS = 32
+"""Tasks that are submitted at once to an executor that does not state it. Chosen: each holds its
+arguments in memory."""
+RETRIES = 2
+"""Further attempts of a task that fails, by default; chosen."""
+_WAIT_S = 1.0
+"""Time after which the number of slots is asked for again, s; chosen."""
+_BY_CHANCE = 0.01
+"""Expected number of tasks that are blamed for workers that others end; chosen."""
+_MOST_DEATHS = 8
+"""Deaths of workers that chance may explain. Chosen: a task that kills its workers comes to an end
+where many others do so, too."""
+_DIED = 'the worker ended while it ran the task'
+"""Message of a task whose worker ended."""
 
 
 class WorkerDied(Exception):
@@ -110,162 +129,139 @@ def open_pool(scheduler: str | None, jobs: int | None = None, shared: tuple = ()
 
 
 class Processes(Pool):
-    """
-    Processes of this machine, each an executor of its own.
-
-    A worker that ends breaks only its own executor. The task that it ran is known.
-    """
+    """Processes of this machine, each with a thread and a pipe of its own: no lock is shared."""
 
     def __init__(self, count: int, shared: tuple = ()) -> None:
         # A new process reads this before it loads numpy; each uses one core.
         os.environ['OPENBLAS_NUM_THREADS'] = '1'
         self.slots = _TASKS_PER_WORKER * count
-        self._workers = [_Worker(shared) for _ in range(count)]
+        self._todo: SimpleQueue[tuple[TaskFuture, tuple] | None] = SimpleQueue()
+        self._workers = [_Worker(shared, self._todo) for _ in range(count)]
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
-        """Give a task to the worker that has the fewest."""
-        return min(self._workers, key=lambda worker: worker.load).submit(partial(fn, **kwargs),
-                                                                         args)
+        """Give a task to the first worker that is free."""
+        future = TaskFuture()
+        self._todo.put((future, (partial(fn, **kwargs), args)))
+        return future
 
     def kill(self) -> None:
         """End all workers at once; they remove their temporary files."""
         for worker in self._workers:
-            worker.kill()
+            worker.is_open = False
+            worker.process.terminate()
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the workers after their tasks."""
-        for worker in self._workers:
-            worker.shutdown(wait, cancel_futures)
+        while cancel_futures and not self._todo.empty():
+            with suppress(Empty):
+                waiting = self._todo.get_nowait()
+                if waiting is not None:
+                    waiting[0].set_exception(TaskLost())
+        for _ in self._workers:
+            self._todo.put(None)
+        for worker in self._workers * wait:
+            worker.thread.join()
+
+
+class _Raised(NamedTuple):
+    """What a task raised, with its traceback, which an error loses on its way to the parent."""
+
+    error: Exception
+    text: str
 
 
 class _Worker:
     """One process at a time, which is started again when it ends."""
 
-    def __init__(self, shared: tuple) -> None:
+    def __init__(self, shared: tuple, todo: SimpleQueue) -> None:
         self._context = get_context('spawn')
-        self._shared = shared
-        self._lock = RLock()
-        self._number = 0
-        self._deaths_at_start = 0
-        self._is_open = True
-        self._process: Any = None
-        self._executor, self._running = self._start()
-        self._waiting: OrderedDict[int, TaskFuture] = OrderedDict()
+        self._shared, self._todo = shared, todo
+        self.is_open = True
+        self._start()
+        self.thread = Thread(target=self._serve, daemon=True)
+        self.thread.start()
 
-    @property
-    def load(self) -> int:
-        """Return the number of tasks that are not finished."""
-        return len(self._waiting)
+    def _start(self) -> None:
+        """Start a process; the only other end of its pipe is in it, so that its end shows."""
+        self._pipe, other = self._context.Pipe()
+        self.process = self._context.Process(target=_work, args=(other, self._shared))
+        self.process.start()
+        other.close()
+        if not self.is_open:
+            self.process.terminate()
 
-    def _start(self) -> tuple[ProcessPoolExecutor, Any]:
-        """Return an executor of one process, and the number of the task that it runs."""
-        # Without a lock, which a worker that is killed could hold for ever.
-        running = self._context.RawValue('Q', 0)
-        return ProcessPoolExecutor(1, self._context, _start_worker,
-                                   (running, self._shared)), running
-
-    def submit(self, work: Callable[..., Any], arguments: tuple) -> Future:
-        """Give a task to the process."""
-        outer = TaskFuture()
-        with self._lock:
-            self._number += 1
-            number = self._number
-            self._waiting[number] = outer
+    def _serve(self) -> None:
+        """Pass tasks to the process until there are no more."""
+        while (given := self._todo.get()) is not None:
+            future, task = given
             try:
-                inner = self._executor.submit(_call, number, work, arguments)
-            except BrokenProcessPool:
-                # The process ended without a task. All that wait are lost, this one, too.
-                self._restart(self._executor)
-                return outer
-            self._process = next(iter((self._executor._processes or {}).values()), self._process)
-            # With this end open, a result that its worker sent in part would be waited for.
-            results: Any = self._executor._result_queue
-            results._writer.close()
-            inner.add_done_callback(partial(self._take, number, self._executor))
-        return outer
-
-    def _take(self, number: int, executor: ProcessPoolExecutor, inner: Future) -> None:
-        """Pass on the result of a task."""
-        with self._lock:
-            if inner.cancelled():
-                outer = self._waiting.pop(number, None)
-                if outer is not None:
-                    outer.set_exception(TaskLost())
-                return
-            error = inner.exception()
-            if isinstance(error, BrokenProcessPool):
-                self._restart(executor)
-                return
-            self._deaths_at_start = 0
-            outer = self._waiting.pop(number, None)
-            if outer is None:
-                return
+                raised, value = self._run(future, task)
+                error: BaseException | None = raised
+                if isinstance(raised, _Raised):
+                    error = raised.error
+                    error.__cause__ = RuntimeError(raised.text)
+            except Exception as problem:
+                # The task, its result or its error cannot be sent.
+                error, value = problem, None
             if error is not None:
-                outer.set_exception(error)
+                future.set_exception(error)
             else:
-                outer.set_result(inner.result())
+                future.set_result(value)
+        self._pipe.close()
+        self.process.join()
 
-    def _restart(self, broken: ProcessPoolExecutor) -> None:
-        """Start another process in place of one that ended; blame the task that it ran."""
-        if broken is not self._executor:
-            return
-        guilty = self._running.value
-        lost, self._waiting = self._waiting, OrderedDict()
-        # One that is killed says nothing about the installation.
-        was_killed = self._process is not None and (self._process.exitcode or 0) < 0
-        if guilty in lost:
-            self._deaths_at_start = 0
-        elif not was_killed:
-            self._deaths_at_start += 1
-        broken.shutdown(wait=False)
-        if self._is_open:
-            self._executor, self._running = self._start()
-        for number, outer in lost.items():
-            outer.deaths = int(number == guilty)
-            if self._deaths_at_start >= _DEATHS_AT_START:
-                outer.set_exception(UserError(
-                    f'a worker ended {_DEATHS_AT_START} times before it ran a task; is the '
-                    'memory of this machine full?'))
-            else:
-                outer.set_exception(WorkerDied('the worker ended while it ran the task')
-                                    if outer.deaths else TaskLost())
-
-    def kill(self) -> None:
-        """End the process at once."""
-        with self._lock:
-            self._is_open = False
-            for process in list((self._executor._processes or {}).values()):
-                process.terminate()
-
-    def shutdown(self, wait: bool, cancel_futures: bool) -> None:
-        """End the process after its tasks."""
-        with self._lock:
-            self._is_open = False
-            executor = self._executor
-        executor.shutdown(wait, cancel_futures=cancel_futures)
+    def _run(self, future: TaskFuture, task: tuple) -> tuple[Any, Any]:
+        """Return error and result of a task; a process that ends before it begins is replaced."""
+        for _ in range(_DEATHS_AT_START):
+            has_begun = False
+            try:
+                self._pipe.send(task)
+                has_begun = self._pipe.recv()
+                return self._pipe.recv()
+            except (EOFError, OSError):
+                self._pipe.close()
+                self.process.join()
+                if self.is_open:
+                    self._start()
+            if has_begun:
+                future.deaths = 1
+                return WorkerDied(_DIED), None
+            if not self.is_open:
+                return TaskLost(), None
+        return UserError(f'a worker ended {_DEATHS_AT_START} times before it ran a task; is the '
+                         'memory of this machine full?'), None
 
 
-_worker: dict[str, Any] = {}
-"""In a worker process: the number of the last task, whether it runs, and what all tasks share."""
-
-
-def _start_worker(running: Any, shared: tuple) -> None:
+def _work(pipe: Connection, shared: tuple) -> None:
     """
-    Prepare a process for tasks.
+    Run tasks in a process until the pipe is closed.
 
     Ctrl-C is left to the parent. A terminated worker ends by an exception, so that it removes its
     files and its own processes. A worker ends with its parent, however that ended.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _terminated)
-    _worker.update(running=running, shared=shared, is_busy=False)
     Thread(target=_end_with_parent, daemon=True).start()
+    try:
+        while True:
+            work, arguments = pipe.recv()
+            pipe.send(True)
+            answer: tuple[_Raised | None, Any]
+            try:
+                answer = None, work(*shared, *arguments)
+            except Exception as error:
+                answer = _Raised(error, traceback.format_exc()), None
+            try:
+                pipe.send(answer)
+            except (pickle.PicklingError, TypeError, AttributeError) as error:
+                pipe.send((_Raised(error, ''), None))
+    except (SystemExit, EOFError, ConnectionError):
+        # Threads of a task do not keep the process.
+        os._exit(0)
 
 
 def _terminated(number: int, frame: FrameType | None) -> None:
-    """End the worker; a task that runs may tidy up first."""
-    if not _worker['is_busy']:
-        os._exit(128 + number)
+    """End the worker by an exception."""
     sys.exit(128 + number)
 
 
@@ -275,19 +271,6 @@ def _end_with_parent() -> None:
     if parent is not None:
         parent.join()
         os.kill(os.getpid(), signal.SIGTERM)
-
-
-def _call(number: int, work: Callable[..., Any], arguments: tuple) -> Any:
-    """Run a task in a worker, and note that it runs."""
-    _worker['running'].value = number
-    _worker['is_busy'] = True
-    try:
-        return work(*_worker['shared'], *arguments)
-    except SystemExit as end:
-        # The executor would pass this on as the error of a task, and the worker would live on.
-        os._exit(end.code if isinstance(end.code, int) else 1)
-    finally:
-        _worker['is_busy'] = False
 
 
 class Cluster(Pool):
@@ -375,7 +358,7 @@ class Cluster(Pool):
             return
         outer.deaths = self._running.pop(inner.key, 0)
         if isinstance(error, self._death):
-            error = WorkerDied('the worker ended while it ran the task') if outer.deaths else \
+            error = WorkerDied(_DIED) if outer.deaths else \
                 self._loss_at_start()
         elif isinstance(error, self._losses):
             error = PoolLost()
@@ -454,3 +437,170 @@ def _ask(question: Callable[..., Any], **words: Any) -> Any:
         return sync(get_worker().loop, question, callback_timeout=_FETCH_S, **words)
     except OSError:
         raise TaskLost from None
+
+
+class Finished(NamedTuple):
+    """The end of a task."""
+
+    arguments: tuple  # Its arguments
+    value: Any  # What it returned; None after an error
+    error: BaseException | None  # What the last attempt raised; None after a success
+    attempts: int  # Number of attempts
+
+
+class _Attempt(NamedTuple):
+    """A task that was submitted or waits; `deaths` is the number of its workers that ended."""
+
+    arguments: tuple
+    number: int = 1
+    deaths: int = 0
+
+
+@dataclass
+class _Deaths:
+    """Attempts of all tasks that ended, and those of them that ended with their worker."""
+
+    attempts: int = 0
+    deaths: int = 0
+
+    def explain(self, deaths: int) -> bool:
+        """
+        Return whether chance explains how often the workers of one task ended.
+
+        Workers end at random if they also end under other tasks. The share of such attempts gives
+        the number of tasks that meet so many deaths by chance.
+        """
+        if deaths > _MOST_DEATHS:
+            return False
+        share = (self.deaths - deaths) / max(self.attempts - deaths, 1)
+        return self.attempts * share ** deaths > _BY_CHANCE
+
+
+class _Queue:
+    """Tasks that wait: repeated ones first, those whose worker ended last."""
+
+    def __init__(self, tasks: Iterable[tuple]) -> None:
+        self._todo: Iterator[_Attempt] | None = (_Attempt(arguments) for arguments in tasks)
+        self.again: list[_Attempt] = []
+        self.suspects: deque[_Attempt] = deque()
+
+    def take(self) -> _Attempt | None:
+        """Return the next task; None where none waits."""
+        if self.again:
+            return self.again.pop()
+        attempt = next(self._todo, None) if self._todo is not None else None
+        if attempt is None:
+            self._todo = None
+            return self.suspects.popleft() if self.suspects else None
+        return attempt
+
+
+def finished_tasks(pool: Executor, work: Callable[..., Any], tasks: Iterable[tuple],
+                   retries: int = RETRIES) -> Generator[Finished, None, None]:
+    """
+    Run tasks in parallel; each gives one result, in the order in which they end.
+
+    A task that raises is repeated. A `UserError` is not: it would come again. A task whose worker
+    ends is repeated after all others, and more often where workers end at random. Tasks that are
+    lost through no fault of their own are submitted again, and that does not count.
+    """
+    queue, total = _Queue(tasks), _Deaths()
+    running: dict[Future, _Attempt] = {}
+    ended: SimpleQueue[Future] = SimpleQueue()
+    try:
+        while True:
+            slots = getattr(pool, 'slots', _SLOTS)
+            while len(running) < slots and (attempt := queue.take()) is not None:
+                future = pool.submit(work, *attempt.arguments)
+                running[future] = attempt
+                future.add_done_callback(ended.put)
+            if not running:
+                return
+            try:
+                future = ended.get(timeout=_WAIT_S)
+            except Empty:
+                continue
+            if future not in running:
+                continue
+            attempt, error = running.pop(future), _error(future)
+            if isinstance(error, TaskLost):
+                queue.again.append(attempt)
+                if isinstance(pool, Pool) and isinstance(error, PoolLost):
+                    pool.renew()
+                    queue.again += running.values()
+                    running.clear()
+                continue
+            attempt = _counted(attempt, getattr(future, 'deaths', 0), error, total)
+            if _is_last(attempt, error, retries, total):
+                yield Finished(attempt.arguments, None if error else future.result(), error,
+                               attempt.number)
+            elif isinstance(error, WorkerDied):
+                queue.suspects.append(attempt._replace(number=attempt.number + 1))
+            else:
+                queue.again.append(attempt._replace(number=attempt.number + 1))
+    finally:
+        for future in running:
+            future.cancel()
+
+
+def _counted(attempt: _Attempt, deaths: int, error: BaseException | None, total: _Deaths
+             ) -> _Attempt:
+    """Return an attempt that ended with the attempts that a cluster repeated unasked."""
+    attempts = max(deaths + (not isinstance(error, WorkerDied)), 1)
+    total.attempts += attempts
+    total.deaths += deaths
+    return attempt._replace(number=attempt.number + attempts - 1, deaths=attempt.deaths + deaths)
+
+
+def _is_last(attempt: _Attempt, error: BaseException | None, retries: int, total: _Deaths
+             ) -> bool:
+    """Return whether a task is not repeated."""
+    if error is None or isinstance(error, UserError):
+        return True
+    return attempt.number > retries and not (
+        isinstance(error, WorkerDied) and total.explain(attempt.deaths))
+
+
+def _error(future: Future) -> BaseException | None:
+    """Return what a task raised."""
+    try:
+        return future.exception()
+    except CancelledError:
+        return TaskLost()
+
+
+def for_each(pool: Executor, work: Callable[..., Any], jobs: Iterable[Callable[[], tuple]],
+             keep: Callable[..., None], show: Callable[[float], None], done: int = 0) -> None:
+    """Run jobs in parallel and keep each result as soon as it is there."""
+    todo = list(jobs)
+    total = done + len(todo)
+    results = finished_tasks(pool, work, (job() for job in todo))
+    try:
+        for end in results:
+            if end.error is not None:
+                raise end.error
+            keep(*end.value)
+            done += 1
+            show(done / total)
+    finally:
+        results.close()
+
+
+def write(path: Path, data: bytes) -> None:
+    """Write a file as a whole or not at all; several processes may write the same one at once."""
+    temporary = path.with_name(f'.{path.name}.{os.uname().nodename}.{os.getpid()}')
+    try:
+        temporary.write_bytes(data)
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise UserError(f'{path}: cannot be written: {error.strerror}') from None
+
+
+def make_folder(folder: Path) -> Path:
+    """Make a folder and return it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f'{folder}: cannot be made: {error.strerror}') from None
+    return folder

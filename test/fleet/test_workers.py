@@ -11,8 +11,7 @@ import sys
 from threading import Event, Thread
 import time
 
-from adxl_ros.jobs.pools import open_pool, WorkerDied
-from adxl_ros.jobs.run import finished_tasks
+from adxl_ros.workers import finished_tasks, open_pool, WorkerDied
 from job_tasks import children, deadly, half_sent, numbered, SUPPORT
 import pytest
 
@@ -79,9 +78,7 @@ def test_workers_end_with_their_parent_and_tidy_up(tmp_path, sent):
     program = f"""
 import sys
 sys.path.append({str(SUPPORT)!r})
-from adxl_ros.jobs import pools
-from adxl_ros.jobs.pools import open_pool
-from adxl_ros.jobs.run import finished_tasks
+from adxl_ros.workers import finished_tasks, open_pool
 from job_tasks import long_with_file
 if __name__ == '__main__':
     with open_pool(None, 2) as pool:

@@ -9,17 +9,32 @@ maximises the restricted likelihood (REML; Viechtbauer 2005), and its interval i
 Q-profile (Viechtbauer 2007). Few units hardly determine the spread. The errors of the mean and of
 a further unit therefore are those over all spreads by their restricted likelihood, with all
 spreads equally likely before (Gelman 2006).
+
+Variances that units share moderate each other: they have a scaled inverse χ² distribution over
+units, whose two parameters the units determine (Smyth 2004, section 6.2).
+
+Batches are units whose serial numbers begin alike, and whose coefficient is not that of the
+others. Levels are compared by Welch's t test, whose chance all batches share (Bonferroni). A
+difference that no one would notice is no bad batch, however certain it is.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from adxl_ros.model.constants import MAD_TO_STD
 from adxl_ros.model.population import PooledCoefficient
 import numpy as np
 import scipy
 
+_EQUAL_VARIANCES = 1e6
+"""Degrees of freedom of the common variance where units do not differ. Chosen: infinite."""
+_NO_FREEDOM = 1e-6
+"""Degrees of freedom of the common variance of one unit, which moderates none. Chosen: small."""
+_NEWTON_STEPS = 20
+"""Steps of Newton's method; it converges in fewer than ten."""
 MIN_UNITS = 5
 """Smallest count of units with a spread: with fewer, a further unit has no finite variance."""
 _GRID = (np.arange(400) + 0.5) / 400
@@ -33,6 +48,50 @@ _MAX_OUTLIERS = 0.25
 """Largest share of units that are far out. Chosen: more of them are a population of their own."""
 _FAR_MADS = 5.0
 """Units further from the median do not count in the first round. Chosen: far beyond normal."""
+MIN_GROUP = 5
+"""Fewest units of a group. Chosen: fewer have nothing in common that a test could show."""
+CHANCE = 0.01
+"""Probability of a false group among all groups. Chosen."""
+
+
+def moderated(variance: np.ndarray, freedom: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Moderate the variances of units.
+
+    variance: variances of the units, (m,). Those without a degree of freedom may be NaN.; freedom:
+    their degrees of freedom, (m,); 0 for none; returns: moderated variances and their degrees of
+    freedom, (m,) each. Without any variance all are 1.
+    """
+    determined = freedom > 0
+    common, common_freedom = _common_variance(variance[determined], freedom[determined])
+    squares = np.where(determined, freedom * np.nan_to_num(variance), 0.0)
+    total = common_freedom + freedom
+    # What all units share is no better known than from all of their recordings (limma).
+    largest = float(freedom[determined].sum())
+    return (common_freedom * common + squares) / total, np.minimum(total, largest or np.inf)
+
+
+def _common_variance(variance: np.ndarray, freedom: np.ndarray) -> tuple[float, float]:
+    """Return the scale of the inverse χ² distribution and its degrees of freedom."""
+    freedom, variance = freedom[variance > 0], variance[variance > 0]
+    if len(variance) < 2:
+        return (float(variance[0]), _NO_FREEDOM) if len(variance) else (1.0, _EQUAL_VARIANCES)
+    log_variance = np.log(variance) - scipy.special.digamma(freedom / 2) + np.log(freedom / 2)
+    mean = float(log_variance.mean())
+    excess = float(log_variance.var(ddof=1) - scipy.special.polygamma(1, freedom / 2).mean())
+    if excess <= 0:
+        return float(np.exp(mean)), _EQUAL_VARIANCES
+    half = _inverse_trigamma(excess)
+    return float(np.exp(mean + scipy.special.digamma(half) - np.log(half))), 2 * half
+
+
+def _inverse_trigamma(value: float) -> float:
+    """Solve trigamma(x) = value by Newton's method (Smyth 2004, appendix)."""
+    x = 0.5 + 1 / value
+    for _ in range(_NEWTON_STEPS):
+        trigamma = float(scipy.special.polygamma(1, x))
+        x += trigamma * (1 - trigamma / value) / float(scipy.special.polygamma(2, x))
+    return min(x, _EQUAL_VARIANCES / 2)
 
 
 @dataclass(frozen=True)
@@ -178,3 +237,40 @@ def _q_profile(y: np.ndarray, variance: np.ndarray) -> tuple[float, float]:
 
     return (solve(float(scipy.special.chdtri(freedom, 0.05))),
             solve(float(scipy.special.chdtri(freedom, 0.95))))
+
+
+class BadBatch(NamedTuple):
+    """Units with a serial number `prefix`…, and how far their mean is above that of the others."""
+
+    prefix: str
+    members: np.ndarray
+    difference: float
+    low: float
+    high: float
+
+
+def by_prefix(serials: Sequence[str]) -> dict[str, np.ndarray]:
+    """Return the units whose serial numbers begin alike, (m,) bool each, by this beginning."""
+    prefixes = {serial[:length] for serial in serials for length in range(1, len(serial))}
+    return {prefix: np.array([serial.startswith(prefix) for serial in serials])
+            for prefix in sorted(prefixes)}
+
+
+def bad_batch(serials: Sequence[str], level: np.ndarray, tolerance: float, tests: int
+              ) -> BadBatch | None:
+    """
+    Return the most certain batch whose level differs by more than a tolerance.
+
+    serials, level: serial number and level of each unit, (m,).
+    """
+    # The larger part of a fleet is what the others are compared with.
+    groups = {prefix: members for prefix, members in by_prefix(serials).items()
+              if MIN_GROUP <= members.sum() <= len(serials) / 2}
+    differing: list[tuple[float, BadBatch]] = []
+    for prefix, members in groups.items():
+        test = scipy.stats.ttest_ind(level[members], level[~members], equal_var=False)
+        difference = float(level[members].mean() - level[~members].mean())
+        if test.pvalue < CHANCE / (len(groups) * tests) and abs(difference) > tolerance:
+            differing.append((float(test.pvalue), BadBatch(
+                prefix, members, difference, *map(float, test.confidence_interval(0.9)))))
+    return min(differing, key=lambda item: item[0])[1] if differing else None
