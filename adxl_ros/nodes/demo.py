@@ -48,30 +48,29 @@ _SILENT_S = 60.0
 """Longest time without progress while poses are taken, s; chosen: a pose takes 1 s."""
 
 
-class Watcher(Node):
-    """Reads the diagnostics of the nodes that the demonstration runs, and calls ~/finish."""
+class DemoGraph:
+    """The nodes that the demonstration runs, each in a process of its own."""
 
-    def __init__(self) -> None:
-        super().__init__('demo')
+    def __init__(self, log: Path) -> None:
+        self._log = log
+        self._processes: dict[str, subprocess.Popen] = {}
         # Newest message and values, by the name of the diagnostic status
-        self.reports: dict[str, dict[str, str]] = {}
-        self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
-        self._finish = self.create_client(Trigger, 'calibration/finish')
+        self._reports: dict[str, dict[str, str]] = {}
+        self._node = Node('demo')
+        self._node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
+        self._finish = self._node.create_client(Trigger, 'calibration/finish')
         self._executor = SingleThreadedExecutor()
-        self._executor.add_node(self)
+        self._executor.add_node(self._node)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             values = {pair.key: pair.value for pair in status.values}
-            self.reports[status.name] = {'message': status.message, **values}
+            self._reports[status.name] = {'message': status.message, **values}
 
     def report_of(self, node: str) -> dict[str, str]:
         """Return the newest diagnostics of a node."""
-        return next((values for name, values in self.reports.items() if name.startswith(node)), {})
-
-    def watch(self, seconds: float) -> None:
-        """Listen for some time, s."""
-        self._executor.spin_once(timeout_sec=seconds)
+        return next((values for name, values in self._reports.items() if name.startswith(node)),
+                    {})
 
     def finish(self) -> str:
         """Let the calibration fit what it has; return its answer."""
@@ -81,15 +80,6 @@ class Watcher(Node):
         if answer is None:
             raise UserError(f'calibration/finish: no answer for {FIT_S:g} s')
         return answer.message
-
-
-class DemoGraph:
-    """The nodes that the demonstration runs, each in a process of its own."""
-
-    def __init__(self, log: Path) -> None:
-        self._log = log
-        self._processes: dict[str, subprocess.Popen] = {}
-        self.watcher = Watcher()  # Receives what they report
 
     def start(self, name: str, params_file: Path, *arguments: str) -> None:
         """Start a node."""
@@ -109,7 +99,7 @@ class DemoGraph:
         newest: object = None
         changed_s = time.monotonic()
         while not finished():
-            self.watcher.watch(_POLL_S)
+            self._executor.spin_once(timeout_sec=_POLL_S)
             message = self._check_nodes()
             news = (progress(), message)
             if news != newest:
@@ -120,7 +110,7 @@ class DemoGraph:
 
     def _check_nodes(self) -> str:
         """Return what the calibration reports; refuse a node that has ended or a failed fit."""
-        message = self.watcher.report_of('calibration').get('message', '')
+        message = self.report_of('calibration').get('message', '')
         ended = [name for name, process in self._processes.items() if process.poll() is not None]
         if ended:
             raise UserError(f'the node {ended[0]} has ended; see {self._log}')
@@ -138,7 +128,6 @@ def open_graph(log: Path) -> Iterator[DemoGraph]:
     try:
         yield graph
     finally:
-        graph.watcher.destroy_node()
         rclpy.try_shutdown()
         graph.close()
 
@@ -335,11 +324,11 @@ def _show_replay(graph: DemoGraph, output: Path, path: Path) -> Poses:
             return count
 
         def replayed() -> bool:
-            return graph.watcher.report_of('driver').get('link_state') == 'ended'
+            return graph.report_of('driver').get('link_state') == 'ended'
 
         graph.wait(replayed, show_rests)
     with steps.step('2/2 fit', f'{len(_accepted_poses(journal))} rests') as step:
-        answer = graph.watcher.finish()
+        answer = graph.finish()
         if not output.exists():
             raise UserError(f'{path}: {answer}')
         poses = Poses.from_records(_fitted_poses(journal))

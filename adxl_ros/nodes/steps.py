@@ -31,12 +31,12 @@ def step(name: str, text: str, total: int = 0) -> Iterator[Step]:
     A terminal shows one line with the time and, where the total is known, a bar. Elsewhere, and
     without rich, there is a line for each tenth of the total and one at the end.
     """
-    shown_step = (_InTerminal if drawable() else _AsLines)(name, text, total)
+    shown = Step(name, text, total)
     try:
-        yield shown_step
-        shown_step.end()
+        yield shown
+        shown.end()
     finally:
-        shown_step.close()
+        shown.close()
 
 
 def drawable() -> bool:
@@ -55,65 +55,51 @@ class Step:
 
     def __init__(self, name: str, text: str, total: int) -> None:
         self._name, self._text, self._total, self._done = name, text, total, 0
-
-    def show(self, text: str, done: int = 0) -> None:
-        """Show how far the step is."""
-        self._text, self._done = text, done
-
-    def end(self) -> None:
-        """Show that the step has succeeded."""
-
-    def close(self) -> None:
-        """Stop drawing, whether it has succeeded or not."""
-
-    def _line(self) -> str:
-        """Return name and text of the step, with spaces up to the bar or the time."""
-        width = _TEXT_WIDTH if self._total else _LINE_WIDTH - _NAME_WIDTH - 2
-        return f' {self._name:{_NAME_WIDTH}} {self._text:{width}}'
-
-
-class _AsLines(Step):
-    """Prints a line for each tenth, and one at the end."""
-
-    def __init__(self, name: str, text: str, total: int) -> None:
-        super().__init__(name, text, total)
         self._begin_s, self._tenth = time.monotonic(), 0
+        self._bar: Any = None
+        if drawable():
+            self._bar = self._drawn()
+
+    def _drawn(self) -> Any:
+        """Draw a line again ten times a second, also while the caller waits."""
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn
+        columns: list[Any] = [TextColumn('{task.description}', markup=False)]
+        if self._total:
+            columns += [BarColumn(_BAR_WIDTH), TextColumn('{task.percentage:3.0f} %')]
+        bar = Progress(*columns, TextColumn('{task.elapsed:4.0f} s'),
+                       console=Console(file=sys.stdout, highlight=False))
+        self._task = bar.add_task(self._line(), total=self._total or None)
+        bar.start()
+        return bar
 
     def show(self, text: str, done: int = 0) -> None:
-        super().show(text, done)
+        """Show how far the step is: a line for each tenth where nothing is drawn."""
+        self._text, self._done = text, done
+        if self._bar is not None:
+            self._bar.update(self._task, description=self._line(),
+                             completed=done if self._total else None)
+            return
         tenth = _TENTHS * done // self._total if self._total else 0
         if self._tenth < tenth < _TENTHS:
             self._print()
         self._tenth = max(tenth, self._tenth)
 
     def end(self) -> None:
-        self._print()
+        """Show that the step has succeeded."""
+        if self._bar is None:
+            self._print()
+
+    def close(self) -> None:
+        """Stop drawing, whether it has succeeded or not."""
+        if self._bar is not None:
+            self._bar.stop()
 
     def _print(self) -> None:
         share = f' {100 * self._done / self._total:3.0f} %' if self._total else ''
         print(f'{self._line()}{share} {time.monotonic() - self._begin_s:4.0f} s', flush=True)
 
-
-class _InTerminal(Step):
-    """Draws a line again ten times a second, also while the caller waits."""
-
-    def __init__(self, name: str, text: str, total: int) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn
-
-        super().__init__(name, text, total)
-        columns: list[Any] = [TextColumn('{task.description}', markup=False)]
-        if total:
-            columns += [BarColumn(_BAR_WIDTH), TextColumn('{task.percentage:3.0f} %')]
-        self._bar = Progress(*columns, TextColumn('{task.elapsed:4.0f} s'),
-                             console=Console(file=sys.stdout, highlight=False))
-        self._task = self._bar.add_task(self._line(), total=total or None)
-        self._bar.start()
-
-    def show(self, text: str, done: int = 0) -> None:
-        super().show(text, done)
-        self._bar.update(self._task, description=self._line(),
-                         completed=done if self._total else None)
-
-    def close(self) -> None:
-        self._bar.stop()
+    def _line(self) -> str:
+        """Return name and text of the step, with spaces up to the bar or the time."""
+        width = _TEXT_WIDTH if self._total else _LINE_WIDTH - _NAME_WIDTH - 2
+        return f' {self._name:{_NAME_WIDTH}} {self._text:{width}}'
