@@ -11,21 +11,18 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import redirect_stderr, redirect_stdout
 import fcntl
-from importlib.metadata import entry_points
-from io import StringIO
+from functools import partial
 import os
 from pathlib import Path
 import shutil
 import signal
 import subprocess
-import sys
 
 from domain import BY_UDP, own_domain
 from hypothesis import settings
 from pages import opener, running_browser
-from processes import executable, REPO, Started
+from processes import executable, REPO, run_in_process, Started
 import pytest
 
 # Each run has the same examples. New ones: make test ARGS='--hypothesis-profile search'
@@ -124,29 +121,9 @@ def start(ros_env: dict[str, str], tmp_path: Path) -> Iterator[Callable[..., Sta
 
 
 @pytest.fixture
-def run_tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-             ) -> Callable[..., subprocess.CompletedProcess]:
-    """
-    Give a function of a name and arguments that runs a tool in `tmp_path` and captures its text.
-
-    The tool runs in this process, which saves the second that its imports take.
-    test_executables.py runs the installed executables.
-    """
-    def run(name: str, *args: object) -> subprocess.CompletedProcess:
-        (tool,) = entry_points(group='console_scripts', name=name)
-        main, on_sigterm = tool.load(), signal.getsignal(signal.SIGTERM)
-        with (redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as err,
-              monkeypatch.context() as patch):
-            patch.chdir(tmp_path)
-            patch.setattr(sys, 'argv', [name, *map(str, args)])
-            try:
-                status = main()
-            except SystemExit as error:
-                status = error.code
-            finally:
-                signal.signal(signal.SIGTERM, on_sigterm)
-        return subprocess.CompletedProcess(sys.argv, status, out.getvalue(), err.getvalue())
-    return run
+def run_tool(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess]:
+    """Give a function of a name and arguments that runs a tool in `tmp_path`, in this process."""
+    return partial(run_in_process, cwd=tmp_path)
 
 
 @pytest.fixture(scope='session')

@@ -20,6 +20,8 @@ from scipy.signal import butter, sosfilt, sosfiltfilt
 from scipy.spatial.transform import Rotation
 from units import nominal
 
+pytestmark = pytest.mark.long
+
 G = 9.80665
 FINE_HZ = 1000.0
 RATE_HZ = 125.0

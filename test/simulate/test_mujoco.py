@@ -14,6 +14,8 @@ from processes import REPO
 import pytest
 from units import nominal
 
+pytestmark = pytest.mark.long
+
 SCRIPT = REPO / 'docs' / 'examples' / 'mujoco_arm.py'
 
 

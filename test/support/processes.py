@@ -5,13 +5,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
+from importlib.metadata import entry_points
+from io import StringIO
 import os
 from pathlib import Path
 import shutil
 import signal
 import subprocess
+import sys
 import time
 
 from ament_index_python.packages import get_package_prefix
@@ -99,3 +102,24 @@ def run_executable(name: str, *args: object, **options: object) -> subprocess.Co
     """Run an installed executable to its end and capture its output."""
     return subprocess.run([executable(name), *map(str, args)], text=True, capture_output=True,
                           stdin=subprocess.DEVNULL, **{'timeout': PATIENCE * 120, **options})
+
+
+def run_in_process(name: str, *args: object, cwd: Path) -> subprocess.CompletedProcess:
+    """
+    Run a tool in this process and capture its text, which saves the second that imports take.
+
+    test_help_and_end.py runs the installed executables.
+    """
+    (tool,) = entry_points(group='console_scripts', name=name)
+    main, on_sigterm = tool.load(), signal.getsignal(signal.SIGTERM)
+    with (redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as err,
+          pytest.MonkeyPatch.context() as patch):
+        patch.chdir(cwd)
+        patch.setattr(sys, 'argv', [name, *map(str, args)])
+        try:
+            status = main()
+        except SystemExit as error:
+            status = error.code
+        finally:
+            signal.signal(signal.SIGTERM, on_sigterm)
+    return subprocess.CompletedProcess(sys.argv, status, out.getvalue(), err.getvalue())

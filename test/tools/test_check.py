@@ -11,7 +11,7 @@ import subprocess
 
 from bags import bag_of, imu, stamps
 import numpy as np
-from processes import run_executable
+from processes import run_in_process
 import pytest
 from still_noise import write_csv
 
@@ -33,7 +33,7 @@ def samples(seconds: float = 60.0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
-    done = run_executable('check', *arguments, cwd=folder)
+    done = run_in_process('check', *arguments, cwd=folder)
     assert done.stderr == ''
     return done
 
@@ -175,7 +175,7 @@ def test_a_damaged_file_does_not_stop_the_others(tmp_path: Path) -> None:
 
 
 def test_wrong_usage_is_status_2(tmp_path: Path) -> None:
-    assert run_executable('check', cwd=tmp_path).returncode == 2
+    assert run_in_process('check', cwd=tmp_path).returncode == 2
 
 
 def test_log_time_against_header_time(tmp_path: Path) -> None:
@@ -219,7 +219,7 @@ def test_the_mapping_of_a_foreign_log_is_one_line(tmp_path: Path) -> None:
 
 
 def test_effects_that_a_recording_could_show_are_listed(tmp_path: Path) -> None:
-    assert run_executable('simulate', 'tilt_both', '--rate', '100', '-o', 'moves.csv',
+    assert run_in_process('simulate', 'tilt_both', '--rate', '100', '-o', 'moves.csv',
                           cwd=tmp_path).returncode == 0
     rows = {row['effect']: row for row in checked(tmp_path, 'moves.csv')['could_show']}
     assert rows['bias']['missing'] == ''

@@ -12,7 +12,7 @@ from adxl_ros.files.exports import FORMATS
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 import numpy as np
-from processes import run_executable
+from processes import run_in_process
 import pytest
 from units import nominal
 import yaml
@@ -42,8 +42,8 @@ def exported(tmp_path_factory):
     folder = tmp_path_factory.mktemp('export')
     parameter_file.save(folder / 'unit.yaml', unit())
     results = {}
-    for name in list(FORMATS):
-        done = run_executable('export', 'unit.yaml', '--to', name, '-o', f'out.{name}', cwd=folder)
+    for name in FORMATS:
+        done = run_in_process('export', 'unit.yaml', '--to', name, '-o', f'out.{name}', cwd=folder)
         assert done.returncode == 0, done.stderr
         path = folder / f'out.{name}'
         results[name] = SimpleNamespace(path=path, text=path.read_text(), screen=done.stdout)
@@ -206,7 +206,7 @@ def test_errors_are_one_line(tmp_path):
             (('unit.yaml', '--to', 'json', '-o', 'unit.yaml'), 1, 'is the input itself'),
             (('none.yaml', '--to', 'json', '-o', 'out.json'), 1, 'cannot be read'),
             (('unit.yaml', '--to', 'urdf', '-o', 'out.urdf'), 2, 'invalid choice')):
-        done = run_executable('export', *arguments, cwd=tmp_path)
+        done = run_in_process('export', *arguments, cwd=tmp_path)
         assert done.returncode == status
         assert words in done.stderr.splitlines()[-1]
     assert [path.name for path in tmp_path.glob('*.*')] == ['unit.yaml']

@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the tools print for people: help texts, version, and the end of a run."""
+"""The installed tools: help, version, exit status, and what a run prints for people."""
 
 from functools import cache
 import os
 from pathlib import Path
 import re
+import subprocess
+import sys
 
 from adxl_ros.model.effects import library
-from processes import executable, run_executable
+from processes import executable, run_executable, run_in_process
 import pytest
 from terminal import Terminal
 
@@ -25,17 +27,17 @@ def help_of(name: str) -> str:
 
 
 @pytest.mark.parametrize('name', TOOLS)
-def test_version(name: str) -> None:
-    done = run_executable(name, '--version')
-    assert (done.returncode, done.stderr) == (0, '')
-    assert re.fullmatch(r'adxl_ros \d+\.\d+\.\d+\n', done.stdout)
-
-
-@pytest.mark.parametrize('name', TOOLS)
-def test_help_has_examples_within_a_terminal(name: str) -> None:
+def test_help_version_and_wrong_usage(name: str, tmp_path: Path) -> None:
     text = help_of(name)
+    assert text.startswith(f'usage: {name}')
     assert f'    ros2 run adxl_ros {name} ' in text.split('examples:')[1]
     assert max(map(len, text.splitlines())) <= COLUMNS
+    done = run_in_process(name, '--version', cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert re.fullmatch(r'adxl_ros \d+\.\d+\.\d+\n', done.stdout)
+    refused = run_in_process(name, '--no-such-option', cwd=tmp_path)
+    assert (refused.returncode, refused.stdout) == (2, '')
+    assert refused.stderr.startswith(f'usage: {name}')
 
 
 @pytest.mark.parametrize('name', ['diagnose', 'fit', 'simulate'])
@@ -76,21 +78,6 @@ def test_each_tool_names_its_files_and_the_next_command(tmp_path: Path) -> None:
         'ros2 run adxl_ros compensation --ros-args -p calibration:=unit.yaml')
 
 
-def test_outcomes_are_coloured_in_a_terminal_only(tmp_path: Path) -> None:
-    run_executable('simulate', 'sweep', '--rate', '50', '-o', 'sweep.csv', cwd=tmp_path)
-    raw = {}
-    for name, environment in (('coloured', {}), ('plain', {'NO_COLOR': '1'})):
-        terminal = Terminal([executable('fit'), 'sweep.csv', '--model', 'linear', '-o',
-                             'unit.yaml', '--store', ''], {**os.environ, **environment}, tmp_path)
-        try:
-            terminal.wait_for('next ros2 run')
-            raw[name] = terminal.raw.decode()
-        finally:
-            terminal.close()
-    assert re.search(r'\x1b\[3[123]m(PASS|NOT SHOWN|FAIL)\x1b\[0m', raw['coloured'])
-    assert not re.search(r'\x1b\[3[123]m', raw['plain'])
-
-
 def test_diagnose_in_a_terminal_of_80_columns(tmp_path: Path) -> None:
     """Stages while it runs; then a coloured verdict, files and steps, none wrapped in a word."""
     run_executable('simulate', 'tilt_both', '--rate', '100', '-o', 'tilt.csv', cwd=tmp_path)
@@ -127,3 +114,34 @@ def test_an_error_wraps_between_words_in_a_terminal_only(tmp_path: Path) -> None
     finally:
         terminal.close()
     assert max(map(len, screen.splitlines())) <= COLUMNS
+
+
+@pytest.mark.parametrize('name', ['apply', 'diagnose', 'fit'])
+def test_a_recording_that_is_missing_is_one_line_and_status_1(name: str, tmp_path: Path) -> None:
+    refused = run_executable(name, 'missing.csv', '-o', 'out', cwd=tmp_path)
+    assert (refused.returncode, refused.stdout) == (1, '')
+    assert refused.stderr.startswith(f'{name}: missing.csv')
+    assert refused.stderr.count('\n') == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize('name', ['simulate', 'driver', 'demo', 'bench'])
+def test_output_that_nobody_reads_ends_an_executable_without_a_message(name: str) -> None:
+    """A tool, a node, and the programs that start nodes, as before `| head -1`."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    try:
+        # argparse ignores the pipe where nothing is buffered.
+        piped = subprocess.run([executable(name), '--help'], text=True, stdout=writer,
+                               stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, timeout=60,
+                               env=os.environ | {'PYTHONUNBUFFERED': ''})
+    finally:
+        os.close(writer)
+    assert (piped.returncode, piped.stderr) == (1, '')
+
+
+def test_a_pipe_between_processes_that_breaks_is_not_hidden() -> None:
+    code = ('from adxl_ros.closed_output import ended_by_closed_output\n'
+            'with ended_by_closed_output():\n    raise BrokenPipeError')
+    done = subprocess.run([sys.executable, '-c', code], text=True, capture_output=True, timeout=60)
+    assert done.returncode == 1 and 'BrokenPipeError' in done.stderr

@@ -9,7 +9,7 @@ import subprocess
 from adxl_ros.files import parameter_file
 import allantools
 import numpy as np
-from processes import run_executable
+from processes import run_in_process
 import pytest
 from still_noise import still_samples, write_csv
 import yaml
@@ -28,7 +28,7 @@ def samples(seconds: float, seed: int = 1, terms: tuple[float, float, float] = (
 
 
 def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
-    done = run_executable('noise', *arguments, cwd=folder)
+    done = run_in_process('noise', *arguments, cwd=folder)
     assert (done.returncode, done.stderr) == (0, '')
     return done
 
@@ -75,7 +75,7 @@ def test_diagnose_takes_the_measured_noise(tmp_path: Path) -> None:
     """A sensor at rest shows no effect, so that there is no verdict, but its gap is its noise."""
     write_csv(tmp_path / 'still.csv', *samples(300.0))
     run(tmp_path, 'still.csv', '-o', 'noise.yaml')
-    run_executable('diagnose', 'still.csv', '--params', 'noise.yaml', '-o', 'gap', cwd=tmp_path)
+    run_in_process('diagnose', 'still.csv', '--params', 'noise.yaml', '-o', 'gap', cwd=tmp_path)
     report = json.loads((tmp_path / 'gap' / 'report.json').read_text())
     assert report['verdict']['effects'] == []
     assert report['gap']['before'] == pytest.approx(report['gap']['floor'], rel=0.05)
@@ -149,7 +149,7 @@ def test_refusals_are_one_line(tmp_path: Path, change: str, reason: str) -> None
     if change == 'stuck half way':
         accel[len(accel) // 2:, 2] = G
     write_csv(tmp_path / 'bad.csv', time_s, accel)
-    done = run_executable('noise', 'bad.csv', '-o', 'noise.yaml', cwd=tmp_path)
+    done = run_in_process('noise', 'bad.csv', '-o', 'noise.yaml', cwd=tmp_path)
     assert done.returncode == 1
     assert done.stderr.startswith('noise: bad.csv: ')
     assert reason in done.stderr

@@ -36,7 +36,7 @@ def test_physical_recovers_the_unit(axes):
     rng = np.random.default_rng(7)
     sensor = nominal(axes)
     inside, alpha_deg = [], []
-    for _ in range(12):
+    for _ in range(6):
         truth = drawn(rng, sensor)
         for effect in ('cross_axis', 'cross_axis_z', 'scale_factor_z'):
             # The paper does not model a z axis.
@@ -63,7 +63,7 @@ def test_physical_reduces_the_tilt_error_as_the_paper_does():
     rng = np.random.default_rng(11)
     sensor = nominal()
     ratios = []
-    for _ in range(10):
+    for _ in range(5):
         poses = swept(rng, drawn(rng, sensor))
         linear_errors, physical_errors = cross_validation.cross_validate(
             {'linear': linear.fit, 'physical': paper_regression.fit}, sensor, poses)

@@ -74,10 +74,7 @@ CASES = {
     'a fine stage': ('noise', {'stage_resolution_rad': 0.0}),
     'a stage as stated': ('stage', {}),
     'a stage worse than stated': ('stage', {'stage_rad': np.radians(2.0)}),
-    'a stage worse than stated, three axes': (
-        'stage', {'stage_rad': np.radians(2.0), 'axes': 'xyz'}),
     'a model that lacks terms': ('model', {'model': 'linear'}),
-    'a model that lacks terms, three axes': ('model', {'model': 'linear', 'axes': 'xyz'}),
 }
 
 
