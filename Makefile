@@ -1,7 +1,7 @@
 # make build    ROS 2 Jazzy (the sourced one, else its wheels in .venv) and the package in install/
 # make demo     the main job on a simulated sensor: a table, and plots in demo_output/
-# make check    linters, types and unit tests: what a change needs, in four minutes
-# make test     every test, in 18 minutes        (make test ARGS='-k fit')
+# make check    linters, types and fast tests: what a change needs, about two minutes on two cores
+# make test     every test, about ten minutes on two cores   (make test ARGS='-k fit')
 # make perf     limits of processor time, for a quiet machine
 # make bench    latency and CPU of the live nodes, and each job beside its rivals
 # make reference  docs/reference, and figures in the pages, from the package and the measurements
@@ -10,8 +10,6 @@
 # make screenshots  docs/screenshots: terminals and pages from real runs, six minutes
 # make reproduction  docs/measurements/reproduction.md and its plots: the paper's experiments on simulated units
 # make coverage do the intervals hold? 300 drawn units and stages, as a table
-# make faults   the links under every fault, as a table
-# make noise    how often the intervals of noise hold the truth
 # make investigate  minutes to a verdict of `investigate` over 60 simulated units, an hour
 # make nulls    recordings without any effect through diagnose: docs/measurements/nulls.md, 90 minutes
 # make blind    the blind check of diagnose, 600 trials, into blind_output/ (make blind ARGS='--seed 1')
@@ -19,7 +17,7 @@
 # make lint     the linters alone
 # make clean    remove what these made
 
-.PHONY: build developed help demo check test perf bench reference gallery site screenshots reproduction coverage faults noise nulls investigate blind working lint clean \
+.PHONY: build developed help demo check test perf bench reference gallery site screenshots reproduction coverage nulls investigate blind working lint clean \
     FORCE
 .DEFAULT_GOAL := build
 
@@ -133,14 +131,7 @@ bench: build
 	    --requirement requirements/bench.txt
 	./run bench --iiod test/support/iiod.py $(ARGS)
 
-# Each of the next takes long: its table goes into docs/measurements.
 python_in_test = cd test && ../run --exec sh -c 'PYTHONPATH="support:$$PYTHONPATH" exec python "$$@"' -
-
-faults: developed
-	$(python_in_test) support/faults.py $(ARGS)
-
-noise: developed
-	$(python_in_test) long/noise_coverage.py $(ARGS)
 
 gallery: build
 	./run --exec python docs/gallery.py

@@ -255,24 +255,6 @@ def test_every_fault_changes_a_recording(name):
     assert np.isfinite(size(1.0))
 
 
-def test_ideal_observer():
-    """The observer detects a strong offset of alpha, and not a weak one."""
-    scene = ideal_observer.Scene(simulator.draw_unit(np.random.default_rng(0)), motion.draw(
-        np.random.default_rng(2), (60.0, 62.0), 125.0, 'one_plane'), 1)
-    observer = ideal_observer.IdealObserver(scene)
-    kind = fault_table.KINDS['stage_offset']
-    seen = [ideal_observer.power(float(np.sum(observer.project(scene.response([simulator.Fault(
-        kind, size, {'w': [0.0, 1.0]})])) ** 2))) for size in (1e-7, 3e-3)]
-    assert seen[0] < 0.05 and seen[1] > 0.99
-    clean = observer.project(np.zeros_like(observer.force))
-    assert np.allclose(clean, 0)
-    noise = simulator.render(scene.unit, scene.manoeuvre, [], 3) - simulator.render(
-        scene.unit, scene.manoeuvre, [], 3, noise=False)
-    spread = observer.project(noise * scene.unit.volts_to_mps2)
-    # Whitened noise has variance 1, because the oracle uses the spectrum of the noise.
-    assert np.var(spread) == pytest.approx(1, abs=0.05)
-
-
 def test_the_command_commits_and_scores(run_tool, tmp_path):
     """One call commits the labels. Another call diagnoses, opens and scores."""
     sealed = run_tool('blind', '--seal', 'dir', '--trials', 1, '--seed', 156)

@@ -4,17 +4,9 @@
 
 
 from adxl_ros.calibrate import joint_settings
-from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, StageMode
-from adxl_ros.calibrate.guided.pose_plan import Target
-from adxl_ros.calibrate.guided.stage_guide import StageGuide
 from adxl_ros.calibrate.joint_settings import recorded_settings, SettingTracker
-from adxl_ros.calibrate.poses import Poses
 import numpy as np
 import pytest
-from setting_checks import (
-    as_read,
-)
-from units import Bench, nominal
 
 NAN = float('nan')
 STEP = 1e-3
@@ -108,57 +100,7 @@ def test_the_live_tracker_and_a_recording_agree(monkeypatch):
     assert 200 < moves < 580
 
 
-ALPHA, BETA = np.pi / 2, np.pi / 6
-PLAN = [Target(ALPHA, 0.0), Target(ALPHA, BETA), Target(1.2, BETA), Target(1.2, BETA),
-        Target(1.2, 0.0)]
-
-
-def bench(mode='commanded', targets=PLAN, accepted=(), **settings):
-    """Return a sweep with poses of 1 s, on a bench."""
-    chosen = CaptureSettings(1.0, np.radians(0.2), 20.0, StageMode(mode), **settings)
-    return Bench(StageGuide(nominal(), targets, chosen, accepted), nominal())
-
-
-def take(on, alpha=None, beta=None):
-    """Rest at the target of the sweep or at other angles; return the entry of the pose."""
-    target = on.sweep.target
-    alpha, beta = (wanted if given is None else given for wanted, given in (
-        (target.alpha_rad, alpha), (target.beta_rad, beta)))
-    on.run(0.2, alpha, beta)
-    on.sweep.capture()
-    entry = on.run(5, alpha, beta)
-    # The entry as it is in a journal.
-    entry = as_read(entry)
-    on.sweep.take(entry)
-    return entry
-
-
 def numbers(entries):
     """Return the settings of both joints, in the order of time."""
     by_time = sorted(entries, key=lambda e: e.start_ns)
     return [e.alpha_setting for e in by_time], [e.beta_setting for e in by_time]
-
-
-def test_after_an_interruption_both_joints_have_moved():
-    """The stage may have lost power. Numbers continue, and the mounting check counts as a move."""
-    on = bench(targets=[Target(ALPHA, 0.0), *[Target(ALPHA, BETA)] * 5])
-    before = [take(on) for _ in range(3)]
-    assert numbers(before) == ([0, 0, 0], [0, 1, 1])
-    begun, on = on, bench(targets=on.sweep.targets, accepted=before)
-    on.now_ns = begun.now_ns
-    while on.sweep.poses_to_verify:
-        target = on.sweep.target
-        assert on.run(3, target.alpha_rad, target.beta_rad) is None
-    after = [take(on) for _ in range(3)]
-    assert numbers(after) == ([1, 1, 1], [2, 2, 2])
-    poses = Poses.from_records([*after, *before])
-    assert poses.alpha_setting.tolist() == [1, 1, 1, 0, 0, 0]
-    # After a restart of the driver, commands move the stage to the check and back.
-    on = bench(targets=on.sweep.targets, accepted=())
-    entries = [take(on) for _ in range(2)]
-    on.sweep.verify()
-    while on.sweep.poses_to_verify:
-        target = on.sweep.target
-        assert on.run(3, target.alpha_rad, target.beta_rad) is None
-    entries.append(take(on))
-    assert numbers(entries) == ([0, 0, 0], [0, 1, 2])

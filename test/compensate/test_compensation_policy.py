@@ -9,7 +9,6 @@ from pathlib import Path
 from adxl_ros.compensate.compensation_policy import CompensationPolicy, Interval, State, Topics
 from adxl_ros.files import calibration_store
 from adxl_ros.files.stream_info import sensor_info, StreamInfo
-from adxl_ros.model.coefficients import with_neutral
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -119,27 +118,6 @@ def test_states_of_the_samples(counts: dict[str, int], state: State, text: str) 
     status = policy_for(unit()).status(interval, None, '')
     assert status.state is state
     assert text in status.text
-
-
-@pytest.mark.parametrize(('of_file', 'of_stream', 'stated'), [
-    ('17', '17', 'confirmed'), ('demo', 'nominal', 'no serial number'),
-    ('nominal', '17', 'no serial number')])
-def test_only_equal_serial_numbers_confirm_the_unit(of_file: str, of_stream: str,
-                                                    stated: str) -> None:
-    policy = policy_for(unit(of_file), serial=of_stream)
-    assert policy.refusal == ''
-    assert policy.values(QUIET, None)['unit'] == stated
-
-
-def test_missing_temperature_or_supply_is_reported() -> None:
-    policy = policy_for(with_neutral(unit(), ['supply']))
-    assert policy.status(QUIET, None, '') == (
-        State.SURROUNDINGS_UNKNOWN, 'supply is taken at 5: nothing on /supply')
-    heard = replace(QUIET, surroundings={'supply_v': 4.8}, ages_s={'supply_v': 1.0})
-    assert policy.status(heard, None, '').state is State.COMPENSATING
-    old = replace(heard, ages_s={'supply_v': 3600.0})
-    assert policy.status(old, None, '') == (
-        State.SURROUNDINGS_UNKNOWN, 'supply is taken at 4.8: nothing on /supply for 3600 s')
 
 
 def test_validity() -> None:

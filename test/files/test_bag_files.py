@@ -310,20 +310,6 @@ def test_ideal_force(tmp_path: Path) -> None:
         recording.read_ideal(bags.bag_of(tmp_path / 'none', [joints(T[0])]))
 
 
-def test_writing_is_all_or_nothing(tmp_path: Path) -> None:
-    sensor = nominal('xyz')
-    for name in ('run', 'run.mcap', 'run.csv'):
-        with pytest.raises(KeyboardInterrupt), recording.writer(tmp_path / name, sensor) as append:
-            append(recorded(50))
-            raise KeyboardInterrupt
-    early = replace(recorded(50), epoch_ns=-10**12)
-    with pytest.raises(UserError, match='cannot be stamps of ROS messages'):
-        recording.write(tmp_path / 'run', early, sensor)
-    with pytest.raises(UserError, match='has the axes xy, but the sensor'):
-        recording.write(tmp_path / 'run', recorded(50, 'xy'), sensor)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_without_rosbags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, 'rosbags.rosbag2', None)
     (tmp_path / 'run').mkdir()

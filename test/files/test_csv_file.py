@@ -191,19 +191,6 @@ def test_the_result_does_not_depend_on_the_blocks(
     assert all(same_bits(cut.columns[name], complete.columns[name]) for name in complete.columns)
 
 
-def test_text_columns_are_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(delimited_text, '_CHUNK_BYTES', 10_000)
-    text = ['far out', '', '"q"', 'ä', '7', '"a,b"']
-    lines = [f'{text[i % 5]},{text[i // 5 % 5]}, {i / 1000!r} ,{text[i % 3]},{1 / (i + 1)!r},,'
-             f'{text[i // 1000]}' for i in range(3000)]
-    header = 'who,where,time_s,why,x_v,alpha_rad,how\n'
-    got = recording.read(written(tmp_path, header + '\n'.join(lines)))
-    assert (got.time_s == np.arange(3000) / 1000).all()
-    assert (got.columns['x_v'] == 1 / np.arange(1.0, 3001)).all()
-    assert np.isnan(got.columns['alpha_rad']).all()
-    assert list(got.columns) == ['x_v', 'alpha_rad']
-
-
 def test_ideal_force(tmp_path: Path) -> None:
     path = written(tmp_path, 'time_s,ay_mps2,ax_mps2,az_mps2,x_v\n0,2,1,3,\n0.5,5,4,6,7\n')
     time_s, force = recording.read_ideal(path)

@@ -15,6 +15,8 @@ from adxl_ros.workers import finished_tasks, open_pool, WorkerDied
 from job_tasks import children, deadly, half_sent, numbered, SUPPORT
 import pytest
 
+pytestmark = pytest.mark.long
+
 _LONG_WAIT_S = 300.0
 """Longest wait of a test for something, s."""
 

@@ -5,7 +5,7 @@
 from dataclasses import replace
 
 from adxl_ros.errors import UserError
-from adxl_ros.links.support import channels, emulated_board
+from adxl_ros.links.support import emulated_board
 from adxl_ros.links.support.clock_sync import ClockMap
 from adxl_ros.links.support.frame_counter import FrameCounter
 from adxl_ros.links.support.wire_format import AFTER_RESET, SampleFrame
@@ -153,24 +153,6 @@ def test_no_frame_is_accepted_twice_or_out_of_order(order):
         run = run + [index] if lost is not None else [index]
         assert run == sorted(set(run))
     assert len(accepted) <= len(order)
-
-
-@pytest.mark.parametrize('roles, reason', [
-    ('x', 'no channel for y'), ('x,y,x', 'twice'), ('x,y,z', 'no axis z'), ('x,y,w', "'w' is")])
-def test_channels_that_do_not_fit_the_sensor_are_refused(roles, reason):
-    with pytest.raises(UserError, match=reason):
-        channels.check_roles(channels.parse_channels(roles), 'xy')
-
-
-def test_slow_values_are_means_of_a_tenth_of_a_second():
-    means = channels.PeriodMeans()
-    stamps = np.arange(1000) * MS
-    values = np.arange(1000.0)
-    out = np.concatenate([means.thin(stamps[k:k + 10], {'supply_v': values[k:k + 10]})['supply_v']
-                          for k in range(0, 1000, 10)])
-    rows = np.flatnonzero(np.isfinite(out))
-    assert rows.tolist() == list(range(100, 1000, 100))
-    assert out[rows] == pytest.approx([row - 50.5 for row in rows])
 
 
 @pytest.mark.parametrize('change, reason', [

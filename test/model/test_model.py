@@ -1,8 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The model compared with values of the paper, of the datasheet and of closed forms."""
+"""The model against the paper, the datasheet and closed forms; names of coefficients."""
+
+import json
 
 from adxl_ros.model import noise
+from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
+from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.effects.mounting import direction
 from adxl_ros.model.kinematics import specific_force
 import numpy as np
@@ -37,3 +42,30 @@ def test_stage_frames():
     np.testing.assert_allclose(specific_force(quarter, 0.0, 9.8), [9.8, 0, 0], atol=1e-12)
     np.testing.assert_allclose(specific_force(quarter, quarter, 9.8), [0, -9.8, 0], atol=1e-12)
     np.testing.assert_allclose(specific_force(0.0, 1.0, 9.8), [0, 0, 9.8], atol=1e-12)
+
+
+@pytest.mark.parametrize(('text', 'coefficient'), [
+    ('bias.offset_v.x', Coefficient('bias', 'offset_v', 'x')),
+    ('time_offset.offset_s', Coefficient('time_offset', 'offset_s'))])
+def test_text_and_name_are_equivalent(text: str, coefficient: Coefficient) -> None:
+    assert Coefficient.parse(text) == coefficient
+    assert str(coefficient) == f'{coefficient}' == text
+    with pytest.raises(TypeError):
+        json.dumps(coefficient)  # reports hold the text
+
+
+def test_names_of_an_effect() -> None:
+    assert [str(name) for name in names_of(effect_named('lever_arm'), 'xy')] == [
+        'lever_arm.x_m', 'lever_arm.y_m', 'lever_arm.z_m']
+    assert names_of(effect_named('bias'), 'xy') == (
+        Coefficient('bias', 'offset_v', 'x'), Coefficient('bias', 'offset_v', 'y'))
+    assert parameter_of(Coefficient('bias', 'offset_v', 'y')).unit == 'V'
+
+
+def test_put_changes_a_copy() -> None:
+    sensor = with_neutral(nominal('xy'), ['bias', 'gravity'])
+    names = [Coefficient('bias', 'offset_v', 'y'), Coefficient('gravity', 'offset_mps2')]
+    changed = put(sensor, names, [0.1, 0.02])
+    assert get(changed, names).tolist() == [0.1, 0.02]
+    assert get(sensor, names).tolist() == [0.0, 0.0]
+    assert changed.zero_g_v.tolist() == [2.5, 2.6]

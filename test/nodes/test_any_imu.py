@@ -4,7 +4,6 @@
 
 from collections.abc import Callable, Iterator
 
-from adxl_ros.files import parameter_file
 from geometry_msgs.msg import Vector3Stamped
 from graph import accel, Graph, stamp_ns
 import numpy as np
@@ -92,41 +91,6 @@ def test_compensation_takes_any_imu(camera: Camera, start: Start, orientation: s
     assert kept is (orientation == 'keep')
 
 
-def test_calibration_takes_any_imu(camera: Camera, start: Start, tmp_path) -> None:
-    """A calibration against gravity by remapping; its file states what was measured."""
-    graph = camera.graph
-    node = start('calibration', '--ros-args', '-r', f'imu/data_raw:={TOPIC}', '-p',
-                 'mode:=gravity', '-p', 'autostart:=true', '-p', 'output:=unit.yaml', '-p',
-                 'sensor.serial:=cam7')
-    camera.connected()
-
-    def measured() -> bool:
-        camera.rest([0.0, 0.0, G], 0.5)
-        graph.spin(0.1)
-        return 'measured from the stream: rate: ' in node.output()
-    graph.spin_until(measured, 40, 'the measured sensor')
-    graph.spin_until(lambda: graph.reports('calibration', ''), 20, 'diagnostics')
-    rng = np.random.default_rng(8)
-    directions = rng.normal(size=(30, 3))
-    directions /= np.linalg.norm(directions, axis=1)[:, None]
-    offset, scale = np.array([0.3, -0.2, 0.5]), np.array([1.01, 0.99, 1.02])
-    for direction in directions:
-        camera.turn()
-        camera.rest((direction * G * scale + offset).tolist(), 3.0)
-    camera.turn()
-    answer = graph.call(Trigger, 'calibration/finish', Trigger.Request())
-    assert answer.success, answer.message
-    assert 'rest in 10 or more directions' in node.output()
-    assert '[ERROR]' not in node.output(), 'jitter of host stamps is no other rate'
-    unit = parameter_file.load(tmp_path / 'unit.yaml')
-    assert (unit.serial, unit.axes, unit.model) == ('cam7', 'xyz', 'gravity')
-    assert unit.rate_hz == pytest.approx(RATE_HZ, rel=0.02)
-    assert unit.adc_bits == 0 and unit.rc_s == 0 and unit.range_g >= 2
-    noise_mps2 = unit.noise_density_g_per_rthz * G * np.sqrt(RATE_HZ / 2)
-    np.testing.assert_allclose(noise_mps2, NOISE_MPS2, rtol=0.2)
-    np.testing.assert_allclose(unit.values['bias']['offset_v'] * G, offset, atol=0.01)
-
-
 def test_a_mounted_sensor_is_turned_into_the_frame_of_the_robot(camera: Camera, start: Start
                                                                 ) -> None:
     """Acceleration, covariance, gyroscope and tilt are those of the robot, after ~/level, too."""
@@ -160,28 +124,3 @@ def test_a_mounted_sensor_is_turned_into_the_frame_of_the_robot(camera: Camera, 
     quaternion = data[-1].orientation
     assert quaternion.x ** 2 + quaternion.w ** 2 == pytest.approx(1)
     assert np.linalg.norm([free[-1].vector.y, free[-1].vector.z]) > 1
-
-
-def test_a_moving_sensor_is_not_level(camera: Camera, start: Start) -> None:
-    """The answer names the scatter, and the mounting stays."""
-    graph = camera.graph
-    data = graph.listen(Imu, 'imu/data')
-    start('compensation', '--ros-args', '-r', f'imu/data_raw:={TOPIC}')
-    camera.connected()
-
-    def published() -> bool:
-        camera.rest([0.0, 0.0, G], 0.1)
-        graph.spin(0.05)
-        return bool(data)
-    graph.spin_until(published, 40, 'corrected samples')
-    client = graph.node.create_client(Trigger, 'compensation/level')
-    assert client.wait_for_service(100)
-    answer = client.call_async(Trigger.Request())
-
-    def moved() -> bool:
-        camera.turn(0.1)
-        graph.spin(0.05)
-        return answer.done()
-    graph.spin_until(moved, 40, 'the answer of ~/level')
-    assert not answer.result().success
-    assert 'the sensor moves' in answer.result().message

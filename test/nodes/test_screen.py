@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The screen as a client of its own: beside a node without a terminal, before it, and after it."""
 
-import json
-import re
 import subprocess
 
 from adxl_ros.files import parameter_file, sweep_journal
@@ -10,7 +8,6 @@ from graph import Graph, RELIABLE
 import numpy as np
 from processes import executable
 import pytest
-from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from terminal import Terminal
 from units import drawn, nominal
@@ -127,22 +124,3 @@ def test_a_screen_without_a_terminal_says_so(start):
     node = start('screen')
     assert node.wait() == 1
     assert node.output() == 'screen: the screen needs a terminal; run it in one\n'
-
-
-def test_a_recorder_of_the_display_is_nobody_at_a_screen(start, tmp_path):
-    """The display is JSON without NaN; whoever only listens is not asked anything."""
-    bench(start, tmp_path)
-    with Graph() as graph:
-        displays = graph.listen(String, 'calibration/display', latched=True)
-
-        def newest():
-            return json.loads(displays[-1].data)
-
-        graph.spin_until(lambda: displays and newest()['live'], 40, 'samples')
-        assert graph.call(Trigger, 'calibration/start', Trigger.Request()).success
-        graph.spin_until(lambda: newest()['progress'] and newest()['progress']['accepted'], 40,
-                         'a pose')
-        graph.call(Trigger, 'calibration/abort', Trigger.Request())
-        answer = graph.call(Trigger, 'calibration/start', Trigger.Request())
-        assert answer.success, answer.message
-    assert not any(re.search(r'NaN|Infinity', message.data) for message in displays)

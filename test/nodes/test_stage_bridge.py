@@ -123,18 +123,6 @@ def test_a_command_that_is_lost_is_sent_again(start):
         assert graph.diagnostics['stage'].level == DiagnosticStatus.WARN
 
 
-def test_wrong_names_are_reported(start):
-    """The message names the missing joint and the joints of the controller."""
-    with Controller('trajectory') as graph:
-        start('stage', '--ros-args', '-p', 'stage.type:=trajectory', '-p',
-              'bridge.alpha.joint:=tilt', '-p', 'bridge.beta.joint:=spin')
-        graph.spin_until(
-            lambda: graph.reports('stage', 'no joint spin; it has gripper, tilt, turn'), 30,
-            'the names')
-        assert graph.diagnostics['stage'].level == DiagnosticStatus.ERROR
-        assert not graph.stage_states
-
-
 @pytest.mark.parametrize('options, words', [
     (('-p', 'bridge.alpha.joint:=tilt'), 'bridge.beta.joint: is not set'),
     ((*NAMES, '-p', 'bridge.beta.sign:=0'), 'bridge.beta.sign: 0 is not 1 or -1')])

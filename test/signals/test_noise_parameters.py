@@ -25,7 +25,7 @@ def cells(seed: int, count: int = 7200, terms: tuple[float, float, float] = (N, 
 
 
 def test_nine_of_ten_intervals_hold_the_truth() -> None:
-    """test/long/noise_coverage.py draws 200 of each case; here are 40 of the middle one."""
+    """docs/measurements/noise_coverage.md has 200 draws of more cases."""
     variances = coefficient_variances(7200, STEP_S)
     fits = [fit_noise(cells(seed), STEP_S, variances) for seed in range(40)]
     for name, truth in (('white', N), ('instability', B), ('walk', K)):

@@ -9,9 +9,8 @@ from adxl_ros.model import noise
 from adxl_ros.model.coefficients import put, typical, with_neutral
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import ActsOn, Coefficient
-from adxl_ros.simulate.motion import Knots, Motion
+from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.simulator import simulate
-from adxl_ros.simulate.smoothed_paths import SmoothedPath
 from adxl_ros.simulate.trajectories import rich, TRAJECTORIES
 import numpy as np
 from pace import within
@@ -173,17 +172,3 @@ def test_apply_corrects_for_temperature_and_supply(run_tool, tmp_path):
     (tmp_path / 'bare.csv').write_text('\n'.join(bare) + '\n')
     done = run_tool('apply', 'bare.csv', '--params', 'unit.yaml', '-o', 'out.csv')
     assert done.returncode == 0 and 'supply is taken at 5' in done.stderr
-
-
-def test_a_smoothed_path_follows_quick_moves_among_slow_ones():
-    """On a slow stage with a few quick moves, no position has an error above two steps."""
-    step = np.radians(0.01)
-    moves = Knots([0, 40, 41, 41.6, 60, 60.5, 61, 90], [0, 1, 1, 2, 2, 3, 2.5, 3.2])
-    time_s = np.arange(0, 90, 0.008)
-    true = moves(time_s)
-    path = SmoothedPath(time_s, np.rint(true / step) * step, step)
-    error_rad = path(time_s) - true
-    assert np.abs(error_rad).max() < 2 * step
-    assert np.sqrt(np.mean(error_rad ** 2)) < 0.3 * step
-    worst = np.abs(path(time_s, 2) - moves(time_s, 2))
-    assert np.sqrt(np.mean(worst ** 2)) < 0.1 * np.abs(moves(time_s, 2)).max()

@@ -1,25 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Faults of devices. After each injected fault, the driver must have published the right samples.
-
-    make faults     all faults for longer than in the tests, as a table
-"""
+"""Faults of devices. After each, the driver must have published the right samples."""
 
 from collections.abc import Callable
-from contextlib import contextmanager
 from dataclasses import dataclass
-import subprocess
-import sys
-import tempfile
 import time
 
-from processes import executable
-from rig import IioRig, private_graph, SampleReport, SerialRig, suspend
-
-TABLE_HEAD = ('| fault | published | wrong | missing | counted | recovered in '
-              '| worst stamp, ms |\n|---|---|---|---|---|---|---|')
-"""Head of the tables in docs/measurements/links.md."""
+from rig import SampleReport, suspend
 
 
 @dataclass(frozen=True)
@@ -103,18 +90,6 @@ IIO_FAULTS = (
 """Faults of the IIO link."""
 
 
-@contextmanager
-def driver(*parameters):
-    """Run the installed driver; give its process."""
-    popen = subprocess.Popen([executable('driver'), '--ros-args', *map(str, parameters)],
-                             stderr=subprocess.DEVNULL)
-    try:
-        yield popen
-    finally:
-        popen.terminate()
-        popen.wait()
-
-
 def run_fault(fault, rig, pid, duration_s):
     """Inject a fault into a rig with the driver `pid`, and return its outcome."""
     rig.begin_report()
@@ -122,46 +97,3 @@ def run_fault(fault, rig, pid, duration_s):
     recovery_ms = rig.recovery_ms(back_ns) if back_ns else None
     rig.wait_for_samples(200, 20, f'samples after: {fault.name}')
     return Outcome(rig.report(), recovery_ms)
-
-
-def table_cells(outcome):
-    """Return the cells of a row of the table, without the name of the fault."""
-    report = outcome.report
-    counted = 'exact' if report.missing == report.counted else str(report.counted)
-    if report.estimated:
-        counted = f'{report.counted}, {report.estimated} estimated'
-    recovery = '' if outcome.recovery_ms is None else f'{outcome.recovery_ms:.0f} ms'
-    return (report.published, report.wrong, report.missing, counted, recovery,
-            f'{report.max_error_ms:.2f}')
-
-
-def table_row(*cells):
-    """Return a row of a table in Markdown."""
-    return f'| {" | ".join(map(str, cells))} |'
-
-
-def print_rows(faults, make_rig, duration_s):
-    """Inject faults into a new rig and print a row for each."""
-    with private_graph() as graph:
-        rig = make_rig(graph)
-        with driver(*rig.driver_parameters()) as process:
-            rig.wait_for_samples(1000, 30)
-            for fault in faults:
-                outcome = run_fault(fault, rig, process.pid, duration_s)
-                print(table_row(fault.name, *table_cells(outcome)), flush=True)
-        rig.end()
-
-
-def main():
-    """Print the table of all faults."""
-    duration_s = float(sys.argv[1]) if len(sys.argv) > 1 else 20.0
-    print(TABLE_HEAD)
-    with tempfile.TemporaryDirectory() as folder:
-        print_rows(SERIAL_FAULTS, lambda graph: SerialRig(graph, folder, {'banner': True}),
-                   duration_s)
-    print_rows(IIO_FAULTS, IioRig, duration_s)
-    return 0
-
-
-if __name__ == '__main__':
-    sys.exit(main())

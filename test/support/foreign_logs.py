@@ -90,28 +90,10 @@ def _counts(log: Turned) -> str:
     return lines([np.arange(len(log.time_s)), *16384 * log.output_g.T], ['%.0f'] * 4, '   ')
 
 
-def _tabs(log: Turned) -> str:
-    return lines([1e6 * log.time_s, *log.output_g.T], ['%.0f'] + ['%.5f'] * 3, '\t')
-
-
 def _epoch(log: Turned) -> str:
     rate = 0.1 + 0 * log.time_s
     return 'timestamp,ax,ay,az,gx,gy,gz\n' + lines(
         [1.7e9 + log.time_s, *log.output_g.T, rate, rate, rate], ['%.6f'] + ['%.5f'] * 6)
-
-
-def _app(log: Turned) -> str:
-    return 'Logger 3.1\nDevice: A\n\nTimestamp [ms],Accel X (g),Accel Y (g),Accel Z (g),\n' \
-        + lines([1.7e12 + 1e3 * log.time_s, *log.output_g.T], ['%.0f'] + ['%.4f'] * 3,
-                end=',\n')
-
-
-def _ros_text(log: Turned) -> str:
-    names = [f'field.linear_acceleration.{axis}' for axis in 'xyz']
-    text = f'%time,field.header.frame_id,{",".join(names)}\n'
-    rows = lines([*(G0_MPS2 * log.output_g).T], ['%.6f'] * 3).splitlines()
-    return text + ''.join(f'{1_700_000_000_000_000_000 + round(1e9 * time_s)},imu,{row}\n'
-                          for time_s, row in zip(log.time_s, rows))
 
 
 def _units_row(log: Turned) -> str:
@@ -148,11 +130,6 @@ def _labels(log: Turned) -> str:
     return ''.join(f'X: {x:.4f} Y: {y:.4f} Z: {z:.4f}\n' for x, y, z in log.output_g)
 
 
-def _quoted(log: Turned) -> str:
-    rows = lines([log.time_s, *log.output_g.T], ['%.3f'] + ['%.4f'] * 3).splitlines()
-    return ''.join(f'"{row}"\n' for row in ['time,ax,ay,az', *rows])
-
-
 def _unsigned(log: Turned) -> str:
     counts = np.rint(16384 * log.output_g) % 65536
     return 'ms,x,y,z\n' + lines([1e3 * log.time_s, *counts.T], ['%.0f'] * 4)
@@ -166,10 +143,9 @@ def _dates(log: Turned) -> str:
 
 
 FORMS = {'arduino.csv': _arduino, 'german.csv': _german, 'phyphox.csv': _phyphox,
-         'counts.txt': _counts, 'tabs.tsv': _tabs, 'epoch.csv': _epoch, 'app.csv': _app,
-         'ros_text.csv': _ros_text, 'units_row.dat': _units_row, 'euroc.csv': _euroc,
-         'usb.csv': _usb, 'repeated.csv': _repeated, 'preamble.csv': _preamble,
-         'labels.txt': _labels, 'quoted.csv': _quoted, 'unsigned.csv': _unsigned,
+         'counts.txt': _counts, 'epoch.csv': _epoch, 'units_row.dat': _units_row,
+         'euroc.csv': _euroc, 'usb.csv': _usb, 'repeated.csv': _repeated,
+         'preamble.csv': _preamble, 'labels.txt': _labels, 'unsigned.csv': _unsigned,
          'dates.csv': _dates}
 """Text of a log by the name of its file."""
 

@@ -33,25 +33,22 @@ _DELAYS_S = {'poses': 2.0, 'fit': 1.0, 'write': 0.005, 'end': 0.0}
 """Longest random delay of a kill after its moment, s."""
 _MOMENTS = ('poses', 'fit', 'poses', 'write', 'end')
 """Moments of the kills, in turn."""
-_FILES = ('unit.yaml.previous', 'unit.yaml', 'store', 'report.html', 'calibration.png')
-"""Files during whose writing a kill of the moment `write` comes."""
 
 
 class Sweeps:
     """
     Runs the calibration node on a simulated stage, kills it, and checks its files.
 
-    kills: number of kills; sweeps: number of sweeps that came to their end in spite of the kills;
-    poses: number of acknowledged poses; lost: acknowledged poses and earlier calibrations that are
-    missing or changed; broken: incomplete files, and other failures; moments: number of kills by
-    the activity of the node.
+    kills: number of kills, `in_fit` of them while it fitted or wrote; sweeps: number of sweeps
+    that came to their end; poses: acknowledged poses; lost: poses and calibrations that are
+    missing or changed; broken: incomplete files, and other failures.
     """
 
     def __init__(self, folder, env, seed):
         self.folder, self.env = Path(folder), env
         self.rng = np.random.default_rng(seed)
-        self.kills = self.sweeps = self.poses = 0
-        self.lost, self.broken, self.moments = [], [], {}
+        self.kills = self.sweeps = self.poses = self.in_fit = 0
+        self.lost, self.broken = [], []
         base = nominal(serial='K1', rate_hz=200.0)
         parameter_file.save(self.folder / 'truth.yaml', drawn(np.random.default_rng(3), base))
         parameter_file.save(self.folder / 'bare.yaml', base)
@@ -80,11 +77,10 @@ class Sweeps:
         """Run the sweep until a moment or the end, kill the node, and check its files."""
         moment = _MOMENTS[self.kills % len(_MOMENTS)]
         delay_s = self.rng.uniform() * _DELAYS_S[moment]
-        file = self.rng.choice(_FILES)
         node = self._start('calibration', 'bare.yaml', *SWEEP)
         began_s, log = time.monotonic(), self.folder / 'calibration.log'
         try:
-            while not self._has_come(moment, file, log.read_text(errors='replace')) \
+            while not self._has_come(moment, log.read_text(errors='replace')) \
                     and time.monotonic() - began_s < _TIMEOUT_S:
                 time.sleep(0.005 if moment != 'write' else 0.001)
             time.sleep(delay_s)
@@ -94,7 +90,7 @@ class Sweeps:
         self.kills += 1
         self._check(log.read_text(errors='replace'))
 
-    def _has_come(self, moment, file, output):
+    def _has_come(self, moment, output):
         """Return whether a moment, or the end of the sweep, has come."""
         if 'wrote unit.yaml' in output:
             return True
@@ -102,8 +98,7 @@ class Sweeps:
             return 'calibrating' in output
         if moment == 'fit':
             return 'fitting' in output
-        return (moment == 'write' and 'fitting' in output
-                and file in map(_file, self._unfinished()))
+        return moment == 'write' and 'fitting' in output and bool(self._unfinished())
 
     def _unfinished(self):
         """Return the hidden folders in which files are written."""
@@ -117,16 +112,11 @@ class Sweeps:
         acknowledged = [int(n) - 1 for n in re.findall(r'pose (\d+) is on disk', output)]
         self.poses += len(acknowledged)
         unfinished = self._unfinished()
-        moment = (
-            'start' if 'calibrating' not in output else
-            'the end' if 'wrote' in output else
-            f'a file is written ({_file(min(unfinished))})' if unfinished else
-            'the fit, or between files' if 'fitting' in output else
-            'the mounting is checked' if not acknowledged and self._kept_poses else 'poses')
-        self.moments[moment] = self.moments.get(moment, 0) + 1
-        if moment == 'start':
+        if 'calibrating' not in output:
             self.broken.append(f'kill {self.kills}: it did not begin: {output[-300:]}')
             return
+        if 'fitting' in output and 'wrote' not in output:
+            self.in_fit += 1
         if self._unfinished_before & unfinished:
             self.broken.append(
                 f'kill {self.kills}: not cleared: {self._unfinished_before & unfinished}')
@@ -175,11 +165,6 @@ class Sweeps:
 def _data(path):
     """Return the hash of the poses of a parameter file; '' without a file."""
     return parameter_file.load(path).provenance['data_sha256'] if path.exists() else ''
-
-
-def _file(folder):
-    """Return the name of the file that was written in a hidden folder."""
-    return 'store' if 'K1' in folder.parts else folder.name.removesuffix('.part')[1:-9]
 
 
 def kill(folder, env, kills, seed):

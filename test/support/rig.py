@@ -2,7 +2,6 @@
 
 """A driver on an emulated device with faults, and a report of what it published."""
 
-from contextlib import contextmanager
 from dataclasses import dataclass
 import json
 import os
@@ -13,9 +12,8 @@ import sys
 import time
 
 from adxl_ros.model.sensor import to_volts
-from domain import own_domain
 from faulty_board import CODES, mark
-from graph import Graph, imu_table
+from graph import imu_table
 import iiod
 import numpy as np
 from sensor_msgs.msg import Imu
@@ -251,16 +249,6 @@ class IioRig(DriverRig):
         """Return the ROS times at which the device took samples, ns."""
         return (self._options['began_ns'] + time.time_ns() - time.monotonic_ns()
                 + np.rint(numbers * 1e6).astype(np.int64))
-
-
-@contextmanager
-def private_graph():
-    """Give a graph outside pytest, in a domain of its own."""
-    with own_domain() as domain:
-        os.environ['ROS_DOMAIN_ID'] = str(domain)
-        os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-        with Graph() as graph:
-            yield graph
 
 
 def suspend(pid, duration_s, graph):

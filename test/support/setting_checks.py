@@ -3,16 +3,9 @@
 """Recording and journal of one sweep number the settings of its joints equally."""
 
 from dataclasses import replace
-import json
 
 from adxl_ros.calibrate import pose_extraction
-from adxl_ros.files.sweep_journal import PoseRecord
 import numpy as np
-
-
-def as_read(record):
-    """Return a record as it is read from a journal."""
-    return PoseRecord.from_json(json.loads(json.dumps(record.to_json())))
 
 
 def same_partition(first, second):

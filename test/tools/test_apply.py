@@ -193,18 +193,6 @@ def test_the_output_does_not_depend_on_blocks(run_tool: RunTool, tmp_path: Path)
     np.testing.assert_allclose(numbers(table, 'alpha_rad', 'beta_rad'), [alpha, beta], atol=1e-8)
 
 
-def test_a_bag_has_the_same_result(run_tool: RunTool, tmp_path: Path) -> None:
-    pytest.importorskip('rosbags', reason='rosbags is not installed: pip install rosbags')
-    sensor = unit()
-    path = record(tmp_path, sensor, volts_of(sensor))
-    from_csv, _ = applied(run_tool, path)
-    recording.write(tmp_path / 'bag', recording.read(path), sensor)
-    from_bag, _ = applied(run_tool, tmp_path / 'bag', tmp_path / 'unit.yaml')
-    names = [name for name in COLUMNS if name != 'time_s']
-    np.testing.assert_allclose(numbers(from_bag, *names), numbers(from_csv, *names), rtol=1e-9)
-    np.testing.assert_allclose(numbers(from_bag, 'time_s'), numbers(from_csv, 'time_s'))
-
-
 def messages_of(path: Path, kinds: dict[str, str]) -> dict[str, list]:
     """Return the messages of a bag by topic, which must have these topics and types only."""
     reader = pytest.importorskip('rosbags.rosbag2').Reader(path)

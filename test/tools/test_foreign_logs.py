@@ -14,6 +14,8 @@ from processes import REPO
 import pytest
 from without_extras import run_without_extras
 
+pytestmark = pytest.mark.long
+
 XYZ_G = 'time=t:s,x=x:g,y=y:g,z=z:g'
 LOG = turned()
 SHORT = 't,x,y,z\n' + ''.join(f'{i / 100},0.01,-0.02,{1 + i % 3 / 1e3}\n' for i in range(500))

@@ -58,6 +58,7 @@ def end_of(text: str) -> tuple[str, str]:
     return end[1], ' '.join(end[2].replace('\\\n', ' ').split())
 
 
+@pytest.mark.long
 def test_each_tool_names_its_files_and_the_next_command(tmp_path: Path) -> None:
     """The next command of one tool is what a user runs then."""
     done = run_executable('simulate', 'sweep', '--rate', '50', '--effect', 'misalignment', '-o',
@@ -78,6 +79,7 @@ def test_each_tool_names_its_files_and_the_next_command(tmp_path: Path) -> None:
         'ros2 run adxl_ros compensation --ros-args -p calibration:=unit.yaml')
 
 
+@pytest.mark.long
 def test_diagnose_in_a_terminal_of_80_columns(tmp_path: Path) -> None:
     """Stages while it runs; then a coloured verdict, files and steps, none wrapped in a word."""
     run_executable('simulate', 'tilt_both', '--rate', '100', '-o', 'tilt.csv', cwd=tmp_path)

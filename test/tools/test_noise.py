@@ -14,6 +14,8 @@ import pytest
 from still_noise import still_samples, write_csv
 import yaml
 
+pytestmark = pytest.mark.long
+
 RATE_HZ = 50.0
 N, B, K = 1e-3, 2e-4, 2e-5
 G = 9.80665
@@ -69,16 +71,6 @@ def test_terms_curve_files_and_settings(tmp_path: Path) -> None:
     # Nothing of the nominal sensor is in the file: a rest shows neither range nor resolution.
     assert (sensor.rc_s, sensor.rate_hz) == (0.0, RATE_HZ)
     assert (sensor.range_g, sensor.adc_bits) == (1000.0, 0)
-
-
-def test_diagnose_takes_the_measured_noise(tmp_path: Path) -> None:
-    """A sensor at rest shows no effect, so that there is no verdict, but its gap is its noise."""
-    write_csv(tmp_path / 'still.csv', *samples(300.0))
-    run(tmp_path, 'still.csv', '-o', 'noise.yaml')
-    run_in_process('diagnose', 'still.csv', '--params', 'noise.yaml', '-o', 'gap', cwd=tmp_path)
-    report = json.loads((tmp_path / 'gap' / 'report.json').read_text())
-    assert report['verdict']['effects'] == []
-    assert report['gap']['before'] == pytest.approx(report['gap']['floor'], rel=0.05)
 
 
 def test_the_lines_to_paste_are_yaml(tmp_path: Path) -> None:

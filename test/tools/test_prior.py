@@ -2,7 +2,6 @@
 """`--prior`: few poses with the population of a fleet, and units that are not of it."""
 
 from dataclasses import replace
-import json
 
 from adxl_ros.files import parameter_file, population_file
 from adxl_ros.model.coefficients import get, put, with_neutral
@@ -72,25 +71,3 @@ def test_a_stranger_is_named_by_fit(run_tool, tmp_path):
         assert ('The prior is not' in done.stdout) == ('--prior' in arguments)
     a, b = (parameter_file.load(tmp_path / f'{name}.yaml') for name in 'ab')
     np.testing.assert_array_equal(get(a, NAMES), get(b, NAMES))
-
-
-@pytest.mark.long
-def test_diagnose_takes_a_population(run_tool, tmp_path):
-    """Without a prior a unit of the fleet has a bias; with it the unit is healthy."""
-    parameter_file.save(tmp_path / 'truth.yaml', drawn(np.random.default_rng(4)))
-    population_file.write(tmp_path / 'right.yaml', population(), [])
-    population_file.write(tmp_path / 'wrong.yaml', population(0.1), [])
-    done = run_tool('simulate', 'tilt_both', '--params', 'truth.yaml', '--rate', 50,
-                    '-o', 'run.csv')
-    assert done.returncode == 0, done.stderr
-    named = {}
-    for name in ('none', 'right', 'wrong'):
-        prior = [] if name == 'none' else ['--prior', f'{name}.yaml']
-        done = run_tool('diagnose', 'run.csv', *prior, '-o', name)
-        assert done.returncode == 0, done.stderr
-        report = json.loads((tmp_path / name / 'report.json').read_text())
-        named[name] = set(report['verdict']['effects'])
-        assert (f'prior: zero-g and scale factor are those of {name}.yaml' in ' '.join(
-            done.stdout.split())) == bool(prior)
-    assert 'bias' in named['none'] and 'bias' not in named['right']
-    assert 'bias' in named['wrong']

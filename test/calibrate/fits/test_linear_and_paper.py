@@ -14,6 +14,8 @@ from pace import within
 import pytest
 from units import drawn, nominal, swept
 
+pytestmark = pytest.mark.long
+
 
 def _made(volts, alpha_deg, beta_deg):
     count = len(volts)

@@ -13,11 +13,9 @@ from adxl_ros.calibrate.report.text_tables import (
     error_table,
     truth_table,
 )
-from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get, names_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.kinematics import specific_force
 import numpy as np
 import pytest
 from units import drawn, nominal
@@ -73,27 +71,6 @@ def test_each_fitted_coefficient_is_compared() -> None:
                                                (1.7 * STD, False), (-1.7 * STD, False)])
 def test_an_interval_is_90_percent(error: float, inside: bool) -> None:
     assert {row.inside for row in compare(*fitted_and_truth(error))} == {inside}
-
-
-@pytest.mark.parametrize('axes', ['xy', 'xyz'])
-def test_linear_terms_that_the_fit_lacks_are_misalignment(axes: str) -> None:
-    """A unit with the compared true coefficients responds as the true unit."""
-    rng = np.random.default_rng(2)
-    truth = drawn(rng, nominal(axes), ('bias', 'scale_factor', 'misalignment'))
-    linear = [name for name in names_for(axes, ('cross_axis', 'cross_axis_z'))
-              if name.without_axis in LINEAR]
-    truth = put(with_neutral(truth, ['cross_axis', 'cross_axis_z']), linear,
-                0.02 * rng.normal(size=len(linear)))
-    fitted = fitted_of(truth, names_for(axes, ('bias', 'scale_factor', 'misalignment')))
-    compared = compare(fitted, truth)
-    nominal_of = {'bias.offset_v': 2.5, 'scale_factor.offset_v_per_g': 1.0}
-    values = [np.radians(row.truth) if row.unit == '°' else
-              row.truth - nominal_of[row.name] for row in compared]
-    bare = put(fitted, linear, np.zeros(len(linear)))
-    same = put(bare, fitted.covariance_names, values)
-    force = specific_force(rng.uniform(0, np.pi, 50), rng.uniform(0, 2 * np.pi, 50), 9.80665)
-    np.testing.assert_allclose(signal_chain.static_response(same)(force),
-                               signal_chain.static_response(truth)(force), rtol=0, atol=1e-12)
 
 
 def test_table_of_the_truth() -> None:

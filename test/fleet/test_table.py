@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The table of a fleet: types, units and times of its columns."""
+"""The table of a fleet: its types and units, and what docs/howto/fleet.md asks of it."""
 
 from datetime import datetime, timezone
+import re
 
 from adxl_ros.fleet.row import arrow_schema, as_table, COLUMNS, empty_row, TIMING
+from made_up_fleet import MadeUpFleet
+from processes import REPO
 import pytest
+
+TEXT = (REPO / 'docs' / 'howto' / 'fleet.md').read_text(encoding='utf-8')
 
 
 def test_a_row_keeps_every_type():
@@ -25,3 +30,14 @@ def test_names_are_unique_and_units_stand_in_the_schema():
     names = [column.name for column in COLUMNS]
     assert len(set(names)) == len(names) and set(TIMING) < set(names)
     assert arrow_schema().field('gap_before_mps2').metadata[b'unit'].decode() == 'm/s²'
+
+
+def test_the_questions_in_sql_have_answers(tmp_path):
+    """The SQL of the page runs on a table, where DuckDB is installed."""
+    duckdb = pytest.importorskip('duckdb', reason='pip install duckdb')
+    (tmp_path / 'results').mkdir()
+    MadeUpFleet(refused=0.2).write(tmp_path / 'results')
+    blocks = re.findall(r'^```sql\n(.*?)^```', TEXT, re.DOTALL | re.MULTILINE)
+    assert len(blocks) == 3
+    for query in ' '.join(blocks).split(';')[:-1]:
+        assert duckdb.sql(query.replace('results/', f'{tmp_path}/results/')).fetchall()
