@@ -326,7 +326,9 @@ def _held_out(rests: NominalRests, kept: np.ndarray, parameters: np.ndarray,
     without, converged = _nearby(used, np.tile(parameters, (stretches, 1)),
                                  others / variance[kept])
     for i in np.flatnonzero(~converged):
-        without[i], _ = _solve(used[others[i]], parameters, variance[kept][others[i]])
+        # Of nine rests the other eight determine no fit.
+        without[i] = parameters if others[i].sum() < len(NAMES) else _solve(
+            used[others[i]], parameters, variance[kept][others[i]])[0]
     errors[kept] = _residual(used, without)[stretch, np.arange(count)]
     return errors
 
