@@ -149,15 +149,6 @@ def test_a_coarse_sensor_at_rest_is_sound(tmp_path: Path) -> None:
     assert checked(tmp_path, 'coarse.csv')['faults'] == []
 
 
-def test_zero_bytes_are_one_line(tmp_path: Path) -> None:
-    """A cut of the power leaves zero bytes, which the message does not repeat."""
-    write_csv(tmp_path / 'log.csv', *samples())
-    data = (tmp_path / 'log.csv').read_bytes()
-    (tmp_path / 'log.csv').write_bytes(data[:5000] + bytes(4096) + data[9096:])
-    fault, = checked(tmp_path, 'log.csv')['faults']
-    assert 'delete the zero bytes' in fault and len(fault) < 200
-
-
 def test_a_damaged_file_does_not_stop_the_others(tmp_path: Path) -> None:
     write_csv(tmp_path / 'good.csv', *samples())
     (tmp_path / 'damaged.mcap').write_bytes(b'\x89MCAP0\r\n' + bytes(100))

@@ -28,22 +28,6 @@ def test_the_guided_order_has_smaller_errors_on_a_stage_with_errors_by_setting(a
     assert pose_plan.travel_rad(guided) < 1.05 * pose_plan.travel_rad(paper)
 
 
-@pytest.mark.parametrize('axes, expected_count', [('xy', 30), ('xyz', 24)])
-def test_the_quick_plan_reaches_its_tilt_error(axes, expected_count):
-    """A plan has about 30 poses in steps of 15°, and more poses for a smaller error."""
-    sensor = nominal(axes)
-    targets = quick_plan.quick(sensor, 5.0, np.radians(0.1), 8)
-    fitted = [t for t in targets if not t.check]
-    assert len(fitted) == expected_count and len(targets) == expected_count + 8
-    assert expected_error_deg(axes, fitted) <= 0.1
-    angles = np.degrees([(t.alpha_rad, t.beta_rad) for t in fitted])
-    np.testing.assert_allclose(angles / 15, np.rint(angles / 15), atol=1e-9)
-    finer = np.radians(0.95 * expected_error_deg(axes, fitted))
-    finer_plan = quick_plan.quick(sensor, 5.0, finer, 0)
-    assert len(finer_plan) > expected_count
-    assert np.radians(expected_error_deg(axes, finer_plan)) <= finer
-
-
 @pytest.mark.parametrize('axes', ['xy', 'xyz'])
 @pytest.mark.parametrize('kind', pose_plan.KINDS)
 def test_fits_have_the_standard_deviations_that_a_plan_predicts(axes, kind):
