@@ -6,7 +6,7 @@ Log evidence of hypotheses: Bayesian comparison of linear models on whitened col
 Columns are sensitivities of the simulated output, and a hypothesis is a set of columns. The
 coefficients have normal priors. The evidence integrates the coefficients out (Bishop 2006,
 section 3.5), so that an effect that the recording hardly shows gains nothing and costs nothing.
-The noise is that of `noise_whitening`; its filter and level are fitted to each hypothesis.
+The noise is that of `noise_model`; its filter and level are fitted to each hypothesis.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
-from adxl_ros.diagnose.noise_model import before_filters, Series, Whitener
+from adxl_ros.diagnose.noise_model import before_filters, Whitener
 import numpy as np
 import scipy
 
@@ -120,36 +120,6 @@ def plain_grams(columns: np.ndarray, used: np.ndarray) -> np.ndarray:
     return np.array([kept[a:b].T @ kept[a:b] for a, b in pairwise(edges)])
 
 
-def prepared(filters: Sequence[Whitener], columns: np.ndarray, used: np.ndarray) -> Series:
-    """
-    Prepare columns for each whitening filter of a channel.
-
-    columns: columns, (n, k); used: samples that are used, (n,) bool; the others are bridged by
-    straight lines; returns: series for `whitened`, (k, n) each.
-    """
-    return before_filters(filters, np.ascontiguousarray(bridged(columns, used).T))
-
-
-def whitened(whitener: Whitener, series: Series, used: np.ndarray) -> np.ndarray:
-    """
-    Whiten columns.
-
-    series: columns that are `prepared`, (k, n) each; used: samples that are used, (n,) bool;
-    returns: whitened columns, (k, n), zero where samples are not used.
-    """
-    values = series[whitener.corrects_angles]
-    white = np.empty_like(values, float)
-    state = np.zeros((len(whitener.sections), len(white), 2))
-    step = max(1, _CACHED_VALUES // max(len(white), 1))
-    for first in range(0, white.shape[1], step):
-        part = slice(first, first + step)
-        white[:, part], state = whitener.continued(values[:, part], state)
-    white[:, ~used] = 0.0
-    # The first sample is a step from zero.
-    white[:, 0] = 0.0
-    return white
-
-
 def block_edges(count: int) -> np.ndarray:
     """Return where the blocks of so many samples begin and end, (blocks + 1,)."""
     return np.linspace(0, count, BLOCKS + 1).astype(int)
@@ -200,12 +170,14 @@ def fit_columns(channels: Sequence[WhitenedChannel], column_ids: Sequence[int],
     variance_v2 = np.array([s.grams[f, 0, 0] / s.count for s, f in zip(selected, filters)])
     prior_precision = prior_std[ids] ** -2.0
     for _ in range(_ITERATIONS):
-        precision, information = _normal_equations(selected, filters, variance_v2,
-                                                   prior_precision)
+        precision, information = np.diag(prior_precision), np.zeros(len(ids))
+        for s, f, variance in zip(selected, filters, variance_v2):
+            precision[np.ix_(s.places, s.places)] += s.grams[f, 1:, 1:] / variance
+            information[s.places] += s.grams[f, 1:, 0] / variance
         values, covariance, half_log_det = _solution(precision, information)
         for i, s in enumerate(selected):
-            squares_v2 = np.maximum(_residual_squares(s.grams, values[s.places]),
-                                    _SMALLEST_SQUARES_V2)
+            v = np.concatenate([[1.0], -values[s.places]])
+            squares_v2 = np.maximum(np.einsum('i,wij,j->w', v, s.grams, v), _SMALLEST_SQUARES_V2)
             filters[i] = int(np.argmax(-s.count / 2 * np.log(squares_v2) + s.log_scales
                                        + log_priors[i]))
             variance_v2[i] = squares_v2[filters[i]] / s.count
@@ -229,17 +201,6 @@ class _SelectedColumns:
     grams: np.ndarray
     count: float
     log_scales: np.ndarray
-
-
-def _normal_equations(selected: Sequence[_SelectedColumns], filters: Sequence[int],
-                      variance_v2: np.ndarray, prior_precision: np.ndarray
-                      ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the posterior precision, (k, k), and the information vector, (k,)."""
-    precision, information = np.diag(prior_precision), np.zeros(len(prior_precision))
-    for s, f, variance in zip(selected, filters, variance_v2):
-        precision[np.ix_(s.places, s.places)] += s.grams[f, 1:, 1:] / variance
-        information[s.places] += s.grams[f, 1:, 0] / variance
-    return precision, information
 
 
 def _selected(channel: WhitenedChannel, ids: np.ndarray, blocks: np.ndarray | None
@@ -271,23 +232,11 @@ def amplitude_log_bayes_factor(mean: np.ndarray, covariance: np.ndarray, prior_s
     """
     Return what the log evidence gains by the log-uniform prior over `AMPLITUDES`.
 
+    For each amplitude it is the logarithm of the posterior mean of the ratio of both priors, in
+    closed form.
+
     mean: posterior mean of the effect's k coefficients with the given prior, (k,); covariance:
     posterior covariance, (k, k); prior_std: standard deviations of the given prior, (k,).
-    """
-    gains = log_bayes_factor_by_amplitude(mean, covariance, prior_std)
-    return float(np.logaddexp.reduce(gains) - np.log(len(gains)))
-
-
-def log_bayes_factor_by_amplitude(mean: np.ndarray, covariance: np.ndarray,
-                                  prior_std: np.ndarray) -> np.ndarray:
-    """
-    Return what the log evidence gains by a narrower prior, for each of `AMPLITUDES`.
-
-    It is the logarithm of the posterior mean of the ratio of both priors, in closed form.
-
-    mean: posterior mean of k coefficients with the given prior, (k,); covariance: posterior
-    covariance, (k, k); prior_std: standard deviations of the given prior, (k,); returns: log Bayes
-    factors, (amplitudes,).
     """
     # Divided by their prior deviations, coefficients in V and in rad have similar sizes.
     precision = np.linalg.inv(covariance / prior_std[:, None] / prior_std)
@@ -300,7 +249,7 @@ def log_bayes_factor_by_amplitude(mean: np.ndarray, covariance: np.ndarray,
         gains.append(-len(prior_std) * np.log(amplitude) + 0.5 * (
             log_det - np.linalg.slogdet(narrower)[1]
             + float(information @ np.linalg.solve(narrower, information)) - quadratic))
-    return np.array(gains)
+    return float(np.logaddexp.reduce(gains) - np.log(len(gains)))
 
 
 def _solution(precision: np.ndarray, information: np.ndarray
@@ -318,12 +267,6 @@ def _solution(precision: np.ndarray, information: np.ndarray
     values = size * scipy.linalg.cho_solve((factor, True), size * information)
     covariance = scipy.linalg.cho_solve((factor, True), np.eye(len(size))) * size[:, None] * size
     return values, covariance, float(np.log(np.diag(factor) / size).sum())
-
-
-def _residual_squares(grams: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the sum of squares of the residual after a fit, by filter, V², (filters,)."""
-    v = np.concatenate([[1.0], -values])
-    return np.einsum('i,wij,j->w', v, grams, v)
 
 
 def robust_std(channels: Sequence[WhitenedChannel], fit: LinearFit, prior_std: np.ndarray

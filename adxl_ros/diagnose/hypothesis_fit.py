@@ -152,11 +152,6 @@ class LinearisedHypothesis:
         return put(self.sensor, self.names,
                    _within_bounds(self.names, self.prior_mean + departures))
 
-    def refitted_sensor(self, fit: LinearFit, full_fit: LinearFit) -> Sensor:
-        """Return the sensor after a fit to some blocks."""
-        return put(self.sensor, self.names, _within_bounds(
-            self.names, self.prior_mean + self.departures(fit, full_fit)))
-
     def departures(self, fit: LinearFit, full_fit: LinearFit | None = None) -> np.ndarray:
         """
         Return the departures from the prior mean after a fit.

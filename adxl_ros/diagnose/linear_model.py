@@ -439,12 +439,6 @@ class LinearModel:
             variance += float(sensor.covariance[i, i])
         return float(np.hypot(hints.healthy_std * scale, np.sqrt(variance)))
 
-    def zero_g_tolerance_v(self, axis: str) -> float:
-        """Return the standard deviation of the zero-g of one axis in a healthy unit, V."""
-        effect = next(e for e in library().values()
-                      if e.diagnosis.straight_line is StraightLine.ZERO_G)
-        return self.tolerance(Coefficient(effect.name, effect.parameters[0].name, axis))
-
     def fit_variants(self, chosen: Sequence[int], start: LinearFit | None = None) -> LinearFit:
         """Fit a set of variants on the sensitivities at the baseline."""
         drifts = drifts_among(self.baseline.effects)
@@ -491,7 +485,7 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
     prior_std: list[float] = []
     kept: list[Variant] = []
     column_ids: list[list[int]] = []
-    columns: list[list[list[NumberedColumn]]] = [_empty_by_axis(c) for c in comparisons]
+    columns: list[list[list[NumberedColumn]]] = [[[] for _ in c.sensor.axes] for c in comparisons]
     for by_recording in _variants(comparisons, baseline_v,
                                   lambda done: show_progress(_SIMULATED_SHARE * done), only):
         numbers: dict[Coefficient, int] = {}
@@ -516,9 +510,12 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
     channels = _whitened_channels(
         comparisons, by_channel, _filters_of(filters, comparisons[0].sensor.effects), flexible)
     show_progress(1.0)
-    nuisance_columns = [_nuisance_columns(channel, names) for channel in by_channel]
-    parts = parts_at_rest([_straight_columns(channel, names) for channel in nuisance_columns],
-                          by_channel, len(names), rests_by_channel(comparisons))
+    # The first column of an effect is that of its smallest start.
+    nuisance_columns = [{names[i]: column for i, column in reversed(channel)
+                         if hints_of(names[i]).nuisance} for channel in by_channel]
+    lines = [{names.index(name): column for name, column in channel.items()
+              if hints_of(name).straight_line} for channel in nuisance_columns]
+    parts = parts_at_rest(lines, by_channel, len(names), rests_by_channel(comparisons))
     return LinearModel(list(comparisons), baseline_v, kept, column_ids, names,
                        np.array(prior_std), channels, list(filters), by_channel, nuisance_columns,
                        {names[i]: amounts for i, amounts in parts.items()})
@@ -531,28 +528,9 @@ def _reference_errors(comparison: BaselineComparison, axis: int
     return lost_motion_filter(comparison, axis, angle_errors) or angle_errors
 
 
-def _empty_by_axis(comparison: BaselineComparison) -> list[list[NumberedColumn]]:
-    """Return an empty list for each axis."""
-    return [[] for _ in comparison.sensor.axes]
-
-
-def _nuisance_columns(channel: Sequence[NumberedColumn], names: Sequence[Coefficient]
-                      ) -> dict[Coefficient, np.ndarray]:
-    """Return the columns of nuisance parameters of a channel by coefficient."""
-    # The first column of an effect is that of its smallest start.
-    return {names[i]: column for i, column in reversed(channel) if hints_of(names[i]).nuisance}
-
-
 def rests_by_channel(comparisons: Sequence[BaselineComparison]) -> list[np.ndarray]:
     """Return the samples at rest of each channel."""
     return [c.at_rest & c.used for c in comparisons for _ in c.sensor.axes]
-
-
-def _straight_columns(channel: dict[Coefficient, np.ndarray], names: list[Coefficient]
-                      ) -> dict[int, np.ndarray]:
-    """Return the columns of zero-g and scale factor of a channel by number."""
-    return {names.index(name): column for name, column in channel.items()
-            if hints_of(name).straight_line}
 
 
 def _variants(comparisons: Sequence[BaselineComparison], baseline_v: Sequence[np.ndarray],

@@ -264,13 +264,13 @@ def predict(manoeuvre: Experiment, sensor: Sensor, effects: Sequence[str],
             of_channel += [(ColumnKey((dimension, number, i), None), scale * _UNKNOWN_G * values)
                            for i, values in enumerate(functions[dimension].T)]
         whitener = model.filters_of(())[number][fit.filter_indices[number]]
-        series = evidence.prepared([whitener], np.array([v for _, v in of_channel]).T,
-                                   comparison.used)
-        white = evidence.whitened(whitener, series, comparison.used)
+        shown = np.array([v for _, v in of_channel]).T
+        grams = evidence.whiten_channel(np.zeros(len(shown)), shown, np.arange(shown.shape[1]),
+                                        comparison.used, [whitener], by_block=False).total_grams
         for key, _ in of_channel:
             places.setdefault(key, len(places))
         blocks.append((np.array([places[key] for key, _ in of_channel]),
-                       white @ white.T / fit.innovation_variance_v2[number]))
+                       grams[0, 1:, 1:] / fit.innovation_variance_v2[number]))
     gram = np.zeros((len(places), len(places)))
     for ids, block in blocks:
         gram[np.ix_(ids, ids)] += block

@@ -555,10 +555,6 @@ class Whitener:
             return np.zeros(len(used))
         return np.where(used, np.log(self.angle_errors.scale), 0.0)
 
-    def __call__(self, series: Series) -> np.ndarray:
-        """Filter k series after `before_filters`, (k, n)."""
-        return scipy.signal.sosfilt(self.sections, series[self.corrects_angles])
-
     def continued(self, values: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
         Filter the next part of k series after `before_filters`.

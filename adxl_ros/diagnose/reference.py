@@ -412,12 +412,13 @@ def stated_poses(recording: Recording, sensor: Sensor) -> tuple[Recording, list[
             continue
         step = 0.0 if joint == 'shift' else sensor.stage_resolution_rad
         values, read_s = columns[name].copy(), time_s[read]
-        path = scipy.interpolate.PchipInterpolator(read_s, values[read])
         limit_s = max(LONGEST_BRIDGE_S,
                       min(USUAL_GAPS * float(np.median(np.diff(read_s))), _SLOWEST_S))
         unknown = (time_s < read_s[0]) & (time_s[0] < read_s[0] - limit_s)
         unknown |= (time_s > read_s[-1]) & (time_s[-1] > read_s[-1] + limit_s)
         wide = np.flatnonzero(np.diff(read_s) > LONGEST_BRIDGE_S)
+        if len(wide):
+            path = scipy.interpolate.PchipInterpolator(read_s, values[read])
         for begin, end in zip(read[wide], read[wide + 1]):
             gap_s, inside = time_s[end] - time_s[begin], slice(begin + 1, end)
             holds = end > begin + 1 and _rests(volts[inside] / sensor.scale_v_per_g, lag) \
