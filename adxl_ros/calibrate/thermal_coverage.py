@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from adxl_ros.calibrate.fits.thermal_fit import ThermalFit
 from adxl_ros.model.coefficients import parameter_of
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.play_operator import play
+from adxl_ros.model.filters import play
 import numpy as np
 
 PARTS = 10

@@ -14,10 +14,9 @@ from adxl_ros.files import imu_message
 from adxl_ros.files.cdr import CdrError
 from adxl_ros.model import noise
 from adxl_ros.model.effects.base import Components
-from adxl_ros.model.mounting import Mounting
 from adxl_ros.model.scalar_or_array import FLOATS
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.tilt import quaternion, UNOBSERVABLE_RAD2
+from adxl_ros.model.tilt import Mounting, quaternion, UNOBSERVABLE_RAD2
 import numpy as np
 
 UNKNOWN_ANGLE_RAD2 = 1e6

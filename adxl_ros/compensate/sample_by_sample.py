@@ -16,10 +16,9 @@ from adxl_ros.model.covariance import (
     UNMEASURED_VARIANCE,
 )
 from adxl_ros.model.effects.base import Components, Environment, NOMINAL_ENVIRONMENT
-from adxl_ros.model.mounting import Mounting
 from adxl_ros.model.scalar_or_array import FLOATS
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.tilt import angles, roll_pitch_covariance
+from adxl_ros.model.tilt import angles, Mounting, roll_pitch_covariance
 import numpy as np
 
 _CELL_MPS2 = 0.5

@@ -20,10 +20,9 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import ActsOn
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.rest_detection import find_rests
-from adxl_ros.simulate.chain_memo import ChainMemo
-from adxl_ros.simulate.from_recording import environment_paths, motion_from_references
 from adxl_ros.simulate.motion import INTERNAL_RATE_HZ, Motion, Path
-from adxl_ros.simulate.response import Response
+from adxl_ros.simulate.response import ChainMemo, Response
+from adxl_ros.simulate.simulator import environment_paths, motion_from_references
 from adxl_ros.simulate.smoothed_paths import ForcePath, PathErrors, SmoothedPath
 import numpy as np
 

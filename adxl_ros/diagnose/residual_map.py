@@ -30,9 +30,8 @@ from adxl_ros.diagnose.noise_model import gravity_slopes
 from adxl_ros.model import noise
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.diagnosis_hints import FormDimension
-from adxl_ros.model.filters import low_pass
+from adxl_ros.model.filters import loop, low_pass
 from adxl_ros.model.kinematics import specific_force
-from adxl_ros.model.play_operator import loop
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 import scipy

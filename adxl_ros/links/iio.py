@@ -10,7 +10,6 @@ import time
 
 from adxl_ros.errors import UserError
 from adxl_ros.links.support import channels
-from adxl_ros.links.support.backoff import Backoff
 from adxl_ros.links.support.base import (
     DeviceSettings,
     Level,
@@ -19,6 +18,7 @@ from adxl_ros.links.support.base import (
     option,
     Samples,
 )
+from adxl_ros.links.support.channels import clock_events, Stamper
 from adxl_ros.links.support.clock_sync import ClockMap, IdentityMap
 from adxl_ros.links.support.iio_stream import (
     AdcInfo,
@@ -28,7 +28,7 @@ from adxl_ros.links.support.iio_stream import (
     ReadError,
     Stream,
 )
-from adxl_ros.links.support.sample_stamps import clock_events, Stamper
+from adxl_ros.links.support.waiting import Backoff
 from adxl_ros.model.sensor import Sensor
 
 _SILENT_S = 0.5

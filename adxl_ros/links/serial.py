@@ -21,16 +21,15 @@ from adxl_ros.links.support.base import (
     option,
     Samples,
 )
+from adxl_ros.links.support.channels import clock_events, Stamper
 from adxl_ros.links.support.clock_sync import ClockMap
-from adxl_ros.links.support.frame_counter import FrameCounter
-from adxl_ros.links.support.sample_stamps import clock_events, Stamper
-from adxl_ros.links.support.serial_port import SerialPort, SILENT
+from adxl_ros.links.support.serial_port import import_pyserial, SerialPort, SILENT
 from adxl_ros.links.support.wire_format import (
     AFTER_RESET,
     BoardInfo,
     decode,
     encode_command,
-    import_cobs,
+    FrameCounter,
     MAX_COUNT,
     RAIL,
     SampleFrame,
@@ -151,7 +150,7 @@ def open_link(sensor: Sensor, settings: Settings) -> SerialLink:
         raise UserError('link.port: names no port; set it to a device path or a pyserial URL')
     if not settings.temperature_v_per_c:
         raise UserError('link.temperature_v_per_c: is 0; set the slope of the temperature sensor')
-    import_cobs()
+    import_pyserial()
     return SerialLink(sensor, settings)
 
 

@@ -11,7 +11,7 @@ from math import inf
 from typing import NamedTuple
 
 from adxl_ros.links.support.base import Level, LinkStatus, option, PacedSettings, Samples
-from adxl_ros.links.support.watchdog import Watchdog
+from adxl_ros.links.support.waiting import Watchdog
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response

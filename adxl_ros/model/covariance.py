@@ -9,15 +9,24 @@ Outside of the validity range of the calibration, `validity` adds to the covaria
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
-from adxl_ros.model import analog_stages, noise, signal_chain
-from adxl_ros.model.coefficient_tangent import coefficient_tangent
+from adxl_ros.model import analog_stages, coefficients, noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Components, Environment, NOMINAL_ENVIRONMENT, Value
-from adxl_ros.model.polynomial_chain import coefficients_of, drawn, MANY, monomials
+from adxl_ros.model.effects.base import (
+    Coefficient,
+    Components,
+    Effect,
+    Environment,
+    NOMINAL_ENVIRONMENT,
+    Parameters,
+    Place,
+    Signals,
+    Value,
+)
 from adxl_ros.model.scalar_or_array import ARRAYS, Maths
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -27,10 +36,6 @@ UNMEASURED_VARIANCE = 1e6
 
 _FORCE2_FLOOR = 1e-30
 """Square of a negligible force, (m/s²)²; chosen: below any noise, it keeps divisors from 0."""
-
-_AGREEMENT = 1e-8
-"""Largest relative difference of polynomials from the derivatives by a coefficient; chosen: far
-above the rounding of these differences, and far below any standard deviation of the covariance."""
 
 _OVERHANG_MPS2 = -0.5
 """Lowest z of a sensor that is stated to be upright, m/s²; chosen: it may lean over by 3°."""
@@ -137,19 +142,20 @@ def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = 
     """
     if sample_variance_v2 is None:
         sample_variance_v2 = noise.sample_std_v(sensor) ** 2
-    tangents = signal_chain.prepared_tangent(sensor)
+    respond = analog_stages.analog_response(sensor)
     follows = any(effect_named(name).follows for name in sensor.effects)
-    variance = _prepared_variance(sensor, follows)
+    by_coefficient = coefficient_tangent(sensor)
     force_leverage = leverage(sensor)
     envelope = sensor.envelope
 
     def covariance(force: Components, environment: Environment = NOMINAL_ENVIRONMENT
                    ) -> MeasuredCovariance:
-        tangent = tangents(force, environment)
+        tangent = signal_chain.tangent(respond, sensor.axes, force, environment)
         count = np.size(force[0])
         by_coefficients = np.zeros((len(sensor.axes), len(sensor.axes), count))
         if len(sensor.covariance):
-            by_coefficients = variance(force, environment)
+            by_coefficients = _coefficient_variance(by_coefficient(force, environment),
+                                                    sensor.covariance)
         noise_v2 = np.diag(sample_variance_v2)[:, :, None]
         measured = _propagated(tangent.back, by_coefficients + noise_v2)
         largest = np.zeros(count)
@@ -165,56 +171,6 @@ def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = 
         return MeasuredCovariance(measured, tangent, largest)
 
     return covariance
-
-
-def _prepared_variance(sensor: Sensor, follows: bool
-                       ) -> Callable[[Components, Environment], np.ndarray]:
-    """
-    Prepare the covariance of the volts by that of the coefficients.
-
-    returns: maps specific force, m/s², three components (n,) or floats, and the surroundings to
-    the covariance, V², (m, m, n). Many samples get that of polynomials, where the derivatives by
-    the coefficients consist of them.
-    """
-    by_coefficient = coefficient_tangent(sensor)
-    roots = cache(lambda: None if follows else _polynomial_roots(sensor, by_coefficient))
-
-    def variance(force: Components, environment: Environment) -> np.ndarray:
-        polynomials = roots() if np.size(force[0]) >= MANY else None
-        if polynomials is None:
-            return _coefficient_variance(by_coefficient(force, environment), sensor.covariance)
-        return _products(polynomials @ monomials(np.array(force)))
-
-    return variance
-
-
-def _polynomial_roots(sensor: Sensor, by_coefficient: Callable[..., np.ndarray]
-                      ) -> np.ndarray | None:
-    """
-    Return polynomials of which the sums of products are the covariance of the volts.
-
-    returns: coefficients of the monomials by axis, (m, k, 20); None where the derivatives by the
-    coefficients are no polynomials.
-    """
-    force, _ = drawn()
-    slopes = by_coefficient(list(force))
-    m, k, count = slopes.shape
-    polynomials = coefficients_of(force, slopes.reshape(m * k, count), _AGREEMENT)
-    if polynomials is None:
-        return None
-    variances, directions = np.linalg.eigh(sensor.covariance)
-    root = np.sqrt(np.maximum(variances, 0.0))[:, None] * directions.T
-    return root @ polynomials.reshape(m, k, -1)
-
-
-def _products(parts: np.ndarray) -> np.ndarray:
-    """Return the sums of products of parts, (m, k, n), over k: (m, m, n)."""
-    m, _, count = parts.shape
-    sums = np.empty((m, m, count))
-    for i in range(m):
-        for j in range(i + 1):
-            sums[i, j] = sums[j, i] = np.einsum('kn,kn->n', parts[i], parts[j])
-    return sums
 
 
 def _coefficient_variance(slope: np.ndarray, covariance: np.ndarray) -> np.ndarray:
@@ -326,3 +282,176 @@ def derived_z_covariance(force: Components, measured: tuple[Value, Value, Value]
     by_zz = [by_z * zz for by_z in slope]
     return (xx + slope[0] * (2 * xz + by_zz[0]), xy + slope[0] * yz + slope[1] * (xz + by_zz[0]),
             xz + by_zz[0], yy + slope[1] * (2 * yz + by_zz[1]), yz + by_zz[1], zz)
+
+
+_RELATIVE_STEP = 1e-3
+"""Step of the central differences by coefficients, in typical sizes; chosen: the chain is smooth
+and nearly linear in them."""
+
+_MANY = 1024
+"""Samples from which the parts of the chain are shared (chosen: the trial takes as long as 500
+samples)."""
+
+_DRAWN = 64
+"""Forces on which the shared parts are tried out (chosen: the trial takes 5 ms)."""
+
+_AGREEMENT = 1e-6
+"""Largest relative difference of the shared parts from the complete chain; chosen: far above
+rounding, and far below the derivative that a missing part would change."""
+
+Slopes = Callable[[Components, Environment], np.ndarray]
+"""Maps forces and environment to derivatives by coefficient and axis, (k, m, n)."""
+
+Difference = Callable[[Signals, Components, Environment], Components]
+"""Maps signals of the chain, forces and environment to a difference of volts by axis, V."""
+
+
+def coefficient_tangent(sensor: Sensor) -> Callable[..., np.ndarray]:
+    """
+    Prepare the derivatives of the volts by the coefficients in `sensor.covariance_names`.
+
+    Returns
+    -------
+    callable
+        Maps specific force, m/s², three components (n,) or floats, and an `Environment` (the
+        nominal one unless given) to derivatives by axis and coefficient, V by the unit of the
+        coefficient, (m, k, n). They are central differences.
+
+    """
+    complete = _complete_chain(sensor)
+    shared = cache(lambda: _shared_chain(sensor, complete))
+
+    def by_coefficient(force: Components,
+                       environment: Environment = NOMINAL_ENVIRONMENT) -> np.ndarray:
+        slopes = complete if np.size(force[0]) < _MANY else shared()
+        return np.swapaxes(slopes(force, environment), 0, 1)
+
+    return by_coefficient
+
+
+def _step(name: Coefficient) -> float:
+    """Return the half step of the central difference by a coefficient, in its unit."""
+    return _RELATIVE_STEP * coefficients.parameter_of(name).scale
+
+
+def _changed(sensor: Sensor, names: tuple[Coefficient, ...], sign: float) -> Sensor:
+    """Return the sensor with coefficients that are larger or smaller by their steps."""
+    values = coefficients.get(sensor, names)
+    return coefficients.put(sensor, names, values + sign * np.array(list(map(_step, names))))
+
+
+def _complete_chain(sensor: Sensor) -> Slopes:
+    """Prepare the differences of the complete chain, one coefficient after the other."""
+    pairs = [tuple(signal_chain.static_response(_changed(sensor, (name,), sign))
+                   for sign in (1, -1)) for name in sensor.covariance_names]
+    distances = [2 * _step(name) for name in sensor.covariance_names]
+
+    def slopes(force: Components, environment: Environment) -> np.ndarray:
+        return np.array([[(a - b) / distance for a, b in zip(above(force, environment),
+                                                             below(force, environment))]
+                         for (above, below), distance in zip(pairs, distances)])
+
+    return slopes
+
+
+def _shared_chain(sensor: Sensor, complete: Slopes) -> Slopes:
+    """
+    Prepare the differences with the parts of the chain that the coefficients share.
+
+    Coefficients of one parameter are changed together if each changes its own axis only.
+    """
+    if analog_stages.effects_at(sensor, Place.ADC, True):
+        return complete  # a step of the ADC shows at some forces only
+    force, environment = _drawn()
+    expected = complete(force, environment)
+    stages = analog_stages.AnalogStages(sensor)
+    groups = [(rows, _difference(sensor, tuple(sensor.covariance_names[row] for row in rows)))
+              for rows in _groups(sensor, expected)]
+    distances = [2 * _step(name) for name in sensor.covariance_names]
+    axes = [sensor.axes.find(name.axis) for name in sensor.covariance_names]
+
+    def slopes(force: Components, environment: Environment) -> np.ndarray:
+        signals = stages.sense(force, environment)
+        stages.respond(signals)
+        stages.amplify(signals)
+        columns = np.zeros((len(distances), len(sensor.axes), np.size(force[0])))
+        for rows, difference in groups:
+            volts = difference(signals, force, environment)
+            for row in rows:
+                changed = range(len(volts)) if len(rows) == 1 else (axes[row],)
+                for axis in changed:
+                    columns[row, axis] = volts[axis] / distances[row]
+        return columns
+
+    largest = np.abs(expected).max(axis=(1, 2), keepdims=True)
+    error = np.abs(slopes(force, environment) - expected)
+    return slopes if (error <= _AGREEMENT * largest).all() else complete
+
+
+def _drawn() -> tuple[Components, Environment]:
+    """Return forces, m/s², three components (n,), and surroundings for a trial."""
+    rng = np.random.default_rng(0)
+    environment = Environment(rng.uniform(0, 1e4, _DRAWN), rng.uniform(-40, 85, _DRAWN),
+                              rng.uniform(3, 6, _DRAWN))
+    return list(rng.normal(size=(3, _DRAWN)) * G0_MPS2), environment
+
+
+def _groups(sensor: Sensor, slopes: np.ndarray) -> list[list[int]]:
+    """
+    Return which coefficients are changed together, by number.
+
+    slopes: derivatives by coefficient and axis, (k, m, n).
+    """
+    groups: dict[Coefficient, list[int]] = {}
+    for row, name in enumerate(sensor.covariance_names):
+        others = [axis != name.axis for axis in sensor.axes]
+        is_own = bool(name.axis) and not slopes[row, others].any()
+        groups.setdefault(name.without_axis if is_own else name, []).append(row)
+    return list(groups.values())
+
+
+def _difference(sensor: Sensor, names: tuple[Coefficient, ...]) -> Difference:
+    """Prepare the difference that coefficients make when they are larger and smaller by a step."""
+    effect = effect_named(names[0].effect)
+    above, below = (_changed(sensor, names, sign) for sign in (1, -1))
+    if effect.place is Place.ELEMENT:
+        return _difference_of_element(effect, analog_stages.parameters(above, effect.name),
+                                      analog_stages.parameters(below, effect.name))
+    if effect.place is Place.ELECTRONICS:
+        return _difference_of_electronics(analog_stages.AnalogStages(above),
+                                          analog_stages.AnalogStages(below))
+    responses = signal_chain.static_response(above), signal_chain.static_response(below)
+
+    def difference(signals: Signals, force: Components, environment: Environment) -> Components:
+        first, second = (respond(force, environment) for respond in responses)
+        return [a - b for a, b in zip(first, second)]
+
+    return difference
+
+
+def _difference_of_element(effect: Effect, above: Parameters, below: Parameters) -> Difference:
+    """Prepare a difference in the output of the element, to which its effects add."""
+    def difference(signals: Signals, force: Components, environment: Environment) -> Components:
+        first, second = (replace(signals, output=[0.0] * len(signals.output)) for _ in range(2))
+        effect.apply(first, above)
+        effect.apply(second, below)
+        return [scale * (a - b)
+                for scale, a, b in zip(signals.scale_v_per_g, first.output, second.output)]
+
+    return difference
+
+
+def _difference_of_electronics(above: analog_stages.AnalogStages,
+                               below: analog_stages.AnalogStages) -> Difference:
+    """Prepare a difference in zero-g and scale factor."""
+    def difference(signals: Signals, force: Components, environment: Environment) -> Components:
+        first, second = replace(signals), replace(signals)
+        above.amplify(first)
+        below.amplify(second)
+        zeros = zip(first.zero_g_v, second.zero_g_v)
+        scales = zip(first.scale_v_per_g, second.scale_v_per_g)
+        return [zero - zero_below + (scale - scale_below) * output
+                for (zero, zero_below), (scale, scale_below), output in zip(
+                    zeros, scales, signals.output)]
+
+    return difference

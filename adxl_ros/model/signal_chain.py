@@ -4,12 +4,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
-from adxl_ros.model.analog_stages import analog_response, AnalogStages, effects_at
+from adxl_ros.model.analog_stages import analog_response, effects_at
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.effects.base import (
     Components,
@@ -18,12 +18,6 @@ from adxl_ros.model.effects.base import (
     Place,
     Signals,
     Value,
-)
-from adxl_ros.model.polynomial_chain import (
-    MANY,
-    monomials,
-    polynomial_chain,
-    PolynomialChain,
 )
 from adxl_ros.model.scalar_or_array import ARRAYS, Maths
 from adxl_ros.model.sensor import Sensor
@@ -43,14 +37,6 @@ solution need far fewer."""
 _CHORD_STEPS = 8
 """Steps with the tangent at rest without gravity before Newton's method; chosen: each leaves a few
 percent of the error of a real sensor, and takes a seventh of the time of a Newton step."""
-
-_TANGENT_STEP = 2
-"""Step of the polynomials with a tangent of its own, which the following ones keep; chosen: the
-steps before it leave 0.1 % of the force, so that one step after it usually ends the search."""
-
-_NEXT_STEP = 0.001
-"""Largest ratio of a step to the one before it, with the tangent of the sample; chosen: a hundred
-times that of a real sensor."""
 
 _CLEAR_Z_MPS2 = 1.0
 """Magnitude of a derived z, m/s², from which |f| = g determines it well; chosen: 6° from alpha =
@@ -217,37 +203,6 @@ def _inverted(by_force: Any, axes: str) -> Tangent:
     return Tangent(back, [-sum(b * row[2] for b, row in zip(line, by_force)) for line in back])
 
 
-def prepared_tangent(sensor: Sensor) -> Callable[[Components, Environment], Tangent]:
-    """
-    Prepare `tangent` for one block of samples after the other.
-
-    Returns
-    -------
-    callable
-        Maps specific force, m/s², three components (n,) or floats, and the surroundings to the
-        tangent. Many samples get that of polynomials, where the chain consists of them.
-
-    """
-    respond = analog_response(sensor)
-    polynomials = cache(lambda: polynomial_chain(AnalogStages(sensor)))
-
-    def tangents(force: Components, environment: Environment) -> Tangent:
-        chain = polynomials() if np.size(force[0]) >= MANY else None
-        if chain is None:
-            return tangent(respond, sensor.axes, force, environment)
-        return _polynomial_tangent(chain, sensor.axes, force, environment)
-
-    return tangents
-
-
-def _polynomial_tangent(chain: PolynomialChain, axes: str, force: Components,
-                        environment: Environment) -> Tangent:
-    """Return the tangent of polynomials; the other arguments are those of `tangent`."""
-    _, gain = chain.levels(environment)
-    slopes = chain.slopes(monomials(np.array(force)))
-    return _inverted([[g * by for by in row] for g, row in zip(gain, slopes)], axes)
-
-
 def _inverse_matrix(a: list[Components]) -> list[Components]:
     """Invert 1×1 to 3×3 matrices by their minors, component by component."""
     if len(a) == 1:
@@ -334,7 +289,6 @@ def inverse(sensor: Sensor, z_sign: np.ndarray | None = None) -> Callable[..., C
 
     """
     respond, gravity = analog_response(sensor), gravity_mps2(sensor)
-    polynomials = cache(lambda: polynomial_chain(AnalogStages(sensor)))
     undo_adc = adc_inverse(sensor)
     up = np.asarray(sensor.z_sign if z_sign is None else z_sign)
 
@@ -345,28 +299,21 @@ def inverse(sensor: Sensor, z_sign: np.ndarray | None = None) -> Callable[..., C
         force = np.full((3, count), np.nan)
         with np.errstate(all='ignore'):
             force[:, finite] = search(
-                input_v[:, finite], polynomials() if count >= MANY else None,
+                input_v[:, finite],
                 Environment(*(np.broadcast_to(np.asarray(e, float), count)[finite]
                               for e in environment)), np.broadcast_to(up, count)[finite])
         return list(force) if np.ndim(volts[0]) else force[:, 0].tolist()
 
-    def search(input_v: np.ndarray, chain: PolynomialChain | None, environment: Environment,
-               signs: np.ndarray) -> np.ndarray:
+    def search(input_v: np.ndarray, environment: Environment, signs: np.ndarray) -> np.ndarray:
         step = partial(newton_step, sensor.axes, gravity, maths=ARRAYS)
-        if chain is None:
-            target, linearise = input_v, partial(_linearised, respond, sensor.axes)
-            first = _chord_steps(respond, sensor.axes, step(signs), input_v, environment)
-        else:
-            target = chain.undo(input_v, environment)
-            linearise = partial(_linearised_polynomials, chain, sensor.axes)
-            first = _polynomial_steps(chain, sensor.axes, step(signs), target)
-        force, is_solved = first
+        force, is_solved = _chord_steps(respond, sensor.axes, step(signs), input_v, environment)
         if sensor.axes == 'xy':
             is_solved &= _is_clear_of_the_fold(force, gravity)
         further = np.flatnonzero(~is_solved)
         if len(further):
-            force[:, further] = _newton_steps(linearise, step, target[:, further], signs[further],
-                                              _select(environment, further))
+            force[:, further] = _newton_steps(
+                respond, sensor.axes, step, input_v[:, further], signs[further],
+                _select(environment, further))
         return force
 
     return invert
@@ -383,59 +330,49 @@ def _is_clear_of_the_fold(force: np.ndarray, gravity: float) -> np.ndarray:
     return (np.abs(z) > _CLEAR_Z_MPS2) & (np.abs(excess) < _TOLERANCE_MPS2 * gravity)
 
 
-def _steps(following: Callable[[int, np.ndarray], np.ndarray], tolerances_mps2: Sequence[float],
-           count: int) -> tuple[np.ndarray, np.ndarray]:
+def _chord_steps(respond: Callable[..., Components], axes: str, advance: Callable[..., Components],
+                 input_v: np.ndarray, environment: Environment
+                 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Take steps from no force until all samples have converged.
+    Take steps from no force with the tangent at rest, which cost one response each.
 
-    following: maps the number of a step and the forces, m/s², (3, n), to the next forces; returns:
-    last forces, m/s², (3, n). Which of them have converged, (n,).
+    returns: last forces, m/s², (3, n), and which of them have converged, (n,).
     """
-    force, moves = np.zeros((3, count)), np.ones(count, bool)
-    for number, tolerance_mps2 in enumerate(tolerances_mps2):
-        new = following(number, force)
+    begin = tangent(respond, axes, [np.zeros(1)] * 3, NOMINAL_ENVIRONMENT)
+    force, moves = np.zeros((3, input_v.shape[1])), np.ones(input_v.shape[1], bool)
+    for _ in range(_CHORD_STEPS):
+        current = list(force)
+        residual_v = [v - r for v, r in zip(input_v, respond(current, environment))]
+        new = np.array(advance(residual_v, current, begin))
         change = np.abs(new - force).max(axis=0)
         # A converged sample stays, so that it does not depend on its neighbours.
         force = np.where(moves, new, force)
-        moves &= ~(change < tolerance_mps2)
+        moves &= ~(change < _TOLERANCE_MPS2)
         if not moves.any():
             break
     return force, ~moves
 
 
-def _chord_steps(respond: Callable[..., Components], axes: str, advance: Callable[..., Components],
-                 input_v: np.ndarray, environment: Environment
-                 ) -> tuple[np.ndarray, np.ndarray]:
-    """Take `_steps` with the tangent at rest, which cost one response each."""
-    begin = tangent(respond, axes, [np.zeros(1)] * 3, NOMINAL_ENVIRONMENT)
-
-    def following(_: int, force: np.ndarray) -> np.ndarray:
-        current = list(force)
-        residual_v = [v - r for v, r in zip(input_v, respond(current, environment))]
-        return np.array(advance(residual_v, current, begin))
-
-    return _steps(following, [_TOLERANCE_MPS2] * _CHORD_STEPS, input_v.shape[1])
-
-
-def _newton_steps(linearise: Callable[..., tuple[Any, Tangent]],
-                  step: Callable[[np.ndarray], Callable[..., Components]], target: np.ndarray,
+def _newton_steps(respond: Callable[..., Components], axes: str,
+                  step: Callable[[np.ndarray], Callable[..., Components]], input_v: np.ndarray,
                   signs: np.ndarray, environment: Environment) -> np.ndarray:
     """
     Take Newton's steps from no force, with a tangent of each sample, until it has converged.
 
-    target: the response to reach, (m, n); signs: sign of a derived z, (n,); returns: forces, m/s²,
+    input_v: volts to reach, (m, n); signs: sign of a derived z, (n,); returns: forces, m/s²,
     (3, n); NaN where there is no solution.
     """
-    count = target.shape[1]
+    count = input_v.shape[1]
     force, unsolved = np.zeros((3, count)), np.ones(count, bool)
     active = np.arange(count)
     for _ in range(_MAX_ITERATIONS):
         # Most samples need equally many steps, and a slice costs less than their numbers.
         samples = slice(None) if len(active) == count else active
         current = list(force[:, samples])
-        response, slope = linearise(current, _select(environment, samples))
-        residual = [t - r for t, r in zip(target[:, samples], response)]
-        following = np.array(step(signs[samples])(residual, current, slope))
+        surroundings = _select(environment, samples)
+        residual_v = [v - r for v, r in zip(input_v[:, samples], respond(current, surroundings))]
+        following = np.array(step(signs[samples])(
+            residual_v, current, tangent(respond, axes, current, surroundings)))
         change = np.abs(following - current).max(axis=0)
         force[:, samples], unsolved[samples] = following, ~(change < _UNSOLVED_MPS2)
         # NaN and infinity fail the comparison, too.
@@ -444,41 +381,6 @@ def _newton_steps(linearise: Callable[..., tuple[Any, Tangent]],
             break
     force[:, unsolved] = np.nan
     return force
-
-
-def _linearised(respond: Callable[..., Components], axes: str, force: Components,
-                environment: Environment) -> tuple[Components, Tangent]:
-    """Return the volts at a force and the tangent there; the arguments are those of `tangent`."""
-    return respond(force, environment), tangent(respond, axes, force, environment)
-
-
-def _linearised_polynomials(chain: PolynomialChain, axes: str, force: Components, _: Environment
-                            ) -> tuple[Components, Tangent]:
-    """Return the output of the element at a force, g, (n,) by axis, and the tangent there."""
-    powers = monomials(np.array(force))
-    return list(chain.output(powers)), _inverted(chain.slopes(powers), axes)
-
-
-def _polynomial_steps(chain: PolynomialChain, axes: str, advance: Callable[..., Components],
-                      output: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Take steps on polynomials, with the tangent at rest and then with that of each sample.
-
-    output: output of the element, g, (m, n); returns: last forces, m/s², (3, n). Which of them
-    have converged, (n,).
-    """
-    slope = _inverted(chain.slopes(monomials(np.zeros((3, 1)))), axes)
-
-    def following(number: int, force: np.ndarray) -> np.ndarray:
-        nonlocal slope
-        powers = monomials(force if number else force[:, :1])  # all begin at no force
-        if number == _TANGENT_STEP:
-            slope = _inverted(chain.slopes(powers), axes)
-        return np.array(advance(output - chain.output(powers), list(force), slope))
-
-    tolerances_mps2 = [_TOLERANCE_MPS2 / (_NEXT_STEP if number >= _TANGENT_STEP else 1.0)
-                       for number in range(_CHORD_STEPS)]
-    return _steps(following, tolerances_mps2, output.shape[1])
 
 
 def _select(environment: Environment, samples: np.ndarray | slice) -> Environment:

@@ -21,8 +21,8 @@ from adxl_ros.files import imu_message
 from adxl_ros.files.stream_info import StreamInfo
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
-from adxl_ros.model.mounting import Mounting
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.tilt import Mounting
 from adxl_ros.nodes.node_help import NodeHelp
 from adxl_ros.nodes.parameters import declare_all, parameter_error
 from adxl_ros.nodes.run_node import run

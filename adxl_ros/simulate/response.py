@@ -8,7 +8,7 @@ from collections.abc import Callable, Hashable
 from dataclasses import replace
 from functools import partial
 from math import ceil
-from typing import Any
+from typing import Any, TypeVar
 import zlib
 
 from adxl_ros.errors import UserError
@@ -29,7 +29,6 @@ from adxl_ros.model.effects.base import (
 from adxl_ros.model.filters import first_order_recursion, low_pass
 from adxl_ros.model.kinematics import specific_force_in_motion, UPRIGHT
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.simulate.chain_memo import ChainMemo
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.smoothed_paths import ForcePath
 import numpy as np
@@ -362,3 +361,26 @@ def check_needs(sensor: Sensor, motion: Motion) -> None:
             if need in missing:
                 raise UserError(f'{name} acts on the {need.value}, but {missing[need]}; leave the '
                                 'effect out')
+
+
+_KEPT = 3
+"""Number of results of each part that are kept. Chosen: the baseline, the present hypothesis and
+one more; a recording of ten minutes then needs below 100 MB."""
+
+_Result = TypeVar('_Result')
+
+
+class ChainMemo:
+    """Results of parts of the chain by what they depend on, the newest of each part."""
+
+    def __init__(self) -> None:
+        self._kept: dict[str, dict[Hashable, object]] = {}
+
+    def __call__(self, part: str, key: Hashable, compute: Callable[[], _Result]) -> _Result:
+        """Return a result that was computed before, or compute it."""
+        kept = self._kept.setdefault(part, {})
+        # The entry moves to the end, so that the one that was not used for longest is dropped.
+        kept[key] = kept.pop(key) if key in kept else compute()
+        while len(kept) > _KEPT:
+            del kept[next(iter(kept))]
+        return kept[key]  # type: ignore[return-value]

@@ -4,12 +4,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import replace
+import os
+from typing import Any
 
-from adxl_ros.files.recording_columns import Recording, REFERENCES
+from adxl_ros.errors import UserError
+from adxl_ros.files import recording
+from adxl_ros.files.recording_columns import JOINTS, Recording, REFERENCES
+from adxl_ros.model.coefficients import neutral
+from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Need
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.simulate.motion import Held, Motion
-from adxl_ros.simulate.response import Response
+from adxl_ros.simulate.motion import Held, INTERNAL_RATE_HZ, Motion, Path
+from adxl_ros.simulate.response import ChainMemo, Response
+from adxl_ros.simulate.smoothed_paths import BAND_LIMITED_DEGREE, ForcePath, SmoothedPath
+from adxl_ros.simulate.trajectories import TRAJECTORIES
 import numpy as np
 
 Columns = dict[str, np.ndarray]
@@ -91,3 +101,148 @@ def encoder_reading(angle_rad: np.ndarray, resolution_rad: float) -> np.ndarray:
     if not resolution_rad:
         return angle_rad
     return np.rint(angle_rad / resolution_rad) * resolution_rad
+
+
+_MAX_SPEED_RAD_S = 100.0
+"""Largest angular velocity of a stage, rad/s; chosen: a faster change is a jump of the reading."""
+
+_MIN_FORCE_SAMPLES = 4
+"""Fewest samples of specific force; a cubic spline needs them."""
+
+
+def motion_from_force(path: str | os.PathLike, resampled: bool, epoch_ns: int = 0
+                      ) -> tuple[Motion, float]:
+    """
+    Make a motion from the specific force of a recording.
+
+    path: recording with specific force in the case frame, m/s²; returns: the motion, and the time
+    at which it begins, s.
+    """
+    time_s, force_mps2 = recording.read_ideal(path, epoch_ns)
+    if len(time_s) < _MIN_FORCE_SAMPLES:
+        raise UserError(f'{path}: {len(time_s)} samples of specific force; at least '
+                        f'{_MIN_FORCE_SAMPLES} are needed')
+    begin_s = float(time_s[0])
+    duration_s = float(time_s[-1] - begin_s)
+    rate_hz = round(1 / float(np.median(np.diff(time_s))), 6)
+    return Motion(
+        duration_s + 1 / rate_hz, force=ForcePath(time_s, force_mps2),
+        internal_rate_hz=rate_hz if resampled else max(rate_hz, INTERNAL_RATE_HZ)), begin_s
+
+
+def motion_from_references(read: Recording, sensor: Sensor) -> Motion:
+    """Make a motion from the stage angles, temperature and supply of a recording."""
+    for name in ('alpha_rad', 'beta_rad'):
+        if name not in read.columns or np.isnan(read.columns[name]).all():
+            raise UserError(f'{read.path}: no stage angle {name} to follow; for specific force '
+                            f'say simulate imu --force {read.path}')
+    resolution = {'alpha': sensor.stage_resolution_rad, 'beta': sensor.stage_resolution_rad,
+                  'shift': 0.0}
+    paths: dict[str, Any] = dict(environment_paths(read))
+    for joint, name in JOINTS.items():
+        values = read.columns.get(name)
+        if values is None or np.isnan(values).all():
+            paths[joint] = Held()
+            continue
+        if joint != 'shift':
+            _check_speed(read, name, resolution[joint])
+        paths[joint] = SmoothedPath(read.time_s, values, resolution[joint],
+                                    BAND_LIMITED_DEGREE)
+    return Motion(float(read.time_s[-1] - read.time_s[0]), **paths)
+
+
+def environment_paths(read: Recording) -> dict[str, Path]:
+    """Return the recorded temperature, °C, and supply, V, as paths by column."""
+    return {name: SmoothedPath(read.time_s, read.columns[name], 0.0)
+            for name in ('temperature_c', 'supply_v')
+            if name in read.columns and np.isfinite(read.columns[name]).any()}
+
+
+def _check_speed(read: Recording, name: str, resolution_rad: float) -> None:
+    """Refuse an angle that changes faster than a stage turns."""
+    sampled = np.flatnonzero(np.isfinite(read.columns[name]))
+    change_rad = np.abs(np.diff(read.columns[name][sampled]))
+    interval_s = np.diff(read.time_s[sampled])
+    jumps = np.flatnonzero(change_rad - 2 * resolution_rad > _MAX_SPEED_RAD_S * interval_s)
+    if len(jumps):
+        i = jumps[0]
+        raise UserError(f'{read.path}: {name} jumps by {change_rad[i]:.3g} rad within '
+                        f'{interval_s[i]:.3g} s at {read.time_s[sampled[i]]:.6g} s, which no '
+                        'stage does; unwrap the angle, or cut the recording there')
+
+
+_SEED = 0
+"""Seed of the manoeuvre and of noise-like effects."""
+
+_QUIET = 1e-9
+"""Factor of the white noise in a comparison; chosen: invisible, but not 0, which effects on the
+noise refuse."""
+
+_FINE_BITS = 32
+"""Resolution of the ADC in a comparison, bit; chosen: its steps are invisible."""
+
+_RATE_HZ = 250.0
+"""Largest sample rate of the comparison, Hz; chosen: above twice the bandwidth of the motion."""
+
+_SHORT_RC_S = 1e-9
+"""Time constant of a filter that does nothing, s; chosen: not 0, which `bandwidth` refuses."""
+
+
+class PartSizes:
+    """Simulates a sensor in the manoeuvre `rich` with and without parts of it."""
+
+    def __init__(self, sensor: Sensor) -> None:
+        """Prepare the comparison."""
+        rich = TRAJECTORIES['rich'](np.random.default_rng(_SEED))
+        self._sensor = replace(sensor, rate_hz=min(sensor.rate_hz, _RATE_HZ))
+        self._motion: Motion = replace(rich, internal_rate_hz=self._sensor.rate_hz)
+        count = int(self._motion.duration_s * self._sensor.rate_hz)
+        self._stamps_s = np.arange(count) / self._sensor.rate_hz
+        self._memo = ChainMemo()
+
+    def effects_mg(self, effects: Collection[str], show: Callable[[float], None]
+                   ) -> dict[str, float]:
+        """Return the size of each effect."""
+        sizes = {}
+        for number, name in enumerate(effects):
+            show(number / len(effects))
+            needs = effect_named(name).needs
+            sensor = self._sensor if {Need.ADC, Need.NOISE} & set(needs) else self._quiet()
+            sizes[name] = self._change_mg(sensor, _without(sensor, [name]))
+        return sizes
+
+    def filter_mg(self) -> float:
+        """Return the rms of what the RC filter changes, mg."""
+        return self._change_mg(self._quiet(), _unfiltered(self._quiet()))
+
+    def remaining_mg(self, held: Collection[str], is_filtered: bool) -> float:
+        """Return the size of all that some effects leave out."""
+        sensor = self._quiet()
+        other = _without(sensor, [name for name in sensor.effects if name not in held])
+        return self._change_mg(sensor, other if is_filtered else _unfiltered(other))
+
+    def _quiet(self) -> Sensor:
+        """Return the sensor with invisible white noise and steps."""
+        sensor = self._sensor
+        return replace(sensor, adc_bits=_FINE_BITS if sensor.adc_bits else 0,
+                       noise_density_g_per_rthz=_QUIET * sensor.noise_density_g_per_rthz)
+
+    def _change_mg(self, sensor: Sensor, other: Sensor) -> float:
+        """Return the rms of the difference of two sensors, mg."""
+        volts = [Response(unit, self._motion, _SEED).whole(self._stamps_s, self._memo)
+                 for unit in (sensor, other)]
+        change_g = (volts[0] - volts[1]) / sensor.nominal_scale_v_per_g
+        return float(1e3 * np.sqrt(np.mean(change_g ** 2)))
+
+
+def _without(sensor: Sensor, effects: Collection[str]) -> Sensor:
+    """Return the sensor with some effects at their neutral values."""
+    return replace(sensor, values={**sensor.values, **{
+        name: neutral(effect_named(name), sensor.axes) for name in effects}})
+
+
+def _unfiltered(sensor: Sensor) -> Sensor:
+    """Return the sensor without its filter."""
+    if not sensor.rc_s:
+        return sensor
+    return replace(sensor, rc_resistance_ohm=_SHORT_RC_S / sensor.rc_capacitance_f)

@@ -10,8 +10,7 @@ from contextlib import contextmanager
 import itertools
 from pathlib import Path
 
-from adxl_ros.compensate.imu_fields import ImuFields
-from adxl_ros.compensate.recordings import effects_left, Estimates, RecordingEstimator
+from adxl_ros.compensate.recordings import effects_left, Estimates, ImuFields, RecordingEstimator
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.bag_writer import TiltBag

@@ -25,7 +25,7 @@ from adxl_ros.model.effects import library
 from adxl_ros.model.population import posterior
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
-from adxl_ros.simulate.from_recording import motion_from_force
+from adxl_ros.simulate.simulator import motion_from_force
 from adxl_ros.tools.command_line import (
     add_recording_options,
     argument_parser,

@@ -21,8 +21,8 @@ from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Concern
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate import simulator
-from adxl_ros.simulate.from_recording import motion_from_force, motion_from_references
 from adxl_ros.simulate.motion import INTERNAL_RATE_HZ
+from adxl_ros.simulate.simulator import motion_from_force, motion_from_references
 from adxl_ros.simulate.trajectories import TRAJECTORIES
 from adxl_ros.tools.command_line import (
     argument_parser,

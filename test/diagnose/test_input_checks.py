@@ -12,9 +12,8 @@ from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.simulate import trajectories
-from adxl_ros.simulate.from_recording import motion_from_force
 from adxl_ros.simulate.motion import Motion
-from adxl_ros.simulate.simulator import simulate
+from adxl_ros.simulate.simulator import motion_from_force, simulate
 from adxl_ros.simulate.trajectories import shaker
 import numpy as np
 import pytest

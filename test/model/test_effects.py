@@ -17,8 +17,7 @@ from adxl_ros.model.coefficients import (
 )
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import ActsOn, Coefficient, Need, Place
-from adxl_ros.model.filters import resonator
-from adxl_ros.model.play_operator import play
+from adxl_ros.model.filters import play, resonator
 from adxl_ros.simulate.motion import Held, Knots, Motion
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.simulator import simulate

@@ -55,7 +55,7 @@ for name, settings in (('serial', {'port': '/dev/null'}), ('iio', {})):
     done = run_without_extras(code, str(nominal))
     assert done.returncode == 0, done.stderr
     serial, iio = done.stdout.splitlines()
-    assert 'pip install pyserial cobs' in serial
+    assert 'pip install pyserial' in serial
     assert "pip install 'pylibiio<1' and sudo apt install libiio0" in iio
 
 

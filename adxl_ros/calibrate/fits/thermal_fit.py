@@ -12,7 +12,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
 from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.play_operator import loop, stop
+from adxl_ros.model.filters import loop, stop
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 import scipy

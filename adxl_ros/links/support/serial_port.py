@@ -16,7 +16,7 @@ import time
 from typing import Any
 
 from adxl_ros.errors import install_hint, UserError
-from adxl_ros.links.support.backoff import Backoff
+from adxl_ros.links.support.waiting import Backoff
 
 SILENT = 'silent, the board sends nothing'
 """Error of a port that is open but delivers nothing."""
@@ -52,7 +52,7 @@ class SerialPort:
         # Bytes that the open port carries per second; infinite where the baud rate has no meaning
         self.uart_bytes_per_s = inf
         self._name, self._baud = name, baud
-        self._pyserial = _import_pyserial()
+        self._pyserial = import_pyserial()
         self._port: Any = None
         self._poll: Any = None
         self._backoff = Backoff()
@@ -189,11 +189,11 @@ def _reason(error: Exception) -> str:
     return ' '.join(str(error).split())
 
 
-def _import_pyserial() -> Any:
+def import_pyserial() -> Any:
     """Return the module serial; raises `UserError` where it is not installed."""
     try:
         import serial
     except ImportError:
-        raise UserError('link.type serial needs the Python packages pyserial and cobs: '
-                        + install_hint('pyserial', 'cobs')) from None
+        raise UserError('link.type serial needs the Python package pyserial: '
+                        + install_hint('pyserial')) from None
     return serial

@@ -4,8 +4,7 @@
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
-from adxl_ros.model.filters import low_pass
-from adxl_ros.model.play_operator import stop
+from adxl_ros.model.filters import low_pass, stop
 
 _IN_PLANE, _OUT_OF_PLANE = (1, 0, 0), (2, 2, 1)
 OTHER_AXIS = {'cross_axis': _IN_PLANE, 'scale_factor_cross': _IN_PLANE,

@@ -7,8 +7,8 @@ from math import cos, sin
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Joint, Need, Parameter, Parameters, Place, Signals
+from adxl_ros.model.filters import play
 from adxl_ros.model.kinematics import angular_motion, carried_acceleration
-from adxl_ros.model.play_operator import play
 import numpy as np
 
 

@@ -5,8 +5,7 @@
 from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
-from adxl_ros.model.filters import low_pass
-from adxl_ros.model.play_operator import loop
+from adxl_ros.model.filters import loop, low_pass
 import numpy as np
 
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Back-off: when a failed attempt is made again, soon at first, then less often, without end."""
+"""Waiting: when a failed attempt is made again, and whether messages come."""
 
 from __future__ import annotations
 
@@ -39,3 +39,29 @@ class Backoff:
     def reset(self) -> None:
         """Retry soon after the next failure."""
         self._wait_s = _FIRST_S
+
+
+class Watchdog:
+    """
+    Measures for how long nothing has come, in time during which the node could listen.
+
+    A node that was held up for seconds finds its messages waiting: they were not missing. And a
+    machine that was held up has stopped whoever publishes them, too. So a turn counts as
+    `longest_turn_s` at most.
+    """
+
+    def __init__(self, longest_turn_s: float) -> None:
+        self._longest_turn_s = longest_turn_s
+        self._checked_s = time.monotonic()
+        self._silent_s = 0.0
+
+    def feed(self) -> None:
+        """Note that a message has come; any thread may call this."""
+        self._silent_s = 0.0
+
+    def check(self) -> float:
+        """Return for how long nothing has come, s; to be called in every turn of the node."""
+        now_s = time.monotonic()
+        self._silent_s += min(now_s - self._checked_s, self._longest_turn_s)
+        self._checked_s = now_s
+        return self._silent_s
