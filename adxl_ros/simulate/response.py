@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import replace
 from functools import partial
 from math import ceil
@@ -70,11 +70,8 @@ class Response:
         self.sensor, self._motion, self._begin_s = sensor, motion, begin_s
         self._seed = seed
         self._force_path: Callable[[np.ndarray], Components] | None = None
-        states = [EffectState(name, analog_stages.parameters(sensor, name), seed)
-                  for name in sensor.effects]
-        self._effects = {place: [state for state in states
-                                 if state.place is place and not state.is_neutral]
-                         for place in Place}
+        self._run = EffectRunner(sensor, sensor.effects, seed)
+        self._effects = self._run.effects
         self._memo: ChainMemo | None = None
         self._block_steps = _BLOCK_STEPS
         steps_per_sample = ceil(motion.internal_rate_hz / sensor.rate_hz - _ROUNDING)
@@ -109,13 +106,7 @@ class Response:
         if self._effects[Place.ADC] or self._effects[Place.CODE]:
             signals.environment = self._environment(instants_s)
         signals.input_v = list((analog_v + self._draw_noise(stamps_s, signals)).T)
-        signals.volts = list(signals.input_v)
-        self._apply(Place.ADC, signals)
-        coded = signal_chain.quantise(np.column_stack(signals.volts), self.sensor,
-                                      signals.lsb_v * np.array(signals.lsb_ratio))
-        signals.volts = list(coded.T)
-        self._apply(Place.CODE, signals)
-        return np.column_stack(signals.volts)
+        return np.column_stack(self._run.convert(signals))
 
     def whole(self, stamps_s: np.ndarray, memo: ChainMemo) -> np.ndarray:
         """
@@ -138,7 +129,7 @@ class Response:
     def _instants(self, stamps_s: np.ndarray) -> np.ndarray:
         """Return the instants of samples by their stamps, s, (n,)."""
         signals = Signals(NOMINAL_ENVIRONMENT, time_s=stamps_s)
-        self._apply(Place.CLOCK, signals)
+        self._run(Place.CLOCK, signals)
         return signals.time_s
 
     def _environment(self, instants_s: np.ndarray) -> Environment:
@@ -149,11 +140,6 @@ class Response:
         if self._motion.supply_v:
             environment = environment._replace(supply_v=self._motion.supply_v(instants_s))
         return environment
-
-    def _apply(self, place: Place, signals: Signals) -> None:
-        for effect in self._effects[place]:
-            signals.memory, signals.rng = effect.memory, effect.rng
-            effect.apply(signals, effect.parameters)
 
     def _sampled(self, steps: np.ndarray) -> tuple[np.ndarray, Signals]:
         """Return filtered volts, (n, m), at samples in steps of the grid, and its signals."""
@@ -185,14 +171,8 @@ class Response:
         """Run the chain up to the filter over the next steps of the grid: volts, (n, m)."""
         signals = self._output_of_element(max(count, 0))
         self._done_steps += max(count, 0)
-        m = len(self.sensor.axes)
-        signals.zero_g_v = self.sensor.nominal_zero_g_v.tolist()
-        signals.scale_v_per_g = self.sensor.nominal_scale_v_per_g.tolist()
-        signals.rc_s, signals.noise_ratio = [self.sensor.rc_s] * m, [1.0] * m
-        signals.lsb_v, signals.lsb_ratio = self.sensor.lsb_v, [1.0] * m
-        self._apply(Place.ELECTRONICS, signals)
-        volts = np.empty((max(count, 0), m))
-        for d, v in enumerate(analog_stages.output_volts(signals)):
+        volts = np.empty((max(count, 0), len(self.sensor.axes)))
+        for d, v in enumerate(self._run.amplify(signals)):
             volts[:, d] = low_pass(np.broadcast_to(v, len(volts)), signals.rc_s[d],
                                    self._dt_s, self._filters[d])
         return volts, signals
@@ -220,7 +200,7 @@ class Response:
 
     def _put_in_time(self, signals: Signals) -> Signals:
         """Set the instants of the samples and the surroundings."""
-        self._apply(Place.CLOCK, signals)
+        self._run(Place.CLOCK, signals)
         signals.environment = self._environment(signals.time_s)
         return signals
 
@@ -237,7 +217,7 @@ class Response:
         signals.alpha, signals.beta, signals.shift = (
             Joint(*(joint(instants_s, order) for order in range(3)))
             for joint in (motion.alpha, motion.beta, motion.shift))
-        self._apply(Place.STAGE, signals)
+        self._run(Place.STAGE, signals)
         signals.force = specific_force_in_motion(
             signals.alpha, signals.beta, signals.shift, signals.gravity_mps2, signals.up)
         return signals
@@ -253,24 +233,24 @@ class Response:
             return force
         signals = Signals(NOMINAL_ENVIRONMENT, time_s=force.time_s, force=force(force.time_s),
                           dt_s=float(np.median(np.diff(force.time_s))))
-        self._apply(Place.REFERENCE, signals)
+        self._run(Place.REFERENCE, signals)
         return ForcePath(signals.time_s, np.column_stack(signals.force))
 
     def _mount(self, signals: Signals) -> Signals:
         """Turn the specific force into the force along the axes of the case, g."""
-        self._apply(Place.FORCE, signals)
+        self._run(Place.FORCE, signals)
         signals.sensed = [f / G0_MPS2 for f in signals.force]
         return signals
 
     def _sense(self, signals: Signals) -> Signals:
         """Turn the force along the axes of the case into that along the sensing axes."""
-        self._apply(Place.MOUNTING, signals)
+        self._run(Place.MOUNTING, signals)
         signals.output = list(signals.sensed)
         return signals
 
     def _put_out(self, signals: Signals) -> Signals:
         """Add the effects of the sensing element."""
-        self._apply(Place.ELEMENT, signals)
+        self._run(Place.ELEMENT, signals)
         return signals
 
     def _kept(self, part: str, key: Hashable, compute: Callable[[], Any]) -> Any:
@@ -325,6 +305,45 @@ class EffectState:
         self.parameters = values
         self.memory: dict[str, Any] = {}
         self.rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
+
+
+class EffectRunner:
+    """Runs the effects of a sensor over samples, in blocks or one by one."""
+
+    def __init__(self, sensor: Sensor, names: Iterable[str], seed: int) -> None:
+        """Prepare some effects of the sensor before the first sample."""
+        self._sensor = sensor
+        states = [EffectState(name, analog_stages.parameters(sensor, name), seed)
+                  for name in names]
+        self.effects = {place: [state for state in states
+                                if state.place is place and not state.is_neutral]
+                        for place in Place}
+
+    def __call__(self, place: Place, signals: Signals) -> None:
+        """Apply the effects of a place."""
+        for effect in self.effects[place]:
+            signals.memory, signals.rng = effect.memory, effect.rng
+            effect.apply(signals, effect.parameters)
+
+    def amplify(self, signals: Signals) -> Components:
+        """Run the electronics up to the filter; return volts by axis."""
+        sensor, count = self._sensor, len(self._sensor.axes)
+        signals.zero_g_v = sensor.nominal_zero_g_v.tolist()
+        signals.scale_v_per_g = sensor.nominal_scale_v_per_g.tolist()
+        signals.rc_s, signals.noise_ratio = [sensor.rc_s] * count, [1.0] * count
+        signals.lsb_v, signals.lsb_ratio = sensor.lsb_v, [1.0] * count
+        self(Place.ELECTRONICS, signals)
+        return analog_stages.output_volts(signals)
+
+    def convert(self, signals: Signals) -> Components:
+        """Run the ADC on `input_v`; return volts by axis."""
+        signals.volts = list(signals.input_v)
+        self(Place.ADC, signals)
+        coded = signal_chain.quantise(np.stack(signals.volts, axis=-1), self._sensor,
+                                      signals.lsb_v * np.array(signals.lsb_ratio))
+        signals.volts = [coded[..., d] for d in range(coded.shape[-1])]
+        self(Place.CODE, signals)
+        return signals.volts
 
 
 def _copied(signals: Signals) -> Signals:

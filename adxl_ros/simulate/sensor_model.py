@@ -11,7 +11,7 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
-from adxl_ros.model import analog_stages, noise, signal_chain
+from adxl_ros.model import noise
 from adxl_ros.model.constants import (
     AXES,
     G0_MPS2,
@@ -23,7 +23,7 @@ from adxl_ros.model.effects.base import Effect, Environment, Need, Place, Signal
 from adxl_ros.model.filters import low_pass
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.simulate.motion import Motion
-from adxl_ros.simulate.response import check_needs, EffectState, lagrange_weights, POINTS
+from adxl_ros.simulate.response import check_needs, EffectRunner, lagrange_weights, POINTS
 import numpy as np
 
 _SAME_STEP = 1e-6
@@ -49,11 +49,8 @@ class SensorModel:
                    for name in self.sensor.effects}
         # Reason by name of an effect of the unit that is not simulated
         self.left_out = {name: reason for name, reason in reasons.items() if reason}
-        states = [EffectState(name, analog_stages.parameters(self.sensor, name), seed)
-                  for name in self.sensor.effects if name not in self.left_out]
-        self._effects = {place: [state for state in states
-                                 if state.place is place and not state.is_neutral]
-                         for place in Place}
+        self._run = EffectRunner(
+            self.sensor, [name for name in self.sensor.effects if name not in self.left_out], seed)
         self._filters: list[dict[str, Any]] = [{} for _ in self.sensor.axes]
         self._white = np.random.default_rng([seed, 0])
         self._noise: np.ndarray | None = None
@@ -140,31 +137,21 @@ class SensorModel:
         oldest = [self._past[i] for i in range(POINTS)]
         return sum(weight * past for weight, past in zip(self._past_weights, reversed(oldest)))
 
-    def _apply(self, place: Place, signals: Signals) -> None:
-        """Apply the effects of a place."""
-        for effect in self._effects[place]:
-            signals.memory, signals.rng = effect.memory, effect.rng
-            effect.apply(signals, effect.parameters)
-
     def _analog(self, now: Environment, force: list[np.ndarray]) -> Signals:
         """Run the chain up to the filter; its volts are in `input_v`, (1, n) each."""
-        sensor, count = self.sensor, len(self.sensor.axes)
+        sensor = self.sensor
         signals = Signals(
             now, time_s=now.time_s, dt_s=self._dt_s, force=force, vref_v=sensor.adc_vref_v,
             nominal_scale_v_per_g=sensor.nominal_scale_v_per_g.tolist())
-        self._apply(Place.FORCE, signals)
+        self._run(Place.FORCE, signals)
         signals.sensed = [f / G0_MPS2 for f in signals.force]
-        self._apply(Place.MOUNTING, signals)
+        self._run(Place.MOUNTING, signals)
         signals.output = list(signals.sensed)
-        self._apply(Place.ELEMENT, signals)
-        signals.zero_g_v = sensor.nominal_zero_g_v.tolist()
-        signals.scale_v_per_g = sensor.nominal_scale_v_per_g.tolist()
-        signals.rc_s, signals.noise_ratio = [sensor.rc_s] * count, [1.0] * count
-        signals.lsb_v, signals.lsb_ratio = sensor.lsb_v, [1.0] * count
-        self._apply(Place.ELECTRONICS, signals)
+        self._run(Place.ELEMENT, signals)
+        amplified_v = self._run.amplify(signals)
         signals.input_v = [low_pass(np.asarray(volts), rc_s, self._dt_s, memory)
-                           for volts, rc_s, memory in zip(analog_stages.output_volts(signals),
-                                                          signals.rc_s, self._filters)]
+                           for volts, rc_s, memory in zip(amplified_v, signals.rc_s,
+                                                          self._filters)]
         return signals
 
     def _digital_v(self, signals: Signals) -> np.ndarray:
@@ -172,15 +159,7 @@ class SensorModel:
         drawn_v = self._draw_noise(signals)
         if drawn_v is not None:
             signals.input_v = [volts + drawn_v[:, d] for d, volts in enumerate(signals.input_v)]
-        signals.volts = list(signals.input_v)
-        self._apply(Place.ADC, signals)
-        coded = signal_chain.quantise(np.stack([volts[0] for volts in signals.volts], axis=-1),
-                                      self.sensor, signals.lsb_v * np.array(signals.lsb_ratio))
-        if not self._effects[Place.CODE]:
-            return coded
-        signals.volts = [volts[None] for volts in coded.T]
-        self._apply(Place.CODE, signals)
-        return np.stack([volts[0] for volts in signals.volts], axis=-1)
+        return np.stack([volts[0] for volts in self._run.convert(signals)], axis=-1)
 
     def _draw_noise(self, signals: Signals) -> np.ndarray | None:
         """Draw the noise behind the filter, V, (n, m), as `Response` does; None without any."""
