@@ -102,7 +102,7 @@ class Sensor:
     # How the driver reaches the unit: values of `link.*` by name. Its file carries them.
     link: dict[str, Any] = field(default_factory=dict)
     # Names of the nominal values that the parameter file leaves out. Their fields hold
-    # placeholders until `signals.measured_values` measures them.
+    # placeholders until `signals.recorded_sensor` measures them.
     unstated: tuple[str, ...] = ()
     # Names of the nominal values that were measured from samples in their place
     measured: tuple[str, ...] = ()
