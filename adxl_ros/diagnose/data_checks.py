@@ -75,6 +75,7 @@ _BURSTS = 0.5
 samples do not change the one, and hardly the other."""
 _USUAL_STEPS = 1.5
 """Steps up to this many medians count as one sample. Chosen: halfway to two."""
+_EVEN = 'an even rate of {:.6g} Hz explains them: it is used'
 _ROUNDS = 3
 """Rounds that number the samples by the line and fit the line. Chosen: numbers then stay."""
 _SAMPLES = 4000
@@ -247,9 +248,10 @@ def even_stamps(stamps_s: np.ndarray) -> EvenStamps | None:
         return None
     rounding_s = _rounding_s(stamps_s)
     if largest * slope_s < (0.5 + _ROUNDING_TOLERANCE) * rounding_s:
-        note = f'stamps are rounded to {rounding_s:g} s, and {_even_text(slope_s)}'
+        note = f'stamps are rounded to {rounding_s:g} s, and {_EVEN.format(1 / slope_s)}'
         return EvenStamps(time_s, True, note if largest > _MENTIONED else '')
-    note = f'stamps scatter by up to {1e3 * largest * slope_s:.3g} ms, and {_even_text(slope_s)}'
+    note = (f'stamps scatter by up to {1e3 * largest * slope_s:.3g} ms, and '
+            f'{_EVEN.format(1 / slope_s)}')
     return EvenStamps(time_s, False, note if largest > _MENTIONED else '')
 
 
@@ -258,11 +260,6 @@ def _line(stamps_s: np.ndarray, number: np.ndarray) -> tuple[np.ndarray, float, 
     slope_s, begin_s = np.polyfit(number, stamps_s - stamps_s[0], 1)
     time_s = stamps_s[0] + begin_s + slope_s * number
     return time_s, float(slope_s), float(np.abs(stamps_s - time_s).max() / slope_s)
-
-
-def _even_text(step_s: float) -> str:
-    """Return which clock is used."""
-    return f'an even rate of {1 / step_s:.6g} Hz explains them: it is used'
 
 
 def _numbers(stamps_s: np.ndarray, steps_s: np.ndarray) -> np.ndarray:
@@ -292,7 +289,7 @@ def _from_bursts(stamps_s: np.ndarray) -> EvenStamps | None:
     time_s, slope_s, largest = _line(stamps_s, np.arange(len(stamps_s)))
     if largest > _LARGEST_BURST:
         return None
-    return EvenStamps(time_s, True, f'stamps come in bursts, and {_even_text(slope_s)}')
+    return EvenStamps(time_s, True, f'stamps come in bursts, and {_EVEN.format(1 / slope_s)}')
 
 
 def find_encoder_fault(recording: Recording, sensor: Sensor) -> DataFault | None:
@@ -559,9 +556,14 @@ def _axis_fault(comparison: BaselineComparison) -> DataFault | None:
     for i, measured in enumerate(measured_g.T):
         correlation[i] = [_correlation(measured, simulated) for simulated in simulated_g.T]
     axes = [sensor.axes[d] for d in moving]
-    return (_order_fault(axes, correlation)
-            or _unit_fault(simulated_g, measured_g, np.diag(correlation))
-            or _reference_fault(float(np.max(np.abs(correlation)))))
+    fault = _order_fault(axes, correlation) or _unit_fault(simulated_g, measured_g,
+                                                           np.diag(correlation))
+    largest = float(np.max(np.abs(correlation)))
+    if fault is not None or largest >= _UNCORRELATED:
+        return fault
+    return DataFault('reference', 'bad_data', 'the output does not follow the reference '
+                     f'(correlation {largest:.2f}); check that both belong to one recording, '
+                     f'with clocks that differ by less than {_LARGEST_DELAY_S:g} s')
 
 
 def _order_fault(axes: list[str], correlation: np.ndarray) -> DataFault | None:
@@ -586,15 +588,6 @@ def _unit_fault(simulated_g: np.ndarray, measured_g: np.ndarray, correlation: np
             return DataFault('unit', 'bad_data', f'the output is {gain:.4g} times the simulated '
                              f'output, as values in {units} are; correct the unit of the columns')
     return None
-
-
-def _reference_fault(correlation: float) -> DataFault | None:
-    """Find an output that does not follow the reference, by its largest correlation."""
-    if correlation >= _UNCORRELATED:
-        return None
-    return DataFault('reference', 'bad_data', 'the output does not follow the reference '
-                     f'(correlation {correlation:.2f}); check that both belong to one recording, '
-                     f'with clocks that differ by less than {_LARGEST_DELAY_S:g} s')
 
 
 def _delay_fault(simulated_g: np.ndarray, measured_g: np.ndarray, rate_hz: float

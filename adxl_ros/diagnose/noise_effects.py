@@ -525,16 +525,11 @@ def compare_noise(residual_v: np.ndarray, simulated_v: np.ndarray, rate_hz: floa
         power_ratio=tuple(float(power[band].sum() / simulated_power[band].sum())
                           for band in bands),
         averaging_times_s=tuple(times_s),
-        allan_ratio=tuple(_allan_ratio(recorded, simulated, round(t * rate_hz))
-                          for t in times_s),
+        allan_ratio=tuple(float(np.sqrt(np.mean((
+            allan_deviation(recorded, round(t * rate_hz))
+            / allan_deviation(simulated, round(t * rate_hz))) ** 2))) for t in times_s),
         log_likelihood=-float(np.sum(power[1:] / expected + np.log(expected))),
         simulated_std_mps2=float(np.sqrt(np.mean(simulated ** 2))))
-
-
-def _allan_ratio(recorded: np.ndarray, simulated: np.ndarray, count: int) -> float:
-    """Return the rms over axes of the ratio of Allan deviations of `count` samples."""
-    ratio = allan_deviation(recorded, count) / allan_deviation(simulated, count)
-    return float(np.sqrt(np.mean(ratio ** 2)))
 
 
 def allan_deviation(values: np.ndarray, count: int) -> np.ndarray:
@@ -602,7 +597,8 @@ def noise_remainders(comparisons: Sequence[BaselineComparison], mean_sensor: Sen
     """Compare the noise-like effects of the recordings with those of their simulation."""
     named = [d for d in detections if d.effect != UNKNOWN]
     remainders: list[NoiseRemainder] = []
-    pairs = [(c, _recorded(c, mean_sensor), _simulated(c, named_sensor, seed))
+    pairs = [(c, _Series(c.volts, bridged(c.residual_v(mean_sensor), c.used)),
+              _simulated(c, named_sensor, seed))
              for c in comparisons] if named else []
     for detection in named:
         if effect_named(detection.effect).diagnosis.detector is Detector.MAINS_LINE:
@@ -665,12 +661,6 @@ def _remainder(effect: str, quantity: str, unit: str, axes: str,
     recorded, simulated = np.sqrt(np.mean(np.square(np.array(values, float)), axis=0))
     return NoiseRemainder(effect, quantity, unit, axes if len(recorded) == len(axes) else '',
                           recorded, simulated)
-
-
-def _recorded(comparison: BaselineComparison, mean_sensor: Sensor) -> _Series:
-    """Return the recording, and its residual, bridged over samples that are not used."""
-    return _Series(comparison.volts,
-                   bridged(comparison.residual_v(mean_sensor), comparison.used))
 
 
 def _simulated(comparison: BaselineComparison, sensor: Sensor, seed: int) -> _Series:

@@ -137,7 +137,8 @@ def estimate(comparisons: Sequence[BaselineComparison]) -> NoiseFloor:
 def _repeat_squares(comparisons: Sequence[BaselineComparison]) -> list[SquareSum]:
     """Return the squares of the differences between repeats of a trajectory on the stage."""
     staged = [c for c in comparisons if c.reference is Reference.STAGE]
-    oriented = [directions(c.motion.alpha(c.time_s), c.motion.beta(c.time_s)) for c in staged]
+    oriented = [np.array(specific_force(c.motion.alpha(c.time_s), c.motion.beta(c.time_s), 1.0))
+                for c in staged]
     out: list[SquareSum] = []
     for i, first in enumerate(staged):
         for j, second in enumerate(staged[i:], i):
@@ -155,12 +156,18 @@ def _repeat_squares(comparisons: Sequence[BaselineComparison]) -> list[SquareSum
 
 
 def _encoder_mean_square(comparison: BaselineComparison) -> float:
-    """Return the mean square that the steps of the encoder make in a recording, (m/s²)²."""
-    if comparison.reference is not Reference.STAGE or not comparison.sensor.stage_resolution_rad:
+    """
+    Return the mean square that the steps of the encoder make, over samples and axes, (m/s²)².
+
+    It is step²/12 times the squared slope of gravity.
+    """
+    motion, sensor = comparison.motion, comparison.sensor
+    if comparison.reference is not Reference.STAGE or not sensor.stage_resolution_rad:
         return 0.0
-    motion, time_s, used = comparison.motion, comparison.time_s, comparison.used
-    return encoder_mean_square(motion.alpha(time_s)[used], motion.beta(time_s)[used],
-                               comparison.sensor)
+    angles = (joint(comparison.time_s)[comparison.used] for joint in (motion.alpha, motion.beta))
+    slopes = gravity_slopes(*angles)[:, :len(sensor.axes)]
+    return float(sensor.local_gravity_mps2 ** 2 * sensor.stage_std_rad ** 2
+                 * np.mean((slopes ** 2).sum(axis=0)))
 
 
 def squares_at_rest(volts: np.ndarray, at_rest: np.ndarray, sensor: Sensor) -> list[SquareSum]:
@@ -223,27 +230,6 @@ def find_repeat(first: np.ndarray, second: np.ndarray, rate_hz: float, resolutio
             or moved < _REPEAT_MOTION:
         return None
     return slice(0, count), slice(lag, lag + count)
-
-
-def directions(alpha_rad: np.ndarray, beta_rad: np.ndarray) -> np.ndarray:
-    """
-    Return the direction of gravity in the sensor's frame.
-
-    alpha_rad, beta_rad: angles of the stage, rad, (n,); returns: unit vectors, (3, n).
-    """
-    return np.array(specific_force(alpha_rad, beta_rad, 1.0))
-
-
-def encoder_mean_square(alpha_rad: np.ndarray, beta_rad: np.ndarray, sensor: Sensor) -> float:
-    """
-    Return the mean square that the steps of the encoder make, over samples and axes.
-
-    alpha_rad, beta_rad: angles of the stage, rad, (n,); returns: step²/12 times the squared slope
-    of gravity, (m/s²)².
-    """
-    slopes = gravity_slopes(alpha_rad, beta_rad)[:, :len(sensor.axes)]
-    return float(sensor.local_gravity_mps2 ** 2 * sensor.stage_std_rad ** 2
-                 * np.mean((slopes ** 2).sum(axis=0)))
 
 
 def gravity_slopes(alpha_rad: np.ndarray, beta_rad: np.ndarray) -> np.ndarray:

@@ -112,10 +112,15 @@ def prove(effect: str, comparison: BaselineComparison, full_rate: BaselineCompar
         return EffectProof(effect, ProofVariable.STEP.value,
                            curves=_histograms(full_rate, sensor, without))
     if library_effect.acts_on is ActsOn.NOISE or ProofVariable.FREQUENCY in variables:
-        is_noise = library_effect.acts_on is ActsOn.NOISE
-        curves = _noise_spectra if is_noise else _mean_spectra
-        return EffectProof(effect, ProofVariable.FREQUENCY.value, True,
-                           curves=curves(full_rate, sensor, without))
+        if library_effect.acts_on is ActsOn.NOISE:
+            signals_v = {'recorded': full_rate.residual_v(sensor),
+                         'without the effect': full_rate.simulated_noise_v(without, 0),
+                         'with the effect': full_rate.simulated_noise_v(sensor, 0)}
+        else:
+            signals_v = {'without the effect': full_rate.residual_v(without),
+                         'with the effect': full_rate.residual_v(sensor)}
+        return EffectProof(effect, ProofVariable.FREQUENCY.value, True, curves=tuple(
+            curve for label, v in signals_v.items() for curve in spectra(full_rate, v, label)))
     return _binned(effect, variables, comparison, sensor, without)
 
 
@@ -223,24 +228,6 @@ def _force_g(comparison: BaselineComparison) -> np.ndarray | None:
     if comparison.reference is Reference.SIMULATOR and motion.force is not None:
         return np.column_stack(motion.force(time_s)) / G0_MPS2
     return None
-
-
-def _mean_spectra(comparison: BaselineComparison, sensor: Sensor, without: Sensor
-                  ) -> tuple[Curve, ...]:
-    """Return spectra of recording minus simulation, without and with an effect on the mean."""
-    residuals = {'without the effect': without, 'with the effect': sensor}
-    return tuple(curve for label, simulated in residuals.items()
-                 for curve in spectra(comparison, comparison.residual_v(simulated), label))
-
-
-def _noise_spectra(comparison: BaselineComparison, sensor: Sensor, without: Sensor
-                   ) -> tuple[Curve, ...]:
-    """Return the spectrum of the recorded noise, and of simulated noise with and without."""
-    signals_v = {'recorded': comparison.residual_v(sensor),
-                 'without the effect': comparison.simulated_noise_v(without, 0),
-                 'with the effect': comparison.simulated_noise_v(sensor, 0)}
-    return tuple(curve for label, signal_v in signals_v.items()
-                 for curve in spectra(comparison, signal_v, label))
 
 
 def spectra(comparison: BaselineComparison, signal_v: np.ndarray, label: str) -> list[Curve]:
