@@ -106,7 +106,7 @@ class Response:
         if self._effects[Place.ADC] or self._effects[Place.CODE]:
             signals.environment = self._environment(instants_s)
         signals.input_v = list((analog_v + self._draw_noise(stamps_s, signals)).T)
-        return np.column_stack(self._run.convert(signals))
+        return self._run.convert(signals)
 
     def whole(self, stamps_s: np.ndarray, memo: ChainMemo) -> np.ndarray:
         """
@@ -335,15 +335,17 @@ class EffectRunner:
         self(Place.ELECTRONICS, signals)
         return analog_stages.output_volts(signals)
 
-    def convert(self, signals: Signals) -> Components:
-        """Run the ADC on `input_v`; return volts by axis."""
+    def convert(self, signals: Signals) -> np.ndarray:
+        """Run the ADC on `input_v`; return volts, (..., m)."""
         signals.volts = list(signals.input_v)
         self(Place.ADC, signals)
         coded = signal_chain.quantise(np.stack(signals.volts, axis=-1), self._sensor,
                                       signals.lsb_v * np.array(signals.lsb_ratio))
+        if not self.effects[Place.CODE]:
+            return coded
         signals.volts = [coded[..., d] for d in range(coded.shape[-1])]
         self(Place.CODE, signals)
-        return signals.volts
+        return np.stack(signals.volts, axis=-1)
 
 
 def _copied(signals: Signals) -> Signals:

@@ -159,7 +159,7 @@ class SensorModel:
         drawn_v = self._draw_noise(signals)
         if drawn_v is not None:
             signals.input_v = [volts + drawn_v[:, d] for d, volts in enumerate(signals.input_v)]
-        return np.stack([volts[0] for volts in self._run.convert(signals)], axis=-1)
+        return self._run.convert(signals)[0]
 
     def _draw_noise(self, signals: Signals) -> np.ndarray | None:
         """Draw the noise behind the filter, V, (n, m), as `Response` does; None without any."""
