@@ -22,6 +22,8 @@ import numpy as np
 import pytest
 from units import nominal
 
+pytestmark = pytest.mark.long
+
 LIMITS = StageLimits((0.0, np.pi), (0.0, 2 * np.pi), 0.5)
 SENSOR = nominal(rate_hz=62.5)
 FIRST = Question(Pose(0.0, 0.0), 0.0, 10.0, False)

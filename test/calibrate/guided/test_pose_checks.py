@@ -100,6 +100,7 @@ def test_a_wrong_pose_is_refused_once_the_unit_is_estimated():
     assert hand.run(4, target.alpha_rad, target.beta_rad, encoder=False)
 
 
+@pytest.mark.long
 def test_units_at_the_edge_of_the_datasheet_are_never_refused():
     """No pose of 15 units with departures up to twice the datasheet's limits is refused."""
     rng = np.random.default_rng(7)

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from scipy.stats import false_discovery_control, linregress
 
+pytestmark = pytest.mark.long
+
 FLEETS = 40
 
 
