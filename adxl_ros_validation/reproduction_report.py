@@ -9,10 +9,11 @@ import os
 import textwrap
 from typing import Any
 
-from adxl_ros.files.plot_file import pyplot, write_plot
+from adxl_ros.files.atomic_write import write_bytes
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.report.figures import png, pyplot
 from adxl_ros_validation import experiments
 from adxl_ros_validation.experiments import DirectionSearch, ModelErrors, MODELS, RUNS, Unit
 import numpy as np
@@ -37,7 +38,7 @@ def draw_misalignment(path: str | os.PathLike, search: DirectionSearch) -> None:
     axis.set(xlabel='beta of the stage, °', ylabel='x output minus its largest, mg',
              title='Direction of the x axis (18): the maximum is flat')
     axis.legend(fontsize=8)
-    write_plot(figure, path)
+    write_bytes(path, png(figure))
 
 
 def draw_tilt(path: str | os.PathLike, unit: Unit) -> None:
@@ -63,7 +64,7 @@ def draw_tilt(path: str | os.PathLike, unit: Unit) -> None:
     grid[0, 0].legend(fontsize=8)
     figure.suptitle('Tilt; gaps are poses whose bound exceeds 1° '
                     '(linear scale within ±0.1°, logarithmic beyond)')
-    write_plot(figure, path)
+    write_bytes(path, png(figure))
 
 
 def draw_motion(path: str | os.PathLike, fitted: dict[str, Sensor],
@@ -85,7 +86,7 @@ def draw_motion(path: str | os.PathLike, fitted: dict[str, Sensor],
                                          f'about an offset of {errors.offset_mmps2:.1f}')
         axis.legend(fontsize=8, loc='upper right')
     row[0].set(ylabel='acceleration along x, mm/s²')
-    write_plot(figure, path)
+    write_bytes(path, png(figure))
 
 
 def draw_components(path: str | os.PathLike, truth: Sensor, fitted: Sensor,
@@ -113,7 +114,7 @@ def draw_components(path: str | os.PathLike, truth: Sensor, fitted: Sensor,
     difference.set(xlabel='acceleration along x, g', ylabel='minus the actual response, mV',
                    title='the same, minus the actual response')
     response.legend(fontsize=8)
-    write_plot(figure, path)
+    write_bytes(path, png(figure))
 
 
 def _volts(unit: Sensor, effects: tuple[str, ...] | None, pose: list[np.ndarray]) -> np.ndarray:

@@ -12,12 +12,12 @@ import hashlib
 from adxl_ros.calibrate.fits.paper_regression import planes
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.files import calibration_store
-from adxl_ros.files.package_version import package_version
 from adxl_ros.model.covariance import leverage
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.validity import Envelope, STRETCH
+from adxl_ros.package_version import package_version
 import numpy as np
 
 _SAME_BETA_RAD = 1e-3

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 from adxl_ros.calibrate.fits.gravity_fit import MIN_RESTS
-from adxl_ros.calibrate.value_text import counted, duration
 from adxl_ros.diagnose.data_checks import SHORTEST_S as SHORTEST_MOTION_S
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import recording
@@ -17,6 +16,7 @@ from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.files.recording_columns import Recording, uncalibrated
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.report.numbers import counted, duration
 from adxl_ros.signals.allan_deviation import shortest_rest_s
 from adxl_ros.signals.recorded_sensor import load_sensor
 from adxl_ros.signals.recording_contents import examine, log_delay, RecordingContents

@@ -39,8 +39,6 @@ from adxl_ros.diagnose.report import (
 )
 from adxl_ros.diagnose.residual_map import BLOCK_S, RANGES, ResidualCell, SIGNIFICANT_P
 from adxl_ros.diagnose.visibility import by_effect
-from adxl_ros.files import html_page, plotly_figures as plots
-from adxl_ros.files.plotly_figures import Figure, figure, line, rounded
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import with_neutral
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
@@ -50,6 +48,8 @@ from adxl_ros.model.effects.base import ActsOn
 from adxl_ros.model.filters import low_pass
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.report import figures as plots, page as html_page
+from adxl_ros.report.figures import Figure, figure, line, rounded
 import numpy as np
 import scipy
 

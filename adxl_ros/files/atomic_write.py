@@ -56,6 +56,12 @@ def write_text(path: str | os.PathLike, text: str) -> None:
         fresh.write_text(text, encoding='utf-8')
 
 
+def write_bytes(path: str | os.PathLike, data: bytes) -> None:
+    """Write a file as a whole or not at all."""
+    with atomic_path(path) as fresh:
+        fresh.write_bytes(data)
+
+
 def remove_unfinished(folder: str | os.PathLike, name: str) -> None:
     """
     Remove the unfinished files of writers that were killed.

@@ -19,7 +19,6 @@ from xml.sax.saxutils import quoteattr
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
-from adxl_ros.files.package_version import package_version
 from adxl_ros.files.parameter_file import float_text
 from adxl_ros.model import analog_stages, noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
@@ -27,6 +26,7 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Place
 from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
+from adxl_ros.package_version import package_version
 import numpy as np
 
 WHITE_NOISE = 'white noise'

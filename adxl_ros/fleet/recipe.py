@@ -21,8 +21,8 @@ from typing import NamedTuple
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
-from adxl_ros.files.package_version import package_version
 from adxl_ros.files.stream_info import NO_UNIT
+from adxl_ros.package_version import package_version
 import yaml
 
 TASKS = ('check', 'noise', 'fit', 'diagnose')

@@ -19,11 +19,11 @@ import textwrap
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.package_version import package_version
 from adxl_ros.links.support import base
 from adxl_ros.nodes.parameters import Kind, Spec, specs_of
 from adxl_ros.nodes.sensor_parameters import nominal_specs
 from adxl_ros.nodes.settings import DriverSettings, link_specs
+from adxl_ros.package_version import package_version
 import rclpy
 from rclpy.node import Node
 

@@ -41,7 +41,7 @@ class _ShowVersion(argparse.Action):
 
     def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
                  values: Any, option_string: str | None = None) -> None:
-        from adxl_ros.files.package_version import package_version
+        from adxl_ros.package_version import package_version
         print(f'adxl_ros {package_version()}')
         parser.exit()
 

@@ -16,7 +16,7 @@ from adxl_ros.diagnose.report import as_json, screen_lines
 from adxl_ros.diagnose.self_check import self_check
 from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.errors import UserError
-from adxl_ros.files import html_page, parameter_file, population_file, recording
+from adxl_ros.files import parameter_file, population_file, recording
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.files.recording_columns import Recording
@@ -24,6 +24,7 @@ from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.model.effects import library
 from adxl_ros.model.population import posterior
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.report import page as html_page
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
 from adxl_ros.simulate.simulator import motion_from_force
 from adxl_ros.tools.command_line import (

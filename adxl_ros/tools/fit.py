@@ -17,7 +17,6 @@ from adxl_ros.calibrate.report.unit_errors import errors_in_words
 from adxl_ros.errors import UserError
 from adxl_ros.files import (
     calibration_store,
-    html_page,
     population_file,
     recording,
     sweep_journal,
@@ -28,6 +27,7 @@ from adxl_ros.files.tables import read_pose_table
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Place
 from adxl_ros.model.sensor import Sensor, with_axes
+from adxl_ros.report import page as html_page
 from adxl_ros.signals.recorded_sensor import BeyondRange, listed, load_sensor, measure_unstated
 from adxl_ros.tools.command_line import (
     add_recording_options,

@@ -11,15 +11,15 @@ from pathlib import Path
 import shlex
 from time import monotonic
 
-from adxl_ros.calibrate.value_text import counted, duration
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.files import calibration_store
-from adxl_ros.files.plain_address import as_utf_8, without_secrets
 from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.fleet.inputs import find_sources, Source, stated_by
 from adxl_ros.fleet.recipe import make_recipe, Recipe, task_names, TASKS
 from adxl_ros.fleet.row import reason_kind, Row
 from adxl_ros.fleet.run import only_client, Plan, plan, Results, Selection, since_text, work
+from adxl_ros.report.addresses import as_utf_8, without_secrets
+from adxl_ros.report.numbers import counted, duration
 from adxl_ros.tools.command_line import (
     add_recording_options,
     argument_parser,

@@ -11,16 +11,17 @@ import json
 from pathlib import Path
 from typing import Any
 
-from adxl_ros.calibrate.value_text import duration
 from adxl_ros.errors import UserError
-from adxl_ros.files import html_page, parameter_file, recording
-from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files import parameter_file, recording
+from adxl_ros.files.atomic_write import write_bytes, write_text
 from adxl_ros.files.csv_file import csv_writer
-from adxl_ros.files.plot_file import pyplot, write_plot
 from adxl_ros.files.recording_columns import Recording, unit_of
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.report import page as html_page
+from adxl_ros.report.figures import png, pyplot
+from adxl_ros.report.numbers import duration
 from adxl_ros.signals.allan_deviation import longest_rest, StillStretch
 from adxl_ros.signals.axis_noise import (
     AxisNoise,
@@ -292,7 +293,7 @@ def _write_page(folder: Path, result: RecordingNoise) -> list[Path]:
     page, plot, curve = (folder / name for name in ('report.html', 'allan.png', 'allan.csv'))
     figure = _plot(result)
     write_text(page, _page(result, figure))
-    write_plot(figure, plot)
+    write_bytes(plot, png(figure))
     with csv_writer(curve) as append:
         append({'tau_s': result.rest.allan.tau_s, 'averages': result.rest.allan.averages,
                 **{f'{noise.axis}_mps2': result.rest.allan.deviation[:, i]

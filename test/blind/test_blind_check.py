@@ -7,7 +7,7 @@ import json
 import shutil
 import sys
 
-from adxl_ros.files.plot_file import pyplot
+from adxl_ros.report.figures import pyplot
 from adxl_ros.workers import open_pool
 from adxl_ros_validation.blind import (
     check,

@@ -10,10 +10,10 @@ from typing import NamedTuple
 from adxl_ros.calibrate.fits import full_model
 from adxl_ros.calibrate.fits.term_selection import Term
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.calibrate.value_text import with_half_width
 from adxl_ros.model.coefficients import get, parameter_of
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.report.numbers import with_half_width
 import numpy as np
 
 NOT_CONVERGED = ('the fit did not converge: coefficients and intervals are those of its last '

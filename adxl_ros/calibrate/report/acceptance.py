@@ -18,11 +18,11 @@ from adxl_ros.calibrate.report.error_budget import (
     rms_mg,
     sample_noise_mps2,
 )
-from adxl_ros.calibrate.value_text import with_half_width
 from adxl_ros.model.coefficients import get, parameter_of
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.report.numbers import with_half_width
 import numpy as np
 
 PASS = 'PASS'

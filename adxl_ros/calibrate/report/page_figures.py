@@ -8,7 +8,8 @@ from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report.acceptance import Assessment
 from adxl_ros.calibrate.report.cross_validation import determining_alpha, HeldOutErrors
 from adxl_ros.calibrate.report.drift_history import DriftSeries
-from adxl_ros.files.plotly_figures import (
+from adxl_ros.model.constants import G0_MPS2, Z_90
+from adxl_ros.report.figures import (
     AXIS_COLOURS,
     axis_number,
     Figure,
@@ -18,7 +19,6 @@ from adxl_ros.files.plotly_figures import (
     QUIET_COLOUR,
     rounded,
 )
-from adxl_ros.model.constants import G0_MPS2, Z_90
 import numpy as np
 
 _BAND_COLOUR = 'rgba(31,95,191,0.12)'

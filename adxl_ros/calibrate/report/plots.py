@@ -13,10 +13,11 @@ from adxl_ros.calibrate.fits import linear, paper_regression
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
 from adxl_ros.calibrate.poses import Poses, reference_force
 from adxl_ros.calibrate.report.cross_validation import HeldOutErrors
-from adxl_ros.files.plot_file import pyplot, write_plot
+from adxl_ros.files.atomic_write import write_bytes
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.report.figures import png, pyplot
 import numpy as np
 
 _FINE_G = np.linspace(-1, 1, 201)
@@ -54,7 +55,7 @@ class _AxisData:
 
 def draw_sweep(path: str | os.PathLike, sensor: Sensor, fitted: Sensor, poses: Poses) -> None:
     """Write the plot of `sweep` as PNG."""
-    write_plot(sweep(sensor, fitted, poses), path)
+    write_bytes(path, png(sweep(sensor, fitted, poses)))
 
 
 def sweep(sensor: Sensor, fitted: Sensor, poses: Poses, panels: Sequence[int] = range(6)) -> Any:

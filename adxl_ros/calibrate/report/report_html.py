@@ -26,18 +26,14 @@ from adxl_ros.calibrate.report.cross_validation import ErrorStatistic, HeldOutEr
 from adxl_ros.calibrate.report.drift_history import DriftHistory
 from adxl_ros.calibrate.report.error_budget import ErrorBudget, rms_mg, sample_noise_mps2
 from adxl_ros.errors import UserError
-from adxl_ros.files import (
-    calibration_store,
-    html_page,
-    parameter_file,
-    plot_file,
-    plotly_figures,
-)
-from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files import calibration_store, parameter_file
+from adxl_ros.files.atomic_write import write_bytes, write_text
 from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.report import page as html_page
+from adxl_ros.report.figures import Figure, png, whisker
 import numpy as np
 
 _PANELS = ((0, 1), (2, 3), (4, 5))
@@ -85,7 +81,7 @@ def write(folder: str | os.PathLike, result: CalibrationResult,
 def draw(path: str | os.PathLike, result: CalibrationResult) -> None:
     """Write the plots of a calibrated unit as PNG."""
     if result.gravity_fit is not None:
-        plot_file.write_plot(plots.gravity_rests(result.name, result.gravity_fit), path)
+        write_bytes(path, png(plots.gravity_rests(result.name, result.gravity_fit)))
     else:
         plots.draw_sweep(path, result.nominal, result.paper_sensor, result.poses)
 
@@ -174,7 +170,7 @@ def _digits(value: float) -> str:
 
 def _figures(result: CalibrationResult, assessment: Assessment | None,
              errors: HeldOutErrors | None, history: DriftHistory
-             ) -> dict[str, plotly_figures.Figure]:
+             ) -> dict[str, Figure]:
     """Return the figures of the page by name."""
     figures = {}
     if result.gravity_fit is not None:
@@ -297,7 +293,7 @@ def _coefficients(fitted: Sensor) -> list[dict[str, Any]]:
         rows.append({
             'label': f'{row.label} {row.axis}', 'name': str(name), 'text': text,
             'datasheet': _range_text(typical, maximum, row.unit), 'outcome': beyond,
-            'mark': plotly_figures.whisker(
+            'mark': whisker(
                 value, value - half_width, value + half_width, (-largest, largest), text,
                 typical or maximum, beyond.startswith('beyond'))})
     return rows
@@ -335,9 +331,7 @@ def _paper_figures(result: CalibrationResult) -> tuple[list[str], str]:
 
 
 def _picture(figure: Any) -> str:
-    url = html_page.picture_url(figure)
-    plot_file.pyplot().close(figure)
-    return url
+    return html_page.picture_url(figure)
 
 
 def _provenance(fitted: Sensor) -> list[list[str]]:

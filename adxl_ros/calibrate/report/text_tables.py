@@ -11,9 +11,9 @@ from adxl_ros.calibrate.report import acceptance
 from adxl_ros.calibrate.report.against_truth import Comparison
 from adxl_ros.calibrate.report.cross_validation import HeldOutErrors
 from adxl_ros.calibrate.report.error_budget import sample_noise_mps2
-from adxl_ros.calibrate.value_text import decimals, duration
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.report.numbers import decimals, duration
 import numpy as np
 
 _MODELS = {'nominal': 'datasheet values', 'linear': 'linear calibration',

@@ -12,7 +12,7 @@ import io
 from pathlib import Path
 from typing import Any
 
-from adxl_ros.files import html_page, plotly_figures as plotly, population_file
+from adxl_ros.files import population_file
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.fleet.report.findings import (
     effect_matrix,
@@ -35,6 +35,7 @@ from adxl_ros.fleet.report.fleet_table import (
 from adxl_ros.fleet.report.trends import FALSE_DISCOVERY_RATE, Scatter
 from adxl_ros.fleet.row import PAGE, POPULATION, reason_kind, TABLE, UNITS
 from adxl_ros.model.constants import AXES, Z_90
+from adxl_ros.report import figures as plotly, page as html_page
 import numpy as np
 import scipy
 

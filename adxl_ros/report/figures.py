@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Figures of plotly.js as plain objects, which `html_page` puts into pages.
+Figures of plotly.js as plain objects, which `page` puts into pages, and plots of matplotlib.
 
 Plain objects serve every version of plotly. Its Python classes would cost a second at start-up.
 """
@@ -8,8 +8,10 @@ Plain objects serve every version of plotly. Its Python classes would cost a sec
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from io import BytesIO
 from typing import Any
 
+from adxl_ros.errors import install_hint, UserError
 import numpy as np
 
 Figure = dict[str, Any]
@@ -30,6 +32,8 @@ _FONT = {'family': 'system-ui, "DejaVu Sans", sans-serif', 'size': 12, 'color': 
 _GRID = {'gridcolor': '#e4e7eb', 'zerolinecolor': '#9aa5b1', 'linecolor': '#9aa5b1',
          'automargin': True, 'exponentformat': 'none', 'hoverformat': '.4~g'}
 """Properties of all axes of a plot."""
+_FILE_DPI = 80
+"""Resolution of PNG files, dots per inch (chosen: a plot of 12 inches fits a screen)."""
 
 
 def figure(traces: Iterable[Figure], height: int, **layout: Any) -> Figure:
@@ -108,3 +112,22 @@ def whisker(value: float, low: float, high: float, bounds: tuple[float, float], 
     shaded = (place(-typical), place(typical) - place(-typical)) if typical else None
     return {'text': text, 'zero': place(0.0), 'dot': place(value), 'typical': shaded,
             'line': (place(low), place(high) - place(low)), 'beyond': beyond}
+
+
+def pyplot() -> Any:
+    """Return matplotlib's drawing functions, without a display."""
+    try:
+        import matplotlib
+    except ImportError:
+        raise UserError(f'plots need matplotlib; {install_hint("matplotlib")}') from None
+    matplotlib.use('Agg')
+    import matplotlib.pyplot
+    return matplotlib.pyplot
+
+
+def png(figure: Any, dpi: int = _FILE_DPI) -> bytes:
+    """Return a matplotlib figure as a PNG picture, and close it."""
+    out = BytesIO()
+    figure.savefig(out, dpi=dpi, format='png', metadata={'Software': None})
+    pyplot().close(figure)
+    return out.getvalue()

@@ -12,15 +12,15 @@ from base64 import b64encode
 from collections.abc import Mapping
 from datetime import datetime
 import gzip
-from io import BytesIO
 from pathlib import Path
 import shlex
 import sys
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.package_version import package_version
-from adxl_ros.files.plain_address import as_utf_8, without_secrets
+from adxl_ros.package_version import package_version
+from adxl_ros.report.addresses import as_utf_8, without_secrets
+from adxl_ros.report.figures import png
 
 _DPI = 100
 """Resolution of pictures, dots per inch (chosen: sharp at the page's width)."""
@@ -44,7 +44,7 @@ def render(package: str, template: str, values: Mapping[str, Any]) -> str:
     from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
     from plotly.offline import get_plotlyjs
     loader = ChoiceLoader([PackageLoader(package, ''),
-                           PackageLoader('adxl_ros.files', 'page_templates')])
+                           PackageLoader('adxl_ros.report', 'page_templates')])
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined,
                               trim_blocks=True, lstrip_blocks=True)
     plotly_js = gzip.compress(get_plotlyjs().encode(), _GZIP_LEVEL, mtime=0)
@@ -61,10 +61,8 @@ def command_of_this_process() -> str:
 
 
 def picture_url(figure: Any) -> str:
-    """Return a matplotlib figure as the URL of an image that is part of the page."""
-    out = BytesIO()
-    figure.savefig(out, dpi=_DPI, format='png', metadata={'Software': None})
-    return f'data:image/png;base64,{b64encode(out.getvalue()).decode()}'
+    """Close a matplotlib figure and return it as the URL of an image that is part of the page."""
+    return f'data:image/png;base64,{b64encode(png(figure, _DPI)).decode()}'
 
 
 def download_url(text: str) -> str:
