@@ -17,9 +17,9 @@ import os
 
 from adxl_ros.calibrate import pose_response
 from adxl_ros.calibrate.fits import full_model, term_selection
-from adxl_ros.calibrate.guided import pose_plan, quick_plan
+from adxl_ros.calibrate.guided import pose_plan, running_estimate
+from adxl_ros.calibrate.pose_response import StageError
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.calibrate.stage_error import StageError
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
 from adxl_ros.model.constants import Z_90
@@ -85,7 +85,7 @@ def draw(nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], se
     truth = _unit(sensor, stage, rng)
     step = float(stated * np.exp(rng.uniform(*np.log(_STATED))))
     targets = pose_plan.guided(pose_plan.default_planes_rad(axes), pose_plan.STEP_RAD, 0) \
-        if kind == 'full' else quick_plan.quick(sensor, _DWELL_S, _QUICK_RAD, 0)
+        if kind == 'full' else running_estimate.quick(sensor, _DWELL_S, _QUICK_RAD, 0)
     poses, true_rad = _swept(truth, targets, stage == STAGES[0], step, rng)
     fit, _ = term_selection.fit_selected(sensor, poses)
     names = fit.fitted.covariance_names

@@ -10,10 +10,10 @@ from functools import partial
 import os
 
 from adxl_ros.calibrate import pose_extraction, pose_response
-from adxl_ros.calibrate.fits import full_model, linear, paper_regression, term_selection
+from adxl_ros.calibrate.fits import full_model, linear, term_selection
 from adxl_ros.calibrate.guided.pose_plan import sweep
+from adxl_ros.calibrate.pose_response import StageError
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.calibrate.stage_error import StageError
 from adxl_ros.compensate import filter_inversion
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info
@@ -206,7 +206,7 @@ def motion_bound_mmps2(nominal: Sensor) -> float:
     return float(1e3 * density * np.sqrt(nominal.rate_hz / 2 * np.sum(impulse ** 2)))
 
 
-MODELS = {'linear': linear.fit, 'physical': paper_regression.fit, 'full': term_selection.fit}
+MODELS = {'linear': linear.fit, 'physical': linear.fit_physical, 'full': term_selection.fit}
 DRAWN = full_model.TERMS
 """Effects of a unit. Each coefficient is normal; its typical size is the standard deviation."""
 PLANES_RAD = tuple(np.radians([90.0, 60.0, 30.0, 0.0, 120.0, 150.0, 180.0]).tolist())

@@ -10,25 +10,11 @@ from dataclasses import dataclass, replace
 from functools import partial
 import os
 
-from adxl_ros.calibrate.fits import (
-    full_fit_text,
-    full_model,
-    gravity_fit as gravity,
-    linear,
-    paper_regression,
-    term_selection,
-)
+from adxl_ros.calibrate.fits import full_model, gravity_fit as gravity, linear, term_selection
 from adxl_ros.calibrate.fits.full_model import FullFit
-from adxl_ros.calibrate.pose_references import has_angles
-from adxl_ros.calibrate.poses import check_polarity, join_poses, Poses, reference_force
-from adxl_ros.calibrate.provenance import envelope, with_provenance
-from adxl_ros.calibrate.recording_consistency import require_one_mounting
-from adxl_ros.calibrate.report import (
-    acceptance,
-    cross_validation,
-    error_budget,
-    unit_errors,
-)
+from adxl_ros.calibrate.poses import check_polarity, has_angles, join_poses, Poses, reference_force
+from adxl_ros.calibrate.provenance import envelope, require_one_mounting, with_provenance
+from adxl_ros.calibrate.report import acceptance, cross_validation, error_budget, text_tables
 from adxl_ros.calibrate.report.acceptance import Assessment
 from adxl_ros.calibrate.report.cross_validation import HeldOutErrors
 from adxl_ros.errors import UserError
@@ -45,7 +31,7 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.recorded_sensor import FilterNoise, with_filter
 import numpy as np
 
-STAGE_FITS = {'linear': linear.fit, 'physical': paper_regression.fit, 'full': term_selection.fit}
+STAGE_FITS = {'linear': linear.fit, 'physical': linear.fit_physical, 'full': term_selection.fit}
 """Models that are fitted against the stage, simplest first."""
 _LISTED_RESTS = 5
 """Largest number of rests that a line lists (chosen: fits into a line)."""
@@ -161,7 +147,7 @@ class CalibrationResult:
     def paper_sensor(self) -> Sensor:
         """Return the unit by a model that the paper's figures can show."""
         return self.fitted if self.fitted.model in ('physical', 'full') else \
-            paper_regression.fit(self.nominal, self.poses.subset(~self.poses.check))
+            linear.fit_physical(self.nominal, self.poses.subset(~self.poses.check))
 
 
 def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None = None,
@@ -197,7 +183,7 @@ def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | 
 
     """
     result = _calibrated(sensor, recordings, model, effects, data_sha256, population)
-    lines = unit_errors.turn_on_lines(result.fitted, [item.poses for item in recordings])
+    lines = text_tables.turn_on_lines(result.fitted, [item.poses for item in recordings])
     return _with_warnings(result, lines)
 
 
@@ -361,8 +347,8 @@ def _fit_affine(sensor: Sensor, recordings: Sequence[RecordedPoses]) -> _StageFi
     def refit(sensor: Sensor, poses: Poses) -> Sensor:
         return term_selection.fit_affine(sensor, poses).fitted
 
-    return _StageFit(full.fitted, refit, [*lines, *full_fit_text.report_lines(full, poses, [])],
-                     warnings=[*lines, *full_fit_text.warnings(full, poses)], full=full)
+    return _StageFit(full.fitted, refit, [*lines, *term_selection.report_lines(full, poses, [])],
+                     warnings=[*lines, *term_selection.warnings(full, poses)], full=full)
 
 
 def _fit_open(sensor: Sensor, recordings: Sequence[RecordedPoses], population: Population
@@ -396,8 +382,8 @@ def _fit(model: str, sensor: Sensor, recordings: Sequence[RecordedPoses], effect
     if len(recordings) > 1:
         require_one_mounting(full, [recording.poses for recording in recordings],
                              [recording.source for recording in recordings])
-    return _StageFit(full.fitted, fit_full, full_fit_text.report_lines(full, poses, terms),
-                     warnings=full_fit_text.warnings(full, poses), full=full)
+    return _StageFit(full.fitted, fit_full, term_selection.report_lines(full, poses, terms),
+                     warnings=term_selection.warnings(full, poses), full=full)
 
 
 def _rms_residual_mg(fitted: Sensor, poses: Poses) -> float:
@@ -443,7 +429,7 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, d
 
 
 def _gravity_fit_lines(fit: gravity.GravityFit, poses: Poses) -> list[str]:
-    lines = [] if fit.converged else [full_fit_text.NOT_CONVERGED]
+    lines = [] if fit.converged else [term_selection.NOT_CONVERGED]
     if fit.outliers:
         rests = ', '.join(f'{i + 1} (from {poses.time_s[i, 0]:.1f} s)' for i in fit.outliers)
         lines.append(f'outliers, left out: rest {rests}')

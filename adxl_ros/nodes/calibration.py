@@ -12,7 +12,6 @@ import os
 from pathlib import Path
 
 from adxl_ros.calibrate.guided import pose_plan
-from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, StageMode
 from adxl_ros.calibrate.guided.controller import (
     Answer,
     Controller,
@@ -21,7 +20,8 @@ from adxl_ros.calibrate.guided.controller import (
     Severity,
 )
 from adxl_ros.calibrate.guided.guide import NextPose
-from adxl_ros.calibrate.guided.session_settings import SessionSettings
+from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, StageMode
+from adxl_ros.calibrate.guided.session import SessionSettings
 from adxl_ros.calibrate.guided.thermal_guide import ThermalSettings
 from adxl_ros.files.stream_info import StreamInfo
 from adxl_ros.nodes.display import Announcer, DisplayPublisher

@@ -17,7 +17,7 @@ import time
 from adxl_ros.calibrate.fits import gravity_fit, linear
 from adxl_ros.calibrate.guided import pose_plan
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.calibrate.report import acceptance, against_truth, cross_validation
+from adxl_ros.calibrate.report import acceptance, cross_validation, text_tables
 from adxl_ros.calibrate.report.text_tables import (
     acceptance_lines,
     added_effect_lines,
@@ -242,8 +242,8 @@ def _run_sweep(folder: Path, speed: float, seed: int) -> None:
         poses = _show_sweep(graph, output)
     fitted = parameter_file.load(output)
     _print('', *error_table(_held_out_errors(sensor, fitted, poses)), '',
-           *truth_table(against_truth.compare(fitted, truth)), '', *acceptance_lines(fitted),
-           *added_effect_lines(against_truth.added_effects(fitted, truth)), '',
+           *truth_table(text_tables.compare(fitted, truth)), '', *acceptance_lines(fitted),
+           *added_effect_lines(text_tables.added_effects(fitted, truth)), '',
            *file_lines({'Page': report / 'report.html', 'Calibration': output}))
 
 

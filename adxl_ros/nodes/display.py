@@ -12,12 +12,10 @@ import subprocess
 import sys
 import termios
 
-from adxl_ros.calibrate.guided.capture_settings import Phase
 from adxl_ros.calibrate.guided.controller import Controller, ControllerState, IDLE_TEXT
-from adxl_ros.calibrate.guided.display import live_reading, SessionDisplay
 from adxl_ros.calibrate.guided.guide import NextPose
-from adxl_ros.calibrate.guided.screen_contents import KeyAction, LiveReading, ScreenContents
-from adxl_ros.calibrate.guided.session import Session
+from adxl_ros.calibrate.guided.screen_contents import KeyAction, LiveReading, Phase, ScreenContents
+from adxl_ros.calibrate.guided.session import live_reading, Session, SessionDisplay
 from adxl_ros.nodes.run_node import executable, held_output
 from adxl_ros.nodes.topics import create_publisher, Level, Status, status_message, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus

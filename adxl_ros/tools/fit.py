@@ -10,10 +10,9 @@ from pathlib import Path
 
 from adxl_ros.calibrate import calibration, pose_extraction, thermal_calibration
 from adxl_ros.calibrate.fits import thermal_fit
-from adxl_ros.calibrate.pose_references import with_table_angles
-from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.poses import Poses, with_table_angles
 from adxl_ros.calibrate.report import acceptance, report_html, text_tables
-from adxl_ros.calibrate.report.unit_errors import errors_in_words
+from adxl_ros.calibrate.report.text_tables import errors_in_words
 from adxl_ros.errors import UserError
 from adxl_ros.files import (
     calibration_store,

@@ -3,8 +3,8 @@
 """Settings of a joint: the rule, and equal numbers from sweep, journal, bag and CSV."""
 
 
-from adxl_ros.calibrate import joint_settings
-from adxl_ros.calibrate.joint_settings import recorded_settings, SettingTracker
+from adxl_ros.calibrate import pose_extraction
+from adxl_ros.calibrate.pose_extraction import recorded_settings, SettingTracker
 import numpy as np
 import pytest
 
@@ -86,7 +86,7 @@ def test_a_joint_moves_with_its_encoder_or_its_command(
 
 def test_the_live_tracker_and_a_recording_agree(monkeypatch):
     """Both agree on random walks of encoder and command, with few readings in the tracker."""
-    monkeypatch.setattr(joint_settings, '_MAX_READINGS', 12)
+    monkeypatch.setattr(pose_extraction, '_MAX_READINGS', 12)
     rng = np.random.default_rng(5)
     moves = 0
     for _ in range(300):

@@ -6,8 +6,8 @@
 from dataclasses import replace
 
 from adxl_ros.calibrate import pose_response
-from adxl_ros.calibrate.fits import full_model, linearised
-from adxl_ros.calibrate.stage_error import PoseCovariance, shared_settings, StageError
+from adxl_ros.calibrate.fits import full_model, linearisation
+from adxl_ros.calibrate.pose_response import PoseCovariance, shared_settings, StageError
 from adxl_ros.model.coefficients import with_neutral
 import numpy as np
 import pytest
@@ -70,8 +70,8 @@ def test_the_stated_error_counts_where_poses_do_not_determine_it(poses):
     unit = with_neutral(nominal(), ('bias', 'scale_factor', 'base_tilt'))
     names = full_model.fitted_coefficients('xy', ('bias', 'scale_factor'))
     precision = full_model.prior_precision(names)
-    few = linearised.linearised(unit, poses.subset(np.arange(4)), names, precision)
+    few = linearisation.linearised(unit, poses.subset(np.arange(4)), names, precision)
     assert few.stage_error(1e-3).total_rad == pytest.approx(1e-3, rel=1.0)
     quiet = replace(poses, volts=pose_response.predicted_volts(unit, poses))
-    many = linearised.linearised(unit, quiet, names, precision)
+    many = linearisation.linearised(unit, quiet, names, precision)
     assert many.stage_error(1e-3).total_rad < 1e-4

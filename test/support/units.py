@@ -5,7 +5,7 @@
 from dataclasses import replace
 
 from adxl_ros.calibrate import pose_response
-from adxl_ros.calibrate.fits.paper_regression import EFFECTS
+from adxl_ros.calibrate.fits.linear import EFFECTS
 from adxl_ros.calibrate.guided.pose_plan import sweep
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.files import parameter_file

@@ -28,11 +28,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from adxl_ros.calibrate.fits import d_optimal, linear
-from adxl_ros.calibrate.fits.linearised import Linearised, linearised
-from adxl_ros.calibrate.pose_response import angle_jacobian, predicted_volts
+from adxl_ros.calibrate.fits import linear, linearisation
+from adxl_ros.calibrate.fits.linearisation import Linearised, linearised
+from adxl_ros.calibrate.pose_response import (
+    angle_jacobian,
+    AngleErrors,
+    PoseCovariance,
+    predicted_volts,
+    StageError,
+)
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.calibrate.stage_error import AngleErrors, PoseCovariance, StageError
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
 from adxl_ros.model.constants import AXES
@@ -597,11 +602,11 @@ def next_poses(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: 
         Alpha and beta of each pose, rad.
 
     """
-    grid = d_optimal.candidate_poses(np.median(poses.std_v, axis=0))
+    grid = linearisation.candidate_poses(np.median(poses.std_v, axis=0))
     scale = np.array([parameter_of(name).scale for name in names])
-    rows = d_optimal.whitened_jacobian(unit, grid, tuple(names), stage) * scale
+    rows = linearisation.whitened_jacobian(unit, grid, tuple(names), stage) * scale
     information = fisher_information(unit, poses, names, stage) * np.outer(scale, scale)
-    chosen = d_optimal.choose_poses(rows, information + _REGULARISATION * np.eye(len(names)),
+    chosen = linearisation.choose_poses(rows, information + _REGULARISATION * np.eye(len(names)),
                                     count)
     return [(float(grid.alpha_rad[i]), float(grid.beta_rad[i])) for i in chosen]
 

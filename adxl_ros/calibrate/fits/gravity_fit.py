@@ -28,10 +28,10 @@ from adxl_ros.calibrate.fits.gravity_model import (
     NominalRests,
     posterior_information,
     regularised_fit,
+    rests_to_add,
     TRIAL_STD_G,
     undetermined,
 )
-from adxl_ros.calibrate.fits.orientations import rests_to_add
 from adxl_ros.errors import UserError
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor

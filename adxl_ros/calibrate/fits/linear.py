@@ -1,16 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The manufacturer's linear model: equations 1 to 3."""
+"""
+The manufacturer's linear model: equations 1 to 3.
+
+- The paper's sequential fit of its nonlinear regression model: equations 4 to 19.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+from adxl_ros.calibrate.pose_response import angle_jacobian
 from adxl_ros.calibrate.poses import Poses, reference_force
 from adxl_ros.errors import UserError
+from adxl_ros.model import signal_chain
+from adxl_ros.model.coefficients import get
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -124,3 +132,245 @@ def _fit_open_line(reference_g: np.ndarray, volts: np.ndarray, std_v: np.ndarray
     covariance = np.linalg.inv(design.T @ design / variance + np.linalg.inv(prior.covariance))
     zero_g_v, scale_v_per_g = nominal + covariance @ (design.T @ residual) / variance
     return _Line(float(zero_g_v), float(scale_v_per_g), covariance)
+
+
+EFFECTS = ('bias', 'scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z',
+           'scale_factor_z')
+"""Effects of the paper's model."""
+_GAUGE = {('cross_axis', 'linear'), ('cross_axis_z', 'linear')}
+"""Effect and parameter of the coefficients that stay 0."""
+_OF_Z_AXIS = ('bias', 'scale_factor', 'misalignment')
+"""Effects of a z axis: the paper has no model of it."""
+_VERTICAL_SIN = np.sin(np.radians(89.0))
+"""Planes with a greater |sin α| count as vertical."""
+_MIN_PLANE_SIN = 0.2
+"""Planes with |sin α| below this do not determine a scale factor (15)."""
+_MIN_PLANE_SPAN_G = 0.1
+"""Smallest span of the reference in a plane that determines a scale factor, g."""
+_MIN_INPUTS = 3
+"""Smallest number of distinct inputs that determine a quadratic."""
+_MIN_INPUT_SPAN_G = 0.3
+"""Smallest span of the inputs that determine a quadratic, g."""
+_SAME_PLANE_RAD = np.radians(1.0)
+"""Largest difference of neighbouring angles alpha in one plane, rad."""
+_REPLICAS = 200
+"""Sweeps of the parametric bootstrap: the standard deviations are known to 5 %."""
+
+
+@dataclass(frozen=True)
+class AxisRegression:
+    """Regressions of one axis before the gauge is fixed, for figures 4 to 8 of the paper."""
+
+    # zero_g_v, scale_v_per_g: Zero-g and scale factor of the linear model, V and V/g
+    zero_g_v: float
+    scale_v_per_g: float
+    # p, q: Coefficients of 1, a, a² in g(V_c) (11) and h(V_z) (13): V, V/g, V/g², (3,)
+    p: np.ndarray
+    q: np.ndarray
+    r: np.ndarray  # Coefficients of 1, a, a² in SF(V_z) (15): V/g, V/g², V/g³, (3,)
+    plane_az_g: np.ndarray  # Mean reference of z in each of n planes, g, (n,)
+    plane_bias_v: np.ndarray  # Bias of each plane minus the zero-g, V, (n,)
+    # Scale factor of each plane, V/g, (n,); NaN where the plane does not determine it
+    plane_scale_v_per_g: np.ndarray
+
+
+def fit_physical(sensor: Sensor, poses: Poses) -> Sensor:
+    """
+    Fit the paper's model to the poses of a sweep through several planes alpha.
+
+    Parameters
+    ----------
+    sensor
+        Nominal values and local gravity of the unit.
+    poses
+        Poses on the stage.
+
+    Returns
+    -------
+    Sensor
+        The fitted unit with its covariance.
+
+    Raises
+    ------
+    UserError
+        The planes do not determine the model. The message names the missing ones.
+
+    """
+    fitted = _assemble(sensor, poses, regress_axes(sensor, poses))
+    return replace(fitted, covariance=_covariance(sensor, fitted, poses))
+
+
+def regress_axes(sensor: Sensor, poses: Poses) -> list[AxisRegression]:
+    """
+    Fit the regressions of the x and y axes (equations 8 to 17).
+
+    Parameters
+    ----------
+    sensor, poses
+        As for `fit`.
+
+    Returns
+    -------
+    list
+        Regressions of x and of y.
+
+    Raises
+    ------
+    UserError
+        The planes do not determine the model, or the sensor has no x and y.
+
+    """
+    if not sensor.axes.startswith('xy'):
+        raise UserError(f'the physical model needs the axes x and y, not {sensor.axes}; '
+                        'fit --model linear')
+    start = fit(sensor, poses)
+    return [_regress_axis(d, start, poses) for d in range(2)]
+
+
+def planes(alpha_rad: np.ndarray) -> list[np.ndarray]:
+    """Group poses by plane: indices of those whose alpha agree within 1°."""
+    order = np.argsort(alpha_rad, kind='stable')
+    cuts = np.flatnonzero(np.diff(alpha_rad[order]) > _SAME_PLANE_RAD) + 1
+    return np.split(order, cuts)
+
+
+def _regress_axis(d: int, start: Sensor, poses: Poses) -> AxisRegression:
+    force = np.column_stack(reference_force(poses, start.local_gravity_mps2)) / G0_MPS2
+    zero, scale = start.zero_g_v[d], start.scale_v_per_g[d]
+    along, az, volts = force[:, d], force[:, 2], poses.volts[:, d]
+    # The measured value of the other axis would add its misalignment to q1 and q2.
+    across = force[:, 1 - d]
+    vertical = np.abs(np.sin(poses.alpha_rad)) > _VERTICAL_SIN
+    residual = volts - zero - scale * along                                  # (10)
+    p = _quadratic(across[vertical], residual[vertical],
+                   'the plane alpha = 90 deg', 'poses at steps of 30 deg in beta there')  # (11)
+    corrected = volts - _polynomial(p, across)
+    rows = [_regress_plane(along[plane], az[plane], corrected[plane], poses.alpha_rad[plane],
+                           scale) for plane in planes(poses.alpha_rad)]
+    plane_az, plane_bias, plane_scale = np.array(rows).T                     # (12), (15)
+    plane_bias -= zero
+    missing = 'planes alpha = 30, 60, 120 and 150 deg beside 90'
+    has_scale = np.isfinite(plane_scale)
+    r = _quadratic(plane_az[has_scale], plane_scale[has_scale], 'the inclined planes', missing)
+    # q1 is the misalignment's A_z, which the scale factor multiplies like any other force.
+    growth = _polynomial(r / r[0], plane_az)
+    q = _quadratic(plane_az, plane_bias, 'the planes', missing, growth)      # (13)
+    return AxisRegression(zero, scale, p, q, r, plane_az, plane_bias, plane_scale)
+
+
+def _regress_plane(along_g: np.ndarray, az_g: np.ndarray, volts: np.ndarray,
+                   alpha_rad: np.ndarray, scale_v_per_g: float) -> tuple[float, float, float]:
+    """Return z in g, bias in V and scale factor in V/g (NaN if undetermined) of a plane."""
+    inclined = np.abs(np.sin(alpha_rad).mean()) >= _MIN_PLANE_SIN
+    if inclined and np.ptp(along_g) > _MIN_PLANE_SPAN_G:
+        scale, bias = np.polyfit(along_g, volts, 1)
+    else:
+        scale, bias = np.nan, np.mean(volts - scale_v_per_g * along_g)
+    return float(az_g.mean()), float(bias), float(scale)
+
+
+def _quadratic(a: np.ndarray, values: np.ndarray, where: str, missing: str,
+               growth: np.ndarray | float = 1.0) -> np.ndarray:
+    """Fit the coefficients of 1, a·growth, a², (3,), for inputs a, g; refuse too few inputs."""
+    # Inputs within 0.017 g are one, as angles within 1° are one plane.
+    if len(planes(a)) < _MIN_INPUTS or np.ptp(a) < _MIN_INPUT_SPAN_G:
+        raise UserError(f'the physical model is not determined: {len(planes(a))} distinct '
+                        f'inputs in {where}, at least {_MIN_INPUTS} are needed; add {missing}, '
+                        'or fit the linear model')
+    design = np.column_stack([np.ones_like(a), a * growth, a * a])
+    return np.linalg.lstsq(design, values, rcond=None)[0]
+
+
+def _polynomial(coefficients: np.ndarray, a: np.ndarray) -> np.ndarray:
+    return np.polynomial.polynomial.polyval(a, coefficients)
+
+
+def _assemble(sensor: Sensor, poses: Poses, regressions: list[AxisRegression]) -> Sensor:
+    """Fix the gauge and convert the regressions into parameters of effects."""
+    count = len(sensor.axes)
+    zero, scale = sensor.nominal_zero_g_v.copy(), sensor.nominal_scale_v_per_g.copy()
+    alpha, beta, p2, q2, r1, r2 = (np.zeros(count) for _ in range(6))
+    for d, axis in enumerate(regressions):
+        slope = axis.r[0]
+        turn, tilt = np.arcsin(axis.p[1] / slope), np.arcsin(axis.q[1] / slope)
+        beta[d], alpha[d] = (turn, -tilt) if d == 0 else (-turn, tilt)       # (18), (19)
+        zero[d] = axis.zero_g_v + axis.p[0] + axis.q[0]
+        scale[d] = slope / (np.cos(turn) * np.cos(tilt))
+        p2[d], q2[d] = axis.p[2] / scale[d], axis.q[2] / scale[d]
+        r1[d], r2[d] = axis.r[1:] / slope
+    if count == 3:
+        zero[2], scale[2], alpha[2], beta[2] = _fit_z_axis(sensor, poses)
+    values = {
+        'bias': {'offset_v': zero - sensor.nominal_zero_g_v},
+        'scale_factor': {'offset_v_per_g': scale - sensor.nominal_scale_v_per_g},
+        'misalignment': {'alpha_rad': alpha, 'beta_rad': beta},
+        'cross_axis': {'linear': np.zeros(count), 'quadratic_per_g': p2},
+        'cross_axis_z': {'linear': np.zeros(count), 'quadratic_per_g': q2},
+        'scale_factor_z': {'linear_per_g': r1, 'quadratic_per_g2': r2}}
+    names = [Coefficient(effect, parameter, axis) for effect, by_parameter in values.items()
+             for parameter in by_parameter if (effect, parameter) not in _GAUGE
+             for axis in sensor.axes if axis != 'z' or effect in _OF_Z_AXIS]
+    return replace(sensor, model='physical', effects=EFFECTS, values=values,
+                   covariance_names=tuple(names))
+
+
+class _ZAxis(NamedTuple):
+    """Zero-g, V, scale factor, V/g, and misalignment of a z axis, rad."""
+
+    zero_g_v: float
+    scale_v_per_g: float
+    alpha_rad: float
+    beta_rad: float
+
+
+def _fit_z_axis(sensor: Sensor, poses: Poses) -> _ZAxis:
+    """Fit zero-g, scale factor and direction of a z axis by least squares."""
+    force = np.column_stack(reference_force(poses, sensor.local_gravity_mps2)) / G0_MPS2
+    design = np.column_stack([np.ones(len(poses)), force])
+    (zero, tx, ty, tz), *_ = np.linalg.lstsq(design, poses.volts[:, 2], rcond=None)
+    scale = np.sqrt(tx * tx + ty * ty + tz * tz)
+    beta = np.arcsin(tx / scale)
+    return _ZAxis(zero, scale, np.arcsin(-ty / scale / np.cos(beta)), beta)
+
+
+def _covariance(sensor: Sensor, fitted: Sensor, poses: Poses) -> np.ndarray:
+    """
+    Return the covariance of the sequential estimates by parametric bootstrap, (p, p).
+
+    Each step of the fit weights the poses differently, so that no formula of least squares
+    holds. Sweeps
+    are drawn from the fitted model and fitted again, with the noise of the means and an encoder
+    error uniform within its step for each setting of a joint. Deviations are widened where the
+    residuals exceed noise and encoder step (effects that the model does not hold).
+    """
+    respond = signal_chain.static_response(fitted)
+    predicted = np.column_stack(respond(reference_force(poses, fitted.local_gravity_mps2)))
+    chi2 = np.sum((poses.volts - predicted) ** 2 / _pose_variance(fitted, poses))
+    freedom = max(poses.volts.size - len(fitted.covariance_names), 1)
+    widening = np.sqrt(max(chi2 / freedom, 1.0))
+    rng = np.random.default_rng(0)
+    drawn = []
+    for _ in range(_REPLICAS):
+        errors_rad = [widening * fitted.stage_resolution_rad * rng.uniform(
+            -0.5, 0.5, int(setting.max()) + 1)[setting]
+            for setting in (poses.alpha_setting, poses.beta_setting)]
+        volts = np.column_stack(respond(specific_force(
+            poses.alpha_rad + errors_rad[0], poses.beta_rad + errors_rad[1],
+            fitted.local_gravity_mps2)))
+        volts += widening * poses.std_v * rng.standard_normal(volts.shape)
+        replica = replace(poses, volts=volts)
+        drawn.append(get(_assemble(sensor, replica, regress_axes(sensor, replica)),
+                         fitted.covariance_names))
+    return np.cov(np.array(drawn).T)
+
+
+def _pose_variance(fitted: Sensor, poses: Poses) -> np.ndarray:
+    """
+    Return the variance of the volts of a pose about the model, V², (k, m).
+
+    It is that of the mean's noise and of the encoder. An encoder of step r leaves the true angle
+    uniform within it: its variance is r²/12 for each joint.
+    """
+    slope_v_per_rad = angle_jacobian(fitted, poses)
+    return poses.std_v ** 2 + np.sum(
+        slope_v_per_rad ** 2 * fitted.stage_std_rad ** 2, axis=2)

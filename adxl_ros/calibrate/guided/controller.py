@@ -15,12 +15,10 @@ from typing import NamedTuple, Protocol
 
 from adxl_ros.calibrate.calibration import CalibrationResult
 from adxl_ros.calibrate.fits.gravity_fit import MIN_RESTS
-from adxl_ros.calibrate.guided.capture_settings import Phase, Status
-from adxl_ros.calibrate.guided.guide import NextPose
+from adxl_ros.calibrate.guided.guide import NewestSamples, NextPose, Readings, STALE_NS
 from adxl_ros.calibrate.guided.hand_guide import ENOUGH_RESTS
-from adxl_ros.calibrate.guided.live_window import NewestSamples, Readings, STALE_NS
-from adxl_ros.calibrate.guided.session import Session
-from adxl_ros.calibrate.guided.session_settings import SessionSettings
+from adxl_ros.calibrate.guided.screen_contents import Phase, Status
+from adxl_ros.calibrate.guided.session import Session, SessionSettings
 from adxl_ros.calibrate.guided.stage_guide import MountingError
 from adxl_ros.calibrate.report import report_html
 from adxl_ros.errors import UserError

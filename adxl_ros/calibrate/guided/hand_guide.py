@@ -8,7 +8,7 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from adxl_ros.calibrate.fits import orientations
+from adxl_ros.calibrate.fits import gravity_model
 from adxl_ros.calibrate.fits.gravity_fit import MIN_RESTS
 from adxl_ros.calibrate.fits.gravity_model import (
     effect_values,
@@ -20,12 +20,9 @@ from adxl_ros.calibrate.fits.gravity_model import (
     regularised_fit,
     TRIAL_STD_G,
 )
-from adxl_ros.calibrate.guided import coverage, pose_checks, running_estimate
-from adxl_ros.calibrate.guided.capture_settings import Phase, Status
-from adxl_ros.calibrate.guided.guide import NextPose
-from adxl_ros.calibrate.guided.live_window import NewestSamples, went_back
-from adxl_ros.calibrate.guided.screen_contents import Estimate, Progress
-from adxl_ros.calibrate.guided.stageless_guide import StagelessGuide
+from adxl_ros.calibrate.guided import pose_checks, pose_plan, running_estimate
+from adxl_ros.calibrate.guided.guide import NewestSamples, NextPose, StagelessGuide, went_back
+from adxl_ros.calibrate.guided.screen_contents import Estimate, Phase, Progress, Status
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.noise_limits import datasheet_noise
@@ -75,7 +72,7 @@ class HandGuide(StagelessGuide):
                  accepted: Sequence[PoseRecord] = ()) -> None:
         super().__init__(sensor, accepted)
         self._span_c = temperature_span_c
-        self._skipped = np.zeros(len(orientations.UP), bool)
+        self._skipped = np.zeros(len(gravity_model.UP), bool)
         self._begin_stream()
         self._update_estimate()
 
@@ -143,7 +140,7 @@ class HandGuide(StagelessGuide):
         if self.next_up is None:
             return 'there is no direction left to skip'
         self._skipped[self.next_up] = True
-        skipped = orientations.name_up(self.next_up)
+        skipped = gravity_model.name_up(self.next_up)
         self._choose_next_up()
         return f'{skipped} up is left out'
 
@@ -194,14 +191,14 @@ class HandGuide(StagelessGuide):
         """Name the direction to turn to, for people."""
         if self.next_up is None:
             return 'turn it to any direction not yet covered, and hold it still'
-        return f'turn it so that {orientations.points_up(orientations.name_up(self.next_up))}, ' \
-               'and hold it still'
+        direction = gravity_model.points_up(gravity_model.name_up(self.next_up))
+        return f'turn it so that {direction}, and hold it still'
 
     def next_pose(self) -> NextPose:
         """Return the direction to announce."""
         values: dict[str, str | float] = {'pose': str(self.pose_number)}
         if self.next_up is not None:
-            up_x, up_y, up_z = map(float, orientations.UP[self.next_up])
+            up_x, up_y, up_z = map(float, gravity_model.UP[self.next_up])
             values |= {'up_x': up_x, 'up_y': up_y, 'up_z': up_z}
         return NextPose(self.destination(), values, None)
 
@@ -226,7 +223,7 @@ class HandGuide(StagelessGuide):
         """Return the progress of the calibration, for the screen."""
         up = self.up()
         position = '' if up is None else \
-            f'{orientations.points_up(orientations.name_nearest(up))} now'
+            f'{gravity_model.points_up(gravity_model.name_nearest(up))} now'
         return Progress(
             number=self.pose_number, destination=self.destination(), position=position,
             accepted=len(self.accepted), total=ENOUGH_RESTS, skipped=0,
@@ -235,8 +232,8 @@ class HandGuide(StagelessGuide):
     def estimate_contents(self) -> Estimate:
         """Return what the rests determine so far, for the screen."""
         return Estimate(
-            coverage=coverage.by_orientation(self._covered),
-            covered_faces=coverage.faces(self._covered), coefficients=self._rows,
+            coverage=pose_plan.by_orientation(self._covered),
+            covered_faces=pose_plan.faces(self._covered), coefficients=self._rows,
             tilt_error_deg=running_estimate.degrees_or_none(self.tilt_error_rad()),
             final_tilt_error_deg=None)
 
@@ -268,15 +265,15 @@ class HandGuide(StagelessGuide):
         self._fitted = replace(self.sensor, effects=tuple(values), values=values,
                                covariance=covariance, covariance_names=NAMES)
         force = force_g(rests.mean, self._coefficients)
-        self._covered = orientations.covered(force / np.linalg.norm(force, axis=1, keepdims=True))
-        self._gain = orientations.information_gain(information, self._coefficients,
+        self._covered = gravity_model.covered(force / np.linalg.norm(force, axis=1, keepdims=True))
+        self._gain = gravity_model.information_gain(information, self._coefficients,
                                                    rests.gravity_g).gain
         self._choose_next_up()
 
     def _choose_next_up(self) -> None:
         """Choose the orientation to ask for."""
         available = ~self._covered & ~self._skipped
-        self.next_up = orientations.next_up(self._gain, available, self.up())
+        self.next_up = gravity_model.next_up(self._gain, available, self.up())
 
     def _fault(self, record: PoseRecord) -> str:
         """Return why a rest is refused, or ''."""

@@ -3,17 +3,106 @@
 """
 Checks of a pose: one line with the value that is wrong, and what to do.
 
+- The dwell in one pose: the samples since the arrival, and the rests among them.
+- The check that the sensor is mounted as it was when earlier poses were taken.
+- What the encoder of the stage has read: angles over time, its silence and its clock.
+
 Each check returns that line, or '' where nothing is wrong.
 """
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Sequence
 from itertools import permutations, product
+from typing import NamedTuple
 
+from adxl_ros.calibrate.guided.guide import went_back
 from adxl_ros.calibrate.guided.pose_plan import Target
 from adxl_ros.calibrate.guided.running_estimate import in_g, RunningEstimate
+from adxl_ros.files.sweep_journal import PoseRecord
+from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.signals.noise_limits import datasheet_noise
+from adxl_ros.signals.rest_detection import Rest, rest_means, RestFinder, Stillness
 import numpy as np
+
+
+class RestMean(NamedTuple):
+    """The average of a rest."""
+
+    # start_ns, stop_ns: Stamps of the first and the last sample, ns
+    start_ns: int
+    stop_ns: int
+    samples: int  # Number of samples
+    # mean_v, std_v: Mean output of each axis and the standard deviation of that mean, V, (m,)
+    mean_v: tuple[float, ...]
+    std_v: tuple[float, ...]
+
+
+class Dwell:
+    """Samples from an arrival on."""
+
+    def __init__(self, sensor: Sensor, arrived_ns: int) -> None:
+        self.arrived_ns = arrived_ns
+        self._sensor = sensor
+        self._finder = RestFinder(sensor.rate_hz, len(sensor.axes), datasheet_noise(sensor),
+                                  learn=False)
+        self._stamps: list[np.ndarray] = []
+        self._volts: list[np.ndarray] = []
+
+    def __len__(self) -> int:
+        """Return the number of samples since the arrival."""
+        return sum(map(len, self._stamps))
+
+    def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
+        """
+        Take samples.
+
+        stamps_ns: their stamps, ns, (n,); volts: the samples, V, (n, m).
+        """
+        new = stamps_ns >= self.arrived_ns
+        self._stamps.append(stamps_ns[new])
+        self._volts.append(volts[new])
+        # From the arrival: float64 seconds since 1970 resolve only 0.2 µs.
+        self._finder.feed((stamps_ns[new] - self.arrived_ns) * 1e-9, volts[new])
+
+    def rests(self) -> list[Rest]:
+        """Return the rests so far; the last one may still go on."""
+        return self._finder.rests() if self._stamps else []
+
+    def stillness(self) -> Stillness | None:
+        """Return whether the newest samples are at rest; None while they are too few."""
+        return self._finder.stillness()
+
+    def at_rest_s(self) -> float:
+        """Return for how long the newest rest has lasted, s."""
+        rests = self.rests()
+        return (rests[-1].stop - rests[-1].start) / self._sensor.rate_hz if rests else 0.0
+
+    def at_rest(self) -> bool:
+        """Return whether the newest samples are known to be at rest."""
+        stillness = self.stillness()
+        return stillness is not None and stillness.at_rest
+
+    def age_s(self) -> float:
+        """Return for how long there have been samples, s."""
+        return len(self) / self._sensor.rate_hz
+
+    def volts(self, rest: Rest) -> np.ndarray:
+        """Return the samples of a rest, V, (n, m)."""
+        return np.concatenate(self._volts)[rest.start:rest.stop]
+
+    def mean(self, rest: Rest, samples: int) -> RestMean:
+        """Average the first samples of a rest."""
+        stamps, start, stop = np.concatenate(self._stamps), rest.start, rest.start + samples
+        times = (stamps - self.arrived_ns) * 1e-9
+        mean, std = rest_means(times, np.concatenate(self._volts),
+                               [Rest(start, stop, times[start], times[stop - 1])],
+                               self._sensor.rate_hz, datasheet_noise(self._sensor))
+        return RestMean(int(stamps[start]), int(stamps[stop - 1]), samples,
+                        tuple(mean[0].tolist()), tuple(std[0].tolist()))
+
 
 _OUTLIER_STDS = 3.5
 """Residual from which a pose is refused, standard deviations; chosen: one of 2000 by chance."""
@@ -153,3 +242,131 @@ def _is_crossed(measured_g: np.ndarray, expected_g: np.ndarray) -> bool:
 
 def _duration_text(seconds: float) -> str:
     return f'{seconds:.1f} s' if seconds < _LONGEST_IN_S else f'{seconds / 3600:.3g} h'
+
+
+_CHANGE_G = 0.003
+"""Largest change of a repeated pose beyond noise and stage error, g; chosen: a turn of 0.17°."""
+_NOISE_STDS = 3.0
+"""Standard deviations of the noise in the limit of a change; chosen: exceeded once in 400."""
+_ACROSS_COSINE = 0.94
+"""Cosine of 20°: two poses whose verticals are closer do not show each turn of the mounting."""
+
+
+def to_take_again(records: Sequence[PoseRecord]) -> list[PoseRecord]:
+    """
+    Choose the poses of a journal that show the mounting when they are taken again.
+
+    A turn about the vertical of the newest pose does not show there. The pose whose vertical is
+    nearest to 90° from it comes second, if there is one.
+    """
+    newest = max(records, key=lambda record: record.stop_ns)
+    across = min(records, key=lambda record: _alignment(record, newest))
+    return [newest, across] if _alignment(across, newest) < _ACROSS_COSINE else [newest]
+
+
+def changed(sensor: Sensor, before: PoseRecord, now: PoseRecord, tolerance_rad: float) -> str:
+    """Compare two readings of the same pose, before and after an interruption."""
+    before_v, now_v = np.array(before.mean_v), np.array(now.mean_v)
+    change_g = np.abs(now_v - before_v) / sensor.nominal_scale_v_per_g
+    noise_g = np.hypot(before.std_v, now.std_v) / sensor.nominal_scale_v_per_g
+    # The stage may be off by its tolerance both times.
+    limit_g = _CHANGE_G + _NOISE_STDS * noise_g + 2 * tolerance_rad
+    axis = int((change_g - limit_g).argmax())
+    if change_g[axis] <= limit_g[axis]:
+        return ''
+    return (f'mounting changed: in pose {before.pose + 1} {sensor.axes[axis]} reads '
+            f'{now_v[axis]:.4f} V, but read {before_v[axis]:.4f} V before the interruption '
+            f'({change_g[axis] * 1e3:.1f} mg apart, {limit_g[axis] * 1e3:.1f} mg are allowed); '
+            'put the sensor back as it was, or begin again with resume:=anew')
+
+
+def _alignment(first: PoseRecord, second: PoseRecord) -> float:
+    """Return the cosine of the angle between the verticals of two poses, without its sign."""
+    first_up = np.array(specific_force(first.alpha_rad, first.beta_rad, 1.0))
+    second_up = np.array(specific_force(second.alpha_rad, second.beta_rad, 1.0))
+    return abs(float(first_up @ second_up))
+
+
+_KEPT_READINGS = 100_000
+"""Readings that stay in memory; chosen: 1000 s at 100 Hz, longer than a usual dwell."""
+_KEPT_OFFSETS = 20
+"""Offsets of the two clocks that stay in memory; chosen: a second of messages at 20 Hz."""
+_FEWEST_OFFSETS = 4
+"""Offsets of the two clocks that a comparison needs; chosen: one message alone may be late."""
+SILENT_S = 3.0
+"""The encoder counts as silent after this, s; chosen: several of its longest usual periods."""
+
+
+class EncoderTrack:
+    """The newest readings of the encoder, against the stamps of the samples."""
+
+    def __init__(self) -> None:
+        self._readings: deque[tuple[int, float, float]] = deque(maxlen=_KEPT_READINGS)
+        self._offsets_s: deque[float] = deque(maxlen=_KEPT_OFFSETS)
+        self._has_new_reading = False
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Return the stamp of the newest reading, ns; None without one."""
+        return self._readings[-1][0] if self._readings else None
+
+    @property
+    def angles_rad(self) -> tuple[float, float] | None:
+        """Return the newest angles alpha and beta, rad; None without a reading."""
+        return self._readings[-1][1:] if self._readings else None
+
+    def read(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> bool:
+        """Take a reading."""
+        restarted = self.newest_ns is not None and went_back(self.newest_ns, stamp_ns)
+        if restarted:
+            self._readings.clear()
+        self._readings.append((stamp_ns, alpha_rad, beta_rad))
+        self._has_new_reading = True
+        return restarted
+
+    def compare_clock(self, sample_ns: int) -> None:
+        """Compare the clock of a new reading with the newest stamp of the samples, ns."""
+        if self._has_new_reading:
+            self._offsets_s.append((self._readings[-1][0] - sample_ns) * 1e-9)
+        self._has_new_reading = False
+
+    def forget_clock(self) -> None:
+        """Forget the comparisons, since the clock of the samples has changed."""
+        self._offsets_s.clear()
+
+    def clock_fault(self) -> str:
+        """Return what is wrong with the clock of the encoder, or ''."""
+        if len(self._offsets_s) < _FEWEST_OFFSETS:
+            return ''
+        # The smallest offset is that of the message with the least delay.
+        return clock_fault(min(self._offsets_s, key=abs))
+
+    def silence(self, sample_ns: int) -> str:
+        """Return one line on the time without readings up to a stamp, ns; '' if it is short."""
+        if not self._readings:
+            return 'nothing on stage/joint_states'
+        silent_s = (sample_ns - self._readings[-1][0]) * 1e-9
+        if silent_s <= SILENT_S:
+            return ''
+        return f'nothing on stage/joint_states for {silent_s:.0f} s'
+
+    def between(self, first_ns: int, last_ns: int) -> np.ndarray:
+        """
+        Return the angles between two stamps.
+
+        returns: angles alpha and beta, rad, (n, 2).
+        """
+        inside = [(alpha_rad, beta_rad) for stamp_ns, alpha_rad, beta_rad in self._readings
+                  if first_ns <= stamp_ns <= last_ns]
+        return np.array(inside).reshape(-1, 2)
+
+    def mean_between(self, first_ns: int, last_ns: int) -> tuple[float, float]:
+        """
+        Average the angles between two stamps; without any, take the newest ones.
+
+        returns: angles alpha and beta, rad.
+        """
+        inside = self.between(first_ns, last_ns)
+        alpha_rad, beta_rad = np.mean(
+            inside if len(inside) else [self._readings[-1][1:]], axis=0)
+        return float(alpha_rad), float(beta_rad)

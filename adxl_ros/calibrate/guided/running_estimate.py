@@ -1,20 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The estimate of a unit after each pose: coefficients and expected tilt error."""
+"""
+The estimate of a unit after each pose: coefficients and expected tilt error.
+
+- The quick plan: the fewest poses that reach a stated tilt error.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
+from math import ceil
 
 from adxl_ros.calibrate import pose_response
-from adxl_ros.calibrate.fits import full_model
-from adxl_ros.calibrate.fits.linearised import linearised
-from adxl_ros.calibrate.guided.pose_plan import spread, Target
+from adxl_ros.calibrate.fits import full_model, linearisation
+from adxl_ros.calibrate.fits.linearisation import linearised
+from adxl_ros.calibrate.guided.pose_plan import nearest, spread, Target, with_checks
 from adxl_ros.calibrate.guided.screen_contents import CoefficientRow
+from adxl_ros.calibrate.pose_response import StageError
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.calibrate.stage_error import StageError
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
 from adxl_ros.model.constants import Z_90
@@ -220,3 +225,47 @@ def _interval(value: float, half_width: float) -> str:
     decimals = min(max(decimals, 0), _MOST_DECIMALS)
     # A sum with 0 has no negative zero.
     return f'{round(value, decimals) + 0.0:+.{decimals}f} ± {half_width:.{decimals}f}'
+
+
+_SPARE_READINGS = 40
+"""Readings beyond the number of coefficients; chosen: they show stage error and outliers."""
+_MOST_POSES = 90
+"""Largest number of poses; chosen: by hand a longer plan is no longer quick."""
+
+
+def quick(sensor: Sensor, dwell_s: float, tilt_error_rad: float, check_poses: int
+          ) -> list[Target]:
+    """Choose the fewest poses that reach a tilt error, and never more than 90."""
+    start = datasheet_estimate(sensor, dwell_s)
+    fewest = ceil((len(start.names) + _SPARE_READINGS) / len(sensor.axes))
+    grid = linearisation.candidate_poses(start.pose_std_v)
+    rows = linearisation.whitened_jacobian(start.unit, grid, start.names, start.stage)
+    chosen = [Target(float(grid.alpha_rad[i]), float(grid.beta_rad[i])) for i in
+              linearisation.choose_poses(rows, np.diag(1 / start.prior ** 2),
+                                     max(_MOST_POSES, fewest))]
+    for count in range(fewest, len(chosen) + 1):
+        targets = _short_path(chosen[:count])
+        if start.with_poses(targets).tilt_error_rad() <= tilt_error_rad:
+            break
+    return with_checks(targets, check_poses)
+
+
+def datasheet_estimate(sensor: Sensor, dwell_s: float) -> RunningEstimate:
+    """Return the estimate of a unit before its first pose, by the datasheet alone."""
+    return from_poses(
+        sensor, no_poses(len(sensor.axes)), dwell_s,
+        sensor.stage_std_rad)
+
+
+def expected_tilt_error_rad(sensor: Sensor, dwell_s: float, targets: Sequence[Target]) -> float:
+    """Predict the rms error of alpha and beta after a pose plan."""
+    fitted = [target for target in targets if not target.check]
+    return datasheet_estimate(sensor, dwell_s).with_poses(fitted).tilt_error_rad()
+
+
+def _short_path(targets: list[Target]) -> list[Target]:
+    """Order poses so that each one is the nearest to the pose before, from the lowest angles."""
+    first = min(targets, key=lambda target: (target.alpha_rad, target.beta_rad))
+    others = list(targets)
+    others.remove(first)
+    return [first, *nearest(first, others)]

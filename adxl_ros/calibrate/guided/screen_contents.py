@@ -1,12 +1,81 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The contents of the calibration screen, and the text that a topic carries them in."""
+"""
+The contents of the calibration screen, and the text that a topic carries them in.
+
+- How poses are taken, and what a guided calibration waits for.
+"""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
+from enum import Enum
 import json
-from typing import Any
+from typing import Any, get_args, get_type_hints
+
+
+class StageMode(Enum):
+    """Who turns the stage, and which angle counts."""
+
+    COMMANDED = 'commanded'
+    """The stage turns itself to the pose; the encoder's angle counts."""
+    ENCODER = 'encoder'
+    """An operator turns the stage and captures; the encoder's angle counts."""
+    MANUAL = 'manual'
+    """An operator turns the stage by a scale and captures; the announced angle counts."""
+
+
+@dataclass(frozen=True)
+class CaptureSettings:
+    """How poses are taken; times are by the stamps of the samples."""
+
+    dwell_s: float  # Time at rest for each pose, s
+    # Largest distance of a joint from the pose at which a stage that turns itself has arrived, rad
+    tolerance_rad: float
+    timeout_s: float  # Time after which an open pose is reported as late, s
+    stage_mode: StageMode  # Who turns the stage
+    # Largest distance of a joint from the pose at which a capture by hand is accepted, rad. The
+    # default is 2°.
+    near_rad: float = 0.035
+    # Largest difference of the temperature from that of the first pose, °C
+    temperature_span_c: float = 3.0
+
+
+class Phase(Enum):
+    """What a guided calibration waits for; the values are those of the diagnostics."""
+
+    IDLE = 'idle'
+    """A start."""
+    INFO = 'info'
+    """The sensor's data on `sensor_info`."""
+    QUESTION = 'question'
+    """The operator's answer on what to do with an interrupted calibration."""
+    SILENT = 'silent'
+    """Samples, which have stopped."""
+    OPERATOR = 'operator'
+    """The operator, who turns the stage and captures."""
+    STAGE = 'stage'
+    """The stage, which is on its way or silent."""
+    REST = 'rest'
+    """The sensor, which moves."""
+    DWELL = 'dwell'
+    """The end of the dwell."""
+    REFUSED = 'refused'
+    """Something to be put right."""
+    FIT = 'fit'
+    """The fit."""
+    DONE = 'done'
+    """Nothing: all poses are taken."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """What a guided calibration waits for, for people."""
+
+    phase: Phase  # What it waits for
+    text: str  # One line with the values that matter
+    # Whether somebody should look: it waits longer than the time-out, or refuses its input
+    late: bool
 
 
 @dataclass(frozen=True)
@@ -130,24 +199,19 @@ class ScreenContents:
     @staticmethod
     def from_json(text: str) -> ScreenContents:
         """Return the contents of a text."""
-        contents = json.loads(text, object_hook=_restore)
-        if not isinstance(contents, ScreenContents):
-            raise ValueError('no contents of a screen')
+        try:
+            contents: ScreenContents = _restored(ScreenContents, dict(json.loads(text)))
+        except (LookupError, TypeError, ValueError) as error:
+            raise ValueError(f'no contents of a screen: {error}') from None
         return contents
 
 
-_CLASSES = (AxisReading, RestReading, LiveReading, Progress, Coverage, CoefficientRow, Estimate,
-            KeyAction, ScreenContents)
-"""The classes of the contents."""
-_KINDS: dict[frozenset[str], Any] = {
-    frozenset(field.name for field in fields(kind)): kind for kind in _CLASSES}
-"""The class of each object of the text, by the names of its fields."""
-
-
-def _restore(values: dict[str, Any]) -> object:
-    """Return the object whose fields are in an object of JSON."""
-    kind = _KINDS.get(frozenset(values))
-    if kind is None:
-        raise ValueError(f'no object of a screen: {", ".join(values)}')
-    return kind(**{name: tuple(value) if isinstance(value, list) else value
-                   for name, value in values.items()})
+def _restored(kind: Any, value: Any) -> Any:
+    """Return a value of JSON as the type that its field states."""
+    if isinstance(value, list):
+        return tuple(_restored(get_args(kind)[0], part) for part in value)
+    if not isinstance(value, dict):
+        return value
+    kind = next(iter(get_args(kind)), kind)  # Of `Kind | None`
+    kinds = get_type_hints(kind)
+    return kind(**{name: _restored(kinds[name], part) for name, part in value.items()})

@@ -13,15 +13,19 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import auto, Enum
 
-from adxl_ros.calibrate.guided import coverage, mounting_check, pose_checks, running_estimate
-from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, Phase, StageMode, Status
-from adxl_ros.calibrate.guided.dwell import Dwell, RestMean
-from adxl_ros.calibrate.guided.encoder_track import EncoderTrack, SILENT_S
-from adxl_ros.calibrate.guided.guide import NextPose
-from adxl_ros.calibrate.guided.live_window import NewestSamples, Surroundings, went_back
+from adxl_ros.calibrate.guided import pose_checks, pose_plan, running_estimate
+from adxl_ros.calibrate.guided.guide import NewestSamples, NextPose, Surroundings, went_back
+from adxl_ros.calibrate.guided.pose_checks import Dwell, EncoderTrack, RestMean, SILENT_S
 from adxl_ros.calibrate.guided.pose_plan import MOVE_S, Target
-from adxl_ros.calibrate.guided.screen_contents import Estimate, Progress
-from adxl_ros.calibrate.joint_settings import angle_tolerance_rad, SettingTracker
+from adxl_ros.calibrate.guided.screen_contents import (
+    CaptureSettings,
+    Estimate,
+    Phase,
+    Progress,
+    StageMode,
+    Status,
+)
+from adxl_ros.calibrate.pose_extraction import angle_tolerance_rad, SettingTracker
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import JournalEntry, MountingUnchecked, PoseRecord, PoseSkipped
@@ -125,7 +129,7 @@ class StageGuide:
     def verify(self) -> None:
         """Take earlier poses again before others, to check the mounting."""
         if self.target is not None and self.accepted:
-            self._to_verify = mounting_check.to_take_again(list(self.accepted.values()))
+            self._to_verify = pose_checks.to_take_again(list(self.accepted.values()))
             self._go(self._to_verify[0].pose)
 
     def capture(self) -> str:
@@ -342,7 +346,7 @@ class StageGuide:
                         and not target.check]
         final = self.estimate.with_poses(open_targets)
         return Estimate(
-            coverage=coverage.by_plane(self.targets, self.accepted), covered_faces='',
+            coverage=pose_plan.by_plane(self.targets, self.accepted), covered_faces='',
             coefficients=self.estimate.rows(),
             tilt_error_deg=running_estimate.degrees_or_none(self.tilt_error_rad()),
             final_tilt_error_deg=running_estimate.degrees_or_none(final.tilt_error_rad()))
@@ -519,7 +523,7 @@ class StageGuide:
                                  abs(record.beta_rad - before.beta_rad))
         else:
             tolerance_rad = max(tolerance_rad, self.settings.tolerance_rad)
-        change = mounting_check.changed(self.sensor, before, record, tolerance_rad)
+        change = pose_checks.changed(self.sensor, before, record, tolerance_rad)
         if change and self.settings.stage_mode is StageMode.MANUAL:
             self._refuse(f'{change}; or turn the stage to where it was, and capture again')
             return

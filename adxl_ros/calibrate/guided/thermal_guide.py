@@ -11,14 +11,18 @@ from adxl_ros.calibrate import thermal_calibration
 from adxl_ros.calibrate.fits import thermal_fit
 from adxl_ros.calibrate.fits.thermal_fit import ThermalFit
 from adxl_ros.calibrate.guided import running_estimate
-from adxl_ros.calibrate.guided.capture_settings import Phase, Status
-from adxl_ros.calibrate.guided.dwell import Dwell
-from adxl_ros.calibrate.guided.guide import NextPose
-from adxl_ros.calibrate.guided.live_window import NewestSamples, went_back
-from adxl_ros.calibrate.guided.screen_contents import CoefficientRow, Coverage, Estimate, Progress
-from adxl_ros.calibrate.guided.stageless_guide import StagelessGuide
+from adxl_ros.calibrate.guided.guide import NewestSamples, NextPose, StagelessGuide, went_back
+from adxl_ros.calibrate.guided.pose_checks import Dwell
+from adxl_ros.calibrate.guided.screen_contents import (
+    CoefficientRow,
+    Coverage,
+    Estimate,
+    Phase,
+    Progress,
+    Status,
+)
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.calibrate.thermal_coverage import expected_error_mg, PARTS, passed
+from adxl_ros.calibrate.thermal_calibration import expected_error_mg, PARTS, passed
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model.coefficients import parameter_of

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import os
 from typing import Any
 
-from adxl_ros.calibrate.fits import linear, paper_regression
+from adxl_ros.calibrate.fits import linear
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
 from adxl_ros.calibrate.poses import Poses, reference_force
 from adxl_ros.calibrate.report.cross_validation import HeldOutErrors
@@ -39,7 +39,7 @@ class _AxisData:
     # deviation_mv, model_mv: Measured and modelled output minus the linear model, mV, (k,)
     deviation_mv: np.ndarray
     model_mv: np.ndarray
-    regression: paper_regression.AxisRegression  # Coefficients of the sequential regression
+    regression: linear.AxisRegression  # Coefficients of the sequential regression
     vertical: np.ndarray  # Whether the pose is in the plane alpha = 90°, (k,)
 
     @property
@@ -61,7 +61,7 @@ def draw_sweep(path: str | os.PathLike, sensor: Sensor, fitted: Sensor, poses: P
 def sweep(sensor: Sensor, fitted: Sensor, poses: Poses, panels: Sequence[int] = range(6)) -> Any:
     """Draw figures 2 to 8 of the paper for the x and y axes, one row per axis."""
     swept = poses.subset(~poses.check)
-    line, regressions = linear.fit(sensor, swept), paper_regression.regress_axes(sensor, swept)
+    line, regressions = linear.fit(sensor, swept), linear.regress_axes(sensor, swept)
     reference = reference_force(swept, sensor.local_gravity_mps2)
     force_g = np.column_stack(reference) / G0_MPS2
     predicted = np.column_stack(signal_chain.static_response(fitted)(
@@ -132,7 +132,7 @@ def _paths(axis: Any, data: _AxisData, chosen: np.ndarray, paper_figure: int) ->
     alpha_deg = np.degrees(data.poses.alpha_rad)
     backward = np.gradient(data.poses.beta_rad) < 0
     force_g, deviation_mv = data.force_g[:, data.d], data.deviation_mv
-    for plane in paper_regression.planes(data.poses.alpha_rad[chosen]):
+    for plane in linear.planes(data.poses.alpha_rad[chosen]):
         index = np.flatnonzero(chosen)[np.sort(plane)]
         line, = axis.plot(force_g[index], deviation_mv[index], lw=1,
                           label=f'{alpha_deg[index].mean():.0f}°')
@@ -160,7 +160,7 @@ def _across(axis: Any, data: _AxisData) -> None:
 def _modelled(axis: Any, data: _AxisData) -> None:
     """Draw the measured and the modelled deviation against the reference, plane by plane."""
     alpha_rad, force_g = data.poses.alpha_rad, data.force_g[:, data.d]
-    for plane in paper_regression.planes(alpha_rad):
+    for plane in linear.planes(alpha_rad):
         index = np.sort(plane)
         line, = axis.plot(force_g[index], data.deviation_mv[index], 'o', ms=3,
                           label=f'{np.degrees(alpha_rad[index]).mean():.0f}°')

@@ -21,10 +21,10 @@ from adxl_ros.calibrate.report.acceptance import (
     NOT_SHOWN,
     PASS,
 )
-from adxl_ros.calibrate.report.against_truth import compare
 from adxl_ros.calibrate.report.cross_validation import ErrorStatistic, HeldOutErrors
-from adxl_ros.calibrate.report.drift_history import DriftHistory
 from adxl_ros.calibrate.report.error_budget import ErrorBudget, rms_mg, sample_noise_mps2
+from adxl_ros.calibrate.report.page_figures import DriftHistory
+from adxl_ros.calibrate.report.text_tables import compare
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.atomic_write import write_bytes, write_text

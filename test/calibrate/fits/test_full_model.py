@@ -5,7 +5,7 @@
 from dataclasses import replace
 
 from adxl_ros.calibrate import calibration
-from adxl_ros.calibrate.fits import full_fit_text, full_model, term_selection
+from adxl_ros.calibrate.fits import full_model, term_selection
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.model.coefficients import get, put, with_neutral
@@ -103,7 +103,7 @@ def test_outliers_are_named_and_excluded():
     error, std = errors(fit, truth)
     assert np.sqrt(np.mean((error / std) ** 2)) < 1.6
     assert any('outliers, left out: pose 8 (alpha' in line
-               for line in full_fit_text.report_lines(fit, poses, terms))
+               for line in term_selection.report_lines(fit, poses, terms))
 
 
 def test_a_change_of_temperature_is_reported_and_fitted():
@@ -111,13 +111,13 @@ def test_a_change_of_temperature_is_reported_and_fitted():
     sensor, truth, poses = swept_unit(10, check_poses=0)
     warm = replace(poses, temperature_c=np.linspace(20, 35, len(poses)))
     fit, terms = term_selection.fit_selected(sensor, warm)
-    words = full_fit_text.report_lines(fit, warm, terms)
+    words = term_selection.report_lines(fit, warm, terms)
     assert any('temperature moved by 15.0 degC' in line for line in words)
     drift = 1e-3 * truth.scale_v_per_g * (warm.temperature_c[:, None] - 25)
     fit, terms = term_selection.fit_selected(sensor, replace(warm, volts=warm.volts + drift))
     assert fit.fitted.values['temperature_bias']['per_k'] == pytest.approx([1e-3] * 2, rel=0.1)
     assert not any('temperature moved' in line
-                   for line in full_fit_text.report_lines(fit, warm, terms))
+                   for line in term_selection.report_lines(fit, warm, terms))
 
 
 @pytest.mark.parametrize('planes_deg, lost', [

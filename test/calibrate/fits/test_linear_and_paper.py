@@ -5,7 +5,7 @@
 from dataclasses import replace
 
 from adxl_ros.calibrate import calibration
-from adxl_ros.calibrate.fits import linear, paper_regression
+from adxl_ros.calibrate.fits import linear
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import cross_validation
 from adxl_ros.errors import UserError
@@ -45,7 +45,7 @@ def test_physical_recovers_the_unit(axes):
             for values in truth.values[effect].values():
                 values[2:] = 0.0
         poses = swept(rng, truth, per_setting=True)
-        fitted = paper_regression.fit(sensor, poses.subset(~poses.check))
+        fitted = linear.fit_physical(sensor, poses.subset(~poses.check))
         std = np.sqrt(np.diag(fitted.covariance))
         for name, sigma in zip(fitted.covariance_names, std):
             index = axes.index(name.axis)
@@ -68,7 +68,7 @@ def test_physical_reduces_the_tilt_error_as_the_paper_does():
     for _ in range(5):
         poses = swept(rng, drawn(rng, sensor))
         linear_errors, physical_errors = cross_validation.cross_validate(
-            {'linear': linear.fit, 'physical': paper_regression.fit}, sensor, poses)
+            {'linear': linear.fit, 'physical': linear.fit_physical}, sensor, poses)
         ratios.append(physical_errors.alpha_deg.rms / linear_errors.alpha_deg.rms)
     assert np.mean(ratios) < 1 - 0.889
 
@@ -79,7 +79,7 @@ def test_physical_takes_less_than_a_second():
     rng = np.random.default_rng(1)
     poses = swept(rng, drawn(rng, nominal()))
     with within(1.0):
-        paper_regression.fit(nominal(), poses)
+        linear.fit_physical(nominal(), poses)
 
 
 @pytest.mark.parametrize('planes_deg, missing', [
@@ -90,7 +90,7 @@ def test_physical_names_the_missing_planes(planes_deg, missing):
     rng = np.random.default_rng(1)
     poses = swept(rng, drawn(rng, nominal()), np.radians(planes_deg), 0)
     with pytest.raises(UserError, match=missing):
-        paper_regression.fit(nominal(), poses)
+        linear.fit_physical(nominal(), poses)
 
 
 @pytest.mark.parametrize('change, words', [

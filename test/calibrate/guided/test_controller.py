@@ -4,9 +4,9 @@
 
 from dataclasses import replace
 
-from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, Phase, StageMode
 from adxl_ros.calibrate.guided.controller import Controller, ControllerState, Resume, Severity
-from adxl_ros.calibrate.guided.session_settings import SessionSettings
+from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, Phase, StageMode
+from adxl_ros.calibrate.guided.session import SessionSettings
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, sweep_journal
 from adxl_ros.files.stream_info import sensor_info, StreamInfo

@@ -5,9 +5,9 @@
 from dataclasses import replace
 
 from adxl_ros.calibrate.guided import pose_checks, running_estimate
-from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, Phase, StageMode
 from adxl_ros.calibrate.guided.hand_guide import HandGuide
 from adxl_ros.calibrate.guided.pose_plan import guided, Target
+from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, Phase, StageMode
 from adxl_ros.calibrate.guided.stage_guide import MountingError, StageGuide
 from adxl_ros.model.coefficients import parameter_of
 from adxl_ros.model.effects.base import Coefficient
@@ -202,7 +202,7 @@ def test_by_hand_directions_are_requested_until_all_are_covered():
 
 
 def _direction(guide):
-    from adxl_ros.calibrate.fits.orientations import UP as EACH
+    from adxl_ros.calibrate.fits.gravity_model import UP as EACH
     return EACH[guide.next_up]
 
 

@@ -4,7 +4,7 @@
 """Pose plans: their travel, and their expected and actual errors."""
 
 from adxl_ros.calibrate.fits import full_model
-from adxl_ros.calibrate.guided import pose_plan, quick_plan
+from adxl_ros.calibrate.guided import pose_plan, running_estimate
 import numpy as np
 import pytest
 from units import drawn, nominal, swept
@@ -15,7 +15,7 @@ STEP = np.radians(30)
 def expected_error_deg(axes, targets, resolution_deg=5 / 60):
     """Return the expected tilt error, deg."""
     sensor = nominal(axes, stage_resolution_rad=np.radians(resolution_deg))
-    return np.degrees(quick_plan.expected_tilt_error_rad(sensor, 5.0, targets))
+    return np.degrees(running_estimate.expected_tilt_error_rad(sensor, 5.0, targets))
 
 
 @pytest.mark.parametrize('axes', ['xy', 'xyz'])
@@ -34,7 +34,7 @@ def test_fits_have_the_standard_deviations_that_a_plan_predicts(axes, kind):
     """On average the standard deviations of the coefficients are the predicted ones."""
     sensor = nominal(axes)
     targets = pose_plan.guided(pose_plan.default_planes_rad(axes), STEP, 0) \
-        if kind == 'full' else quick_plan.quick(sensor, 5.0, np.radians(0.1), 0)
+        if kind == 'full' else running_estimate.quick(sensor, 5.0, np.radians(0.1), 0)
     ratios = []
     for seed in range(6):
         rng = np.random.default_rng(seed)
@@ -42,7 +42,7 @@ def test_fits_have_the_standard_deviations_that_a_plan_predicts(axes, kind):
         poses = swept(rng, truth, per_setting=True, targets=targets)
         fit = full_model.fit_full(sensor, poses)
         spread = np.sqrt(np.diag(fit.fitted.covariance))
-        promised = quick_plan.datasheet_estimate(sensor, 5.0).with_poses(targets)
+        promised = running_estimate.datasheet_estimate(sensor, 5.0).with_poses(targets)
         stds = dict(zip(promised.names, promised.std))
         ratios += [s / stds[name] for s, name in zip(spread, fit.fitted.covariance_names)]
     assert np.exp(np.mean(np.log(ratios))) == pytest.approx(1.0, abs=0.15)

@@ -4,9 +4,8 @@
 
 from dataclasses import replace
 
-from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, StageMode
-from adxl_ros.calibrate.guided.session import Session
-from adxl_ros.calibrate.guided.session_settings import SessionSettings
+from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, StageMode
+from adxl_ros.calibrate.guided.session import Session, SessionSettings
 from adxl_ros.errors import UserError
 from adxl_ros.files import atomic_write, sweep_journal
 from adxl_ros.model import signal_chain

@@ -2,8 +2,8 @@
 
 """The guided sweep without ROS: its waits, its messages and its accepted poses."""
 
-from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, Phase, StageMode
 from adxl_ros.calibrate.guided.pose_plan import guided, sweep as plan_sweep, Target, travel_rad
+from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, Phase, StageMode
 from adxl_ros.calibrate.guided.stage_guide import StageGuide
 from adxl_ros.errors import UserError
 import numpy as np

@@ -4,9 +4,8 @@
 
 from dataclasses import replace
 
-from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, StageMode
-from adxl_ros.calibrate.guided.session import Session
-from adxl_ros.calibrate.guided.session_settings import SessionSettings
+from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, StageMode
+from adxl_ros.calibrate.guided.session import Session, SessionSettings
 from adxl_ros.calibrate.guided.thermal_guide import ThermalSettings
 from adxl_ros.files import parameter_file, sweep_journal
 from adxl_ros.model.coefficients import with_neutral

@@ -7,9 +7,9 @@ import re
 
 from adxl_ros.calibrate.fits.full_model import TERMS
 from adxl_ros.calibrate.report import acceptance, cross_validation
-from adxl_ros.calibrate.report.against_truth import compare
 from adxl_ros.calibrate.report.text_tables import (
     acceptance_lines,
+    compare,
     error_table,
     truth_table,
 )
