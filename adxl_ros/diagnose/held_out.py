@@ -272,7 +272,11 @@ def _levels(products: _Products, dimension: np.ndarray, chosen: np.ndarray, vari
 
 
 def pose_shares(hypothesis: Hypothesis, model: LinearModel) -> dict[str, float]:
-    """Return for each effect the share of what it does that a function of the pose also does."""
+    """
+    Return for each effect the share of what it does that a function of the pose also does.
+
+    Beyond the share that the pose of another time does: a slow signal is like many functions.
+    """
     done, by_pose = dict.fromkeys(hypothesis.effects, 0.0), dict.fromkeys(hypothesis.effects, 0.0)
     linearised = hypothesis.linearised
     for number, columns in enumerate(linearised.columns):
@@ -281,14 +285,18 @@ def pose_shares(hypothesis: Hypothesis, model: LinearModel) -> dict[str, float]:
         rows = np.flatnonzero(comparison.used)[::max(1, int(comparison.used.sum()) // _POSES)]
         pose = np.concatenate([np.ones((len(rows), 1)), *(
             basis[d][rows] for d in POSE if d in basis)], axis=1)
+        basis_of_pose = np.linalg.qr(pose)[0]
         for effect in hypothesis.effects:
             own = [i for i, k in enumerate(columns.places)
                    if k < len(hypothesis.names) and hypothesis.names[k].effect == effect]
             does = columns.values[rows][:, 1:][:, own] @ hypothesis.values[columns.places[own]]
-            rest = does - pose @ np.linalg.lstsq(pose, does, rcond=None)[0]
-            done[effect] += float(does @ does)
-            by_pose[effect] += float(does @ does - rest @ rest)
-    return {e: by_pose[e] / done[e] if done[e] else 1.0 for e in hypothesis.effects}
+            shares = [np.sum((basis_of_pose.T @ np.roll(does, k * len(does) // 4)) ** 2)
+                      for k in range(4)]
+            square, other = float(does @ does), float(np.mean(shares[1:]))
+            done[effect] += square - other
+            by_pose[effect] += float(shares[0]) - other
+    return {e: float(np.clip(by_pose[e] / done[e], 0.0, 1.0)) if done[e] > 0 else 1.0
+            for e in hypothesis.effects}
 
 
 def drift_mps2(fits: HeldOutFits, model: LinearModel) -> float:
