@@ -84,7 +84,7 @@ development := requirements/test.txt
 
 # Directories count, too: their time changes when a file in them is removed.
 sources := package.xml setup.py setup.cfg \
-    $(shell find adxl_ros adxl_ros_validation launch params resource security -name __pycache__ -prune -o -print)
+    $(shell find adxl_ros adxl_ros_validation launch params resource security share -name __pycache__ -prune -o -print)
 
 build: install/.built
 

@@ -38,13 +38,15 @@ setup(
         (f'share/{PACKAGE}/launch', glob('launch/*.launch.py')),
         (f'share/{PACKAGE}/params', glob('params/*.yaml')),
         (f'share/{PACKAGE}/security', glob('security/*.xml')),
+        *((f'share/{PACKAGE}/{name}', glob(f'share/{name}/*'))
+          for name in ('completion', 'layouts', 'udev', 'urdf')),
     ],
     python_requires='>=3.10',
     install_requires=['setuptools', *requirements('core')],
     extras_require={name: requirements(name) for name in ('extras', 'fleet', 'test')},
     zip_safe=True,
     maintainer='the adxl_ros authors',
-    maintainer_email='maintainers@example.org',
+    maintainer_email='adxl-ros-maintainers@users.noreply.github.com',
     description='Driver, calibration and compensation of low-g analog MEMS accelerometers',
     license='Apache-2.0',
     entry_points={

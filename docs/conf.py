@@ -15,8 +15,8 @@ html_theme = 'furo'
 html_title = 'adxl_ros'
 html_show_copyright = False
 root_doc = 'docs/index'
-include_patterns = ['README.md', 'CONTRIBUTING.md', 'firmware/README.md', 'docs/*.md',
-                    'docs/**/*.md']
+include_patterns = ['README.md', 'CONTRIBUTING.md', 'QUALITY_DECLARATION.md', 'firmware/README.md',
+                    'docs/*.md', 'docs/**/*.md']
 source_suffix = {'.md': 'markdown'}
 myst_heading_anchors = 4
 highlight_language = 'text'
@@ -24,7 +24,8 @@ suppress_warnings = ['myst.header']  # a log begins its tables one level too dee
 
 FIRST = {'docs/index': ['README', 'start/tilt', 'start/compare', 'start/stage', 'howto/index',
                         'explain/index', 'reference/index', 'maintain/index',
-                        'measurements/index', 'CONTRIBUTING', 'firmware/README']}
+                        'measurements/index', 'CONTRIBUTING', 'QUALITY_DECLARATION',
+                        'firmware/README']}
 """Pages in the order of the side bar; other index pages list those of their folder."""
 
 
@@ -35,8 +36,7 @@ def add_contents(app: Sphinx, name: str, source: list[str]) -> None:
     folder = ROOT / Path(name).parent
     pages = FIRST.get(name) or sorted(page.stem for page in folder.glob('*.md')
                                       if page.stem != 'index')
-    entries = [f'/{page}' if page in ('README', 'CONTRIBUTING', 'firmware/README')
-               else page for page in pages]
+    entries = [f'/{page}' if (ROOT / f'{page}.md').exists() else page for page in pages]
     source[0] += '\n'.join(['', '```{toctree}', ':hidden:', '', *entries, '```', ''])
 
 

@@ -8,6 +8,7 @@ A subprocess in which the import of every extra fails stands for an environment 
 
 import json
 from pathlib import Path
+import re
 
 from processes import REPO
 from without_extras import run_without_extras
@@ -57,6 +58,28 @@ for name, settings in (('serial', {'port': '/dev/null'}), ('iio', {})):
     serial, iio = done.stdout.splitlines()
     assert 'pip install pyserial' in serial
     assert "pip install 'pylibiio<1' and sudo apt install libiio0" in iio
+
+
+def test_what_needs_an_extra_names_it() -> None:
+    code = """
+from adxl_ros.errors import UserError
+from adxl_ros.files import bag_messages, tables
+from adxl_ros.fleet import inputs
+from adxl_ros.fleet.report import fleet_table
+from adxl_ros.report import figures, page
+for use in (lambda: tables.open_table('log.ulg'), lambda: tables.open_table('log.parquet'),
+            lambda: fleet_table.read('fleet.parquet'), lambda: inputs.file_system('log.csv'),
+            bag_messages.import_rosbags, figures.pyplot, page.check_libraries):
+    try:
+        use()
+    except UserError as error:
+        print(error)
+"""
+    lines = run_without_extras(code).stdout.splitlines()
+    assert len(lines) == 7
+    for line, name in zip(lines, ('pyulog', 'pyarrow', 'pyarrow', 'adxl_ros[fleet]', 'rosbags>=',
+                                  'matplotlib', 'python3-plotly')):
+        assert re.search(f'install .*{re.escape(name)}', line), line
 
 
 def test_a_csv_is_fitted(tmp_path: Path) -> None:

@@ -50,3 +50,20 @@ def test_manifest() -> None:
     assert package.licenses == ['Apache-2.0']
     assert package.version == re.search(r"version='([^']+)'", setup)[1]
     package.validate()
+    # A package with a key of pip cannot be released.
+    assert not [key.name for key in package.exec_depends + package.test_depends
+                if key.name.endswith('-pip')]
+    for maintainer in package.maintainers:
+        assert f"maintainer_email='{maintainer.email}'" in setup
+
+
+def test_changelog() -> None:
+    """catkin_pkg reads every entry; it would leave out those of a section in a version."""
+    changelog = pytest.importorskip('catkin_pkg.changelog')
+    text = (REPO / 'CHANGELOG.rst').read_text(encoding='utf-8')
+    log = changelog.Changelog('adxl_ros')
+    changelog.populate_changelog_from_rst(log, text.replace(
+        'Forthcoming\n-----------', '99.0.0 (2000-01-01)\n-------------------'))
+    read = [entry for _, _, content in log.foreach_version() for part in content
+            if isinstance(part, changelog.BulletList) for entry in part]
+    assert len(read) == len(re.findall(r'^\* ', text, re.MULTILINE))

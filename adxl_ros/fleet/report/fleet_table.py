@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import os
 from typing import Any
 
-from adxl_ros.errors import UserError
+from adxl_ros.errors import install_hint, UserError
 from adxl_ros.fleet.report.populations import (
     bad_batch,
     BadBatch,
@@ -115,7 +115,7 @@ def read(path: str | os.PathLike) -> FleetTable:
         import pyarrow as pa
         import pyarrow.parquet as pq
     except ImportError:
-        raise UserError(f'{path}: Parquet needs pyarrow; pip install pyarrow') from None
+        raise UserError(f'{path}: Parquet needs pyarrow; {install_hint("pyarrow")}') from None
     names = [*_TEXTS, *_LISTS, *_NUMBERS, 'date', *_quantity_columns()]
     try:
         return from_arrow(pq.read_table(path, columns=list(dict.fromkeys(names))))
