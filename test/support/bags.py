@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import get_typestore, Stores
+import pytest
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
+rosbag2 = pytest.importorskip('rosbags.rosbag2')
+typesys = pytest.importorskip('rosbags.typesys')
+STORE = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
 TYPES = STORE.types
 IMU = 'sensor_msgs/msg/Imu'
 JOINTS = 'sensor_msgs/msg/JointState'
@@ -66,7 +67,7 @@ def info(topic: str = '/sensor_info', **values: str) -> Sent:
 def bag_of(path: Path, messages: Iterable[Sent], little_endian: bool = True) -> Path:
     """Write messages to a bag, in this order."""
     connections: dict[tuple[str, str], Any] = {}
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+    with rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
         for i, sent in enumerate(messages):
             key = sent.topic, sent.kind
             if key not in connections:

@@ -5,8 +5,10 @@ from dataclasses import dataclass
 
 from adxl_ros.fleet.row import arrow_schema
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
+import pytest
+
+pa = pytest.importorskip('pyarrow')
+pq = pytest.importorskip('pyarrow.parquet')
 
 SCALE_V_PER_G = 1.0
 MPS2_PER_MG = 9.80665e-3

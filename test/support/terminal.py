@@ -13,8 +13,9 @@ import threading
 import time
 
 from processes import PATIENCE
-import pyte
 import pytest
+
+pyte = pytest.importorskip('pyte')
 
 
 class Terminal:

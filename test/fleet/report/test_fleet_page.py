@@ -8,10 +8,10 @@ from adxl_ros.files import population_file
 from adxl_ros.fleet.report import report_html
 from made_up_fleet import MadeUpFleet
 from pages import layout_faults, NEEDS_CHROMIUM, wait_until_drawn, WIDTHS
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
+pa = pytest.importorskip('pyarrow')
+pq = pytest.importorskip('pyarrow.parquet')
 pytestmark = pytest.mark.long
 
 FLEETS = {
