@@ -50,19 +50,8 @@ class Belief:
     root: np.ndarray  # Square root of the covariance, S = root·rootᵀ, (k, r)
 
 
-def bhattacharyya(gram: np.ndarray, first: Belief, second: Belief) -> float:
-    """
-    Return the Bhattacharyya distance between the predictions of two hypotheses.
-
-    gram: products of the sensitivities, in units of the noise, (k, k); returns: distance, nat; 0
-    for equal predictions.
-    """
-    return _distance(gram, first, second) - 0.25 * (
-        _log_det_of(gram, first) + _log_det_of(gram, second))
-
-
 def _distance(gram: np.ndarray, first: Belief, second: Belief) -> float:
-    """Return the part of the distance that is not a function of one belief alone."""
+    """Return the part of the Bhattacharyya distance that is not of one belief alone."""
     both = np.hstack([first.root, second.root]) / np.sqrt(2)
     difference = first.mean - second.mean
     projected = gram @ difference

@@ -2,16 +2,9 @@
 
 """The expected information in cases with a closed form."""
 
-from adxl_ros.diagnose.next_experiment import Belief, bhattacharyya, entropy, expected_information
+from adxl_ros.diagnose.next_experiment import Belief, entropy, expected_information
 import numpy as np
 import pytest
-
-
-def test_the_distance_of_two_known_predictions_is_an_eighth_of_the_squared_difference():
-    gram = np.diag([4.0, 1.0])
-    first = Belief(np.array([1.0, 0.0]), np.zeros((2, 0)))
-    second = Belief(np.array([0.0, 2.0]), np.zeros((2, 0)))
-    assert bhattacharyya(gram, first, second) == pytest.approx((4 + 4) / 8)
 
 
 def test_two_hypotheses_give_less_information_than_their_exact_mutual_information():

@@ -16,6 +16,7 @@ from adxl_ros.links.support import base, emulated_board
 from adxl_ros.links.support.wire_format import (
     BoardInfo,
     decode_command,
+    encode_payload,
     Encoder,
     Splitter,
 )
@@ -374,3 +375,63 @@ def test_a_board_on_a_terminal_is_read_to_the_last_sample(tmp_path):
         assert link.status().values()['frame_ms'] == 2.0, 'the board obeys link.latency_ms'
         link.close()
     assert not os.path.lexists(path)
+
+
+def test_data_before_the_first_info_is_held_back_and_counted(connect):
+    board = connect()
+    board.send_frames(7)
+    assert not board.read()
+    assert board.value('held_back') == 70
+    board.send_info()
+    board.send_frames(3)
+    parts = board.read_samples(30)
+    assert sample_count(parts) == 30
+    assert board.value('held_back') == 70
+    assert missing(parts) == 0
+
+
+def test_a_repeated_frame_is_not_published_again(connect):
+    board = connect()
+    board.send_info()
+    raw = board.encoder.sample_frame(0, 0, board.codes)
+    board.send(raw + raw)
+    board.index = 10
+    board.send_frames(2)
+    board.send(raw)
+    board.send_frames(1)
+    parts = board.read_samples(40)
+    assert sample_count(parts) == 40
+    assert board.value('repeated') == 20
+
+
+def test_another_board_on_the_port_is_another_sensor(connect):
+    board = connect()
+    board.send_info()
+    board.send_frames(3)
+    board.read_samples(30)
+    board.encoder, board.index = Encoder(BoardInfo(1000.0, 12, 2, 2.5, 'Z1')), 0
+    board.codes = np.full((10, 2), 2048)
+    board.send_info()
+    board.send_frames(3)
+    parts = board.read_samples(30)
+    assert board.link.sensor.serial == 'Z1'
+    assert volts_of(parts) == pytest.approx(1.25)
+
+
+def test_a_board_that_waits_for_its_info_is_asked_at_once(connect):
+    """It answers with its info frame, so that the first samples need not wait for a second."""
+    board = connect()
+    board.send_frames(1)
+    board.read(0.1)
+    assert board.commands() == [2000]
+
+
+def test_another_version_of_the_format_is_reported(connect):
+    board = connect()
+    board.send(encode_payload(b'\1\2' + bytes(30)))
+    assert not board.read()
+    assert 'speaks wire format 2' in board.link.status().text
+    board.send_info()
+    board.send_frames(3)
+    board.read_samples(30)
+    assert board.link.status().text == 'streaming'
