@@ -11,13 +11,12 @@
 # make reproduction  docs/measurements/reproduction.md and its plots: the paper's experiments on simulated units
 # make coverage do the intervals hold? 300 drawn units and stages, as a table
 # make investigate  minutes to a verdict of `investigate` over 60 simulated units, an hour
-# make nulls    recordings without any effect through diagnose: docs/measurements/nulls.md, 90 minutes
 # make blind    the blind check of diagnose, 600 trials, into blind_output/ (make blind ARGS='--seed 1')
 # make working  working cases of diagnose, one line each, then the scores (make working ARGS='--count 20 --seed 3')
 # make lint     the linters alone
 # make clean    remove what these made
 
-.PHONY: build developed help demo check test perf bench reference gallery site screenshots reproduction coverage nulls investigate blind working lint clean \
+.PHONY: build developed help demo check test perf bench reference gallery site screenshots reproduction coverage investigate blind working lint clean \
     FORCE
 .DEFAULT_GOAL := build
 
@@ -162,11 +161,6 @@ coverage: build
 investigate: developed
 	OPENBLAS_NUM_THREADS=1; export OPENBLAS_NUM_THREADS; \
 	$(python_in_test) long/investigate_units.py -o ../investigate_units.jsonl $(ARGS)
-
-# Goes on where it was cut short.
-nulls: developed
-	OPENBLAS_NUM_THREADS=1; export OPENBLAS_NUM_THREADS; \
-	$(python_in_test) long/nulls.py ../docs/measurements/nulls.md $(ARGS)
 
 # Goes on where it was cut short; with a seed of its own in ARGS, into another folder.
 blind: build

@@ -156,10 +156,9 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
     if even is not None and even.certain:
         recording = replace(recording, time_s=even.time_s)
         notes += [even.note] if even.note else []
-    fault = find_clock_fault(recording.time_s)
-    if fault is not None:
-        return fault
-    fault = _too_slow(recording)
+    fault = find_clock_fault(recording.time_s) or _too_slow(recording)
+    if fault is None and sim is None:
+        fault = find_encoder_fault(recording, sensor)
     if fault is not None:
         return fault
     if sim is not None:
@@ -168,10 +167,6 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
             return aligned
         recording, sim = aligned.recording, aligned.sim
         notes += aligned.notes
-    else:
-        fault = find_encoder_fault(recording, sensor)
-        if fault is not None:
-            return fault
     left_out: list[LeftOut] = []
     if sim is None:
         step_rad = seen_step_rad(recording, sensor.stage_resolution_rad)
@@ -187,9 +182,8 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
         if _roughness(even_comparison) < _SAME_ROUGHNESS * _roughness(comparison):
             recording, comparison = evenly, even_comparison
             notes += [even.note] if even.note else []
-    if comparison.reference is not Reference.STAGE:
-        left_out = []
-    left_out += without_reading(recording, comparison)
+    stated = left_out if comparison.reference is Reference.STAGE else []
+    left_out = [*stated, *without_reading(recording, comparison)]
     # What moves too fast is looked for where the reference is stated.
     for found in (left_out, too_coarse(recording, _without(comparison, left_out))):
         comparison = _without(comparison, found)

@@ -12,7 +12,7 @@ from typing import Any
 from adxl_ros_validation.blind import trials
 from adxl_ros_validation.blind.trials import Label
 from adxl_ros_validation.blind.world.fault_table import KNOWN
-from adxl_ros_validation.blind.world.simulator import G0
+from adxl_ros_validation.blind.world.simulator import G0, Unit
 import numpy as np
 import scipy
 
@@ -200,20 +200,8 @@ def true_parameters(label: Label) -> dict[str, float]:
     for fault in label.faults:
         name, size = fault['effect'], fault['size']
         w = size * np.asarray(fault['shape'].get('w', [0.0]), float)
-        by_axis = dict(zip(unit.axes, w))
-        scale = dict(zip(unit.axes, unit.scale_v_per_g))
-        zero = dict(zip(unit.axes, unit.zero_v))
-        noise = dict(zip(unit.axes, zip(unit.noise_g_per_rthz, unit.stated_noise_g_per_rthz)))
-        if name == 'bias':
-            true |= {f'bias.offset_v.{d}': zero[d] + v * scale[d] - 2.5
-                     for d, v in by_axis.items()}
-        elif name == 'scale_factor':
-            true |= {f'scale_factor.offset_v_per_g.{d}': scale[d] * (1 + v) - 1.0
-                     for d, v in by_axis.items()}
-        elif name == 'noise_excess':
-            true |= {f'noise_excess.ratio.{d}': math.sqrt(
-                noise[d][0] ** 2 + (v / scale[d]) ** 2 / _NOISE_BAND_HZ) / noise[d][1] - 1
-                for d, v in by_axis.items()}
+        if name in _BY_AXIS:
+            true |= _true_by_axis(name, unit, w)
         elif name == 'gravity':
             true['gravity.offset_mps2'] = G0 * w[0]
         elif name == 'time_offset':
@@ -238,6 +226,21 @@ def true_parameters(label: Label) -> dict[str, float]:
         elif name == 'mount_resonance':
             true['mount_resonance.frequency_hz'] = fault['shape']['hertz']
     return true
+
+
+_BY_AXIS = ('bias', 'scale_factor', 'noise_excess')
+
+
+def _true_by_axis(name: str, unit: Unit, w: np.ndarray) -> dict[str, float]:
+    """Return the true values of a parameter that each axis has."""
+    if name == 'bias':
+        values, parameter = unit.zero_v + w * unit.scale_v_per_g - 2.5, 'offset_v'
+    elif name == 'scale_factor':
+        values, parameter = unit.scale_v_per_g * (1 + w) - 1.0, 'offset_v_per_g'
+    else:
+        noise = np.hypot(unit.noise_g_per_rthz, w / unit.scale_v_per_g / _NOISE_BAND_HZ ** 0.5)
+        values, parameter = noise / unit.stated_noise_g_per_rthz - 1, 'ratio'
+    return {f'{name}.{parameter}.{axis}': value for axis, value in zip(unit.axes, values)}
 
 
 COMPONENTS = (*KNOWN, UNKNOWN)
