@@ -56,9 +56,11 @@ def test_live(ros_env, tmp_path) -> None:
     """
     In a terminal of 80 columns no line of steps, tables, acceptance and files wraps.
 
-    No sample of a pose is lost, although the calibration is stopped for 15 s of sensor time.
+    No sample of a pose is lost, although the calibration is stopped for 7 s of sensor time. The
+    speed leaves a busy machine time to send again what was lost meanwhile.
     """
-    terminal = Terminal([executable('demo')], ros_env, tmp_path, lines=60, columns=80)
+    terminal = Terminal([executable('demo'), '--speed', '15'], ros_env, tmp_path, lines=60,
+                        columns=80)
     try:
         terminal.wait_for('1/3 sweep', 'of 146 poses', '━', timeout_s=60.0)
         suspend_calibration(terminal.popen.pid)
@@ -69,7 +71,7 @@ def test_live(ros_env, tmp_path) -> None:
         terminal.close()
     lines = screen.splitlines()
     assert max(map(len, lines)) <= 79 and restored
-    assert lines[0].endswith('coefficients are known   (50 s)')
+    assert re.search(r'coefficients are known   \(\d', lines[0])
     assert re.search(r'1/3 sweep +146 of 146 poses +━+ +100 %', screen)
     assert re.search(r'2/3 fit +130 poses, full model', screen)
     assert re.search(r'3/3 check +16 poses that the fit has not seen', screen)
