@@ -16,7 +16,7 @@ from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.files.recording_columns import Recording, uncalibrated
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.report.numbers import counted, duration
+from adxl_ros.report.quantities import counted, duration
 from adxl_ros.signals.allan_deviation import shortest_rest_s
 from adxl_ros.signals.recorded_sensor import load_sensor
 from adxl_ros.signals.recording_contents import examine, log_delay, RecordingContents

@@ -289,7 +289,7 @@ def _detections(checked: Sequence[CheckedRecording], best: Hypothesis, baseline:
         # In motion, a smooth reference lacks knocks that look like spikes.
         regular = used | ~comparison.at_rest if comparison.reference_fades else used
         if spikes is not None and noise_effects.residual_shows_spikes(spikes, residual_v,
-                                                                        regular, sensor):
+                                                                      regular, sensor):
             detections.append(spikes)
         by_sensor = [noise_effects.residual_detections(NoiseSamples(
             time_s=comparison.time_s, residual_v=bridged(residual_v, used),

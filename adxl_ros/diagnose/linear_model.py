@@ -505,7 +505,7 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
     by_channel = list(chain(*columns))
     if filters is None:
         filters = [whiteners(c.sensor, d, c.dt_s, c.span_s,
-                                             _reference_errors(c, d))
+                             _reference_errors(c, d))
                    for c in comparisons for d in range(len(c.sensor.axes))]
     channels = _whitened_channels(
         comparisons, by_channel, _filters_of(filters, comparisons[0].sensor.effects), flexible)

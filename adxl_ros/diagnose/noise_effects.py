@@ -697,7 +697,7 @@ def _spike_rate_and_size(comparison: BaselineComparison, series: _Series
     """Return the rate of spikes, 1/s, (1,), and their median size, m/s², (m,)."""
     finite = np.isfinite(series.volts).all(axis=1)
     _, spikes = isolated_samples(series.volts, comparison.time_s, finite,
-                                                 comparison.sensor)
+                                 comparison.sensor)
     if spikes is None:
         return np.zeros(1), np.zeros(len(comparison.sensor.axes))
     return (np.atleast_1d(spikes.values['rate_hz']),
@@ -708,7 +708,7 @@ def _repeated_share(comparison: BaselineComparison, series: _Series) -> np.ndarr
     """Return the share of samples that repeat the one before, (1,)."""
     finite = np.isfinite(series.volts).all(axis=1)
     used, _ = repeated_samples(series.volts, comparison.time_s, finite,
-                                               comparison.sensor)
+                               comparison.sensor)
     return np.array([float(np.mean(finite & ~used))])
 
 

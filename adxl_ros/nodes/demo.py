@@ -274,7 +274,7 @@ def _show_sweep(graph: DemoGraph, output: Path) -> Poses:
     """Show the sweep, the fit and the check while they run; return the poses."""
     journal = _journal(output)
     total = len(pose_plan.guided(np.radians(_PLANES_DEG).tolist(), float(np.radians(_STEP_DEG)),
-                                  _CHECK_POSES))
+                                 _CHECK_POSES))
     with steps.step('1/3 sweep', 'starting', total) as step:
         def show_poses() -> int:
             count = len(_accepted_poses(journal))

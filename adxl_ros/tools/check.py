@@ -21,7 +21,7 @@ from adxl_ros.files import recording
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.report import page as html_page
-from adxl_ros.report.numbers import duration
+from adxl_ros.report.quantities import duration
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
 from adxl_ros.signals.recording_contents import RecordingContents
 from adxl_ros.tools.command_line import (

@@ -68,7 +68,7 @@ def _sized(sensor: Sensor, options: argparse.Namespace, held: set[str],
     if sensor.rc_s:
         sizes_mg[exports.FILTER] = parts.filter_mg()
     return exports.Export(sensor, Path(options.params).name, sizes_mg,
-                       parts.remaining_mg({*held, *stage}, exports.FILTER in held))
+                          parts.remaining_mg({*held, *stage}, exports.FILTER in held))
 
 
 def _rms_mg(values_mps2: list[float]) -> float:

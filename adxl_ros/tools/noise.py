@@ -21,7 +21,7 @@ from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report import page as html_page
 from adxl_ros.report.figures import png, pyplot
-from adxl_ros.report.numbers import duration
+from adxl_ros.report.quantities import duration
 from adxl_ros.signals.allan_deviation import longest_rest, StillStretch
 from adxl_ros.signals.axis_noise import (
     AxisNoise,

@@ -9,7 +9,7 @@ import subprocess
 import sys
 
 # Packages with an import name that differs from the distribution, or without an entry in setup.py.
-OTHERS = ('PIL', 'arch', 'iio', 'jinja2', 'mcap', 'numba', 'pandas', 'rosbag2_py',
+OTHERS = ('PIL', 'arch', 'iio', 'jinja2', 'mcap', 'numba', 'rosbag2_py',
           'ruamel', 'serial', 'sklearn', 'tqdm')
 
 BLOCK = """

@@ -607,7 +607,7 @@ def next_poses(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: 
     rows = linearisation.whitened_jacobian(unit, grid, tuple(names), stage) * scale
     information = fisher_information(unit, poses, names, stage) * np.outer(scale, scale)
     chosen = linearisation.choose_poses(rows, information + _REGULARISATION * np.eye(len(names)),
-                                    count)
+                                        count)
     return [(float(grid.alpha_rad[i]), float(grid.beta_rad[i])) for i in chosen]
 
 

@@ -26,7 +26,7 @@ from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.report.numbers import with_half_width
+from adxl_ros.report.quantities import with_half_width
 import numpy as np
 import scipy
 

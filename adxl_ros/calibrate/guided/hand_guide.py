@@ -267,7 +267,7 @@ class HandGuide(StagelessGuide):
         force = force_g(rests.mean, self._coefficients)
         self._covered = gravity_model.covered(force / np.linalg.norm(force, axis=1, keepdims=True))
         self._gain = gravity_model.information_gain(information, self._coefficients,
-                                                   rests.gravity_g).gain
+                                                    rests.gravity_g).gain
         self._choose_next_up()
 
     def _choose_next_up(self) -> None:

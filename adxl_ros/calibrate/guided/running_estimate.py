@@ -242,7 +242,7 @@ def quick(sensor: Sensor, dwell_s: float, tilt_error_rad: float, check_poses: in
     rows = linearisation.whitened_jacobian(start.unit, grid, start.names, start.stage)
     chosen = [Target(float(grid.alpha_rad[i]), float(grid.beta_rad[i])) for i in
               linearisation.choose_poses(rows, np.diag(1 / start.prior ** 2),
-                                     max(_MOST_POSES, fewest))]
+                                         max(_MOST_POSES, fewest))]
     for count in range(fewest, len(chosen) + 1):
         targets = _short_path(chosen[:count])
         if start.with_poses(targets).tilt_error_rad() <= tilt_error_rad:

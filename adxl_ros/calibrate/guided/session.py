@@ -86,7 +86,7 @@ class SessionSettings:
             return []
         if self.plan_kind == 'quick':
             return running_estimate.quick(unit, self.capture.dwell_s, self.tilt_error_rad,
-                                    self.check_poses)
+                                          self.check_poses)
         planes_rad = self.planes_rad or pose_plan.default_planes_rad(unit.axes)
         return pose_plan.guided(planes_rad, self.step_rad, self.check_poses)
 

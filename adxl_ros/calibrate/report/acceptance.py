@@ -22,7 +22,7 @@ from adxl_ros.model.coefficients import get, parameter_of
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.report.numbers import with_half_width
+from adxl_ros.report.quantities import with_half_width
 import numpy as np
 
 PASS = 'PASS'

@@ -26,7 +26,7 @@ from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.effects.element import OTHER_AXIS
 from adxl_ros.model.effects.mounting import direction
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.report.numbers import decimals, duration
+from adxl_ros.report.quantities import decimals, duration
 import numpy as np
 
 _SCALE = Coefficient('scale_factor', 'offset_v_per_g')

@@ -123,7 +123,7 @@ def _of_batches(effects: Sequence[str], by_unit: np.ndarray, serials: Sequence[s
 
 
 def _of_places(effects: Sequence[str], has: np.ndarray, unit: np.ndarray, folders: Sequence[str]
-            ) -> list[str]:
+               ) -> list[str]:
     """Name the effects of units that are recorded below one folder."""
     pairs = sorted(set(zip(unit.tolist(), folders)))
     numbers = {pair: i for i, pair in enumerate(pairs)}

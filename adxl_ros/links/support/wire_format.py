@@ -285,8 +285,6 @@ class Splitter:
         self._incomplete, self._skipping = b'', False
 
 
-
-
 _REMEMBERED = 20_000
 """Frames that are recognised when they come twice. Chosen: 40 s of frames of 2 ms."""
 _TOLERANCE_US = 1000.0

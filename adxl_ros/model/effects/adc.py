@@ -47,7 +47,7 @@ _BITS = ('first_bit_v', 'second_bit_v', 'third_bit_v', 'fourth_bit_v', 'fifth_bi
 
 
 _INL_STARTS = (1.0, 2.4, 4.0, 5.8, 7.6, 9.4, 11.2, 13.0, 14.8, 16.6, 18.4, 20.2, 22.0, 23.8, 25.6,
-           27.4, 29.2, 32.0, 36.0, 41.0, 47.0, 54.0, 62.0)
+               27.4, 29.2, 32.0, 36.0, 41.0, 47.0, 54.0, 62.0)
 """Periods from which a fit starts. Chosen: 1 g of either sign covers 0.4 of the full scale.
 A start that differs by a third of a period there, 0.9, explains half of the power of a sine. Above
 30 the steps are wider, because converters with so many segments are rare."""
