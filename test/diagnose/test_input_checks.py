@@ -19,6 +19,8 @@ import numpy as np
 import pytest
 from units import nominal
 
+pytest.importorskip('plotly')  # the page of `diagnose`
+
 
 def unit(rate_hz=100.0):
     """Return a nominal unit on a stage with a fine encoder."""

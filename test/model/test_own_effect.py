@@ -12,6 +12,7 @@ import sys
 from adxl_ros.files import parameter_file, recording
 import numpy as np
 from processes import REPO, run_executable
+import pytest
 from units import nominal
 
 PAGE = REPO / 'docs' / 'howto' / 'own_effect.md'
@@ -19,6 +20,7 @@ PAGE = REPO / 'docs' / 'howto' / 'own_effect.md'
 
 def test_the_documented_package_works(tmp_path, monkeypatch):
     """Its effect is available to `simulate`, to parameter files and to `apply`."""
+    pytest.importorskip('plotly')
     blocks = re.findall(r'`([a-z_.]+)`:\n\n```\w+\n(.*?)```', PAGE.read_text(), re.DOTALL)
     assert {name for name, _ in blocks} == {'pyproject.toml', 'crane_effects.py'}
     package = tmp_path / 'package'

@@ -66,6 +66,8 @@ def test_a_row_that_fails_is_named_and_the_others_stand(monkeypatch, capsys) -> 
 @pytest.mark.parametrize('kind', ['csv', 'mcap'])
 def test_a_long_recording_is_applied_with_its_memory_and_leaves_no_file(
         monkeypatch, tmp_path, kind):
+    if kind == 'mcap':
+        pytest.importorskip('rosbags')
     # The other executables stand beside the running one.
     monkeypatch.setattr(sys, 'argv', [executable('bench')])
     jobs = bench_jobs._long_applying(tmp_path, nominal(), kind, 0.01)

@@ -165,6 +165,7 @@ def test_figures_are_those_of_the_measurements() -> None:
 
 
 def test_reference_is_that_of_the_package(tmp_path: Path) -> None:
+    pytest.importorskip('plotly')
     reference().main(tmp_path)
     for page in tmp_path.glob('*.md'):
         assert (DOCS / 'reference' / page.name).read_text('utf-8') == page.read_text('utf-8'), \
