@@ -130,8 +130,6 @@ bench: build
 	    --requirement requirements/bench.txt
 	./run bench --iiod test/support/iiod.py $(ARGS)
 
-python_in_test = cd test && ../run --exec sh -c 'PYTHONPATH="support:$$PYTHONPATH" exec python "$$@"' -
-
 gallery: build
 	./run --exec python docs/gallery.py
 
@@ -158,9 +156,9 @@ coverage: build
 	OPENBLAS_NUM_THREADS=1 ./run reproduce --units 0 --draws 300 -o coverage_output $(ARGS)
 
 # Goes on where it was cut short.
-investigate: developed
-	OPENBLAS_NUM_THREADS=1; export OPENBLAS_NUM_THREADS; \
-	$(python_in_test) long/investigate_units.py -o ../investigate_units.jsonl $(ARGS)
+investigate: build
+	OPENBLAS_NUM_THREADS=1 ./run --exec python docs/measurements/investigate_units.py \
+	    -o investigate_units.jsonl $(ARGS)
 
 # Goes on where it was cut short; with a seed of its own in ARGS, into another folder.
 blind: build

@@ -233,6 +233,7 @@ _BY_AXIS = ('bias', 'scale_factor', 'noise_excess')
 
 def _true_by_axis(name: str, unit: Unit, w: np.ndarray) -> dict[str, float]:
     """Return the true values of a parameter that each axis has."""
+    w = w[:len(unit.axes)]
     if name == 'bias':
         values, parameter = unit.zero_v + w * unit.scale_v_per_g - 2.5, 'offset_v'
     elif name == 'scale_factor':
