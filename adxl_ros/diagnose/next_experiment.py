@@ -55,21 +55,22 @@ def _distance(gram: np.ndarray, first: Belief, second: Belief) -> float:
     both = np.hstack([first.root, second.root]) / np.sqrt(2)
     difference = first.mean - second.mean
     projected = gram @ difference
-    middle = np.eye(both.shape[1]) + both.T @ gram @ both
-    across = both.T @ projected
+    values, vectors = _eigen(both.T @ gram @ both)
+    across = vectors.T @ (both.T @ projected)
     # Woodbury: (1 + J·S·Jᵀ)⁻¹ within the span of J.
-    square = float(difference @ projected - across @ np.linalg.solve(middle, across))
-    return max(square, 0.0) / 8 + 0.5 * _log_det(middle)
+    square = float(difference @ projected - np.sum(across ** 2 / (1 + values)))
+    return max(square, 0.0) / 8 + 0.5 * float(np.log1p(values).sum())
 
 
 def _log_det_of(gram: np.ndarray, belief: Belief) -> float:
     """Return the log determinant of the covariance of a prediction, in units of the noise."""
-    return _log_det(np.eye(belief.root.shape[1]) + belief.root.T @ gram @ belief.root)
+    return float(np.log1p(_eigen(belief.root.T @ gram @ belief.root)[0]).sum())
 
 
-def _log_det(matrix: np.ndarray) -> float:
-    """Return the log determinant of a positive definite matrix."""
-    return float(np.linalg.slogdet(matrix)[1])
+def _eigen(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return eigenvalues and vectors; 1 + products is singular in floats where one is huge."""
+    values, vectors = np.linalg.eigh((products + products.T) / 2)
+    return np.maximum(values, 0.0), vectors
 
 
 def expected_information(gram: np.ndarray, probabilities: Sequence[float],
