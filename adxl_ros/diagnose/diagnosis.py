@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import NamedTuple
 
 from adxl_ros.diagnose import data_checks, noise_effects, noise_model
@@ -187,15 +188,15 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
         model.lost_motion_mps2, np.inf if floor.source == 'assumed' else floor.rms_mps2)
     detections = _detections(checked, search.best, model.baseline)
     verdict = decide(
-        evidence, lambda effects, drift: reproducible_rest(fits[effects][1][drift], model),
+        evidence, cache(lambda effects, drift: reproducible_rest(fits[effects][1][drift], model)),
         [d.effect for d in detections if d.effect != UNKNOWN],
         lambda share: float(np.interp(share, _REPEATED, _RIGHT)))
     show('report', 0.0)
     if verdict.status == 'no_gap' and not any(map(_could_show, model.comparisons)):
         verdict = replace(verdict, status='insufficient')
     best = frozenset(verdict.best.effects)
-    named = _named_sensor(verdict, detections, model.baseline, replace(
-        checked[0].comparison.sensor), fits[best][1])
+    named = _named_sensor(verdict, detections, model.baseline, checked[0].comparison.sensor,
+                          fits[best][1])
     report = _report(checked, model, search, verdict, detections, floor, evidence, named, seed)
     show('report', 1.0)
     return Diagnosis(tuple(model.comparisons), tuple(c.comparison for c in checked), None, report)
@@ -304,9 +305,8 @@ def _detections(checked: Sequence[CheckedRecording], best: Hypothesis, baseline:
 
 def _could_show(comparison: BaselineComparison) -> bool:
     """Determine whether the sensor moves, or its temperature or supply changes."""
-    if comparison.reference is Reference.SIMULATOR:
-        return True
-    if comparison.reference is Reference.STAGE and not comparison.at_rest.all():
+    if comparison.reference is Reference.SIMULATOR or (
+            comparison.reference is Reference.STAGE and not comparison.at_rest.all()):
         return True
     paths = {name: getattr(comparison.motion, name) for name in _SMALLEST_RANGES}
     return any(path is not None and np.ptp(path(comparison.time_s)) > _SMALLEST_RANGES[name]
@@ -338,17 +338,13 @@ def _named_sensor(verdict: Verdict, detections: Sequence[Detection], searched: S
         hidden = [name for name, is_open in zip(best.names, best.undetermined)
                   if is_open and parameter_of(name).is_size]
         sensor = put(sensor, hidden, get(from_file, hidden))
-    for detection in detections:
-        if detection.effect != UNKNOWN:
-            sensor = with_neutral(sensor, [detection.effect])
-            sensor = replace(sensor, values={
-                **sensor.values, detection.effect: {
-                    **sensor.values[detection.effect], **detection.values}})
-    for drift in drifts[:1]:
-        sensor = with_neutral(sensor, [drift])
-        parameter = effect_named(drift).parameters[0].name
-        sensor = replace(sensor, values={**sensor.values, drift: {
-            **sensor.values[drift], parameter: drift_densities(fits[drift], sensor)}})
+    in_noise = {d.effect: d.values for d in detections if d.effect != UNKNOWN}
+    in_noise |= {drift: {effect_named(drift).parameters[0].name: drift_densities(
+        fits[drift], sensor)} for drift in drifts[:1]}
+    for effect, values in in_noise.items():
+        sensor = with_neutral(sensor, [effect])
+        sensor = replace(sensor, values={
+            **sensor.values, effect: {**sensor.values[effect], **values}})
     kept = [i for i, name in enumerate(baseline.covariance_names) if name.effect in sensor.effects]
     return replace(sensor, covariance=baseline.covariance[np.ix_(kept, kept)],
                    covariance_names=tuple(baseline.covariance_names[i] for i in kept))

@@ -14,12 +14,13 @@ from adxl_ros.diagnose.hypothesis_fit import Hypothesis
 from adxl_ros.diagnose.next_experiment import MENU, NextExperiment
 from adxl_ros.diagnose.noise_effects import UNKNOWN
 from adxl_ros.diagnose.residual_map import SIGNIFICANT_P
-from adxl_ros.diagnose.verdict import Interval, Verdict, WeightedHypothesis
+from adxl_ros.diagnose.verdict import Verdict, WeightedHypothesis
 from adxl_ros.diagnose.visibility import by_effect, CouldShow
 from adxl_ros.model.coefficients import fitted_of, get, parameter_of
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import ActsOn, Coefficient, Concern
+from adxl_ros.report.quantities import Interval
 import numpy as np
 
 _DIGITS = 6
@@ -273,13 +274,12 @@ def headline(diagnosis: Diagnosis) -> str:
     if verdict.status == 'insufficient':
         return 'No verdict: neither motion nor temperature nor supply changes, so that no ' \
                'effect can show.'
-    rest = mg_text(_amplitude(verdict.rest.value))
+    rest = mg_text(_amplitude(verdict.remaining))
     if verdict.status == 'unknown':
-        return f'Unknown {sure}: {rest} repeats that no effect of the library explains.' \
-               f'{_follows(verdict)}'
+        return f'Unknown {sure}: no effect of the library explains {rest}.{_follows(verdict)}'
     if verdict.status == 'partly':
         share = verdict.explained_share
-        return f'Partly explained {sure}: {percent(share)} of what repeats is {named}; ' \
+        return f'Partly explained {sure}: {percent(share)} of the gap is {named}; ' \
                f'{percent(1 - share)} ({rest}) is something else.{_follows(verdict)}' \
                f'{_of_reference(verdict)}'
     recordings = 'these recordings do' if len(diagnosis.comparisons) > 1 else 'this recording does'
@@ -290,7 +290,8 @@ def headline(diagnosis: Diagnosis) -> str:
 
 def _follows(verdict: Verdict) -> str:
     """Return a sentence on what the reproducible rest follows."""
-    where = [_DIMENSIONS.get(d, d) for d in verdict.rest_follows[:_MOST_DIMENSIONS]]
+    repeats = verdict.rest.low > 0
+    where = [_DIMENSIONS.get(d, d) for d in verdict.rest_follows[:_MOST_DIMENSIONS] if repeats]
     return f' It follows {listed(where, "and")}.' if where else ''
 
 

@@ -20,6 +20,7 @@ from adxl_ros.diagnose.hypothesis_fit import Hypothesis
 from adxl_ros.diagnose.noise_effects import UNKNOWN
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Concern
+from adxl_ros.report.quantities import Interval
 import numpy as np
 
 HEALTHY = ''
@@ -73,15 +74,6 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Interval:
-    """A value with its 90 % interval."""
-
-    value: float
-    low: float
-    high: float
-
-
-@dataclass(frozen=True)
 class Verdict:
     """The result of a diagnosis; powers are mean squares over samples and axes, (m/s²)²."""
 
@@ -105,11 +97,15 @@ class Verdict:
     rest_follows: tuple[str, ...] = ()
 
     @property
+    def remaining(self) -> float:
+        """Power beside the best set: what repeats, or all above the noise where that is more."""
+        return max(self.rest.value, self.left.value, 0.0)
+
+    @property
     def explained_share(self) -> float:
         """Share of the power above the noise that the best set explains; 1 without any."""
-        rest = max(self.rest.value, self.left.value, 0.0)
-        total = max(self.explained.value, 0.0) + rest
-        return 1.0 - rest / total if total > 0 else 1.0
+        total = max(self.explained.value, 0.0) + self.remaining
+        return 1.0 - self.remaining / total if total > 0 else 1.0
 
 
 _Modelled = tuple[frozenset[str], str]

@@ -23,6 +23,7 @@ from adxl_ros.monitor.reference_stream import (
     ReferenceStream,
     StreamBuffer,
 )
+from adxl_ros.report.quantities import Interval
 import numpy as np
 import scipy
 
@@ -60,15 +61,6 @@ call every twentieth closed gap open."""
 _EXPLAINED_LEAST = 1.1
 """Rms of the difference to the datasheet, divided by the floor, from which there is something to
 explain. Chosen: an added effect of half the noise."""
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A value with its 90 % interval."""
-
-    value: float
-    low: float
-    high: float
 
 
 @dataclass(frozen=True)

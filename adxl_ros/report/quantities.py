@@ -1,10 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Coefficients as text, with the digits that their intervals allow."""
+"""Values with their intervals, and as text with the digits that these allow."""
+
+from dataclasses import dataclass
 
 _MOST_DECIMALS = 7
 """Largest number of decimals (chosen: a table of 79 columns has room for ten digits)."""
 _UNKNOWN_DECIMALS = 4
 """Number of decimals of a coefficient without an interval."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A value with its 90 % interval."""
+
+    value: float
+    low: float
+    high: float
 
 
 def decimals(half_width: float) -> int:
