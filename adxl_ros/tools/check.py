@@ -40,7 +40,9 @@ _NAME_COLUMNS = 21
 _WIDTHS = (13, 10, 9, 8, 6)
 """Columns of length, rate, missing samples, share at rest and axes."""
 _HEAD = ('length', 'rate', 'missing', 'rest', 'axes')
-SHOWS_HEAD = ('effect', 'from', 'typical', '')
+_SHOWS_HEAD = ('effect', 'from', 'typical', '')
+_MOST_SHOWN = 1_000_000
+"""Samples up to which it is listed what `diagnose` could show. Chosen: a minute, and 1 GB."""
 _MOST_DETAILED = 3
 """Recordings up to which the details of sound ones are printed, too. Chosen: a screen."""
 _LABEL_COLUMNS = 12
@@ -63,7 +65,7 @@ def _lines(results: list[Findings]) -> list[str]:
             count = sum(not missing for *_, missing in result.shows)
             rows += ['', f'  {count} of {len(result.shows)} effects could show to diagnose',
                      *(f'  {a:24}{b:16}{c:14}{d}'.rstrip()
-                       for a, b, c, d in (SHOWS_HEAD, *result.shows))]
+                       for a, b, c, d in (_SHOWS_HEAD, *result.shows))]
     if len(detailed) < len(results):
         rows += ['', '--report DIR and --json have the details of all recordings.']
     return [*rows, '']
@@ -152,7 +154,7 @@ def _page(results: list[Findings]) -> str:
     return html_page.render('adxl_ros.tools', 'check.html', {
         'title': 'Check of recordings', 'about': [], 'badge': badge,
         'figures': {}, 'columns': ('recording', *_HEAD, 'verdict'), 'rows': rows,
-        'recordings': recordings, 'shows_head': SHOWS_HEAD})
+        'recordings': recordings, 'shows_head': _SHOWS_HEAD})
 
 
 _EXAMPLES = {
@@ -205,6 +207,10 @@ def _with_what_shows(result: Findings, params: str | None, reading: ReadingOptio
     if not result.is_sound or not any(a.tool == 'diagnose' and a.is_able
                                       for a in result.abilities):
         return result
+    if result.contents is None or result.contents.samples > _MOST_SHOWN:
+        return replace(result, remarks=(
+            *result.remarks, 'what diagnose could show is listed for recordings of '
+            f'{_MOST_SHOWN} samples at most; check a part'))
     try:
         read = recording.read(result.path, reading)
         sensor, _ = measure_unstated(load_sensor(params, read), read)

@@ -2,6 +2,8 @@
 
 """The sensing element: dependence of its output on force along and across the axis."""
 
+from functools import partial
+
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
 from adxl_ros.model.filters import low_pass, stop
@@ -13,10 +15,10 @@ OTHER_AXIS = {'cross_axis': _IN_PLANE, 'scale_factor_cross': _IN_PLANE,
 is out of plane is y."""
 
 
-def _cross_axis(signals: Signals, p: Parameters) -> None:
-    """Add p1·A_c + p2·A_c² to each measured axis."""
+def _bias_by(others: tuple[int, int, int], signals: Signals, p: Parameters) -> None:
+    """Add p1·A_c + p2·A_c² of another axis c to each measured axis."""
     for d, (p1, p2) in enumerate(zip(p['linear'], p['quadratic_per_g'])):
-        other = signals.sensed[_IN_PLANE[d]]
+        other = signals.sensed[others[d]]
         signals.output[d] = signals.output[d] + (p1 + p2 * other) * other
 
 
@@ -29,7 +31,7 @@ CROSS_AXIS = Effect(
         Parameter('quadratic_per_g', '1/g', -0.3, 0.3, 0.01, 'paper, figure 4',
                   'p2 of equation 11'),
     ),
-    apply=_cross_axis,
+    apply=partial(_bias_by, _IN_PLANE),
     invertible=True,
     cause='The other in-plane axis shifts the bias; calibrate with the plane alpha = 90 deg.',
     diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, form=(FormDimension.CROSS_FORCE,),
@@ -41,13 +43,6 @@ The z axis gets it from x.
 """
 
 
-def _cross_axis_z(signals: Signals, p: Parameters) -> None:
-    """Add q1·A_z + q2·A_z² to the x and y axes, and the same of A_y to the z axis."""
-    for d, (q1, q2) in enumerate(zip(p['linear'], p['quadratic_per_g'])):
-        other = signals.sensed[_OUT_OF_PLANE[d]]
-        signals.output[d] = signals.output[d] + (q1 + q2 * other) * other
-
-
 CROSS_AXIS_Z = Effect(
     name='cross_axis_z',
     place=Place.ELEMENT,
@@ -57,7 +52,7 @@ CROSS_AXIS_Z = Effect(
         Parameter('quadratic_per_g', '1/g', -0.3, 0.3, 0.01, 'paper, figure 6',
                   'q2 of equation 13'),
     ),
-    apply=_cross_axis_z,
+    apply=partial(_bias_by, _OUT_OF_PLANE),
     invertible=True,
     cause='The out-of-plane axis shifts the bias; calibrate with several planes alpha.',
     diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, form=(FormDimension.CROSS_FORCE,),
