@@ -4,10 +4,8 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, ExitStack, suppress
-from dataclasses import dataclass
 import os
 from pathlib import Path
 import subprocess
@@ -38,8 +36,6 @@ _FIRST_MESSAGES = 50
 """Messages after which a stream has begun."""
 _WARM_UP_S = 2.0
 """Time between the begin of a stream and its measurement, s; chosen."""
-_READ_BYTES = 65536
-"""Most bytes of one read of the bare reader, as the serial link reads them."""
 _QUEUE = 1000
 """Messages that the listener keeps while it is busy; chosen: 1 s."""
 BARE_QUEUE = 10
@@ -63,21 +59,12 @@ class Listener(Node):
         self.raw.append(raw)
 
     def listen(self, seconds: float, limit: float = np.inf) -> None:
-        """
-        Keep the messages of some time.
-
-        seconds: duration, s.
-        """
+        """Keep the messages of some time."""
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s and len(self.raw) < limit:
             self._inbox.receive(self._on_message)
         if not self.raw:
             raise UserError(f'no messages for {seconds:g} s')
-
-    def clear(self) -> None:
-        """Forget the messages so far."""
-        self.raw.clear()
-        self.arrived_ns.clear()
 
 
 @contextmanager
@@ -115,77 +102,59 @@ class BareRelay(Node):
         self.create_subscription(Imu, 'bare', publisher.publish, qos_profile_sensor_data)
 
 
-BARE_NODES = {'publisher': BarePublisher, 'relay': BareRelay}
-"""Bare nodes by the value of the hidden option `--bare`, which runs one in its own process."""
-
-
-def run_bare_node(make: Callable[[], Node]) -> int:
-    """Spin a node until a signal ends it."""
+def spin(make: Callable[[], Node]) -> None:
+    """Spin a bare node until a signal ends it."""
     rclpy.init()
     executor = SingleThreadedExecutor()
     executor.add_node(make())
     with suppress(KeyboardInterrupt, ExternalShutdownException):
         executor.spin()
-    return 0
-
-
-def run_bare_reader(port: str) -> int:
-    """Read what a board sends, and do nothing with it."""
-    with open(port, 'rb', buffering=0) as file, suppress(KeyboardInterrupt, OSError):
-        while file.read(_READ_BYTES):
-            pass
-    return 0
 
 
 class _Subject(NamedTuple):
     """What is measured."""
 
     label: str  # Its name in the table
-    topic: str  # Topic of its last node; '' for a process that publishes nothing
+    topic: str  # Topic of its last node
     commands: Sequence[Sequence[str]]  # Commands of its processes
 
 
-@dataclass(frozen=True)
-class _Result:
+class _Result(NamedTuple):
     """One measurement of a subject."""
 
-    rate_hz: float  # Messages by time, Hz; NaN without a topic
+    rate_hz: float  # Messages by time
     missing: float  # Samples that did not come
-    # p50_ms, p99_ms: Age of the samples on arrival, ms; NaN without a topic
-    p50_ms: float
+    p50_ms: float  # Age of the samples on arrival
     p99_ms: float
     loads: tuple[float, ...]  # Processor time by time, one for each process
 
 
 def measure_live(seconds: float, rounds: int, iiod: str | None) -> None:
-    """
-    Print a row for each subject: rate, loss, age on arrival, processor time.
-
-    seconds: duration of one measurement, s.
-    """
+    """Print rate, loss, age on arrival and processor time of each subject, of some rounds."""
     print(f'{RATE_HZ:g} Hz, {rounds} x {seconds:g} s: medians (range). '
           f'Load of the machine before: {os.getloadavg()[0]:.1f}')
     print(f'{"":27} {"Hz":>6} {"lost":>4} {"p50 ms":>16} {"p99 ms":>17}  CPU, %', flush=True)
+    results: dict[str, list[_Result]] = {}
+    failures: dict[str, list[str]] = {}
     with ExitStack() as stack:
         subjects = _subjects(stack, iiod)
-        results: dict[str, list[_Result]] = {subject.label: [] for subject in subjects}
-        failures: dict[str, list[str]] = {subject.label: [] for subject in subjects}
-        for _ in range(rounds):
-            for subject in subjects:
-                try:
-                    results[subject.label].append(_measure(subject, seconds))
-                except UserError as error:
-                    failures[subject.label].append(str(error))
-    for label, measured in results.items():
-        if measured:
-            print(_row(label, measured))
-        if failed := failures[label]:
-            print(f'{label:27} failed in {len(failed)} of {rounds} rounds: {failed[-1]}')
-    bare = np.median([sum(result.loads) for result in results[_RELAY]] or [np.nan])
-    for label, measured in results.items():
-        if 'compensation' in label and measured:
-            load = np.median([sum(result.loads) for result in measured])
-            print(f'CPU of {label} by that of the {_RELAY}: {load / bare:.2f}')
+        for subject in subjects * rounds:
+            try:
+                results.setdefault(subject.label, []).append(_measure(subject, seconds))
+            except UserError as error:
+                failures.setdefault(subject.label, []).append(str(error))
+    for label in (subject.label for subject in subjects):
+        if label in results:
+            print(_row(label, results[label]))
+        if label in failures:
+            print(f'{label:27} failed in {len(failures[label])} of {rounds} rounds: '
+                  f'{failures[label][-1]}')
+    loads = {label: np.median([sum(result.loads) for result in measured])
+             for label, measured in results.items()}
+    for label, load in loads.items():
+        if 'compensation' in label:
+            print(f'CPU of {label} by that of the {_RELAY}: '
+                  f'{load / loads.get(_RELAY, np.nan):.2f}')
     driver, compensation = [executable('driver')], [executable('compensation')]
     for label, topic, command, before in (('driver, sim', 'imu/data_raw', driver, []),
                                           ('compensation', 'imu/data', compensation, [driver])):
@@ -199,7 +168,8 @@ def measure_live(seconds: float, rounds: int, iiod: str | None) -> None:
 
 def _subjects(stack: ExitStack, iiod: str | None) -> list[_Subject]:
     """Return what is measured; `stack` ends the devices."""
-    bare = [[sys.executable, sys.argv[0], '--bare', kind] for kind in BARE_NODES]
+    bare = [[sys.executable, '-c', f'from adxl_ros_validation import bench_command as bench; '
+             f'bench.spin(bench.{node.__name__})'] for node in (BarePublisher, BareRelay)]
     port = stack.enter_context(_emulated_board())
     driver, compensation = executable('driver'), executable('compensation')
     drivers = {'sim': [driver], 'serial': [
@@ -210,8 +180,6 @@ def _subjects(stack: ExitStack, iiod: str | None) -> list[_Subject]:
         drivers['iio'] = [driver, '--ros-args', '-p', 'link.type:=iio', '-p', f'link.uri:={uri}']
     return [
         _Subject('bare publisher', 'bare', bare[:1]), _Subject(_RELAY, 'relayed', bare),
-        _Subject('bare reader of the port', '',
-                 [[sys.executable, sys.argv[0], '--read', port]]),
         *(_Subject(f'driver, {link}', 'imu/data_raw', [command])
           for link, command in drivers.items()),
         *(_Subject(f'driver, {link}, compensation', 'imu/data', [command, [compensation]])
@@ -250,17 +218,12 @@ def _measure(subject: _Subject, seconds: float) -> _Result:
         def cpu_times_s() -> np.ndarray:
             return np.array([cpu_time_s(process.pid) for process in processes])
 
-        if not subject.topic:
-            time.sleep(_WARM_UP_S)
-            before_s = cpu_times_s()
-            time.sleep(seconds)
-            loads = (cpu_times_s() - before_s) / seconds
-            return _Result(np.nan, 0, np.nan, np.nan, tuple(loads))
         try:
             with _listening(subject.topic) as listener:
                 listener.listen(_START_S, _FIRST_MESSAGES)
                 listener.listen(_WARM_UP_S)
-                listener.clear()
+                listener.raw.clear()
+                listener.arrived_ns.clear()
                 before_s, began_s = cpu_times_s(), time.monotonic()
                 listener.listen(seconds)
                 duration_s = time.monotonic() - began_s
@@ -295,8 +258,6 @@ def _row(label: str, results: Sequence[_Result]) -> str:
     """Return the row of a subject."""
     loads = ' + '.join(f'{100 * load:.1f}'
                        for load in np.median([result.loads for result in results], axis=0))
-    if np.isnan(results[0].rate_hz):
-        return f'{label:27} {"":46}  {loads}'
     return (f'{label:27} {np.median([result.rate_hz for result in results]):6.0f} '
             f'{np.median([result.missing for result in results]):4.0f} '
             f'{_spread([result.p50_ms for result in results]):>16} '
@@ -308,12 +269,6 @@ def _spread(values: Sequence[float]) -> str:
     return f'{np.median(values):.2f} ({min(values):.2f}-{max(values):.2f})'
 
 
-_SECONDS = 10.0
-"""Default duration of one live measurement, s."""
-_ROUNDS = 3
-"""Default number of measurements of each row; chosen: a median needs three."""
-_HOURS = 8.0
-"""Default duration of the long recordings, h."""
 _EXAMPLES = {'all measurements, ten minutes': '',
              'with recordings of 10 minutes, not 8 hours': '--hours 0.17',
              'only the live nodes': '--live',
@@ -325,22 +280,16 @@ _EXAMPLES = {'all measurements, ten minutes': '',
 def main() -> int:
     """Run the benchmark; return the exit status."""
     parser = program_parser('bench', __doc__, _EXAMPLES)
-    parser.add_argument('--seconds', type=float, default=_SECONDS,
-                        help=f'duration of each live measurement, s (default {_SECONDS:g})')
-    parser.add_argument('--rounds', type=int, default=_ROUNDS,
-                        help=f'measurements of each row (default {_ROUNDS})')
-    parser.add_argument('--hours', type=float, default=_HOURS,
-                        help='duration of the recordings of the rows "apply, … h" (default '
-                             f'{_HOURS:g}: 30 GB of disk)')
+    parser.add_argument('--seconds', type=float, default=10.0,
+                        help='duration of each live measurement, s (default 10)')
+    parser.add_argument('--rounds', type=int, default=3,
+                        help='measurements of each row (default 3)')
+    parser.add_argument('--hours', type=float, default=8.0,
+                        help='duration of the recordings of the rows "apply, … h" (default 8: '
+                             '30 GB of disk)')
     parser.add_argument('--live', action='store_true', help='measure only the live nodes')
     parser.add_argument('--iiod', metavar='FILE', help="the tests' IIOD, for the link iio")
-    parser.add_argument('--bare', choices=list(BARE_NODES), help=argparse.SUPPRESS)
-    parser.add_argument('--read', metavar='PORT', help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.bare:
-        return run_bare_node(BARE_NODES[options.bare])
-    if options.read:
-        return run_bare_reader(options.read)
     use_own_graph()
     try:
         measure_live(options.seconds, options.rounds, options.iiod)

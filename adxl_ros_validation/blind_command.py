@@ -6,15 +6,13 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-import secrets
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import write_text
-from adxl_ros.report.figures import pyplot
 from adxl_ros.tools.command_line import argument_parser, command
 from adxl_ros.tools.output import make_folder, note, print_end, progress, quoted, run
 from adxl_ros.workers import open_pool
-from adxl_ros_validation.blind import check, real_sensors, report_html
+from adxl_ros_validation.blind import check, real_sensors, report_html, sealing, trials
 
 PROG = 'blind'
 """Name of the command, for messages."""
@@ -52,12 +50,10 @@ def parser() -> argparse.ArgumentParser:
 
 def blind(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
-    if options.trials < 1:
-        raise UserError(f'--trials {options.trials}: at least 1 is needed')
-    if options.jobs is not None and options.jobs < 1:
-        raise UserError(f'--jobs {options.jobs}: at least 1 is needed')
-    if options.seed is not None and options.seed < 0:
-        raise UserError(f'--seed {options.seed}: must not be negative')
+    for name, least in (('trials', 1), ('jobs', 1), ('seed', 0)):
+        value = getattr(options, name)
+        if value is not None and value < least:
+            raise UserError(f'--{name} {value}: must be at least {least}')
     folder = Path(options.output or options.seal or options.open)
     try:
         return _check(options, folder)
@@ -68,32 +64,30 @@ def blind(options: argparse.Namespace) -> int:
 
 def _check(options: argparse.Namespace, folder: Path) -> int:
     """Draw and seal the trials, diagnose and score them, and write the report."""
-    draw = pyplot()
     if not options.open:
         make_folder(folder)
     with open_pool(options.scheduler, options.jobs) as pool:
         if not options.open:
             if options.real:
-                seed = secrets.randbelow(2 ** 31) if options.seed is None else options.seed
-                digest = real_sensors.seal(folder, Path(options.real).resolve(), seed,
+                digest = real_sensors.seal(folder, Path(options.real).resolve(), options.seed,
                                            options.trials, pool, progress)
             else:
                 with progress('draw') as show:
-                    digest = check.draw(folder, options.seed, options.trials, pool, show)
+                    digest = sealing.seal(folder, options.seed, options.trials, trials.plans,
+                                          trials.draw_trial, pool, show)
             print(f'SHA-256 of salt and labels: {digest}', flush=True)
         if options.seal:
             print_end([], [folder], command(PROG, f'--open {quoted(folder)}'))
             return 0
         if (folder / 'baseline').exists():
-            made = real_sensors.score(folder, None, pool, progress)
-            said, tables = real_sensors.said(made), real_sensors.tables(made)
-            markdown = report_html.tables_as_markdown([said], tables)
-            page = report_html.tables_as_page('Blind check on real sensors', {said: ''}, '',
-                                              tables)
+            made = real_sensors.score(folder, pool, progress)
+            said, tables = [real_sensors.said(made)], real_sensors.tables(made)
+            markdown = report_html.tables_as_markdown(said, tables)
+            page = report_html.tables_as_page('Blind check on real sensors', said, tables)
             screen = report_html.terminal_table(tables['Result'])
         else:
-            made = check.score(folder, None, pool, progress)
-            markdown, page = report_html.markdown(made), report_html.page(made, draw)
+            made = check.score(folder, pool, progress)
+            markdown, page = report_html.markdown(made), report_html.page(made)
             screen = report_html.summary(made).splitlines()
     write_text(folder / 'blind.json', json.dumps(made, indent=1, allow_nan=False) + '\n')
     write_text(folder / 'blind.md', markdown)

@@ -26,6 +26,7 @@ from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros_validation import experiments
+from adxl_ros_validation.reproduction_report import markdown_table
 import numpy as np
 import scipy
 
@@ -94,29 +95,26 @@ def draw(nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], se
     sigma = step / np.sqrt(12)
     levels = StageError(0.0, sigma) if stage == STAGES[0] else StageError(sigma)
     bound = experiments.sweep_bound(truth, poses, true_rad, levels,
-                                    (*full_model.default_terms(axes), *_extra(stage)))
+                                    _terms(axes, stage))
     held_out = _random_poses(truth, rng)
     tilt = experiments.angle_errors(fit.fitted, bound, *held_out)
     force, force_std = experiments.force_errors(fit.fitted, truth, *held_out)
+    bound_std = dict(zip(bound.covariance_names, np.sqrt(np.diag(bound.covariance))))
+    bound_ratio = error / [bound_std[name] for name in names] \
+        if set(names) == set(bound_std) else np.zeros(0)
     return Draw(stage, axes, kind, names, error / np.sqrt(np.diag(fit.fitted.covariance)),
-                _by_bound(names, error, bound), (tilt.error / tilt.std)[tilt.determined],
+                bound_ratio, (tilt.error / tilt.std)[tilt.determined],
                 (force / force_std).ravel(), fit.converged)
 
 
-def _extra(stage: str) -> tuple[str, ...]:
-    return ('stage_eccentricity',) if stage == 'eccentric' else ()
-
-
-def _by_bound(names: Sequence[Coefficient], error: np.ndarray, bound: Sensor) -> np.ndarray:
-    std = dict(zip(bound.covariance_names, np.sqrt(np.diag(bound.covariance))))
-    if set(names) != set(std):
-        return np.zeros(0)
-    return np.array([e / std[name] for name, e in zip(names, error)])
+def _terms(axes: str, stage: str) -> tuple[str, ...]:
+    extra = ('stage_eccentricity',) if stage == 'eccentric' else ()
+    return (*full_model.default_terms(axes), *extra)
 
 
 def _unit(sensor: Sensor, stage: str, rng: np.random.Generator) -> Sensor:
     """Draw a unit: each coefficient is normal with its typical size, in the gauge of the fit."""
-    effects = (*full_model.default_terms(sensor.axes), *_extra(stage), 'base_tilt')
+    effects = (*_terms(sensor.axes, stage), 'base_tilt')
     unit = with_neutral(replace(sensor, effects=(), values={}), effects)
     names = [name for name in full_model.fitted_coefficients(sensor.axes, effects)
              if full_model.term_of(name) not in full_model.GAUGE
@@ -158,43 +156,37 @@ def _read(truth: Sensor, poses: Poses, true_rad: np.ndarray, rng: np.random.Gene
     return replace(poses, volts=volts + poses.std_v * rng.normal(size=volts.shape))
 
 
-def interval(inside: int, count: int) -> tuple[float, float]:
-    """Return the 90 % interval of a share (Clopper and Pearson 1934)."""
-    low = scipy.stats.beta.ppf(0.05, inside, count - inside + 1) if inside else 0.0
-    high = scipy.stats.beta.ppf(0.95, inside + 1, count - inside) if inside < count else 1.0
-    return float(low), float(high)
-
-
 def page(draws: Sequence[Draw], made: str) -> str:
     """Return the section about coverage."""
     ratio = np.concatenate([d.bound_ratio for d in draws])
-    lines = [f'## Coverage of the intervals: {len(draws)} drawn units and stages', '', made, '',
-             'A unit is drawn at datasheet spread. Its stage has an encoder of 0.01° to 0.1° and '
-             'a true error of 0.5 to 2 times the stated one. Plans, axes and stages alternate. '
-             'Coverage is the share of 90 % intervals that contain the truth. In brackets is its '
-             '90 % interval: by the binomial distribution, or by bootstrap over draws where one '
-             'draw has several values. Ranks are counts of the truth in the ten tenths of its '
-             'posterior; p is that of a uniform distribution.', '',
-             f'Error over the Cramér-Rao bound of the same error model, rms over {len(ratio)} '
-             f'coefficients of {sum(len(d.bound_ratio) > 0 for d in draws)} fits with the '
-             f'terms that were drawn: {np.sqrt(np.mean(ratio ** 2)):.3f}. '
-             f'Fits that converged: {sum(d.converged for d in draws)} of {len(draws)}.', '',
-             '| | coverage, % | rms of error / stated | ranks | p |', '|---|---|---|---|---|',
-             _several('all coefficients', [d.z for d in draws]),
-             _several('tilt', [d.tilt_z for d in draws]),
-             _several('acceleration', [d.force_z for d in draws])]
-    for field in ('stage', 'axes', 'plan'):
-        for value in dict.fromkeys(getattr(d, field) for d in draws):
-            lines.append(_several(f'{field} {value}: coefficients', [
-                d.z for d in draws if getattr(d, field) == value]))
-    lines += ['', '| coefficient | coverage, % | rms of error / stated | ranks | p |',
-              '|---|---|---|---|---|']
+    kinds = [(field, value) for field in ('stage', 'axes', 'plan')
+             for value in dict.fromkeys(getattr(d, field) for d in draws)]
+    rows = [_several(label, parts) for label, parts in (
+        ('all coefficients', [d.z for d in draws]), ('tilt', [d.tilt_z for d in draws]),
+        ('acceleration', [d.force_z for d in draws]),
+        *((f'{field} {value}: coefficients', [d.z for d in draws if getattr(d, field) == value])
+          for field, value in kinds))]
+    single = []
     for name in dict.fromkeys(name for d in draws for name in d.names):
         z = np.array([d.z[d.names.index(name)] for d in draws if name in d.names])
-        inside = int(np.sum(np.abs(z) < Z_90))
-        low, high = interval(inside, len(z))
-        lines.append(_row(f'{name} ({len(z)})', inside / len(z), (low, high), z))
-    return '\n'.join(lines) + '\n'
+        inside = scipy.stats.binomtest(int(np.sum(np.abs(z) < Z_90)), len(z))
+        single.append(_row(f'{name} ({len(z)})', inside.statistic,
+                           inside.proportion_ci(0.9, 'exact'), z))
+    head = ['coverage, %', 'rms of error / stated', 'ranks', 'p']
+    return '\n'.join([
+        f'## Coverage of the intervals: {len(draws)} drawn units and stages', '', made, '',
+        'A unit is drawn at datasheet spread. Its stage has an encoder of 0.01° to 0.1° and '
+        'a true error of 0.5 to 2 times the stated one. Plans, axes and stages alternate. '
+        'Coverage is the share of 90 % intervals that contain the truth. In brackets is its '
+        '90 % interval: by the binomial distribution, or by bootstrap over draws where one '
+        'draw has several values. Ranks are counts of the truth in the ten tenths of its '
+        'posterior; p is that of a uniform distribution.', '',
+        f'Error over the Cramér-Rao bound of the same error model, rms over {len(ratio)} '
+        f'coefficients of {sum(len(d.bound_ratio) > 0 for d in draws)} fits with the '
+        f'terms that were drawn: {np.sqrt(np.mean(ratio ** 2)):.3f}. '
+        f'Fits that converged: {sum(d.converged for d in draws)} of {len(draws)}.', '',
+        markdown_table(['', *head], rows), '', markdown_table(['coefficient', *head], single),
+        ''])
 
 
 def screen_lines(draws: Sequence[Draw]) -> list[str]:
@@ -218,13 +210,14 @@ def _coverage(parts: Sequence[np.ndarray]) -> tuple[float, tuple[float, float]]:
     return float(total[0] / total[1]), (float(low), float(high))
 
 
-def _several(label: str, parts: Sequence[np.ndarray]) -> str:
+def _several(label: str, parts: Sequence[np.ndarray]) -> list[str]:
     return _row(label, *_coverage(parts), np.concatenate(parts))
 
 
-def _row(label: str, share: float, share_interval: tuple[float, float], z: np.ndarray) -> str:
+def _row(label: str, share: float, share_interval: tuple[float, float], z: np.ndarray
+         ) -> list[str]:
     low, high = (100 * end for end in share_interval)
     counts = np.histogram(scipy.special.ndtr(z), BINS, (0, 1))[0]
-    return (f'| {label} | {100 * share:.1f} ({low:.1f} to {high:.1f}) | '
-            f'{np.sqrt(np.mean(z ** 2)):.2f} | {" ".join(map(str, counts))} | '
-            f'{scipy.stats.chisquare(counts).pvalue:.2f} |')
+    return [label, f'{100 * share:.1f} ({low:.1f} to {high:.1f})',
+            f'{np.sqrt(np.mean(z ** 2)):.2f}', ' '.join(map(str, counts)),
+            f'{scipy.stats.chisquare(counts).pvalue:.2f}']

@@ -8,6 +8,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 import os
+from typing import NamedTuple
 
 from adxl_ros.calibrate import pose_extraction, pose_response
 from adxl_ros.calibrate.fits import full_model, linear, term_selection
@@ -67,14 +68,11 @@ def search(truth: Sensor, seed: int) -> DirectionSearch:
     curve = np.polyfit(SEARCH_RAD, top, 2)
     # The output near ±90° is ∓s·(turn − u) + zero-g, so that the difference is 0 at u.
     slope, level = np.polyfit(SEARCH_RAD, (volts['left'] - volts['right']) / 2, 1)
-    return DirectionSearch(_direction(truth), -float(SEARCH_RAD[np.argmax(top)]),
+    # β_x of (18) with the linear cross-axis term, which equals it to first order.
+    direction = sum(float(truth.values.get(effect, {}).get(name, [0.0])[0]) for effect, name in (
+        ('misalignment', 'beta_rad'), ('cross_axis', 'linear')))
+    return DirectionSearch(direction, -float(SEARCH_RAD[np.argmax(top)]),
                            float(curve[1] / (2 * curve[0])), float(level / slope), SEARCH_RAD, top)
-
-
-def _direction(truth: Sensor) -> float:
-    """Return β_x of (18) with the linear cross-axis term, which equals it to first order."""
-    beta = float(truth.values.get('misalignment', {}).get('beta_rad', [0.0])[0])
-    return beta + float(truth.values.get('cross_axis', {}).get('linear', [0.0])[0])
 
 
 MAX_BOUND_RAD = np.radians(1.0)
@@ -174,20 +172,13 @@ def force_errors(fitted: Sensor, truth: Sensor, poses: Poses, true_rad: np.ndarr
             np.sqrt(np.column_stack([covariance[d, d] for d in axes])))
 
 
-@dataclass(frozen=True)
-class MotionErrors:
-    """Errors of the motion experiment."""
-
-    rmse_mmps2: float  # rms of the residual about its mean, mm/s²
-    offset_mmps2: float  # mean of the residual, mm/s²
-
-
 def motion_errors(fitted: Sensor, time_s: np.ndarray, volts: np.ndarray, reference_mps2: np.ndarray
-                  ) -> tuple[MotionErrors, np.ndarray, np.ndarray]:
+                  ) -> tuple[tuple[float, float], np.ndarray, np.ndarray]:
     """
     Compare the acceleration of a calibrated unit in motion with the reference.
 
-    The RC filter is inverted. Estimate and reference then pass the same Butterworth filter.
+    The RC filter is inverted. Estimate and reference then pass the same Butterworth filter. Return
+    the rms of the residual about its mean and this mean, mm/s², the estimate and the reference.
     """
     unfiltered = filter_inversion.undo(volts, time_s, noise.electronics(fitted).rc_s,
                                        fitted.rate_hz)
@@ -195,7 +186,7 @@ def motion_errors(fitted: Sensor, time_s: np.ndarray, volts: np.ndarray, referen
     b, a = scipy.signal.butter(_BUTTERWORTH_ORDER, _BUTTERWORTH_HZ, fs=fitted.rate_hz)
     smooth, expected = (scipy.signal.lfilter(b, a, v) for v in (estimate, reference_mps2))
     residual = 1e3 * (smooth - expected)[time_s > _SETTLED_S]
-    return MotionErrors(float(residual.std()), float(residual.mean())), smooth, expected
+    return (float(residual.std()), float(residual.mean())), smooth, expected
 
 
 def motion_bound_mmps2(nominal: Sensor) -> float:
@@ -221,16 +212,15 @@ SETTLED_S = 1.0
 """Time from the stop of the stage to the start of a pose's mean, s; chosen."""
 
 
-@dataclass(frozen=True)
-class Stage:
+class Stage(NamedTuple):
     """Errors of a stage."""
 
     resolution_rad: float  # step of the encoder, rad
     level_rad: float  # standard deviation of the base's tilt, rad
 
 
-PERFECT = Stage(0.0, 0.0)
-PAPER = Stage(np.radians(5 / 60), full_model.LEVEL_STD_RAD)
+STAGES = {'perfect': Stage(0.0, 0.0),
+          'paper': Stage(np.radians(5 / 60), full_model.LEVEL_STD_RAD)}
 
 
 @dataclass(frozen=True)
@@ -274,8 +264,12 @@ def poses_at(truth: Sensor, read_rad: np.ndarray, seed: int
     errors = step * rng.uniform(-0.5, 0.5, read_rad.shape)
     held = np.maximum.accumulate(np.where(moved, np.arange(len(moved))[:, None], 0), axis=0)
     true = on_grid + np.take_along_axis(errors, held, axis=0)
-    motion, ends_s = visited(true)
-    columns = simulate(truth, motion, seed)
+    script, ends_s = trajectories.Script(*true[0]), []
+    for pose in true:
+        script.go(*pose)
+        script.rest(SETTLED_S + trajectories.DWELL_S)
+        ends_s.append(script.now)
+    columns = simulate(truth, Motion(script.now, *script.joints()), seed)
     time_s = columns.pop('time_s')
     recording = Recording('simulated', time_s, columns, sensor_info(truth))
     samples = round(trajectories.DWELL_S * truth.rate_hz)
@@ -285,18 +279,6 @@ def poses_at(truth: Sensor, read_rad: np.ndarray, seed: int
                    alpha_rad=alpha_rad, beta_rad=beta_rad)
         for number, (end_s, (alpha_rad, beta_rad)) in enumerate(zip(ends_s, on_grid))]
     return pose_extraction.extract_poses(recording, bare(truth), records), true, recording
-
-
-def visited(true_rad: np.ndarray) -> tuple[Motion, list[float]]:
-    """Return the motion through poses, (k, 2), rad, and the end of each dwell, s."""
-    script = trajectories.Script(*true_rad[0])
-    dwell_ends_s = []
-    for pose in true_rad:
-        script.go(*pose)
-        script.rest(SETTLED_S + trajectories.DWELL_S)
-        dwell_ends_s.append(script.now)
-    alpha, beta = script.joints()
-    return Motion(script.now, alpha, beta), dwell_ends_s
 
 
 def calibrated(truth: Sensor, seed: int, models: Sequence[str] = tuple(MODELS)) -> Run:
@@ -318,10 +300,9 @@ def shaken(truth: Sensor, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray
     nominal_motion = trajectories.motion(rng)
     joint_error_rad = truth.stage_resolution_rad * rng.uniform(-0.5, 0.5, 2)
     at_rest = np.zeros(1)
-    alpha_rad, beta_rad = (
-        float(joint(at_rest)[0] + error) for joint, error in zip(
-            (nominal_motion.alpha, nominal_motion.beta), joint_error_rad))
-    motion = replace(nominal_motion, alpha=Held(alpha_rad), beta=Held(beta_rad))
+    alpha, beta = (Held(float(joint(at_rest)[0] + error)) for joint, error in zip(
+        (nominal_motion.alpha, nominal_motion.beta), joint_error_rad))
+    motion = replace(nominal_motion, alpha=alpha, beta=beta)
     columns = simulate(truth, motion, seed)
     volts = np.column_stack([columns[f'{axis}_v'] for axis in truth.axes])
     return columns['time_s'], volts, motion.shift(columns['time_s'], 2)
@@ -335,7 +316,6 @@ RUNS = {
 """Alpha and beta of figure 10, deg; (b) at alpha = 90°, as beta has no effect at 0."""
 RANDOM_POSES = 40
 """Number of poses in random directions; chosen."""
-STAGES = {'perfect': PERFECT, 'paper': PAPER}
 
 
 @dataclass(frozen=True)
@@ -350,7 +330,11 @@ class ModelErrors:
     # errors of the coefficients over their standard deviation, (p,). Empty where the truth is
     # not in the gauge of the fit
     coefficient_z: np.ndarray
-    motion: MotionErrors  # errors of the motion experiment
+    motion: tuple[float, float]  # rms about the mean, and mean, of the residual in motion, mm/s²
+
+    def all_angles(self) -> list[AngleErrors]:
+        """Return the angle errors of all experiments."""
+        return [self.random, *self.runs.values()]
 
 
 @dataclass(frozen=True)
@@ -396,11 +380,10 @@ def _coefficients(fitted: Sensor, truth: Sensor) -> np.ndarray:
 def evaluate_all(nominal: Sensor, units: int, seed: int, show: Callable[[float], None]
                  ) -> dict[str, list[Unit]]:
     """Evaluate several units on each stage, in parallel."""
-    results: dict[str, list[Unit]] = {}
+    results: dict[str, list[Unit]] = {name: [] for name in STAGES}
     with ProcessPoolExecutor(os.cpu_count()) as pool:
         for i, (name, stage) in enumerate(STAGES.items()):
-            seeds: Sequence[int] = [1000 * seed + k for k in range(units)]
-            results[name] = []
+            seeds = range(1000 * seed, 1000 * seed + units)
             for unit in pool.map(partial(evaluate, nominal, stage), seeds):
                 results[name].append(unit)
                 show((i + len(results[name]) / units) / len(STAGES))

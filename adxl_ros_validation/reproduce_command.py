@@ -51,12 +51,9 @@ def parser() -> argparse.ArgumentParser:
 
 def reproduce(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
-    if options.draws < 0:
-        raise UserError(f'--draws {options.draws}: must not be negative')
-    if options.units < (0 if options.draws else 1):
-        raise UserError(f'--units {options.units}: at least 1 is needed')
-    if options.seed < 0:
-        raise UserError(f'--seed {options.seed}: must not be negative')
+    for name, least in (('draws', 0), ('seed', 0), ('units', 0 if options.draws else 1)):
+        if getattr(options, name) < least:
+            raise UserError(f'--{name} {getattr(options, name)}: must be at least {least}')
     sensor = parameter_file.load(options.params or parameter_file.nominal_path())
     folder = Path(options.output)
     make_folder(folder / FIGURES)
@@ -106,7 +103,8 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path
     with progress('reproduce') as show:
         results = experiments.evaluate_all(sensor, options.units, options.seed, show)
     first = 1000 * options.seed
-    truth = experiments.draw(sensor, experiments.PAPER, np.random.default_rng([first, 0]))
+    truth = experiments.draw(sensor, experiments.STAGES['paper'],
+                             np.random.default_rng([first, 0]))
     unit = experiments.calibrated(truth, first)
     pictures = folder / FIGURES
     sweep_figures.draw_sweep(pictures / 'sweep.png', experiments.bare(truth),

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 import os
 import textwrap
@@ -79,11 +79,11 @@ def draw_motion(path: str | os.PathLike, fitted: dict[str, Sensor],
     time_s = shaken[0]
     part = (time_s >= _SHOWN_S[0]) & (time_s <= _SHOWN_S[1])
     for axis, (name, unit) in zip(row, fitted.items()):
-        errors, estimate, reference = experiments.motion_errors(unit, *shaken)
+        (rmse, offset), estimate, reference = experiments.motion_errors(unit, *shaken)
         axis.plot(time_s[part], 1e3 * reference[part], ':', color='k', label='interferometer')
         axis.plot(time_s[part], 1e3 * estimate[part], color=_COLOURS[name], label=name)
-        axis.set(xlabel='time, s', title=f'fig. 12, {name}: rmse {errors.rmse_mmps2:.1f} mm/s² '
-                                         f'about an offset of {errors.offset_mmps2:.1f}')
+        axis.set(xlabel='time, s', title=f'fig. 12, {name}: rmse {rmse:.1f} mm/s² '
+                                         f'about an offset of {offset:.1f}')
         axis.legend(fontsize=8, loc='upper right')
     row[0].set(ylabel='acceleration along x, mm/s²')
     write_bytes(path, png(figure))
@@ -131,34 +131,12 @@ MOTION_MMPS2 = {'linear': 299.8, 'physical': 20.8}
 _STAGE_WORDS = {
     'perfect': 'perfect stage',
     'paper': "the paper's stage (5 arcmin, a new error with each move of a joint, level 0.1°)"}
+_FIGURE_TITLES = {
+    'sweep': 'Figures 2 to 8: deviation from the linear model, and the physical model',
+    'misalignment': 'Figure 9: the direction of the x axis', 'tilt': 'Figure 10: errors of tilt',
+    'motion': 'Figure 12: motion', 'components': 'Figure 13: what each part of the model does'}
 FIGURES = 'reproduction'
 """Folder of the plots, in the folder of the page."""
-NOTES = """\
-## What differs from the paper, and why
-
-- **The noise floor.** The paper compares its motion residual, 20.8 mm/s², with a "rated rms
-  noise" of 16.4 mm/s². That is 110 µg/√Hz times 15.2 Hz: the square root is missing. 110 µg/√Hz
-  are 5.25 mm/s² after the RC filter, and 5.08 after the 20 Hz Butterworth. The residual of the
-  paper is four times this floor; here the residual reaches it.
-- **Θy.** For (19), α_y = 0.75° and β_y = 0.5° give θ_yx = −0.0087. The paper prints −0.0029,
-  which needs β_y = 0.17°. And x_ref in (18) is [1 0 0]ᵀ: with [0 0 1]ᵀ the printed Θx does not
-  result.
-- **Tilt run (b)** turns beta "at alpha = 0", where beta has no effect. It must have been 90°,
-  and is here.
-- **p1, q1 and Θ** are the same to first order. The sequential fit and the separate search count
-  them twice. Here they are one (docs/explain/calibration.md, "The gauge").
-- **The offset of the motion experiment** is the stage's: 0.1° of level are 17 mm/s². `full` fits
-  the level and keeps it out of the sensor. `linear` and `physical` include it in the sensor, where
-  it cancels on the same base only.
-- **The search for the largest output** cannot give the ±0.2° that the paper states, as the plot
-  shows. Null crossings can.
-- **±90°.** A two-axis sensor determines alpha there by a root of zero, with no bound below 1°.
-  Such poses do not count. Poses near it do not count where |f| = g has two upright solutions.
-- **The paper's values are of one unit of its time.** Units here are drawn at datasheet spread:
-  each coefficient is normal with its typical size, the filter's resistor within ±25 %.
-"""
-
-
 def page(results: dict[str, list[Unit]], bound_mmps2: float, made: str, coverage: str = '') -> str:
     """Lay out the page, Markdown."""
     parts = ["# The paper's experiments, on simulated units", made,
@@ -168,45 +146,37 @@ def page(results: dict[str, list[Unit]], bound_mmps2: float, made: str, coverage
     for stage, units in results.items():
         parts += [f'## {_STAGE_WORDS[stage][0].upper()}{_STAGE_WORDS[stage][1:]}', _tilt(units),
                   _to_reach(units), _motion(units, bound_mmps2)]
-    parts += [coverage] if coverage else []
-    parts += ['## Direction of the x axis by (18)', _directions(results['paper']),
-              '## Figures', _DRAWN, NOTES]
-    return '\n\n'.join(part.strip('\n') for part in parts) + '\n'
+    parts += [coverage, '## Direction of the x axis by (18)', _directions(results['paper']),
+              '## Figures',
+              *(f'![{title}]({FIGURES}/{name}.png)' for name, title in _FIGURE_TITLES.items()),
+              '## What differs from the paper, and why', 'See docs/maintain/reproduction.md.']
+    return '\n\n'.join(part.strip('\n') for part in parts if part) + '\n'
 
 
 def screen_lines(results: dict[str, list[Unit]], bound_mmps2: float) -> list[str]:
     """Return Table I and the motion experiment as lines for a terminal."""
-    lines = [f' {"Table I, rms error of":28}{"paper":>15}'
-             + ''.join(f'{name:>9}' for name in MODELS) + f'{"bound":>8}']
+    rows: list[tuple[str, str, list[float]]] = []
     for stage, units in results.items():
         for row, angle in enumerate(('alpha', 'beta')):
-            label = f'{_STAGE_WORDS[stage].partition(" (")[0]}, {angle}'
             paper = ' / '.join(f'{rms:.2f}' for (a, _), (rms, _) in TABLE_I.items() if a == angle)
-            values = [float(np.degrees(_rms(_errors(units, name, row)))) for name in MODELS]
-            bound = float(np.degrees(_rms(_bounds(units, row))))
-            lines.append(_screen_row(label, paper, values, bound))
+            errors = [*(_errors(units, name, row) for name in MODELS), _bounds(units, row)]
+            rows.append((f'{stage}, {angle}', paper, [np.degrees(_rms(e)) for e in errors]))
+    paper = ' / '.join(f'{value:.1f}' for value in MOTION_MMPS2.values())
     for stage, units in results.items():
-        label = f'{_STAGE_WORDS[stage].partition(" (")[0]}, motion'
-        paper = ' / '.join(f'{value:.1f}' for value in MOTION_MMPS2.values())
-        values = [_rms(np.array([np.hypot(unit.models[name].motion.rmse_mmps2,
-                                          unit.models[name].motion.offset_mmps2)
-                                 for unit in units])) for name in MODELS]
-        lines.append(_screen_row(label, paper, values, bound_mmps2))
-    return [*lines, ' tilt in °, motion in mm/s²; paper: linear / physical; bound: Cramér-Rao,',
+        both = [_rms(np.hypot(*_motion_errors(units, name))) for name in MODELS]
+        rows.append((f'{stage}, motion', paper, [*both, bound_mmps2]))
+    return [f' {"Table I, rms error of":28}{"paper":>15}'
+            + ''.join(f'{name:>9}' for name in MODELS) + f'{"bound":>8}',
+            *(f' {_screen_label(label):28}{paper:>15}' + ''.join(
+                f'{value:9.3g}' for value in values[:-1]) + f'{values[-1]:8.3g}'
+              for label, paper, values in rows),
+            ' tilt in °, motion in mm/s²; paper: linear / physical; bound: Cramér-Rao,',
             ' or the noise floor']
 
 
-def _screen_row(label: str, paper: str, values: Sequence[float], bound: float) -> str:
-    """Lay out one row of the terminal's table."""
-    cells = ''.join(f'{value:9.3g}' for value in values)
-    return f' {label:28}{paper:>15}{cells}{bound:8.3g}'
-
-
-_DRAWN = '\n\n'.join(f'![{title}]({FIGURES}/{name}.png)' for name, title in (
-    ('sweep', 'Figures 2 to 8: deviation from the linear model, and the physical model'),
-    ('misalignment', 'Figure 9: the direction of the x axis'),
-    ('tilt', 'Figure 10: errors of tilt'), ('motion', 'Figure 12: motion'),
-    ('components', 'Figure 13: what each part of the model does')))
+def _screen_label(label: str) -> str:
+    stage, _, what = label.partition(', ')
+    return f'{_STAGE_WORDS[stage].partition(" (")[0]}, {what}'
 
 
 def in_words(angle: str) -> str:
@@ -215,26 +185,37 @@ def in_words(angle: str) -> str:
                      in TABLE_I.items() if a == angle)
 
 
-def _tilt(units: Sequence[Unit]) -> str:
-    lines = ['Table I: rms / largest error of tilt, °, over the three runs of figure 10; poses '
-             'whose bound exceeds 1° do not count.', '',
-             *_head('', 'paper', *MODELS, 'Cramér-Rao bound, rms')]
-    for row, angle in enumerate(('alpha', 'beta')):
-        cells = [f'{np.degrees(_rms(e)):.3f} / {np.degrees(np.abs(e).max()):.3f}'
-                 for e in (_errors(units, name, row) for name in MODELS)]
-        lines.append(f'| {angle} | {in_words(angle)} | {" | ".join(cells)} | '
-                     f'{np.degrees(_rms(_bounds(units, row))):.4f} |')
-    return '\n'.join(lines)
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table, Markdown."""
+    return '\n'.join([f'| {" | ".join(head)} |', '|' + '---|' * len(head),
+                      *(f'| {" | ".join(cells)} |' for cells in rows)])
 
 
-def _errors(units: Sequence[Unit], model: str, row: int) -> np.ndarray:
-    return np.concatenate([a.error[a.determined[:, row], row] for unit in units
+def _errors(units: Sequence[Unit], model: str, row: int, what: str = 'error') -> np.ndarray:
+    """Return the errors of alpha (0) or beta (1) that count, of all units and runs."""
+    return np.concatenate([getattr(a, what)[a.determined[:, row], row] for unit in units
                            for a in unit.models[model].runs.values()])
 
 
 def _bounds(units: Sequence[Unit], row: int) -> np.ndarray:
-    return np.concatenate([a.bound[a.determined[:, row], row] for unit in units
-                           for a in unit.models['full'].runs.values()])
+    return _errors(units, 'full', row, 'bound')
+
+
+def _motion_errors(units: Sequence[Unit], model: str) -> np.ndarray:
+    """Return rms and mean of the residual of each unit in motion, mm/s², (2, units)."""
+    return np.array([unit.models[model].motion for unit in units]).T
+
+
+def _tilt(units: Sequence[Unit]) -> str:
+    rows = []
+    for row, angle in enumerate(('alpha', 'beta')):
+        errors = [np.degrees(_errors(units, name, row)) for name in MODELS]
+        rows.append([angle, in_words(angle),
+                     *(f'{_rms(e):.3f} / {np.abs(e).max():.3f}' for e in errors),
+                     f'{np.degrees(_rms(_bounds(units, row))):.4f}'])
+    return ('Table I: rms / largest error of tilt, °, over the three runs of figure 10; poses '
+            'whose bound exceeds 1° do not count.\n\n'
+            + markdown_table(['', 'paper', *MODELS, 'Cramér-Rao bound, rms'], rows))
 
 
 def _to_reach(units: Sequence[Unit]) -> str:
@@ -242,74 +223,53 @@ def _to_reach(units: Sequence[Unit]) -> str:
         return [[function(unit.models[name]) for unit in units] for name in MODELS]
 
     def flat(errors: ModelErrors) -> np.ndarray:
-        every = [errors.random, *errors.runs.values()]
-        return np.concatenate([a.error[a.determined[:, 0] & ~a.near_vertical, 0] for a in every])
+        return np.concatenate([a.error[a.determined[:, 0] & ~a.near_vertical, 0]
+                               for a in errors.all_angles()])
 
     def ratio(pose_only: bool) -> Callable[[ModelErrors], np.ndarray]:
-        return lambda errors: np.concatenate([
-            a.ratio(pose_only) for a in (errors.random, *errors.runs.values())])
+        return lambda errors: np.concatenate([a.ratio(pose_only) for a in errors.all_angles()])
 
-    lines = _head('random poses and the three runs, none fitted', *MODELS)
-    for pose_only, text in ((True, 'of the noise of one pose'),
-                            (False, 'of pose and calibration')):
-        lines.append(f'| tilt error ÷ bound {text}, rms | '
-                     + ' | '.join(_interval(parts) for parts in over(ratio(pose_only))) + ' |')
-    before = over(flat)[0]
-    reduced = [100 * (1 - _rms(np.concatenate(parts)) / _rms(np.concatenate(before)))
-               for parts in over(flat)]
-    lines.append('| reduction of the rms error of alpha, 15° and more from ±90°, % | – | '
-                 + ' | '.join(f'{r:.2f}' for r in reduced[1:]) + ' |')
+    rows = [[f'tilt error ÷ bound {text}, rms', *map(_interval, over(ratio(pose_only)))]
+            for pose_only, text in ((True, 'of the noise of one pose'),
+                                    (False, 'of pose and calibration'))]
+    before, *after = (_rms(np.concatenate(parts)) for parts in over(flat))
+    rows.append(['reduction of the rms error of alpha, 15° and more from ±90°, %', '–',
+                 *(f'{100 * (1 - rms / before):.2f}' for rms in after)])
     for text, z_of in (('acceleration', lambda errors: np.ravel(errors.force_z)),
                        ('coefficients', lambda errors: errors.coefficient_z)):
-        cells = []
-        for parts in over(z_of):
-            z = np.concatenate(parts)
-            cells.append(f'{100 * np.mean(np.abs(z) < Z_90):.1f} (of {len(z)})' if len(z)
-                         else '–')
-        lines.append(f'| coverage of 90 % intervals, {text}, % | ' + ' | '.join(cells) + ' |')
-    every = [a for unit in units for a in (unit.models['full'].random,
-                                           *unit.models['full'].runs.values())]
-    undetermined = sum(int((~a.determined[:, 0]).sum()) for a in every)
-    count = sum(len(a.error) for a in every)
-    lines += ['', f'Of {count} poses {undetermined} determine alpha worse than 1° and do not '
-                  'count.']
-    return '\n'.join(lines)
+        zs = [np.concatenate(parts) for parts in over(z_of)]
+        rows.append([f'coverage of 90 % intervals, {text}, %', *(
+            f'{100 * np.mean(np.abs(z) < Z_90):.1f} (of {len(z)})' if len(z) else '–'
+            for z in zs)])
+    determined = np.concatenate([a.determined[:, 0] for unit in units
+                                 for a in unit.models['full'].all_angles()])
+    return (markdown_table(['random poses and the three runs, none fitted', *MODELS], rows)
+            + f'\n\nOf {len(determined)} poses {np.sum(~determined)} determine alpha worse than '
+              '1° and do not count.')
 
 
 def _motion(units: Sequence[Unit], bound_mmps2: float) -> str:
-    rmse = {name: np.array([unit.models[name].motion.rmse_mmps2 for unit in units])
-            for name in MODELS}
-    offset = {name: np.array([unit.models[name].motion.offset_mmps2 for unit in units])
-              for name in MODELS}
-    rmse_cells = [_interval([np.array([value]) for value in values]) for values in rmse.values()]
-    offset_cells = [f'{_rms(values):.1f}' for values in offset.values()]
-    both_cells = [f'{_rms(np.hypot(rmse[name], offset[name])):.1f}' for name in MODELS]
+    errors = [_motion_errors(units, name) for name in MODELS]
     paper = ', '.join(f'{name} {value}' for name, value in MOTION_MMPS2.items())
-    rows = (('rmse about the offset', '–', *rmse_cells, f'{bound_mmps2:.2f}'),
-            ("offset, rms, the stage's part included", '–', *offset_cells, '–'),
-            ('both together', paper, *both_cells, f'{bound_mmps2:.2f}'))
-    return '\n'.join([*_head('motion, mm/s²', 'paper', *MODELS, 'bound'), *map(_row, rows)])
+    bound = f'{bound_mmps2:.2f}'
+    return markdown_table(['motion, mm/s²', 'paper', *MODELS, 'bound'], [
+        ['rmse about the offset', '–', *(_interval(rmse[:, None]) for rmse, _ in errors), bound],
+        ["offset, rms, the stage's part included", '–',
+         *(f'{_rms(offset):.1f}' for _, offset in errors), '–'],
+        ['both together', paper, *(f'{_rms(np.hypot(*both)):.1f}' for both in errors), bound]])
 
 
 def _directions(units: Sequence[Unit]) -> str:
     step = np.degrees(experiments.SEARCH_RAD[1] - experiments.SEARCH_RAD[0])
-    lines = [f'Error of β_x, ° rms over units, base level to 0.1° (steps of {step:g}°):', '',
-             *_head('largest output', 'parabola through the outputs', 'null crossings')]
-    rms_deg = [np.degrees(_rms(np.array([getattr(u.directions, name) - u.directions.truth_rad
-               for u in units])))
-               for name in ('largest_rad', 'parabola_rad', 'null_rad')]
-    return '\n'.join([*lines, _row([f'{value:.3f}' for value in rms_deg])])
+    errors = [np.array([getattr(unit.directions, name) - unit.directions.truth_rad
+                        for unit in units])
+              for name in ('largest_rad', 'parabola_rad', 'null_rad')]
+    return (f'Error of β_x, ° rms over units, base level to 0.1° (steps of {step:g}°):\n\n'
+            + markdown_table(['largest output', 'parabola through the outputs', 'null crossings'],
+                             [[f'{np.degrees(_rms(error)):.3f}' for error in errors]]))
 
 
-def _head(*names: str) -> list[str]:
-    return [_row(names), '|' + '---|' * len(names)]
-
-
-def _row(cells: Sequence[str]) -> str:
-    return f'| {" | ".join(cells)} |'
-
-
-def _interval(parts: Sequence[np.ndarray]) -> str:
+def _interval(parts: Sequence[np.ndarray] | np.ndarray) -> str:
     """Write the rms over all with its 90 % interval by bootstrap over units."""
     squares = np.array([[np.sum(p ** 2), len(p)] for p in parts])
     rng = np.random.default_rng(0)

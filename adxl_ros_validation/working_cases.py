@@ -4,7 +4,6 @@ Working cases: draw recordings with known causes, diagnose them, and score the v
 
     make working ARGS='--count 40 --seed 7'         one line as each case ends, then the scores
     make working ARGS='--count 20 --only single'    one group only
-    make working ARGS='--real ../shared/real'       defects put into recordings of real sensors
 
 A case that has been looked at is a development case: draw a fresh seed for a score that counts.
 """
@@ -13,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 import json
 import math
@@ -26,19 +25,11 @@ from adxl_ros.tools.command_line import argument_parser
 from adxl_ros.tools.output import run
 from adxl_ros.workers import for_each, make_folder, open_pool, write
 from adxl_ros_validation import working_world as world
-from adxl_ros_validation.blind import diagnosis_runs, grading, real_sensors, scores, trials
+from adxl_ros_validation.blind import diagnosis_runs, grading, scores, trials
 from adxl_ros_validation.blind.grading import Answer
 from adxl_ros_validation.blind.trials import Label
-from adxl_ros_validation.blind.world import ideal_observer
-from adxl_ros_validation.blind.world.ideal_observer import Scene
-from adxl_ros_validation.blind.world.simulator import (
-    Fault,
-    G0,
-    parameter_file,
-    references,
-    render,
-    stamps,
-)
+from adxl_ros_validation.blind.world import ideal_observer, simulator
+from adxl_ros_validation.blind.world.simulator import Fault, G0, Scene
 import numpy as np
 
 GROUPS = ('null', 'single', 'pair', 'outside')
@@ -50,8 +41,8 @@ _AT_REST_SHARE = 0.5
 """Share of the faults that were there when the unit was calibrated, of those that show at rest."""
 _COLOUR = (0.03, 0.12)
 """Smallest and largest share of coloured noise, of the rms of the noise."""
-_SHIFT_STEP_M = 1e-8
-"""Resolution of the displacement, m."""
+_DIGITS = {**simulator.DIGITS, 'shift_m': 8}
+"""Digits of the columns of a recording."""
 _NOTICED = 1.05
 """Ratio of true and stated noise from which a verdict may name the noise, too."""
 _HARM = 0.01
@@ -89,52 +80,37 @@ def draw(seed: int, number: int, only: str | None = None) -> Case:
     faults, rows, at_rest = [], [], []
     for kind in kinds:
         strength = 1e-3 * G0 * math.exp(rng.uniform(*np.log(_STRENGTHS_MG)))
-        fault, change = trials.sized(partial(trials.measured, scene, force),
-                                     Fault(kind, kind.start, kind.draw(rng, unit)), strength)
+        fault, _, change = trials.sized(partial(trials.measured, scene, force),
+                                        Fault(kind, kind.start, kind.draw(rng, unit)), strength)
         calibrated = kind.at_rest and bool(rng.random() < _AT_REST_SHARE)
+        stated = unit
         if calibrated:
             left = _strength(unit, world.recalibrated(unit, [fault]), change, force)
             fault = replace(fault, size=min(fault.size * min(strength / max(left, 1e-9), 5.0),
                                             kind.largest))
             change = scene.response([fault], coarse=True)
+            stated = world.recalibrated(unit, [fault])
             at_rest.append(fault)
-        stated = world.recalibrated(unit, [fault]) if calibrated else unit
         faults.append(fault)
-        rows.append({'effect': kind.name, 'noise_like': kind.random, 'size': fault.size,
-                     'shape': {key: np.asarray(value).tolist()
-                               for key, value in fault.shape.items()},
-                     'strength_mps2': _strength(unit, stated, change, force), 'power': 1.0,
-                     'told': 1.0, 'inseparable': [], 'calibrated': calibrated})
+        rows.append({**trials.described(fault, _strength(unit, stated, change, force)),
+                     'calibrated': calibrated})
     if at_rest:
         scene = replace(scene, unit=world.recalibrated(unit, at_rest))
     label = Label(f'w{seed}_{number:04d}', {'null': 'none'}.get(group, group), tuple(names),
                   (seed, number), (moves.seconds, moves.seconds), moves.kind, unit.axes,
                   noise_g * G0, rows)
     acting = [background, *faults]
-    return Case(label, scene, acting, _recording(scene, acting), parameter_file(
-        scene.unit, label.name))
+    return Case(label, scene, acting, scene.recording(acting, _DIGITS),
+                simulator.parameter_file(scene.unit, label.name))
 
 
-def _strength(unit: world.Unit, stated: world.Unit, change: np.ndarray, force: np.ndarray
-              ) -> float:
+def _strength(unit: simulator.Unit, stated: simulator.Unit, change: np.ndarray,
+              force: np.ndarray) -> float:
     """Return the rms of a change, m/s², beyond what a calibration has taken up of it."""
     zero = (stated.stated_zero_v - unit.stated_zero_v) / unit.stated_scale_v_per_g
     scale = stated.stated_scale_v_per_g / unit.stated_scale_v_per_g - 1
     left = change - zero[:, None] * G0 - scale[:, None] * force
     return ideal_observer.rms(ideal_observer.beyond_calibration(unit, left, force))
-
-
-def _volts(scene: Scene, faults: Sequence[Fault]) -> np.ndarray:
-    return render(scene.unit, scene.manoeuvre, faults, scene.seed)
-
-
-def _recording(scene: Scene, faults: Sequence[Fault]) -> str:
-    """Return the recording as CSV; encoder and shaker are read at the recording's own rate."""
-    columns = {'time_s': stamps(scene.unit, scene.manoeuvre)}
-    columns |= {f'{axis}_v': row for axis, row in zip(scene.unit.axes, _volts(scene, faults))}
-    columns |= references(scene.unit, scene.manoeuvre, scene.seed)
-    columns['shift_m'] = np.round(columns['shift_m'] / _SHIFT_STEP_M) * _SHIFT_STEP_M
-    return trials.csv_text(columns)
 
 
 def _harm(case: Case, fitted: str | None) -> bool:
@@ -145,10 +121,8 @@ def _harm(case: Case, fitted: str | None) -> bool:
     needs = {world.KINDS[name].needs for name in case.label.effects} - {''}
     scene = replace(case.scene, seed=case.scene.seed + 1,
                     manoeuvre=world.draw_motion(rng, case.scene.unit, needs))
-    compared = diagnosis_runs.Comparison(scene, scene.force(), _volts(scene, case.faults),
-                                         _recording(scene, case.faults))
-    before = compared.squares(diagnosis_runs.simulated(compared.csv, case.parameters))
-    after = compared.after(before, case.parameters, fitted)[0]
+    compared = diagnosis_runs.Comparison(scene, case.faults, case.parameters, fitted)
+    before, after = compared.before, compared.after
     return compared.interval(after - before)[0] > _HARM * float(before.mean())
 
 
@@ -165,10 +139,10 @@ class Row(NamedTuple):
         """Return the answer without the effects that it may name, too."""
         given = grading.answer(self.result)
         certain = given.certain - self.tolerated
-        status = 'no_gap' if given.certain and not certain and not given.groups \
-            and given.status in ('explained', 'partly') else given.status
-        return replace(given, certain=certain, status=status, limit_mps2=given.limit_mps2
-                       if status == given.status else None)
+        if given.certain and not certain and not given.groups \
+                and given.status in ('explained', 'partly'):
+            return replace(given, certain=certain, status='no_gap', limit_mps2=None)
+        return replace(given, certain=certain)
 
 
 def diagnosed(seed: int, number: int, only: str | None, folder: Path) -> tuple[Row]:
@@ -176,10 +150,10 @@ def diagnosed(seed: int, number: int, only: str | None, folder: Path) -> tuple[R
     case = draw(seed, number, only)
     place = make_folder(folder / case.label.name)
     for suffix, text in (('csv', case.recording), ('yaml', case.parameters),
-                         ('json', trials.as_json([case.label]))):
+                         ('json', json.dumps(asdict(case.label), indent=1))):
         write(place / f'{case.label.name}.{suffix}', text.encode())
     result = diagnosis_runs.diagnose(case.label.name, case.recording.encode(),
-                                     case.parameters.encode(), None)[1]
+                                     case.parameters.encode())[1]
     write(place / 'result.json', json.dumps(result).encode())
     unit = case.scene.unit
     noisy = bool(np.any(unit.noise_g_per_rthz > _NOTICED * unit.stated_noise_g_per_rthz))
@@ -260,8 +234,6 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--seed', type=int, default=1, help='seed of the cases (default 1)')
     parse.add_argument('--only', choices=GROUPS, help='cases of one group only')
     parse.add_argument('--jobs', type=int, default=2, help='processes at once (default 2)')
-    parse.add_argument('--real', metavar='FOLDER',
-                       help='put defects into these recordings of real sensors instead')
     return parse
 
 
@@ -277,22 +249,11 @@ def working(options: argparse.Namespace) -> int:
         print(line(row), flush=True)
 
     with open_pool(None, options.jobs) as pool:
-        if options.real:
-            print(real_sensors.working(Path(options.real), options.seed, options.count,
-                                       world.KINDS, pool, partial(print, flush=True)))
-            return 0
-        for_each(pool, diagnosed, [partial(_job, options.seed, number, options.only, folder)
-                                   for number in numbers], keep, _show_nothing)
+        for_each(pool, diagnosed, [
+            partial(tuple, (options.seed, number, options.only, folder)) for number in numbers],
+            keep, lambda done: None)
     print(f'\n{table(rows)}')
     return 0
-
-
-def _job(*arguments: Any) -> tuple:
-    return arguments
-
-
-def _show_nothing(done: float) -> None:
-    """Show no progress: each case has its line."""
 
 
 def main() -> int:

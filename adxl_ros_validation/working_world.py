@@ -9,29 +9,13 @@ the axes and the noise. So the blind check stays blind to what is developed with
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 import math
 
-from adxl_ros_validation.blind.world.simulator import (
-    Act,
-    ADC_BITS,
-    column,
-    Fault,
-    FaultKind,
-    G0,
-    low_pass,
-    LSB_V,
-    Place,
-    render,
-    Run,
-    SCALE_STD,
-    Shape,
-    stamps,
-    Unit,
-    weights,
-    ZERO_G_STD_G,
-)
+from adxl_ros_validation.blind.world import faults, ideal_observer, simulator as sim
+from adxl_ros_validation.blind.world.motion import low_pass, Manoeuvre, Script
+from adxl_ros_validation.blind.world.simulator import Fault, G0, Place, Run, Scene, Shape, Unit
 import numpy as np
 import scipy
 
@@ -43,6 +27,9 @@ _NOISE_OFF = (0.05, 0.2)
 """Smallest and largest share by which the noise is not the stated one."""
 _OTHER = [1, 0, 0]
 """The other axis of the plane, of x, y and z."""
+_PLANE = np.array([[1.0], [1.0], [0.0]])
+"""Weights of the axes of the plane."""
+_PHASE = (0.0, 2 * math.pi)
 
 
 def draw_unit(rng: np.random.Generator) -> Unit:
@@ -53,151 +40,108 @@ def draw_unit(rng: np.random.Generator) -> Unit:
     stated = rng.uniform(60e-6, 250e-6) * rng.uniform(0.9, 1.1, n)
     off = 1 + rng.choice([-1, 1]) * rng.uniform(*_NOISE_OFF)
     resolution = math.radians(rng.choice([0.001, 0.005, 0.02]))
-    return Unit(axes, zero, scale, zero + ZERO_G_STD_G * scale * rng.normal(size=n),
-                scale * (1 + SCALE_STD * rng.normal(size=n)), off * stated, stated,
+    return Unit(axes, zero, scale, zero + sim.ZERO_G_STD_G * scale * rng.normal(size=n),
+                scale * (1 + sim.SCALE_STD * rng.normal(size=n)), off * stated, stated,
                 rate / rng.uniform(2.0, 6.0), 10 ** rng.uniform(-6.3, -5.3, n),
                 10 ** rng.uniform(-5.5, -4.8, n), resolution, np.zeros(6), rate)
 
 
-@dataclass
-class Moves:
-    """Moves of both joints by one profile of velocity, and bursts of the shaker."""
-
-    trapezoidal: bool
-    alpha: float = math.pi / 2
-    beta: float = 0.0
-    seconds: float = 0.0
-    kind: str = ''
-    steps: list[tuple[str, float, float, float, float]] = field(default_factory=list)
-    bursts: list[tuple[float, float, float, float, float]] = field(default_factory=list)
-    heat: tuple[float, float, float] = (25.0, 0.0, 20.0)  # start and rise, °C; time constant, s
-    sag: tuple[float, float] = (0.0, 1.0)  # size, V, and period, s, of the supply's steps
-
-    def go(self, seconds: float, **to: float) -> None:
-        """Move joints to where they should be, rad, at once."""
-        for joint, value in to.items():
-            self.steps.append((joint, self.seconds, seconds, getattr(self, joint), value))
-            setattr(self, joint, value)
-        self.seconds += seconds
-
-    def shake(self, size: float, hertz: float, to_hertz: float, seconds: float) -> None:
-        """Sweep the shaker from one frequency to another at a peak acceleration, m/s²."""
-        self.bursts.append((self.seconds, seconds, size, hertz, to_hertz))
-        self.seconds += seconds
-
-    def joints(self, t: np.ndarray) -> dict[str, np.ndarray]:
-        """Return alpha and beta (rad) and shift (m) at instants t (s)."""
-        out = {'alpha': np.full_like(t, self._first('alpha')),
-               'beta': np.full_like(t, self._first('beta')), 'shift': np.zeros_like(t)}
-        for joint, start, seconds, begin, end in self.steps:
-            a, b = np.searchsorted(t, [start, start + seconds])
-            out[joint][a:b] += (end - begin) * self._share((t[a:b] - start) / seconds)
-            out[joint][b:] += end - begin
-        for start, seconds, size, low, high in self.bursts:
-            a, b = np.searchsorted(t, [start, start + seconds])
-            u = (t[a:b] - start) / seconds
-            hertz = low + (high - low) * u
-            phase = 2 * np.pi * seconds * (low * u + (high - low) * u * u / 2)
-            fade = 0.5 - 0.5 * np.cos(np.pi * np.clip(np.minimum(u, 1 - u) / 0.15, 0, 1))
-            out['shift'][a:b] += size * fade * np.sin(phase) / (2 * np.pi * hertz) ** 2
-        return out
-
-    def climate(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return temperature (°C) and supply (V) at instants t (s)."""
-        start, rise, lag = self.heat
-        on = np.clip(t - 0.15 * self.seconds, 0, None)
-        off = np.clip(t - 0.6 * self.seconds, 0, None)
-        warm = start + rise * (np.exp(-off / lag) - np.exp(-on / lag))
-        return warm, 5.0 + self.sag[0] * np.tanh(4 * np.sin(2 * np.pi * t / self.sag[1]))
-
-    def _first(self, joint: str) -> float:
-        """Return where a joint is before its first move, rad."""
-        return next((step[3] for step in self.steps if step[0] == joint), getattr(self, joint))
-
-    def _share(self, u: np.ndarray) -> np.ndarray:
-        """Return the share of a move that is done at a share of its time."""
-        if not self.trapezoidal:
-            return u - np.sin(2 * np.pi * u) / (2 * np.pi)
-        ramp, edge = 0.2, np.minimum(u, 1 - u)
-        part = np.where(edge < ramp, edge ** 2 / (2 * ramp), edge - ramp / 2) / (1 - ramp)
-        return np.where(u < 0.5, part, 1 - part)
+def trapezoidal(u: np.ndarray) -> np.ndarray:
+    """Return the share of a move whose velocity is a trapezium."""
+    ramp, edge = 0.2, np.minimum(u, 1 - u)
+    part = np.where(edge < ramp, edge ** 2 / (2 * ramp), edge - ramp / 2) / (1 - ramp)
+    return np.where(u < 0.5, part, 1 - part)
 
 
-def draw_motion(rng: np.random.Generator, unit: Unit, needs: set[str]) -> Moves:
+def cycloidal(u: np.ndarray) -> np.ndarray:
+    """Return the share of a move whose velocity is a raised cosine."""
+    return u - np.sin(2 * np.pi * u) / (2 * np.pi)
+
+
+def _fade(u: np.ndarray) -> np.ndarray:
+    return 0.5 - 0.5 * np.cos(np.pi * np.clip(np.minimum(u, 1 - u) / 0.15, 0, 1))
+
+
+def draw_motion(rng: np.random.Generator, unit: Unit, needs: set[str]) -> Manoeuvre:
     """Draw a manoeuvre that has what some faults need: 'heat', 'supply', 'shake' or 'fast'."""
-    moves = Moves(bool(rng.random() < 0.5))
+    script = Script(share=trapezoidal if rng.random() < 0.5 else cycloidal, fade=_fade)
     length = min(rng.uniform(*SECONDS), _MOST_SAMPLES / unit.rate_hz)
-    moves.beta = rng.uniform(-3, 3)
-    moves.go(2.0)
+    script.beta[0] = rng.uniform(-3, 3)
+    script.rest(2.0)
     blocks = ['planes', 'poses', 'fast', 'shake']
     if not needs and rng.random() < 0.2:
         blocks = [str(rng.choice(['planes', 'poses']))]
-    moves.kind = '+'.join(blocks) if len(blocks) == 1 else 'mixed'
-    while moves.seconds < length:
+    while script.end < length:
         for block in rng.permutation(blocks):
-            _block(moves, str(block), rng, unit)
-    moves.go(2.0)
+            _block(script, str(block), rng, unit)
+    script.rest(2.0)
     warm = 'heat' in needs or rng.random() < 0.5
-    moves.heat = (rng.uniform(20, 28), rng.uniform(6, 20) * warm, rng.uniform(8, 30))
-    moves.sag = (rng.uniform(0.02, 0.08) * ('supply' in needs or rng.random() < 0.4),
-                 rng.uniform(17, 50))
-    return moves
+    heat = (rng.uniform(20, 28), rng.uniform(6, 20) * warm, rng.uniform(8, 30))
+    sag = (rng.uniform(0.02, 0.08) * ('supply' in needs or rng.random() < 0.4),
+           rng.uniform(17, 50))
+    return Manoeuvre(blocks[0] if len(blocks) == 1 else 'mixed', script,
+                     partial(_climate, script.end, heat, sag))
 
 
-def _block(moves: Moves, block: str, rng: np.random.Generator, unit: Unit) -> None:
+def _block(script: Script, block: str, rng: np.random.Generator, unit: Unit) -> None:
     """Add some moves of one sort, 15 to 40 s."""
     if block == 'planes':
-        moves.go(2.0, alpha=math.radians(rng.uniform(20, 160)))
+        script.go(seconds=2.0, alpha=math.radians(rng.uniform(20, 160)))
         step, speed = rng.uniform(0.5, 1.2), rng.uniform(0.4, 1.5)
         for sign in [1] * 5 + [-1] * 5:
-            moves.go(step / speed, beta=moves.beta + sign * step)
-            moves.go(rng.uniform(0.5, 1.5))
+            script.go(seconds=step / speed, beta=script.beta[-1] + sign * step)
+            script.rest(rng.uniform(0.5, 1.5))
     elif block == 'poses':
         for _ in range(6):
-            moves.go(rng.uniform(1.5, 4), alpha=math.acos(rng.uniform(-0.98, 0.98)),
-                     beta=moves.beta + rng.uniform(-2, 2))
-            moves.go(rng.uniform(0.8, 2.5))
+            script.go(seconds=rng.uniform(1.5, 4), alpha=math.acos(rng.uniform(-0.98, 0.98)),
+                      beta=script.beta[-1] + rng.uniform(-2, 2))
+            script.rest(rng.uniform(0.8, 2.5))
     elif block == 'fast':
         for i in range(8):
             turn = rng.uniform(0.8, 1.6)
-            moves.go(turn / rng.uniform(2, 4), beta=moves.beta + turn * (-1) ** i)
-            moves.go(rng.uniform(0.2, 0.5))
-        moves.go(1.0, alpha=math.radians(rng.uniform(40, 140)))
+            script.go(seconds=turn / rng.uniform(2, 4), beta=script.beta[-1] + turn * (-1) ** i)
+            script.rest(rng.uniform(0.2, 0.5))
+        script.go(seconds=1.0, alpha=math.radians(rng.uniform(40, 140)))
     else:
         low, high = 2.0, min(20.0, unit.rate_hz / 12)
         for _ in range(2):
-            moves.shake(rng.uniform(1, 4), rng.uniform(low, high), rng.uniform(low, high),
-                        rng.uniform(5, 9))
-            moves.go(0.5)
+            peak_mps2, first_hz = rng.uniform(1, 4), rng.uniform(low, high)
+            last_hz = rng.uniform(low, high)
+            script.swing('shift', peak_mps2 / (2 * np.pi * first_hz) ** 2, first_hz,
+                         rng.uniform(5, 9), last_hz)
+            script.rest(0.5)
 
 
-def recalibrated(unit: Unit, faults: list[Fault]) -> Unit:
+def _climate(seconds: float, heat: tuple[float, float, float], sag: tuple[float, float],
+             t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return temperature, °C, and supply, V: a heater goes on and off, a load switches."""
+    start_c, rise_c, lag_s = heat
+    on, off = (np.clip(t - part * seconds, 0, None) for part in (0.15, 0.6))
+    warm = start_c + rise_c * (np.exp(-off / lag_s) - np.exp(-on / lag_s))
+    return warm, 5.0 + sag[0] * np.tanh(4 * np.sin(2 * np.pi * t / sag[1]))
+
+
+def recalibrated(unit: Unit, acting: list[Fault]) -> Unit:
     """Calibrate zero-g and scale factor of a unit that has faults at rest by a straight line."""
-    moves = Moves(True)
+    script = Script(share=trapezoidal)
     ends = []
     for alpha in (90, 45, 135):
         for beta in range(0, 360, 30):
-            moves.go(0.4, alpha=math.radians(alpha), beta=math.radians(beta))
-            moves.go(0.6)
-            ends.append(moves.seconds)
+            script.go(math.radians(alpha), math.radians(beta), 0.4)
+            script.rest(0.6)
+            ends.append(script.end)
     still = replace(unit, rate_hz=50.0)
-    with_faults, without = (render(still, moves, acting, 0, noise=False, fine_hz=200.0)
-                            for acting in (faults, []))
-    t = stamps(still, moves)
+    climate = partial(_climate, script.end, (25.0, 0.0, 20.0), (0.0, 1.0))
+    scene = Scene(still, Manoeuvre('rests', script, climate), 0)
+    with_faults, without = (scene.volts(kept, noise=False, fine_hz=200.0)
+                            for kept in (acting, []))
+    t = scene.stamps()
     rest = np.any([(t > end - 0.2) & (t < end) for end in ends], axis=0)
-    zero, scale = unit.stated_zero_v.copy(), unit.stated_scale_v_per_g.copy()
-    for d in range(len(unit.axes)):
-        u = (without[d, rest] - unit.zero_v[d]) / unit.scale_v_per_g[d]
-        line = np.column_stack([np.ones_like(u), u])
-        change = np.linalg.lstsq(line, (with_faults - without)[d, rest], rcond=None)[0]
-        zero[d] += change[0]
-        scale[d] += change[1]
-    return replace(unit, stated_zero_v=zero, stated_scale_v_per_g=scale)
-
-
-def _stage_offset(run: Run, size: float, shape: Shape) -> None:
-    run.alpha += size * shape['w'][0]
-    run.beta += size * shape['w'][1]
+    u = (without - unit.zero_v[:, None]) / unit.scale_v_per_g[:, None]
+    zero, scale = np.transpose([ideal_observer.line(along[rest], change[rest])
+                                for along, change in zip(u, with_faults - without)])
+    return replace(unit, stated_zero_v=unit.stated_zero_v + zero,
+                   stated_scale_v_per_g=unit.stated_scale_v_per_g + scale)
 
 
 def _stage_eccentricity(run: Run, size: float, shape: Shape) -> None:
@@ -234,10 +178,6 @@ def _gravity(run: Run, size: float, shape: Shape) -> None:
     run.gravity = G0 + size * shape['w'][0]
 
 
-def _lever_arm(run: Run, size: float, shape: Shape) -> None:
-    run.arm = size * np.asarray(shape['w'])
-
-
 def _late(run: Run, late_s: np.ndarray | float) -> None:
     """Read the output some seconds late."""
     run.volts = np.stack([np.interp(run.t - late_s, run.t, row) for row in run.volts])
@@ -271,37 +211,28 @@ def _misalignment(run: Run, size: float, shape: Shape) -> None:
     run.u = (run.directions @ run.force)[run.unit.axis_indices] / G0
 
 
+def _turns(rng: np.random.Generator, count: int) -> np.ndarray:
+    return rng.normal(size=count)
+
+
 def _other(run: Run) -> np.ndarray:
     """Return the other axis of the plane of each measured axis, g, (m, n)."""
     return run.force[[_OTHER[d] for d in run.unit.axis_indices]] / G0
 
 
-def _cross_axis(run: Run, size: float, shape: Shape) -> None:
+def _cross_axis(run: Run, shape: Shape) -> np.ndarray:
     c = _other(run)
-    run.u += size * column(shape) * (c * c * (1 - 0.3 * c * c) + shape['odd'] * c)
+    return c * c * (1 - 0.3 * c * c) + shape['odd'] * c
 
 
-def _cross_axis_z(run: Run, size: float, shape: Shape) -> None:
+def _cross_axis_z(run: Run, shape: Shape) -> np.ndarray:
     c = run.force[2] / G0
-    run.u[:2] += size * column(shape)[:2] * (np.log(np.cosh(1.5 * c)) + shape['odd'] * c)
+    return _PLANE[:len(run.u)] * (np.log(np.cosh(1.5 * c)) + shape['odd'] * c)
 
 
-def _scale_factor_cross(run: Run, size: float, shape: Shape) -> None:
-    run.u *= 1 + size * column(shape) * np.tanh(1.2 * _other(run))
-
-
-def _scale_factor_z(run: Run, size: float, shape: Shape) -> None:
+def _scale_factor_z(run: Run, shape: Shape) -> np.ndarray:
     c = run.force[2] / G0
-    run.u[:2] *= 1 + size * column(shape)[:2] * (np.tanh(1.2 * c + 0.4) - np.tanh(0.4))
-
-
-def _nonlinearity(run: Run, size: float, shape: Shape) -> None:
-    """Soften by the arc tangent, g."""
-    run.u += size * column(shape) * (np.arctan(shape['bend'] * run.u) / shape['bend'] - run.u)
-
-
-def _quadratic(run: Run, size: float, shape: Shape) -> None:
-    run.u += size * column(shape) * np.abs(run.u) ** shape['power']
+    return _PLANE[:len(run.u)] * (np.tanh(1.2 * c + 0.4) - np.tanh(0.4))
 
 
 def _hysteresis(run: Run, size: float, shape: Shape) -> None:
@@ -322,41 +253,27 @@ def _saturation(run: Run, size: float, shape: Shape) -> None:
             row -= sign * (over + knee * np.expm1(-over / knee))
 
 
-def _temperature_bias(run: Run, size: float, shape: Shape) -> None:
-    """Shift zero-g by a cubic law of a die that follows the thermometer late, g."""
+def _warm(run: Run, shape: Shape, cubic: float) -> np.ndarray:
+    """Return a law of a die that follows the thermometer late, of 10 K."""
     warm = low_pass(run.temperature - 25, shape['late_s'], run.dt)
-    run.u += size * column(shape) * warm * (1 + shape['bend'] * warm * (1 + 0.02 * warm)) / 10
+    return warm * (1 + shape['bend'] * warm * (1 + cubic * warm)) / 10
 
 
-def _temperature_scale(run: Run, size: float, shape: Shape) -> None:
-    warm = low_pass(run.temperature - 25, shape['late_s'], run.dt)
-    run.u *= 1 + size * column(shape) * warm * (1 + shape['bend'] * warm) / 10
-
-
-def _warm_up(run: Run, size: float, shape: Shape) -> None:
-    """Settle by two time constants, or by a hyperbola, g."""
+def _warm_up(run: Run, shape: Shape) -> np.ndarray:
+    """Settle by two time constants, or by a hyperbola."""
     t = np.clip(run.t, 0, None) / shape['tau_s']
-    run.u += size * column(shape) * (0.65 * np.exp(-t) + 0.35 * np.exp(-t / 4)
-                                     if shape['law'] < 0.5 else 1 / (1 + t))
+    return 0.65 * np.exp(-t) + 0.35 * np.exp(-t / 4) if shape['law'] < 0.5 else 1 / (1 + t)
 
 
-def _vibration_rectification(run: Run, size: float, shape: Shape) -> None:
+def _vibration_rectification(run: Run, shape: Shape) -> np.ndarray:
     moving = np.abs(run.u - low_pass(run.u, 0.25, run.dt)) ** shape['power']
-    run.u += size * column(shape) * low_pass(moving, 0.8, run.dt)
-
-
-def _bias(run: Run, size: float, shape: Shape) -> None:
-    run.volts += size * column(shape) * run.unit.scale_v_per_g[:, None]
-
-
-def _scale_factor(run: Run, size: float, shape: Shape) -> None:
-    run.u *= 1 + size * column(shape)
+    return low_pass(moving, 0.8, run.dt)
 
 
 def _supply(run: Run, size: float, shape: Shape) -> None:
     """Follow the supply with a square, behind a capacitor."""
     change = low_pass(run.supply / 5 - 1, shape['late_s'], run.dt)
-    run.volts *= 1 + size * column(shape) * change * (1 + shape['bend'] * change)
+    run.volts *= 1 + size * sim.column(shape) * change * (1 + shape['bend'] * change)
 
 
 def _bandwidth(run: Run, size: float, shape: Shape) -> None:
@@ -364,48 +281,42 @@ def _bandwidth(run: Run, size: float, shape: Shape) -> None:
     run.second_hz = run.corner_hz / shape['second']
 
 
-def _add(run: Run, size: float, shape: Shape, law: np.ndarray) -> None:
-    """Add a law, (n,) or (m, n), to the output of each axis by its weight, g."""
-    run.volts += size * column(shape) * law * run.unit.scale_v_per_g[:, None]
-
-
 def _unit_rms(rows: np.ndarray) -> np.ndarray:
     return rows / np.maximum(rows.std(axis=-1, keepdims=True), 1e-12)
 
 
-def _noise_excess(run: Run, size: float, shape: Shape) -> None:
-    """Add noise of heavy tails behind the filter, g rms."""
+def _heavy_tails(run: Run, shape: Shape) -> np.ndarray:
+    """Add noise of heavy tails behind the filter."""
     drawn = run.random('tails').standard_t(shape['tails'], run.volts.shape)
-    _add(run, size, shape, _unit_rms(low_pass(drawn, 0.004, run.dt)))
+    return _unit_rms(low_pass(drawn, 0.004, run.dt))
 
 
-def _colour(run: Run, size: float, shape: Shape) -> None:
-    """Add slow Gaussian noise, g rms: no unit is quite white."""
+def _colour(run: Run, shape: Shape) -> np.ndarray:
+    """Add slow Gaussian noise: no unit is quite white."""
     drawn = run.random('colour').normal(size=run.volts.shape)
-    _add(run, size, shape, _unit_rms(low_pass(drawn, shape['lag_s'], run.dt)))
+    return _unit_rms(low_pass(drawn, shape['lag_s'], run.dt))
 
 
-def _flicker(run: Run, size: float, shape: Shape) -> None:
-    """Add noise whose density falls with another power of the frequency, g rms."""
+def _flicker(run: Run, shape: Shape) -> np.ndarray:
+    """Add noise whose density falls with another power of the frequency."""
     drawn = np.fft.rfft(run.random('flicker').normal(size=run.volts.shape))
     ratio = np.maximum(np.arange(drawn.shape[1]), 1.0) ** (-shape['power'] / 2)
     ratio[0] = 0
-    _add(run, size, shape, _unit_rms(np.fft.irfft(drawn * ratio, run.volts.shape[1])))
+    return _unit_rms(np.fft.irfft(drawn * ratio, run.volts.shape[1]))
 
 
-def _bias_walk(run: Run, size: float, shape: Shape) -> None:
-    """Add a walk whose power changes from part to part, g rms."""
+def _bias_walk(run: Run, shape: Shape) -> np.ndarray:
+    """Add a walk whose power changes from part to part."""
     rng, n = run.random('walk'), len(run.t)
     power = np.interp(np.linspace(0, 7, n), np.arange(8), np.exp(shape['uneven'] * rng.normal(
         size=8)))
-    _add(run, size, shape, _unit_rms(np.cumsum(power * rng.normal(size=run.volts.shape), axis=1)))
+    return _unit_rms(np.cumsum(power * rng.normal(size=run.volts.shape), axis=1))
 
 
-def _mains_hum(run: Run, size: float, shape: Shape) -> None:
-    """Add hum, V, off its nominal frequency, with the harmonics of a rectifier."""
+def _mains_hum(run: Run, shape: Shape) -> np.ndarray:
+    """Add hum off its nominal frequency, with the harmonics of a rectifier."""
     phase = 2 * np.pi * (shape['mains'] + shape['off']) * run.t + shape['phase']
-    _add(run, size, shape, np.sin(phase) + shape['second'] * np.sin(2 * phase)
-         + 0.15 * np.sin(5 * phase))
+    return np.sin(phase) + shape['second'] * np.sin(2 * phase) + 0.15 * np.sin(5 * phase)
 
 
 def _spikes(run: Run, size: float, shape: Shape) -> None:
@@ -413,7 +324,7 @@ def _spikes(run: Run, size: float, shape: Shape) -> None:
     rng, like = run.random('spikes'), run.volts.shape
     hit = rng.random(like) < shape['rate_hz'] * run.dt
     sign = np.where(rng.random(like) < shape['up'], 1.0, -1.0)
-    run.volts += size * np.abs(column(shape)) * hit * sign * (0.4 + 0.6 * rng.exponential(
+    run.volts += size * np.abs(sim.column(shape)) * hit * sign * (0.4 + 0.6 * rng.exponential(
         size=like))
 
 
@@ -427,7 +338,7 @@ def _stuck(run: Run, size: float, shape: Shape) -> None:
 
 def _quantisation(run: Run, size: float, shape: Shape) -> None:
     """Lose low bits by rounding or by cutting off; single axes may lose none."""
-    step = LSB_V * 2.0 ** round(math.log2(1 + size / LSB_V))
+    step = sim.LSB_V * 2.0 ** round(math.log2(1 + size / sim.LSB_V))
     rounded = np.floor if shape['cut'] > 0.5 else np.rint
     for d, w in enumerate(shape['w']):
         if w:
@@ -436,7 +347,7 @@ def _quantisation(run: Run, size: float, shape: Shape) -> None:
 
 def _adc_inl(run: Run, size: float, shape: Shape) -> None:
     """Bend the converter, V: some wrong bits, two sines, or a bow."""
-    share, (law, phase, cycles, *bits) = run.volts / (LSB_V * 2 ** ADC_BITS), shape['curve']
+    share, (law, phase, cycles, *bits) = run.volts / (sim.LSB_V * 2 ** sim.ADC_BITS), shape['w']
     if law < 0.5:
         run.volts += size * sum((bit > 0.5) * (np.floor(share * 2 ** (i + 1)) % 2 - 0.5)
                                 for i, bit in enumerate(bits))
@@ -448,143 +359,117 @@ def _adc_inl(run: Run, size: float, shape: Shape) -> None:
         run.volts += size * (x - x ** 3 + 0.5 * x ** 5)
 
 
-def _beat(run: Run, size: float, shape: Shape) -> None:
-    """Add a slow sine in time, g, as of a radio carrier that beats with the clock."""
-    _add(run, size, shape, np.sin(2 * np.pi * run.t / shape['period_s'] + shape['phase']))
+def _curve(rng: np.random.Generator, count: int) -> np.ndarray:
+    return rng.random(count)
 
 
-def _ripple(run: Run, size: float, shape: Shape) -> None:
-    """Add a ripple over the axis's own force, g, as of a servo loop with a limit cycle."""
-    run.u += size * column(shape) * np.sin(2 * np.pi * run.u / shape['period_g'] + shape['phase'])
-
-
-def _turning(run: Run) -> np.ndarray:
-    """Return how fast the joints turn, 0 to 1, (n,)."""
+def _motion_lag(run: Run, shape: Shape) -> np.ndarray:
+    """Shift zero-g while and after a joint turns: current of a motor, charge of a mass."""
     rate = np.hypot(np.gradient(run.alpha, run.dt), np.gradient(run.beta, run.dt))
-    return 1 - np.exp(-(rate / 0.3) ** 2)
+    return low_pass(1 - np.exp(-(rate / 0.3) ** 2), shape['late_s'], run.dt)
 
 
-def _motion_lag(run: Run, size: float, shape: Shape) -> None:
-    """Shift zero-g while and after a joint turns, g: current of a motor, charge of a mass."""
-    _add(run, size, shape, low_pass(_turning(run), shape['late_s'], run.dt))
+def _magnet(run: Run, shape: Shape) -> np.ndarray:
+    """Shift zero-g by the direction in the room, beyond its first harmonics."""
+    return np.sin(3 * run.beta + shape['phase']) * (1 + 0.5 * np.cos(2 * run.alpha))
 
 
-def _magnet(run: Run, size: float, shape: Shape) -> None:
-    """Shift zero-g by the direction in the room, g, beyond its first harmonics."""
-    _add(run, size, shape, np.sin(3 * run.beta + shape['phase']) * (
-        1 + 0.5 * np.cos(2 * run.alpha)))
-
-
-def _two_levels(run: Run, size: float, shape: Shape) -> None:
-    """Switch zero-g between two levels at uneven times, g, as popcorn noise does."""
+def _two_levels(run: Run, shape: Shape) -> np.ndarray:
+    """Switch zero-g between two levels at uneven times, as popcorn noise does."""
     phase = 2 * np.pi * run.t / shape['period_s'] + shape['phase']
-    _add(run, size, shape, np.where(np.sin(phase) + 0.7 * np.sin(2.718 * phase) > 0.4, 1.0, 0.0))
-
-
-def _fading_gain(run: Run, size: float, shape: Shape) -> None:
-    """Change the scale factor with time, as leakage into a reference does."""
-    run.u *= 1 + size * column(shape) * run.t / 100
-
-
-def _draw(count: int | None, positive: bool, bounds: dict[str, tuple[float, float]],
-          rng: np.random.Generator, unit: Unit) -> Shape:
-    """Draw weights, of the axes where no count is given, and a number within each bound."""
-    w = weights(count or len(unit.axes), rng)
-    return {'w': np.abs(w) if positive else w,
-            **{name: float(rng.uniform(*pair)) for name, pair in bounds.items()}}
+    return np.where(np.sin(phase) + 0.7 * np.sin(2.718 * phase) > 0.4, 1.0, 0.0)
 
 
 @dataclass(frozen=True)
-class Kind(FaultKind):
+class Kind(sim.Kind):
     """A kind of fault of this world."""
 
     needs: str = ''  # what the manoeuvre must have for it to show
     at_rest: bool = False  # whether a calibration at rest takes a part of it up
 
 
-def _kind(name: str, place: Place, act: Act, start: float, largest: float, *,
-          count: int | None = None, positive: bool = False, needs: str = '',
-          at_rest: bool = False, random: bool = False, listed: bool = True,
-          **bounds: tuple[float, float]) -> Kind:
-    return Kind(name, place, act, partial(_draw, count, positive, bounds), lambda unit: [],
-                start, largest, random=random, in_library=listed, needs=needs, at_rest=at_rest)
-
-
-def _draw_turns(rng: np.random.Generator, unit: Unit) -> Shape:
-    return {'w': rng.normal(size=3 * len(unit.axes))}
-
-
-def _draw_curve(rng: np.random.Generator, unit: Unit) -> Shape:
-    return {'curve': rng.random(9)}
-
-
-def _draw_mains(rng: np.random.Generator, unit: Unit) -> Shape:
-    return {**_draw(None, False, {'off': (-0.03, 0.03), 'phase': _PHASE, 'second': (0.0, 0.3)},
-                    rng, unit), 'mains': float(rng.choice([50.0, 60.0]))}
-
-
-_PHASE = (0.0, 2 * math.pi)
-_STAGE, _MOUNT, _ELEMENT = Place.STAGE, Place.MOUNT, Place.ELEMENT
-_VOLTS, _WIRE, _SAMPLES = Place.ELECTRONICS, Place.WIRE, Place.SAMPLES
-KINDS = {kind.name: kind for kind in (
-    _kind('bias', _VOLTS, _bias, 2e-3, 0.1),
-    _kind('scale_factor', _ELEMENT, _scale_factor, 3e-3, 0.1),
-    _kind('gravity', _STAGE, _gravity, 0.02, 0.09, count=1, at_rest=True),
-    _kind('base_tilt', _STAGE, _base_tilt, 2e-3, 0.05, count=2, at_rest=True),
-    _kind('stage_offset', _STAGE, _stage_offset, 2e-3, 0.05, count=2, at_rest=True),
-    _kind('stage_eccentricity', _STAGE, _stage_eccentricity, 2e-3, 0.05, count=4, at_rest=True,
-          second=(-0.15, 0.15)),
-    _kind('backlash', _STAGE, _backlash, 4e-3, 0.05, count=2, positive=True),
-    _kind('lever_arm', _STAGE, _lever_arm, 0.02, 0.5, count=3, needs='fast'),
-    _kind('time_offset', _WIRE, _time_offset, 5e-3, 0.2, count=1, needs='fast'),
-    _kind('clock_skew', _WIRE, _clock_skew, 5e-5, 2e-3, count=1, needs='fast',
-          growth=(-0.1, 0.1)),
-    replace(_kind('misalignment', _ELEMENT, _misalignment, 3e-3, 0.05, at_rest=True),
-            draw=_draw_turns),
-    _kind('mount_resonance', _MOUNT, _mount_resonance, 0.3, 1.0, needs='shake',
-          hertz=(12.0, 45.0), damping=(0.03, 0.12)),
-    _kind('cross_axis', _ELEMENT, _cross_axis, 3e-3, 0.1, at_rest=True, odd=(-0.5, 0.5)),
-    _kind('cross_axis_z', _ELEMENT, _cross_axis_z, 3e-3, 0.1, at_rest=True, odd=(-0.5, 0.5)),
-    _kind('scale_factor_cross', _ELEMENT, _scale_factor_cross, 5e-3, 0.1, at_rest=True),
-    _kind('scale_factor_z', _ELEMENT, _scale_factor_z, 5e-3, 0.1, at_rest=True),
-    _kind('nonlinearity', _ELEMENT, _nonlinearity, 0.02, 0.5, at_rest=True, bend=(0.6, 1.2)),
-    _kind('quadratic', _ELEMENT, _quadratic, 5e-3, 0.1, at_rest=True, power=(1.5, 2.5)),
-    _kind('hysteresis', _ELEMENT, _hysteresis, 4e-3, 0.05, reach=(0.08, 0.5), skew=(-0.3, 0.3)),
-    _kind('vibration_rectification', _ELEMENT, _vibration_rectification, 0.3, 30.0,
-          needs='shake', power=(1.7, 2.4)),
-    _kind('saturation', _ELEMENT, _saturation, 0.6, 1.2, positive=True, at_rest=True,
-          knee=(0.005, 0.05), lower=(0.96, 1.04)),
-    _kind('temperature_bias', _ELEMENT, _temperature_bias, 3e-3, 0.1, needs='heat',
-          bend=(-0.03, 0.03), late_s=(0.5, 6.0)),
-    _kind('temperature_scale', _ELEMENT, _temperature_scale, 5e-3, 0.2, needs='heat',
-          bend=(-0.03, 0.03), late_s=(0.5, 6.0)),
-    _kind('warm_up', _ELEMENT, _warm_up, 5e-3, 0.1, tau_s=(20.0, 150.0), law=(0.0, 1.0)),
-    _kind('supply', _VOLTS, _supply, 0.3, 3.0, needs='supply', late_s=(0.05, 0.5),
-          bend=(-3.0, 3.0)),
-    _kind('bandwidth', _VOLTS, _bandwidth, 0.3, 1.5, needs='shake', second=(0.02, 0.1)),
-    _kind('noise_excess', _WIRE, _noise_excess, 2e-3, 0.05, random=True, tails=(3.5, 30.0)),
-    _kind('flicker', _WIRE, _flicker, 2e-3, 0.05, random=True, power=(0.85, 1.25)),
-    _kind('bias_walk', _WIRE, _bias_walk, 2e-3, 0.05, random=True, uneven=(0.0, 0.7)),
-    replace(_kind('mains_hum', _WIRE, _mains_hum, 3e-3, 0.1, random=True), draw=_draw_mains),
-    _kind('spikes', _SAMPLES, _spikes, 0.1, 2.0, random=True, rate_hz=(0.05, 0.5),
-          up=(0.3, 1.0)),
-    _kind('stuck', _SAMPLES, _stuck, 0.1, 2.0, random=True, rate_hz=(0.03, 0.2)),
-    _kind('quantisation', _SAMPLES, _quantisation, 5e-3, 0.1, random=True, cut=(0.0, 1.0)),
-    replace(_kind('adc_inl', _SAMPLES, _adc_inl, 3e-3, 0.05, at_rest=True), draw=_draw_curve),
-    _kind('beat', _VOLTS, _beat, 3e-3, 0.1, listed=False, period_s=(6.0, 40.0), phase=_PHASE),
-    _kind('ripple', _ELEMENT, _ripple, 3e-3, 0.1, listed=False, period_g=(0.2, 0.5),
-          phase=_PHASE),
-    _kind('aftermath', _VOLTS, _motion_lag, 3e-3, 0.1, listed=False, needs='fast',
-          late_s=(4.0, 15.0)),
-    _kind('motor_current', _VOLTS, _motion_lag, 3e-3, 0.1, listed=False, needs='fast',
-          late_s=(0.03, 0.1)),
-    _kind('magnet', _VOLTS, _magnet, 3e-3, 0.1, listed=False, phase=_PHASE),
-    _kind('two_levels', _VOLTS, _two_levels, 3e-3, 0.1, listed=False, period_s=(15.0, 60.0),
-          phase=_PHASE),
-    _kind('fading_gain', _ELEMENT, _fading_gain, 3e-3, 0.1, listed=False),
-)}
+_ODD, _DIE = {'odd': (-0.5, 0.5)}, {'bend': (-0.03, 0.03), 'late_s': (0.5, 6.0)}
+_LISTED = (
+    Kind('bias', sim.added_at_output(sim.constant), 2e-3, 0.1, place=Place.ELECTRONICS),
+    Kind('scale_factor', sim.scaled(sim.constant), 3e-3, 0.1),
+    Kind('gravity', _gravity, 0.02, 0.09, place=Place.STAGE, fixed=1, at_rest=True),
+    Kind('base_tilt', _base_tilt, 2e-3, place=Place.STAGE, fixed=2, at_rest=True),
+    Kind('stage_offset', faults.stage_offset, 2e-3, place=Place.STAGE, fixed=2, at_rest=True),
+    Kind('stage_eccentricity', _stage_eccentricity, 2e-3, place=Place.STAGE, fixed=4, at_rest=True,
+         bounds={'second': (-0.15, 0.15)}),
+    Kind('backlash', _backlash, 4e-3, place=Place.STAGE, fixed=2, weigh=sim.positive),
+    Kind('lever_arm', faults.lever_arm, 0.02, 0.5, place=Place.STAGE, fixed=3, needs='fast'),
+    Kind('time_offset', _time_offset, 5e-3, 0.2, place=Place.WIRE, fixed=1, needs='fast'),
+    Kind('clock_skew', _clock_skew, 5e-5, 2e-3, place=Place.WIRE, fixed=1, needs='fast',
+         bounds={'growth': (-0.1, 0.1)}),
+    Kind('misalignment', _misalignment, 3e-3, each=3, weigh=_turns, at_rest=True),
+    Kind('mount_resonance', _mount_resonance, 0.3, 1.0, place=Place.MOUNT, needs='shake',
+         bounds={'hertz': (12.0, 45.0), 'damping': (0.03, 0.12)}),
+    Kind('cross_axis', sim.added(_cross_axis), 3e-3, 0.1, at_rest=True, bounds=_ODD),
+    Kind('cross_axis_z', sim.added(_cross_axis_z), 3e-3, 0.1, at_rest=True, bounds=_ODD),
+    Kind('scale_factor_cross', sim.scaled(lambda run, shape: np.tanh(1.2 * _other(run))), 5e-3,
+         0.1, at_rest=True),
+    Kind('scale_factor_z', sim.scaled(_scale_factor_z), 5e-3, 0.1, at_rest=True),
+    Kind('nonlinearity', sim.added(
+        lambda run, shape: np.arctan(shape['bend'] * run.u) / shape['bend'] - run.u), 0.02, 0.5,
+        at_rest=True, bounds={'bend': (0.6, 1.2)}),
+    Kind('quadratic', sim.added(lambda run, shape: np.abs(run.u) ** shape['power']), 5e-3, 0.1,
+         at_rest=True, bounds={'power': (1.5, 2.5)}),
+    Kind('hysteresis', _hysteresis, 4e-3, bounds={'reach': (0.08, 0.5), 'skew': (-0.3, 0.3)}),
+    Kind('vibration_rectification', sim.added(_vibration_rectification), 0.3, 30.0, needs='shake',
+         bounds={'power': (1.7, 2.4)}),
+    Kind('saturation', _saturation, 0.6, 1.2, weigh=sim.positive, at_rest=True,
+         bounds={'knee': (0.005, 0.05), 'lower': (0.96, 1.04)}),
+    Kind('temperature_bias', sim.added(partial(_warm, cubic=0.02)), 3e-3, 0.1, needs='heat',
+         bounds=_DIE),
+    Kind('temperature_scale', sim.scaled(partial(_warm, cubic=0.0)), 5e-3, 0.2, needs='heat',
+         bounds=_DIE),
+    Kind('warm_up', sim.added(_warm_up), 5e-3, 0.1,
+         bounds={'tau_s': (20.0, 150.0), 'law': (0.0, 1.0)}),
+    Kind('supply', _supply, 0.3, 3.0, place=Place.ELECTRONICS, needs='supply',
+         bounds={'late_s': (0.05, 0.5), 'bend': (-3.0, 3.0)}),
+    Kind('bandwidth', _bandwidth, 0.3, 1.5, place=Place.ELECTRONICS, needs='shake',
+         bounds={'second': (0.02, 0.1)}),
+    Kind('noise_excess', sim.added_at_output(_heavy_tails), 2e-3, place=Place.WIRE, random=True,
+         bounds={'tails': (3.5, 30.0)}),
+    Kind('flicker', sim.added_at_output(_flicker), 2e-3, place=Place.WIRE, random=True,
+         bounds={'power': (0.85, 1.25)}),
+    Kind('bias_walk', sim.added_at_output(_bias_walk), 2e-3, place=Place.WIRE, random=True,
+         bounds={'uneven': (0.0, 0.7)}),
+    Kind('mains_hum', sim.added_at_output(_mains_hum), 3e-3, 0.1, place=Place.WIRE, random=True,
+         bounds={'off': (-0.03, 0.03), 'phase': _PHASE, 'second': (0.0, 0.3),
+                 'mains': [50.0, 60.0]}),
+    Kind('spikes', _spikes, 0.1, 2.0, place=Place.SAMPLES, random=True,
+         bounds={'rate_hz': (0.05, 0.5), 'up': (0.3, 1.0)}),
+    Kind('stuck', _stuck, 0.1, 2.0, place=Place.SAMPLES, random=True,
+         bounds={'rate_hz': (0.03, 0.2)}),
+    Kind('quantisation', _quantisation, 5e-3, 0.1, place=Place.SAMPLES, random=True,
+         bounds={'cut': (0.0, 1.0)}),
+    Kind('adc_inl', _adc_inl, 3e-3, place=Place.SAMPLES, fixed=9, weigh=_curve, at_rest=True),
+)
+_UNLISTED = (
+    # A radio carrier that beats with the clock.
+    Kind('beat', sim.added_at_output(
+        lambda run, shape: np.sin(2 * np.pi * run.t / shape['period_s'] + shape['phase'])),
+        3e-3, 0.1, place=Place.ELECTRONICS, bounds={'period_s': (6.0, 40.0), 'phase': _PHASE}),
+    # A servo loop with a limit cycle.
+    Kind('ripple', sim.added(
+        lambda run, shape: np.sin(2 * np.pi * run.u / shape['period_g'] + shape['phase'])),
+        3e-3, 0.1, bounds={'period_g': (0.2, 0.5), 'phase': _PHASE}),
+    Kind('aftermath', sim.added_at_output(_motion_lag), 3e-3, 0.1, place=Place.ELECTRONICS,
+         needs='fast', bounds={'late_s': (4.0, 15.0)}),
+    Kind('motor_current', sim.added_at_output(_motion_lag), 3e-3, 0.1, place=Place.ELECTRONICS,
+         needs='fast', bounds={'late_s': (0.03, 0.1)}),
+    Kind('magnet', sim.added_at_output(_magnet), 3e-3, 0.1, place=Place.ELECTRONICS,
+         bounds={'phase': _PHASE}),
+    Kind('two_levels', sim.added_at_output(_two_levels), 3e-3, 0.1, place=Place.ELECTRONICS,
+         bounds={'period_s': (15.0, 60.0), 'phase': _PHASE}),
+    # Leakage into a reference.
+    Kind('fading_gain', sim.scaled(lambda run, shape: run.t / 100), 3e-3, 0.1),
+)
+LISTED, UNLISTED = (tuple(kind.name for kind in kinds) for kinds in (_LISTED, _UNLISTED))
+KINDS = {kind.name: kind for kind in (*_LISTED, *_UNLISTED)}
 """All kinds by name; the order is part of a seed."""
-COLOUR = _kind('colour', _VOLTS, _colour, 1e-4, 1e-2, random=True, lag_s=(0.02, 0.3))
+COLOUR = Kind('colour', sim.added_at_output(_colour), 1e-4, 1e-2, place=Place.ELECTRONICS,
+              random=True, bounds={'lag_s': (0.02, 0.3)})
 """What every recording has: noise that is not quite white."""
-LISTED = tuple(name for name, kind in KINDS.items() if kind.in_library)
-UNLISTED = tuple(name for name, kind in KINDS.items() if not kind.in_library)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A whole check: trials are drawn and committed, diagnosed and scored, with negative controls."""
+"""A check is diagnosed and scored, with negative controls."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ from datetime import date
 from functools import partial
 import json
 from pathlib import Path
-import secrets
 from typing import Any
 
 from adxl_ros.errors import UserError
+from adxl_ros.package_version import package_version
 from adxl_ros.workers import for_each, make_folder, write
-from adxl_ros_validation.blind import diagnosis_runs, grading, scores, trials
-from adxl_ros_validation.blind.grading import Answer
+from adxl_ros_validation.blind import diagnosis_runs, grading, scores, sealing
 from adxl_ros_validation.blind.scores import Trial
-from adxl_ros_validation.blind.trials import Label, Setup
+from adxl_ros_validation.blind.trials import Label
 import numpy as np
 import scipy
 
@@ -26,58 +25,31 @@ Show = Callable[[str], AbstractContextManager[Callable[[float], None]]]
 """Receives the name of a stage; gives a context with what receives the finished fraction."""
 
 
-def draw(folder: Path, seed: int | None, count: int, pool: Executor,
-         show: Callable[[float], None]) -> str:
-    """Draw a check and commit to its labels, or continue the check of the folder."""
-    digest = trials.published_hash(folder)
-    if digest is not None:
-        existing: Setup | None = trials.committed_labels(folder).setup
-    else:
-        existing = trials.interrupted_setup(folder)
-        if existing is None and any(folder.glob('*')):
-            raise UserError(f'{folder}: is not empty and has no check; choose another folder')
-    if seed is None:
-        seed = existing.seed if existing else secrets.randbelow(2 ** 31)
-    setup = Setup(seed, count)
-    if existing not in (None, setup):
-        raise UserError(f'{folder}: has a check of another seed or number of trials; repeat the '
-                        'same options to continue it, or choose another folder')
-    if digest is not None:
-        return digest
-    return trials.commit(folder, setup, trials.plans(seed, count), pool, show)
-
-
-def score(folder: Path, command: Sequence[str] | None, pool: Executor, show: Show
-          ) -> dict[str, Any]:
+def score(folder: Path, pool: Executor, show: Show) -> dict[str, Any]:
     """Diagnose all recordings that have no report yet, read the labels and score."""
-    digest = trials.published_hash(folder)
+    digest = sealing.published_hash(folder)
     if digest is None:
         raise UserError(f'{folder}: no labels are committed there; use --seal {folder} first')
-    trials.remove_drawn(folder)
-    trials.refuse_encrypted(folder)
     # Labels may be on another machine: the diagnosis does not need them.
     with show('diagnose') as advance:
-        results = diagnosis_runs.diagnose_all(folder, command, pool, advance)
-    version = (folder / 'reports' / 'version.txt').read_text()
-    committed = trials.committed_labels(folder)
-    labels = committed.labels
+        results = diagnosis_runs.diagnose_all(folder, pool, advance)
+    setup, labels = sealing.committed_labels(folder)
     missing = [label.name for label in labels if label.name not in results]
     if missing:
         raise UserError(f'{folder / "recordings"}: {missing[0]}.csv is missing, {len(missing)} '
                         'of the committed recordings in all; a check needs all of them')
     with show('held out') as advance:
         held_out = _held_out(folder, labels, results, pool, advance)
-    answers = [grading.answer(results[label.name]) for label in labels]
-    graded = [Trial(label, answer, held_out[label.name])
-              for label, answer in zip(labels, answers)]
+    graded = [Trial(label, grading.answer(results[label.name]), held_out[label.name])
+              for label in labels]
     made = scores.scores(graded)
-    negative = controls(folder, labels, answers)
+    negative = controls(folder, graded)
     return {
-        'schema': 1, 'hash': digest, 'seed': committed.setup.seed,
-        'trials': committed.setup.trials, 'cases': len(labels), 'date': str(date.today()),
-        'version': diagnosis_runs.package_version(), 'diagnose_code': version,
-        'failed': {label.name: results[label.name]['error'] for label, answer
-                   in zip(labels, answers) if answer.status == 'failed'},
+        'schema': 1, 'hash': digest, **setup._asdict(), 'cases': len(labels),
+        'date': str(date.today()), 'version': package_version(),
+        'diagnose_code': (folder / 'reports' / 'version.txt').read_text(),
+        'failed': {trial.label.name: results[trial.label.name]['error'] for trial in graded
+                   if trial.answer.status == 'failed'},
         'bars': scores.bars(made), 'controls': negative,
         'leaks': any(control['leaks'] for control in negative.values()),
         'scores': made, 'rows': [_row(trial) for trial in graded]}
@@ -104,17 +76,13 @@ def _held_out(folder: Path, labels: Sequence[Label], results: dict[str, diagnosi
 def _row(trial: Trial) -> dict[str, Any]:
     """Return the data of one trial from which the scores follow."""
     label, answer = trial.label, trial.answer
-    return {'name': label.name, 'group': label.group, 'effects': list(label.effects),
-            'strength_mps2': [fault['strength_mps2'] for fault in label.faults],
-            'power': [fault['power'] for fault in label.faults],
-            'told': [fault['told'] for fault in label.faults],
-            'inseparable': [fault['inseparable'] for fault in label.faults],
+    faults = {name: [fault[name] for fault in label.faults]
+              for name in ('strength_mps2', 'power', 'told', 'inseparable')}
+    return {'name': label.name, 'group': label.group, 'effects': list(label.effects), **faults,
             'flexible': label.flexible, 'manoeuvre': label.manoeuvre, 'axes': label.axes,
             'status': answer.status, 'top': sorted(answer.top), 'named': sorted(answer.named),
-            'probability': answer.probability,
-            'right': grading.verdict_right(answer, label), 'seconds': answer.seconds,
-            'ranks': grading.ranks(answer, label),
-            'held': trial.held_out}
+            'probability': answer.probability, 'right': grading.verdict_right(answer, label),
+            'seconds': answer.seconds, 'held': trial.held_out}
 
 
 _CHANCE = 0.002
@@ -123,31 +91,31 @@ _SHUFFLES = 2000
 """Number of permutations of the labels; chosen."""
 
 
-def controls(folder: Path, labels: Sequence[Label],
-             answers: Sequence[Answer]) -> dict[str, dict[str, Any]]:
+def controls(folder: Path, trials: Sequence[Trial]) -> dict[str, dict[str, Any]]:
     """Run all controls; `leaks` states whether a control is not at chance."""
-    return {'labels_permuted': permuted(labels, answers),
-            'metadata_only': metadata(folder / 'recordings', labels),
-            'strength_zero': strength_zero(labels, answers)}
+    return {'labels_permuted': permuted(trials),
+            'metadata_only': metadata(folder / 'recordings', [trial.label for trial in trials]),
+            'strength_zero': strength_zero(trials)}
 
 
-def permuted(labels: Sequence[Label], answers: Sequence[Answer]) -> dict[str, Any]:
+def permuted(trials: Sequence[Trial]) -> dict[str, Any]:
     """
     Score the answers against the labels of other trials.
 
     The score by chance follows from the frequencies of answers and labels. A higher score uses
     something besides the answers.
     """
-    real = [(label, answer) for label, answer in zip(labels, answers) if label.group != 'zero']
-    right = np.array([[answer.top in grading.right(label) for label, _ in real]
-                      for _, answer in real], float)
+    real = [trial for trial in trials if trial.label.group != 'zero']
+    accepted = [grading.right(trial.label) for trial in real]
+    right = np.array([[trial.answer.top in effects for effects in accepted]
+                      for trial in real], float)
     rng, n = np.random.default_rng(0), len(real)
     shuffled = np.array([right[np.arange(n), rng.permutation(n)].mean()
-                         for _ in range(_SHUFFLES)]) if n else np.zeros(1)
-    chance = float(right.mean()) if n else 0.0
-    in_place = float(np.trace(right)) / max(n, 1)
+                         for _ in range(_SHUFFLES)])
+    chance = float(right.mean())
     low, high = (float(q) for q in np.quantile(shuffled, (_CHANCE / 2, 1 - _CHANCE / 2)))
-    return {'score': float(shuffled.mean()), 'chance': chance, 'labels_in_place': in_place,
+    return {'score': float(shuffled.mean()), 'chance': chance,
+            'labels_in_place': float(np.trace(right)) / n,
             'by_chance_between': [low, high], 'leaks': not low <= chance <= high}
 
 
@@ -194,13 +162,12 @@ def _facts(recordings: Path, name: str) -> tuple[float, ...]:
             yaml.stat().st_size, yaml.stat().st_mtime, float(last.split(b',')[0]))
 
 
-def strength_zero(labels: Sequence[Label], answers: Sequence[Answer]) -> dict[str, Any]:
+def strength_zero(trials: Sequence[Trial]) -> dict[str, Any]:
     """Compare trials whose effect has strength zero with trials without an effect."""
-    pairs = list(zip(labels, answers))
-    zero, none = ([answer.gap for label, answer in pairs if label.group == group]
+    zero, none = ([trial.answer.gap for trial in trials if trial.label.group == group]
                   for group in ('zero', 'none'))
-    named = sum(label.effects[0] in answer.named for label, answer in pairs
-                if label.group == 'zero')
+    named = sum(trial.label.effects[0] in trial.answer.named for trial in trials
+                if trial.label.group == 'zero')
     if not zero or not none:
         return {'score': None, 'chance': None, 'p': 1.0, 'leaks': False, 'named': named}
     p = float(scipy.stats.fisher_exact([[sum(zero), len(zero) - sum(zero)],

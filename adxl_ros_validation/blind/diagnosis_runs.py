@@ -8,18 +8,15 @@ from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 import hashlib
-from importlib.metadata import PackageNotFoundError, version
-import io
 import json
 import os
 from pathlib import Path
 import resource
-import signal
 import subprocess
 import sys
 import tempfile
 import time
-from typing import Any, NamedTuple
+from typing import Any
 
 import adxl_ros
 from adxl_ros.errors import UserError
@@ -27,9 +24,10 @@ from adxl_ros.workers import for_each, make_folder, write
 from adxl_ros_validation.blind import trials
 from adxl_ros_validation.blind.trials import Label
 from adxl_ros_validation.blind.world import ideal_observer
-from adxl_ros_validation.blind.world.fault_table import KINDS
-from adxl_ros_validation.blind.world.simulator import Fault, render
+from adxl_ros_validation.blind.world.faults import KINDS
+from adxl_ros_validation.blind.world.simulator import Fault, Scene
 import numpy as np
+import pandas as pd
 import yaml
 
 _ENVIRONMENT = ('PATH', 'LD_LIBRARY_PATH', 'PYTHONPATH', 'AMENT_PREFIX_PATH', 'VIRTUAL_ENV',
@@ -53,41 +51,34 @@ def call(command: Sequence[str], folder: Path) -> tuple[int, str]:
     # Each process uses one core: linear algebra must not use the others.
     environment |= {'HOME': str(folder), 'OPENBLAS_NUM_THREADS': '1', 'OMP_NUM_THREADS': '1',
                     'MPLCONFIGDIR': str(folder)}
-    with subprocess.Popen(command, cwd=folder, env=environment, stdin=subprocess.DEVNULL,
-                          stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-                          start_new_session=True) as process:
-        try:
-            error = process.communicate(timeout=_TIMEOUT_S)[1]
-            crashed = 'traceback: ' if 'Traceback (most recent' in error else ''
-            return process.returncode, crashed + (error.strip().splitlines() or [''])[-1]
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            return 1, f'not finished after {_TIMEOUT_S:.0f} s'
-        except BaseException:
-            os.killpg(process.pid, signal.SIGKILL)
-            raise
+    try:
+        done = subprocess.run(command, cwd=folder, env=environment, stdin=subprocess.DEVNULL,
+                              stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+                              timeout=_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        return 1, f'not finished after {_TIMEOUT_S:.0f} s'
+    crashed = 'traceback: ' if 'Traceback (most recent' in done.stderr else ''
+    return done.returncode, crashed + (done.stderr.strip().splitlines() or [''])[-1]
 
 
-def diagnose(name: str, recording: bytes, parameters: bytes, command: Sequence[str] | None,
-             sim: bytes | None = None) -> tuple[str, Result]:
+def diagnose(name: str, recording: bytes, parameters: bytes, sim: bytes | None = None
+             ) -> tuple[str, Result]:
     """Diagnose a recording in a folder that has nothing but it, its parameters and its `sim`."""
     with tempfile.TemporaryDirectory(prefix='diagnose_') as temporary:
         folder = Path(temporary)
-        csv, yaml, out = folder / f'{name}.csv', folder / f'{name}.yaml', folder / 'out'
-        force = folder / f'{name}_sim.csv'
-        for path, data in ((csv, recording), (yaml, parameters), (force, sim)):
+        for suffix, data in (('.csv', recording), ('.yaml', parameters), ('_sim.csv', sim)):
             if data is not None:
-                path.write_bytes(data)
-                os.utime(path, (0, 0))
-        arguments = [*(command or executable('diagnose')), csv.name, '--params', yaml.name,
-                     '-o', out.name, '--json', '--seed', '0',
-                     *(['--sim', force.name] if sim else [])]
+                (folder / f'{name}{suffix}').write_bytes(data)
+                os.utime(folder / f'{name}{suffix}', (0, 0))
+        arguments = [*executable('diagnose'), f'{name}.csv', '--params',
+                     f'{name}.yaml', '-o', 'out', '--json', '--seed', '0',
+                     *(['--sim', f'{name}_sim.csv'] if sim else [])]
         start, cpu = time.monotonic(), _children_cpu_s()
         status, error = call(arguments, folder)
         seconds, cpu = time.monotonic() - start, _children_cpu_s() - cpu
-        report, params = out / 'report.json', out / 'params.yaml'
+        params = folder / 'out' / 'params.yaml'
         try:
-            content = json.loads(report.read_bytes())
+            content = json.loads(params.with_name('report.json').read_bytes())
         except (OSError, ValueError) as problem:
             content, error = None, error or f'no report: {problem}'
         return name, {'report': content, 'seconds': seconds, 'cpu_s': cpu,
@@ -101,10 +92,10 @@ def _children_cpu_s() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def diagnose_all(folder: Path, command: Sequence[str] | None, pool: Executor,
-                 show: Callable[[float], None]) -> dict[str, Result]:
+def diagnose_all(folder: Path, pool: Executor, show: Callable[[float], None]
+                 ) -> dict[str, Result]:
     """Diagnose all recordings of a folder that have no report yet."""
-    reports, code = make_folder(folder / 'reports'), code_version(command)
+    reports, code = make_folder(folder / 'reports'), code_version()
     stamp = reports / 'version.txt'
     if stamp.exists() and stamp.read_text() != code:
         raise UserError(f'{stamp}: earlier reports are of another version of the diagnosis '
@@ -118,7 +109,7 @@ def diagnose_all(folder: Path, command: Sequence[str] | None, pool: Executor,
         source = folder / 'recordings' / name
         sim = source.with_suffix('.sim')
         return (name, source.with_suffix('.csv').read_bytes(),
-                source.with_suffix('.yaml').read_bytes(), command,
+                source.with_suffix('.yaml').read_bytes(),
                 sim.read_bytes() if sim.exists() else None)
 
     def keep(name: str, result: Result) -> None:
@@ -126,34 +117,21 @@ def diagnose_all(folder: Path, command: Sequence[str] | None, pool: Executor,
 
     for_each(pool, diagnose, [partial(job, name) for name in todo], keep, show,
              len(names) - len(todo))
-    if code_version(command) != code:
+    if code_version() != code:
         raise UserError('the code of the diagnosis changed while it ran; draw a new check into '
                         'another folder, and do not change the package meanwhile')
     return {name: json.loads((reports / f'{name}.json').read_bytes()) for name in names}
 
 
-def code_version(command: Sequence[str] | None) -> str:
-    """Hash the code of the diagnosis: the package, or the command's files."""
+def code_version() -> str:
+    """Hash the code of the diagnosis."""
     hashed = hashlib.sha256()
-    if command is None:
-        files = sorted(Path(adxl_ros.__file__).parent.rglob('*.py'))
-    else:
-        files = [Path(word) for word in command[1:] if Path(word).is_file()]
-        hashed.update(repr(list(command)).encode())
-    for path in files:
+    for path in sorted(Path(adxl_ros.__file__).parent.rglob('*.py')):
         hashed.update(path.name.encode() + path.read_bytes())
     return hashed.hexdigest()
 
 
-def package_version() -> str:
-    """Return the version of this package; 'unknown' when it runs from its source."""
-    try:
-        return version('adxl_ros')
-    except PackageNotFoundError:
-        return 'unknown'
-
-
-NOISE_LIKE = frozenset(name for name, kind in KINDS.items() if kind.random and name != 'adc_inl')
+NOISE_LIKE = frozenset(name for name, kind in KINDS.items() if kind.random)
 """Effects that are removed before a recording is simulated again, as noise does not repeat."""
 _BLOCK_S = 5.0
 """Length of the blocks of the bootstrap, s; chosen."""
@@ -161,61 +139,56 @@ _RESAMPLES = 400
 """Number of bootstrap samples; chosen."""
 
 
-def evaluate(label: Label, stated: str, fitted: str | None
-             ) -> tuple[str, dict[str, Any] | None]:
-    """Simulate a held-out recording of a trial, with and without what the diagnosis found."""
-    faults = [fault for fault in trials.faults_of(label) if fault.kind.name not in NOISE_LIKE]
-    if not changed(stated, fitted) and not faults:
-        return label.name, None
-    held_out = trials.scene(label.seed, label.seconds, held_out=True)
-    unit = held_out.unit
-    measured = render(unit, held_out.manoeuvre, trials.faults_of(label), held_out.seed)
-    compared = Comparison(held_out, held_out.force(), measured,
-                          trials.recording(label, held_out=True))
+class Comparison:
+    """Another recording of a unit, simulated with the stated and with the fitted parameters."""
 
-    def clean(acting: list[Fault]) -> np.ndarray:
-        return render(unit, held_out.manoeuvre, acting, held_out.seed, noise=False)
-
-    baseline, without_faults = simulated(compared.csv, stated), clean([])
-    before = compared.squares(baseline)
-    after, error = compared.after(before, stated, fitted)
-    # The package's simulator follows the rounded encoder; the world's own effect is added to it.
-    floor, oracle = (compared.squares(baseline + clean(acting) - without_faults)
-                     for acting in (faults, _fitted(label, faults)))
-    gap_ci, harm_ci = (compared.interval(row) for row in (before - floor, after - before))
-    return label.name, {'before': before.mean(), 'after': after.mean(), 'oracle': oracle.mean(),
-                        'floor': floor.mean(), 'gap_ci': gap_ci, 'harm_ci': harm_ci,
-                        'error': error}
-
-
-class Comparison(NamedTuple):
-    """A held-out recording, to compare simulations with it."""
-
-    scene: ideal_observer.Scene
-    force: np.ndarray  # specific force along each axis, m/s², (m, n)
-    measured: np.ndarray  # volts, (m, n)
-    csv: str
+    def __init__(self, scene: Scene, faults: list[Fault], stated: str, fitted: str | None) -> None:
+        self._scene, self._force = scene, scene.force()
+        self._measured, csv = scene.volts(faults), scene.recording(faults)
+        self.baseline = simulated(csv, stated)
+        self.before = self.after = self.squares(self.baseline)
+        self.error: str | None = None
+        if fitted is not None and changed(stated, fitted):
+            try:
+                self.after = self.squares(simulated(csv, fitted))
+            except UserError as problem:
+                # A parameter file that cannot be simulated closes nothing.
+                self.error = str(problem)
 
     def squares(self, volts: np.ndarray) -> np.ndarray:
         """Return the squared gap beyond the stated calibration of each sample, (m/s²)², (n,)."""
-        gap = (self.measured - volts) * self.scene.unit.volts_to_mps2
-        rest = ideal_observer.beyond_calibration(self.scene.unit, gap, self.force)
+        unit = self._scene.unit
+        rest = ideal_observer.beyond_calibration(
+            unit, (self._measured - volts) * unit.volts_to_mps2, self._force)
         return np.mean(rest ** 2, axis=0)
-
-    def after(self, before: np.ndarray, stated: str, fitted: str | None
-              ) -> tuple[np.ndarray, str | None]:
-        """Return the squares with the fitted parameters, and why they cannot be simulated."""
-        if fitted is None or not changed(stated, fitted):
-            return before, None
-        try:
-            return self.squares(simulated(self.csv, fitted)), None
-        except UserError as problem:
-            # A parameter file that cannot be simulated closes nothing.
-            return before, str(problem)
 
     def interval(self, values: np.ndarray) -> list[float]:
         """Return the 90 % interval of a mean by resampling blocks."""
-        return _interval(values, int(_BLOCK_S * self.scene.unit.rate_hz))
+        block = int(_BLOCK_S * self._scene.unit.rate_hz)
+        means = np.array([part.mean() for part in np.array_split(
+            values, max(len(values) // block, 2))])
+        rng = np.random.default_rng(0)
+        drawn = means[rng.integers(len(means), size=(_RESAMPLES, len(means)))].mean(axis=1)
+        return [float(q) for q in np.quantile(drawn, (0.05, 0.95))]
+
+
+def evaluate(label: Label, stated: str, fitted: str | None
+             ) -> tuple[str, dict[str, Any] | None]:
+    """Simulate a held-out recording of a trial, with and without what the diagnosis found."""
+    faults = [fault for fault in label.acting() if not fault.kind.random]
+    if not changed(stated, fitted) and not faults:
+        return label.name, None
+    scene = trials.scene(label, held_out=True)
+    compared = Comparison(scene, label.acting(), stated, fitted)
+    without_faults = scene.volts([], noise=False)
+    # The package's simulator follows the rounded encoder; the world's own effect is added to it.
+    floor, oracle = (compared.squares(
+        compared.baseline + scene.volts(acting, noise=False) - without_faults)
+        for acting in (faults, _fitted(label, faults)))
+    before, after = compared.before, compared.after
+    return label.name, {'before': before.mean(), 'after': after.mean(), 'oracle': oracle.mean(),
+                        'floor': floor.mean(), 'gap_ci': compared.interval(before - floor),
+                        'harm_ci': compared.interval(after - before), 'error': compared.error}
 
 
 def changed(stated: str, fitted: str | None) -> bool:
@@ -240,37 +213,22 @@ def simulated(csv: str, parameters: str) -> np.ndarray:
         (folder / 'held.csv').write_text(csv)
         (folder / 'held.yaml').write_text(yaml.safe_dump(
             {'/**': {'ros__parameters': _without_noise(parameters)}}))
-        status, error = call(
-            [*executable('simulate'), 'held.csv', '--params', 'held.yaml',
-             '-o', 'again.csv'], folder)
+        status, error = call([*executable('simulate'), 'held.csv', '--params', 'held.yaml',
+                              '-o', 'again.csv'], folder)
         if status:
             raise UserError(f'simulate: {error}')
-        lines = [line for line in (folder / 'again.csv').read_text().splitlines()
-                 if not line.startswith('#')]
-    names = lines[0].split(',')
-    rows = np.loadtxt(io.StringIO('\n'.join(lines[1:])), delimiter=',', ndmin=2, usecols=[
-        names.index(name) for name in ('x_v', 'y_v', 'z_v') if name in names])
-    return rows.T
+        table = pd.read_csv(folder / 'again.csv', comment='#', float_precision='round_trip')
+    return table[[name for name in ('x_v', 'y_v', 'z_v') if name in table]].to_numpy().T
 
 
 def _fitted(label: Label, faults: list[Fault]) -> list[Fault]:
     """Fit the sizes of the true faults, in their true forms, to the recording of the trial."""
     if not faults:
         return []
-    drawn = trials.scene(label.seed, label.seconds)
+    drawn = trials.scene(label)
     observer = ideal_observer.IdealObserver(drawn)
-    volts = render(drawn.unit, drawn.manoeuvre, trials.faults_of(label), drawn.seed)
-    gap = (volts - drawn.unit.stated_zero_v[:, None]) * drawn.unit.volts_to_mps2 - observer.force
     columns = np.stack([observer.project(drawn.response([fault])) for fault in faults], axis=1)
-    sizes = np.linalg.lstsq(columns, observer.project(gap), rcond=None)[0]
+    gap = observer.project(drawn.gap(label.acting()))
+    sizes = np.linalg.lstsq(columns, gap, rcond=None)[0]
     return [replace(fault, size=fault.size * float(np.clip(size, 0, 2)))
             for fault, size in zip(faults, sizes)]
-
-
-def _interval(values: np.ndarray, block: int) -> list[float]:
-    """Return the 90 % interval of a mean by resampling blocks."""
-    means = np.array([part.mean() for part in np.array_split(
-        values, max(len(values) // block, 2))])
-    rng = np.random.default_rng(0)
-    drawn = means[rng.integers(len(means), size=(_RESAMPLES, len(means)))].mean(axis=1)
-    return [float(q) for q in np.quantile(drawn, (0.05, 0.95))]

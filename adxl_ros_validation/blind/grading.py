@@ -3,18 +3,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, field
 from itertools import combinations, permutations, product
 import math
 from typing import Any
 
 from adxl_ros_validation.blind import trials
 from adxl_ros_validation.blind.trials import Label
-from adxl_ros_validation.blind.world.fault_table import KNOWN
+from adxl_ros_validation.blind.world.faults import KNOWN
 from adxl_ros_validation.blind.world.simulator import G0, Unit
 import numpy as np
-import scipy
 
 UNKNOWN = 'unknown'
 MATERIAL_MPS2 = 0.1e-3 * G0
@@ -26,24 +25,20 @@ CERTAIN_POWER = 0.9
 _NOISE_BAND_HZ = 78.5
 """Noise bandwidth of the 50 Hz output filter, Hz: π/2 of its corner."""
 
-_SMALLEST_WIDTH = 1e-30
-"""Smallest width of an interval, in any unit, so that an interval of one value divides by it."""
-
 
 @dataclass(frozen=True)
 class Answer:
     """What a report answers."""
 
     status: str  # status of the verdict; 'failed' without a report
-    certain: frozenset[str]  # effects that the verdict names for certain
-    groups: tuple[frozenset[str], ...]  # groups of which the verdict names one effect each
-    probability: float  # probability of the verdict by the report
+    certain: frozenset[str] = frozenset()  # effects that the verdict names for certain
+    groups: tuple[frozenset[str], ...] = ()  # of each of which the verdict names one effect
+    probability: float = 0.0  # probability of the verdict by the report
     # effects and probability of each hypothesis
-    hypotheses: tuple[tuple[frozenset[str], float], ...]
+    hypotheses: tuple[tuple[frozenset[str], float], ...] = ((frozenset(), 0.0),)
     # value, and ends of the 90 % interval, by parameter
-    parameters: dict[str, tuple[float, float, float]]
-    seconds: float  # run time, s
-    closed: float | None = None  # share of the gap that is closed; None without one
+    parameters: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    seconds: float = 0.0  # run time, s
     material_mps2: float = MATERIAL_MPS2  # amplitude from which an effect counts
     limit_mps2: float | None = None  # upper limit of the gap; None where none is stated
 
@@ -81,12 +76,11 @@ def answer(result: dict[str, Any]) -> Answer:
         return Answer(verdict['status'], certain,
                       tuple(frozenset(group) for group in verdict['groups']),
                       float(verdict['probability']), hypotheses or ((frozenset(), 0.0),),
-                      parameters, float(result['seconds']), report['gap'].get('closed'),
+                      parameters, float(result['seconds']),
                       float(report.get('material') or MATERIAL_MPS2),
                       report['gap'].get('upper_limit'))
     except (KeyError, TypeError, ValueError, AttributeError):
-        return Answer('failed', frozenset(), (), 0.0, ((frozenset(), 0.0),), {},
-                      float(result['seconds']))
+        return Answer('failed', seconds=float(result['seconds']))
 
 
 def truth(label: Label) -> frozenset[str]:
@@ -171,21 +165,22 @@ def brier(answer: Answer, label: Label) -> float:
     return (1 - correct) ** 2 + wrong
 
 
-def ranks(answer: Answer, label: Label) -> dict[str, float]:
-    """
-    Return the rank of the truth in the posterior of each parameter that means the same.
-
-    The rank is the probability that the report gives to values below the truth. Its 90 % interval
-    is that of a normal posterior, whose halves may have different widths.
-    """
-    rank_by_name = {}
-    for name, true in true_parameters(label).items():
-        if name in answer.parameters:
-            value, low, high = answer.parameters[name]
-            half_width = high - value if true > value else value - low
-            z = (true - value) * scipy.stats.norm.ppf(0.95) / max(half_width, _SMALLEST_WIDTH)
-            rank_by_name[name] = float(scipy.stats.norm.cdf(z))
-    return rank_by_name
+_PARAMETERS: dict[str, tuple[tuple[str, int, float, int | None], ...]] = {
+    'gravity': (('offset_mps2', 0, G0, None),),
+    'time_offset': (('offset_s', 0, 1, None),),
+    'lever_arm': (('x_m', 0, 1, None), ('y_m', 1, 1, None), ('z_m', 2, 1, None)),
+    'stage_offset': (('alpha_rad', 0, 1, 0), ('beta_rad', 1, 1, 3)),
+    'base_tilt': (('x_rad', 1, -1, None), ('y_rad', 0, 1, None)),
+    'backlash': (('alpha_rad', 0, 1, None), ('beta_rad', 1, 1, None)),
+    'stage_eccentricity': (('beta_sine_rad', 0, 1, 4), ('beta_cosine_rad', 1, 1, 5),
+                           ('alpha_sine_rad', 2, 1, 1), ('alpha_cosine_rad', 3, 1, 2)),
+    # Equations 18 and 19, to first order, of the directions xy, xz, yx, yz, zx, zy.
+    'misalignment': (('beta_rad.x', 0, 1, None), ('alpha_rad.x', 1, -1, None),
+                     ('beta_rad.y', 2, -1, None), ('alpha_rad.y', 3, 1, None),
+                     ('beta_rad.z', 4, 1, None), ('alpha_rad.z', 5, -1, None)),
+}
+"""Parameters that mean the same in both worlds: name in the report, weight of the fault, factor,
+and the error of each unit's own stage that adds to it."""
 
 
 def true_parameters(label: Label) -> dict[str, float]:
@@ -195,53 +190,32 @@ def true_parameters(label: Label) -> dict[str, float]:
     A coefficient of another functional form has no counterpart.
     """
     true: dict[str, float] = {}
-    unit = trials.scene(label.seed, label.seconds).unit
-    stage = unit.stage_rad
+    unit = trials.scene(label).unit
     for fault in label.faults:
-        name, size = fault['effect'], fault['size']
-        w = size * np.asarray(fault['shape'].get('w', [0.0]), float)
-        if name in _BY_AXIS:
-            true |= _true_by_axis(name, unit, w)
-        elif name == 'gravity':
-            true['gravity.offset_mps2'] = G0 * w[0]
-        elif name == 'time_offset':
-            true['time_offset.offset_s'] = w[0]
-        elif name == 'lever_arm':
-            true |= {f'lever_arm.{d}_m': v for d, v in zip('xyz', w)}
-        elif name == 'stage_offset':
-            true |= {'stage_offset.alpha_rad': w[0] + stage[0],
-                     'stage_offset.beta_rad': w[1] + stage[3]}
-        elif name == 'base_tilt':
-            true |= {'base_tilt.x_rad': -w[1], 'base_tilt.y_rad': w[0]}
-        elif name == 'backlash':
-            true |= {'backlash.alpha_rad': abs(w[0]), 'backlash.beta_rad': abs(w[1])}
-        elif name == 'stage_eccentricity':
-            true |= {f'stage_eccentricity.{part}_rad': v + stage[i] for part, v, i in zip(
-                ('beta_sine', 'beta_cosine', 'alpha_sine', 'alpha_cosine'), w, (4, 5, 1, 2))}
-        elif name == 'misalignment':
-            # Equations 18 and 19, to first order, of the directions xy, xz, yx, yz, zx, zy.
-            true |= {f'misalignment.{part}_rad.{d}': sign * v for part, d, sign, v in zip(
-                ('beta', 'alpha', 'beta', 'alpha', 'beta', 'alpha'), 'xxyyzz',
-                (1, -1, -1, 1, 1, -1), w)}
-        elif name == 'mount_resonance':
+        name = fault['effect']
+        w = fault['size'] * np.asarray(fault['shape'].get('w', []), float)
+        true |= {f'{name}.{part}': float(factor * w[i] + (0 if own is None else
+                                                          unit.stage_rad[own]))
+                 for part, i, factor, own in _PARAMETERS.get(name, ()) if i < len(w)}
+        true |= {f'{name}.{part}.{axis}': float(value)
+                 for part, values in _by_axis(name, unit, w).items()
+                 for axis, value in zip(unit.axes, values)}
+        if name == 'mount_resonance':
             true['mount_resonance.frequency_hz'] = fault['shape']['hertz']
     return true
 
 
-_BY_AXIS = ('bias', 'scale_factor', 'noise_excess')
-
-
-def _true_by_axis(name: str, unit: Unit, w: np.ndarray) -> dict[str, float]:
+def _by_axis(name: str, unit: Unit, w: np.ndarray) -> dict[str, np.ndarray]:
     """Return the true values of a parameter that each axis has."""
     w = w[:len(unit.axes)]
     if name == 'bias':
-        values, parameter = unit.zero_v + w * unit.scale_v_per_g - 2.5, 'offset_v'
-    elif name == 'scale_factor':
-        values, parameter = unit.scale_v_per_g * (1 + w) - 1.0, 'offset_v_per_g'
-    else:
+        return {'offset_v': unit.zero_v + w * unit.scale_v_per_g - 2.5}
+    if name == 'scale_factor':
+        return {'offset_v_per_g': unit.scale_v_per_g * (1 + w) - 1.0}
+    if name == 'noise_excess':
         noise = np.hypot(unit.noise_g_per_rthz, w / unit.scale_v_per_g / _NOISE_BAND_HZ ** 0.5)
-        values, parameter = noise / unit.stated_noise_g_per_rthz - 1, 'ratio'
-    return {f'{name}.{parameter}.{axis}': value for axis, value in zip(unit.axes, values)}
+        return {'ratio': noise / unit.stated_noise_g_per_rthz - 1}
+    return {}
 
 
 COMPONENTS = (*KNOWN, UNKNOWN)
@@ -295,38 +269,8 @@ def true_group(label: Label) -> set[Diagnosis]:
     Each effect can be replaced by one that the recording cannot separate from it. Effects that the
     ideal observer does not see are missing, as the competition uses diagnoses of the least size.
     """
-    visible = [fault for fault in label.faults if fault['power'] >= VISIBLE_POWER] \
-        if label.group != 'zero' else []
-    choices: list[Iterable[str]] = [
-        [UNKNOWN if label.group == 'outside' else fault['effect'], *fault['inseparable']]
-        for fault in visible]
-    diagnoses = {frozenset(choice) for choice in product(*choices)}
-    return {diagnosis for diagnosis in diagnoses if len(diagnosis) == len(visible)}
-
-
-def answers(labels: Sequence[Label]) -> dict[str, list[Answer]]:
-    """
-    Return the answers of all reference methods.
-
-    `Null` never names an effect, `Random` names one at random, and `Worst` names all together.
-    They are the references of the diagnosis competition (github.com/jdekleer/dxc26synth,
-    RandomDiagnoser.py).
-    Guessing draws from the mix of the check. The others choose by the smallest residual or by the
-    smallest BIC for white noise, with the responses of the check's own world.
-    """
-    rng = np.random.default_rng(0)
-    effects: dict[str, list[frozenset[str]]] = {
-        'BIC, white noise': [frozenset(filter(None, [label.plain['bic']])) for label in labels],
-        'smallest RMSE': [frozenset({label.plain['rmse']}) for label in labels],
-        'guess by the mix': [truth(labels[i]) for i in rng.permutation(len(labels))],
-        'Null': [frozenset()] * len(labels),
-        'Random': [frozenset({str(name)}) for name in rng.choice(COMPONENTS, len(labels))],
-        'Worst': [frozenset(COMPONENTS)] * len(labels),
-    }
-    return {name: [certain(row) for row in rows] for name, rows in effects.items()}
-
-
-def certain(effects: frozenset[str]) -> Answer:
-    """Return an answer that names effects for certain."""
-    status = 'no_gap' if not effects else 'unknown' if UNKNOWN in effects else 'explained'
-    return Answer(status, effects, (), 1.0, ((effects, 1.0),), {}, 0.0)
+    choices = [[UNKNOWN if label.group == 'outside' else fault['effect'], *fault['inseparable']]
+               for fault in label.faults
+               if fault['power'] >= VISIBLE_POWER and label.group != 'zero']
+    diagnoses = map(frozenset, product(*choices))
+    return {diagnosis for diagnosis in diagnoses if len(diagnosis) == len(choices)}

@@ -9,10 +9,10 @@ rest (the baseline) is there already, and no error.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 import hashlib
 import json
@@ -22,13 +22,30 @@ import tempfile
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.workers import for_each, make_folder, write
-from adxl_ros_validation.blind import diagnosis_runs, grading, report_html, scores, trials
+from adxl_ros.workers import make_folder, write
+from adxl_ros_validation.blind import (
+    diagnosis_runs,
+    grading,
+    report_html,
+    scores,
+    sealing,
+    trials,
+)
 from adxl_ros_validation.blind.grading import Answer, UNKNOWN
-from adxl_ros_validation.blind.trials import Drawn, Label, Plan, Setup
-from adxl_ros_validation.blind.world import fault_table, ideal_observer
-from adxl_ros_validation.blind.world.simulator import Fault, FaultKind, G0, Place, Run, Unit
+from adxl_ros_validation.blind.trials import Drawn, Label, Plan
+from adxl_ros_validation.blind.world import ideal_observer
+from adxl_ros_validation.blind.world.faults import KINDS, KNOWN
+from adxl_ros_validation.blind.world.simulator import (
+    csv_text,
+    Fault,
+    G0,
+    parameter_file,
+    Place,
+    Run,
+    Unit,
+)
 import numpy as np
+import pandas as pd
 import scipy
 import yaml
 
@@ -50,15 +67,13 @@ _STILL_G = 0.05
 """Largest change of the force of a sensor that rests, g rms."""
 _REST_S = 1.5
 """Shortest rest, s."""
-_NO_PLACE = frozenset(['cogging', 'rate_pull', 'aftermath', 'motor_current', 'magnet', 'supply',
-                       'bandwidth', 'saturation', 'flicker'])
+_NO_PLACE = frozenset(['cogging', 'rate_pull', 'supply', 'bandwidth', 'saturation', 'flicker'])
 """Defects of joints, supply and filter, which need more than samples; sensors have flicker."""
 _OF_TEMPERATURE = frozenset(['temperature_bias', 'temperature_scale', 'thermal_loop'])
 _OF_MOTION = frozenset(['time_offset', 'clock_skew', 'vibration_rectification', 'creep'])
 _OF_FORCE = frozenset(['scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z',
-                       'scale_factor_cross', 'scale_factor_z', 'nonlinearity', 'quadratic',
-                       'hysteresis', 'ripple', 'dead_zone', 'product', 'loose_gain',
-                       'fading_gain', 'adc_inl'])
+                       'scale_factor_z', 'nonlinearity', 'quadratic', 'hysteresis', 'dead_zone',
+                       'product', 'loose_gain', 'adc_inl'])
 Show = Callable[[str], AbstractContextManager[Callable[[float], None]]]
 
 
@@ -85,14 +100,26 @@ class Half:
         return np.stack([self.columns[f'a{d}_mps2'] / G0 if f'a{d}_mps2' in self.columns
                          else self.columns[f'{d}_v'] - _ZERO_V for d in self.axes])
 
-    def kinds(self, table: Mapping[str, FaultKind]) -> list[str]:
+    def texts(self) -> tuple[str, str, str | None]:
+        """Return recording, parameters and another simulator's force as texts of files."""
+        return (csv_text(self.columns, self.digits), self.parameters,
+                csv_text(self.sim, self.digits) if self.sim else None)
+
+    def unit(self) -> Unit:
+        """Return a unit of 2.5 V and 1 V/g with the axes of the recording."""
+        one = np.ones(len(self.axes))
+        rate_hz = 1 / float(np.median(np.diff(self.columns['time_s'])))
+        return Unit(self.axes, _ZERO_V * one, one, _ZERO_V * one, one, one, one, math.inf, one,
+                    one, 0.0, np.zeros(6), rate_hz)
+
+    def kinds(self) -> list[str]:
         """Return the defects that can be put into its samples and shown by its reference."""
         warm = self.columns.get('temperature_c', np.zeros(1))
         out = set(_NO_PLACE)
         out |= set() if np.ptp(warm) > 3 else _OF_TEMPERATURE
         out |= _OF_MOTION if self.reference == 'rests' else set()
         out |= _OF_FORCE | _OF_MOTION if np.std(self.g(), axis=1).max() < _STILL_G else set()
-        return [name for name, kind in table.items() if name not in out and (
+        return [name for name, kind in KINDS.items() if name not in out and (
             kind.place not in (Place.STAGE, Place.MOUNT) or name in _OF_MOTION)]
 
 
@@ -135,22 +162,15 @@ def _sources(source: Path) -> list[tuple[Path, Path | None, str]]:
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, int]]:
     """Read the columns of a CSV file, and their digits after the point."""
-    lines = [row for row in path.read_text(encoding='utf-8').splitlines()
-             if row and not row.startswith('#')]
-    names = lines[0].split(',')
-    table = np.genfromtxt(lines[1:], delimiter=',', ndmin=2)
-    cells = [row.split(',') for row in lines[1:200]]
-    if table.shape[1] != len(names) or 'time_s' not in names:
+    try:
+        cells = pd.read_csv(path, comment='#', dtype=str, keep_default_na=False)
+        columns = {name: cells[name].replace('', 'nan').to_numpy(float) for name in cells}
+    except ValueError as error:
+        raise UserError(f'is no recording of this project: {error}') from None
+    if 'time_s' not in columns:
         raise UserError('is no recording of this project: its first line names no time_s')
-    return dict(zip(names, table.T)), {
-        name: max(len(row[i].partition('.')[2]) for row in cells) for i, name in enumerate(names)}
-
-
-def _text(columns: dict[str, np.ndarray], digits: dict[str, int]) -> str:
-    """Return columns as CSV; what is not known is empty."""
-    formats = ','.join(f'%.{digits.get(name, 6)}f' for name in columns)
-    rows = [formats % tuple(row) for row in np.stack(list(columns.values()), axis=1).tolist()]
-    return '\n'.join([','.join(columns), *rows, '']).replace('nan', '')
+    return columns, {name: int(cells[name][:200].str.partition('.')[2].str.len().max())
+                     for name in cells}
 
 
 def _part(columns: dict[str, np.ndarray], start: float, stop: float) -> dict[str, np.ndarray]:
@@ -178,7 +198,7 @@ def _half(path: Path, sim_path: Path | None) -> Half:
     with tempfile.TemporaryDirectory(prefix='half_') as temporary:
         folder = Path(temporary)
         for name, half in (('first', first), ('second', second)):
-            (folder / f'{name}.csv').write_text(_text(half.columns, digits))
+            (folder / f'{name}.csv').write_text(half.texts()[0])
         second = replace(second, parameters=_fitted(folder, 'temperature_c' in columns))
         if kind == 'rests':
             angles = _angles_at_rest(_applied(folder), second.columns['time_s'])
@@ -205,22 +225,14 @@ def _against_force(first: Half) -> str:
     lines = []
     for d, row in zip(first.axes, first.g()):
         force = np.interp(first.columns['time_s'], first.sim['time_s'], first.sim[f'a{d}_mps2'])
-        lines.append(np.linalg.lstsq(np.column_stack([np.ones_like(force), force / G0]), row,
-                                     rcond=None)[0])
+        lines.append(ideal_observer.line(force / G0, row))
     zero, scale = np.transpose(lines)
-    rate = _unit(first).rate_hz
-    n, density = len(first.axes), _noise(first) / G0 / math.sqrt(rate / 2)
-    return yaml.safe_dump({'/**': {'ros__parameters': {
-        'format': 1, 'units': 'V, V/g, 1/g, rad', 'model': 'linear',
-        'sensor': {
-            'serial': 'unit', 'axes': first.axes, 'nominal_zero_g_v': [0.0] * n,
-            'nominal_scale_v_per_g': [1.0] * n, 'noise_density_g_per_rthz': [density] * n,
-            'rc_resistance_ohm': 10000.0, 'rc_capacitance_f': 0.0, 'adc_bits': 0,
-            'adc_vref_v': 100.0, 'rate_hz': rate, 'range_g': 16.0, 'local_gravity_mps2': G0,
-            'z_sign': 1},
-        'stage': {'resolution_rad': 1e-3}, 'effects': ['bias', 'scale_factor'],
-        'bias': {'offset_v': zero.tolist()},
-        'scale_factor': {'offset_v_per_g': (scale - 1).tolist()}}}})
+    unit = first.unit()
+    density = np.full(len(first.axes), _noise(first) / G0 / math.sqrt(unit.rate_hz / 2))
+    return parameter_file(
+        replace(unit, stated_zero_v=zero, stated_scale_v_per_g=scale,
+                stated_noise_g_per_rthz=density, resolution_rad=1e-3),
+        'unit', nominal_zero_v=0.0, is_certain=True, adc_bits=0, adc_vref_v=100.0, range_g=16.0)
 
 
 def _applied(folder: Path) -> np.ndarray:
@@ -266,17 +278,16 @@ def _noise(half: Half) -> float:
     return float(np.sqrt(np.mean(quiet)) * G0)
 
 
-def plans(seed: int, count: int, halves: Sequence[Half], table: Mapping[str, FaultKind]
-          ) -> list[Plan]:
+def plans(halves: Sequence[Half], seed: int, count: int) -> list[Plan]:
     """Plan trials: recordings and defects in turn, a quarter without any."""
     rng = np.random.default_rng([seed, 3])
     rows: list[tuple[int, str, int, tuple[str, ...]]] = []
-    used = dict.fromkeys(table, 0)
+    used = dict.fromkeys(KINDS, 0)
     for k in range(count):
         half = k % len(halves)
         group = str(rng.choice(['none', 'outside', 'single'], p=(*_SHARES, 1 - sum(_SHARES))))
-        names = [name for name in halves[half].kinds(table)
-                 if table[name].in_library == (group == 'single')]
+        names = [name for name in halves[half].kinds()
+                 if (name in KNOWN) == (group == 'single')]
         if group == 'none' or not names:
             rows.append((k, 'none', half, ()))
             continue
@@ -284,50 +295,38 @@ def plans(seed: int, count: int, halves: Sequence[Half], table: Mapping[str, Fau
         name = str(rng.choice([name for name in names if used[name] == fewest]))
         used[name] += 1
         rows.append((k, group, half, (name,)))
-    order = rng.permutation(count)
-    return [Plan(f'r{i:04d}', rows[k][1], rows[k][3], (seed, 4, int(k), rows[k][2]))
-            for i, k in enumerate(order)]
+    drawn = [rows[k] for k in rng.permutation(count)]
+    return [Plan(f'r{i:04d}', group, effects, (seed, 4, k, half))
+            for i, (k, group, half, effects) in enumerate(drawn)]
 
 
-def draw(halves: Sequence[Half], table: Mapping[str, FaultKind], plan: Plan) -> Drawn:
+def draw(halves: Sequence[Half], plan: Plan) -> Drawn:
     """Cut a part of a later part and put the defect of a plan into it."""
     half, rng = halves[plan.seed[-1]], np.random.default_rng([*plan.seed, 0])
     end = float(half.columns['time_s'][-1])
     start = float(rng.uniform(0, (1 - _PART) * end))
     half = replace(half, columns=_part(half.columns, start, start + _PART * end),
                    sim=_part(half.sim, start, start + _PART * end) if half.sim else None)
-    label = Label(plan.name, plan.group, plan.effects, plan.seed, plan.seconds,
-                  f'{half.name} by {half.reference}', half.axes, half.noise_mps2)
-    changed = half.g()
+    faults, changed = [], half.g()
     for name in plan.effects:
-        kind = table[name]
+        kind = KINDS[name]
         wanted = half.noise_mps2 * math.exp(rng.uniform(*np.log(_NOISES)))
-        shape = kind.draw(rng, _unit(half))
-        fault, changed = trials.sized(partial(_with_fault, half, plan.seed),
-                                      Fault(kind, kind.start, shape), wanted)
-        label = replace(label, faults=[{
-            'effect': name, 'size': fault.size, 'noise_like': kind.random, 'power': 1.0,
-            'told': 1.0, 'inseparable': [], 'shape': {
-                key: np.asarray(value).tolist() for key, value in shape.items()},
-            'strength_mps2': _strength(half, changed - half.g(), kind)}])
+        fault, strength, changed = trials.sized(
+            partial(_with_fault, half, plan.seed),
+            Fault(kind, kind.start, kind.draw(rng, half.unit())), wanted)
+        faults.append(trials.described(fault, strength))
     columns = dict(half.columns)
     for d, row in zip(half.axes, changed):
-        columns |= {f'a{d}_mps2': row * G0} if f'a{d}_mps2' in columns else {
+        columns |= {f'a{d}_mps2': G0 * row} if f'a{d}_mps2' in columns else {
             f'{d}_v': row + _ZERO_V}
-    sim = _text(half.sim, half.digits) if half.sim else None
-    return Drawn(label, _text(columns, half.digits), half.parameters, sim)
-
-
-def _unit(half: Half) -> Unit:
-    """Return a unit of 2.5 V and 1 V/g with the axes of a recording."""
-    one = np.ones(len(half.axes))
-    return Unit(half.axes, _ZERO_V * one, one, _ZERO_V * one, one, one, one, math.inf, one, one,
-                0.0, np.zeros(6), 1 / float(np.median(np.diff(half.columns['time_s']))))
+    return Drawn(Label(**asdict(plan), manoeuvre=f'{half.name} by {half.reference}',
+                       axes=half.axes, floor_mps2=half.noise_mps2, faults=faults),
+                 *replace(half, columns=columns).texts())
 
 
 def _motion(half: Half) -> np.ndarray:
     """Return the force without its noise, m/s², (3, n); an axis that is not measured has 0."""
-    rate = _unit(half).rate_hz
+    rate = half.unit().rate_hz
     force = np.zeros((3, len(half.columns['time_s'])))
     rows = half.g() * G0
     if rate > 3 * _MOTION_HZ:
@@ -339,10 +338,10 @@ def _motion(half: Half) -> np.ndarray:
 
 def _with_fault(half: Half, seed: tuple[int, ...], fault: Fault) -> tuple[float, np.ndarray]:
     """Let a fault act on recorded samples; return its strength, m/s², and samples, g."""
-    unit, before = _unit(half), half.g()
+    unit, before = half.unit(), half.g()
     t = np.arange(before.shape[1]) / unit.rate_hz
     still = np.zeros_like(t)
-    run = Run(unit, t, int(np.random.SeedSequence(seed).generate_state(1)[0]), still, still,
+    run = Run(unit, t, trials.integer_seed(*seed), still, still,
               still, half.columns.get('temperature_c', still + 25.0), still + 5.0,
               corner_hz=math.inf, force=_motion(half))
     run.u = run.force[unit.axis_indices] / G0
@@ -351,41 +350,40 @@ def _with_fault(half: Half, seed: tuple[int, ...], fault: Fault) -> tuple[float,
     fault.kind.act(run, fault.size, fault.shape)
     run.volts = run.volts + run.u - sensed
     if run.late or run.skew:
-        late = run.late + run.skew * (t + 8 * np.sin(t / 25))
-        run.volts = np.stack([np.interp(t - late, t, row) for row in run.volts])
+        run.volts = np.stack([np.interp(t - run.late_s(t), t, row) for row in run.volts])
     after = run.volts - _ZERO_V
-    return _strength(half, after - before, fault.kind), after
+    return _strength(half, after - before, fault.kind.name), after
 
 
-def _strength(half: Half, change: np.ndarray, kind: FaultKind) -> float:
+def _strength(half: Half, change: np.ndarray, name: str) -> float:
     """Return the rms of a change where the reference is known; zero-g and scale are free."""
     known = ~np.isnan(half.columns['alpha_rad']) if half.reference == 'rests' else slice(None)
     rest, force = G0 * change[:, known], half.g()[:, known]
-    if kind.name not in ('bias', 'scale_factor'):
+    if name not in ('bias', 'scale_factor'):
         for row, along in zip(rest, force):
-            line = np.column_stack([np.ones_like(along), along])
-            row -= line @ np.linalg.lstsq(line, row, rcond=None)[0]
+            zero, scale = ideal_observer.line(along, row)
+            row -= zero + scale * along
     return ideal_observer.rms(rest)
 
 
-def seal(folder: Path, source: Path, seed: int, count: int, pool: Executor, show: Show) -> str:
+def seal(folder: Path, source: Path, seed: int | None, count: int, pool: Executor, show: Show
+         ) -> str:
     """Draw the trials of a folder or manifest into a folder; return the published hash."""
-    digest = trials.published_hash(folder)
-    if digest is not None:
+    base, digest = folder / 'baseline' / 'recordings', sealing.published_hash(folder)
+    if digest is not None and base.exists():
         return digest
     with show('first parts'):
         halves, left_out = prepare(source)
-    base = make_folder(folder / 'baseline' / 'recordings')
-    for half in halves:
-        drawn = {'csv': _text(half.columns, half.digits), 'yaml': half.parameters,
-                 **({'sim': _text(half.sim, half.digits)} if half.sim else {})}
-        for suffix, text in drawn.items():
-            write(base / f'{half.name}.{suffix}', text.encode())
-    write(folder / 'left_out.json', json.dumps(left_out).encode())
     with show('draw') as advance:
-        return trials.commit(folder, Setup(seed, count),
-                             plans(seed, count, halves, fault_table.KINDS), pool, advance,
-                             partial(draw, halves, fault_table.KINDS))
+        digest = sealing.seal(folder, seed, count, partial(plans, halves), partial(draw, halves),
+                              pool, advance)
+    write(folder / 'left_out.json', json.dumps(left_out).encode())
+    make_folder(base)
+    for half in halves:
+        for suffix, text in zip(('csv', 'yaml', 'sim'), half.texts()):
+            if text is not None:
+                write(base / f'{half.name}.{suffix}', text.encode())
+    return digest
 
 
 def right(answer: Answer, base: Answer, label: Label) -> tuple[bool, bool]:
@@ -413,17 +411,16 @@ def right(answer: Answer, base: Answer, label: Label) -> tuple[bool, bool]:
     return exact, found
 
 
-def score(folder: Path, command: Sequence[str] | None, pool: Executor, show: Show
-          ) -> dict[str, Any]:
+def score(folder: Path, pool: Executor, show: Show) -> dict[str, Any]:
     """Diagnose what has no report yet, compare labels with the hash, and score."""
     with show('untouched') as advance:
-        untouched = diagnosis_runs.diagnose_all(folder / 'baseline', command, pool, advance)
+        untouched = diagnosis_runs.diagnose_all(folder / 'baseline', pool, advance)
     with show('diagnose') as advance:
-        results = diagnosis_runs.diagnose_all(folder, command, pool, advance)
-    committed = trials.committed_labels(folder)
+        results = diagnosis_runs.diagnose_all(folder, pool, advance)
+    setup, labels = sealing.committed_labels(folder)
     base = {name: grading.answer(result) for name, result in untouched.items()}
     rows = []
-    for label in committed.labels:
+    for label in labels:
         answer = grading.answer(results[label.name])
         source = label.manoeuvre.split(' by ')[0]
         exact, found = right(answer, base[source], label)
@@ -435,8 +432,8 @@ def score(folder: Path, command: Sequence[str] | None, pool: Executor, show: Sho
                      'already': sorted(base[source].named),
                      'probability': answer.probability, 'seconds': answer.seconds,
                      'error': results[label.name]['error'],
-                     'by_chance': _by_chance(label, committed.labels, base[source], answer)})
-    return {'hash': trials.published_hash(folder), 'seed': committed.setup.seed,
+                     'by_chance': _by_chance(label, labels, base[source], answer)})
+    return {'hash': sealing.published_hash(folder), 'seed': setup.seed,
             'trials': len(rows), 'diagnose_code': (folder / 'reports' / 'version.txt').read_text(),
             'left_out': json.loads((folder / 'left_out.json').read_text()), 'rows': rows,
             'baseline': {name: [answer.status, sorted(answer.named)]
@@ -457,26 +454,26 @@ def tables(made: dict[str, Any]) -> dict[str, report_html.Table]:
     def part(name: str, chosen: Sequence[dict[str, Any]]) -> list[str]:
         return [name, *(scores.in_words(scores.share([row[key] for row in chosen]))
                         for key in ('exact', 'in_set')),
-                f'{np.mean([row["by_chance"] for row in chosen]):.2f}' if chosen else '-']
+                f'{np.mean([row["by_chance"] for row in chosen]):.2f}']
 
-    groups = {'no defect: nothing new is named': 'none', 'a defect of the library': 'single',
-              'a defect outside it: unknown or partly': 'outside'}
+    def parts(name_of: Callable[[dict[str, Any]], str | None]) -> report_html.Table:
+        names = sorted({name for name in map(name_of, rows) if name})
+        return head, [part(name, [row for row in rows if name_of(row) == name]) for name in names]
+
+    def strength(row: dict[str, Any]) -> str | None:
+        edges = {'0 to 3': 3, '3 to 8': 8, 'more than 8': math.inf}
+        return next(f'{words} times the noise' for words, high in edges.items()
+                    if row['noises'] < high) if row['group'] == 'single' else None
+
+    groups = {'none': 'no defect: nothing new is named', 'single': 'a defect of the library',
+              'outside': 'a defect outside it: unknown or partly'}
     head = ['trials', 'exactly right (90 % interval)', 'in the named set', 'labels permuted']
-    defects = [row for row in rows if row['group'] == 'single']
-    edges = ((0, 3), (3, 8), (8, 1e9))
     pairs = [(row['probability'], row['exact']) for row in rows]
     return {
-        'Result': (head, [part(words, [row for row in rows if row['group'] == name])
-                          for words, name in groups.items()]),
-        'By strength': (head, [part(f'{low:g} to {high:g} times the noise' if high < 1e6 else
-                                    f'more than {low:g} times the noise', [
-                                        row for row in defects if low <= row['noises'] < high])
-                               for low, high in edges]),
-        'By recording': (head, [part(name, [row for row in rows if row['recording'] == name])
-                                for name in sorted({row['recording'] for row in rows})]),
-        'By defect': (head, [part(name, [row for row in rows if row['effects'] == [name]])
-                             for name in sorted({row['effects'][0] for row in rows
-                                                 if row['effects']})]),
+        'Result': parts(lambda row: groups[row['group']]),
+        'By strength': parts(strength),
+        'By recording': parts(lambda row: row['recording']),
+        'By defect': parts(lambda row: ''.join(row['effects'])),
         'How often verdicts of a probability are right': report_html.reliability_table(
             scores.reliability(pairs)),
         'Untouched parts': (['recording', 'verdict', 'named'], [
@@ -490,47 +487,3 @@ def said(made: dict[str, Any]) -> str:
     return (f'{made["trials"]} trials on recordings of real sensors, seed {made["seed"]}; SHA-256 '
             f'of salt and labels {made["hash"]}; code of the diagnosis '
             f'{made["diagnose_code"][:16]}.')
-
-
-def working(source: Path, seed: int, count: int, table: Mapping[str, FaultKind], pool: Executor,
-            show: Callable[[str], None]) -> str:
-    """Draw, diagnose and grade trials with other defects; show one line each; return a table."""
-    halves, left_out = prepare(source)
-    for text in left_out:
-        show(f'left out: {text}')
-    base = [grading.answer(diagnosis_runs.diagnose(
-        'half', _text(half.columns, half.digits).encode(), half.parameters.encode(), None,
-        _text(half.sim, half.digits).encode() if half.sim else None)[1]) for half in halves]
-    for half, answer in zip(halves, base):
-        show(f'untouched {half.name}: {answer.status} {", ".join(sorted(answer.named))}')
-    hits: dict[str, list[tuple[bool, bool]]] = {}
-
-    def keep(label: Label, result: dict[str, Any]) -> None:
-        answer = grading.answer(result)
-        good = right(answer, base[label.seed[-1]], label)
-        hits.setdefault(label.group, []).append(good)
-        truth = ', '.join(f'{row["effect"]} {row["strength_mps2"] / label.floor_mps2:.1f} noises'
-                          for row in label.faults) or 'nothing'
-        show(f'{"ok  " if good[0] else "set " if good[1] else "MISS"} {label.name} '
-             f'{label.manoeuvre} {truth}: {answer.status} {answer.probability:.2f} '
-             f'{", ".join(sorted(answer.named)) or result["error"] or "-"}; '
-             f'{result["cpu_s"]:.1f} s')
-
-    for_each(pool, _drawn_and_diagnosed, [partial(_job, halves, table, plan)
-                                          for plan in plans(seed, count, halves, table)], keep,
-             lambda done: None)
-    return '\n'.join(f'{group:10} exactly {scores.in_words(scores.share([a for a, _ in rows]))}, '
-                     f'in the named set {scores.in_words(scores.share([b for _, b in rows]))}'
-                     for group, rows in sorted(hits.items()))
-
-
-def _job(*arguments: Any) -> tuple:
-    return arguments
-
-
-def _drawn_and_diagnosed(halves: Sequence[Half], table: Mapping[str, FaultKind], plan: Plan
-                         ) -> tuple[Label, dict[str, Any]]:
-    drawn = draw(halves, table, plan)
-    return drawn.label, diagnosis_runs.diagnose(
-        plan.name, drawn.recording.encode(), drawn.parameters.encode(), None,
-        drawn.sim.encode() if drawn.sim else None)[1]

@@ -7,7 +7,6 @@ import json
 import shutil
 import sys
 
-from adxl_ros.report.figures import pyplot
 from adxl_ros.workers import open_pool
 from adxl_ros_validation.blind import (
     check,
@@ -15,10 +14,11 @@ from adxl_ros_validation.blind import (
     grading,
     report_html,
     scores,
+    sealing,
     trials,
 )
-from adxl_ros_validation.blind.trials import Label, Setup
-from adxl_ros_validation.blind.world import fault_table, ideal_observer, motion, simulator
+from adxl_ros_validation.blind.trials import Label
+from adxl_ros_validation.blind.world import faults, ideal_observer, motion, simulator
 import numpy as np
 import pytest
 
@@ -62,6 +62,11 @@ def answer(recording, parameters):
 """
 
 
+def short_plans(seed, count):
+    """Plan trials of short recordings."""
+    return trials.plans(seed, count, SECONDS)
+
+
 def no_progress(fraction):
     """Receive the fraction that is finished."""
 
@@ -72,11 +77,15 @@ def show(stage):
     yield no_progress
 
 
-def script(folder, body):
-    """Write a diagnosis and return its command."""
-    path = folder / 'diagnosis.py'
+def scored(folder, body, pool):
+    """Score a check with a diagnosis that is a script."""
+    path = folder.parent / 'diagnosis.py'
     path.write_text(SCRIPT.format(body=body))
-    return [sys.executable, str(path)]
+    real = diagnosis_runs.executable
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(diagnosis_runs, 'executable', lambda name: [
+            sys.executable, str(path)] if name == 'diagnose' else real(name))
+        return check.score(folder, pool, show)
 
 
 @pytest.fixture(scope='module')
@@ -89,8 +98,7 @@ def pool():
 def committed_check(tmp_path_factory):
     folder = tmp_path_factory.mktemp('check') / 'blind'
     with open_pool(None) as pool:
-        trials.commit(folder, Setup(SEED, TRIALS), trials.plans(SEED, TRIALS, SECONDS),
-                      pool, no_progress)
+        sealing.seal(folder, SEED, TRIALS, short_plans, trials.draw_trial, pool, no_progress)
     return folder
 
 
@@ -99,8 +107,7 @@ def null_check(committed_check, tmp_path_factory, pool):
     """Score a diagnosis that names no effect, once for all tests that use it."""
     folder = tmp_path_factory.mktemp('nothing')
     shutil.copytree(committed_check, folder / 'blind')
-    return folder / 'blind', check.score(folder / 'blind', script(folder, NOTHING), pool,
-                                         show)
+    return folder / 'blind', scored(folder / 'blind', NOTHING, pool)
 
 
 def copied(committed_check, null_check, folder):
@@ -116,7 +123,7 @@ def test_only_the_label_file_contains_labels(committed_check):
     assert names == sorted(f'r{i:04d}.{suffix}' for i in range(count)
                            for suffix in ('csv', 'yaml'))
     assert {path.stat().st_mtime for path in (committed_check / 'recordings').iterdir()} == {0}
-    effects = [name.encode() for name in fault_table.KINDS if name not in (
+    effects = [name.encode() for name in faults.KINDS if name not in (
         'bias', 'gravity', 'scale_factor', 'supply')]
     assert [path.name for path in (committed_check / 'labels').iterdir()] == ['labels.json']
     for path in committed_check.rglob('*'):
@@ -142,19 +149,19 @@ def test_scores_of_a_diagnosis_without_effects(null_check):
 def test_a_diagnosis_cannot_reach_the_labels(committed_check, null_check, tmp_path, pool):
     """Working directory, arguments and environment of a diagnosis do not lead to a label."""
     folder = copied(committed_check, null_check, tmp_path)
-    blindfolded = check.score(folder, script(tmp_path, CHEAT.format(folder='.')), pool, show)
+    blindfolded = scored(folder, CHEAT.format(folder='.'), pool)
     assert not any(row['named'] for row in blindfolded['rows'])
     # The same diagnosis names the labels if it has the folder.
     shutil.rmtree(folder / 'reports')
-    opened = check.score(folder, script(tmp_path, CHEAT.format(folder=str(folder))), pool,
-                         show)
+    opened = scored(folder, CHEAT.format(folder=str(folder)), pool)
     assert all(sorted(row['named']) == sorted(row['effects']) for row in opened['rows']
                if row['group'] != 'zero')
 
 
-def test_a_failed_diagnosis_is_counted(tmp_path):
-    command = [sys.executable, '-c', 'import sys; sys.exit("no such thing")']
-    result = diagnosis_runs.diagnose('r0', b'time_s,x_v\n', b'', command)[1]
+def test_a_failed_diagnosis_is_counted(monkeypatch):
+    monkeypatch.setattr(diagnosis_runs, 'executable', lambda name: [
+        sys.executable, '-c', 'import sys; sys.exit("no such thing")'])
+    result = diagnosis_runs.diagnose('r0', b'time_s,x_v\n', b'')[1]
     given = grading.answer(result)
     assert (given.status, given.gap, result['error']) == ('failed', False, 'no such thing')
     for report in ({}, {'verdict': None}, {'verdict': {'status': 'explained'}}, []):
@@ -175,7 +182,7 @@ def answer(recording, parameters):
 
 def test_a_generator_that_leaks_labels_is_detected(null_check, tmp_path, pool):
     """The length of the recordings reveals which trials have an effect."""
-    folder, labels = tmp_path / 'blind', trials.committed_labels(null_check[0]).labels
+    folder, labels = tmp_path / 'blind', sealing.committed_labels(null_check[0])[1]
     recordings = null_check[0] / 'recordings'
 
     def leaking(plan):
@@ -184,12 +191,11 @@ def test_a_generator_that_leaks_labels_is_detected(null_check, tmp_path, pool):
                             for suffix in ('csv', 'yaml'))
         return trials.Drawn(label, padded(label, text), parameters)
 
-    trials.commit(folder, Setup(SEED, TRIALS), trials.plans(SEED, TRIALS, SECONDS),
-                  pool, no_progress, leaking)
+    sealing.seal(folder, SEED, TRIALS, short_plans, leaking, pool, no_progress)
     shutil.copytree(null_check[0] / 'labels' / 'held', folder / 'labels' / 'held')
-    made = check.score(folder, script(tmp_path, PADDED), pool, show)
+    made = scored(folder, PADDED, pool)
     assert made['controls']['metadata_only']['leaks'] and made['leaks']
-    assert 'LEAKS' in report_html.summary(made) and 'LEAKS' in report_html.page(made, pyplot())
+    assert 'LEAKS' in report_html.summary(made) and 'LEAKS' in report_html.page(made)
 
 
 def drawn_labels():
@@ -201,7 +207,7 @@ def drawn_labels():
                    'strength_mps2': 0.01 * (i + 1), 'power': 1.0, 'told': 1.0, 'inseparable': []}
                   for i, name in enumerate(plan.effects)]
         rows.append(Label(plan.name, plan.group, plan.effects, plan.seed, plan.seconds, **common,
-                          faults=faults, flexible=1.0, plain={'rmse': 'bias', 'bic': ''}))
+                          faults=faults, flexible=1.0))
     return rows
 
 
@@ -222,37 +228,27 @@ def test_perfect_and_wrong_answers():
     assert right['calibration_error']['value'] == pytest.approx(0.05)
     assert right['brier']['value'] == pytest.approx(2 * 0.05 ** 2)
     assert right['pairs']['whole']['value'] == 1
-    assert all(row['met'] for row in scores.bars(right) if row['met'] is not None)
+    assert {row['met'] for row in scores.bars(right)} == {'yes', 'too few', 'no trial'}
     wrong = scores.scores([scores.Trial(label, answered(label, True), None)
                            for label in labels])
     assert wrong['false_alarms']['value'] == 1 and wrong['top_1']['value'] == 0
-    assert {row['name'] for row in scores.bars(wrong) if row['met']} == {'harm'}
+    assert {row['name'] for row in scores.bars(wrong) if row['met'] != 'NO'} == {
+        'harm', 'coverage', 'closed_by_oracle', 'limit_held'}
 
 
-def test_the_detection_curve_contains_the_true_strength():
-    rng = np.random.default_rng(0)
-    strength = np.exp(rng.uniform(-7, -1, 600))
-    seen = rng.random(600) < 1 / (1 + np.exp(-(np.log(strength) + 4) / 0.5))
-    curve = scores.curve(strength, seen, 0.0)
-    assert curve['at_50']['ci'][0] < np.exp(-4) < curve['at_50']['ci'][1]
-    assert curve['at_90']['ci'][0] < np.exp(-4 + 0.5 * np.log(9)) < curve['at_90']['ci'][1]
-
-
-@pytest.mark.parametrize('name', fault_table.KINDS)
+@pytest.mark.parametrize('name', faults.KINDS)
 def test_every_fault_changes_a_recording(name):
-    """The change grows with the size, and is zero at size zero."""
-    scene = ideal_observer.Scene(simulator.draw_unit(np.random.default_rng(0)), motion.draw(
+    """The change grows with the size."""
+    scene = simulator.Scene(simulator.draw_unit(np.random.default_rng(0)), motion.draw(
         np.random.default_rng(2), (60.0, 62.0), 125.0, 'rich'), 1)
-    kind = fault_table.KINDS[name]
+    kind = faults.KINDS[name]
     shape = kind.draw(np.random.default_rng(1), scene.unit)
 
     def size(times):
         return ideal_observer.rms(scene.response(
             [simulator.Fault(kind, times * kind.start, shape)], True))
 
-    assert size(0.0) == pytest.approx(0, abs=1e-9)
-    assert 0 < size(1.0) < size(2.0)
-    assert np.isfinite(size(1.0))
+    assert 0 < size(1.0) < size(2.0) < np.inf
 
 
 def test_the_command_commits_and_scores(run_tool, tmp_path):

@@ -150,7 +150,7 @@ def test_faults_of_the_samples_are_counted() -> None:
 def test_memory_is_bounded_and_the_recording_has_the_newest_samples() -> None:
     world = World(UNIT, UNIT)
     world.live = LiveGap(UNIT, ReferenceKind.STAGE, GapSettings(history_s=60.0))
-    world.run(200)
+    world.run(100)
     recording = world.live.diagnosis_input().recording
     assert recording.time_s[-1] == pytest.approx(60, abs=0.1)
     assert {'ax_mps2', 'alpha_rad', 'beta_rad'} <= set(recording.columns)

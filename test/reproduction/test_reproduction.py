@@ -10,7 +10,7 @@ from units import NOMINAL
 
 pytestmark = pytest.mark.long
 
-_UNITS = {'perfect': 8, 'paper': 16}
+_UNITS = {'perfect': 4, 'paper': 10}
 
 
 @pytest.fixture(scope='module')
@@ -23,8 +23,7 @@ def evaluations():
 
 def angles_of(evaluated, model):
     """Return the angles of all experiments of all units."""
-    return [a for unit in evaluated for a in (unit.models[model].random,
-                                              *unit.models[model].runs.values())]
+    return [a for unit in evaluated for a in unit.models[model].all_angles()]
 
 
 def rms(parts):
@@ -52,7 +51,7 @@ def test_motion_error_reaches_the_noise_floor(evaluations):
     nominal = parameter_file.load(NOMINAL)
     bound = experiments.motion_bound_mmps2(nominal)
     assert bound == pytest.approx(5.08, abs=0.01)
-    error_mmps2 = [unit.models['full'].motion.rmse_mmps2
+    error_mmps2 = [unit.models['full'].motion[0]
                    for evaluated in evaluations.values() for unit in evaluated]
     assert np.sqrt(np.mean(np.square(error_mmps2))) < 1.05 * bound
 
@@ -89,7 +88,7 @@ def test_the_command_on_a_recording(run_tool, tmp_path):
 
 
 @pytest.mark.parametrize('option, words', [
-    (('--units', '0'), 'at least 1'), (('--seed', '-1'), 'must not be negative')])
+    (('--units', '0'), 'at least 1'), (('--seed', '-1'), 'at least 0')])
 def test_wrong_options_are_refused_in_one_line(run_tool, tmp_path, option, words):
     """The reason is reported, and no file is written."""
     done = run_tool('reproduce', *option, '-o', tmp_path / 'out')

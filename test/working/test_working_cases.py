@@ -4,8 +4,9 @@
 from adxl_ros.model.effects import library
 from adxl_ros_validation import working_cases, working_world as world
 from adxl_ros_validation.blind.trials import Label
-from adxl_ros_validation.blind.world.ideal_observer import rms, Scene
-from adxl_ros_validation.blind.world.simulator import Fault
+from adxl_ros_validation.blind.world.ideal_observer import rms
+from adxl_ros_validation.blind.world.motion import Script
+from adxl_ros_validation.blind.world.simulator import Fault, Scene
 import numpy as np
 import pytest
 
@@ -22,21 +23,21 @@ def scene():
 @pytest.mark.parametrize('name', world.KINDS)
 def test_every_fault_changes_a_recording(name, scene):
     kind = world.KINDS[name]
-    assert (name in library()) == kind.in_library
+    assert (name in library()) == (name in world.LISTED)
     shape = {**kind.draw(np.random.default_rng(1), scene.unit)}
     sizes = [rms(scene.response([Fault(kind, size, shape)], True))
              for size in (kind.start, min(3 * kind.start, kind.largest))]
     assert np.all(np.isfinite(sizes)) and 1e-5 < sizes[0] < sizes[1]
 
 
-@pytest.mark.parametrize('trapezoidal', [True, False])
-def test_moves_reach_their_ends_without_a_jump(trapezoidal):
-    moves = world.Moves(trapezoidal)
-    moves.go(1.0)
-    moves.go(2.0, beta=1.0, alpha=0.5)
-    moves.go(1.0, beta=-0.5)
+@pytest.mark.parametrize('share', [world.trapezoidal, world.cycloidal])
+def test_moves_reach_their_ends_without_a_jump(share):
+    script = Script(share=share)
+    script.rest(1.0)
+    script.go(seconds=2.0, beta=1.0, alpha=0.5)
+    script.go(seconds=1.0, beta=-0.5)
     t = np.arange(0, 5, 1e-3)
-    joints = moves.joints(t)
+    joints = script.joints(t)
     assert joints['beta'][[500, 3000, 4500]] == pytest.approx([0.0, 1.0, -0.5])
     assert joints['alpha'][[500, 3500]] == pytest.approx([np.pi / 2, 0.5])
     assert np.abs(np.diff(joints['beta'])).max() < 4e-3

@@ -3,25 +3,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 import math
 
-from adxl_ros_validation.blind.world.fault_table import KINDS, KNOWN
-from adxl_ros_validation.blind.world.simulator import (
-    Fault,
-    FaultKind,
-    FINE_HZ,
-    G0,
-    LSB_V,
-    Motion,
-    references,
-    render,
-    SCALE_STD,
-    STAGE_STD,
-    stamps,
-    Unit,
-    ZERO_G_STD_G,
-)
+from adxl_ros_validation.blind.world import simulator as sim
+from adxl_ros_validation.blind.world.faults import KINDS, KNOWN
+from adxl_ros_validation.blind.world.simulator import Fault, G0, Kind, Scene, Unit
 import numpy as np
 import scipy
 
@@ -32,8 +18,6 @@ INSEPARABLE_BELOW = 9.0
 
 These are three standard deviations; chosen.
 """
-_COARSE_HZ = 400.0
-"""Lowest rate of the simulation of responses, Hz; chosen: eight times the filter's corner."""
 _NOISE_STD = 0.02
 """Uncertainty of the stated noise density, a share; that of units is 0.015."""
 _FLEXIBLE_LEVEL = 0.001
@@ -42,32 +26,10 @@ _RECOGNISABLE_SAMPLE = 7.0
 """Squared visibility of one repeated sample; chosen."""
 
 
-@dataclass(frozen=True)
-class Scene:
-    """A unit in a manoeuvre."""
-
-    unit: Unit  # the unit and its motion
-    manoeuvre: Motion
-    seed: int  # seed of all random numbers
-
-    def response(self, faults: list[Fault], coarse: bool = False) -> np.ndarray:
-        """Return the change of the output by faults."""
-        noise = any(fault.kind.random for fault in faults)
-        fine = _COARSE_HZ if coarse else FINE_HZ
-        with_faults, without = (render(self.unit, self.manoeuvre, acting, self.seed, noise=noise,
-                                       fine_hz=fine) for acting in (faults, []))
-        return (with_faults - without) * self.unit.volts_to_mps2
-
-    def force(self) -> np.ndarray:
-        """Return the specific force along each axis without faults, m/s², (m, n)."""
-        volts = render(self.unit, self.manoeuvre, [], self.seed, noise=False)
-        return (volts - self.unit.zero_v[:, None]) * self.unit.volts_to_mps2
-
-
 def beyond_calibration(unit: Unit, change: np.ndarray, force: np.ndarray) -> np.ndarray:
     """Remove what zero-g and scale factor explain within two standard deviations of the file."""
     rest = np.empty_like(change)
-    bounds = 2 * np.array([ZERO_G_STD_G * G0, SCALE_STD])
+    bounds = 2 * np.array([sim.ZERO_G_STD_G * G0, sim.SCALE_STD])
     for row, along, out in zip(change, force, rest):
         columns = np.stack([np.ones_like(along), along], axis=1)
         q, r = np.linalg.qr(columns)
@@ -78,6 +40,11 @@ def beyond_calibration(unit: Unit, change: np.ndarray, force: np.ndarray) -> np.
 def rms(values: np.ndarray) -> float:
     """Return the rms over samples and axes."""
     return float(np.sqrt(np.mean(values ** 2)))
+
+
+def line(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return zero and slope of a straight line by least squares."""
+    return np.linalg.lstsq(np.column_stack([np.ones_like(x), x]), y, rcond=None)[0]
 
 
 def _spectrum(unit: Unit, count: int) -> np.ndarray:
@@ -95,7 +62,7 @@ def _spectrum(unit: Unit, count: int) -> np.ndarray:
     power += unit.flicker_g[:, None] ** 2 * sum(4 * lag / (1 + (w * lag) ** 2) for lag in lags)
     # The rounding of the encoder stays for the length of a pose; that of the ADC is white.
     power += unit.resolution_rad ** 2 / 24 * 4 * 2.0 / (1 + (w * 2.0) ** 2)
-    power += ((LSB_V / unit.scale_v_per_g) ** 2 / 12 * 2 / rate)[:, None]
+    power += ((sim.LSB_V / unit.scale_v_per_g) ** 2 / 12 * 2 / rate)[:, None]
     return G0 ** 2 * power
 
 
@@ -112,30 +79,25 @@ class IdealObserver:
         self.force = scene.force()
         self.axes, self.count = self.force.shape
         self.weight = 1 / np.sqrt(_spectrum(scene.unit, self.count) * scene.unit.rate_hz / 2)
-        stated = []
-        for i, change in enumerate(self._stage()):
-            prior = np.zeros(2 * self.axes + 6)
-            prior[2 * self.axes + i] = 1.0
-            stated.append(np.concatenate([self.whiten(change), prior]))
-        for d in range(self.axes):
-            for response, std in ((np.ones_like(self.force[d]), ZERO_G_STD_G * G0),
-                                  (self.force[d], SCALE_STD)):
-                rows = np.zeros_like(self.force)
-                rows[d] = response
-                prior = np.zeros(2 * self.axes + 6)
-                prior[len(stated) - 6] = 1 / std
-                stated.append(np.concatenate([self.whiten(rows), prior]))
-        self.stated = np.linalg.qr(np.stack(stated, axis=1))[0]
+        stage_error = sim.STAGE_STD * scene.unit.resolution_rad
+        # What is stated only to its standard deviation: the stage, zero-g and scale factor.
+        stated = [(scene.response([Fault(KINDS[name], stage_error, {'w': row})], coarse=True), 1.0)
+                  for name, count in (('stage_offset', 2), ('stage_eccentricity', 4))
+                  for row in np.eye(count)]
+        stated += [(self.of_axis(d, response), std) for d in range(self.axes)
+                   for response, std in ((np.ones(self.count), sim.ZERO_G_STD_G * G0),
+                                         (self.force[d], sim.SCALE_STD))]
+        self._no_prior = np.zeros(len(stated))
+        priors = np.diag([1 / std for _, std in stated])
+        self.stated = np.linalg.qr(np.stack([
+            np.concatenate([self.whiten(change), prior])
+            for (change, _), prior in zip(stated, priors)], axis=1))[0]
 
-    def _stage(self) -> list[np.ndarray]:
-        """Return the response to each error of the stage at its standard deviation."""
-        unit = self.scene.unit
-        size = STAGE_STD * unit.resolution_rad
-        errors = [('stage_offset', [0]), ('stage_eccentricity', [2]), ('stage_eccentricity', [3]),
-                  ('stage_offset', [1]), ('stage_eccentricity', [0]), ('stage_eccentricity', [1])]
-        return [self.scene.response([Fault(KINDS[name], size, {
-            'w': np.isin(np.arange(4), weights).astype(float)})], coarse=True)
-            for name, weights in errors]
+    def of_axis(self, d: int, row: np.ndarray) -> np.ndarray:
+        """Return a change of one axis only, m/s², (m, n)."""
+        rows = np.zeros_like(self.force)
+        rows[d] = row
+        return rows
 
     def whiten(self, change: np.ndarray) -> np.ndarray:
         """Whiten a change, m/s², (m, n), into one vector."""
@@ -143,7 +105,7 @@ class IdealObserver:
 
     def project(self, change: np.ndarray) -> np.ndarray:
         """Whiten a change and remove what the uncertainty of the calibration explains."""
-        vector = np.concatenate([self.whiten(change), np.zeros(2 * self.axes + 6)])
+        vector = np.concatenate([self.whiten(change), self._no_prior])
         return vector - self.stated @ (self.stated.T @ vector)
 
     def responses(self) -> dict[str, list[np.ndarray]]:
@@ -151,37 +113,18 @@ class IdealObserver:
         responses = {}
         for name in KNOWN:
             kind = KINDS[name]
-            if not kind.random or name == 'adc_inl':
-                faults = [Fault(kind, multiple * kind.start, shape)
-                          for shape in kind.spread(self.scene.unit) for multiple in kind.sizes]
-                responses[name] = [part for fault in faults for part in _parts(
-                    kind, self.scene.response([fault], coarse=True))]
+            if kind.random:
+                continue
+            changes = [self.scene.response([Fault(kind, multiple * kind.start, shape)], True)
+                       for shape in kind.spread(self.scene.unit) for multiple in kind.sizes]
+            responses[name] = [self.of_axis(d, change[d]) for change in changes
+                               for d in range(self.axes) if change[d].any()
+                               ] if kind.per_axis else changes
         return responses
 
     def span(self, responses: list[np.ndarray]) -> np.ndarray:
         """Return orthonormal columns that span whitened responses, (v, k)."""
         return _orthonormal([self.project(change) for change in responses], self.stated.shape[0])
-
-    def simple_choices(self, residual: np.ndarray,
-                       responses: dict[str, list[np.ndarray]]) -> dict[str, str]:
-        """Choose an effect by two common methods: smallest RMSE, and BIC with white noise."""
-        axes = range(self.axes)
-        affine = _orthonormal([(response * (np.arange(self.axes) == d)[:, None]).ravel()
-                               for response in (np.ones_like(self.force), self.force)
-                               for d in axes], residual.size)
-
-        def beyond(rows: np.ndarray) -> np.ndarray:
-            return rows.ravel() - affine @ (affine.T @ rows.ravel())
-
-        rest = beyond(residual)
-        total, cost = float(rest @ rest), math.log(rest.size)
-        squares, criterion = {}, {'': rest.size * math.log(total)}
-        for name, changes in responses.items():
-            columns = _orthonormal([beyond(change) for change in changes], rest.size)
-            squares[name] = total - float(np.sum((columns.T @ rest) ** 2))
-            criterion[name] = rest.size * math.log(squares[name]) + columns.shape[1] * cost
-        return {'rmse': min(squares, key=squares.__getitem__),
-                'bic': min(criterion, key=criterion.__getitem__)}
 
     def flexible_power(self, reserved: np.ndarray, vector: np.ndarray) -> float:
         """Return the power of a flexible model of force, rate, angle, temperature and time."""
@@ -191,22 +134,13 @@ class IdealObserver:
         for d in range(self.axes):
             columns = []
             for hat in hats:
-                rows = np.zeros_like(self.force)
-                rows[d] = hat
-                column = self.project(rows)
+                column = self.project(self.of_axis(d, hat))
                 columns.append(column - reserved @ (reserved.T @ column))
             basis = _orthonormal(columns, len(rest))
             explained += float(np.sum((basis.T @ rest) ** 2))
             used += basis.shape[1]
         threshold = scipy.stats.chi2.isf(_FLEXIBLE_LEVEL, used)
         return float(scipy.stats.ncx2.sf(threshold, used, explained))
-
-
-def _parts(kind: FaultKind, change: np.ndarray) -> list[np.ndarray]:
-    if not kind.per_axis:
-        return [change]
-    return [change * (np.arange(len(change)) == d)[:, None] for d in range(len(change))
-            if change[d].any()]
 
 
 def _orthonormal(columns: list[np.ndarray], length: int) -> np.ndarray:
@@ -223,8 +157,7 @@ def _orthonormal(columns: list[np.ndarray], length: int) -> np.ndarray:
 
 def _hats(scene: Scene, force: np.ndarray) -> list[np.ndarray]:
     """Return the hat functions of the flexible model, (n,) each."""
-    t = stamps(scene.unit, scene.manoeuvre)
-    measured = references(scene.unit, scene.manoeuvre, scene.seed)
+    t, measured = scene.stamps(), scene.references()
     rates = [np.gradient(scene.manoeuvre.joints(t)[name], t) for name in ('alpha', 'beta')]
     over = [(along, 7) for along in force] + [(np.tanh(2 * rate), 5) for rate in rates]
     over += [(np.sin(measured['beta_rad']), 5), (np.cos(measured['beta_rad']), 5),
@@ -247,14 +180,14 @@ def separation_probability(strength: float) -> float:
     return float(scipy.stats.norm.cdf(0.5 * math.sqrt(max(strength, 0.0))))
 
 
-def noise_visibility(observer: IdealObserver, kind: FaultKind, change: np.ndarray) -> float:
+def noise_visibility(observer: IdealObserver, kind: Kind, change: np.ndarray) -> float:
     """
     Return the squared visibility of a fault that differs from run to run.
 
     It follows from the spectrum (Whittle), with an uncertainty of the stated noise of 2 %. Spikes
     also show one by one, and repeated or missing codes by their number.
     """
-    if kind.name in ('mains_hum', 'adc_inl'):
+    if kind.name == 'mains_hum':
         return float(np.sum(observer.project(change) ** 2))
     white = observer.weight ** 2 * np.abs(np.fft.rfft(change)) ** 2 / observer.count
     excess = np.stack([_smooth(row) for row in white])[:, 1:]
@@ -266,7 +199,7 @@ def noise_visibility(observer: IdealObserver, kind: FaultKind, change: np.ndarra
     elif kind.name == 'stuck':
         repeated = np.count_nonzero(np.any(np.abs(change) > 0, axis=0))
         visibility = max(visibility, _RECOGNISABLE_SAMPLE * repeated)
-    elif kind.name == 'quantisation' and np.abs(change).max() > 2 * G0 * LSB_V:
+    elif kind.name == 'quantisation' and np.abs(change).max() > 2 * G0 * sim.LSB_V:
         visibility = max(visibility, float(observer.count))
     return float(visibility)
 

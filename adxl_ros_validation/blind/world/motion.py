@@ -3,14 +3,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
+import scipy
 
 POOR = ('one_way', 'crawl', 'few_poses', 'together', 'one_plane')
 """Kinds of manoeuvres that cannot separate all effects."""
 _FASTEST_HZ = 22.0
 """Highest frequency of the shaker, Hz; chosen: below the 50 Hz of the filter."""
+
+
+Curve = Callable[[np.ndarray], np.ndarray]
+
+
+def low_pass(values: np.ndarray, lag: float, dt: float) -> np.ndarray:
+    """Filter by one slow pole that is at rest before the first value."""
+    keep = np.exp(-dt / lag)
+    first = values[..., :1]
+    return first + scipy.signal.lfilter([1 - keep], [1, -keep], values - first)
+
+
+def smooth(x: np.ndarray) -> np.ndarray:
+    """Return the share of a move without a jump of velocity or acceleration at either end."""
+    return x ** 3 * (10 - 15 * x + 6 * x * x)
+
+
+def _fade(u: np.ndarray) -> np.ndarray:
+    """Fade in and out over a fifth of the duration, with three derivatives."""
+    edge = np.clip(np.minimum(u, 1 - u) / 0.2, 0, 1)
+    return edge ** 4 * (35 - 84 * edge + 70 * edge ** 2 - 20 * edge ** 3)
 
 
 @dataclass
@@ -21,9 +45,10 @@ class Script:
     # joint angles at the knots, rad
     alpha: list[float] = field(default_factory=lambda: [np.pi / 2])
     beta: list[float] = field(default_factory=lambda: [0.0])
-    # joint, amplitude (rad or m), frequency (Hz), start and end (s) of each swing
-    swings: list[tuple[str, float, float, float, float]] = field(default_factory=list)
-    fastest_hz: float = _FASTEST_HZ  # highest frequency of the shaker, Hz
+    # joint, amplitude (rad or m), first and last frequency (Hz), start and end (s) of each swing
+    swings: list[tuple[str, float, float, float, float, float]] = field(default_factory=list)
+    share: Curve = smooth  # share of a move that is done at a share of its time
+    fade: Curve = _fade  # amplitude of a swing at a share of its time
 
     @property
     def end(self) -> float:
@@ -32,28 +57,47 @@ class Script:
 
     def rest(self, seconds: float) -> None:
         """Stay for some seconds."""
-        self.go(self.alpha[-1], self.beta[-1], seconds)
+        self.go(seconds=seconds)
 
-    def go(self, alpha: float, beta: float, seconds: float) -> None:
-        """Move without a jump of velocity or acceleration at either end."""
+    def go(self, alpha: float | None = None, beta: float | None = None, seconds: float = 0.0
+           ) -> None:
+        """Move joints to where they should be, rad, at once."""
         self.time.append(self.end + seconds)
-        self.alpha.append(alpha)
-        self.beta.append(beta)
+        self.alpha.append(self.alpha[-1] if alpha is None else alpha)
+        self.beta.append(self.beta[-1] if beta is None else beta)
 
-    def swing(self, joint: str, size: float, hertz: float, seconds: float) -> None:
-        """Swing a joint about its position."""
-        self.swings.append((joint, size, hertz, self.end, self.end + seconds))
+    def swing(self, joint: str, size: float, hertz: float, seconds: float,
+              to_hertz: float | None = None) -> None:
+        """Swing a joint about its position; a frequency that changes keeps the acceleration."""
+        self.swings.append((joint, size, hertz, to_hertz or hertz, self.end, self.end + seconds))
         self.rest(seconds)
+
+    def joints(self, t: np.ndarray) -> dict[str, np.ndarray]:
+        """Return alpha and beta (rad) and shift (m) at instants t (s)."""
+        knots = np.asarray(self.time)
+        i = np.clip(np.searchsorted(knots, t, 'right') - 1, 0, len(knots) - 2)
+        share = self.share(np.clip((t - knots[i]) / (knots[i + 1] - knots[i]), 0, 1))
+        joints = {'shift': np.zeros_like(t)}
+        for name in ('alpha', 'beta'):
+            angles = np.asarray(getattr(self, name))
+            joints[name] = angles[i] + (angles[i + 1] - angles[i]) * share
+        for joint, size, first, last, start, stop in self.swings:
+            a, b = np.searchsorted(t, [start, stop])
+            since = t[a:b] - start
+            u = since / (stop - start)
+            cycles = since * (first + (last - first) * u / 2)
+            joints[joint][a:b] += size * (first / (first + (last - first) * u)) ** 2 * self.fade(
+                u) * np.sin(2 * np.pi * cycles)
+        return joints
 
 
 @dataclass(frozen=True)
 class Manoeuvre:
     """One manoeuvre and its environment."""
 
-    kind: str  # 'rich' or one of `POOR`
+    kind: str
     script: Script  # motion of the joints
-    temperature: tuple[np.ndarray, np.ndarray]  # instants, s, and values, °C or V
-    supply: tuple[np.ndarray, np.ndarray]
+    climate: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]  # °C and V at instants, s
 
     @property
     def seconds(self) -> float:
@@ -62,26 +106,7 @@ class Manoeuvre:
 
     def joints(self, t: np.ndarray) -> dict[str, np.ndarray]:
         """Return alpha and beta (rad) and shift (m) at instants t (s)."""
-        knots = np.asarray(self.script.time)
-        i = np.clip(np.searchsorted(knots, t, 'right') - 1, 0, len(knots) - 2)
-        x = np.clip((t - knots[i]) / (knots[i + 1] - knots[i]), 0, 1)
-        blend = x ** 3 * (10 - 15 * x + 6 * x * x)
-        joints = {'shift': np.zeros_like(t)}
-        for name in ('alpha', 'beta'):
-            angles = np.asarray(getattr(self.script, name))
-            joints[name] = angles[i] + (angles[i + 1] - angles[i]) * blend
-        for joint, size, hertz, start, stop in self.script.swings:
-            a, b = np.searchsorted(t, [start, stop])
-            u = (t[a:b] - start) / (stop - start)
-            # Each swing fades in and out over a fifth of its duration, with three derivatives.
-            edge = np.clip(np.minimum(u, 1 - u) / 0.2, 0, 1)
-            fade = edge ** 4 * (35 - 84 * edge + 70 * edge ** 2 - 20 * edge ** 3)
-            joints[joint][a:b] += size * fade * np.sin(2 * np.pi * hertz * (t[a:b] - start))
-        return joints
-
-    def climate(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return temperature (°C) and supply (V) at instants t (s)."""
-        return np.interp(t, *self.temperature), np.interp(t, *self.supply)
+        return self.script.joints(t)
 
 
 def draw(rng: np.random.Generator, seconds: tuple[float, float], rate_hz: float,
@@ -90,18 +115,21 @@ def draw(rng: np.random.Generator, seconds: tuple[float, float], rate_hz: float,
     length = rng.uniform(*seconds)
     if kind is None:
         kind = str(rng.choice(POOR)) if rng.random() < 0.25 else 'rich'
-    script = Script(fastest_hz=min(_FASTEST_HZ, rate_hz / 10))
+    script = Script()
     script.beta[0] = rng.uniform(-np.pi, np.pi)
     script.rest(rng.uniform(1.5, 3.0))
-    {'rich': _rich, 'one_way': _one_way, 'crawl': _crawl, 'few_poses': _few_poses,
-     'together': _few_poses, 'one_plane': _one_plane}[kind](script, length, rng)
+    moves: dict[str, Callable[[Script, float, np.random.Generator], None]] = {
+        'rich': partial(_rich, min(_FASTEST_HZ, rate_hz / 10)), 'one_way': _one_way,
+        'crawl': _crawl, 'few_poses': _few_poses, 'together': _few_poses,
+        'one_plane': _one_plane}
+    moves[kind](script, length, rng)
     script.rest(rng.uniform(1.0, 2.0))
-    return Manoeuvre(kind, script, _temperature(kind, script.end, rng),
-                     _supply(kind, script.end, rng))
+    temperature, supply = (law(kind, script.end, rng) for law in (_temperature, _supply))
+    return Manoeuvre(kind, script, lambda t: (np.interp(t, *temperature), np.interp(t, *supply)))
 
 
-def _rich(script: Script, length: float, rng: np.random.Generator) -> None:
-    moves = [_plane, _tilts, _swing_beta, _shake, _plane, _swing_alpha, _dash]
+def _rich(fastest_hz: float, script: Script, length: float, rng: np.random.Generator) -> None:
+    moves = [_plane, _tilts, _swing_beta, partial(_shake, fastest_hz), _plane, _swing_alpha, _dash]
     while True:
         for i in rng.permutation(len(moves)):
             if script.end > length:
@@ -137,9 +165,9 @@ def _swing_alpha(script: Script, rng: np.random.Generator) -> None:
     script.swing('alpha', rng.uniform(0.2, 0.5), rng.uniform(0.25, 0.8), rng.uniform(8, 12))
 
 
-def _shake(script: Script, rng: np.random.Generator) -> None:
+def _shake(fastest_hz: float, script: Script, rng: np.random.Generator) -> None:
     for _ in range(2):
-        hertz = np.exp(rng.uniform(np.log(3), np.log(script.fastest_hz)))
+        hertz = np.exp(rng.uniform(np.log(3), np.log(fastest_hz)))
         size = rng.uniform(0.8, 3.5) / (2 * np.pi * hertz) ** 2
         script.swing('shift', size, hertz, rng.uniform(4, 7))
 
@@ -201,7 +229,7 @@ def _temperature(kind: str, end: float,
         on = rng.uniform(0, 0.75) * end
         heat[(t > on) & (t < on + rng.uniform(0.15, 0.4) * end)] += rng.uniform(5, 16)
     for lag in (rng.uniform(8, 18), rng.uniform(3, 8)):
-        heat = _lag(heat, 0.5, lag)
+        heat = low_pass(heat, lag, 0.5)
     return t, start + heat
 
 
@@ -216,14 +244,5 @@ def _supply(kind: str, end: float, rng: np.random.Generator) -> tuple[np.ndarray
             on = rng.uniform(0, 0.9) * end
             steps[(t > on) & (t < on + rng.uniform(6, 30))] += rng.choice([-1, 1]) * rng.uniform(
                 0.02, 0.07)
-        volts += _lag(steps, 0.25, 0.7)
+        volts += low_pass(steps, 0.7, 0.25)
     return t, volts
-
-
-def _lag(values: np.ndarray, dt: float, lag: float) -> np.ndarray:
-    out, keep = np.empty_like(values), np.exp(-dt / lag)
-    level = values[0]
-    for i, value in enumerate(values):
-        level = value + (level - value) * keep
-        out[i] = level
-    return out

@@ -3,15 +3,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from enum import Enum
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, KW_ONLY
+from enum import auto, Enum
+from itertools import product
 import math
-from typing import Any, Protocol
+from typing import Any
 import zlib
 
+from adxl_ros_validation.blind.world.motion import Manoeuvre
 import numpy as np
 import scipy
+import yaml
 
 G0 = 9.80665
 """Standard gravity, m/s², exact."""
@@ -79,61 +82,41 @@ def draw_unit(rng: np.random.Generator) -> Unit:
         float(rng.choice([100.0, 125.0, 200.0, 250.0])))
 
 
-def parameter_file(unit: Unit, serial: str) -> str:
-    """Return the parameter file that the user has; every number takes the same space."""
-    n = len(unit.axes)
-
-    def row(values: np.ndarray) -> str:
-        return '[' + ', '.join(f'{value:+.9e}' for value in values) + ']'
-
-    names = [f'bias.offset_v.{axis}' for axis in unit.axes] + [
-        f'scale_factor.offset_v_per_g.{axis}' for axis in unit.axes]
-    spread = np.concatenate([ZERO_G_STD_G * unit.stated_scale_v_per_g,
-                             SCALE_STD * unit.stated_scale_v_per_g])
-    resistance = 32e3
-    return f"""\
-/**:
-  ros__parameters:
-    format: 1
-    units: 'V, V/g, 1/g, rad'
-    model: linear
-    sensor:
-      serial: {serial}
-      axes: {unit.axes}
-      nominal_zero_g_v: {row(np.full(n, 2.5))}
-      nominal_scale_v_per_g: {row(np.full(n, 1.0))}
-      noise_density_g_per_rthz: {row(unit.stated_noise_g_per_rthz)}
-      rc_resistance_ohm: {resistance:.9e}
-      rc_capacitance_f: {1 / (2 * np.pi * resistance * unit.corner_hz):.9e}
-      adc_bits: {ADC_BITS}
-      adc_vref_v: {ADC_VREF}
-      rate_hz: {unit.rate_hz:05.1f}
-      range_g: 1.7
-      local_gravity_mps2: {G0}
-      z_sign: 1
-    stage:
-      resolution_rad: {unit.resolution_rad:.9e}
-    effects: [bias, scale_factor]
-    bias:
-      offset_v: {row(unit.stated_zero_v - 2.5)}
-    scale_factor:
-      offset_v_per_g: {row(unit.stated_scale_v_per_g - 1.0)}
-    covariance_names: [{', '.join(names)}]
-    covariance: {row(np.diag(spread ** 2).ravel())}
-    provenance:
-      source: sweep
-"""
+def parameter_file(unit: Unit, serial: str, *, nominal_zero_v: float = 2.5,
+                   is_certain: bool = False, **sensor: float) -> str:
+    """Return the parameter file that the user has, with other values of the sensor, if any."""
+    n, resistance = len(unit.axes), 32e3
+    names = ('bias.offset_v', 'scale_factor.offset_v_per_g')
+    variance = np.repeat(np.square((ZERO_G_STD_G, SCALE_STD)), n) * np.tile(
+        unit.stated_scale_v_per_g, 2) ** 2
+    stated = {} if is_certain else {
+        'covariance_names': [f'{name}.{axis}' for name in names for axis in unit.axes],
+        'covariance': np.diag(variance).ravel().tolist()}
+    return yaml.safe_dump({'/**': {'ros__parameters': {
+        'format': 1, 'units': 'V, V/g, 1/g, rad', 'model': 'linear',
+        'sensor': {
+            'serial': serial, 'axes': unit.axes, 'nominal_zero_g_v': [nominal_zero_v] * n,
+            'nominal_scale_v_per_g': [1.0] * n,
+            'noise_density_g_per_rthz': unit.stated_noise_g_per_rthz.tolist(),
+            'rc_resistance_ohm': resistance,
+            'rc_capacitance_f': float(1 / (2 * np.pi * resistance * unit.corner_hz)),
+            'adc_bits': ADC_BITS, 'adc_vref_v': ADC_VREF, 'rate_hz': unit.rate_hz,
+            'range_g': 1.7, 'local_gravity_mps2': G0, 'z_sign': 1, **sensor},
+        'stage': {'resolution_rad': unit.resolution_rad}, 'effects': ['bias', 'scale_factor'],
+        'bias': {'offset_v': (unit.stated_zero_v - nominal_zero_v).tolist()},
+        'scale_factor': {'offset_v_per_g': (unit.stated_scale_v_per_g - 1.0).tolist()},
+        **stated, 'provenance': {'source': 'sweep'}}}}, sort_keys=False)
 
 
 class Place(Enum):
     """Where in the chain a fault acts."""
 
-    STAGE = 'stage'
-    MOUNT = 'mount'
-    ELEMENT = 'element'
-    ELECTRONICS = 'electronics'
-    WIRE = 'wire'
-    SAMPLES = 'samples'
+    STAGE = auto()
+    MOUNT = auto()
+    ELEMENT = auto()
+    ELECTRONICS = auto()
+    WIRE = auto()
+    SAMPLES = auto()
 
 
 @dataclass
@@ -171,6 +154,10 @@ class Run:
         """Return the step of the grid, s."""
         return float(self.t[1] - self.t[0])
 
+    def late_s(self, t: np.ndarray) -> np.ndarray:
+        """Return how late the samples are, s; the oven of the clock makes it wander."""
+        return self.late + self.skew * (t + 8 * np.sin(t / 25))
+
     def random(self, stream: str) -> np.random.Generator:
         """Return the random generator of a stream; other faults do not change it."""
         return np.random.default_rng([self.seed, zlib.crc32(stream.encode())])
@@ -185,13 +172,6 @@ def pink_noise(t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         noise += scipy.signal.lfilter([math.sqrt(1 - keep * keep)], [1, -keep],
                                       rng.normal(size=len(t)), zi=[keep * rng.normal()])[0]
     return noise
-
-
-def low_pass(values: np.ndarray, lag: float, dt: float) -> np.ndarray:
-    """Filter by one slow pole that is at rest before the first value."""
-    keep = np.exp(-dt / lag)
-    first = values[..., :1]
-    return first + scipy.signal.lfilter([1 - keep], [1, -keep], values - first)
 
 
 def travel_memory(x: np.ndarray, travel: float) -> np.ndarray:
@@ -213,36 +193,50 @@ def travel_memory(x: np.ndarray, travel: float) -> np.ndarray:
 
 Shape = dict[str, Any]
 """The numbers of a fault that stay when its size changes: weights `w`, and others by name."""
-Draw = Callable[[np.random.Generator, Unit], Shape]
-"""Draws the shape of a fault of a unit."""
 Act = Callable[[Run, float, Shape], None]
 """Lets a fault of a size and a shape act on a run."""
+Law = Callable[[Run, Shape], Any]
+"""What a fault of size and weight 1 does to an axis, (n,), or to all, (m, n)."""
 
 
-@dataclass(frozen=True)
-class FaultKind:
-    """One kind of fault."""
-
-    name: str  # its name
-    place: Place  # where in the chain it acts
-    act: Act  # how it acts
-    draw: Draw  # how its shape is drawn
-    spread: Callable[[Unit], list[Shape]]  # shapes whose responses span all its responses
-    start: float  # a size at which the search for a strength begins
-    largest: float  # its largest size
-    per_axis: bool = False  # whether the responses of single axes are independent
-    random: bool = False  # whether it differs from run to run
-    in_library: bool = True  # whether the library of effects of the package has its name
-    sizes: tuple[float, ...] = (1.0,)  # multiples of `start` at which its responses span all
+def column(shape: Shape) -> np.ndarray:
+    """Return the weights as a column, (m, 1)."""
+    return np.asarray(shape['w'])[:, None]
 
 
-@dataclass(frozen=True)
-class Fault:
-    """One fault."""
+def constant(run: Run, shape: Shape) -> float:
+    """Shift, or scale, by the size itself: the simplest law."""
+    return 1.0
 
-    kind: FaultKind  # its kind, its size in the unit of the kind, and its shape
-    size: float
-    shape: Shape
+
+def added(law: Law) -> Act:
+    """Add a law to the input of each axis by its weight, g."""
+    def act(run: Run, size: float, shape: Shape) -> None:
+        w = column(shape)
+        run.u[:len(w)] += size * w * law(run, shape)
+    return act
+
+
+def scaled(law: Law) -> Act:
+    """Change the scale factor of each axis by a law and its weight."""
+    def act(run: Run, size: float, shape: Shape) -> None:
+        w = column(shape)
+        run.u[:len(w)] *= 1 + size * w * law(run, shape)
+    return act
+
+
+def added_v(law: Law) -> Act:
+    """Add a law to the output of each axis by its weight, V."""
+    def act(run: Run, size: float, shape: Shape) -> None:
+        run.volts += size * column(shape) * law(run, shape)
+    return act
+
+
+def added_at_output(law: Law) -> Act:
+    """Add a law to the output of each axis by its weight, g."""
+    def act(run: Run, size: float, shape: Shape) -> None:
+        run.volts += size * column(shape) * law(run, shape) * run.unit.scale_v_per_g[:, None]
+    return act
 
 
 _SINGLE_SHARE = 0.4
@@ -251,7 +245,7 @@ _LOG_SPREAD = 0.4
 """Standard deviation of the logarithm of a weight; chosen."""
 
 
-def weights(count: int, rng: np.random.Generator) -> np.ndarray:
+def weights(rng: np.random.Generator, count: int) -> np.ndarray:
     """Draw weights with rms 1 over those that are not 0: one of them, or all."""
     w = rng.choice([-1.0, 1.0], count) * np.exp(rng.normal(0, _LOG_SPREAD, count))
     if rng.random() < _SINGLE_SHARE:
@@ -259,114 +253,159 @@ def weights(count: int, rng: np.random.Generator) -> np.ndarray:
     return w / np.sqrt(np.mean(w[w != 0] ** 2))
 
 
-def draw_weights(count: int, rng: np.random.Generator, unit: Unit) -> Shape:
-    """Draw a number of weights that do not depend on the axes of the unit."""
-    return {'w': weights(count, rng)}
+def positive(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Draw weights as `weights`, all of them positive."""
+    return np.abs(weights(rng, count))
 
 
-def single_weights(count: int, unit: Unit) -> list[Shape]:
-    """Return a shape for each weight alone."""
-    return [{'w': row} for row in np.eye(count)]
+@dataclass(frozen=True)
+class Kind:
+    """One kind of fault."""
+
+    name: str
+    act: Act
+    start: float = 1e-3  # a size at which the search for a strength begins
+    largest: float = 0.05  # its largest size
+    place: Place = Place.ELEMENT  # where in the chain it acts
+    _: KW_ONLY
+    fixed: int = 0  # number of its weights; where it is 0, `each` for each measured axis
+    each: int = 1
+    weigh: Callable[[np.random.Generator, int], np.ndarray] = weights  # draws the weights
+    # its other numbers: bounds of each, or a list to choose from
+    bounds: Mapping[str, tuple[float, float] | list[float]] = field(default_factory=dict)
+    per_axis: bool = True  # whether the responses of single axes are independent
+    random: bool = False  # whether it differs from run to run
+    # multiples of `start`, and other numbers, at which its responses span all
+    sizes: tuple[float, ...] = (1.0,)
+    spread_at: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+
+    def _count(self, unit: Unit) -> int:
+        return self.fixed or self.each * len(unit.axes)
+
+    def draw(self, rng: np.random.Generator, unit: Unit) -> Shape:
+        """Draw the shape of a fault of a unit."""
+        count = self._count(unit)
+        shape: Shape = {'w': self.weigh(rng, count)} if count else {}
+        for name, limits in self.bounds.items():
+            shape[name] = float(rng.choice(limits) if isinstance(limits, list)
+                                else rng.uniform(*limits))
+        return shape
+
+    def spread(self, unit: Unit) -> list[Shape]:
+        """Return shapes whose responses span all its responses."""
+        count = self._count(unit)
+        rows = np.ones((1, count)) if self.per_axis else np.eye(count)
+        shapes: list[Shape] = [{'w': row} for row in rows if count] or [{}]
+        return [{**shape, **dict(zip(self.spread_at, numbers))}
+                for shape in shapes for numbers in product(*self.spread_at.values())]
 
 
-def equal_weights(count: int, unit: Unit) -> list[Shape]:
-    """Return the shape whose weights are all 1."""
-    return [{'w': np.ones(count)}]
+@dataclass(frozen=True)
+class Fault:
+    """One fault: its kind, its size in the unit of the kind, and its shape."""
 
-
-def by_axis(rng: np.random.Generator, unit: Unit) -> Shape:
-    """Draw a weight for each axis of the unit."""
-    return {'w': weights(len(unit.axes), rng)}
-
-
-def all_axes(unit: Unit) -> list[Shape]:
-    """Return the shape with all axes at once."""
-    return [{'w': np.ones(len(unit.axes))}]
-
-
-def column(shape: Shape) -> np.ndarray:
-    """Return the weights as a column, (m, 1)."""
-    return np.asarray(shape['w'])[:, None]
-
-
-class Motion(Protocol):
-    """What moves and surrounds a unit."""
-
-    @property
-    def kind(self) -> str:
-        """Return the kind of the manoeuvre."""
-
-    @property
-    def seconds(self) -> float:
-        """Return the duration, s."""
-
-    def joints(self, t: np.ndarray) -> dict[str, np.ndarray]:
-        """Return alpha and beta (rad) and shift (m) at instants t (s)."""
-
-    def climate(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return temperature (°C) and supply (V) at instants t (s)."""
+    kind: Kind
+    size: float
+    shape: Shape
 
 
 FINE_HZ = 2000.0
 """Lowest rate of the simulation, Hz; chosen. Each sample has a whole number of its steps."""
+_COARSE_HZ = 400.0
+"""Lowest rate of the simulation of responses, Hz; chosen: eight times the filter's corner."""
+DIGITS = {'shift_m': 10, 'temperature_c': 3, 'supply_v': 5}
+"""Digits of a column of a recording after the point; 7 without one."""
 
 
-def stamps(unit: Unit, manoeuvre: Motion) -> np.ndarray:
-    """Return the stamps of a recording."""
-    return np.arange(int(manoeuvre.seconds * unit.rate_hz)) / unit.rate_hz
+@dataclass(frozen=True)
+class Scene:
+    """A unit in a manoeuvre, with the seed of all random numbers; m axes, n samples."""
+
+    unit: Unit
+    manoeuvre: Manoeuvre
+    seed: int
+
+    def stamps(self) -> np.ndarray:
+        """Return the stamps of the recording, s, (n,)."""
+        return np.arange(int(self.manoeuvre.seconds * self.unit.rate_hz)) / self.unit.rate_hz
+
+    def volts(self, faults: Sequence[Fault], *, noise: bool = True, fine_hz: float = FINE_HZ
+              ) -> np.ndarray:
+        """Simulate the recording's volts, (m, n)."""
+        unit, sampled = self.unit, self.stamps()
+        step = 1 / (unit.rate_hz * math.ceil(fine_hz / unit.rate_hz))
+        # Late and early samples must lie within the grid.
+        t = np.arange(-0.5, sampled[-1] + 1.0, step)
+        joints = self.manoeuvre.joints(t)
+        run = Run(unit, t, self.seed, joints['alpha'], joints['beta'], joints['shift'],
+                  *self.manoeuvre.climate(t), corner_hz=unit.corner_hz)
+
+        def act(place: Place) -> None:
+            for fault in faults:
+                if fault.kind.place is place:
+                    fault.kind.act(run, fault.size, fault.shape)
+
+        if noise:
+            _stage_errors(run)
+        act(Place.STAGE)
+        run.force = _force(run)
+        act(Place.MOUNT)
+        run.u = (run.directions @ run.force)[unit.axis_indices] / G0
+        act(Place.ELEMENT)
+        run.volts = unit.zero_v[:, None] + unit.scale_v_per_g[:, None] * run.u
+        act(Place.ELECTRONICS)
+        if noise:
+            run.volts += unit.scale_v_per_g[:, None] * _sensor_noise(run)
+        run.volts = _one_pole(_one_pole(run.volts, run.corner_hz, step), run.second_hz, step)
+        act(Place.WIRE)
+        run.volts = scipy.interpolate.CubicSpline(t, run.volts, axis=1)(
+            np.clip(sampled - run.late_s(sampled), t[0], t[-1]))
+        run.t = sampled
+        act(Place.SAMPLES)
+        if noise:
+            run.volts = np.clip(np.floor(run.volts / LSB_V), 0, 2 ** ADC_BITS - 1) * LSB_V
+        return run.volts
+
+    def response(self, faults: Sequence[Fault], coarse: bool = False) -> np.ndarray:
+        """Return the change of the output by faults, m/s², (m, n)."""
+        noise = any(fault.kind.random for fault in faults)
+        with_faults, without = (self.volts(acting, noise=noise, fine_hz=_COARSE_HZ if coarse
+                                           else FINE_HZ) for acting in (faults, []))
+        return (with_faults - without) * self.unit.volts_to_mps2
+
+    def force(self) -> np.ndarray:
+        """Return the specific force along each axis without faults, m/s², (m, n)."""
+        volts = self.volts([], noise=False)
+        return (volts - self.unit.zero_v[:, None]) * self.unit.volts_to_mps2
+
+    def gap(self, faults: Sequence[Fault]) -> np.ndarray:
+        """Return the recording minus the stated nominal response, m/s², (m, n)."""
+        volts = self.volts(faults) - self.unit.stated_zero_v[:, None]
+        return volts * self.unit.volts_to_mps2 - self.force()
+
+    def references(self) -> dict[str, np.ndarray]:
+        """Return the other columns of the recording, by encoder, thermometer and voltmeter."""
+        t, rng = self.stamps(), np.random.default_rng([self.seed, 77])
+        joints, (temperature, supply) = self.manoeuvre.joints(t), self.manoeuvre.climate(t)
+        step = self.unit.resolution_rad
+        return {'alpha_rad': np.round(joints['alpha'] / step) * step,
+                'beta_rad': np.round(joints['beta'] / step) * step,
+                'shift_m': joints['shift'],
+                'temperature_c': temperature + 0.006 * rng.normal(size=len(t)),
+                'supply_v': supply + 1e-4 * rng.normal(size=len(t))}
+
+    def recording(self, faults: Sequence[Fault], digits: Mapping[str, int] = DIGITS) -> str:
+        """Return the recording as CSV."""
+        volts = {f'{axis}_v': row for axis, row in zip(self.unit.axes, self.volts(faults))}
+        return csv_text({'time_s': self.stamps(), **volts, **self.references()}, digits)
 
 
-def render(unit: Unit, manoeuvre: Motion, faults: Sequence[Fault], seed: int, *,
-           noise: bool = True, fine_hz: float = FINE_HZ) -> np.ndarray:
-    """Simulate a recording's volts."""
-    sampled = stamps(unit, manoeuvre)
-    step = 1 / (unit.rate_hz * math.ceil(fine_hz / unit.rate_hz))
-    # Late and early samples must lie within the grid.
-    t = np.arange(-0.5, sampled[-1] + 1.0, step)
-    joints = manoeuvre.joints(t)
-    run = Run(unit, t, seed, joints['alpha'], joints['beta'], joints['shift'],
-              *manoeuvre.climate(t), corner_hz=unit.corner_hz)
-
-    if noise:
-        _stage_errors(run)
-    _act(faults, Place.STAGE, run)
-    run.force = _force(run)
-    _act(faults, Place.MOUNT, run)
-    run.u = (run.directions @ run.force)[unit.axis_indices] / G0
-    _act(faults, Place.ELEMENT, run)
-    run.volts = unit.zero_v[:, None] + unit.scale_v_per_g[:, None] * run.u
-    _act(faults, Place.ELECTRONICS, run)
-    if noise:
-        run.volts += unit.scale_v_per_g[:, None] * _sensor_noise(run)
-    run.volts = _one_pole(_one_pole(run.volts, run.corner_hz, step), run.second_hz, step)
-    _act(faults, Place.WIRE, run)
-    late = run.late + run.skew * (sampled + 8 * np.sin(sampled / 25))
-    run.volts = scipy.interpolate.CubicSpline(t, run.volts, axis=1)(
-        np.clip(sampled - late, t[0], t[-1]))
-    run.t = sampled
-    _act(faults, Place.SAMPLES, run)
-    if noise:
-        run.volts = np.clip(np.floor(run.volts / LSB_V), 0, 2 ** ADC_BITS - 1) * LSB_V
-    return run.volts
-
-
-def _act(faults: Sequence[Fault], place: Place, run: Run) -> None:
-    for fault in faults:
-        if fault.kind.place is place:
-            fault.kind.act(run, fault.size, fault.shape)
-
-
-def references(unit: Unit, manoeuvre: Motion, seed: int) -> dict[str, np.ndarray]:
-    """Return the other columns of a recording, by encoder, thermometer and voltmeter."""
-    t = stamps(unit, manoeuvre)
-    rng = np.random.default_rng([seed, 77])
-    joints, (temperature, supply) = manoeuvre.joints(t), manoeuvre.climate(t)
-    step = unit.resolution_rad
-    return {'alpha_rad': np.round(joints['alpha'] / step) * step,
-            'beta_rad': np.round(joints['beta'] / step) * step,
-            'shift_m': joints['shift'],
-            'temperature_c': temperature + 0.006 * rng.normal(size=len(t)),
-            'supply_v': supply + 1e-4 * rng.normal(size=len(t))}
+def csv_text(columns: dict[str, np.ndarray], digits: Mapping[str, int]) -> str:
+    """Return columns as CSV, each with as many digits in each recording; NaN is empty."""
+    formats = ','.join(f'%.{digits.get(name, 7)}f' for name in columns)
+    rows = np.stack(list(columns.values()), axis=1)
+    return '\n'.join([','.join(columns), *(formats % tuple(row) for row in rows.tolist()), '']
+                     ).replace('nan', '')
 
 
 def _stage_errors(run: Run) -> None:
