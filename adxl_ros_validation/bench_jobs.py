@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import date
 from importlib import import_module
@@ -95,32 +96,23 @@ def rows_of(job: Job, rounds: int) -> list[str]:
     """Measure one job and its rivals in turns."""
     runs = {'': job.run, **job.rivals}
     seconds: dict[str, list[float]] = {name: [] for name in runs}
-    missing = set()
     # The first of several rounds imports and allocates.
-    warm_up = rounds > 1
-    for number in range(rounds + warm_up):
+    for number in range(0 if rounds > 1 else 1, rounds + 1):
         for name, run in runs.items():
-            if name in missing:
-                continue
             began_s = job.clock()
-            try:
+            with suppress(ImportError):
                 run()
-            except ImportError:
-                missing.add(name)
-                continue
-            if number or not warm_up:
-                seconds[name].append(job.clock() - began_s)
-    measured = np.array(seconds[''])
+                if number:
+                    seconds[name].append(job.clock() - began_s)
+    measured = np.array(seconds.pop(''))
     limit = f'{job.goal:g}' if job.goal else '–'
-    job_name = job.name + job.detail()
+    head = f'| {job.name}{job.detail()} | {_spread(measured)} |'
     if not job.rivals:
-        return [f'| {job_name} | {_spread(measured)} | – | – | {limit} s |'.replace('– s', '–')]
-    rows = []
-    for name in job.rivals:
-        ratio = 'not installed' if name in missing else _spread(measured / np.array(seconds[name]))
-        rows.append(f'| {job_name} | {_spread(measured)} | {name} | {ratio} | {limit} |')
-        limit = '–'
-    return rows
+        return [f'{head} – | – | {limit} s |'.replace('– s', '–')]
+    ratios = [_spread(measured / np.array(theirs)) if theirs else 'not installed'
+              for theirs in seconds.values()]
+    return [f'{head} {name} | {ratio} | {limit if i == 0 else "–"} |'
+            for i, (name, ratio) in enumerate(zip(seconds, ratios))]
 
 
 def _spread(values: np.ndarray) -> str:
@@ -184,24 +176,20 @@ _FREE_BODY = """<mujoco><option timestep="0.001"/><worldbody><body><freejoint/>
 
 def offline_jobs(hours: float) -> Iterator[Job]:
     """Yield the jobs, each with its files."""
-    with tempfile.TemporaryDirectory() as folder:
-        yield from _jobs(Path(folder), hours)
-
-
-def _jobs(folder: Path, hours: float) -> Iterator[Job]:
-    sensor = parameter_file.load(parameter_file.nominal_path())
-    columns = simulate(sensor, sweep(np.random.default_rng(0)), 0)
-    del columns['time_s']
-    samples = _recording(sensor, columns, _ROWS)
-    yield _csv_reading(folder, sensor, samples)
-    yield _csv_writing(folder, sensor, samples)
-    yield _mcap_reading(folder, sensor, samples)
-    yield _applying(folder, sensor, columns)
-    yield from (make() for make in (_simulating, _gravity_fit, _allan, _frames, _in_the_loop,
-                                    _help))
-    yield _demonstration(folder)
-    for kind in ('csv', 'mcap'):
-        yield from _long_applying(folder, sensor, kind, hours)
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        sensor = parameter_file.load(parameter_file.nominal_path())
+        columns = simulate(sensor, sweep(np.random.default_rng(0)), 0)
+        del columns['time_s']
+        samples = _recording(sensor, columns, _ROWS)
+        yield from _reading_and_writing(folder, sensor, samples)
+        yield _applying(folder, sensor, columns)
+        yield from (make() for make in (_simulating, _gravity_fit, _allan, _frames, _in_the_loop,
+                                        _help))
+        demo = _Program('demo', '-o', str(folder / 'demo'))
+        yield Job('demo, elapsed time', demo.run, _DEMO_S, rounds=1, clock=time.monotonic)
+        for kind in ('csv', 'mcap'):
+            yield from _long_applying(folder, sensor, kind, hours)
 
 
 def _recording(sensor: Sensor, columns: dict[str, np.ndarray], rows: int) -> Recording:
@@ -210,39 +198,30 @@ def _recording(sensor: Sensor, columns: dict[str, np.ndarray], rows: int) -> Rec
     return Recording('bench', np.arange(rows) / _RATE_HZ, repeated, sensor_info(sensor))
 
 
-def _csv_reading(folder: Path, sensor: Sensor, samples: Recording) -> Job:
-    path = folder / 'read.csv'
-    recording.write(path, replace(samples, info={}), sensor)
-    return Job(f'read CSV, {_ROWS} rows', lambda: recording.read(path), 1.5, {
-        'pyarrow': lambda: import_module('pyarrow.csv').read_csv(path),
-        'polars': lambda: import_module('polars').read_csv(path)})
+def _reading_and_writing(folder: Path, sensor: Sensor, samples: Recording) -> Iterator[Job]:
+    csv, mcap = folder / 'read.csv', folder / 'read.mcap'
+    recording.write(csv, replace(samples, info={}), sensor)
+    recording.write(mcap, samples, sensor)
 
-
-def _csv_writing(folder: Path, sensor: Sensor, samples: Recording) -> Job:
-    columns = {'time_s': samples.time_s, **samples.columns}
-
-    def by_pyarrow() -> None:
-        table = import_module('pyarrow').table(columns)
+    def write_by_pyarrow() -> None:
+        table = import_module('pyarrow').table({'time_s': samples.time_s, **samples.columns})
         import_module('pyarrow.csv').write_csv(table, folder / 'theirs.csv')
 
-    return Job(f'write CSV, {_ROWS} rows',
-               lambda: recording.write(folder / 'ours.csv', samples, sensor), 0.0,
-               {'pyarrow': by_pyarrow})
-
-
-def _mcap_reading(folder: Path, sensor: Sensor, samples: Recording) -> Job:
-    path = folder / 'read.mcap'
-    recording.write(path, samples, sensor)
-
-    def by_rosbags() -> None:
+    def read_by_rosbags() -> None:
         types = import_module('rosbags.typesys')
         store = types.get_typestore(types.Stores.ROS2_JAZZY)
-        with import_module('rosbags.rosbag2').Reader(path) as reader:
+        with import_module('rosbags.rosbag2').Reader(mcap) as reader:
             for connection, _, raw in reader.messages():
                 store.deserialize_cdr(raw, connection.msgtype)
 
-    return Job(f'read MCAP, {2 * _ROWS} messages', lambda: recording.read(path), 0.25,
-               {'rosbags': by_rosbags})
+    yield Job(f'read CSV, {_ROWS} rows', lambda: recording.read(csv), 1.5, {
+        'pyarrow': lambda: import_module('pyarrow.csv').read_csv(csv),
+        'polars': lambda: import_module('polars').read_csv(csv)})
+    yield Job(f'write CSV, {_ROWS} rows',
+              lambda: recording.write(folder / 'ours.csv', samples, sensor), 0.0,
+              {'pyarrow': write_by_pyarrow})
+    yield Job(f'read MCAP, {2 * _ROWS} messages', lambda: recording.read(mcap), 0.25,
+              {'rosbags': read_by_rosbags})
 
 
 def _applying(folder: Path, sensor: Sensor, columns: dict[str, np.ndarray]) -> Job:
@@ -291,12 +270,6 @@ class _Program:
     def costs(self) -> str:
         """Return elapsed time and largest memory of the last run, for people."""
         return f' ({self.elapsed_s:.0f} s elapsed, {self.memory_mb:.0f} MB)'
-
-
-def _demonstration(folder: Path) -> Job:
-    """Run the demonstration, in elapsed time."""
-    program = _Program('demo', '-o', str(folder / 'demo'))
-    return Job('demo, elapsed time', program.run, _DEMO_S, rounds=1, clock=time.monotonic)
 
 
 def _long_applying(folder: Path, sensor: Sensor, kind: str, hours: float) -> Iterator[Job]:

@@ -26,7 +26,7 @@ from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros_validation import experiments
-from adxl_ros_validation.reproduction_report import markdown_table
+from adxl_ros_validation.blind.report_html import markdown_table
 import numpy as np
 import scipy
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 import os
 import textwrap
@@ -15,6 +15,7 @@ from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report.figures import png, pyplot
 from adxl_ros_validation import experiments
+from adxl_ros_validation.blind.report_html import markdown_table
 from adxl_ros_validation.experiments import DirectionSearch, ModelErrors, MODELS, RUNS, Unit
 import numpy as np
 
@@ -183,12 +184,6 @@ def in_words(angle: str) -> str:
     """Return the paper's rms and largest error of an angle by model."""
     return ', '.join(f'{name} {rms} / {largest}°' for (a, name), (rms, largest)
                      in TABLE_I.items() if a == angle)
-
-
-def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table, Markdown."""
-    return '\n'.join([f'| {" | ".join(head)} |', '|' + '---|' * len(head),
-                      *(f'| {" | ".join(cells)} |' for cells in rows)])
 
 
 def _errors(units: Sequence[Unit], model: str, row: int, what: str = 'error') -> np.ndarray:

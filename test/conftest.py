@@ -42,13 +42,16 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests of a graph; keep the shared results of a module in one worker of xdist."""
+    """Mark tests of a graph; keep the results that a module shares in one worker of xdist."""
     for item in items:
         fixtures = set(getattr(item, 'fixturenames', ()))
         if 'ros_env' in fixtures:
             item.add_marker(pytest.mark.live)
         if {'committed_check', 'evaluations'} & fixtures:
             item.add_marker(pytest.mark.xdist_group(item.path.stem))
+    # The longest first, so that no worker waits for the others at the end.
+    items.sort(key=lambda item: [item.get_closest_marker(mark) is None
+                                 for mark in ('xdist_group', 'long')])
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -3,26 +3,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager
 from datetime import date
-from functools import partial
-import json
 from pathlib import Path
 from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.package_version import package_version
-from adxl_ros.workers import for_each, make_folder, write
+from adxl_ros.workers import make_folder
 from adxl_ros_validation.blind import diagnosis_runs, grading, scores, sealing
+from adxl_ros_validation.blind.diagnosis_runs import Show
 from adxl_ros_validation.blind.scores import Trial
 from adxl_ros_validation.blind.trials import Label
 import numpy as np
 import scipy
-
-Show = Callable[[str], AbstractContextManager[Callable[[float], None]]]
-"""Receives the name of a stage; gives a context with what receives the finished fraction."""
 
 
 def score(folder: Path, pool: Executor, show: Show) -> dict[str, Any]:
@@ -38,8 +33,15 @@ def score(folder: Path, pool: Executor, show: Show) -> dict[str, Any]:
     if missing:
         raise UserError(f'{folder / "recordings"}: {missing[0]}.csv is missing, {len(missing)} '
                         'of the committed recordings in all; a check needs all of them')
+    by_name = {label.name: label for label in labels}
+
+    def job(name: str) -> tuple:
+        stated = (folder / 'recordings' / f'{name}.yaml').read_text()
+        return by_name[name], stated, results[name]['parameters']
+
     with show('held out') as advance:
-        held_out = _held_out(folder, labels, results, pool, advance)
+        held_out = diagnosis_runs.kept(make_folder(folder / 'labels' / 'held'), list(by_name),
+                                       diagnosis_runs.evaluate, job, pool, advance)
     graded = [Trial(label, grading.answer(results[label.name]), held_out[label.name])
               for label in labels]
     made = scores.scores(graded)
@@ -53,24 +55,6 @@ def score(folder: Path, pool: Executor, show: Show) -> dict[str, Any]:
         'bars': scores.bars(made), 'controls': negative,
         'leaks': any(control['leaks'] for control in negative.values()),
         'scores': made, 'rows': [_row(trial) for trial in graded]}
-
-
-def _held_out(folder: Path, labels: Sequence[Label], results: dict[str, diagnosis_runs.Result],
-              pool: Executor, show: Callable[[float], None]) -> dict[str, dict[str, Any] | None]:
-    done = make_folder(folder / 'labels' / 'held')
-
-    def keep(name: str, gap: dict[str, Any] | None) -> None:
-        write(done / f'{name}.json', json.dumps(gap).encode())
-
-    def job(label: Label) -> tuple:
-        stated = (folder / 'recordings' / f'{label.name}.yaml').read_text()
-        return label, stated, results[label.name]['parameters']
-
-    todo = [label for label in labels if not (done / f'{label.name}.json').exists()]
-    for_each(pool, diagnosis_runs.evaluate, [partial(job, label) for label in todo],
-             keep, show, len(labels) - len(todo))
-    return {label.name: json.loads((done / f'{label.name}.json').read_bytes())
-            for label in labels}
 
 
 def _row(trial: Trial) -> dict[str, Any]:

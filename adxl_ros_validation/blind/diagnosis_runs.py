@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 import hashlib
@@ -35,6 +36,8 @@ _ENVIRONMENT = ('PATH', 'LD_LIBRARY_PATH', 'PYTHONPATH', 'AMENT_PREFIX_PATH', 'V
 """Variables that ROS 2 and Python need. None contains the folder of the check."""
 _TIMEOUT_S = 1200.0
 """Longest time of one diagnosis, s; chosen."""
+Show = Callable[[str], AbstractContextManager[Callable[[float], None]]]
+"""Receives the name of a stage; gives a context with what receives the finished fraction."""
 Result = dict[str, Any]
 """What a diagnosis left: `report`, `parameters`, `seconds`, `status` and `error`."""
 
@@ -45,16 +48,16 @@ def executable(name: str) -> list[str]:
             f'import sys; from adxl_ros.tools.{name} import main; sys.exit(main())']
 
 
-def call(command: Sequence[str], folder: Path) -> tuple[int, str]:
-    """Run a command in a folder, with an environment that names no other folder of the user."""
+def call(folder: Path, name: str, *arguments: str) -> tuple[int, str]:
+    """Run an executable in a folder, in an environment that names no other folder of the user."""
     environment = {name: os.environ[name] for name in _ENVIRONMENT if name in os.environ}
     # Each process uses one core: linear algebra must not use the others.
     environment |= {'HOME': str(folder), 'OPENBLAS_NUM_THREADS': '1', 'OMP_NUM_THREADS': '1',
                     'MPLCONFIGDIR': str(folder)}
     try:
-        done = subprocess.run(command, cwd=folder, env=environment, stdin=subprocess.DEVNULL,
-                              stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-                              timeout=_TIMEOUT_S)
+        done = subprocess.run([*executable(name), *arguments], cwd=folder, env=environment,
+                              stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+                              stderr=subprocess.PIPE, text=True, timeout=_TIMEOUT_S)
     except subprocess.TimeoutExpired:
         return 1, f'not finished after {_TIMEOUT_S:.0f} s'
     crashed = 'traceback: ' if 'Traceback (most recent' in done.stderr else ''
@@ -70,11 +73,10 @@ def diagnose(name: str, recording: bytes, parameters: bytes, sim: bytes | None =
             if data is not None:
                 (folder / f'{name}{suffix}').write_bytes(data)
                 os.utime(folder / f'{name}{suffix}', (0, 0))
-        arguments = [*executable('diagnose'), f'{name}.csv', '--params',
-                     f'{name}.yaml', '-o', 'out', '--json', '--seed', '0',
-                     *(['--sim', f'{name}_sim.csv'] if sim else [])]
         start, cpu = time.monotonic(), _children_cpu_s()
-        status, error = call(arguments, folder)
+        status, error = call(
+            folder, 'diagnose', f'{name}.csv', '--params', f'{name}.yaml', '-o', 'out', '--json',
+            '--seed', '0', *(['--sim', f'{name}_sim.csv'] if sim else []))
         seconds, cpu = time.monotonic() - start, _children_cpu_s() - cpu
         params = folder / 'out' / 'params.yaml'
         try:
@@ -95,32 +97,40 @@ def _children_cpu_s() -> float:
 def diagnose_all(folder: Path, pool: Executor, show: Callable[[float], None]
                  ) -> dict[str, Result]:
     """Diagnose all recordings of a folder that have no report yet."""
-    reports, code = make_folder(folder / 'reports'), code_version()
+    reports, recordings = make_folder(folder / 'reports'), folder / 'recordings'
+    code = code_version()
     stamp = reports / 'version.txt'
     if stamp.exists() and stamp.read_text() != code:
         raise UserError(f'{stamp}: earlier reports are of another version of the diagnosis '
                         f'({stamp.read_text()[:12]}, now {code[:12]}); draw a new check '
                         'into another folder')
     write(stamp, code.encode())
-    names = sorted(path.stem for path in (folder / 'recordings').glob('*.csv'))
-    todo = [name for name in names if not (reports / f'{name}.json').exists()]
 
     def job(name: str) -> tuple:
-        source = folder / 'recordings' / name
-        sim = source.with_suffix('.sim')
-        return (name, source.with_suffix('.csv').read_bytes(),
-                source.with_suffix('.yaml').read_bytes(),
+        csv, parameters, sim = (recordings / f'{name}.{suffix}' for suffix in (
+            'csv', 'yaml', 'sim'))
+        return (name, csv.read_bytes(), parameters.read_bytes(),
                 sim.read_bytes() if sim.exists() else None)
 
-    def keep(name: str, result: Result) -> None:
-        write(reports / f'{name}.json', json.dumps(result).encode())
-
-    for_each(pool, diagnose, [partial(job, name) for name in todo], keep, show,
-             len(names) - len(todo))
+    results = kept(reports, sorted(path.stem for path in recordings.glob('*.csv')), diagnose, job,
+                   pool, show)
     if code_version() != code:
         raise UserError('the code of the diagnosis changed while it ran; draw a new check into '
                         'another folder, and do not change the package meanwhile')
-    return {name: json.loads((reports / f'{name}.json').read_bytes()) for name in names}
+    return results
+
+
+def kept(folder: Path, names: Sequence[str], work: Callable[..., tuple[str, Any]],
+         job: Callable[[str], tuple], pool: Executor, show: Callable[[float], None]
+         ) -> dict[str, Any]:
+    """Do the work that has no result in a folder yet, and return all results by name."""
+    def keep(name: str, result: Any) -> None:
+        write(folder / f'{name}.json', json.dumps(result).encode())
+
+    todo = [name for name in names if not (folder / f'{name}.json').exists()]
+    for_each(pool, work, [partial(job, name) for name in todo], keep, show,
+             len(names) - len(todo))
+    return {name: json.loads((folder / f'{name}.json').read_bytes()) for name in names}
 
 
 def code_version() -> str:
@@ -213,8 +223,8 @@ def simulated(csv: str, parameters: str) -> np.ndarray:
         (folder / 'held.csv').write_text(csv)
         (folder / 'held.yaml').write_text(yaml.safe_dump(
             {'/**': {'ros__parameters': _without_noise(parameters)}}))
-        status, error = call([*executable('simulate'), 'held.csv', '--params', 'held.yaml',
-                              '-o', 'again.csv'], folder)
+        status, error = call(folder, 'simulate', 'held.csv', '--params', 'held.yaml', '-o',
+                             'again.csv')
         if status:
             raise UserError(f'simulate: {error}')
         table = pd.read_csv(folder / 'again.csv', comment='#', float_precision='round_trip')

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 import hashlib
@@ -31,6 +30,7 @@ from adxl_ros_validation.blind import (
     sealing,
     trials,
 )
+from adxl_ros_validation.blind.diagnosis_runs import Show
 from adxl_ros_validation.blind.grading import Answer, UNKNOWN
 from adxl_ros_validation.blind.trials import Drawn, Label, Plan
 from adxl_ros_validation.blind.world import ideal_observer
@@ -74,7 +74,6 @@ _OF_MOTION = frozenset(['time_offset', 'clock_skew', 'vibration_rectification', 
 _OF_FORCE = frozenset(['scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z',
                        'scale_factor_z', 'nonlinearity', 'quadratic', 'hysteresis', 'dead_zone',
                        'product', 'loose_gain', 'adc_inl'])
-Show = Callable[[str], AbstractContextManager[Callable[[float], None]]]
 
 
 @dataclass(frozen=True)
@@ -211,9 +210,8 @@ def _fitted(folder: Path, warm: bool) -> str:
     """Return the parameters that `fit` makes of the first part."""
     error = ''
     for words in ([], ['--effect', 'temperature_bias']) if warm else ([],):
-        status, error = diagnosis_runs.call(
-            [*diagnosis_runs.executable('fit'), 'first.csv', *words, '--store', '', '-o',
-             'unit.yaml'], folder)
+        status, error = diagnosis_runs.call(folder, 'fit', 'first.csv', *words, '--store', '',
+                                            '-o', 'unit.yaml')
         if not status:
             return (folder / 'unit.yaml').read_text()
     raise UserError(f'its first part makes no parameters: {error}')
@@ -237,9 +235,8 @@ def _against_force(first: Half) -> str:
 
 def _applied(folder: Path) -> np.ndarray:
     """Return the calibrated force of the later part, m/s², (3, n)."""
-    status, error = diagnosis_runs.call(
-        [*diagnosis_runs.executable('apply'), 'second.csv', '--params', 'unit.yaml', '-o',
-         'force.csv'], folder)
+    status, error = diagnosis_runs.call(folder, 'apply', 'second.csv', '--params', 'unit.yaml',
+                                        '-o', 'force.csv')
     if status:
         raise UserError(error)
     columns = _read(folder / 'force.csv')[0]

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from html import escape
 from itertools import chain
 import textwrap
@@ -67,7 +68,7 @@ def terminal_table(table: Table) -> list[str]:
 def markdown_result(made: dict[str, Any]) -> str:
     """Return the table of the result for the documentation."""
     return '\n'.join([_filled(_drawn(made)), '', _leaks(made), '',
-                      *_markdown_table(_result(made)), '', _TOO_FEW])
+                      markdown_table(*_result(made)), '', _TOO_FEW])
 
 
 def markdown(made: dict[str, Any]) -> str:
@@ -80,7 +81,7 @@ def tables_as_markdown(said: list[str], tables: dict[str, Table]) -> str:
     out = [line for text in said for line in (_filled(text), '')]
     for title, table in tables.items():
         if table[1]:
-            out += [f'### {title}', '', *_markdown_table(table), '']
+            out += [f'### {title}', '', markdown_table(*table), '']
     return '\n'.join(out)
 
 
@@ -88,10 +89,10 @@ def _filled(text: str) -> str:
     return textwrap.fill(text, 99, break_on_hyphens=False)
 
 
-def _markdown_table(table: Table) -> list[str]:
-    head, rows = table
-    return [f'| {" | ".join(head)} |', '|' + '---|' * len(head),
-            *(f'| {" | ".join(row)} |' for row in rows)]
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table, Markdown."""
+    return '\n'.join([f'| {" | ".join(head)} |', '|' + '---|' * len(head),
+                      *(f'| {" | ".join(row)} |' for row in rows)])
 
 
 def page(made: dict[str, Any]) -> str:

