@@ -14,7 +14,7 @@ from functools import partial
 import math
 
 from adxl_ros_validation.blind.world import faults, ideal_observer, simulator as sim
-from adxl_ros_validation.blind.world.motion import low_pass, Manoeuvre, Script
+from adxl_ros_validation.blind.world.motion import low_pass, Manoeuvre
 from adxl_ros_validation.blind.world.simulator import Fault, G0, Place, Run, Scene, Shape, Unit
 import numpy as np
 import scipy
@@ -64,14 +64,14 @@ def _fade(u: np.ndarray) -> np.ndarray:
 
 def draw_motion(rng: np.random.Generator, unit: Unit, needs: set[str]) -> Manoeuvre:
     """Draw a manoeuvre that has what some faults need: 'heat', 'supply', 'shake' or 'fast'."""
-    script = Script(share=trapezoidal if rng.random() < 0.5 else cycloidal, fade=_fade)
+    script = Manoeuvre(share=trapezoidal if rng.random() < 0.5 else cycloidal, fade=_fade)
     length = min(rng.uniform(*SECONDS), _MOST_SAMPLES / unit.rate_hz)
     script.beta[0] = rng.uniform(-3, 3)
     script.rest(2.0)
     blocks = ['planes', 'poses', 'fast', 'shake']
     if not needs and rng.random() < 0.2:
         blocks = [str(rng.choice(['planes', 'poses']))]
-    while script.end < length:
+    while script.seconds < length:
         for block in rng.permutation(blocks):
             _block(script, str(block), rng, unit)
     script.rest(2.0)
@@ -79,11 +79,12 @@ def draw_motion(rng: np.random.Generator, unit: Unit, needs: set[str]) -> Manoeu
     heat = (rng.uniform(20, 28), rng.uniform(6, 20) * warm, rng.uniform(8, 30))
     sag = (rng.uniform(0.02, 0.08) * ('supply' in needs or rng.random() < 0.4),
            rng.uniform(17, 50))
-    return Manoeuvre(blocks[0] if len(blocks) == 1 else 'mixed', script,
-                     partial(_climate, script.end, heat, sag))
+    script.kind = blocks[0] if len(blocks) == 1 else 'mixed'
+    script.climate = partial(_climate, script.seconds, heat, sag)
+    return script
 
 
-def _block(script: Script, block: str, rng: np.random.Generator, unit: Unit) -> None:
+def _block(script: Manoeuvre, block: str, rng: np.random.Generator, unit: Unit) -> None:
     """Add some moves of one sort, 15 to 40 s."""
     if block == 'planes':
         script.go(seconds=2.0, alpha=math.radians(rng.uniform(20, 160)))
@@ -123,16 +124,15 @@ def _climate(seconds: float, heat: tuple[float, float, float], sag: tuple[float,
 
 def recalibrated(unit: Unit, acting: list[Fault]) -> Unit:
     """Calibrate zero-g and scale factor of a unit that has faults at rest by a straight line."""
-    script = Script(share=trapezoidal)
+    script = Manoeuvre('rests', share=trapezoidal)
     ends = []
     for alpha in (90, 45, 135):
         for beta in range(0, 360, 30):
             script.go(math.radians(alpha), math.radians(beta), 0.4)
             script.rest(0.6)
-            ends.append(script.end)
+            ends.append(script.seconds)
     still = replace(unit, rate_hz=50.0)
-    climate = partial(_climate, script.end, (25.0, 0.0, 20.0), (0.0, 1.0))
-    scene = Scene(still, Manoeuvre('rests', script, climate), 0)
+    scene = Scene(still, script, 0)
     with_faults, without = (scene.volts(kept, noise=False, fine_hz=200.0)
                             for kept in (acting, []))
     t = scene.stamps()

@@ -145,7 +145,7 @@ def _noise(drawn: Scene) -> np.ndarray:
 
 def _with_faults(label: Label, observer: IdealObserver) -> Label:
     rng = np.random.default_rng([*label.seed, 9])
-    rivals = {name: observer.span(changes) for name, changes in observer.responses().items()}
+    rivals = observer.rivals()
     rows, flexible = [], 0.0
     for name in label.effects:
         kind = KINDS[name]

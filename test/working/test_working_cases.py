@@ -5,7 +5,7 @@ from adxl_ros.model.effects import library
 from adxl_ros_validation import working_cases, working_world as world
 from adxl_ros_validation.blind.trials import Label
 from adxl_ros_validation.blind.world.ideal_observer import rms
-from adxl_ros_validation.blind.world.motion import Script
+from adxl_ros_validation.blind.world.motion import Manoeuvre
 from adxl_ros_validation.blind.world.simulator import Fault, Scene
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def test_every_fault_changes_a_recording(name, scene):
 
 @pytest.mark.parametrize('share', [world.trapezoidal, world.cycloidal])
 def test_moves_reach_their_ends_without_a_jump(share):
-    script = Script(share=share)
+    script = Manoeuvre(share=share)
     script.rest(1.0)
     script.go(seconds=2.0, beta=1.0, alpha=0.5)
     script.go(seconds=1.0, beta=-0.5)

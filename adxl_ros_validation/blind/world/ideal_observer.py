@@ -108,23 +108,21 @@ class IdealObserver:
         vector = np.concatenate([self.whiten(change), self._no_prior])
         return vector - self.stated @ (self.stated.T @ vector)
 
-    def responses(self) -> dict[str, list[np.ndarray]]:
-        """Return the responses of each effect that is not like noise, m/s², (m, n) each."""
-        responses = {}
+    def rivals(self) -> dict[str, np.ndarray]:
+        """Return columns that span the responses of each effect that is not like noise, (v, k)."""
+        rivals = {}
         for name in KNOWN:
             kind = KINDS[name]
             if kind.random:
                 continue
             changes = [self.scene.response([Fault(kind, multiple * kind.start, shape)], True)
                        for shape in kind.spread(self.scene.unit) for multiple in kind.sizes]
-            responses[name] = [self.of_axis(d, change[d]) for change in changes
-                               for d in range(self.axes) if change[d].any()
-                               ] if kind.per_axis else changes
-        return responses
-
-    def span(self, responses: list[np.ndarray]) -> np.ndarray:
-        """Return orthonormal columns that span whitened responses, (v, k)."""
-        return _orthonormal([self.project(change) for change in responses], self.stated.shape[0])
+            if kind.per_axis:
+                changes = [self.of_axis(d, change[d]) for change in changes
+                           for d in range(self.axes) if change[d].any()]
+            rivals[name] = _orthonormal([self.project(change) for change in changes],
+                                        self.stated.shape[0])
+        return rivals
 
     def flexible_power(self, reserved: np.ndarray, vector: np.ndarray) -> float:
         """Return the power of a flexible model of force, rate, angle, temperature and time."""

@@ -31,6 +31,11 @@ def smooth(x: np.ndarray) -> np.ndarray:
     return x ** 3 * (10 - 15 * x + 6 * x * x)
 
 
+def still_air(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return 25 °C and 5 V."""
+    return np.full_like(t, 25.0), np.full_like(t, 5.0)
+
+
 def _fade(u: np.ndarray) -> np.ndarray:
     """Fade in and out over a fifth of the duration, with three derivatives."""
     edge = np.clip(np.minimum(u, 1 - u) / 0.2, 0, 1)
@@ -38,9 +43,10 @@ def _fade(u: np.ndarray) -> np.ndarray:
 
 
 @dataclass
-class Script:
-    """Knots of the joints, with swings and bursts of the shaker added to them."""
+class Manoeuvre:
+    """Knots of the joints, with swings and bursts of the shaker added, and the environment."""
 
+    kind: str = ''
     time: list[float] = field(default_factory=lambda: [0.0])  # instants of the knots, s
     # joint angles at the knots, rad
     alpha: list[float] = field(default_factory=lambda: [np.pi / 2])
@@ -49,10 +55,12 @@ class Script:
     swings: list[tuple[str, float, float, float, float, float]] = field(default_factory=list)
     share: Curve = smooth  # share of a move that is done at a share of its time
     fade: Curve = _fade  # amplitude of a swing at a share of its time
+    # temperature, °C, and supply, V, at instants, s
+    climate: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] = still_air
 
     @property
-    def end(self) -> float:
-        """Return the instant of the last knot, s."""
+    def seconds(self) -> float:
+        """Return the duration so far, s."""
         return self.time[-1]
 
     def rest(self, seconds: float) -> None:
@@ -62,14 +70,15 @@ class Script:
     def go(self, alpha: float | None = None, beta: float | None = None, seconds: float = 0.0
            ) -> None:
         """Move joints to where they should be, rad, at once."""
-        self.time.append(self.end + seconds)
+        self.time.append(self.seconds + seconds)
         self.alpha.append(self.alpha[-1] if alpha is None else alpha)
         self.beta.append(self.beta[-1] if beta is None else beta)
 
     def swing(self, joint: str, size: float, hertz: float, seconds: float,
               to_hertz: float | None = None) -> None:
         """Swing a joint about its position; a frequency that changes keeps the acceleration."""
-        self.swings.append((joint, size, hertz, to_hertz or hertz, self.end, self.end + seconds))
+        self.swings.append((joint, size, hertz, to_hertz or hertz, self.seconds,
+                            self.seconds + seconds))
         self.rest(seconds)
 
     def joints(self, t: np.ndarray) -> dict[str, np.ndarray]:
@@ -91,53 +100,36 @@ class Script:
         return joints
 
 
-@dataclass(frozen=True)
-class Manoeuvre:
-    """One manoeuvre and its environment."""
-
-    kind: str
-    script: Script  # motion of the joints
-    climate: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]  # °C and V at instants, s
-
-    @property
-    def seconds(self) -> float:
-        """Return the duration, s."""
-        return self.script.end
-
-    def joints(self, t: np.ndarray) -> dict[str, np.ndarray]:
-        """Return alpha and beta (rad) and shift (m) at instants t (s)."""
-        return self.script.joints(t)
-
-
 def draw(rng: np.random.Generator, seconds: tuple[float, float], rate_hz: float,
          kind: str | None = None) -> Manoeuvre:
     """Draw a manoeuvre; a quarter of them are poor."""
     length = rng.uniform(*seconds)
     if kind is None:
         kind = str(rng.choice(POOR)) if rng.random() < 0.25 else 'rich'
-    script = Script()
+    script = Manoeuvre(kind)
     script.beta[0] = rng.uniform(-np.pi, np.pi)
     script.rest(rng.uniform(1.5, 3.0))
-    moves: dict[str, Callable[[Script, float, np.random.Generator], None]] = {
+    moves: dict[str, Callable[[Manoeuvre, float, np.random.Generator], None]] = {
         'rich': partial(_rich, min(_FASTEST_HZ, rate_hz / 10)), 'one_way': _one_way,
         'crawl': _crawl, 'few_poses': _few_poses, 'together': _few_poses,
         'one_plane': _one_plane}
     moves[kind](script, length, rng)
     script.rest(rng.uniform(1.0, 2.0))
-    temperature, supply = (law(kind, script.end, rng) for law in (_temperature, _supply))
-    return Manoeuvre(kind, script, lambda t: (np.interp(t, *temperature), np.interp(t, *supply)))
+    temperature, supply = (law(kind, script.seconds, rng) for law in (_temperature, _supply))
+    script.climate = lambda t: (np.interp(t, *temperature), np.interp(t, *supply))
+    return script
 
 
-def _rich(fastest_hz: float, script: Script, length: float, rng: np.random.Generator) -> None:
+def _rich(fastest_hz: float, script: Manoeuvre, length: float, rng: np.random.Generator) -> None:
     moves = [_plane, _tilts, _swing_beta, partial(_shake, fastest_hz), _plane, _swing_alpha, _dash]
     while True:
         for i in rng.permutation(len(moves)):
-            if script.end > length:
+            if script.seconds > length:
                 return
             moves[i](script, rng)
 
 
-def _plane(script: Script, rng: np.random.Generator) -> None:
+def _plane(script: Manoeuvre, rng: np.random.Generator) -> None:
     alpha = np.deg2rad(rng.uniform(25, 155))
     script.go(alpha, script.beta[-1], rng.uniform(1.0, 2.5))
     step, start = rng.uniform(0.7, 1.5), script.beta[-1]
@@ -148,31 +140,31 @@ def _plane(script: Script, rng: np.random.Generator) -> None:
     script.go(alpha, start + rng.normal(0, 0.3), 1.0)
 
 
-def _tilts(script: Script, rng: np.random.Generator) -> None:
+def _tilts(script: Manoeuvre, rng: np.random.Generator) -> None:
     beta = script.beta[-1]
     for _ in range(int(rng.integers(4, 7))):
         script.go(np.deg2rad(rng.uniform(5, 175)), beta, rng.uniform(0.8, 2.5))
         script.rest(rng.uniform(0.5, 1.3))
 
 
-def _swing_beta(script: Script, rng: np.random.Generator) -> None:
+def _swing_beta(script: Manoeuvre, rng: np.random.Generator) -> None:
     script.go(np.deg2rad(rng.uniform(50, 130)), script.beta[-1], 1.5)
     script.swing('beta', rng.uniform(0.4, 0.9), rng.uniform(0.25, 0.9), rng.uniform(9, 15))
 
 
-def _swing_alpha(script: Script, rng: np.random.Generator) -> None:
+def _swing_alpha(script: Manoeuvre, rng: np.random.Generator) -> None:
     script.go(np.deg2rad(rng.uniform(60, 120)), script.beta[-1] + rng.uniform(-1, 1), 1.5)
     script.swing('alpha', rng.uniform(0.2, 0.5), rng.uniform(0.25, 0.8), rng.uniform(8, 12))
 
 
-def _shake(fastest_hz: float, script: Script, rng: np.random.Generator) -> None:
+def _shake(fastest_hz: float, script: Manoeuvre, rng: np.random.Generator) -> None:
     for _ in range(2):
         hertz = np.exp(rng.uniform(np.log(3), np.log(fastest_hz)))
         size = rng.uniform(0.8, 3.5) / (2 * np.pi * hertz) ** 2
         script.swing('shift', size, hertz, rng.uniform(4, 7))
 
 
-def _dash(script: Script, rng: np.random.Generator) -> None:
+def _dash(script: Manoeuvre, rng: np.random.Generator) -> None:
     for _ in range(5):
         turn = rng.uniform(0.8, 2.2) * rng.choice([-1, 1])
         script.go(float(np.clip(script.alpha[-1] + rng.normal(0, 0.4), 0.1, 3.0)),
@@ -180,24 +172,24 @@ def _dash(script: Script, rng: np.random.Generator) -> None:
         script.rest(rng.uniform(0.3, 0.9))
 
 
-def _one_way(script: Script, length: float, rng: np.random.Generator) -> None:
+def _one_way(script: Manoeuvre, length: float, rng: np.random.Generator) -> None:
     """Turn in one plane, in one direction, at one speed."""
     alpha, step = np.deg2rad(rng.uniform(70, 110)), rng.uniform(0.35, 0.6)
     script.alpha[:] = [alpha] * len(script.alpha)
-    while script.end < 0.6 * length:
+    while script.seconds < 0.6 * length:
         script.go(alpha, script.beta[-1] + step, step / 0.5)
         script.rest(1.2)
 
 
-def _crawl(script: Script, length: float, rng: np.random.Generator) -> None:
+def _crawl(script: Manoeuvre, length: float, rng: np.random.Generator) -> None:
     """Turn slowly between random poses."""
-    while script.end < 0.8 * length:
+    while script.seconds < 0.8 * length:
         script.go(np.deg2rad(rng.uniform(30, 150)), script.beta[-1] + rng.uniform(-2, 2),
                   rng.uniform(12, 20))
         script.rest(2.0)
 
 
-def _few_poses(script: Script, length: float, rng: np.random.Generator) -> None:
+def _few_poses(script: Manoeuvre, length: float, rng: np.random.Generator) -> None:
     """Visit five or six poses, each once."""
     count = int(rng.integers(5, 7))
     for _ in range(count):
@@ -205,11 +197,11 @@ def _few_poses(script: Script, length: float, rng: np.random.Generator) -> None:
         script.rest(0.7 * length / count - 3.0)
 
 
-def _one_plane(script: Script, length: float, rng: np.random.Generator) -> None:
+def _one_plane(script: Manoeuvre, length: float, rng: np.random.Generator) -> None:
     """Turn in the vertical plane only, forward and backward, at one speed."""
     script.alpha[:] = [np.pi / 2] * len(script.alpha)
     step = rng.uniform(0.5, 0.9)
-    while script.end < 0.7 * length:
+    while script.seconds < 0.7 * length:
         for direction in [1] * 7 + [-1] * 7:
             script.go(np.pi / 2, script.beta[-1] + direction * step, step / 0.7)
             script.rest(1.0)
