@@ -18,10 +18,13 @@ pytestmark = pytest.mark.long
 DATED = {'date': '2026-01-02T03:04:05+00:00', 'data_sha256': 'ab' * 32}
 
 
-@pytest.fixture(scope='module')
-def swept_csv(tmp_path_factory):
+@pytest.fixture
+def swept_csv(made_once):
     """Return a folder with a sweep of the unit U/7, its temperature, supply and nominal file."""
-    folder = tmp_path_factory.mktemp('swept')
+    return made_once('swept', sweep)
+
+
+def sweep(folder):
     (folder / 'u7.yaml').write_text(
         NOMINAL.read_text().replace('serial: nominal', 'serial: U/7'))
     done = subprocess.run([executable('simulate'), 'sweep', '--params', 'u7.yaml', '--rate', '100',
@@ -37,7 +40,6 @@ def swept_csv(tmp_path_factory):
         cells = line.split(',')
         rows.append(','.join([*(cells[k] for k in kept), f'{22 + i / len(lines):.3f}', '4.95']))
     (folder / 'sweep.csv').write_text('\n'.join([*lines[:head], *rows]) + '\n')
-    return folder
 
 
 def test_provenance_store_and_the_previous_file(run_tool, swept_csv, tmp_path):

@@ -43,15 +43,15 @@ class Counts(ctypes.Structure):
 
 
 @pytest.fixture(scope='module')
-def library(tmp_path_factory):
+def library(made_once):
     """Compile frame.c and load it."""
     compiler = shutil.which('cc') or shutil.which('gcc') or shutil.which('clang')
     if compiler is None:
         pytest.skip('no C compiler: apt install gcc')
-    made = tmp_path_factory.mktemp('firmware') / 'frame.so'
-    subprocess.run([compiler, '-std=c99', '-Wall', '-Wextra', '-Werror', '-pedantic', '-shared',
-                    '-fPIC', '-o', made, SOURCE], check=True)
-    library = ctypes.CDLL(str(made))
+    folder = made_once('firmware', lambda folder: subprocess.run(
+        [compiler, '-std=c99', '-Wall', '-Wextra', '-Werror', '-pedantic', '-shared', '-fPIC',
+         '-o', folder / 'frame.so', SOURCE], check=True))
+    library = ctypes.CDLL(str(folder / 'frame.so'))
     library.frame_data.restype = library.frame_info.restype = ctypes.c_size_t
     library.frame_samples.restype = ctypes.c_uint8
     return library
@@ -125,16 +125,15 @@ def test_no_stream_breaks_the_receiver(library, parts):
 
 
 @pytest.fixture(scope='module')
-def sketch(tmp_path_factory):
+def sketch(made_once):
     """Compile the sketch for this machine."""
     compiler = shutil.which('g++') or shutil.which('clang++')
     if compiler is None:
         pytest.skip('no C++ compiler: apt install g++')
-    made = tmp_path_factory.mktemp('sketch') / 'sketch'
-    subprocess.run([compiler, '-std=c++17', '-O1', '-Wall', '-Wextra', '-Werror', '-pthread',
-                    '-x', 'c++', '-I', REPO / 'test' / 'support' / 'arduino', '-I', FOLDER,
-                    FOLDER / 'adxl_board.ino', SOURCE, '-o', made], check=True)
-    return made
+    return made_once('sketch', lambda folder: subprocess.run(
+        [compiler, '-std=c++17', '-O1', '-Wall', '-Wextra', '-Werror', '-pthread', '-x', 'c++',
+         '-I', REPO / 'test' / 'support' / 'arduino', '-I', FOLDER, FOLDER / 'adxl_board.ino',
+         SOURCE, '-o', folder / 'sketch'], check=True)) / 'sketch'
 
 
 @contextmanager

@@ -2,7 +2,9 @@
 
 """What the documentation shows is so: commands, links, figures, and the reference."""
 
+from collections.abc import Callable
 from importlib.util import module_from_spec, spec_from_file_location
+import json
 from pathlib import Path
 import re
 import shlex
@@ -77,9 +79,13 @@ def test_an_argument_that_ros_does_not_parse() -> None:
 
 
 @pytest.fixture(scope='module')
-def helps() -> dict[str, str]:
+def helps(made_once: Callable) -> dict[str, str]:
     """Return the help of each executable."""
-    return {name: run_executable(name, '--help').stdout for name in TOOLS + NODES}
+    def fill(folder: Path) -> None:
+        texts = {name: run_executable(name, '--help').stdout for name in TOOLS + NODES}
+        (folder / 'helps.json').write_text(json.dumps(texts))
+
+    return json.loads((made_once('helps', fill) / 'helps.json').read_text())
 
 
 @pytest.mark.parametrize('page', BY_HAND, ids=name_of)
