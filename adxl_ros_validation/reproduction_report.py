@@ -138,6 +138,8 @@ _FIGURE_TITLES = {
     'motion': 'Figure 12: motion', 'components': 'Figure 13: what each part of the model does'}
 FIGURES = 'reproduction'
 """Folder of the plots, in the folder of the page."""
+
+
 def page(results: dict[str, list[Unit]], bound_mmps2: float, made: str, coverage: str = '') -> str:
     """Lay out the page, Markdown."""
     parts = ["# The paper's experiments, on simulated units", made,
