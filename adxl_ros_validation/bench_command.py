@@ -140,7 +140,8 @@ def measure_live(seconds: float, rounds: int, iiod: str | None) -> None:
         subjects = _subjects(stack, iiod)
         for subject in subjects * rounds:
             try:
-                results.setdefault(subject.label, []).append(_measure(subject, seconds))
+                result = _measure(subject, seconds)
+                results.setdefault(subject.label, []).append(result)
             except UserError as error:
                 failures.setdefault(subject.label, []).append(str(error))
     for label in (subject.label for subject in subjects):

@@ -227,7 +227,7 @@ def simulated(csv: str, parameters: str) -> np.ndarray:
                              'again.csv')
         if status:
             raise UserError(f'simulate: {error}')
-        table = pd.read_csv(folder / 'again.csv', comment='#', float_precision='round_trip')
+        table = pd.read_csv(folder / 'again.csv', comment='#')
     return table[[name for name in ('x_v', 'y_v', 'z_v') if name in table]].to_numpy().T
 
 
