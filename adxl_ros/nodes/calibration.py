@@ -11,34 +11,26 @@ import math
 import os
 from pathlib import Path
 
-from adxl_ros.calibrate.guided import pose_plan
-from adxl_ros.calibrate.guided.controller import (
-    Answer,
-    Controller,
-    ControllerState,
-    Resume,
-    Severity,
-)
-from adxl_ros.calibrate.guided.guide import NextPose
+from adxl_ros.calibrate.guided import controller, pose_plan
+from adxl_ros.calibrate.guided.controller import Answer, ControllerState
 from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, StageMode
 from adxl_ros.calibrate.guided.session import SessionSettings
 from adxl_ros.calibrate.guided.thermal_guide import ThermalSettings
-from adxl_ros.files.stream_info import StreamInfo
+from adxl_ros.nodes import topics
 from adxl_ros.nodes.display import Announcer, DisplayPublisher
-from adxl_ros.nodes.node_help import NodeHelp
-from adxl_ros.nodes.parameters import declare_all, low_and_high, numbers, parameter_error
-from adxl_ros.nodes.run_node import run
-from adxl_ros.nodes.samples_in import joint_readings, Samples
-from adxl_ros.nodes.sensor_parameters import anonymous_sensor, declare_sensor, make_sensor
-from adxl_ros.nodes.settings import CalibrationSettings, check_given_parameters, given_link
-from adxl_ros.nodes.topics import (
-    create_subscription,
-    DiagnosticsReporter,
-    Inbox,
-    Level,
-    Status,
-    STEADY,
+from adxl_ros.nodes.parameters import (
+    anonymous_sensor,
+    declare_all,
+    declare_sensor,
+    low_and_high,
+    make_sensor,
+    numbers,
+    parameter_error,
 )
+from adxl_ros.nodes.run_node import NodeHelp, run
+from adxl_ros.nodes.samples_in import joint_readings, Samples
+from adxl_ros.nodes.settings import CalibrationSettings, check_given_parameters, given_link
+from adxl_ros.nodes.topics import Level, Status, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -86,44 +78,29 @@ class Calibration(Node):
         settings = _session_settings(own)
         self._has_stage = settings.mode == 'stage'
         self._captures: list[Future] = []
-        self._announcer = Announcer(self, self._has_stage)
+        announcer = Announcer(self, self._has_stage)
+        # What the controller asks of a node
+        self.announce, self.withdraw_pose = announcer.announce, announcer.withdraw
         self._samples = Samples(self)
-        self._controller = Controller(settings, sensor, Resume(own.resume), self._samples, self,
-                                      anonymous)
+        self._controller = controller.Controller(
+            settings, sensor, controller.Resume(own.resume), self._samples, self, anonymous)
         if own.autostart:
             self._controller.wait_for_sensor()
         self._connect()
         self._has_run = False
         self._idle_since_ns: int | None = None
         self._display = DisplayPublisher(self, self._controller, own.screen)
+        self.show_fit = self._display.show_fit
 
-    def log(self, severity: Severity, text: str) -> None:
+    def log(self, severity: controller.Severity, text: str) -> None:
         """Log a line."""
-        # rclpy allows one severity for each place in the code.
-        if severity is Severity.INFO:
-            self.get_logger().info(text)
-        elif severity is Severity.WARNING:
-            self.get_logger().warning(text)
-        else:
-            self.get_logger().error(text)
+        topics.log(self, severity.name, text)
 
     def answer_captures(self, answer: Answer) -> None:
         """Answer all calls of ~/capture that wait."""
         for future in self._captures:
             future.set_result(answer)
         self._captures.clear()
-
-    def announce(self, pose: NextPose) -> None:
-        """Announce the pose to go to."""
-        self._announcer.announce(pose)
-
-    def withdraw_pose(self, reason: str) -> None:
-        """Take the announced pose back."""
-        self._announcer.withdraw(reason)
-
-    def show_fit(self, text: str) -> None:
-        """Show that the fit begins."""
-        self._display.show_fit(text)
 
     def close(self) -> None:
         """Close the journal and the screen."""
@@ -132,13 +109,18 @@ class Calibration(Node):
 
     def _connect(self) -> None:
         """Make diagnostics, subscriptions, services and the timer."""
-        self._diagnostics = DiagnosticsReporter(self, {'calibration': self._status})
-        create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
+        self._diagnostics = topics.DiagnosticsReporter(self, {'calibration': self._status})
+        topics.create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1,
+                                   latched=True)
         if self._has_stage:
-            self._stage = Inbox(self, JointState, 'stage/joint_states', _STAGE_QUEUE)
-            create_subscription(self, JointState, 'stage/command', self._on_command, _QUEUE)
-        create_subscription(self, Temperature, 'temperature', self._on_temperature, _QUEUE)
-        create_subscription(self, BatteryState, 'supply', self._on_supply, _QUEUE)
+            self._stage = topics.Inbox(self, JointState, 'stage/joint_states', _STAGE_QUEUE)
+            topics.create_subscription(self, JointState, 'stage/command', self._on_command, _QUEUE)
+        topics.create_subscription(
+            self, Temperature, 'temperature', lambda message: self._controller.read_temperature(
+                _stamp_ns(message), message.temperature), _QUEUE)
+        topics.create_subscription(
+            self, BatteryState, 'supply', lambda message: self._controller.read_supply(
+                _stamp_ns(message), message.voltage), _QUEUE)
         start = self._controller.start
         requests: dict[str, Callable[[], Answer]] = {
             'start': start, 'resume': partial(start, start_over=False),
@@ -151,7 +133,8 @@ class Calibration(Node):
         self.create_service(Trigger, '~/capture', self._on_capture,
                             callback_group=ReentrantCallbackGroup())
         self.create_timer(_POLL_S, self._poll, clock=STEADY)
-        self.create_timer(_NOTICE_S, self._notice, clock=STEADY)
+        self.create_timer(_NOTICE_S, lambda: self._diagnostics.notice(
+            'calibration', self._level(self._controller.status().late)), clock=STEADY)
 
     def _poll(self) -> None:
         self._read_stage()
@@ -160,9 +143,6 @@ class Calibration(Node):
         self._controller.poll()
         if self._own.exit_when_done:
             self._exit_when_done()
-
-    def _notice(self) -> None:
-        self._diagnostics.notice('calibration', self._level(self._controller.status().late))
 
     def _exit_when_done(self) -> None:
         """End the node after a calibration, when its last report has been received."""
@@ -185,8 +165,7 @@ class Calibration(Node):
         return Level.WARN if late else Level.OK
 
     def _on_info(self, message: DiagnosticStatus) -> None:
-        texts = {pair.key: pair.value for pair in message.values}
-        self._controller.read_sensor_info(StreamInfo(texts, 'sensor_info'))
+        self._controller.read_sensor_info(topics.stream_info(message, 'sensor_info'))
 
     def _read_stage(self) -> None:
         """Give the angles of the stage that have come to the controller."""
@@ -197,12 +176,6 @@ class Calibration(Node):
 
     def _on_command(self, message: JointState) -> None:
         self._controller.read_command(*_angles(dict(zip(message.name, message.position))))
-
-    def _on_temperature(self, message: Temperature) -> None:
-        self._controller.read_temperature(_stamp_ns(message), message.temperature)
-
-    def _on_supply(self, message: BatteryState) -> None:
-        self._controller.read_supply(_stamp_ns(message), message.voltage)
 
     def _service(self, request: Callable[[], Answer]) -> Callable[..., Trigger.Response]:
         """Make the callback of a service that calls a request of the controller."""

@@ -18,28 +18,22 @@ from adxl_ros.compensate.compensation_policy import CompensationPolicy, Interval
 from adxl_ros.compensate.live_stream import COUNTS, LiveStream
 from adxl_ros.errors import UserError
 from adxl_ros.files import imu_message
-from adxl_ros.files.stream_info import StreamInfo
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.tilt import Mounting
-from adxl_ros.nodes.node_help import NodeHelp
-from adxl_ros.nodes.parameters import declare_all, parameter_error
-from adxl_ros.nodes.run_node import run
+from adxl_ros.nodes import topics
+from adxl_ros.nodes.parameters import (
+    declare_all,
+    ExchangeableSensor,
+    is_from_file,
+    parameter_error,
+)
+from adxl_ros.nodes.run_node import NodeHelp, run
 from adxl_ros.nodes.sample_output import SampleAges
 from adxl_ros.nodes.samples_in import finite_samples
-from adxl_ros.nodes.sensor_parameters import ExchangeableSensor, is_from_file
 from adxl_ros.nodes.settings import check_given_parameters, CompensationSettings
-from adxl_ros.nodes.topics import (
-    create_publisher,
-    create_subscription,
-    DiagnosticsReporter,
-    Inbox,
-    Level,
-    RepeatingThread,
-    Status,
-    STEADY,
-)
+from adxl_ros.nodes.topics import Level, Status, STEADY
 from adxl_ros.signals.recorded_sensor import unit_of_stream
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
@@ -70,30 +64,34 @@ class MountingParameters:
     def __init__(self, node: Node, stream: LiveStream, settings: CompensationSettings) -> None:
         self._node, self._stream = node, stream
         self._frame_id = settings.mounting_frame_id
-        self._mounting = _mounting(settings.rpy_rad)
         self._waiting: Future | None = None
-        stream.mount(self._mounting, self._frame_id)
+        self._mount(settings.rpy_rad)
         node.add_on_set_parameters_callback(_check)
         node.add_post_set_parameters_callback(self._apply)
         # The answer comes after a second of samples, which the node takes meanwhile.
         node.create_service(Trigger, '~/level', self._on_level,
                             callback_group=ReentrantCallbackGroup())
 
+    def _mount(self, rpy_rad: Sequence[float]) -> None:
+        if fault := _fault(rpy_rad):
+            raise parameter_error(_RPY, fault)
+        roll, pitch, yaw = map(float, rpy_rad)
+        self._mounting = Mounting((roll, pitch, yaw))
+        self._stream.mount(self._mounting, self._frame_id)
+
     def _apply(self, parameters: Sequence[Parameter]) -> None:
         for parameter in parameters:
             if parameter.name == _RPY:
-                self._mounting = _mounting(parameter.value)
-                self._stream.mount(self._mounting, self._frame_id)
+                self._mount(parameter.value)
 
     async def _on_level(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._waiting is not None:
             response.message = 'a rest is being averaged; wait for its answer'
             return response
-        self._waiting = Future()
+        self._waiting = waiting = Future()
         self._stream.collect()
-        timer = self._node.create_timer(_LEVEL_S, self._waiting_ends,
-                                        clock=STEADY)
-        await self._waiting
+        timer = self._node.create_timer(_LEVEL_S, lambda: waiting.set_result(True), clock=STEADY)
+        await waiting
         self._node.destroy_timer(timer)
         forces_mps2, self._waiting = self._stream.collected(), None
         self._stream.stop_collecting()
@@ -113,10 +111,6 @@ class MountingParameters:
             f"{{{_RPY}: {yaml}}}}}' into a file and start it with --params-file")
         self._node.get_logger().info(response.message)
         return response
-
-    def _waiting_ends(self) -> None:
-        if self._waiting is not None and not self._waiting.done():
-            self._waiting.set_result(True)
 
 
 def level(mounting: Mounting, forces_mps2: np.ndarray, sensor: Sensor) -> Mounting:
@@ -141,13 +135,6 @@ def level(mounting: Mounting, forces_mps2: np.ndarray, sensor: Sensor) -> Mounti
         raise UserError(f'the sensor reads {magnitude_mps2:.2f} m/s², and gravity is '
                         f'{sensor.local_gravity_mps2:.2f} m/s²; calibrate it first')
     return mounting.levelled(mean_mps2.tolist())
-
-
-def _mounting(rpy_rad: Sequence[float]) -> Mounting:
-    if _fault(rpy_rad):
-        raise parameter_error(_RPY, _fault(rpy_rad))
-    roll, pitch, yaw = rpy_rad
-    return Mounting((float(roll), float(pitch), float(yaw)))
 
 
 def _fault(rpy_rad: Sequence[float]) -> str:
@@ -202,31 +189,33 @@ class Compensation(Node):
         self._obstacle = ''
         self._reported: Counter[str] = Counter()
         self._reported_ns = STEADY.now().nanoseconds
-        self._diagnostics = DiagnosticsReporter(self, {'compensation': self._status})
+        self._diagnostics = topics.DiagnosticsReporter(self, {'compensation': self._status})
         self._ages = SampleAges()
-        self._data = create_publisher(self, Imu, 'imu/data', _DEPTH)
-        tilt = create_publisher(self, Vector3Stamped, 'tilt', _DEPTH)
-        free = create_publisher(self, Vector3Stamped, 'imu/linear_acceleration_free', _DEPTH) \
+        self._data = topics.create_publisher(self, Imu, 'imu/data', _DEPTH)
+        tilt = topics.create_publisher(self, Vector3Stamped, 'tilt', _DEPTH)
+        free = topics.create_publisher(
+            self, Vector3Stamped, 'imu/linear_acceleration_free', _DEPTH) \
             if settings.free_acceleration else None
         self._stream = LiveStream(
             paper, settings.undo_filter, self._publish, tilt.publish,
             settings.orientation == 'keep', free.publish if free else None,
             settings.output_rate_hz)
-        self._policy = CompensationPolicy(paper, settings.store, Topics(
-            data_raw=self.resolve_topic_name('imu/data_raw'),
-            sensor_info=self.resolve_topic_name('sensor_info'),
-            temperature=self.resolve_topic_name('temperature'),
-            supply=self.resolve_topic_name('supply')))
-        self._samples = Inbox(self, Imu, 'imu/data_raw', _DEPTH)
+        self._policy = CompensationPolicy(paper, settings.store, Topics(**{
+            name.replace('imu/', ''): self.resolve_topic_name(name)
+            for name in ('imu/data_raw', 'sensor_info', 'temperature', 'supply')}))
+        self._samples = topics.Inbox(self, Imu, 'imu/data_raw', _DEPTH)
         self._sensor = ExchangeableSensor(
             self, settings.calibration, self._policy.check, self._use)
         MountingParameters(self, self._stream, settings)
         self.create_timer(_LOOK_S, self._look, clock=STEADY)
-        create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
-        create_subscription(self, Temperature, 'temperature', self._on_temperature, 1)
-        create_subscription(self, BatteryState, 'supply', self._on_supply, 1)
-        self._thread = RepeatingThread(self, lambda: self._samples.receive(self._stream),
-                                       'imu/data_raw')
+        topics.create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1,
+                                   latched=True)
+        topics.create_subscription(self, Temperature, 'temperature', lambda message:
+                                   self._surround('temperature_c', message.temperature), 1)
+        topics.create_subscription(self, BatteryState, 'supply', lambda message:
+                                   self._surround('supply_v', message.voltage), 1)
+        self._thread = topics.RepeatingThread(
+            self, lambda: self._samples.receive(self._stream), 'imu/data_raw')
 
     def close(self) -> None:
         """End the thread that receives."""
@@ -274,8 +263,7 @@ class Compensation(Node):
         self._correct_by(unit, 'what the stream shows')
 
     def _on_info(self, message: DiagnosticStatus) -> None:
-        self._policy.info = StreamInfo({pair.key: pair.value for pair in message.values},
-                                       self.resolve_topic_name('sensor_info'))
+        self._policy.info = topics.stream_info(message, self.resolve_topic_name('sensor_info'))
         if self._stream.may_be_foreign or self._policy.sensor is not self._named[0]:
             self._use(*self._named)
         self._take_from_store()
@@ -311,13 +299,7 @@ class Compensation(Node):
             self.get_logger().info('publishing again')
         self._diagnostics.notice('compensation', Level.ERROR if refusal else Level.OK)
 
-    def _on_temperature(self, message: Temperature) -> None:
-        self._set_surroundings('temperature_c', message.temperature)
-
-    def _on_supply(self, message: BatteryState) -> None:
-        self._set_surroundings('supply_v', message.voltage)
-
-    def _set_surroundings(self, name: str, value: float) -> None:
+    def _surround(self, name: str, value: float) -> None:
         """Use a temperature, °C, or supply, V, from the next sample on; ignore NaN."""
         if isfinite(value):
             self._stream.surround(name, value)

@@ -14,9 +14,9 @@ import termios
 
 from adxl_ros.calibrate.guided.controller import Controller, ControllerState, IDLE_TEXT
 from adxl_ros.calibrate.guided.guide import NextPose
-from adxl_ros.calibrate.guided.screen_contents import KeyAction, LiveReading, Phase, ScreenContents
+from adxl_ros.calibrate.guided.screen_contents import KeyAction, Phase, ScreenContents
 from adxl_ros.calibrate.guided.session import live_reading, Session, SessionDisplay
-from adxl_ros.nodes.run_node import executable, held_output
+from adxl_ros.nodes.jobs import executable, held_output
 from adxl_ros.nodes.topics import create_publisher, Level, Status, status_message, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
@@ -195,30 +195,22 @@ class DisplayPublisher:
 
     def _publish(self, phase: Phase, text: str) -> None:
         controller, unit = self._controller, self._controller.unit
-        display = self._session_display()
-        keys = () if phase is Phase.FIT else self._keys()
+        if controller.session is not self._session:
+            self._session = controller.session
+            self._display = SessionDisplay(self._session) if self._session else None
+        display, newest = self._display, controller.newest
+        live = None
+        if display is not None:
+            live = display.live()
+        elif newest is not None and unit is not None:
+            live = live_reading(newest, unit, newest.stillness())
         self._publisher.publish(String(data=ScreenContents(
             phase=phase.value, text=text, unit=f'{unit.serial} ({unit.axes})' if unit else '',
-            output=str(controller.settings.output), keys=keys,
-            live=self._idle_reading() if display is None else display.live(),
+            output=str(controller.settings.output),
+            keys=() if phase is Phase.FIT else self._keys(), live=live,
             progress=None if display is None else display.progress(),
             estimate=None if display is None else display.estimate(),
             outcome=controller.outcome).to_json()))
-
-    def _session_display(self) -> SessionDisplay | None:
-        """Return the display of the running session; None while there is none."""
-        session = self._controller.session
-        if session is not self._session:
-            self._session = session
-            self._display = None if session is None else SessionDisplay(session)
-        return self._display
-
-    def _idle_reading(self) -> LiveReading | None:
-        """Return what the sensor reads while no session runs; None before the first samples."""
-        newest, unit = self._controller.newest, self._controller.unit
-        if newest is None or unit is None:
-            return None
-        return live_reading(newest, unit, newest.stillness())
 
     def _keys(self) -> tuple[KeyAction, ...]:
         """Return the keys that have an action now."""

@@ -8,15 +8,7 @@ from collections.abc import Iterable, Sequence
 from textwrap import wrap
 from typing import NamedTuple
 
-from adxl_ros.calibrate.guided.screen_contents import (
-    CoefficientRow,
-    Estimate,
-    KeyAction,
-    LiveReading,
-    Progress,
-    RestReading,
-    ScreenContents,
-)
+from adxl_ros.calibrate.guided import screen_contents as screen
 
 Line = list[tuple[str, str]]
 """A line of the screen: styles of prompt_toolkit, each with its text."""
@@ -60,11 +52,12 @@ class LogLine(NamedTuple):
     style: str = 'ansibrightblack'  # Its style
 
 
-def draw(contents: ScreenContents, log: Sequence[LogLine], columns: int, rows: int) -> list[Line]:
+def draw(contents: screen.ScreenContents, log: Sequence[LogLine], columns: int, rows: int
+         ) -> list[Line]:
     """Lay the contents out."""
     width = max(columns - 1, _LEAST_WIDTH)
     top = [*_head(contents, width), *_pose(contents.progress, width),
-           *_reading(contents.live, contents.progress),
+           *_reading(contents.live, contents.progress, width),
            *_progress(contents.progress, contents.estimate, width)]
     bottom = [*_log(log, width), _keys(contents.keys)]
     middle = _outcome(contents.outcome, width) or _coefficients(contents.estimate, width)
@@ -83,7 +76,7 @@ def _shorten(lines: list[Line], room: int) -> list[Line]:
     return [*lines[:kept], _text(f'… {len(lines) - kept} more lines in a taller window')][:room]
 
 
-def _head(contents: ScreenContents, width: int) -> list[Line]:
+def _head(contents: screen.ScreenContents, width: int) -> list[Line]:
     task = f' of {contents.unit or "no sensor yet"} into {contents.output}'
     title = f' calibration{task if contents.output else ""}'
     style = _COLOURS.get(contents.phase, 'bold')
@@ -91,88 +84,79 @@ def _head(contents: ScreenContents, width: int) -> list[Line]:
             *(_text(line, style) for line in wrap(contents.text, width)[:_TEXT_LINES])]
 
 
-def _pose(progress: Progress | None, width: int) -> list[Line]:
+def _pose(progress: screen.Progress | None, width: int) -> list[Line]:
     if progress is None:
         return []
     total = '' if progress.remaining_s is None else f' of {progress.total}'
-    lines = _wrapped('pose', f'{progress.number}{total}: {progress.destination}', width)
-    if progress.position:
-        lines.append(_row('now', progress.position))
-    return lines
+    lines = _labelled('pose', f'{progress.number}{total}: {progress.destination}', width)
+    return lines + (_labelled('now', progress.position, width) if progress.position else [])
 
 
-def _reading(live: LiveReading | None, progress: Progress | None) -> list[Line]:
+def _reading(live: screen.LiveReading | None, progress: screen.Progress | None, width: int
+             ) -> list[Line]:
     if live is None:
         return []
     axes = '  '.join(f'{axis.axis} {axis.mean_mps2:+.3f} ± {axis.rms_mps2:.3f}'
                      for axis in live.axes)
     rate = '' if live.rate_hz is None else f'  {live.rate_hz:.0f} Hz'
-    lines = [_row('reads', f'{axes} m/s²{rate}')]
-    if live.rest is not None:
-        lines.append(_rest(live.rest))
+    lines = _labelled('reads', f'{axes} m/s²{rate}', width)
+    if (rest := live.rest) is not None:
+        share = rest.value_mps2 / rest.limit_mps2 if rest.limit_mps2 else 1.0
+        motion = 'at rest' if rest.at_rest else {'rms': 'moving', 'drift': 'drifting'}[
+            rest.quantity]
+        lines += _labelled(
+            'rest', f'{_bar(share)} {motion}: {rest.value_mps2:.2g} m/s² {rest.quantity} on '
+            f'{rest.axis}, must be below {rest.limit_mps2:.2g}', width,
+            'green' if rest.at_rest else 'yellow')
     if progress is not None and progress.dwell_s is not None and progress.dwelt_s is not None:
-        bar = _bar(progress.dwelt_s / progress.dwell_s, _BAR_WIDTH)
-        lines.append(_row('dwell', f'{bar} {progress.dwelt_s:.1f} of {progress.dwell_s:g} s'))
+        lines += _labelled('dwell', f'{_bar(progress.dwelt_s / progress.dwell_s)} '
+                           f'{progress.dwelt_s:.1f} of {progress.dwell_s:g} s', width)
     return lines
 
 
-def _rest(rest: RestReading) -> Line:
-    share = rest.value_mps2 / rest.limit_mps2 if rest.limit_mps2 else 1.0
-    motion = 'at rest' if rest.at_rest else {'rms': 'moving', 'drift': 'drifting'}[rest.quantity]
-    return _row('rest', f'{_bar(share, _BAR_WIDTH)} {motion}: {rest.value_mps2:.2g} m/s² '
-                f'{rest.quantity} on {rest.axis}, must be below {rest.limit_mps2:.2g}',
-                'green' if rest.at_rest else 'yellow')
-
-
-def _progress(progress: Progress | None, estimate: Estimate | None, width: int) -> list[Line]:
+def _progress(progress: screen.Progress | None, estimate: screen.Estimate | None, width: int
+              ) -> list[Line]:
     if progress is None or estimate is None:
         return []
-    lines = [_row('parts' if estimate.range_error else 'poses', _counts(progress))]
     covered = ', '.join(f'{row.group} {row.accepted}/{row.total}' for row in estimate.coverage)
     if estimate.covered_faces:
         covered += f' ({estimate.covered_faces} up)'
-    lines += _wrapped('coverage', covered, width)
+    lines = [*_labelled('parts' if estimate.range_error else 'poses', _counts(progress), width),
+             *_labelled('coverage', covered, width)]
     if estimate.range_error:
-        return [*lines, *_wrapped('error', estimate.range_error, width)]
+        return [*lines, *_labelled('error', estimate.range_error, width)]
     if estimate.tilt_error_deg is None:
-        return [*lines, _row('tilt error', 'no pose shows both angles to one axis')]
+        return [*lines, *_labelled('tilt error', 'no pose shows both angles to one axis', width)]
     final = '' if estimate.final_tilt_error_deg is None else \
         f', {estimate.final_tilt_error_deg:.2g}° after all poses'
-    return [*lines, _row('tilt error', f'{estimate.tilt_error_deg:.2g}° expected now{final}',
-                         'bold')]
+    return [*lines, *_labelled('tilt error', f'{estimate.tilt_error_deg:.2g}° expected now{final}',
+                               width, 'bold')]
 
 
-def _counts(progress: Progress) -> str:
+def _counts(progress: screen.Progress) -> str:
     closed = progress.accepted + progress.skipped
     skipped = f'{progress.skipped} left out, ' if progress.skipped else ''
     time = ' for a good fit' if progress.remaining_s is None else \
         f', about {_span(progress.remaining_s)}'
-    return (f'{_bar(closed / progress.total, _BAR_WIDTH)} {progress.accepted} done, {skipped}'
+    return (f'{_bar(closed / progress.total)} {progress.accepted} done, {skipped}'
             f'{max(progress.total - closed, 0)} left{time}')
 
 
-def _coefficients(estimate: Estimate | None, width: int) -> list[Line]:
+def _coefficients(estimate: screen.Estimate | None, width: int) -> list[Line]:
     """Return a row for each coefficient: name, bar and intervals, shortened to the width."""
     if estimate is None:
         return []
     rows, bar_width = estimate.coefficients, _COEFFICIENT_BAR_WIDTH
-    names, texts = [row.name for row in rows], ['  '.join(row.intervals) for row in rows]
-    if any(len(name) > _name_room(text, bar_width, width) for name, text in zip(names, texts)):
+    texts = {row.name: '  '.join(row.intervals) for row in rows}
+    if any(len(name) > _name_room(text, bar_width, width) for name, text in texts.items()):
         # Intervals of three axes are long. The name of a parameter has its unit, too.
         bar_width = _NARROW_BAR_WIDTH
-        names, texts = [row.name.split(',')[0] for row in rows], [_narrow(row) for row in rows]
-    widest = max(map(len, names), default=0)
-    lines = []
-    for row, name, text in zip(rows, names, texts):
-        room = min(_name_room(text, bar_width, width), widest)
-        bar = _bar(row.determined, bar_width)
-        lines.append(_text(f'{_cut(name, room):{room}} {bar} {text}'))
-    return lines
-
-
-def _narrow(row: CoefficientRow) -> str:
-    """Return the intervals of a coefficient with few spaces."""
-    return ' '.join(interval.replace(' ± ', '±') for interval in row.intervals)
+        texts = {row.name.split(',')[0]: ' '.join(row.intervals).replace(' ± ', '±')
+                 for row in rows}
+    widest = max(map(len, texts), default=0)
+    rooms = [min(_name_room(text, bar_width, width), widest) for text in texts.values()]
+    return [_text(f'{_cut(name, room):{room}} {_bar(row.determined, bar_width)} {text}')
+            for row, (name, text), room in zip(rows, texts.items(), rooms)]
 
 
 def _name_room(text: str, bar_width: int, width: int) -> int:
@@ -186,11 +170,9 @@ def _cut(text: str, width: int) -> str:
 
 
 def _outcome(outcome: Sequence[str], width: int) -> list[Line]:
-    lines: list[str] = []
-    for line in outcome:
-        # A line that fits keeps its spaces.
-        lines += [line] if len(line) <= width else wrap(line, width)
-    return [_text(line) for line in lines]
+    # A line that fits keeps its spaces.
+    return [_text(line) for text in outcome
+            for line in ([text] if len(text) <= width else wrap(text, width))]
 
 
 def _log(log: Sequence[LogLine], width: int) -> list[Line]:
@@ -204,20 +186,18 @@ def _log(log: Sequence[LogLine], width: int) -> list[Line]:
     return lines
 
 
-def _keys(keys: Iterable[KeyAction]) -> Line:
+def _keys(keys: Iterable[screen.KeyAction]) -> Line:
     actions = [(key.key, key.action) for key in keys] + [('q', 'quit')]
     return [part for key, action in actions
             for part in (('reverse', f' {key} '), ('', f' {action}  '))]
 
 
-def _row(label: str, text: str, style: str = '') -> Line:
-    return _text(f'{label:{_LABEL_WIDTH}} {text}', style)
-
-
-def _wrapped(label: str, text: str, width: int) -> list[Line]:
+def _labelled(label: str, text: str, width: int, style: str = '') -> list[Line]:
     """Return the first lines of a text beside its label."""
-    first, *others = wrap(text, max(width - _LABEL_WIDTH - 1, _LEAST_TEXT_WIDTH)) or ['']
-    return [_row(label, first), *(_row('', line) for line in others[:_LABELLED_LINES - 1])]
+    lines = wrap(text, max(width - _LABEL_WIDTH - 1, _LEAST_TEXT_WIDTH)) or ['']
+    labels = [label, *[''] * _LABELLED_LINES]
+    return [_text(f'{label:{_LABEL_WIDTH}} {line}', style)
+            for label, line in zip(labels, lines[:_LABELLED_LINES])]
 
 
 def _text(text: str, style: str = '') -> Line:
@@ -233,7 +213,7 @@ def _cut_line(line: Line, width: int) -> Line:
     return parts
 
 
-def _bar(share: float, width: int) -> str:
+def _bar(share: float, width: int = _BAR_WIDTH) -> str:
     """Return a bar of a width in columns, of which a share from 0 to 1 is full."""
     full = round(min(max(share, 0.0), 1.0) * width)
     return '█' * full + '░' * (width - full)

@@ -10,10 +10,9 @@ import traceback
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.links.support import base
 from adxl_ros.nodes.link_reader import LinkReader
-from adxl_ros.nodes.node_help import NodeHelp
-from adxl_ros.nodes.run_node import run
+from adxl_ros.nodes.parameters import declare_sensor, make_sensor
+from adxl_ros.nodes.run_node import NodeHelp, run
 from adxl_ros.nodes.sample_output import SampleOutput, Tally
-from adxl_ros.nodes.sensor_parameters import declare_sensor, make_sensor
 from adxl_ros.nodes.settings import check_given_parameters, declare_driver, DriverSettings
 from adxl_ros.nodes.topics import DiagnosticsReporter, Level, Status, STEADY
 from rclpy.clock import Clock, ClockType

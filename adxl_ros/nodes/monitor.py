@@ -14,29 +14,17 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.files.recording_columns import check_unit, unit_of
 from adxl_ros.files.stream_info import NO_UNIT, StreamInfo
-from adxl_ros.model.sensor import Sensor
 from adxl_ros.monitor import records
 from adxl_ros.monitor.live_gap import AxisGap, GapChange, GapSettings, LiveGap
 from adxl_ros.monitor.records import DiagnosisResult, DiagnosisRun, iso_time
-from adxl_ros.monitor.reference_stream import ReferenceKind
-from adxl_ros.nodes.node_help import NodeHelp
-from adxl_ros.nodes.parameters import declare_all
+from adxl_ros.monitor.reference_stream import ReferenceKind, ReferenceStream
+from adxl_ros.nodes import topics
+from adxl_ros.nodes.parameters import declare_all, declare_sensor, make_sensor
 from adxl_ros.nodes.rclpy_internals import NotForExecutors, take_request
-from adxl_ros.nodes.run_node import run
+from adxl_ros.nodes.run_node import NodeHelp, run
 from adxl_ros.nodes.samples_in import decoded, imu_samples, joint_readings
-from adxl_ros.nodes.sensor_parameters import declare_sensor, make_sensor
 from adxl_ros.nodes.settings import check_given_parameters, MonitorSettings
-from adxl_ros.nodes.topics import (
-    create_publisher,
-    create_subscription,
-    DiagnosticsReporter,
-    Inbox,
-    Level,
-    stamp,
-    Status,
-    status_message,
-    STEADY,
-)
+from adxl_ros.nodes.topics import Inbox, Level, Status
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import numpy as np
 from rclpy.node import Node
@@ -62,11 +50,10 @@ class GapState:
     @property
     def event(self) -> list[GapChange]:
         """Return the changes of the newest event, the earliest first."""
-        if not self.changes:
-            return []
-        newest_ns = max(change.since_ns for change in self.changes)
-        event = [change for change in self.changes if newest_ns - change.since_ns < _TOGETHER_NS]
-        return sorted(event, key=lambda change: change.since_ns)
+        newest_ns = max((change.since_ns for change in self.changes), default=0)
+        return sorted((change for change in self.changes
+                       if newest_ns - change.since_ns < _TOGETHER_NS),
+                      key=lambda change: change.since_ns)
 
     @property
     def level(self) -> Level:
@@ -83,21 +70,18 @@ class GapState:
         gaps = ', '.join(f'{gap.axis} {gap.gap.value:.3g}' for gap in self.axes)
         floors = ', '.join(f'{gap.axis} {gap.floor.value:.3g}' for gap in self.axes)
         parts = [f'gap {gaps} mg, floor {floors} mg']
-        event = self.event
-        if event:
+        if event := self.event:
             latest = {(change.axis, change.quantity): change.text() for change in event}
             parts.append(f'changed since {iso_time(event[0].since_ns)}: '
                          f'{", ".join(latest.values())}')
         if self.likely is not None:
-            parts.append(f'likely {self.likely.text}' if self.likely.effects
-                         else self.likely.text)
+            parts.append('likely ' * bool(self.likely.effects) + self.likely.text)
         return '; '.join(parts)
 
     def values(self) -> dict[str, object]:
         """Return the values of the summary by key."""
         values: dict[str, object] = {'window_s': self.window_s, 'changes': len(self.changes)}
-        event = self.event
-        if event:
+        if event := self.event:
             values |= {'changed_since': iso_time(event[0].since_ns),
                        'changed_since_s': event[0].since_ns * 1e-9,
                        'detected_s': event[0].detected_ns * 1e-9}
@@ -108,14 +92,13 @@ class GapState:
 
     def message(self) -> DiagnosticArray:
         """Return the message of the topic `gap`: the summary, then one status for each axis."""
-        array = DiagnosticArray()
-        array.header.stamp = stamp(self.stamp_ns)
-        array.status.append(status_message('gap', Status(
-            self.level, self.text(), self.serial, self.values())))
-        for gap in () if self.obstacle else self.axes:
-            array.status.append(status_message(f'gap: {gap.axis}', Status(
-                Level.WARN if gap.is_open else Level.OK, _axis_text(gap), self.serial,
-                axis_values(gap))))
+        summary = Status(self.level, self.text(), self.serial, self.values())
+        axes = {f'gap: {gap.axis}': Status(
+            Level.WARN if gap.is_open else Level.OK, _axis_text(gap), self.serial,
+            axis_values(gap)) for gap in (() if self.obstacle else self.axes)}
+        array = DiagnosticArray(status=[topics.status_message(name, status) for name, status in
+                                        ({'gap': summary} | axes).items()])
+        array.header.stamp = topics.stamp(self.stamp_ns)
         return array
 
 
@@ -160,24 +143,20 @@ class MonitorStreams:
         """Return that several nodes publish samples or reference, so that none count, or ''."""
         return self._samples.fault() or self._reference.fault()
 
-    def take_others(self, live: LiveGap) -> int:
-        """Give reference and surroundings that wait to a comparison; return how many came."""
-        reference = live.reference
-        for name, field, subscription, layout in (
-                ('temperature_c', 'temperature', self._temperature, cdr.temperature),
-                ('supply_v', 'voltage', self._supply, cdr.battery_state)):
-            stamps_ns, fields = decoded(subscription.take(), layout, **{field: 1})
-            for stamp_ns, value in zip(stamps_ns.tolist(), fields[field][:, 0].tolist()):
-                reference.add_surroundings(name, stamp_ns, value)
+    def take_others(self, reference: ReferenceStream) -> int:
+        """Add reference and surroundings that wait; return how many messages of it came."""
+        stamps_ns, fields = decoded(self._temperature.take(), cdr.temperature, temperature=1)
+        reference.add_surroundings('temperature_c', stamps_ns, fields['temperature'])
+        stamps_ns, fields = decoded(self._supply.take(), cdr.battery_state, voltage=1)
+        reference.add_surroundings('supply_v', stamps_ns, fields['voltage'])
+        messages = self._reference.take()
         if self._kind is ReferenceKind.IMU:
-            stamps_ns, force = imu_samples(self._reference.take())
-            reference.add_readings(stamps_ns, force)
-            return len(stamps_ns)
-        raws = self._reference.take()
-        for reading in joint_readings(raws):
-            if reading.position:
-                reference.add_joints(reading.stamp_ns, reading.position)
-        return len(raws)
+            reference.add_readings(*imu_samples(messages))
+        else:
+            readings = [reading for reading in joint_readings(messages) if reading.position]
+            reference.add_joints([reading.stamp_ns for reading in readings],
+                                 [reading.position for reading in readings])
+        return len(messages)
 
 
 _TURN_S = 0.05
@@ -231,13 +210,14 @@ class Monitor(Node):
         self._diagnosed_s = -_PAUSE_S
         self._begun_s = self._sampled_s = self._referenced_s = self._heard_s = 0.0
         self._streams = MonitorStreams(self, self._kind, self._reference_topic)
-        self._publisher = create_publisher(self, DiagnosticArray, 'gap', _QUEUE)
+        self._publisher = topics.create_publisher(self, DiagnosticArray, 'gap', _QUEUE)
         self._service = self.create_service(Trigger, '~/diagnose', lambda _, answer: answer,
                                             callback_group=NotForExecutors())
-        self._diagnostics = DiagnosticsReporter(self, {'gap': self._status})
-        create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
-        self.create_timer(_TURN_S, self._turn, clock=STEADY)
-        self.create_timer(_PERIOD_S, self._publish, clock=STEADY)
+        self._diagnostics = topics.DiagnosticsReporter(self, {'gap': self._status})
+        topics.create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1,
+                                   latched=True)
+        self.create_timer(_TURN_S, self._turn, clock=topics.STEADY)
+        self.create_timer(_PERIOD_S, self._publish, clock=topics.STEADY)
 
     def close(self) -> None:
         """End a diagnosis that runs."""
@@ -246,11 +226,10 @@ class Monitor(Node):
 
     def _on_info(self, message: DiagnosticStatus) -> None:
         """Compare by what the stream states of its sensor; begin again if that has changed."""
-        texts = {pair.key: pair.value for pair in message.values}
-        if self._info is not None and self._info.texts == texts:
-            return
-        self._info = StreamInfo(texts, self.resolve_topic_name('sensor_info'))
-        self._compare_by(self._info)
+        info = topics.stream_info(message, self.resolve_topic_name('sensor_info'))
+        if self._info is None or self._info.texts != info.texts:
+            self._info = info
+            self._compare_by(info)
 
     def _compare_by(self, info: StreamInfo) -> None:
         """Begin a comparison with the parameters, as far as they fit the stream."""
@@ -261,14 +240,11 @@ class Monitor(Node):
                 sensor = replace(sensor, rate_hz=info.rate_hz or sensor.rate_hz)
             else:
                 sensor = unit_of(sensor, info)
-            self._use(sensor)
+            self._live, self._refusal = LiveGap(sensor, self._kind, self._settings), ''
         except UserError as error:
             self._live, self._refusal = None, str(error)
             self.get_logger().error(self._refusal)
-
-    def _use(self, sensor: Sensor) -> None:
-        """Begin a comparison with a sensor."""
-        self._live, self._refusal = LiveGap(sensor, self._kind, self._settings), ''
+            return
         self._changed_ns = self._result = None
         effects = ', '.join(sensor.effects) or 'no effects'
         self.get_logger().info(
@@ -290,7 +266,7 @@ class Monitor(Node):
             self._compare_by(StreamInfo({}, self.resolve_topic_name('sensor_info')))
         if self._live is not None:
             self._live.add_samples(stamps_ns, accel_mps2)
-            if self._streams.take_others(self._live):
+            if self._streams.take_others(self._live.reference):
                 self._referenced_s = now_s
             self._advance(self._live)
         self._serve()
@@ -377,7 +353,7 @@ class Monitor(Node):
         """Return what is known now."""
         live = self._live
         sensor = live.sensor if live else self._file_sensor
-        return GapState(sensor.serial, (live.newest_ns or 0) if live else 0, self._obstacle(),
+        return GapState(sensor.serial, live.newest_ns if live else 0, self._obstacle(),
                         live.report() if live else (), live.changes if live else (),
                         self._result, self._settings.window_s)
 

@@ -9,7 +9,8 @@ This takes a tenth of the time of filling messages.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+import struct
+from typing import Any, NamedTuple
 
 from adxl_ros.compensate.live_stream import UNKNOWN_ANGLE_RAD2
 from adxl_ros.files import cdr
@@ -18,7 +19,7 @@ from adxl_ros.nodes.topics import Inbox, STEADY
 import numpy as np
 from rclpy.node import Node
 from rclpy.serialization import serialize_message
-from sensor_msgs.msg import Imu, JointState
+from sensor_msgs.msg import Imu
 
 _TOPIC = 'imu/data_raw'
 """Topic of the samples, relative to the namespace of the node."""
@@ -44,15 +45,14 @@ class Samples:
         """Restart the time without samples."""
         self._heard_ns = STEADY.now().nanoseconds
 
-    def clear(self) -> None:
-        """Forget all samples so far."""
-        self._receive()
-        self._raw.clear()
-
-    def keep_newest(self) -> None:
+    def keep_newest(self, count: int = _QUEUE) -> None:
         """Forget all samples but the newest, as many as the queue holds."""
         self._receive()
-        del self._raw[:-_QUEUE]
+        del self._raw[:max(len(self._raw) - count, 0)]
+
+    def clear(self) -> None:
+        """Forget all samples so far."""
+        self.keep_newest(0)
 
     def waiting(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the samples that wait: stamps, ns, (n,), and m/s², (n, 3), finite; keep them."""
@@ -70,7 +70,7 @@ class Samples:
         accel = accel[:, :len(unit.axes)]
         finite = np.isfinite(accel)
         if batch:
-            self.fault = self._why_compensated(yaw_rad2) or _why_not_finite(finite, unit)
+            self.fault = self._fault(bool((yaw_rad2 != UNKNOWN_ANGLE_RAD2).all()), finite, unit)
         complete = finite.all(axis=1)
         return stamps[complete], to_volts(accel[complete], unit)
 
@@ -86,12 +86,18 @@ class Samples:
         """Return whether several nodes publish the samples, so that none is taken."""
         return bool(self._subscription.fault())
 
-    def _why_compensated(self, yaw_rad2: np.ndarray) -> str:
-        """Return that a stream with these variances of yaw is compensated, or ''."""
-        return '' if (yaw_rad2 != UNKNOWN_ANGLE_RAD2).all() else (
-            f'{self._node.resolve_topic_name(_TOPIC)}: this stream is already compensated '
-            '(it carries an orientation, as imu/data does); remap it to imu/data_raw of the '
-            'driver')
+    def _fault(self, is_raw: bool, finite: np.ndarray, unit: Sensor) -> str:
+        """Return why samples with these finite values, (n, m), cannot be used, or ''."""
+        if not is_raw:
+            return (f'{self._node.resolve_topic_name(_TOPIC)}: this stream is already compensated '
+                    '(it carries an orientation, as imu/data does); remap it to imu/data_raw of '
+                    'the driver')
+        if finite.all(axis=1).any():
+            return ''
+        dead = ' and '.join(axis for axis, lives in zip(unit.axes, np.asarray(finite.any(axis=0)))
+                            if not lives)
+        return f'{dead or "one axis or another"} is not a number in all samples; check its ' \
+               'wiring and the driver'
 
     def silence(self) -> str:
         """Return in words why or for how long no sample has come; '' while samples come."""
@@ -130,16 +136,6 @@ def decoded(messages: Sequence[bytes], layout: Callable[[bytes], cdr.Layout], **
     return stamps_ns, fields
 
 
-def _why_not_finite(finite: np.ndarray, unit: Sensor) -> str:
-    """Return why no sample is complete, by which values are finite, (n, m); '' if one is."""
-    if finite.all(axis=1).any():
-        return ''
-    axis_lives = np.asarray(finite.any(axis=0))
-    dead = ' and '.join(axis for axis, lives in zip(unit.axes, axis_lives) if not lives)
-    return f'{dead or "one axis or another"} is not a number in all samples; check its wiring ' \
-           'and the driver'
-
-
 class JointReading(NamedTuple):
     """Motion of the joints at one stamp."""
 
@@ -150,37 +146,46 @@ class JointReading(NamedTuple):
 
 def joint_readings(messages: Sequence[bytes]) -> list[JointReading]:
     """Return the readings of serialized sensor_msgs/JointState, in their order."""
-    numbered: list[tuple[int, JointReading]] = []
+    readings: dict[int, JointReading] = {}
     for table in cdr.tables(messages, cdr.joint_state):
         names = [text for key, text in table.layout.texts.items() if key != 'frame_id']
         positions, velocities = (
             table.numbers(field).tolist() if field in table.layout.fields
             else [[]] * len(table.rows) for field in ('position', 'velocity'))
-        numbered += [
-            (row, JointReading(stamp_ns, dict(zip(names, position)), dict(zip(names, velocity))))
-            for row, stamp_ns, position, velocity in zip(
-                table.rows.tolist(), table.stamp_ns().tolist(), positions, velocities)]
-    return [reading for _, reading in sorted(numbered, key=lambda item: item[0])]
+        for row, stamp_ns, position, velocity in zip(
+                table.rows.tolist(), table.stamp_ns().tolist(), positions, velocities):
+            readings[row] = JointReading(stamp_ns, dict(zip(names, position)),
+                                         dict(zip(names, velocity)))
+    return [readings[row] for row in sorted(readings)]
 
 
-class JointStateWriter:
-    """Makes serialized messages of joints."""
+class MessageWriter:
+    """
+    Makes serialized messages with a stamp, by replacing numbers in the bytes of a template.
 
-    def __init__(self, names: Sequence[str]) -> None:
-        zeros = [0.0] * len(names)
-        self._template = serialize_message(
-            JointState(name=list(names), position=zeros, velocity=zeros))
-        self._layout = cdr.joint_state(self._template)
+    Messages are one or few that come after a pause of the processor. Calls of numpy are slow then:
+    these messages would take twice the time.
+    """
 
-    def messages(self, stamp_ns: np.ndarray, position: np.ndarray, velocity: np.ndarray
-                 ) -> list[bytes]:
-        """
-        Serialize readings.
+    def __init__(self, template: Any, layout_of: Callable[[bytes], cdr.Layout], **counts: int
+                 ) -> None:
+        """Find the fields; of those that `counts` names, only so many numbers are written."""
+        self._template = serialize_message(template)
+        layout = layout_of(self._template)
+        self._stamp = struct.Struct(f'{layout.order}iI')
+        self._stamp_offset = layout.fields['sec'].offset
+        self._fields = {name: (struct.Struct(f'{layout.order}{counts.get(name, field.count)}d'),
+                               field.offset)
+                        for name, field in layout.fields.items() if field.code == 'f8'}
 
-        stamp_ns: stamps, ns, (n,); position: positions, rad or m, (n, k); velocity: velocities,
-        rad/s or m/s, (n, k).
-        """
-        data = cdr.fill(self._template, self._layout, stamp_ns,
-                        {'position': position, 'velocity': velocity}).tobytes()
-        size = len(self._template)
-        return [data[i:i + size] for i in range(0, len(data), size)]
+    def messages(self, stamp_ns: np.ndarray, **fields: np.ndarray) -> list[bytes]:
+        """Serialize messages with stamps, ns, (n,), and number fields, (n, k)."""
+        columns = [(*self._fields[name], rows.tolist()) for name, rows in fields.items()]
+        messages = []
+        for i, time_ns in enumerate(stamp_ns.tolist()):
+            message = bytearray(self._template)
+            self._stamp.pack_into(message, self._stamp_offset, *divmod(time_ns, 10 ** 9))
+            for packer, offset, rows in columns:
+                packer.pack_into(message, offset, *rows[i])
+            messages.append(bytes(message))
+        return messages

@@ -18,9 +18,9 @@ from typing import TextIO, TYPE_CHECKING
 from adxl_ros.calibrate.guided.screen_contents import ScreenContents
 from adxl_ros.errors import UserError
 from adxl_ros.nodes.draw import draw, Line, LogLine
-from adxl_ros.nodes.node_help import NodeHelp
+from adxl_ros.nodes.jobs import held_output
 from adxl_ros.nodes.parameters import declare_all
-from adxl_ros.nodes.run_node import held_output, run
+from adxl_ros.nodes.run_node import NodeHelp, run
 from adxl_ros.nodes.settings import ScreenSettings
 from adxl_ros.nodes.topics import create_subscription
 from rcl_interfaces.msg import Log

@@ -21,11 +21,11 @@ from adxl_ros.nodes.parameters import (
     parameter,
     parameter_error,
     refuse_files_of_others,
+    sensor_keys,
     Spec,
     specs_of,
 )
 from adxl_ros.nodes.rclpy_internals import given_parameters
-from adxl_ros.nodes.sensor_parameters import sensor_keys
 import numpy as np
 from rclpy.node import Node
 

@@ -9,24 +9,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.nodes.node_help import NodeHelp
+from adxl_ros.files import cdr
+from adxl_ros.nodes import settings, topics
 from adxl_ros.nodes.parameters import declare_all, parameter_error
-from adxl_ros.nodes.run_node import run
-from adxl_ros.nodes.samples_in import JointStateWriter
-from adxl_ros.nodes.settings import (
-    BridgeSettings,
-    check_given_parameters,
-    SimulatedStageSettings,
-    StageSettings,
-)
-from adxl_ros.nodes.topics import (
-    create_publisher,
-    create_subscription,
-    DiagnosticsReporter,
-    Level,
-    Status,
-    STEADY,
-)
+from adxl_ros.nodes.run_node import NodeHelp, run
+from adxl_ros.nodes.samples_in import MessageWriter
+from adxl_ros.nodes.topics import Level, Status, STEADY
 from adxl_ros.simulate.simulated_stage import JOINTS, SimulatedStage
 from builtin_interfaces.msg import Duration
 import numpy as np
@@ -54,23 +42,25 @@ class SimulatedStageNode:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        own = declare_all(node, SimulatedStageSettings)
+        own = declare_all(node, settings.SimulatedStageSettings)
         self._stage = SimulatedStage(
             np.array([own.alpha_rad, own.beta_rad, own.shift_m]),
             np.array([own.slew_rate_rad_s, own.slew_rate_rad_s, own.slew_rate_m_s]),
             own.settling_time_s, np.array([own.resolution_rad, own.resolution_rad, 0.0]), own.seed)
         self._delay_ns = round(1e9 * own.delay_s)
         self._unshown: deque[tuple[int, bytes]] = deque()
-        self._writer = JointStateWriter(JOINTS)
+        zeros = [0.0] * len(JOINTS)
+        self._writer = MessageWriter(
+            JointState(name=list(JOINTS), position=zeros, velocity=zeros), cdr.joint_state)
         self._simulated_ns = 0
         self._is_commanded = False
         self._refusal_count = 0
         self._refusal = ''
-        self._encoders = create_publisher(node, JointState, 'stage/joint_states', _QUEUE)
-        self._true = create_publisher(node, JointState, 'stage/true_joint_states', _QUEUE)
-        self._diagnostics = DiagnosticsReporter(node, {'stage': self._status})
-        create_subscription(node, JointState, 'stage/command', self._on_command,
-                            _COMMAND_QUEUE)
+        self._encoders = topics.create_publisher(node, JointState, 'stage/joint_states', _QUEUE)
+        self._true = topics.create_publisher(node, JointState, 'stage/true_joint_states', _QUEUE)
+        self._diagnostics = topics.DiagnosticsReporter(node, {'stage': self._status})
+        topics.create_subscription(node, JointState, 'stage/command', self._on_command,
+                                   _COMMAND_QUEUE)
         limits = (f'{name} {node.get_parameter(name).value:g}' for name in _LIMITS)
         pose = ', '.join(f'{name} {p:.4g}' for name, p in zip(JOINTS, self._stage.encoder()))
         node.get_logger().info(
@@ -119,10 +109,10 @@ class SimulatedStageNode:
             self._stage.step(_STEP_NS * 1e-9)
             position[i], velocity[i] = self._stage.position, self._stage.velocity
             encoder[i] = self._stage.encoder()
-        for message in self._writer.messages(stamps_ns, position, velocity):
+        for message in self._writer.messages(stamps_ns, position=position, velocity=velocity):
             self._true.publish(message)
-        self._unshown.extend(zip(stamps_ns.tolist(),
-                                 self._writer.messages(stamps_ns, encoder, velocity)))
+        self._unshown.extend(zip(stamps_ns.tolist(), self._writer.messages(
+            stamps_ns, position=encoder, velocity=velocity)))
 
     def _status(self) -> Status:
         level, text = Level.OK, 'moving' if self._stage.moving() else 'at rest'
@@ -193,7 +183,7 @@ class StageBridge:
 
     def __init__(self, node: Node, kind: str) -> None:
         self._node, self._kind = node, kind
-        own = declare_all(node, BridgeSettings)
+        own = declare_all(node, settings.BridgeSettings)
         self._joints = {'alpha': _Joint(own.alpha_joint, own.alpha_sign, own.alpha_offset_rad),
                         'beta': _Joint(own.beta_joint, own.beta_sign, own.beta_offset_rad)}
         for name, joint in self._joints.items():
@@ -202,29 +192,27 @@ class StageBridge:
                                       "is not set; name the controller's joint")
             if joint.sign == 0:
                 raise parameter_error(f'bridge.{name}.sign', '0 is not 1 or -1')
-        self._states_topic, self._speed_rad_s = own.joint_states, own.speed_rad_s
+        self._states_topic = node.resolve_topic_name(own.joint_states)
+        self._speed_rad_s = own.speed_rad_s
         self._goal: dict[str, float] = {}
-        self._heard_ns = 0
-        self._resend_ns = 0
-        self._commanded_ns = 0
-        self._late_ns = 0
+        self._heard_ns = self._resend_ns = self._commanded_ns = self._late_ns = 0
         self._controller_joints: set[str] = set()
         self._refusal = ''
-        self._positions = create_publisher(node, JointState, 'stage/joint_states', _BRIDGE_QUEUE)
-        self._commands = create_publisher(
+        self._positions = topics.create_publisher(node, JointState, 'stage/joint_states',
+                                                  _BRIDGE_QUEUE)
+        self._commands = topics.create_publisher(
             node, JointTrajectory if kind == 'trajectory' else JointState,
-            own.command or _DEFAULT_COMMANDS[kind],
-            _COMMAND_QUEUE)
-        self._diagnostics = DiagnosticsReporter(node, {'stage': self._status})
-        create_subscription(node, JointState, 'stage/command', self._on_command,
-                            _COMMAND_QUEUE)
-        create_subscription(node, JointState, self._states_topic, self._on_states,
-                            _STATES_QUEUE)
+            own.command or _DEFAULT_COMMANDS[kind], _COMMAND_QUEUE)
+        self._diagnostics = topics.DiagnosticsReporter(node, {'stage': self._status})
+        topics.create_subscription(node, JointState, 'stage/command', self._on_command,
+                                   _COMMAND_QUEUE)
+        topics.create_subscription(node, JointState, own.joint_states, self._on_states,
+                                   _STATES_QUEUE)
         joints = ', '.join(f'{name} is {joint.name}' for name, joint in self._joints.items())
         speed = f' at most {self._speed_rad_s:g} rad/s' if kind == 'trajectory' else ''
         node.get_logger().info(
             f'bridge ({kind}){speed}: {joints}; commands go to {self._commands.topic_name}, '
-            f'positions come from {node.resolve_topic_name(self._states_topic)}; waiting for '
+            f'positions come from {self._states_topic}; waiting for '
             f'{node.resolve_topic_name("stage/command")}')
 
     def _on_command(self, message: JointState) -> None:
@@ -246,7 +234,10 @@ class StageBridge:
             return
         if not self._goal:
             self._node.get_logger().info(f'first command: {positions}')
-        duration_s = self._duration_s(goal)
+        # The longer way to the goal counts, or half a turn where it is unknown.
+        ways_rad = [abs(goal[name] - joint.angle_rad) for name, joint in self._joints.items()
+                    if joint.angle_rad is not None]
+        duration_s = max(max(ways_rad, default=np.pi) / self._speed_rad_s, _SHORTEST_S)
         self._resend_ns = now_ns + round(duration_s * 1e9) + _GRACE_NS
         if goal != self._goal:
             self._commanded_ns, self._late_ns = now_ns, self._resend_ns
@@ -267,12 +258,6 @@ class StageBridge:
             message = JointTrajectory(joint_names=names, points=[JointTrajectoryPoint(
                 positions=positions, time_from_start=Duration(sec=sec, nanosec=nanosec))])
         self._commands.publish(message)
-
-    def _duration_s(self, goal: dict[str, float]) -> float:
-        """Return the time that the longer way to a goal takes; half a turn if it is unknown."""
-        ways_rad = [abs(goal[name] - joint.angle_rad) for name, joint in self._joints.items()
-                    if joint.angle_rad is not None]
-        return max(max(ways_rad, default=np.pi) / self._speed_rad_s, _SHORTEST_S)
 
     def _late(self) -> bool:
         """Return whether the stage has not reached its goal in time."""
@@ -316,30 +301,26 @@ class StageBridge:
 
     def _state(self) -> tuple[Level, str]:
         """Return the level and one line: the motion, or why there is none."""
-        topic = self._node.resolve_topic_name(self._states_topic)
         missing = [joint.name for joint in self._joints.values() if joint.angle_rad is None]
+        now_ns = STEADY.now().nanoseconds
         if self._refusal:
             return Level.WARN, f'refused {self._refusal}'
         if missing and self._controller_joints:
             return Level.ERROR, (
-                f'{topic}: no joint {", ".join(missing)}; it has '
+                f'{self._states_topic}: no joint {", ".join(missing)}; it has '
                 f'{", ".join(sorted(self._controller_joints))}; correct bridge.alpha.joint and '
                 'bridge.beta.joint')
-        if STEADY.now().nanoseconds - self._heard_ns > _SILENT_NS:
-            return Level.WARN, f'nothing on {topic}; is the controller running?'
+        if now_ns - self._heard_ns > _SILENT_NS:
+            return Level.WARN, f'nothing on {self._states_topic}; is the controller running?'
         if not self._node.count_subscribers(self._commands.topic_name):
             return Level.WARN, f'nobody listens to {self._commands.topic_name}'
         if self._late():
-            return Level.WARN, self._delay_text()
+            angles = ', '.join(f'{name} is at {np.degrees(joint.angle_rad or 0.0):.1f}° of '
+                               f'{np.degrees(self._goal[name]):.1f}°'
+                               for name, joint in self._joints.items())
+            late_s = (now_ns - self._commanded_ns) * 1e-9
+            return Level.WARN, f'the controller has not followed for {late_s:.0f} s: {angles}'
         return Level.OK, 'on the way' if self._goal and not self._arrived() else 'at rest'
-
-    def _delay_text(self) -> str:
-        late_s = (STEADY.now().nanoseconds - self._commanded_ns) * 1e-9
-        angles = ', '.join(f'{name} is at {np.degrees(joint.angle_rad):.1f}° of '
-                           f'{np.degrees(self._goal[name]):.1f}°'
-                           for name, joint in self._joints.items()
-                           if joint.angle_rad is not None)
-        return f'the controller has not followed for {late_s:.0f} s: {angles}'
 
 
 _EXAMPLES = {
@@ -356,13 +337,14 @@ class Stage(Node):
 
     def __init__(self) -> None:
         super().__init__('stage')
-        check_given_parameters(self)
-        kind = declare_all(self, StageSettings).kind
+        settings.check_given_parameters(self)
+        kind = declare_all(self, settings.StageSettings).kind
         self._stage = SimulatedStageNode(self) if kind == 'simulated' else StageBridge(self, kind)
 
 
 def main() -> int:
     """Run the node."""
     return run(Stage, NodeHelp(
-        __doc__, _EXAMPLES, (StageSettings, SimulatedStageSettings), has_sensor=False,
-        variants={'stage.type:=trajectory, or joint_state': BridgeSettings}))
+        __doc__, _EXAMPLES, (settings.StageSettings, settings.SimulatedStageSettings),
+        has_sensor=False,
+        variants={'stage.type:=trajectory, or joint_state': settings.BridgeSettings}))

@@ -13,6 +13,7 @@ import time
 from typing import Any
 
 from adxl_ros.errors import one_line, UserError
+from adxl_ros.files.stream_info import StreamInfo
 from adxl_ros.nodes.rclpy_internals import MessageWait, NotForExecutors, take_messages
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -42,13 +43,14 @@ def create_publisher(node: Node, kind: Any, topic: str, depth: int, latched: boo
     qos = QoSProfile(depth=depth)
     if latched:
         qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
-    with _one_line('publisher', node.resolve_topic_name(topic)):
+    with _qos_errors(node.resolve_topic_name(topic), 'publisher'):
         return node.create_publisher(kind, topic, qos, qos_overriding_options=_OVERRIDING)
 
 
 def create_subscription(node: Node, kind: Any, topic: str, callback: Callable[[Any], object],
                         depth: int, latched: bool = False, raw: bool = False,
-                        group: CallbackGroup | None = None) -> Subscription:
+                        group: CallbackGroup | None = None, reliable: bool = False
+                        ) -> Subscription:
     """
     Subscribe best effort, so that both kinds of publisher connect; QoS can be overridden.
 
@@ -59,10 +61,12 @@ def create_subscription(node: Node, kind: Any, topic: str, callback: Callable[[A
         for message in take_messages(subscription, kind, raw, depth):
             callback(message)
 
-    qos = QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
+    qos = QoSProfile(depth=depth)
     if latched:
-        qos = QoSProfile(depth=depth, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    with _one_line('subscription', node.resolve_topic_name(topic)):
+        qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
+    elif not reliable:
+        qos.reliability = ReliabilityPolicy.BEST_EFFORT
+    with _qos_errors(node.resolve_topic_name(topic), 'subscription'):
         subscription = node.create_subscription(
             kind, topic, take_all, qos, raw=raw, callback_group=group,
             qos_overriding_options=_OVERRIDING)
@@ -80,36 +84,59 @@ class OnePublisher:
     def __init__(self, node: Node, topic: str) -> None:
         self._node, self._topic = node, node.resolve_topic_name(topic)
         self._number = 0
-        self._back_s = self._until_s = -_MIXED_S
+        self._back_s, self._until_s = -_MIXED_S, 0.0
 
     def __call__(self, number: int | None) -> bool:
         """Return whether to take a message of a sequence number; None where the RMW has none."""
-        if number is None:
-            return True
-        if number <= self._number:
-            now_s = time.monotonic()
-            if now_s - self._back_s < _MIXED_S:
-                self._until_s = now_s + _MIXED_S
-            self._back_s = now_s
-        self._number = number
-        return self._until_s <= 0 or time.monotonic() > self._until_s
+        if number is not None:
+            if number <= self._number:
+                now_s = time.monotonic()
+                if now_s - self._back_s < _MIXED_S:
+                    self._until_s = now_s + _MIXED_S
+                self._back_s = now_s
+            self._number = number
+        return not self._mixes
+
+    @property
+    def _mixes(self) -> bool:
+        return bool(self._until_s) and time.monotonic() <= self._until_s
 
     def fault(self) -> str:
         """Return how many nodes publish on the topic while messages are withheld, or ''."""
-        if self._until_s <= 0 or time.monotonic() > self._until_s:
+        if not self._mixes:
             return ''
         count = max(self._node.count_publishers(self._topic), 2)
         return f'{self._topic}: {count} nodes publish it, and their samples mix; end all but one'
 
 
 @contextmanager
-def _one_line(entity: str, topic: str) -> Iterator[None]:
+def _qos_errors(topic: str, entity: str) -> Iterator[None]:
     """Turn rclpy's errors of an invalid QoS override into one line for the user."""
     try:
         yield
     except (RuntimeError, ParameterException) as error:
         # rclpy has no class for a policy that it does not know.
         raise UserError(f'qos_overrides.{topic}.{entity}: {one_line(error)}') from None
+
+
+def stream_info(message: DiagnosticStatus, topic: str) -> StreamInfo:
+    """Return what a stream states of itself on `sensor_info`."""
+    return StreamInfo({pair.key: pair.value for pair in message.values}, topic)
+
+
+def log(node: Node, severity: str, text: str) -> None:
+    """Log a line; rclpy permits one severity for each place in the code."""
+    if severity in ('OK', 'INFO'):
+        node.get_logger().info(text)
+    elif severity in ('WARN', 'WARNING'):
+        node.get_logger().warning(text)
+    else:
+        node.get_logger().error(text)
+
+
+def type_name(kind: Any) -> str:
+    """Return the name of the class of a message or service, with its package."""
+    return f'{kind.__module__.partition(".")[0]}/{kind.__name__}'
 
 
 def stamp(time_ns: int) -> Time:
@@ -119,10 +146,15 @@ def stamp(time_ns: int) -> Time:
 
 
 class RepeatingThread:
-    """Calls a function again and again until closed; an exception from it ends the node."""
+    """
+    Calls a function again and again until closed; an exception from it ends the node.
 
-    def __init__(self, node: Node, turn: Callable[[], None], name: str) -> None:
-        self._turn, self._context = turn, node.context
+    A `UserError` ends the thread only, where a function takes it.
+    """
+
+    def __init__(self, node: Node, turn: Callable[[], None], name: str,
+                 on_error: Callable[[UserError], None] | None = None) -> None:
+        self._turn, self._context, self._on_error = turn, node.context, on_error
         self._open = True
         self._failure: Exception | None = None
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -141,7 +173,11 @@ class RepeatingThread:
                 self._turn()
         except Exception as error:
             # After the signal nothing can be published: a failure then belongs to the end.
-            if self._context.ok():
+            if not self._context.ok():
+                return
+            if isinstance(error, UserError) and self._on_error is not None:
+                self._on_error(error)
+            else:
                 self._failure = error
                 self._context.try_shutdown()
 
@@ -154,12 +190,14 @@ class Inbox:
     effort. Samples (sensor_msgs/Imu) of several publishers are withheld.
     """
 
-    def __init__(self, node: Node, kind: Any, topic: str, depth: int) -> None:
+    def __init__(self, node: Node, kind: Any, topic: str, depth: int, reliable: bool = False
+                 ) -> None:
         self._node, self._kind, self._depth = node, kind, depth
         self._publishers = OnePublisher(node, topic)
         self._subscription = create_subscription(
-            node, kind, topic, lambda _: None, depth, raw=True, group=NotForExecutors())
-        self._wait = MessageWait(self._subscription, node)
+            node, kind, topic, lambda _: None, depth, raw=True, group=NotForExecutors(),
+            reliable=reliable)
+        self.wait = MessageWait(self._subscription, node)  # Waits for a message for up to 0.1 s
 
     def take(self) -> list[bytes]:
         """Return the messages since the last call, at most as many as are kept."""
@@ -167,7 +205,7 @@ class Inbox:
 
     def receive(self, callback: Callable[[bytes], object]) -> None:
         """Wait for a message for up to 0.1 s, and give all that have come to a function."""
-        self._wait()
+        self.wait()
         for message in self._waiting():
             callback(message)
 

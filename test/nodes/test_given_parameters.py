@@ -5,8 +5,7 @@
 from pathlib import Path
 
 from adxl_ros.files import parameter_file
-from adxl_ros.nodes.parameters import specs_of
-from adxl_ros.nodes.sensor_parameters import sensor_keys
+from adxl_ros.nodes.parameters import sensor_keys, specs_of
 from adxl_ros.nodes.settings import NODES
 from diagnostic_msgs.msg import DiagnosticStatus
 from graph import Graph
