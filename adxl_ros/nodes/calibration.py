@@ -16,17 +16,8 @@ from adxl_ros.calibrate.guided.controller import Answer, ControllerState
 from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, StageMode
 from adxl_ros.calibrate.guided.session import SessionSettings
 from adxl_ros.calibrate.guided.thermal_guide import ThermalSettings
-from adxl_ros.nodes import topics
+from adxl_ros.nodes import parameters, topics
 from adxl_ros.nodes.display import Announcer, DisplayPublisher
-from adxl_ros.nodes.parameters import (
-    anonymous_sensor,
-    declare_all,
-    declare_sensor,
-    low_and_high,
-    make_sensor,
-    numbers,
-    parameter_error,
-)
 from adxl_ros.nodes.run_node import NodeHelp, run
 from adxl_ros.nodes.samples_in import joint_readings, Samples
 from adxl_ros.nodes.settings import CalibrationSettings, check_given_parameters, given_link
@@ -71,10 +62,10 @@ class Calibration(Node):
     def __init__(self) -> None:
         super().__init__('calibration')
         check_given_parameters(self)
-        flat, link = declare_sensor(self), given_link(self)
-        sensor = replace(make_sensor(flat, may_measure=True), link=link)
-        anonymous = replace(anonymous_sensor(self, flat), link=link)
-        self._own = own = declare_all(self, CalibrationSettings)
+        flat, link = parameters.declare_sensor(self), given_link(self)
+        sensor = replace(parameters.make_sensor(flat, may_measure=True), link=link)
+        anonymous = replace(parameters.anonymous_sensor(self, flat), link=link)
+        self._own = own = parameters.declare_all(self, CalibrationSettings)
         settings = _session_settings(own)
         self._has_stage = settings.mode == 'stage'
         self._captures: list[Future] = []
@@ -203,11 +194,11 @@ def _session_settings(own: CalibrationSettings) -> SessionSettings:
     output = Path(own.output)
     journal = Path(own.journal or f'{output}.journal')
     if own.mode == 'thermal' and own.report:
-        raise parameter_error('report', 'mode thermal writes no page; leave it empty')
+        raise parameters.parameter_error('report', 'mode thermal writes no page; leave it empty')
     for name, path in (('output', output), ('journal', journal)):
         if path.is_dir():
-            raise parameter_error(name, f'{path} is a directory; name a file')
-    planes_rad = tuple(np.radians(numbers('sweep.planes_deg', own.planes_deg or [],
+            raise parameters.parameter_error(name, f'{path} is a directory; name a file')
+    planes_rad = tuple(np.radians(parameters.numbers('sweep.planes_deg', own.planes_deg or [],
                                           '[30.0, 60.0, 90.0]')).tolist())
     step_rad = float(np.radians(own.step_deg))
     capture = CaptureSettings(own.dwell_s, own.tolerance_rad, own.timeout_s,
@@ -225,8 +216,8 @@ def _session_settings(own: CalibrationSettings) -> SessionSettings:
         tilt_error_rad=float(np.radians(own.tilt_error_deg)),
         check_poses=_CHECK_POSES[kind] if own.check_poses < 0 else own.check_poses,
         capture=capture, output=output, journal=journal, report=own.report, store=own.store,
-        thermal=ThermalSettings(
-            low_and_high('thermal.range_c', own.range_c, ThermalSettings.range_c), own.block_s))
+        thermal=ThermalSettings(parameters.low_and_high(
+            'thermal.range_c', own.range_c, ThermalSettings.range_c), own.block_s))
 
 
 def _angles(position_rad: dict[str, float]) -> tuple[float, float]:

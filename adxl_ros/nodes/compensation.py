@@ -22,13 +22,7 @@ from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.tilt import Mounting
-from adxl_ros.nodes import topics
-from adxl_ros.nodes.parameters import (
-    declare_all,
-    ExchangeableSensor,
-    is_from_file,
-    parameter_error,
-)
+from adxl_ros.nodes import parameters, topics
 from adxl_ros.nodes.run_node import NodeHelp, run
 from adxl_ros.nodes.sample_output import SampleAges
 from adxl_ros.nodes.samples_in import finite_samples
@@ -74,13 +68,13 @@ class MountingParameters:
 
     def _mount(self, rpy_rad: Sequence[float]) -> None:
         if fault := _fault(rpy_rad):
-            raise parameter_error(_RPY, fault)
+            raise parameters.parameter_error(_RPY, fault)
         roll, pitch, yaw = map(float, rpy_rad)
         self._mounting = Mounting((roll, pitch, yaw))
         self._stream.mount(self._mounting, self._frame_id)
 
-    def _apply(self, parameters: Sequence[Parameter]) -> None:
-        for parameter in parameters:
+    def _apply(self, changed: Sequence[Parameter]) -> None:
+        for parameter in changed:
             if parameter.name == _RPY:
                 self._mount(parameter.value)
 
@@ -147,13 +141,11 @@ def _fault(rpy_rad: Sequence[float]) -> str:
     return ''
 
 
-def _check(parameters: Sequence[Parameter]) -> SetParametersResult:
+def _check(changed: Sequence[Parameter]) -> SetParametersResult:
     """Refuse a rotation that is not three angles in rad."""
-    for parameter in parameters:
-        fault = _fault(parameter.value) if parameter.name == _RPY else ''
-        if fault:
-            return SetParametersResult(successful=False, reason=f'{_RPY}: {fault}')
-    return SetParametersResult(successful=True)
+    faults = [_fault(parameter.value) for parameter in changed if parameter.name == _RPY]
+    reason = f'{_RPY}: {faults[0]}' if faults and faults[0] else ''
+    return SetParametersResult(successful=not reason, reason=reason)
 
 
 _DEPTH = 100
@@ -182,7 +174,7 @@ class Compensation(Node):
     def __init__(self) -> None:
         super().__init__('compensation')
         check_given_parameters(self)
-        self._settings = settings = declare_all(self, CompensationSettings)
+        self._settings = settings = parameters.declare_all(self, CompensationSettings)
         paper = settings.inverse == 'paper'
         self._heard_ns: dict[str, int] = {}
         self._named: tuple[Sensor, str]
@@ -204,7 +196,7 @@ class Compensation(Node):
             name.replace('imu/', ''): self.resolve_topic_name(name)
             for name in ('imu/data_raw', 'sensor_info', 'temperature', 'supply')}))
         self._samples = topics.Inbox(self, Imu, 'imu/data_raw', _DEPTH)
-        self._sensor = ExchangeableSensor(
+        self._sensor = parameters.ExchangeableSensor(
             self, settings.calibration, self._policy.check, self._use)
         MountingParameters(self, self._stream, settings)
         self.create_timer(_LOOK_S, self._look, clock=STEADY)
@@ -231,7 +223,7 @@ class Compensation(Node):
         """Correct samples by a sensor from the next one on; `source` says where it is from."""
         self._named = sensor, source
         self._stream.release()
-        is_named = sensor.effects or self._calibration() or is_from_file(self)
+        is_named = sensor.effects or self._calibration() or parameters.is_from_file(self)
         self._stream.may_be_foreign = not (is_named or self._policy.info)
         if sensor.unstated:
             self._stream.hold()

@@ -177,9 +177,9 @@ def _place_of(key: str) -> str:
             return 'parameters of the launch file: ' if _is_of_launch(value) else \
                 f'{value}:{marks[0].line + 1}:{marks[0].column + 1}: '
     files = [path for path in reversed(_paths()) if not _is_of_launch(path)]
-    return next((f'{path}: ' for path in files
-                 if any(name == 'format' for _, name, _ in _entries(path))),
-                f'{files[0]}: ' if files else '')
+    of_sensor = [path for path in files
+                 if any(name == 'format' for _, name, _ in _entries(path))]
+    return ''.join(f'{path}: ' for path in [*of_sensor, *files][:1])
 
 
 def _is_of_launch(path: str) -> bool:
@@ -345,7 +345,7 @@ class ExchangeableSensor:
             name: str(value) for name, value in given_parameters(node)
             if name.startswith('provenance.')}
         sensor = make_sensor(self._flat, may_measure=True)
-        self._new: Sensor | None = None
+        self._new: tuple[Sensor, str] | None = None
         if calibration:
             sensor = parameter_file.load(calibration)
             check(sensor)
@@ -360,21 +360,16 @@ class ExchangeableSensor:
 
     def _check(self, parameters: Sequence[Parameter]) -> msg.SetParametersResult:
         """Load the file of `calibration`; refuse it where the node cannot use it."""
-        path = _calibration(parameters)
+        self._new = None
         try:
-            self._new = parameter_file.load(path) if path else None
-            if self._new is not None:
-                self._check_use(self._new)
+            for path in (str(p.value) for p in parameters if p.name == 'calibration' and p.value):
+                self._new = parameter_file.load(path), path
+                self._check_use(self._new[0])
         except UserError as error:
             return msg.SetParametersResult(successful=False, reason=one_line(error))
         return msg.SetParametersResult(successful=True)
 
-    def _apply(self, parameters: Sequence[Parameter]) -> None:
-        sensor, self._new = self._new, None
-        if sensor is not None:
-            self._use(sensor, _calibration(parameters))
-
-
-def _calibration(parameters: Sequence[Parameter]) -> str:
-    """Return the path of a calibration among parameters that are set, or ''."""
-    return next((str(p.value) for p in parameters if p.name == 'calibration'), '')
+    def _apply(self, _: Sequence[Parameter]) -> None:
+        new, self._new = self._new, None
+        if new is not None:
+            self._use(*new)

@@ -13,24 +13,16 @@ from adxl_ros.files import calibration_store
 from adxl_ros.files.parameter_file import SENSOR_FIELDS
 from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.links.support import base
-from adxl_ros.nodes.parameters import (
-    declare,
-    declare_all,
-    Kind,
-    nearest,
-    parameter,
-    parameter_error,
-    refuse_files_of_others,
-    sensor_keys,
-    Spec,
-    specs_of,
-)
+from adxl_ros.nodes import parameters
+from adxl_ros.nodes.parameters import declare, Kind, nearest, parameter, parameter_error, Spec
 from adxl_ros.nodes.rclpy_internals import given_parameters
 import numpy as np
 from rclpy.node import Node
 
 LINK = 'link.'
 """Begin of the names of all parameters of a link; the driver alone has them."""
+_TYPE = 'link.type'
+"""Parameter that chooses the link."""
 _ANY_NODE = ('use_sim_time', 'start_type_description_service')
 """Parameters of every node of rclpy."""
 _FREE_PREFIXES = ('provenance.', 'qos_overrides.', LINK)
@@ -277,9 +269,9 @@ NODES: dict[str, tuple[type, ...]] = {
 
 def check_given_parameters(node: Node) -> None:
     """Refuse parameters that no node of this package has, and files that name other nodes."""
-    refuse_files_of_others(node.get_fully_qualified_name())
-    of_nodes = (spec.name for part in chain(*NODES.values()) for spec in specs_of(part))
-    names = {*_ANY_NODE, *sensor_keys(), *of_nodes}
+    parameters.refuse_files_of_others(node.get_fully_qualified_name())
+    of_nodes = (spec.name for part in chain(*NODES.values()) for spec in parameters.specs_of(part))
+    names = {*_ANY_NODE, *parameters.sensor_keys(), *of_nodes}
     for name, _ in given_parameters(node):
         if name not in names and not name.startswith(_FREE_PREFIXES):
             raise parameter_error(name, 'no node has a parameter of this name; did you mean '
@@ -317,33 +309,25 @@ def given_link(node: Node) -> dict[str, Any]:
 
 def declare_driver(node: Node, serial: str) -> tuple[DriverSettings, ChosenLink]:
     """Declare the parameters of the driver and of its link; no real unit gets simulated data."""
-    given = [f'{LINK}{name}' for name in given_link(node)]
-    if 'link.type' not in given:
-        _refuse_to_guess(given, serial)
-    settings = declare_all(node, DriverSettings)
+    given, links = [f'{LINK}{name}' for name in given_link(node)], links_by_parameter()
+    is_chosen = _TYPE in given
+    for name in given:
+        if not is_chosen and name not in links:
+            raise parameter_error(name, 'is no parameter of any link; did you mean '
+                                  f'{nearest(name, [_TYPE, *links])}?')
+    reason = f'{given[0]} is given' if given else \
+        f'the sensor is the unit {serial}' if serial != NO_UNIT else ''
+    if reason and not is_chosen:
+        devices = [name for name in base.link_names() if name != base.DEFAULT_LINK]
+        raise parameter_error(_TYPE, f'is not set, but {reason}; set it to {", ".join(devices)}, '
+                              f'or to {base.DEFAULT_LINK} for a simulated sensor')
+    settings = parameters.declare_all(node, DriverSettings)
     module, specs = base.link_module(settings.link), link_specs(settings.link)
-    own = ['link.type', *(spec.name for spec in specs)]
+    own = [_TYPE, *(spec.name for spec in specs)]
     for name in given:
         if name not in own:
-            links = links_by_parameter().get(name)
-            hint = f'link.type {" or ".join(links)} has it' if links else \
+            hint = f'link.type {" or ".join(links[name])} has it' if name in links else \
                 f'did you mean {nearest(name, own)}?'
             raise parameter_error(name, f'the link {settings.link} has no such parameter; {hint}')
     values = {spec.name.removeprefix(LINK): declare(node, spec) for spec in specs}
     return settings, ChosenLink(settings.link, module, module.Settings(**values))
-
-
-def _refuse_to_guess(given: list[str], serial: str) -> None:
-    """Refuse the default link, which simulates, where the parameters mean a real sensor."""
-    names = ['link.type', *links_by_parameter()] if given else []
-    for name in given:
-        if name not in names:
-            raise parameter_error(name, f'is no parameter of any link; did you mean '
-                                  f'{nearest(name, names)}?')
-    reason = f'{given[0]} is given' if given else \
-        f'the sensor is the unit {serial}' if serial != NO_UNIT else ''
-    if reason:
-        devices = [name for name in base.link_names() if name != base.DEFAULT_LINK]
-        raise parameter_error('link.type', f'is not set, but {reason}; set it to '
-                              f'{", ".join(devices)}, or to {base.DEFAULT_LINK} for a '
-                              'simulated sensor')
