@@ -9,15 +9,14 @@ The topic tilt has three angles in a Vector3Stamped, so tf2 must not transform i
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import isfinite
-from typing import Any
 
 from adxl_ros.compensate import filter_inversion
 from adxl_ros.compensate.compensation_policy import CompensationPolicy, Interval, State, Topics
 from adxl_ros.compensate.live_stream import COUNTS, LiveStream
 from adxl_ros.errors import UserError
-from adxl_ros.files import imu_message
+from adxl_ros.files import imu_message, parameter_file
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
@@ -32,7 +31,6 @@ from adxl_ros.signals.recorded_sensor import unit_of_stream
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 import numpy as np
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -59,24 +57,17 @@ class MountingParameters:
         self._node, self._stream = node, stream
         self._frame_id = settings.mounting_frame_id
         self._waiting: Future | None = None
-        self._mount(settings.rpy_rad)
-        node.add_on_set_parameters_callback(_check)
-        node.add_post_set_parameters_callback(self._apply)
+        self._mount(_mounting(settings.rpy_rad, parameters.parameter_error))
+        # The file of the parameters has no part in what is set while the node runs.
+        parameters.on_change(node, _RPY, lambda value: _mounting(
+            value, lambda name, reason: UserError(f'{name}: {reason}')), self._mount)
         # The answer comes after a second of samples, which the node takes meanwhile.
         node.create_service(Trigger, '~/level', self._on_level,
                             callback_group=ReentrantCallbackGroup())
 
-    def _mount(self, rpy_rad: Sequence[float]) -> None:
-        if fault := _fault(rpy_rad):
-            raise parameters.parameter_error(_RPY, fault)
-        roll, pitch, yaw = map(float, rpy_rad)
-        self._mounting = Mounting((roll, pitch, yaw))
-        self._stream.mount(self._mounting, self._frame_id)
-
-    def _apply(self, changed: Sequence[Parameter]) -> None:
-        for parameter in changed:
-            if parameter.name == _RPY:
-                self._mount(parameter.value)
+    def _mount(self, mounting: Mounting) -> None:
+        self._mounting = mounting
+        self._stream.mount(mounting, self._frame_id)
 
     async def _on_level(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._waiting is not None:
@@ -131,21 +122,16 @@ def level(mounting: Mounting, forces_mps2: np.ndarray, sensor: Sensor) -> Mounti
     return mounting.levelled(mean_mps2.tolist())
 
 
-def _fault(rpy_rad: Sequence[float]) -> str:
-    """Return why a rotation is not three angles in rad; empty where it is."""
+def _mounting(rpy_rad: Sequence[float], refusal: Callable[[str, str], UserError]) -> Mounting:
+    """Return the mounting of a parameter; refuse what is not three angles in rad."""
     if len(rpy_rad) != 3 or not np.isfinite(rpy_rad).all():
-        return f'{list(rpy_rad)} is not roll, pitch and yaw in rad'
+        raise refusal(_RPY, f'{list(rpy_rad)} is not roll, pitch and yaw in rad')
     if np.abs(rpy_rad).max() > 2 * np.pi:
         in_rad = ', '.join(f'{angle:.6g}' for angle in np.radians(rpy_rad))
-        return f'{list(rpy_rad)} is more than a turn in rad; if it is in degrees, write [{in_rad}]'
-    return ''
-
-
-def _check(changed: Sequence[Parameter]) -> SetParametersResult:
-    """Refuse a rotation that is not three angles in rad."""
-    faults = [_fault(parameter.value) for parameter in changed if parameter.name == _RPY]
-    reason = f'{_RPY}: {faults[0]}' if faults and faults[0] else ''
-    return SetParametersResult(successful=not reason, reason=reason)
+        raise refusal(_RPY, f'{list(rpy_rad)} is more than a turn in rad; if it is in degrees, '
+                      f'write [{in_rad}]')
+    roll, pitch, yaw = map(float, rpy_rad)
+    return Mounting((roll, pitch, yaw))
 
 
 _DEPTH = 100
@@ -196,8 +182,12 @@ class Compensation(Node):
             name.replace('imu/', ''): self.resolve_topic_name(name)
             for name in ('imu/data_raw', 'sensor_info', 'temperature', 'supply')}))
         self._samples = topics.Inbox(self, Imu, 'imu/data_raw', _DEPTH)
-        self._sensor = parameters.ExchangeableSensor(
-            self, settings.calibration, self._policy.check, self._use)
+        self._flat = parameters.given_sensor(self)
+        own = parameters.make_sensor(self._flat, may_measure=True), (
+            'the parameters given' if parameters.is_from_file(self) else
+            f'the nominal {parameter_file.nominal_path()}')
+        self._use(*(self._load(settings.calibration) or own))
+        parameters.on_change(self, 'calibration', self._load, self._exchange)
         MountingParameters(self, self._stream, settings)
         self.create_timer(_LOOK_S, self._look, clock=STEADY)
         topics.create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1,
@@ -218,6 +208,18 @@ class Compensation(Node):
         self._data.publish(raw)
         stamp_s, _ = imu_message.read(raw)
         self._ages.add((self.get_clock().now().nanoseconds * 1e-9 - stamp_s,))
+
+    def _load(self, path: str) -> tuple[Sensor, str] | None:
+        """Load the file of `calibration`, if one is named; it is refused if it does not fit."""
+        if not path:
+            return None
+        sensor = parameter_file.load(path)
+        self._policy.check(sensor)
+        return sensor, path
+
+    def _exchange(self, loaded: tuple[Sensor, str] | None) -> None:
+        if loaded is not None:
+            self._use(*loaded)
 
     def _use(self, sensor: Sensor, source: str) -> None:
         """Correct samples by a sensor from the next one on; `source` says where it is from."""
@@ -245,8 +247,8 @@ class Compensation(Node):
             return
         named, _ = self._named
         try:
-            unit, lines = unit_of_stream(
-                named if named.unstated else self._sensor.anonymous(), *finite_samples([*samples]))
+            sensor = named if named.unstated else parameters.anonymous_sensor(self, self._flat)
+            unit, lines = unit_of_stream(sensor, *finite_samples([*samples]))
         except UserError as error:
             self._obstacle = f'{error}'
             return
@@ -280,15 +282,12 @@ class Compensation(Node):
 
     def _assess(self) -> None:
         """Publish only if the coefficients are those of the stream's unit; log a change."""
-        changed = self._policy.assess()
-        refusal = self._policy.refusal
+        changed, refusal = self._policy.assess(), self._policy.refusal
         self._stream.refused = bool(refusal)
         if not changed:
             return
-        if refusal:
-            self.get_logger().error(f'publishing nothing: {refusal}')
-        else:
-            self.get_logger().info('publishing again')
+        topics.log(self, 'ERROR' if refusal else 'INFO',
+                   f'publishing nothing: {refusal}' if refusal else 'publishing again')
         self._diagnostics.notice('compensation', Level.ERROR if refusal else Level.OK)
 
     def _surround(self, name: str, value: float) -> None:
@@ -298,32 +297,23 @@ class Compensation(Node):
             self._heard_ns[name] = self.get_clock().now().nanoseconds
 
     def _status(self) -> Status:
-        interval = self._interval()
+        steady_ns, ros_ns = STEADY.now().nanoseconds, self.get_clock().now().nanoseconds
+        totals = {name: self._stream.counts[name] for name in COUNTS}
+        duration_s = (steady_ns - self._reported_ns) * 1e-9
+        counts = {name: total - self._reported[name] for name, total in totals.items()}
+        self._reported, self._reported_ns = Counter(totals), steady_ns
+        interval = Interval(
+            duration_s, counts, self._stream.outside, self._stream.surroundings.copy(),
+            {name: (ros_ns - ns) * 1e-9 for name, ns in self._heard_ns.items()},
+            self._obstacle if self._stream.unknown is not None else '')
         newer = self._policy.newer()
         state, text = self._policy.status(interval, newer, self._calibration())
-        counts, duration_s = interval.counts, interval.duration_s
         late = filter_inversion.HALF if self._settings.undo_filter else 0
-        values: dict[str, Any] = {
-            'rate_in_hz': round(counts['received'] / duration_s, 1),
-            'rate_out_hz': round(counts['published'] / duration_s, 1),
-            **{name: self._reported[name] for name in COUNTS},
-            'delay_s': late / self._policy.rate_hz, **self._ages.report(),
-            **self._policy.values(interval, newer)}
+        values = {'rate_in_hz': round(counts['received'] / duration_s, 1),
+                  'rate_out_hz': round(counts['published'] / duration_s, 1), **totals,
+                  'delay_s': late / self._policy.rate_hz, **self._ages.report(),
+                  **self._policy.values(interval, newer)}
         return Status(_LEVELS.get(state, Level.WARN), text, self._policy.sensor.serial, values)
-
-    def _interval(self) -> Interval:
-        """Return what the stream has shown since the last report, and begin a new interval."""
-        steady_ns, ros_ns = STEADY.now().nanoseconds, self.get_clock().now().nanoseconds
-        counts = Counter({name: self._stream.counts[name] for name in COUNTS})
-        interval = Interval(
-            duration_s=(steady_ns - self._reported_ns) * 1e-9,
-            counts={name: counts[name] - self._reported[name] for name in COUNTS},
-            outside=self._stream.outside,
-            surroundings=self._stream.surroundings.copy(),
-            ages_s={name: (ros_ns - ns) * 1e-9 for name, ns in self._heard_ns.items()},
-            obstacle=self._obstacle if self._stream.unknown is not None else '')
-        self._reported, self._reported_ns = counts, steady_ns
-        return interval
 
 
 def main() -> int:

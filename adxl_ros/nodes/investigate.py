@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 import shlex
@@ -118,7 +119,7 @@ class BagRecorder:
         """Subscribe; nothing is kept before `start`."""
         self._node, self._watchdog = node, watchdog
         self.has_samples = False  # Whether a sample has come
-        self._bag: LiveBag | None = None
+        self.bag: LiveBag | None = None  # None before `start`
         self._thread: topics.RepeatingThread | None = None
         self._system = Clock(clock_type=ClockType.SYSTEM_TIME)
         # The message of sensor_info comes once, perhaps before the bag is open.
@@ -126,40 +127,31 @@ class BagRecorder:
         for topic, kind in _KINDS.items():
             topics.create_subscription(node, kind, topic, partial(self._write, topic), _SLOW_QUEUE,
                                        latched=topic == 'sensor_info', raw=True)
-        self._samples = topics.Inbox(node, Imu, _SAMPLES, _SAMPLES_QUEUE)
-
-    @property
-    def is_writing(self) -> bool:
-        """Return whether there is a bag."""
-        return self._bag is not None
+        self.samples = topics.Inbox(node, Imu, _SAMPLES, _SAMPLES_QUEUE)
 
     def listen(self) -> None:
         """Take samples, so that `has_samples` shows them."""
         self._thread = topics.RepeatingThread(
-            self._node, lambda: self._samples.receive(self._write_sample), _SAMPLES)
+            self._node, lambda: self.samples.receive(self._write_sample), _SAMPLES)
 
     def start(self, path: Path) -> None:
         """Begin to write."""
-        self._bag = LiveBag(path)
+        self.bag = LiveBag(path)
         if self._info:
             self._write('sensor_info', self._info)
 
-    def fault(self) -> str:
-        """Return that several nodes publish samples, so that none is written, or ''."""
-        return self._samples.fault()
-
     def flush(self) -> None:
         """Write the messages so far to the file."""
-        if self._bag is not None:
-            self._bag.flush()
+        if self.bag is not None:
+            self.bag.flush()
 
     def close(self) -> None:
         """End the thread, and write the end of the bag."""
         if self._thread is not None:
             self._thread.close()
             self._thread = None
-        if self._bag is not None:
-            self._bag.close()
+        if self.bag is not None:
+            self.bag.close()
 
     def _write_sample(self, data: bytes) -> None:
         self.has_samples = True
@@ -167,9 +159,9 @@ class BagRecorder:
         self._write(_SAMPLES, data)
 
     def _write(self, topic: str, data: bytes) -> None:
-        if self._bag is not None:
+        if self.bag is not None:
             package, _, name = topics.type_name(_KINDS.get(topic, Imu)).partition('/')
-            self._bag.write(self._node.resolve_topic_name(topic), f'{package}/msg/{name}', data,
+            self.bag.write(self._node.resolve_topic_name(topic), f'{package}/msg/{name}', data,
                             self._system.now().nanoseconds)
         elif topic == 'sensor_info':
             self._info = data
@@ -208,8 +200,8 @@ class Investigate(Node):
         self._settings = own = declare_all(self, InvestigateSettings)
         alpha_deg = low_and_high('limits.alpha_deg', own.alpha_deg, (0.0, 180.0))
         beta_deg = low_and_high('limits.beta_deg', own.beta_deg, (0.0, 360.0))
-        self._limits = StageLimits(_radians(alpha_deg), _radians(beta_deg),
-                                   float(np.radians(own.rate_deg_s)))
+        self._limits = limits = StageLimits(_radians(alpha_deg), _radians(beta_deg),
+                                            float(np.radians(own.rate_deg_s)))
         self._commands = topics.create_publisher(self, JointState, 'stage/command', _COMMAND_QUEUE)
         self.create_service(Trigger, '~/abort', self._on_abort)
         topics.create_subscription(self, JointState, 'stage/joint_states', self._on_stage,
@@ -219,7 +211,11 @@ class Investigate(Node):
                            for topic in ('imu/data_raw', 'stage/joint_states')}
         self._diagnostics = topics.DiagnosticsReporter(self, {'investigate': self._status})
         self._recorder = BagRecorder(self, self._watchdogs['imu/data_raw'])
-        self._investigation: Investigation | None = None
+        self._folder = OutputFolder.free(Path(own.output))
+        self._investigation = Investigation(
+            limits, own.minutes, BackgroundDiagnoser(self._folder, limits, own.seed),
+            lambda minutes, answer: self._print(answer_lines(minutes, answer)),
+            self._recorder.flush)
         self._screen: LiveLine | None = None
         self._ended_ns: int | None = None
         self._request = ''
@@ -230,29 +226,24 @@ class Investigate(Node):
 
     def begin(self) -> None:
         """Wait for sensor and stage; the files are made when both are there."""
-        settings = self._settings
-        self._folder = OutputFolder.free(Path(settings.output))
-        self._screen = screen = LiveLine()
-        screen.print(*opening_lines(self._folder.path, self._limits, settings.minutes))
-        self._investigation = Investigation(
-            self._limits, settings.minutes,
-            BackgroundDiagnoser(self._folder, self._limits, settings.seed),
-            lambda minutes, answer: screen.print(*answer_lines(minutes, answer)),
-            self._recorder.flush)
+        self._screen = LiveLine()
+        self._print(opening_lines(self._folder.path, self._limits, self._settings.minutes))
         self._recorder.listen()
         self.create_timer(_POLL_S, self._poll, clock=topics.STEADY)
 
     def close(self) -> None:
         """Write the end of the bag, and end the screen and the diagnosis."""
-        if self._investigation is not None:
-            self._investigation.stop('the node has ended')
+        self._investigation.stop('the node has ended')
         self._recorder.close()
         if self._screen is not None:
             self._screen.close()
 
+    def _print(self, lines: Sequence[str]) -> None:
+        if self._screen is not None:
+            self._screen.print(*lines)
+
     def _poll(self) -> None:
-        investigation, screen = self._investigation, self._screen
-        assert investigation is not None and screen is not None
+        investigation = self._investigation
         if self._request:
             investigation.stop(self._request)
         if not investigation.has_ended:
@@ -263,7 +254,8 @@ class Investigate(Node):
             self._commands.publish(JointState(
                 header=Header(stamp=self.get_clock().now().to_msg()), name=['alpha', 'beta'],
                 position=list(command), velocity=list(investigation.speed or ())))
-        screen.show(status_line(investigation.status()))
+        if self._screen is not None:
+            self._screen.show(status_line(investigation.status()))
         if investigation.has_ended:
             self._end(investigation)
 
@@ -274,7 +266,7 @@ class Investigate(Node):
             self._ended_ns = now_ns
         elif now_ns - self._ended_ns > _FAREWELL_S * 1e9:
             self.close()
-            print('\n'.join(closing_lines(investigation, self._folder)), flush=True)
+            self._print(closing_lines(investigation, self._folder))
             raise SystemExit(0 if investigation.has_verdict else 1)
 
     def _check_streams(self, investigation: Investigation) -> None:
@@ -282,12 +274,12 @@ class Investigate(Node):
         if investigation.state is State.RECORDING:
             if not self._recorder.has_samples:
                 self._pose = None
-            elif self._pose is not None and not self._recorder.is_writing:
+            elif self._pose is not None and self._recorder.bag is None:
                 self._folder.make(self._sensor)
                 self._recorder.start(self._folder.bag)
             return
-        if self._recorder.fault():
-            investigation.stop(f'{self._recorder.fault()}; the stage holds its pose')
+        if fault := self._recorder.samples.fault():
+            investigation.stop(f'{fault}; the stage holds its pose')
         for topic, watchdog in self._watchdogs.items():
             silent_s = watchdog.check()
             if silent_s > _SILENT_S:
@@ -307,8 +299,6 @@ class Investigate(Node):
         return response
 
     def _status(self) -> Status:
-        if self._investigation is None:
-            return Status(Level.OK, 'not begun', self._sensor.serial, {})
         status = self._investigation.status()
         level = Level.WARN if status.state in (State.STOPPED, State.RECORDING) else Level.OK
         answers = self._investigation.answers

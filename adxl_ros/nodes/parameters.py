@@ -329,47 +329,29 @@ def anonymous_sensor(node: Node, flat: Mapping[str, Any]) -> Sensor:
     return make_sensor(parameter_file.to_flat(any_imu) | given, may_measure=True)
 
 
-class ExchangeableSensor:
-    """
-    The sensor by which a node works: that of its parameters, or of the file of `calibration`.
+def given_sensor(node: Node) -> dict[str, Any]:
+    """Declare what a parameter file holds; return what is given, its provenance among it."""
+    # The keys of a provenance are free, so that they cannot be declared.
+    return declare_sensor(node) | {name: str(value) for name, value in given_parameters(node)
+                                   if name.startswith('provenance.')}
 
-    The parameter `calibration` exchanges a calibration as a whole while the node runs. A file that
-    cannot be used is refused, and changes nothing.
-    """
 
-    def __init__(self, node: Node, calibration: str, check: Callable[[Sensor], None],
-                 use: Callable[[Sensor, str], None]) -> None:
-        self._node, self._check_use, self._use = node, check, use
-        # The keys of a provenance are free, so that they cannot be declared.
-        self._flat = declare_sensor(node) | {
-            name: str(value) for name, value in given_parameters(node)
-            if name.startswith('provenance.')}
-        sensor = make_sensor(self._flat, may_measure=True)
-        self._new: tuple[Sensor, str] | None = None
-        if calibration:
-            sensor = parameter_file.load(calibration)
-            check(sensor)
-        node.add_on_set_parameters_callback(self._check)
-        node.add_post_set_parameters_callback(self._apply)
-        use(sensor, calibration or ('the parameters given' if is_from_file(node) else
-                                    f'the nominal {parameter_file.nominal_path()}'))
+def on_change(node: Node, name: str, prepare: Callable[[Any], T], use: Callable[[T], None]
+              ) -> None:
+    """Prepare and use what is set while the node runs; an error of `prepare` refuses it."""
+    prepared: list[T] = []
 
-    def anonymous(self) -> Sensor:
-        """Return the sensor of a stream that states nothing of itself, where none is named."""
-        return anonymous_sensor(self._node, self._flat)
-
-    def _check(self, parameters: Sequence[Parameter]) -> msg.SetParametersResult:
-        """Load the file of `calibration`; refuse it where the node cannot use it."""
-        self._new = None
+    def check(changed: Sequence[Parameter]) -> msg.SetParametersResult:
+        prepared.clear()
         try:
-            for path in (str(p.value) for p in parameters if p.name == 'calibration' and p.value):
-                self._new = parameter_file.load(path), path
-                self._check_use(self._new[0])
+            prepared.extend(prepare(p.value) for p in changed if p.name == name)
         except UserError as error:
             return msg.SetParametersResult(successful=False, reason=one_line(error))
         return msg.SetParametersResult(successful=True)
 
-    def _apply(self, _: Sequence[Parameter]) -> None:
-        new, self._new = self._new, None
-        if new is not None:
-            self._use(*new)
+    def apply(_: Sequence[Parameter]) -> None:
+        while prepared:
+            use(prepared.pop())
+
+    node.add_on_set_parameters_callback(check)
+    node.add_post_set_parameters_callback(apply)

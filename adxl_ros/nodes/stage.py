@@ -70,21 +70,22 @@ class SimulatedStageNode:
         node.create_timer(_STEP_NS * 1e-9, self._tick)
 
     def _on_command(self, message: JointState) -> None:
+        positions = dict(zip(message.name, message.position))
         try:
             if len(message.name) != len(message.position):
                 raise UserError(f'{len(message.name)} names, but {len(message.position)} '
                                 'positions')
-            positions = dict(zip(message.name, message.position))
             self._stage.command(positions, dict(zip(message.name, message.velocity)))
-            if not self._is_commanded:
-                self._is_commanded = True
-                self._node.get_logger().info(f'first command: {positions}')
         except UserError as error:
             self._refusal_count += 1
             self._refusal = f'{self._node.resolve_topic_name("stage/command")}: {error}'
             self._node.get_logger().warning(
                 f'{self._refusal}; the stage stays with the command before')
             self._diagnostics.notice('stage', Level.WARN)
+            return
+        if not self._is_commanded:
+            self._is_commanded = True
+            self._node.get_logger().info(f'first command: {positions}')
 
     def _tick(self) -> None:
         """Simulate up to the time at which a new command may take effect; show what is due."""
@@ -117,8 +118,7 @@ class SimulatedStageNode:
     def _status(self) -> Status:
         level, text = Level.OK, 'moving' if self._stage.moving() else 'at rest'
         if self._refusal:
-            level, text = Level.WARN, f'refused {self._refusal}'
-        self._refusal = ''
+            level, text, self._refusal = Level.WARN, f'refused {self._refusal}', ''
         values = {name: float(p) for name, p in zip(JOINTS, self._stage.encoder())}
         return Status(level, text, 'simulated', {**values, 'refused': self._refusal_count})
 
@@ -152,10 +152,6 @@ class _Joint:
     sign: int  # 1 or -1: the direction in which the controller counts
     offset_rad: float  # Stage angle where the controller's joint is at 0, rad
     angle_rad: float | None = None  # Stage angle, rad; None before the first joint state
-
-    def to_controller(self, stage_rad: float) -> float:
-        """Convert a stage angle to the controller's, rad."""
-        return self.sign * (stage_rad - self.offset_rad)
 
     def update(self, position_rad: float) -> None:
         """Take an angle of the controller, rad, and unwrap it."""
@@ -247,7 +243,7 @@ class StageBridge:
     def _send(self, duration_s: float) -> None:
         """Send the goal to the controller, as a motion of a duration, s."""
         names = [joint.name for joint in self._joints.values()]
-        positions = [float(joint.to_controller(self._goal[name]))
+        positions = [joint.sign * (self._goal[name] - joint.offset_rad)
                      for name, joint in self._joints.items()]
         if self._kind == 'joint_state':
             message = JointState(name=names, position=positions)
@@ -272,14 +268,14 @@ class StageBridge:
     def _on_states(self, message: JointState) -> None:
         positions = dict(zip(message.name, message.position))
         self._controller_joints |= set(positions)
-        joints = [joint for joint in self._joints.values() if joint.name in positions
-                  and np.isfinite(positions[joint.name])]
-        for joint in joints:
+        known = [joint for joint in self._joints.values()
+                 if np.isfinite(positions.get(joint.name, np.nan))]
+        for joint in known:
             joint.update(positions[joint.name])
         if self._late():
             for name, joint in self._joints.items():
                 joint.unwrap_to(self._goal[name])
-        if not joints or any(joint.angle_rad is None for joint in self._joints.values()):
+        if not known or any(joint.angle_rad is None for joint in self._joints.values()):
             return
         self._heard_ns = STEADY.now().nanoseconds
         stage = JointState(name=list(self._joints),
