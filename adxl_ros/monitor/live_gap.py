@@ -15,6 +15,7 @@ from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.monitor.change_test import ChangeSettings, ChangeTest
+from adxl_ros.monitor.records import DiagnosisInput, GapChange
 from adxl_ros.monitor.reference_stream import (
     AFTER_NS,
     Block,
@@ -83,23 +84,6 @@ class AxisGap:
 
 
 @dataclass(frozen=True)
-class GapChange:
-    """A change of the residual."""
-
-    axis: str  # x, y or z
-    quantity: str  # `mean`, or `noise` for the standard deviation within a second
-    since_ns: int  # Stamp of the change, ns
-    detected_ns: int  # Stamp of its detection, ns
-    size: float  # Change of the mean, mg; ratio of the standard deviations
-
-    def text(self) -> str:
-        """Return the change in words."""
-        if self.quantity == 'mean':
-            return f'{self.axis} by {self.size:+.3g} mg'
-        return f'noise of {self.axis} by a factor of {self.size:.3g}'
-
-
-@dataclass(frozen=True)
 class GapSettings:
     """Settings of the comparison."""
 
@@ -107,16 +91,6 @@ class GapSettings:
     false_alarms_per_day: float = 1 / 30  # Largest rate of changes that are none
     history_s: float = 600.0  # Time that is kept for a diagnosis, s
     wait_s: float = 120.0  # Time after a change of an axis in which further ones belong to it, s
-
-
-@dataclass(frozen=True)
-class DiagnosisInput:
-    """What a diagnosis compares."""
-
-    recording: Recording  # Samples, with the references of a stage
-    sensor: Sensor  # The baseline
-    # Times, s, (k,), and force of a simulator, m/s², (k, 3); None with a stage
-    force: tuple[np.ndarray, np.ndarray] | None = None
 
 
 @dataclass

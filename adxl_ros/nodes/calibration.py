@@ -16,10 +16,12 @@ from adxl_ros.calibrate.guided.controller import Answer, ControllerState
 from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, StageMode
 from adxl_ros.calibrate.guided.session import SessionSettings
 from adxl_ros.calibrate.guided.thermal_guide import ThermalSettings
+from adxl_ros.compensate.live_stream import UNKNOWN_ANGLE_RAD2
+from adxl_ros.files import cdr
+from adxl_ros.model.sensor import Sensor, to_volts
 from adxl_ros.nodes import parameters, topics
 from adxl_ros.nodes.display import Announcer, DisplayPublisher
 from adxl_ros.nodes.run_node import NodeHelp, run
-from adxl_ros.nodes.samples_in import joint_readings, Samples
 from adxl_ros.nodes.settings import CalibrationSettings, check_given_parameters, given_link
 from adxl_ros.nodes.topics import Level, Status, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -27,7 +29,7 @@ import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
-from sensor_msgs.msg import BatteryState, JointState, Temperature
+from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
 from std_srvs.srv import Trigger
 
 _POLL_S = 0.02
@@ -50,6 +52,97 @@ _EXAMPLES = {
     'a three-axis sensor without a stage': '--ros-args -p mode:=gravity -p output:=unit.yaml',
 }
 """Examples of arguments, by their purpose."""
+
+
+_SAMPLES = 'imu/data_raw'
+"""Topic of the samples, relative to the namespace of the node."""
+_YAW_VARIANCE = 8
+"""Place of the variance of yaw in an orientation's covariance of 9 numbers, from 0."""
+_SILENT_S = 3.0
+"""Time without samples after which the stream is silent, s; chosen."""
+_SAMPLES_QUEUE = 20000
+"""Samples that are kept: 20 s at 1 kHz, longer than a fit takes."""
+
+
+class Samples:
+    """Takes the serialized messages that wait, and decodes many at once."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._raw: list[bytes] = []
+        self.fault = ''  # Why the newest samples cannot be used, or ''
+        self.restart_silence()
+        self._subscription = topics.Inbox(node, Imu, _SAMPLES, _SAMPLES_QUEUE)
+
+    def restart_silence(self) -> None:
+        """Restart the time without samples."""
+        self._heard_ns = STEADY.now().nanoseconds
+
+    def keep_newest(self, count: int = _SAMPLES_QUEUE) -> None:
+        """Forget all samples but the newest, as many as the queue holds."""
+        self._receive()
+        del self._raw[:max(len(self._raw) - count, 0)]
+
+    def clear(self) -> None:
+        """Forget all samples so far."""
+        self.keep_newest(0)
+
+    def waiting(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the samples that wait: stamps, ns, (n,), and m/s², (n, 3), finite; keep them."""
+        self._receive()
+        return topics.finite_samples(self._raw)
+
+    def take(self, unit: Sensor) -> tuple[np.ndarray, np.ndarray]:
+        """Return the samples since the last call: stamps, ns, (n,), and volts, (n, m), finite."""
+        self._receive()
+        batch, self._raw = self._raw, []
+        stamps, fields = topics.decoded(batch, cdr.imu, linear_acceleration=3,
+                                        orientation_covariance=9)
+        accel, covariance = fields['linear_acceleration'], fields['orientation_covariance']
+        # -1 in the first place means that a message has no orientation.
+        yaw_rad2 = np.where(covariance[:, 0] >= 0, covariance[:, _YAW_VARIANCE], 0.0)
+        accel = accel[:, :len(unit.axes)]
+        finite = np.isfinite(accel)
+        if batch:
+            self.fault = self._fault(bool((yaw_rad2 != UNKNOWN_ANGLE_RAD2).all()), finite, unit)
+        complete = finite.all(axis=1)
+        return stamps[complete], to_volts(accel[complete], unit)
+
+    def _receive(self) -> None:
+        """Take the messages that have come since the last call."""
+        new = self._subscription.take()
+        self._raw += new
+        if new:
+            self.restart_silence()
+
+    @property
+    def is_mixed(self) -> bool:
+        """Return whether several nodes publish the samples, so that none is taken."""
+        return bool(self._subscription.fault())
+
+    def _fault(self, is_raw: bool, finite: np.ndarray, unit: Sensor) -> str:
+        """Return why samples with these finite values, (n, m), cannot be used, or ''."""
+        if not is_raw:
+            return (f'{self._node.resolve_topic_name(_SAMPLES)}: this stream is already '
+                    'compensated (it carries an orientation, as imu/data does); remap it to '
+                    'imu/data_raw of the driver')
+        if finite.all(axis=1).any():
+            return ''
+        dead = ' and '.join(axis for axis, lives in zip(unit.axes, np.asarray(finite.any(axis=0)))
+                            if not lives)
+        return f'{dead or "one axis or another"} is not a number in all samples; check its ' \
+               'wiring and the driver'
+
+    def silence(self) -> str:
+        """Return in words why or for how long no sample has come; '' while samples come."""
+        if self.is_mixed:
+            return self._subscription.fault()
+        silent_s = (STEADY.now().nanoseconds - self._heard_ns) * 1e-9
+        if silent_s < _SILENT_S:
+            return ''
+        topic = self._node.resolve_topic_name(_SAMPLES)
+        publishers = '' if self._node.count_publishers(topic) else ', and nobody publishes it'
+        return f'nothing on {topic} for {silent_s:.0f} s{publishers}'
 
 
 class Calibration(Node):
@@ -160,7 +253,7 @@ class Calibration(Node):
 
     def _read_stage(self) -> None:
         """Give the angles of the stage that have come to the controller."""
-        for reading in joint_readings(self._stage.take() if self._has_stage else ()):
+        for reading in topics.joint_readings(self._stage.take() if self._has_stage else ()):
             alpha_rad, beta_rad = _angles(reading.position)
             if math.isfinite(alpha_rad) and math.isfinite(beta_rad):
                 self._controller.read_stage(reading.stamp_ns, alpha_rad, beta_rad)

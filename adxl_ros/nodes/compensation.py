@@ -24,7 +24,6 @@ from adxl_ros.model.tilt import Mounting
 from adxl_ros.nodes import parameters, topics
 from adxl_ros.nodes.run_node import NodeHelp, run
 from adxl_ros.nodes.sample_output import SampleAges
-from adxl_ros.nodes.samples_in import finite_samples
 from adxl_ros.nodes.settings import check_given_parameters, CompensationSettings
 from adxl_ros.nodes.topics import Level, Status, STEADY
 from adxl_ros.signals.recorded_sensor import unit_of_stream
@@ -248,7 +247,7 @@ class Compensation(Node):
         named, _ = self._named
         try:
             sensor = named if named.unstated else parameters.anonymous_sensor(self, self._flat)
-            unit, lines = unit_of_stream(sensor, *finite_samples([*samples]))
+            unit, lines = unit_of_stream(sensor, *topics.finite_samples([*samples]))
         except UserError as error:
             self._obstacle = f'{error}'
             return

@@ -55,7 +55,7 @@ class Argument(NamedTuple):
         """Return the value of the parameter."""
         default = self.spec.default
         # A list of numbers has a unit; names with commas stay one text.
-        kind = tuple if default == () and self.spec.unit else type(default)
+        kind = str if default == () and not self.spec.unit else type(default)
         convert, expected = _KINDS.get(kind, (str, ''))
         try:
             return convert(text)
@@ -68,7 +68,7 @@ def _numbers(text: str) -> list[float]:
 
 
 _KINDS: dict[type, tuple[Callable[[str], Any], str]] = {
-    int: (int, 'a whole number'), float: (float, 'a number'), bool: (bool, ''),
+    int: (int, 'a whole number'), float: (float, 'a number'),
     tuple: (_numbers, 'numbers with commas, such as 30,60,90')}
 """Conversion of an argument, and what is expected, by the type of the default."""
 
@@ -157,8 +157,7 @@ def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, A
         raise UserError(f'{path}: has no parameters of the node {name}; begin the file with /**: '
                         f'or {name}:')
     link = [argument for argument in LINK if argument.name in context.launch_configurations]
-    given = {'frame_id': text(context, 'frame_id'), **given_parameters(context, link),
-             **overrides}
+    given = {'frame_id': text(context, 'frame_id'), **given_parameters(context, link), **overrides}
     # The last argument counts. rcl takes the name of a node without its namespace.
     node = '' if namespace.strip('/') else f'{executable}:'
     rules = [part for key, value in given.items() for part in (
@@ -230,8 +229,7 @@ def simulated_link(context: LaunchContext, speed: Mapping[str, Any]) -> dict[str
     return {'link.type': link or 'sim', **speed} if speed else {}
 
 
-def give_up(most_refusals: int = _MOST_REFUSALS
-            ) -> Callable[[ProcessExited, LaunchContext], None]:
+def give_up(most_refusals: int = _MOST_REFUSALS) -> Callable[[ProcessExited, LaunchContext], None]:
     """Return a function that ends a launch when a node refuses to start again and again."""
     refusals_s: list[float] = []
 

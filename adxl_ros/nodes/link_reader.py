@@ -13,9 +13,8 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.links.support.base import ImuLink, Level, Link, LinkStatus, StageLink
 from adxl_ros.links.support.waiting import Watchdog
+from adxl_ros.nodes import topics
 from adxl_ros.nodes.sample_output import References, SampleOutput
-from adxl_ros.nodes.samples_in import decoded, joint_readings
-from adxl_ros.nodes.topics import create_subscription, Inbox, log, RepeatingThread
 from rclpy.clock import ROSClock
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -50,8 +49,8 @@ class SimulatorInput:
         self._foreign = Watchdog(_LONGEST_TURN_S)
         self._is_warned = False
         self._due_s = self._counted_s = time.monotonic()
-        self._inbox = Inbox(node, Imu, link.imu_topic, _SIMULATOR_QUEUE)
-        self._temperature = create_subscription(
+        self._inbox = topics.Inbox(node, Imu, link.imu_topic, _SIMULATOR_QUEUE)
+        self._temperature = topics.create_subscription(
             node, Temperature, link.temperature_topic,
             lambda message: link.sense_temperature(message.temperature), 1)
 
@@ -71,7 +70,7 @@ class SimulatorInput:
             self._link.sense_publishers(self._node.count_publishers(topic), self._inbox.fault())
             self._counted_s = self._due_s
         if raws:
-            stamps_ns, fields = decoded(raws, cdr.imu, **_FIELDS)
+            stamps_ns, fields = topics.decoded(raws, cdr.imu, **_FIELDS)
             self.frame_id = cdr.imu(raws[-1]).texts['frame_id']
             self._warn_of_clock(int(stamps_ns[-1]))
             self._link.sense_imu(stamps_ns, fields)
@@ -129,7 +128,7 @@ class LinkReader:
         self._ticked_ns = self._searched_ns = time.monotonic_ns()
         self._due_s = time.monotonic()
         self._newest_ns: int | None = None
-        self._stage: Inbox | None = None
+        self._stage: topics.Inbox | None = None
         self._simulator: SimulatorInput | None = None
         with ExitStack() as on_close:
             on_close.callback(link.close)
@@ -147,10 +146,10 @@ class LinkReader:
             if link.sensor is not None:
                 output.use(link.sensor)
             if isinstance(link, StageLink):
-                self._stage = Inbox(node, JointState, link.joint_state_topic, _QUEUE,
+                self._stage = topics.Inbox(node, JointState, link.joint_state_topic, _QUEUE,
                                     reliable=True)
                 on_close.callback(self._stage.destroy)
-            on_close.callback(RepeatingThread(
+            on_close.callback(topics.RepeatingThread(
                 node, self._live_turn if link.live else self._paced_turn, 'link', on_error).close)
             self._on_close = on_close.pop_all()
 
@@ -281,7 +280,7 @@ class LinkReader:
         if self._stage is None or self._now_ns is None:
             return
         assert isinstance(self._link, StageLink), 'only a link on the stage takes its motion'
-        for reading in joint_readings(self._stage.take()):
+        for reading in topics.joint_readings(self._stage.take()):
             self._link.sense_stage(*reading)
 
 
@@ -300,8 +299,8 @@ class StatusLog:
             return
         for event in status.events:
             if event.count > self._counts.get(event.message, 0):
-                log(self._node, 'WARN', event.message)
+                topics.log(self._node, 'WARN', event.message)
                 self._counts[event.message], self._logged_s = event.count, now_s
         if status.text != self._text:
             self._text, self._logged_s = status.text, now_s
-            log(self._node, status.level.name, status.text)
+            topics.log(self._node, status.level.name, status.text)

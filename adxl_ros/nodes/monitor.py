@@ -21,7 +21,6 @@ from adxl_ros.nodes import topics
 from adxl_ros.nodes.parameters import declare_all, declare_sensor, make_sensor
 from adxl_ros.nodes.rclpy_internals import NotForExecutors, take_request
 from adxl_ros.nodes.run_node import NodeHelp, run
-from adxl_ros.nodes.samples_in import decoded, imu_samples, joint_readings
 from adxl_ros.nodes.settings import check_given_parameters, MonitorSettings
 from adxl_ros.nodes.topics import Inbox, Level, Status
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -119,7 +118,7 @@ class MonitorStreams:
 
     def take_samples(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the samples that wait: stamps, ns, (n,), and acceleration, m/s², (n, 3)."""
-        return imu_samples(self._samples.take())
+        return topics.imu_samples(self._samples.take())
 
     def fault(self) -> str:
         """Return that several nodes publish samples or reference, so that none count, or ''."""
@@ -127,15 +126,16 @@ class MonitorStreams:
 
     def take_others(self, reference: ReferenceStream) -> int:
         """Add reference and surroundings that wait; return how many messages of it came."""
-        stamps_ns, fields = decoded(self._temperature.take(), cdr.temperature, temperature=1)
-        reference.add_surroundings('temperature_c', stamps_ns, fields['temperature'])
-        stamps_ns, fields = decoded(self._supply.take(), cdr.battery_state, voltage=1)
-        reference.add_surroundings('supply_v', stamps_ns, fields['voltage'])
+        for name, field, inbox, layout in (
+                ('temperature_c', 'temperature', self._temperature, cdr.temperature),
+                ('supply_v', 'voltage', self._supply, cdr.battery_state)):
+            stamps_ns, fields = topics.decoded(inbox.take(), layout, **{field: 1})
+            reference.add_surroundings(name, stamps_ns, fields[field])
         messages = self._reference.take()
         if self._kind is ReferenceKind.IMU:
-            reference.add_readings(*imu_samples(messages))
+            reference.add_readings(*topics.imu_samples(messages))
         else:
-            readings = [reading for reading in joint_readings(messages) if reading.position]
+            readings = [reading for reading in topics.joint_readings(messages) if reading.position]
             reference.add_joints([reading.stamp_ns for reading in readings],
                                  [reading.position for reading in readings])
         return len(messages)

@@ -177,8 +177,7 @@ def _place_of(key: str) -> str:
             return 'parameters of the launch file: ' if _is_of_launch(value) else \
                 f'{value}:{marks[0].line + 1}:{marks[0].column + 1}: '
     files = [path for path in reversed(_paths()) if not _is_of_launch(path)]
-    of_sensor = [path for path in files
-                 if any(name == 'format' for _, name, _ in _entries(path))]
+    of_sensor = [path for path in files if any(name == 'format' for _, name, _ in _entries(path))]
     return ''.join(f'{path}: ' for path in [*of_sensor, *files][:1])
 
 
@@ -272,8 +271,7 @@ def declare_sensor(node: Node) -> dict[str, Any]:
 def nominal_specs() -> list[Spec]:
     """Return the parameters of a sensor, with the values of the nominal one as defaults."""
     nominal = parameter_file.to_flat(parameter_file.load(parameter_file.nominal_path()))
-    return [spec._replace(default=nominal.get(spec.name, spec.default))
-            for spec in sensor_specs()]
+    return [spec._replace(default=nominal.get(spec.name, spec.default)) for spec in sensor_specs()]
 
 
 def is_from_file(node: Node) -> bool:

@@ -17,8 +17,7 @@ from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.nodes.samples_in import MessageWriter
-from adxl_ros.nodes.topics import create_publisher, Level, stamp, Status, status_message
+from adxl_ros.nodes import topics
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.clock import Clock as StampClock
@@ -128,7 +127,7 @@ class References:
                           if column in columns}
         self._published = {topic: (-1, np.full(len(of_topic), np.inf))
                            for topic, of_topic in self._columns.items()}
-        self._publishers = {topic: create_publisher(
+        self._publishers = {topic: topics.create_publisher(
             node, JointState if topic == _STAGE else _SCALARS[topic][1], topic, _REFERENCE_QUEUE)
             for topic in self._columns}
 
@@ -149,7 +148,7 @@ class References:
             values = np.column_stack([columns[column] for column in self._columns[topic]])
             for i in self._new_rows(topic, stamps_ns, values):
                 message = self._message(topic, values[i].tolist())
-                message.header.stamp = stamp(stamps_ns[i])
+                message.header.stamp = topics.stamp(stamps_ns[i])
                 publisher.publish(message)
 
     def _new_rows(self, topic: str, stamps_ns: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -182,9 +181,9 @@ _UNKNOWN_NODE = '_NODE_NAME_UNKNOWN_'
 """Name that the middleware gives a node that it has not discovered yet (rmw_dds_common)."""
 
 
-def imu_writer(sensor: Sensor, frame_id: str) -> MessageWriter:
+def imu_writer(sensor: Sensor, frame_id: str) -> topics.MessageWriter:
     """Return what writes the measured axes of samples, and further fields."""
-    return MessageWriter(imu_message(sensor, frame_id), cdr.imu,
+    return topics.MessageWriter(imu_message(sensor, frame_id), cdr.imu,
                          linear_acceleration=len(sensor.axes))
 
 
@@ -214,9 +213,10 @@ class SampleOutput:
         self.sensor, self.frame_id, self.is_clock, self.tally = sensor, frame_id, is_clock, tally
         self._follows_frame = not frame_id
         self._writer = imu_writer(sensor, frame_id)
-        self._data = create_publisher(node, Imu, 'imu/data_raw', _QUEUE)
-        self._info = create_publisher(node, DiagnosticStatus, 'sensor_info', 1, latched=True)
-        self._clock = create_publisher(node, Clock, '/clock', 1) if is_clock else None
+        self._data = topics.create_publisher(node, Imu, 'imu/data_raw', _QUEUE)
+        self._info = topics.create_publisher(node, DiagnosticStatus, 'sensor_info', 1,
+                                             latched=True)
+        self._clock = topics.create_publisher(node, Clock, '/clock', 1) if is_clock else None
 
     def destroy(self) -> None:
         """Remove the topics."""
@@ -244,8 +244,8 @@ class SampleOutput:
         """Convert samples by the nominal values of a sensor, and publish these."""
         self.sensor = sensor
         self._writer = imu_writer(sensor, self.frame_id)
-        self._info.publish(status_message('sensor_info', Status(
-            Level.OK, '', sensor.serial, sensor_info(sensor))))
+        self._info.publish(topics.status_message('sensor_info', topics.Status(
+            topics.Level.OK, '', sensor.serial, sensor_info(sensor))))
 
     def follow_frame(self, frame_id: str) -> None:
         """Publish in the frame of a simulator's samples, unless a frame was given."""
@@ -274,4 +274,4 @@ class SampleOutput:
             saturated=int(self.sensor.saturated(finite.volts).any(axis=1).sum()))
         self.tally.now_ns = samples.until_ns
         if self._clock is not None:
-            self._clock.publish(Clock(clock=stamp(samples.until_ns)))
+            self._clock.publish(Clock(clock=topics.stamp(samples.until_ns)))

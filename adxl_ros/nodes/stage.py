@@ -13,7 +13,6 @@ from adxl_ros.files import cdr
 from adxl_ros.nodes import settings, topics
 from adxl_ros.nodes.parameters import declare_all, parameter_error
 from adxl_ros.nodes.run_node import NodeHelp, run
-from adxl_ros.nodes.samples_in import MessageWriter
 from adxl_ros.nodes.topics import Level, Status, STEADY
 from adxl_ros.simulate.simulated_stage import JOINTS, SimulatedStage
 from builtin_interfaces.msg import Duration
@@ -50,7 +49,7 @@ class SimulatedStageNode:
         self._delay_ns = round(1e9 * own.delay_s)
         self._unshown: deque[tuple[int, bytes]] = deque()
         zeros = [0.0] * len(JOINTS)
-        self._writer = MessageWriter(
+        self._writer = topics.MessageWriter(
             JointState(name=list(JOINTS), position=zeros, velocity=zeros), cdr.joint_state)
         self._simulated_ns = 0
         self._is_commanded = False
