@@ -4,7 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain
 from textwrap import wrap
 from typing import NamedTuple
 
@@ -12,11 +13,15 @@ from adxl_ros.calibrate.guided import screen_contents as screen
 
 Line = list[tuple[str, str]]
 """A line of the screen: styles of prompt_toolkit, each with its text."""
+Row = tuple[str, str, str]
+"""Label, text and style of a row."""
 
 _COLOURS = {'dwell': 'ansigreen', 'refused': 'ansired', 'silent': 'ansired',
             'question': 'ansiyellow', 'rest': 'ansiyellow', 'stage': 'ansiyellow',
             'operator': 'bold ansicyan', 'fit': 'ansigreen'}
 """Styles by phase."""
+_MOTIONS = {'rms': 'moving', 'drift': 'drifting'}
+"""What a sensor does that is not at rest, by the quantity that shows it."""
 _LEAST_WIDTH = 20
 """A narrower terminal is drawn as if it had this width, columns."""
 _LEAST_LINES = 4
@@ -56,9 +61,10 @@ def draw(contents: screen.ScreenContents, log: Sequence[LogLine], columns: int, 
          ) -> list[Line]:
     """Lay the contents out."""
     width = max(columns - 1, _LEAST_WIDTH)
-    top = [*_head(contents, width), *_pose(contents.progress, width),
-           *_reading(contents.live, contents.progress, width),
-           *_progress(contents.progress, contents.estimate, width)]
+    rows_of_text = chain(_readings(contents.progress, contents.live),
+                         _progress(contents.progress, contents.estimate))
+    top = [*_head(contents, width),
+           *(line for row in rows_of_text for line in _labelled(width, *row))]
     bottom = [*_log(log, width), _keys(contents.keys)]
     middle = _outcome(contents.outcome, width) or _coefficients(contents.estimate, width)
     lines = [*top, *_shorten(middle, rows - len(top) - len(bottom))]
@@ -84,62 +90,53 @@ def _head(contents: screen.ScreenContents, width: int) -> list[Line]:
             *(_text(line, style) for line in wrap(contents.text, width)[:_TEXT_LINES])]
 
 
-def _pose(progress: screen.Progress | None, width: int) -> list[Line]:
-    if progress is None:
-        return []
-    total = '' if progress.remaining_s is None else f' of {progress.total}'
-    lines = _labelled('pose', f'{progress.number}{total}: {progress.destination}', width)
-    return lines + (_labelled('now', progress.position, width) if progress.position else [])
-
-
-def _reading(live: screen.LiveReading | None, progress: screen.Progress | None, width: int
-             ) -> list[Line]:
+def _readings(progress: screen.Progress | None, live: screen.LiveReading | None) -> Iterator[Row]:
+    """Yield the pose, where the stage is, and what the sensor reads."""
+    if progress is not None:
+        total = '' if progress.remaining_s is None else f' of {progress.total}'
+        yield 'pose', f'{progress.number}{total}: {progress.destination}', ''
+        if progress.position:
+            yield 'now', progress.position, ''
     if live is None:
-        return []
+        return
     axes = '  '.join(f'{axis.axis} {axis.mean_mps2:+.3f} ± {axis.rms_mps2:.3f}'
                      for axis in live.axes)
     rate = '' if live.rate_hz is None else f'  {live.rate_hz:.0f} Hz'
-    lines = _labelled('reads', f'{axes} m/s²{rate}', width)
+    yield 'reads', f'{axes} m/s²{rate}', ''
     if (rest := live.rest) is not None:
         share = rest.value_mps2 / rest.limit_mps2 if rest.limit_mps2 else 1.0
-        motion = 'at rest' if rest.at_rest else {'rms': 'moving', 'drift': 'drifting'}[
-            rest.quantity]
-        lines += _labelled(
-            'rest', f'{_bar(share)} {motion}: {rest.value_mps2:.2g} m/s² {rest.quantity} on '
-            f'{rest.axis}, must be below {rest.limit_mps2:.2g}', width,
-            'green' if rest.at_rest else 'yellow')
+        motion = 'at rest' if rest.at_rest else _MOTIONS[rest.quantity]
+        yield 'rest', (
+            f'{_bar(share)} {motion}: {rest.value_mps2:.2g} m/s² {rest.quantity} on {rest.axis}, '
+            f'must be below {rest.limit_mps2:.2g}'), 'green' if rest.at_rest else 'yellow'
     if progress is not None and progress.dwell_s is not None and progress.dwelt_s is not None:
-        lines += _labelled('dwell', f'{_bar(progress.dwelt_s / progress.dwell_s)} '
-                           f'{progress.dwelt_s:.1f} of {progress.dwell_s:g} s', width)
-    return lines
+        bar = _bar(progress.dwelt_s / progress.dwell_s)
+        yield 'dwell', f'{bar} {progress.dwelt_s:.1f} of {progress.dwell_s:g} s', ''
 
 
-def _progress(progress: screen.Progress | None, estimate: screen.Estimate | None, width: int
-              ) -> list[Line]:
+def _progress(progress: screen.Progress | None, estimate: screen.Estimate | None
+              ) -> Iterator[Row]:
+    """Yield how many poses are done, what they cover, and how good the fit will be."""
     if progress is None or estimate is None:
-        return []
-    covered = ', '.join(f'{row.group} {row.accepted}/{row.total}' for row in estimate.coverage)
-    if estimate.covered_faces:
-        covered += f' ({estimate.covered_faces} up)'
-    lines = [*_labelled('parts' if estimate.range_error else 'poses', _counts(progress), width),
-             *_labelled('coverage', covered, width)]
-    if estimate.range_error:
-        return [*lines, *_labelled('error', estimate.range_error, width)]
-    if estimate.tilt_error_deg is None:
-        return [*lines, *_labelled('tilt error', 'no pose shows both angles to one axis', width)]
-    final = '' if estimate.final_tilt_error_deg is None else \
-        f', {estimate.final_tilt_error_deg:.2g}° after all poses'
-    return [*lines, *_labelled('tilt error', f'{estimate.tilt_error_deg:.2g}° expected now{final}',
-                               width, 'bold')]
-
-
-def _counts(progress: screen.Progress) -> str:
+        return
     closed = progress.accepted + progress.skipped
     skipped = f'{progress.skipped} left out, ' if progress.skipped else ''
     time = ' for a good fit' if progress.remaining_s is None else \
         f', about {_span(progress.remaining_s)}'
-    return (f'{_bar(closed / progress.total)} {progress.accepted} done, {skipped}'
-            f'{max(progress.total - closed, 0)} left{time}')
+    yield 'parts' if estimate.range_error else 'poses', (
+        f'{_bar(closed / progress.total)} {progress.accepted} done, {skipped}'
+        f'{max(progress.total - closed, 0)} left{time}'), ''
+    covered = ', '.join(f'{row.group} {row.accepted}/{row.total}' for row in estimate.coverage)
+    faces = f' ({estimate.covered_faces} up)' if estimate.covered_faces else ''
+    yield 'coverage', covered + faces, ''
+    if estimate.range_error:
+        yield 'error', estimate.range_error, ''
+    elif estimate.tilt_error_deg is None:
+        yield 'tilt error', 'no pose shows both angles to one axis', ''
+    else:
+        final = '' if estimate.final_tilt_error_deg is None else \
+            f', {estimate.final_tilt_error_deg:.2g}° after all poses'
+        yield 'tilt error', f'{estimate.tilt_error_deg:.2g}° expected now{final}', 'bold'
 
 
 def _coefficients(estimate: screen.Estimate | None, width: int) -> list[Line]:
@@ -192,12 +189,11 @@ def _keys(keys: Iterable[screen.KeyAction]) -> Line:
             for part in (('reverse', f' {key} '), ('', f' {action}  '))]
 
 
-def _labelled(label: str, text: str, width: int, style: str = '') -> list[Line]:
+def _labelled(width: int, label: str, text: str, style: str) -> list[Line]:
     """Return the first lines of a text beside its label."""
     lines = wrap(text, max(width - _LABEL_WIDTH - 1, _LEAST_TEXT_WIDTH)) or ['']
-    labels = [label, *[''] * _LABELLED_LINES]
-    return [_text(f'{label:{_LABEL_WIDTH}} {line}', style)
-            for label, line in zip(labels, lines[:_LABELLED_LINES])]
+    return [_text(f'{first:{_LABEL_WIDTH}} {line}', style)
+            for first, line in zip((label, *[''] * (_LABELLED_LINES - 1)), lines)]
 
 
 def _text(text: str, style: str = '') -> Line:
