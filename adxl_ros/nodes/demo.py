@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 import json
@@ -64,7 +64,7 @@ once in this time, and the samples of a longer time would overflow the shared me
 _QUEUE = 100_000
 """Samples that wait for a busy subscriber; chosen: 2.5 s of real time at the default
 speed, longer than a busy machine lets a process wait."""
-_KEEPING = {'qos_overrides./imu/data_raw.publisher.depth': _QUEUE}
+_KEEPING: dict[str, object] = {'qos_overrides./imu/data_raw.publisher.depth': _QUEUE}
 """Parameters of a driver that keeps its samples until the calibration has them."""
 _UNATTENDED = {'autostart': True, 'screen': False,
                'qos_overrides./imu/data_raw.subscription.reliability': 'reliable',
@@ -108,19 +108,20 @@ class DemoGraph:
             raise UserError(f'calibration/finish: no answer for {_FIT_S:g} s')
         return future.result().message
 
-    def start(self, name: str, params_file: Path, **parameters: object) -> None:
+    def start(self, name: str, params_file: Path, parameters: Mapping[str, object]) -> None:
         """Start a node that follows the clock of the driver."""
         command = [jobs.executable(name), '--ros-args', '--log-level', 'warn', '--params-file',
                    str(params_file)]
-        for key, value in ({'use_sim_time': True} | parameters).items():
+        for key, value in {'use_sim_time': True, **parameters}.items():
             command += ['-p', f'{key}:={json.dumps(value, ensure_ascii=False, default=str)}']
         with self._log.open('ab') as log:
             self._processes[name] = subprocess.Popen(command, stdout=log, stderr=log)
 
-    def start_calibration(self, params_file: Path, output: Path, **parameters: object) -> None:
-        """Start a calibration that writes a file, and a page into the folder of its name."""
-        self.start('calibration', params_file, **_UNATTENDED, **parameters, output=output,
-                   store=output.parent / 'calibrations')
+    def start_calibration(self, params_file: Path, output: Path, parameters: Mapping[str, object]
+                          ) -> None:
+        """Start a calibration that writes a file, and keeps a copy beside it."""
+        self.start('calibration', params_file, {
+            **_UNATTENDED, **parameters, 'output': output, 'store': output.parent / 'calibrations'})
 
     def close(self) -> None:
         """End the nodes."""
@@ -214,10 +215,10 @@ def _run_sweep(folder: Path, speed: float, seed: int) -> None:
     _print(title(f'Demo: calibrate a simulated {name.upper()} whose true coefficients are known',
                  _SWEEP_S / speed + _OVERHEAD_S), '')
     with open_graph(output) as graph:
-        graph.start('driver', unit, **_KEEPING, **{'link.type': 'sim', 'link.speed': speed})
-        graph.start('stage', nominal, delay_s=_DELAY_S, seed=seed)
-        graph.start_calibration(nominal, output, report=report, **{
-            'sweep.planes_deg': _PLANES_DEG, 'sweep.step_deg': _STEP_DEG,
+        graph.start('driver', unit, _KEEPING | {'link.type': 'sim', 'link.speed': speed})
+        graph.start('stage', nominal, {'delay_s': _DELAY_S, 'seed': seed})
+        graph.start_calibration(nominal, output, {
+            'report': report, 'sweep.planes_deg': _PLANES_DEG, 'sweep.step_deg': _STEP_DEG,
             'sweep.check_poses': _CHECK_POSES})
         poses = _show_sweep(graph, output)
     fitted = parameter_file.load(output)
@@ -273,8 +274,8 @@ def _run_recording(folder: Path, path: Path, length_s: float) -> None:
                      length_s / _SPEED + _OVERHEAD_S), '')
     nominal_path = parameter_file.nominal_path()
     with open_graph(output) as graph:
-        graph.start_calibration(nominal_path, output, report=report, mode='gravity')
-        graph.start('driver', nominal_path, **_KEEPING, **{
+        graph.start_calibration(nominal_path, output, {'report': report, 'mode': 'gravity'})
+        graph.start('driver', nominal_path, _KEEPING | {
             'link.type': 'replay', 'link.recording': path, 'link.speed': _SPEED})
         poses = _show_replay(graph, output, path)
     fitted = parameter_file.load(output)
