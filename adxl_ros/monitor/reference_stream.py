@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import takewhile
+from typing import NamedTuple
 
 from adxl_ros.diagnose.comparison import noiseless
 from adxl_ros.files.recording_columns import JOINTS
@@ -114,13 +115,11 @@ class ReferenceKind(Enum):
     IMU = 'imu'
 
 
-@dataclass(frozen=True)
-class BlockMotion:
+class BlockMotion(NamedTuple):
     """What the reference shows of one block."""
 
     moves: bool  # Whether it moves
-    # Standard deviation of the force by the steps of an encoder, m/s², (3,)
-    error_mps2: np.ndarray
+    error_mps2: np.ndarray  # Standard deviation of the force by the steps of an encoder, (3,)
 
 
 class ReferenceStream:

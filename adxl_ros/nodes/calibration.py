@@ -292,7 +292,7 @@ def _session_settings(own: CalibrationSettings) -> SessionSettings:
         if path.is_dir():
             raise parameters.parameter_error(name, f'{path} is a directory; name a file')
     planes_rad = tuple(np.radians(parameters.numbers('sweep.planes_deg', own.planes_deg or [],
-                                          '[30.0, 60.0, 90.0]')).tolist())
+                                                     '[30.0, 60.0, 90.0]')).tolist())
     step_rad = float(np.radians(own.step_deg))
     capture = CaptureSettings(own.dwell_s, own.tolerance_rad, own.timeout_s,
                               StageMode(own.stage_mode), float(np.radians(own.near_deg)),

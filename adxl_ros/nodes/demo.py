@@ -120,8 +120,8 @@ class DemoGraph:
     def start_calibration(self, params_file: Path, output: Path, parameters: Mapping[str, object]
                           ) -> None:
         """Start a calibration that writes a file, and keeps a copy beside it."""
-        self.start('calibration', params_file, {
-            **_UNATTENDED, **parameters, 'output': output, 'store': output.parent / 'calibrations'})
+        self.start('calibration', params_file, {**_UNATTENDED, **parameters, 'output': output,
+                                                'store': output.parent / 'calibrations'})
 
     def close(self) -> None:
         """End the nodes."""

@@ -162,7 +162,7 @@ class BagRecorder:
         if self.bag is not None:
             package, _, name = topics.type_name(_KINDS.get(topic, Imu)).partition('/')
             self.bag.write(self._node.resolve_topic_name(topic), f'{package}/msg/{name}', data,
-                            self._system.now().nanoseconds)
+                           self._system.now().nanoseconds)
         elif topic == 'sensor_info':
             self._info = data
 

@@ -147,7 +147,7 @@ class LinkReader:
                 output.use(link.sensor)
             if isinstance(link, StageLink):
                 self._stage = topics.Inbox(node, JointState, link.joint_state_topic, _QUEUE,
-                                    reliable=True)
+                                           reliable=True)
                 on_close.callback(self._stage.destroy)
             on_close.callback(topics.RepeatingThread(
                 node, self._live_turn if link.live else self._paced_turn, 'link', on_error).close)

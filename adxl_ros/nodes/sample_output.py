@@ -184,7 +184,7 @@ _UNKNOWN_NODE = '_NODE_NAME_UNKNOWN_'
 def imu_writer(sensor: Sensor, frame_id: str) -> topics.MessageWriter:
     """Return what writes the measured axes of samples, and further fields."""
     return topics.MessageWriter(imu_message(sensor, frame_id), cdr.imu,
-                         linear_acceleration=len(sensor.axes))
+                                linear_acceleration=len(sensor.axes))
 
 
 def imu_message(sensor: Sensor, frame_id: str) -> Imu:
