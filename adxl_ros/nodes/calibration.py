@@ -52,8 +52,6 @@ _EXAMPLES = {
     'a three-axis sensor without a stage': '--ros-args -p mode:=gravity -p output:=unit.yaml',
 }
 """Examples of arguments, by their purpose."""
-
-
 _SAMPLES = 'imu/data_raw'
 """Topic of the samples, relative to the namespace of the node."""
 _YAW_VARIANCE = 8
@@ -193,7 +191,7 @@ class Calibration(Node):
 
     def _connect(self) -> None:
         """Make diagnostics, subscriptions, services and the timer."""
-        self._diagnostics = topics.DiagnosticsReporter(self, {'calibration': self._status})
+        self._diagnostics = topics.DiagnosticsReporter(self, 'calibration', self._status)
         topics.create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1,
                                    latched=True)
         if self._has_stage:
@@ -218,7 +216,7 @@ class Calibration(Node):
                             callback_group=ReentrantCallbackGroup())
         self.create_timer(_POLL_S, self._poll, clock=STEADY)
         self.create_timer(_NOTICE_S, lambda: self._diagnostics.notice(
-            'calibration', self._level(self._controller.status().late)), clock=STEADY)
+            self._level(self._controller.status().late)), clock=STEADY)
 
     def _poll(self) -> None:
         self._read_stage()

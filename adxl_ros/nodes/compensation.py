@@ -166,7 +166,7 @@ class Compensation(Node):
         self._obstacle = ''
         self._reported: Counter[str] = Counter()
         self._reported_ns = STEADY.now().nanoseconds
-        self._diagnostics = topics.DiagnosticsReporter(self, {'compensation': self._status})
+        self._diagnostics = topics.DiagnosticsReporter(self, 'compensation', self._status)
         self._ages = SampleAges()
         self._data = topics.create_publisher(self, Imu, 'imu/data', _DEPTH)
         tilt = topics.create_publisher(self, Vector3Stamped, 'tilt', _DEPTH)
@@ -287,7 +287,7 @@ class Compensation(Node):
             return
         topics.log(self, 'ERROR' if refusal else 'INFO',
                    f'publishing nothing: {refusal}' if refusal else 'publishing again')
-        self._diagnostics.notice('compensation', Level.ERROR if refusal else Level.OK)
+        self._diagnostics.notice(Level.ERROR if refusal else Level.OK)
 
     def _surround(self, name: str, value: float) -> None:
         """Use a temperature, °C, or supply, V, from the next sample on; ignore NaN."""

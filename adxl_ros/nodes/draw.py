@@ -114,8 +114,7 @@ def _readings(progress: screen.Progress | None, live: screen.LiveReading | None)
         yield 'dwell', f'{bar} {progress.dwelt_s:.1f} of {progress.dwell_s:g} s', ''
 
 
-def _progress(progress: screen.Progress | None, estimate: screen.Estimate | None
-              ) -> Iterator[Row]:
+def _progress(progress: screen.Progress | None, estimate: screen.Estimate | None) -> Iterator[Row]:
     """Yield how many poses are done, what they cover, and how good the fit will be."""
     if progress is None or estimate is None:
         return

@@ -79,7 +79,7 @@ class Driver(LifecycleNode):
         self._announces = not own.autostart
         self._output: SampleOutput | None = None
         self._reader: LinkReader | None = None
-        self._diagnostics = DiagnosticsReporter(self, {'link': self._status})
+        self._diagnostics = DiagnosticsReporter(self, 'link', self._status)
         if not own.autostart:
             self._announce('unconfigured')
         elif self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
@@ -101,7 +101,7 @@ class Driver(LifecycleNode):
         link = self._link.module.open_link(self._sensor, self._link.settings)
         self._reader = LinkReader(
             self, link, self._output, self._link.settings, self._fail,
-            lambda level: self._diagnostics.notice('link', Level[level.name]))
+            lambda level: self._diagnostics.notice(Level[level.name]))
 
     def close(self) -> None:
         """End the thread and close the link."""
@@ -134,11 +134,11 @@ class Driver(LifecycleNode):
                 return TransitionCallbackReturn.FAILURE
             self._fault = f'the driver has failed: {one_line(error)}'
             self.get_logger().fatal(traceback.format_exc())
-            self._diagnostics.notice('link', Level.ERROR)
+            self._diagnostics.notice(Level.ERROR)
             return TransitionCallbackReturn.ERROR
         if goal == 'active' or self._announces:
             self._announce(goal)
-        self._diagnostics.notice('link', self._level())
+        self._diagnostics.notice(self._level())
         return TransitionCallbackReturn.SUCCESS
 
     def _announce(self, state: str) -> None:
@@ -156,7 +156,7 @@ class Driver(LifecycleNode):
         """Report why there are no samples, and stay up."""
         self._fault = str(error)
         self.get_logger().error(self._fault)
-        self._diagnostics.notice('link', Level.ERROR)
+        self._diagnostics.notice(Level.ERROR)
 
     def _status(self) -> Status:
         link = self._link_status()

@@ -209,7 +209,7 @@ class Investigate(Node):
         self._pose: Pose | None = None
         self._watchdogs = {topic: Watchdog(_LONGEST_TURN_S)
                            for topic in ('imu/data_raw', 'stage/joint_states')}
-        self._diagnostics = topics.DiagnosticsReporter(self, {'investigate': self._status})
+        self._diagnostics = topics.DiagnosticsReporter(self, 'investigate', self._status)
         self._recorder = BagRecorder(self, self._watchdogs['imu/data_raw'])
         self._folder = OutputFolder.free(Path(own.output))
         self._investigation = Investigation(

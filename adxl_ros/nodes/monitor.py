@@ -195,7 +195,7 @@ class Monitor(Node):
         self._publisher = topics.create_publisher(self, DiagnosticArray, 'gap', _QUEUE)
         self._service = self.create_service(Trigger, '~/diagnose', lambda _, answer: answer,
                                             callback_group=NotForExecutors())
-        self._diagnostics = topics.DiagnosticsReporter(self, {'gap': self._status})
+        self._diagnostics = topics.DiagnosticsReporter(self, 'gap', self._status)
         self._info_topic = self.resolve_topic_name('sensor_info')
         topics.create_subscription(
             self, DiagnosticStatus, 'sensor_info', lambda message: self._compare_by(
@@ -263,7 +263,7 @@ class Monitor(Node):
         if changes:
             # The waiting time of a diagnosis does not start again with a further change.
             self._changed_ns = self._changed_ns or min(change.since_ns for change in changes)
-            self._diagnostics.notice('gap', Level.WARN)
+            self._diagnostics.notice(Level.WARN)
 
     def _diagnose_if_due(self) -> None:
         """Diagnose a change, or the first open gap, once there are enough samples."""

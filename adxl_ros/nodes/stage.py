@@ -57,7 +57,7 @@ class SimulatedStageNode:
         self._refusal = ''
         self._encoders = topics.create_publisher(node, JointState, 'stage/joint_states', _QUEUE)
         self._true = topics.create_publisher(node, JointState, 'stage/true_joint_states', _QUEUE)
-        self._diagnostics = topics.DiagnosticsReporter(node, {'stage': self._status})
+        self._diagnostics = topics.DiagnosticsReporter(node, 'stage', self._status)
         topics.create_subscription(node, JointState, 'stage/command', self._on_command,
                                    _COMMAND_QUEUE)
         limits = (f'{name} {node.get_parameter(name).value:g}' for name in _LIMITS)
@@ -80,7 +80,7 @@ class SimulatedStageNode:
             self._refusal = f'{self._node.resolve_topic_name("stage/command")}: {error}'
             self._node.get_logger().warning(
                 f'{self._refusal}; the stage stays with the command before')
-            self._diagnostics.notice('stage', Level.WARN)
+            self._diagnostics.notice(Level.WARN)
             return
         if not self._is_commanded:
             self._is_commanded = True
@@ -198,7 +198,7 @@ class StageBridge:
         self._commands = topics.create_publisher(
             node, JointTrajectory if kind == 'trajectory' else JointState,
             own.command or _DEFAULT_COMMANDS[kind], _COMMAND_QUEUE)
-        self._diagnostics = topics.DiagnosticsReporter(node, {'stage': self._status})
+        self._diagnostics = topics.DiagnosticsReporter(node, 'stage', self._status)
         topics.create_subscription(node, JointState, 'stage/command', self._on_command,
                                    _COMMAND_QUEUE)
         topics.create_subscription(node, JointState, own.joint_states, self._on_states,
@@ -287,7 +287,7 @@ class StageBridge:
         if reason != self._refusal:
             self._node.get_logger().warning(reason)
         self._refusal = reason
-        self._diagnostics.notice('stage', Level.WARN)
+        self._diagnostics.notice(Level.WARN)
 
     def _status(self) -> Status:
         values = {name: joint.angle_rad for name, joint in self._joints.items()

@@ -255,30 +255,28 @@ class Status:
 
 
 class DiagnosticsReporter:
-    """Reports the tasks of a node once a second, and at once when a level changes."""
+    """Reports the state of a node once a second, and at once when its level changes."""
 
-    def __init__(self, node: Node, tasks: Mapping[str, Callable[[], Status]]) -> None:
-        self._node, self._tasks = node, tasks
-        self._levels: dict[str, Level] = {}
+    def __init__(self, node: Node, task: str, status: Callable[[], Status]) -> None:
+        self._node, self._task, self._status = node, task, status
+        self._level: Level | None = None
         self._publisher = create_publisher(node, DiagnosticArray, '/diagnostics', _REPORTS)
         self._timer = node.create_timer(_PERIOD_S, self._report, clock=STEADY)
         self._at_once = node.create_guard_condition(self._report)
 
-    def notice(self, task: str, level: Level) -> None:
-        """Report at once if a task has another level than in the last report; from any thread."""
-        if level != self._levels.get(task, level):
-            self._levels[task] = level
+    def notice(self, level: Level) -> None:
+        """Report at once if the level is another than in the last report; from any thread."""
+        if self._level not in (None, level):
+            self._level = level
             self._at_once.trigger()
 
     def _report(self) -> None:
         self._timer.reset()
-        prefix = self._node.get_fully_qualified_name().lstrip('/')
-        array = DiagnosticArray()
+        status = self._status()
+        self._level = status.level
+        name = f'{self._node.get_fully_qualified_name().lstrip("/")}: {self._task}'
+        array = DiagnosticArray(status=[status_message(name, status)])
         array.header.stamp = self._node.get_clock().now().to_msg()
-        for name, task in self._tasks.items():
-            status = task()
-            self._levels[name] = status.level
-            array.status.append(status_message(f'{prefix}: {name}', status))
         self._publisher.publish(array)
 
 
