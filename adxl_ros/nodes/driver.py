@@ -59,9 +59,9 @@ class Driver(LifecycleNode):
         super().__init__('driver')
         check_given_parameters(self)
         self._sensor = make_sensor(declare_sensor(self))
-        own, self._link = declare_driver(self, self._sensor.serial)
+        own, self._module, self._settings = declare_driver(self, self._sensor.serial)
         self._delay_ns = round(1e9 * own.stamp_offset_s)
-        settings = self._link.settings
+        settings, self._link = self._settings, own.link
         has_frame = isinstance(settings, base.SimulatorSettings) and not settings.turns_case
         self._frame_id = own.frame_id or ('' if has_frame else _FRAME)
         paced = isinstance(settings, base.PacedSettings)
@@ -72,7 +72,7 @@ class Driver(LifecycleNode):
         # A real device lives in real time, whatever the clock of the graph is.
         self._stamp_clock = self.get_clock() if paced or isinstance(
             settings, base.SimulatorSettings) else Clock(clock_type=ClockType.SYSTEM_TIME)
-        self._simulates = self._link.name == base.DEFAULT_LINK
+        self._simulates = self._link == base.DEFAULT_LINK
         self._tally = Tally(STEADY.now().nanoseconds)
         self._fault = ''
         self._refusal: UserError | None = None
@@ -98,9 +98,9 @@ class Driver(LifecycleNode):
         """Open the link and read it from now on; a failure leaves no link open."""
         assert self._output is not None, 'the life cycle configures a node before it activates it'
         self._fault = ''
-        link = self._link.module.open_link(self._sensor, self._link.settings)
+        link = self._module.open_link(self._sensor, self._settings)
         self._reader = LinkReader(
-            self, link, self._output, self._link.settings, self._fail,
+            self, link, self._output, self._settings, self._fail,
             lambda level: self._diagnostics.notice(Level[level.name]))
 
     def close(self) -> None:
@@ -147,7 +147,7 @@ class Driver(LifecycleNode):
             return
         sensor = self._output.sensor if self._output else self._sensor
         topic = self.resolve_topic_name('imu/data_raw')
-        self.get_logger().info(f'{state}: link {self._link.name}, unit {sensor.serial}, '
+        self.get_logger().info(f'{state}: link {self._link}, unit {sensor.serial}, '
                                f'{sensor.rate_hz:g} Hz, topic {topic}')
         if state == 'active' and self._simulates:
             self.get_logger().warning(f'{_SIMULATED}: no sensor is read')
@@ -172,11 +172,11 @@ class Driver(LifecycleNode):
         level = self._level()
         if warning and level is Level.OK:
             level = Level.WARN
-        kind = _SIMULATED if self._simulates else self._link.name
+        kind = _SIMULATED if self._simulates else self._link
         text = ', '.join(filter(None, (f'{kind}: {link.text}', warning)))
         serial = (self._output.sensor if self._output else self._sensor).serial
         return Status(level, text, serial, {
-            **values, 'link_type': self._link.name, 'link_state': link.text, **link.values()})
+            **values, 'link_type': self._link, 'link_state': link.text, **link.values()})
 
     def _level(self) -> Level:
         """Return the level of the link; a simulated sensor is a warning at least."""

@@ -19,7 +19,7 @@ import re
 import signal
 import sys
 import textwrap
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 from adxl_ros.closed_output import ended_by_closed_output
 from adxl_ros.errors import UserError
@@ -130,9 +130,15 @@ def _topics(make_node: Callable[[], Node]) -> dict[str, dict[str, str]]:
                 'services': {service.srv_name: type_name(service.srv_type)
                              for service in node.services if service.srv_name.startswith('~/')}}
     finally:
-        getattr(node, 'close', lambda: None)()
+        _close(node)
         node.destroy_node()
         rclpy.shutdown()
+
+
+def _close(node: Node) -> None:
+    """Close what a node holds open."""
+    if hasattr(node, 'close'):
+        node.close()
 
 
 def _typed(endpoints: Iterable[Any]) -> dict[str, str]:
@@ -199,14 +205,6 @@ _USAGE = '%(prog)s [--ros-args -p NAME:=VALUE ... --params-file FILE -r FROM:=TO
 """Usage that follows an unknown argument."""
 
 
-@runtime_checkable
-class Closable(Protocol):
-    """A node that holds something open."""
-
-    def close(self) -> None:
-        """Close it."""
-
-
 @ended_by_closed_output()
 def run(make_node: Callable[[], Node], node_help: NodeHelp,
         work: Callable[[Any, Executor], None] = lambda _, executor: executor.spin()) -> int:
@@ -241,8 +239,7 @@ def run(make_node: Callable[[], Node], node_help: NodeHelp,
     try:
         _spin(node, work)
     finally:
-        if isinstance(node, Closable):
-            node.close()
+        _close(node)
         rclpy.try_shutdown()
         # A launch passes Ctrl-C on, although the terminal has sent it too. The second signal may
         # come after Python has removed its handlers.

@@ -4,9 +4,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from itertools import chain
-from typing import Any, NamedTuple
+from typing import Any
 
 from adxl_ros.compensate.filter_inversion import HALF
 from adxl_ros.files import calibration_store
@@ -263,18 +263,10 @@ def check_given_parameters(node: Node) -> None:
                                   f'{nearest(name, names)}?')
 
 
-class ChosenLink(NamedTuple):
-    """The link that the parameters choose."""
-
-    name: str  # Value of `link.type`
-    module: base.LinkModule  # Module of the link
-    settings: Any  # Instance of the module's `Settings`
-
-
 def link_specs(link: str) -> list[Spec]:
     """Return the parameters of a link, `link.type` aside."""
-    return [Spec(f'{LINK}{option.name}', option.default, option.doc, option.unit, option.lower,
-                 option.upper) for option in base.options(base.link_module(link).Settings)]
+    return [Spec(f'{LINK}{name}', *description) for name, *description in map(
+        astuple, base.options(base.link_module(link).Settings))]
 
 
 def links_by_parameter() -> dict[str, list[str]]:
@@ -292,8 +284,12 @@ def given_link(node: Node) -> dict[str, Any]:
             if name.startswith(LINK)}
 
 
-def declare_driver(node: Node, serial: str) -> tuple[DriverSettings, ChosenLink]:
-    """Declare the parameters of the driver and of its link; no real unit gets simulated data."""
+def declare_driver(node: Node, serial: str) -> tuple[DriverSettings, base.LinkModule, Any]:
+    """
+    Declare the parameters of the driver and of its link, which are returned with its module.
+
+    No real unit gets simulated data: a link must then be named.
+    """
     given, links = [f'{LINK}{name}' for name in given_link(node)], links_by_parameter()
     is_chosen = _TYPE in given
     for name in given:
@@ -315,4 +311,4 @@ def declare_driver(node: Node, serial: str) -> tuple[DriverSettings, ChosenLink]
                 f'did you mean {nearest(name, own)}?'
             raise parameter_error(name, f'the link {settings.link} has no such parameter; {hint}')
     values = {spec.name.removeprefix(LINK): declare(node, spec) for spec in specs}
-    return settings, ChosenLink(settings.link, module, module.Settings(**values))
+    return settings, module, module.Settings(**values)
