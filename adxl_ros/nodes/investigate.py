@@ -240,7 +240,7 @@ class Investigate(Node):
 
     def _print(self, lines: Sequence[str]) -> None:
         if self._screen is not None:
-            self._screen.print(*lines)
+            self._screen.add(*lines)
 
     def _poll(self) -> None:
         investigation = self._investigation

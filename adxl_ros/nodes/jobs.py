@@ -149,7 +149,7 @@ class LiveLine:
             self._task = self._progress.add_task('', total=total or None)
             self._progress.start()
 
-    def print(self, *lines: str) -> None:
+    def add(self, *lines: str) -> None:
         """Print lines above the one that changes."""
         for line in lines:
             if self._progress is None:

@@ -63,7 +63,6 @@ def test_saturation_is_reported_at_the_rails_and_beyond_the_range():
     assert not nominal(adc_bits=0, range_g=16.0).saturated(volts).any()
 
 
-
 def test_sim_publishes_every_sample_as_documented(start):
     driver = start('driver', ROS, '-p', 'link.type:=sim', '-p',
                    'link.alpha_rad:=1.5707963267948966', '-p', 'frame_id:=case', '-p',
