@@ -17,8 +17,8 @@ from typing import NamedTuple
 from adxl_ros.closed_output import ended_by_closed_output
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
-from adxl_ros.nodes.node_help import program_parser
-from adxl_ros.nodes.run_node import cpu_time_s, executable, running, use_own_graph
+from adxl_ros.nodes.jobs import cpu_time_s, executable, running, use_own_graph
+from adxl_ros.nodes.run_node import program_parser
 from adxl_ros.nodes.topics import Inbox
 from adxl_ros_validation.bench_jobs import offline_jobs, print_table
 import numpy as np

@@ -20,13 +20,12 @@ launch with an error.
 
 from typing import Any
 
-from adxl_ros.errors import UserError
 from adxl_ros.nodes import launch_nodes
 from adxl_ros.nodes.launch_nodes import arguments, given_anywhere, LINK, make_node, STAGE, text
 from adxl_ros.nodes.settings import CalibrationSettings
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
-from launch.actions import DeclareLaunchArgument, LogInfo
+from launch.actions import LogInfo
 
 SWEEP = arguments(
     CalibrationSettings, 'stage.mode', 'report', 'resume', 'sweep.plan', 'sweep.planes_deg',
@@ -37,15 +36,12 @@ RESUMES = 'its line above says why; accepted poses are kept, and the same comman
 def generate_launch_description() -> LaunchDescription:
     return launch_nodes.describe([
         *launch_nodes.common_arguments(*LINK, *STAGE, *SWEEP, *launch_nodes.SPEED),
-        DeclareLaunchArgument('output', default_value='calibrated.yaml',
-                              description='parameter file that the calibration writes'),
-        DeclareLaunchArgument('mode', default_value='stage',
-                              choices=['stage', 'gravity', 'thermal'],
-                              description='poses of a stage, rests of a hand-held sensor, or one '
-                                          'rest over temperature'),
-        DeclareLaunchArgument('screen', default_value='false', choices=['true', 'false'],
-                              description='show the calibration screen in this terminal; logs '
-                              'then go to files')], make_nodes)
+        launch_nodes.declared('output', 'calibrated.yaml',
+                              'parameter file that the calibration writes'),
+        launch_nodes.declared('mode', 'stage', 'poses of a stage, rests of a hand-held sensor, or '
+                              'one rest over temperature', 'stage', 'gravity', 'thermal'),
+        launch_nodes.declared('screen', 'false', 'show the calibration screen in this terminal; '
+                              'logs then go to files', 'true', 'false')], make_nodes)
 
 
 def make_nodes(context: LaunchContext) -> list[Action]:
@@ -57,7 +53,7 @@ def make_nodes(context: LaunchContext) -> list[Action]:
     log = {'output': 'log'} if shows_screen else {}
     respawn = {'respawn': True, 'respawn_delay': 2.0, **log}
     stage = [make_node(context, 'stage', sim_time | launch_nodes.given_parameters(context, STAGE),
-                       **respawn, on_exit=launch_nodes.GiveUp())] if has_stage(context) else []
+                       **respawn, on_exit=launch_nodes.give_up())] if has_stage(context) else []
     output, report = text(context, 'output'), text(context, 'report')
     files = ' and '.join(filter(None, (output, report and f'{report}/report.html')))
     success = f'wrote {files}; next: ros2 launch adxl_ros robot.launch.py params_file:={output}'
@@ -65,7 +61,7 @@ def make_nodes(context: LaunchContext) -> list[Action]:
     return [
         show_screen(context, shows_screen),
         make_node(context, 'driver', launch_nodes.simulated_link(context, speed) | sim_time,
-                  **respawn, on_exit=launch_nodes.GiveUp()),
+                  **respawn, on_exit=launch_nodes.give_up()),
         *stage,
         make_node(context, 'calibration', {
             **sim_time, **sweep, 'autostart': True, 'exit_when_done': True, 'screen': False,
@@ -86,14 +82,9 @@ def has_stage(context: LaunchContext) -> bool:
     """Return whether there is a stage node; a real sensor never gets a simulated stage unasked."""
     if text(context, 'mode') in ('gravity', 'thermal'):
         return False
-    link = given_anywhere(context, 'link.type', 'driver')
-    is_real = link not in ('', 'sim')
-    stage = given_anywhere(context, 'stage.type', 'stage')
-    by_hand = given_anywhere(context, 'stage.mode', 'calibration') in ('encoder', 'manual')
-    if is_real and not stage and not by_hand:
-        raise UserError(
-            f'link_type is {link}, but the stage would be simulated; set stage_type:=trajectory '
-            'or joint_state with bridge_alpha_joint and bridge_beta_joint for a stage that turns '
-            'itself, stage_mode:=encoder or manual for one turned by hand, mode:=gravity for a '
-            'hand-held sensor, or stage_type:=simulated')
-    return bool(stage) or not is_real
+    is_real = given_anywhere(context, 'link.type', 'driver') not in ('', 'sim')
+    if given_anywhere(context, 'stage.mode', 'calibration') not in ('encoder', 'manual'):
+        launch_nodes.refuse_simulated_stage(context, 'stage_mode:=encoder or manual for one '
+                                            'turned by hand, mode:=gravity for a hand-held '
+                                            'sensor, ')
+    return bool(given_anywhere(context, 'stage.type', 'stage')) or not is_real

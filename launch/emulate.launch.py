@@ -18,7 +18,6 @@ from adxl_ros.nodes.launch_nodes import arguments, text
 from adxl_ros.nodes.settings import DriverSettings
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
-from launch.actions import DeclareLaunchArgument
 
 LINK = arguments(DriverSettings, in_topic='link.topic', temperature_topic='link.temperature_topic',
                  seed='link.seed')
@@ -27,13 +26,11 @@ LINK = arguments(DriverSettings, in_topic='link.topic', temperature_topic='link.
 def generate_launch_description() -> LaunchDescription:
     return launch_nodes.describe([
         *launch_nodes.common_arguments(*LINK, frame_id=''),
-        DeclareLaunchArgument('rpy_rad', default_value='0,0,0',
-                              description='roll, pitch and yaw of the case in the frame of the '
-                              'ideal samples, rad'),
-        DeclareLaunchArgument('out_topic', default_value='imu/data_raw',
-                              description='topic of the realistic samples'),
-        DeclareLaunchArgument('use_sim_time', default_value='true', choices=['true', 'false'],
-                              description='follow the clock of the simulator')], make_nodes)
+        launch_nodes.declared('rpy_rad', '0,0,0', 'roll, pitch and yaw of the case in the frame '
+                              'of the ideal samples, rad'),
+        launch_nodes.declared('out_topic', 'imu/data_raw', 'topic of the realistic samples'),
+        launch_nodes.declared('use_sim_time', 'true', 'follow the clock of the simulator', 'true',
+                              'false')], make_nodes)
 
 
 def make_nodes(context: LaunchContext) -> list[Action]:
@@ -45,4 +42,4 @@ def make_nodes(context: LaunchContext) -> list[Action]:
             'link.type': 'topic', **rotation, **launch_nodes.given_parameters(context, LINK),
             'use_sim_time': text(context, 'use_sim_time') == 'true'},
         remappings=[('imu/data_raw', text(context, 'out_topic'))], respawn=True,
-        respawn_delay=2.0, on_exit=launch_nodes.GiveUp())]
+        respawn_delay=2.0, on_exit=launch_nodes.give_up())]

@@ -13,22 +13,11 @@ simulated sensor, whose gap to `params_file` is then found. The launch ends with
 investigation: status 0 with a verdict, else 1. Ctrl-C leaves the stage at rest.
 """
 
-from adxl_ros.errors import UserError
 from adxl_ros.nodes import launch_nodes
-from adxl_ros.nodes.launch_nodes import (
-    arguments,
-    given_anywhere,
-    given_parameters,
-    LINK,
-    make_node,
-    SPEED,
-    STAGE,
-    text,
-)
+from adxl_ros.nodes.launch_nodes import arguments, given_parameters, make_node, text
 from adxl_ros.nodes.settings import InvestigateSettings
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
-from launch.actions import DeclareLaunchArgument
 
 INVESTIGATION = arguments(InvestigateSettings, 'output', 'limits.alpha_deg', 'limits.beta_deg',
                           'limits.rate_deg_s', 'limits.minutes')
@@ -37,24 +26,24 @@ RESULT = 'the lines above have the result'
 
 def generate_launch_description() -> LaunchDescription:
     return launch_nodes.describe([
-        *launch_nodes.common_arguments(*LINK, *STAGE, *INVESTIGATION, *SPEED),
-        DeclareLaunchArgument('unit_file', default_value='',
-                              description='parameter file of the unit that the driver simulates; '
-                              'empty: params_file')], make_nodes)
+        *launch_nodes.common_arguments(*launch_nodes.LINK, *launch_nodes.STAGE,
+                                       *INVESTIGATION, *launch_nodes.SPEED),
+        launch_nodes.declared('unit_file', '', 'parameter file of the unit that the driver '
+                              'simulates; empty: params_file')], make_nodes)
 
 
 def make_nodes(context: LaunchContext) -> list[Action]:
     """Return the nodes."""
-    speed = given_parameters(context, SPEED)
+    speed = given_parameters(context, launch_nodes.SPEED)
     sim_time = {'use_sim_time': True} if speed else {}
     respawn = {'respawn': True, 'respawn_delay': 2.0}
-    check_stage(context)
+    launch_nodes.refuse_simulated_stage(context)
     return [
         make_node(context, 'driver', launch_nodes.simulated_link(context, speed) | sim_time,
                   params_file=text(context, 'unit_file'), **respawn,
-                  on_exit=launch_nodes.GiveUp()),
-        make_node(context, 'stage', sim_time | given_parameters(context, STAGE),
-                  **respawn, on_exit=launch_nodes.GiveUp()),
+                  on_exit=launch_nodes.give_up()),
+        make_node(context, 'stage', sim_time | given_parameters(context, launch_nodes.STAGE),
+                  **respawn, on_exit=launch_nodes.give_up()),
         make_node(context, 'investigate',
                   sim_time | loses_nothing(context) | given_parameters(context, INVESTIGATION),
                   on_exit=launch_nodes.end_with(RESULT, RESULT))]
@@ -64,13 +53,3 @@ def loses_nothing(context: LaunchContext) -> dict[str, str]:
     """Return QoS of the recorded topics: driver and stage repeat what a busy machine misses."""
     return {f'qos_overrides.{launch_nodes.full_name(context, topic)}.subscription.reliability':
             'reliable' for topic in ('imu/data_raw', 'stage/joint_states')}
-
-
-def check_stage(context: LaunchContext) -> None:
-    """Refuse a simulated stage beside a real sensor, unless it is asked for."""
-    link = given_anywhere(context, 'link.type', 'driver')
-    if link not in ('', 'sim') and not given_anywhere(context, 'stage.type', 'stage'):
-        raise UserError(
-            f'link_type is {link}, but the stage would be simulated; set stage_type:=trajectory '
-            'or joint_state with bridge_alpha_joint and bridge_beta_joint, or '
-            'stage_type:=simulated')

@@ -24,7 +24,6 @@ from adxl_ros.nodes.launch_nodes import arguments, LINK, text
 from adxl_ros.nodes.settings import CompensationSettings
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
-from launch.actions import DeclareLaunchArgument
 
 OUTPUT_RATE = arguments(CompensationSettings, 'output_rate_hz')
 
@@ -32,13 +31,12 @@ OUTPUT_RATE = arguments(CompensationSettings, 'output_rate_hz')
 def generate_launch_description() -> LaunchDescription:
     return launch_nodes.describe([
         *launch_nodes.common_arguments(*LINK, *OUTPUT_RATE), *launch_nodes.TRANSFORM,
-        DeclareLaunchArgument('imu_topic', default_value='', description='topic of another '
-                              "driver's sensor_msgs/Imu, such as /camera/imu, which is corrected "
-                              'in place of that of our driver; empty: start our driver'),
-        DeclareLaunchArgument('use_sim_time', default_value='false', choices=['true', 'false'],
-                              description='follow /clock'),
-        DeclareLaunchArgument('respawn', default_value='true', choices=['true', 'false'],
-                              description='start a node again that ends')], make_nodes)
+        launch_nodes.declared('imu_topic', '', "topic of another driver's sensor_msgs/Imu, such "
+                              'as /camera/imu, which is corrected in place of that of our driver; '
+                              'empty: start our driver'),
+        launch_nodes.declared('use_sim_time', 'false', 'follow /clock', 'true', 'false'),
+        launch_nodes.declared('respawn', 'true', 'start a node again that ends', 'true',
+                              'false')], make_nodes)
 
 
 def make_nodes(context: LaunchContext) -> list[Action]:
@@ -54,5 +52,5 @@ def make_nodes(context: LaunchContext) -> list[Action]:
         launch_nodes.make_node(
             context, executable, parameters | sim_time, respawn=respawn, respawn_delay=2.0,
             remappings=[('imu/data_raw', imu_topic)] if imu_topic else [],
-            on_exit=launch_nodes.GiveUp() if respawn else launch_nodes.GiveUp(1))
+            on_exit=launch_nodes.give_up() if respawn else launch_nodes.give_up(1))
         for executable, parameters in nodes.items())]

@@ -11,13 +11,13 @@ does.
 from __future__ import annotations
 
 from concurrent.futures import Future
-from dataclasses import dataclass
 from itertools import chain, count
 import json
 import os
 from pathlib import Path
 import shlex
 import shutil
+from typing import Any
 
 from adxl_ros.diagnose import page
 from adxl_ros.diagnose.diagnosis import Diagnosis
@@ -37,36 +37,16 @@ _WITHOUT_DIAGNOSIS = {'bag', 'baseline.yaml', 'answer.json'}
 """Files of an investigation that was stopped before its first diagnosis of samples."""
 
 
-@dataclass(frozen=True)
 class OutputFolder:
     """The folder of an investigation."""
 
-    path: Path  # The folder
-
-    @property
-    def bag(self) -> Path:
-        """Return the recording, a rosbag2 directory."""
-        return self.path / 'bag'
-
-    @property
-    def baseline(self) -> Path:
-        """Return the parameter file that the recording is compared with."""
-        return self.path / 'baseline.yaml'
-
-    @property
-    def parameters(self) -> Path:
-        """Return the parameter file with the effects that were found."""
-        return self.path / 'params.yaml'
-
-    @property
-    def report(self) -> Path:
-        """Return the page of the diagnosis."""
-        return self.path / 'report.html'
-
-    @property
-    def answer(self) -> Path:
-        """Return the newest answer, JSON."""
-        return self.path / 'answer.json'
+    def __init__(self, path: Path) -> None:
+        self.path = path  # The folder
+        self.bag = path / 'bag'  # The recording, a rosbag2 directory
+        self.baseline = path / 'baseline.yaml'  # What the recording is compared with
+        self.parameters = path / 'params.yaml'  # The parameters with the effects that were found
+        self.report = path / 'report.html'  # The page of the diagnosis
+        self.answer = path / 'answer.json'  # The newest answer
 
     @staticmethod
     def free(path: Path) -> OutputFolder:
@@ -93,20 +73,23 @@ def _write_diagnosis(folder: OutputFolder, diagnosis: Diagnosis, recording: Reco
     subject = (f'{folder.bag.name} ({recording.time_s[-1] - recording.time_s[0]:.0f} s, '
                f'{recording.rate_hz:.4g} Hz, {" ".join(recording.axes)})  minus  simulation of '
                f'{folder.baseline.name}')
-    write_text(folder.path / 'report.json', json.dumps(
-        as_json(diagnosis), indent=1, allow_nan=False) + '\n')
+    write_text(folder.path / 'report.json', _as_text(as_json(diagnosis)))
     parameters = ''
     if diagnosis.report is not None:
-        lines = screen_lines(diagnosis, subject)
-        parameters = parameter_file.as_text(diagnosis.report.sensor, lines)
+        parameters = parameter_file.as_text(diagnosis.report.sensor,
+                                            screen_lines(diagnosis, subject))
         write_text(folder.parameters, parameters)
     if with_page:
         steps = [('simulate with these parameters', 'ros2 run adxl_ros simulate rich --params '
                   f'{folder.parameters} -o sim.csv')] if parameters else []
+        command = shlex.join(['ros2', 'run', 'adxl_ros', 'diagnose', str(folder.bag), '--params',
+                              str(folder.baseline), '-o', f'{folder.path}_again'])
         write_text(folder.report, page.page(diagnosis, page.Run(
-            subject, folder.baseline.name, steps, parameters, shlex.join(
-                ['ros2', 'run', 'adxl_ros', 'diagnose', str(folder.bag), '--params',
-                 str(folder.baseline), '-o', f'{folder.path}_again']))))
+            subject, folder.baseline.name, steps, parameters, command)))
+
+
+def _as_text(values: dict[str, Any]) -> str:
+    return json.dumps(values, indent=1, allow_nan=False) + '\n'
 
 
 class BackgroundDiagnoser:
@@ -150,5 +133,5 @@ def _diagnose(folder: OutputFolder, question: Question, limits: StageLimits, see
     if diagnosis is not None:
         _write_diagnosis(folder, diagnosis, recordings[0],
                          with_page=answer.outcome is not Outcome.GO_ON)
-    write_text(folder.answer, json.dumps(answer.as_json(), indent=1, allow_nan=False) + '\n')
+    write_text(folder.answer, _as_text(answer.as_json()))
     return answer

@@ -213,7 +213,7 @@ def _with_90_percent(hypotheses: Sequence[WeightedHypothesis]) -> list[WeightedH
 def _sentence(outcome: Outcome, named: Sequence[WeightedHypothesis]) -> str:
     """Return the result in one sentence with one number."""
     percent = f'{100 * sum(h.probability for h in named):.0f} %'
-    names = _listed([hypothesis_text(h.effects) for h in named])
+    names = listed([hypothesis_text(h.effects) for h in named])
     return {
         Outcome.CERTAIN: f'The recording shows {names}: {percent}.',
         Outcome.NO_VISIBLE_GAP: f'There is no gap that this stage can show: {percent}.',
@@ -230,7 +230,7 @@ def hypothesis_text(effects: Sequence[str]) -> str:
     return ' with '.join(named + ['something unknown'] * (UNKNOWN in effects))
 
 
-def _listed(names: Sequence[str]) -> str:
+def listed(names: Sequence[str]) -> str:
     """Return the first names in a sentence, and how many others there are."""
     others = len(names) - _LARGEST_NAMED
     if others > 1:

@@ -13,7 +13,7 @@ commands come late. Where they end for any reason, the stage comes to rest at th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -30,8 +30,6 @@ _SLOW_SHARE = 1 / 3
 nine times smaller."""
 _SWING_RAD = np.radians(15.0)
 """Amplitude of swings and of reversals, rad. Chosen: far beyond every backlash."""
-_APPROACH_RAD = np.radians(20.0)
-"""Distance from which a pose is approached, rad. Chosen: beyond every backlash."""
 _SWINGS = 4
 """Number of swings forth and back. Chosen: their reversals are averaged."""
 LONGEST_STEP_S = 0.2
@@ -123,6 +121,20 @@ class Path:
                 self.turn(joint, middle_rad + side * _SWING_RAD, share)
         self.turn(joint, middle_rad, share)
 
+    def turn_of_beta(self, alpha_deg: float, share: float = 1.0) -> None:
+        """Turn beta over its range, a turn at most, forth and back."""
+        low_rad, high_rad = self.limits.beta_rad
+        self.rest(alpha_deg, np.degrees(low_rad), 1.0)
+        self.turn('beta', min(high_rad, low_rad + 2 * np.pi), share)
+        self.turn('beta', low_rad, share)
+
+    def turn_of_alpha(self, beta_deg: float, share: float = 1.0) -> None:
+        """Turn alpha over its range, a turn at most, forth and back."""
+        low_rad, high_rad = self.limits.alpha_rad
+        self.rest(np.degrees(low_rad), beta_deg, 1.0)
+        self.turn('alpha', min(high_rad, low_rad + 2 * np.pi), share)
+        self.turn('alpha', low_rad, share)
+
     def motion(self) -> Motion:
         """Return the path as a motion that begins at its own time."""
         alpha, beta = self._script.joints()
@@ -133,126 +145,66 @@ class Path:
         return Pose(self._script.alpha, self._script.beta)
 
 
-def rests_upright(path: Path) -> None:
-    """Rest in steps of 60° of beta, with x and y upright."""
-    for beta_deg in range(0, 360, 60):
-        path.rest(90, beta_deg)
+class Manoeuvre(NamedTuple):
+    """A manoeuvre of the catalogue."""
+
+    kind: str  # What it varies
+    text: str  # What it does, for people
+    moves: Sequence[tuple]  # Name of a method of `Path` and its arguments, for each move
 
 
-def rests_on_sphere(path: Path) -> None:
-    """Rest in poses that spread gravity over the sphere."""
-    for alpha_deg, beta_deg in ((0, 0), (45, 0), (45, 120), (45, 240), (135, 240), (135, 120),
-                                (135, 0), (180, 0)):
-        path.rest(alpha_deg, beta_deg)
-
-
-def slow_turn_of_beta(path: Path) -> None:
-    """Turn beta once, forth and back, slowly."""
-    _turn_of_beta(path, 90.0, _SLOW_SHARE)
-
-
-def fast_turn_of_beta(path: Path) -> None:
-    """Turn beta once, forth and back, at the limit of rate."""
-    _turn_of_beta(path, 90.0, 1.0)
-
-
-def inclined_turn_of_beta(path: Path) -> None:
-    """Turn beta once at alpha 45°, forth and back, at the limit of rate."""
-    _turn_of_beta(path, 45.0, 1.0)
-
-
-def level_turn_of_beta(path: Path) -> None:
-    """Turn beta once with z upright, at the limit of rate."""
-    _turn_of_beta(path, 0.0, 1.0)
-
-
-def slow_turn_of_alpha(path: Path) -> None:
-    """Turn alpha over its range, forth and back, slowly."""
-    _turn_of_alpha(path, (45.0,), _SLOW_SHARE)
-
-
-def fast_turns_of_alpha(path: Path) -> None:
-    """Turn alpha over its range at two angles beta, at the limit of rate."""
-    _turn_of_alpha(path, (0.0, 90.0), 1.0)
-
-
-def two_rates_of_beta(path: Path) -> None:
-    """Turn beta over half a turn at three rates, forth and back."""
-    path.rest(90, 0, 1.0)
-    for share in (1.0, 0.5, 0.25):
-        path.turn('beta', np.pi, share)
-        path.turn('beta', 0.0, share)
-
-
-def swings_of_beta(path: Path) -> None:
-    """Swing beta about a pose, with reversals."""
-    path.rest(90, 45, 1.0)
-    path.swing('beta')
-    path.swing('beta', 0.5)
-
-
-def swings_of_alpha(path: Path) -> None:
-    """Swing alpha about a pose, with reversals."""
-    path.rest(45, 45, 1.0)
-    path.swing('alpha')
-    path.swing('alpha', 0.5)
-
-
-def poses_from_both_sides(path: Path) -> None:
-    """Approach the same poses from both sides of each joint."""
-    approach_deg = np.degrees(_APPROACH_RAD)
-    for alpha_deg, beta_deg in ((60, 45), (60, 225)):
-        for side in (-1, 1):
-            path.rest(alpha_deg, beta_deg + side * approach_deg, 0.5)
-            path.rest(alpha_deg, beta_deg, 3.0)
-        for side in (-1, 1):
-            path.rest(alpha_deg + side * approach_deg, beta_deg, 0.5)
-            path.rest(alpha_deg, beta_deg, 3.0)
-
-
-def long_rests(path: Path) -> None:
-    """Rest for a minute in two opposite poses."""
-    path.rest(90, 45, _LONG_REST_S)
-    path.rest(90, 225, _LONG_REST_S)
-
-
-def rests_on_axes(path: Path) -> None:
-    """Rest with each axis up and down."""
-    for beta_deg in (0, 90, 180, 270):
-        path.rest(90, beta_deg, 2.0)
-
-
-def _turn_of_beta(path: Path, alpha_deg: float, share: float) -> None:
-    """Turn beta over its range, a turn at most, forth and back."""
-    low_rad, high_rad = path.limits.beta_rad
-    high_rad = min(high_rad, low_rad + 2 * np.pi)
-    path.rest(alpha_deg, np.degrees(low_rad), 1.0)
-    path.turn('beta', high_rad, share)
-    path.turn('beta', low_rad, share)
-
-
-def _turn_of_alpha(path: Path, betas_deg: Sequence[float], share: float) -> None:
-    """Turn alpha over its range, a turn at most, forth and back at some angles beta."""
-    low_rad, high_rad = path.limits.alpha_rad
-    high_rad = min(high_rad, low_rad + 2 * np.pi)
-    for beta_deg in betas_deg:
-        path.rest(np.degrees(low_rad), beta_deg, 1.0)
-        path.turn('alpha', high_rad, share)
-        path.turn('alpha', low_rad, share)
-
-
-_KINDS: dict[str, tuple[Callable[[Path], None], ...]] = {
-    'rests': (rests_upright, rests_on_sphere, rests_on_axes),
-    'turns of beta': (slow_turn_of_beta, fast_turn_of_beta, inclined_turn_of_beta,
-                      level_turn_of_beta),
-    'turns of alpha': (slow_turn_of_alpha, fast_turns_of_alpha),
-    'rates': (two_rates_of_beta,),
-    'reversals': (swings_of_beta, swings_of_alpha, poses_from_both_sides),
-    'long rests': (long_rests,)}
-CATALOGUE = {f.__name__: f for functions in _KINDS.values() for f in functions}
+_APPROACH_DEG = 20.0
+"""Distance from which a pose is approached, degrees. Chosen: beyond every backlash."""
+CATALOGUE = {
+    'rests_upright': Manoeuvre(
+        'rests', 'rest in steps of 60° of beta, with x and y upright',
+        [('rest', 90, beta_deg) for beta_deg in range(0, 360, 60)]),
+    'rests_on_sphere': Manoeuvre(
+        'rests', 'rest in poses that spread gravity over the sphere',
+        [('rest', *pose) for pose in ((0, 0), (45, 0), (45, 120), (45, 240), (135, 240),
+                                      (135, 120), (135, 0), (180, 0))]),
+    'rests_on_axes': Manoeuvre(
+        'rests', 'rest with each axis up and down',
+        [('rest', 90, beta_deg, 2.0) for beta_deg in (0, 90, 180, 270)]),
+    'slow_turn_of_beta': Manoeuvre(
+        'turns of beta', 'turn beta once, forth and back, slowly',
+        [('turn_of_beta', 90.0, _SLOW_SHARE)]),
+    'fast_turn_of_beta': Manoeuvre(
+        'turns of beta', 'turn beta once, forth and back, at the limit of rate',
+        [('turn_of_beta', 90.0)]),
+    'inclined_turn_of_beta': Manoeuvre(
+        'turns of beta', 'turn beta once at alpha 45°, forth and back, at the limit of rate',
+        [('turn_of_beta', 45.0)]),
+    'level_turn_of_beta': Manoeuvre(
+        'turns of beta', 'turn beta once with z upright, at the limit of rate',
+        [('turn_of_beta', 0.0)]),
+    'slow_turn_of_alpha': Manoeuvre(
+        'turns of alpha', 'turn alpha over its range, forth and back, slowly',
+        [('turn_of_alpha', 45.0, _SLOW_SHARE)]),
+    'fast_turns_of_alpha': Manoeuvre(
+        'turns of alpha', 'turn alpha over its range at two angles beta, at the limit of rate',
+        [('turn_of_alpha', 0.0), ('turn_of_alpha', 90.0)]),
+    'two_rates_of_beta': Manoeuvre(
+        'rates', 'turn beta over half a turn at three rates, forth and back',
+        [('rest', 90, 0, 1.0), *(('turn', 'beta', to_rad, share) for share in (1.0, 0.5, 0.25)
+                                 for to_rad in (np.pi, 0.0))]),
+    'swings_of_beta': Manoeuvre(
+        'reversals', 'swing beta about a pose, with reversals',
+        [('rest', 90, 45, 1.0), ('swing', 'beta'), ('swing', 'beta', 0.5)]),
+    'swings_of_alpha': Manoeuvre(
+        'reversals', 'swing alpha about a pose, with reversals',
+        [('rest', 45, 45, 1.0), ('swing', 'alpha'), ('swing', 'alpha', 0.5)]),
+    'poses_from_both_sides': Manoeuvre(
+        'reversals', 'approach the same poses from both sides of each joint',
+        [move for beta_deg in (45, 225) for d_alpha, d_beta in ((0, -1), (0, 1), (-1, 0), (1, 0))
+         for move in (('rest', 60 + d_alpha * _APPROACH_DEG, beta_deg + d_beta * _APPROACH_DEG,
+                       0.5), ('rest', 60, beta_deg, 3.0))]),
+    'long_rests': Manoeuvre(
+        'long rests', 'rest for a minute in two opposite poses',
+        [('rest', 90, 45, _LONG_REST_S), ('rest', 90, 225, _LONG_REST_S)])}
 """Manoeuvres by name."""
-KIND_OF = {f.__name__: kind for kind, functions in _KINDS.items() for f in functions}
-"""Kind of each manoeuvre: what it varies."""
+KIND_OF = {name: manoeuvre.kind for name, manoeuvre in CATALOGUE.items()}
+"""Kind of each manoeuvre."""
 
 
 @dataclass(frozen=True)
@@ -269,22 +221,17 @@ class PlannedManoeuvre:
         """Return the duration, min."""
         return self.motion.duration_s / 60
 
-    @property
-    def text(self) -> str:
-        """Return what it does, for people."""
-        return description(self.name)
-
 
 def description(name: str) -> str:
     """Return what a manoeuvre does, for people."""
-    first_line = (CATALOGUE[name].__doc__ or name).strip().splitlines()[0]
-    return first_line[0].lower() + first_line[1:].rstrip('.')
+    return CATALOGUE[name].text
 
 
 def plan(name: str, limits: StageLimits, pose: Pose, begin_s: float = 0.0) -> PlannedManoeuvre:
     """Plan a manoeuvre."""
     path = Path(limits, pose, begin_s)
-    CATALOGUE[name](path)
+    for move, *arguments in CATALOGUE[name].moves:
+        getattr(path, move)(*arguments)
     return PlannedManoeuvre(name, begin_s, path.motion(), path.end())
 
 

@@ -56,7 +56,6 @@ class Change:
     channel: int  # Number of the series
     blocks: int  # Number of blocks since the change
     size: float  # Mean after the change minus mean before
-    std: float  # Usual size of such a difference
 
 
 @dataclass(frozen=True)
@@ -121,21 +120,20 @@ class ChangeTest:
         place = self._count % self._size
         self._sums[place] = self._sums[last] + values
         self._moves[place] = self._moves[last] + moves
-        alarms: dict[int, tuple[int, float]] = {}
+        alarms: dict[int, int] = {}
         for j in range(_LENGTHS):
             length = 2 ** j
-            if self._count % _stride(length) or self._count < (1 + _BEFORE) * length:
-                continue
-            for channel, std in self._compare(j, length):
-                alarms.setdefault(channel, (length, std))
-        return [self._located(channel, *alarm) for channel, alarm in alarms.items()]
+            if self._count % _stride(length) == 0 and self._count >= (1 + _BEFORE) * length:
+                for channel in self._compare(j, length):
+                    alarms.setdefault(channel, length)
+        return [self._located(channel, length) for channel, length in alarms.items()]
 
     def restart(self) -> None:
         """Compare no block to come with a block before, but keep the usual sizes."""
         self._begin_again(np.arange(self.settings.channels), self._count)
 
-    def _compare(self, j: int, length: int) -> list[tuple[int, float]]:
-        """Compare one length, and learn; return channels that have changed, with usual sizes."""
+    def _compare(self, j: int, length: int) -> list[int]:
+        """Compare one length, and learn; return the channels that have changed."""
         begin = self._count - (1 + _BEFORE) * length
         now, middle, first = (k % self._size for k in (self._count, self._count - length, begin))
         difference = (self._sums[now] - self._sums[middle]) / length \
@@ -151,11 +149,9 @@ class ChangeTest:
                 (1 + _BEFORE) / 3 * length * self.settings.block_s)
             shortest_std, shortest_factor = self._usual(kind, 0)
             limit = np.minimum(limit, shortest_factor * np.hypot(shortest_std, walk))
-        changed = np.flatnonzero(valid & (np.abs(difference) > limit))
-        usable = valid.copy()
-        usable[changed] = False
-        self._waiting[j].append((self._count, kind, difference, usable))
-        return [(int(channel), float(std[channel])) for channel in changed]
+        changed = valid & (np.abs(difference) > limit)
+        self._waiting[j].append((self._count, kind, difference, valid & ~changed))
+        return np.flatnonzero(changed).tolist()
 
     def _usual(self, kind: int, j: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the usual size of a difference by series, and the limit of Student's t."""
@@ -175,7 +171,7 @@ class ChangeTest:
             self._squares[kind, j] = self._squares[kind, j] * kept + usable * difference ** 2
             self._weights[kind, j] = self._weights[kind, j] * kept + usable
 
-    def _located(self, channel: int, length: int, std: float) -> Change:
+    def _located(self, channel: int, length: int) -> Change:
         """Find where a mean has changed in the compared blocks; the series begins again there."""
         begin = max(int(self._since[channel]), self._count - (1 + _BEFORE) * length)
         places = np.arange(begin, self._count + 1) % self._size
@@ -187,7 +183,7 @@ class ChangeTest:
         self._begin_again(np.array([channel]), begin + int(before[best]))
         # After a change of the gain, the residual of motion has another usual size.
         self._squares[:, :, channel] = self._weights[:, :, channel] = 0.0
-        return Change(channel, total - int(before[best]), float(change[best]), std)
+        return Change(channel, total - int(before[best]), float(change[best]))
 
     def _begin_again(self, channels: np.ndarray, block: int) -> None:
         """Let series begin at a block; no waiting difference of them is learnt."""

@@ -14,15 +14,10 @@ from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.monitor import reference_stream
 from adxl_ros.monitor.change_test import ChangeSettings, ChangeTest
-from adxl_ros.monitor.reference_stream import (
-    AFTER_NS,
-    Block,
-    Prediction,
-    ReferenceKind,
-    ReferenceStream,
-    StreamBuffer,
-)
+from adxl_ros.monitor.records import DiagnosisInput, GapChange
+from adxl_ros.monitor.reference_stream import Block, ReferenceKind
 from adxl_ros.report.quantities import Interval
 import numpy as np
 import scipy
@@ -83,23 +78,6 @@ class AxisGap:
 
 
 @dataclass(frozen=True)
-class GapChange:
-    """A change of the residual."""
-
-    axis: str  # x, y or z
-    quantity: str  # `mean`, or `noise` for the standard deviation within a second
-    since_ns: int  # Stamp of the change, ns
-    detected_ns: int  # Stamp of its detection, ns
-    size: float  # Change of the mean, mg; ratio of the standard deviations
-
-    def text(self) -> str:
-        """Return the change in words."""
-        if self.quantity == 'mean':
-            return f'{self.axis} by {self.size:+.3g} mg'
-        return f'noise of {self.axis} by a factor of {self.size:.3g}'
-
-
-@dataclass(frozen=True)
 class GapSettings:
     """Settings of the comparison."""
 
@@ -109,17 +87,7 @@ class GapSettings:
     wait_s: float = 120.0  # Time after a change of an axis in which further ones belong to it, s
 
 
-@dataclass(frozen=True)
-class DiagnosisInput:
-    """What a diagnosis compares."""
-
-    recording: Recording  # Samples, with the references of a stage
-    sensor: Sensor  # The baseline
-    # Times, s, (k,), and force of a simulator, m/s², (k, 3); None with a stage
-    force: tuple[np.ndarray, np.ndarray] | None = None
-
-
-@dataclass(frozen=True)
+@dataclass
 class Counts:
     """Counts since the start."""
 
@@ -142,8 +110,8 @@ class LiveGap:
         self.sensor, self._settings = sensor, settings
         span_ns = round(settings.history_s * 1e9)
         # The reference, which takes its messages itself
-        self.reference = ReferenceStream(kind, sensor, span_ns)
-        self._samples = StreamBuffer(len(sensor.axes), span_ns)
+        self.reference = reference_stream.ReferenceStream(kind, sensor, span_ns)
+        self._samples = reference_stream.StreamBuffer(len(sensor.axes), span_ns)
         self.counts = Counts()  # Counts since the start
         self.obstacle = 'no samples yet'  # Why the newest second was not compared; empty if it was
         self.changes: list[GapChange] = []  # Changes so far, the newest last
@@ -155,19 +123,15 @@ class LiveGap:
             2 * count, settings.false_alarms_per_day, BLOCK_NS * 1e-9,
             walks=(_healthy_walk(sensor),) * count + (np.inf,) * count))
         self._changed_ns: dict[str, int] = {}
-        self._prediction = Prediction(sensor, self.reference)
+        self._prediction = reference_stream.Prediction(sensor, self.reference)
+        self.left_out = self._prediction.left_out  # Effects that the reference cannot drive
         self._next_ns: int | None = None
         self._compared_ns: int | None = None
 
     @property
-    def left_out(self) -> tuple[str, ...]:
-        """Return the effects that the reference cannot drive."""
-        return self._prediction.left_out
-
-    @property
-    def newest_ns(self) -> int | None:
-        """Return the stamp of the newest sample, ns."""
-        return self._samples.newest_ns
+    def newest_ns(self) -> int:
+        """Return the stamp of the newest sample, ns; 0 before the first."""
+        return self._samples.newest_ns or 0
 
     def add_samples(self, stamp_ns: np.ndarray, accel_mps2: np.ndarray) -> None:
         """
@@ -178,21 +142,16 @@ class LiveGap:
         """
         accel_mps2 = accel_mps2[:, :len(self.sensor.axes)]
         finite = np.isfinite(accel_mps2).all(axis=1)
-        self._count(samples=len(stamp_ns), dropped=int((~finite).sum()))
+        self.counts.samples += len(stamp_ns)
+        self.counts.dropped += int((~finite).sum())
         stamp_ns, accel_mps2 = stamp_ns[finite], accel_mps2[finite]
-        if not len(stamp_ns):
-            return
         newest_ns = self._samples.newest_ns
-        steps_ns = np.diff(stamp_ns, prepend=stamp_ns[0] if newest_ns is None else newest_ns)
+        steps_ns = np.diff(stamp_ns, prepend=stamp_ns[:1] if newest_ns is None else newest_ns)
         jumps = np.flatnonzero((steps_ns < -_JUMP_NS) | (steps_ns > _BREAK_NS))
-        if len(jumps):
-            first = int(jumps[0])
-            self._append(stamp_ns[:first], accel_mps2[:first])
-            self._restart()
-            self._count(jumps=1, samples=first - len(stamp_ns))
-            self.add_samples(stamp_ns[first:], accel_mps2[first:])
-            return
-        self._append(stamp_ns, accel_mps2)
+        for i, part in enumerate(np.split(np.arange(len(stamp_ns)), jumps)):
+            if i:
+                self._restart()
+            self._append(stamp_ns[part], accel_mps2[part])
 
     def advance(self) -> list[GapChange]:
         """Compare all seconds whose reference is known; return the changes in them."""
@@ -200,8 +159,7 @@ class LiveGap:
         while self._next_ns is not None or self._begin():
             assert self._next_ns is not None, 'a comparison that has begun has a next second'
             end_ns = self._next_ns + BLOCK_NS
-            newest_ns = self._samples.newest_ns or 0
-            if newest_ns < end_ns or self._waits(end_ns, newest_ns):
+            if self.newest_ns < end_ns or self._waits(end_ns, self.newest_ns):
                 break
             block = self._compared(self._next_ns, end_ns)
             self._next_ns = end_ns
@@ -218,7 +176,7 @@ class LiveGap:
 
     def diagnosis_input(self, begin_ns: int = 0) -> DiagnosisInput:
         """Return what there is since a stamp, ns, of at most the history, for a diagnosis."""
-        newest_ns = self._samples.newest_ns or 0
+        newest_ns = self.newest_ns
         begin_ns = max(begin_ns, newest_ns - round(self._settings.history_s * 1e9))
         stamps_ns, accel_mps2 = self._samples.between(begin_ns, newest_ns + 1)
         origin_ns = int(stamps_ns[0]) if len(stamps_ns) else 0
@@ -241,25 +199,21 @@ class LiveGap:
 
     def span_s(self, begin_ns: int = 0) -> float:
         """Return the time of the samples since a stamp, ns, that are kept, s."""
-        stamps_ns, _ = self._samples.between(begin_ns, (self._samples.newest_ns or 0) + 1)
+        stamps_ns, _ = self._samples.between(begin_ns, self.newest_ns + 1)
         return float(stamps_ns[-1] - stamps_ns[0]) * 1e-9 if len(stamps_ns) else 0.0
-
-    def _count(self, **added: int) -> None:
-        """Add to counts."""
-        self.counts = replace(self.counts, **{
-            name: getattr(self.counts, name) + number for name, number in added.items()})
 
     def _append(self, stamp_ns: np.ndarray, accel_mps2: np.ndarray) -> None:
         """Keep samples, and count what is missing before them."""
         newest_ns = self._samples.newest_ns
-        dropped = self._samples.add(stamp_ns, accel_mps2)
+        self.counts.dropped += self._samples.add(stamp_ns, accel_mps2)
         ascending = np.unique(stamp_ns if newest_ns is None else
                               np.maximum(np.append(newest_ns, stamp_ns), newest_ns))
         periods = np.rint(np.diff(ascending) * 1e-9 * self.sensor.rate_hz)
-        self._count(dropped=dropped, missing=int((periods - 1).clip(0).sum()))
+        self.counts.missing += int((periods - 1).clip(0).sum())
 
     def _restart(self) -> None:
         """Begin again after a jump of the stamps; what was learnt of the noise is kept."""
+        self.counts.jumps += 1
         self._samples.clear()
         self._next_ns = None
         self._prediction.restart()
@@ -269,23 +223,21 @@ class LiveGap:
 
     def _begin(self) -> bool:
         """Begin with the first whole second, at the measured rate; return whether it has come."""
-        newest_ns = self._samples.newest_ns
-        if newest_ns is None:
-            return False
+        newest_ns = self.newest_ns
         stamps_ns, _ = self._samples.between(newest_ns - 2 * BLOCK_NS, newest_ns + 1)
         if len(stamps_ns) < _FEWEST_SAMPLES or newest_ns - stamps_ns[0] < BLOCK_NS:
             return False
         measured_hz = 1e9 / float(np.median(np.diff(stamps_ns)))
         if abs(measured_hz / self.sensor.rate_hz - 1) > _RATE_TOLERANCE:
             self.sensor = replace(self.sensor, rate_hz=measured_hz)
-            self._prediction = Prediction(self.sensor, self.reference)
+            self._prediction = reference_stream.Prediction(self.sensor, self.reference)
         self._next_ns = -(-int(stamps_ns[0]) // BLOCK_NS) * BLOCK_NS
         return True
 
     def _waits(self, end_ns: int, newest_ns: int) -> bool:
         """Return whether a block waits for its reference; set the obstacle where it does long."""
         reference_ns = self.reference.readings.newest_ns
-        if reference_ns is not None and reference_ns >= end_ns + AFTER_NS:
+        if reference_ns is not None and reference_ns >= end_ns + reference_stream.AFTER_NS:
             return False
         waits = newest_ns - end_ns < _LATE_NS
         if not waits or reference_ns is None:
@@ -305,7 +257,7 @@ class LiveGap:
             self._prediction.start(begin_ns)
         motion = self.reference.prepare(begin_ns, end_ns)
         if motion is None or len(stamps_ns) < _FEWEST_SAMPLES:
-            self._count(skipped=1)
+            self.counts.skipped += 1
             if motion is None and not self.obstacle.startswith(('no ref', 'the ref')):
                 self.obstacle = 'the reference does not cover the samples; is its clock another?'
             elif motion is not None:
@@ -319,7 +271,7 @@ class LiveGap:
 
     def _take(self, block: Block) -> list[GapChange]:
         """Add a block to the window, and test it."""
-        self._count(blocks=1)
+        self.counts.blocks += 1
         self._blocks.append(block)
         self._ends_ns.append(block.end_ns)
         changes = []

@@ -22,8 +22,9 @@ import time
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import ACCEL, Recording
-from adxl_ros.monitor.live_gap import DiagnosisInput, GapChange
+from adxl_ros.model.sensor import Sensor
 from adxl_ros.workers import Processes
+import numpy as np
 
 NAME = 'changes.jsonl'
 """Name of the file."""
@@ -33,6 +34,33 @@ _NICENESS = 15
 """Niceness of the process; chosen: every node of the robot has priority."""
 _REASON_LENGTH = 300
 """Most characters of a reason; chosen: one line of diagnostics."""
+
+
+@dataclass(frozen=True)
+class GapChange:
+    """A change of the residual."""
+
+    axis: str  # x, y or z
+    quantity: str  # `mean`, or `noise` for the standard deviation within a second
+    since_ns: int  # Stamp of the change, ns
+    detected_ns: int  # Stamp of its detection, ns
+    size: float  # Change of the mean, mg; ratio of the standard deviations
+
+    def text(self) -> str:
+        """Return the change in words."""
+        if self.quantity == 'mean':
+            return f'{self.axis} by {self.size:+.3g} mg'
+        return f'noise of {self.axis} by a factor of {self.size:.3g}'
+
+
+@dataclass(frozen=True)
+class DiagnosisInput:
+    """What a diagnosis compares."""
+
+    recording: Recording  # Samples, with the references of a stage
+    sensor: Sensor  # The baseline
+    # Times, s, (k,), and force of a simulator, m/s², (k, 3); None with a stage
+    force: tuple[np.ndarray, np.ndarray] | None = None
 
 
 def iso_time(stamp_ns: int) -> str:

@@ -4,9 +4,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from itertools import takewhile
+from typing import NamedTuple
 
 from adxl_ros.diagnose.comparison import noiseless
 from adxl_ros.files.recording_columns import JOINTS
@@ -41,8 +44,6 @@ _STILL_MPS2 = 0.05
 """Range of the force of a simulator at rest, m/s². Chosen: noise of a simulator that adds some."""
 _MOST_ROWS = 4_000_000
 """Largest number of rows in memory; chosen: an hour at 1 kHz, 130 MB with three columns."""
-_FIRST_ROWS = 1024
-"""Rows that have a place from the beginning; chosen."""
 _OUTLIER = 6.0
 """Distance from the median, in standard deviations, from which a sample does not count in the mean
 of a block. Chosen: one of 10⁹ samples of normal noise."""
@@ -56,70 +57,55 @@ _SMALLEST_MPS2 = 1e-9
 
 
 class StreamBuffer:
-    """Keeps the newest rows of a stream; stamps ascend."""
+    """Keeps the newest rows of a stream, in the pieces in which they came; stamps ascend."""
 
     def __init__(self, columns: int, span_ns: int) -> None:
-        self._span_ns = span_ns
-        self._stamps = np.zeros(_FIRST_ROWS, np.int64)
-        self._rows = np.zeros((_FIRST_ROWS, columns))
-        self._begin = self._end = 0
+        self._span_ns, self._rows = span_ns, 0
+        # It gives parts without rows their shape.
+        self._nothing = np.zeros(0, np.int64), np.zeros((0, columns))
+        self._pieces: deque[tuple[np.ndarray, np.ndarray]] = deque()
 
     def __len__(self) -> int:
         """Return the number of rows."""
-        return self._end - self._begin
+        return self._rows
 
     @property
     def newest_ns(self) -> int | None:
         """Return the newest stamp, ns; None without rows."""
-        return int(self._stamps[self._end - 1]) if len(self) else None
+        return int(self._pieces[-1][0][-1]) if self._pieces else None
 
     def add(self, stamp_ns: np.ndarray, rows: np.ndarray) -> int:
         """
-        Append rows, and drop those whose stamp does not increase.
+        Append rows; drop those whose stamp does not increase, and return their number.
 
         stamp_ns: stamps, ns, (n,); rows: numbers, (n, k).
         """
-        if not len(stamp_ns):
-            return 0
-        newest_ns = self.newest_ns
-        before = np.concatenate([[stamp_ns[0] - 1 if newest_ns is None else newest_ns], stamp_ns])
-        later = stamp_ns > np.maximum.accumulate(before)[:-1]
-        stamps, rows = stamp_ns[later][-_MOST_ROWS:], rows[later][-_MOST_ROWS:]
-        self._make_room(len(stamps))
-        part = slice(self._end, self._end + len(stamps))
-        self._stamps[part], self._rows[part] = stamps, rows
-        self._end += len(stamps)
+        newest_ns = np.iinfo(np.int64).min if self.newest_ns is None else self.newest_ns
+        later = stamp_ns > np.maximum.accumulate(np.append(newest_ns, stamp_ns))[:-1]
+        stamp_ns, rows = stamp_ns[later], rows[later]
+        if len(stamp_ns):
+            self._pieces.append((stamp_ns, rows))
+            self._rows += len(stamp_ns)
+            while self._pieces[0][0][-1] < stamp_ns[-1] - self._span_ns \
+                    or self._rows > max(_MOST_ROWS, len(stamp_ns)):
+                self._rows -= len(self._pieces.popleft()[0])
         return int((~later).sum())
 
     def between(self, begin_ns: int, end_ns: int) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return copies of the rows of a time.
+        Return the rows of a time.
 
         returns: stamps, ns, (n,), and rows, (n, k).
         """
-        kept = self._stamps[self._begin:self._end]
-        part = slice(*(self._begin + np.searchsorted(kept, [begin_ns, end_ns])))
-        return self._stamps[part].copy(), self._rows[part].copy()
+        pieces = [*takewhile(lambda piece: piece[0][-1] >= begin_ns, reversed(self._pieces))]
+        stamps, rows = (np.concatenate(parts) for parts in zip(self._nothing, *pieces[::-1]))
+        part = slice(*np.searchsorted(stamps, [begin_ns, end_ns]))
+        return stamps[part], rows[part]
 
     def clear(self) -> None:
         """Forget all rows."""
-        self._begin = self._end = 0
-
-    def _make_room(self, count: int) -> None:
-        """Forget old rows, and make room for new ones."""
-        if self._end + count <= len(self._stamps):
-            return
-        newest_ns = self.newest_ns
-        if newest_ns is not None:
-            kept = self._stamps[self._begin:self._end]
-            self._begin += int(np.searchsorted(kept, newest_ns - self._span_ns))
-        self._begin = max(self._begin, self._end - (_MOST_ROWS - count))
-        size = max(2 * (len(self) + count), _FIRST_ROWS)
-        stamps = np.zeros(size, np.int64)
-        rows = np.zeros((size, self._rows.shape[1]))
-        stamps[:len(self)] = self._stamps[self._begin:self._end]
-        rows[:len(self)] = self._rows[self._begin:self._end]
-        self._stamps, self._rows, self._begin, self._end = stamps, rows, 0, len(self)
+        self._pieces.clear()
+        self._rows = 0
 
 
 class ReferenceKind(Enum):
@@ -129,13 +115,11 @@ class ReferenceKind(Enum):
     IMU = 'imu'
 
 
-@dataclass(frozen=True)
-class BlockMotion:
+class BlockMotion(NamedTuple):
     """What the reference shows of one block."""
 
     moves: bool  # Whether it moves
-    # Standard deviation of the force by the steps of an encoder, m/s², (3,)
-    error_mps2: np.ndarray
+    error_mps2: np.ndarray  # Standard deviation of the force by the steps of an encoder, (3,)
 
 
 class ReferenceStream:
@@ -148,53 +132,51 @@ class ReferenceStream:
         self.readings = StreamBuffer(3, span_ns)
         self.surroundings = {'temperature_c': StreamBuffer(1, span_ns),
                              'supply_v': StreamBuffer(1, span_ns)}
-        self._held = np.zeros(3)
+        self._held = [0.0, 0.0, 0.0]
         self._origin_ns = 0
         self._paths: list[Path] = [Held(), Held(), Held()]
-        self._force: ForcePath | None = None
+        self._force: ForcePath
 
-    def add_joints(self, stamp_ns: int, positions: Mapping[str, float]) -> None:
-        """Add one message of the stage."""
-        values = np.array([positions.get(joint, held)
-                           for joint, held in zip(JOINTS, self._held.tolist())])
-        if np.isfinite(values).all():
-            self._held = values
-            self.add_readings(np.array([stamp_ns]), values[None])
+    def add_joints(self, stamps_ns: Sequence[int], positions: Sequence[Mapping[str, float]]
+                   ) -> None:
+        """Add messages of the stage; a joint that one does not name is where it was before."""
+        rows = []
+        for position in positions:
+            values = [position.get(joint, held) for joint, held in zip(JOINTS, self._held)]
+            self._held = values if np.isfinite(values).all() else self._held
+            rows.append(values)
+        self.add_readings(np.array(stamps_ns, np.int64), np.array(rows).reshape(-1, len(JOINTS)))
 
     def add_readings(self, stamp_ns: np.ndarray, readings: np.ndarray) -> None:
         """
-        Add readings; stamps that jump back begin a new reference.
+        Add readings.
 
         stamp_ns: stamps, ns, (n,); readings: joints, rad and m, or force, m/s², (n, 3).
         """
-        finite = np.isfinite(readings).all(axis=1)
-        stamp_ns, readings = stamp_ns[finite], readings[finite]
-        newest_ns = self.readings.newest_ns
-        if len(stamp_ns) and newest_ns is not None \
-                and stamp_ns[-1] < newest_ns - _LONGEST_GAP_NS:
-            self.readings.clear()
-        self.readings.add(stamp_ns, readings)
+        _add_finite(self.readings, stamp_ns, readings, _LONGEST_GAP_NS)
 
-    def add_surroundings(self, name: str, stamp_ns: int, value: float) -> None:
-        """Add a temperature or a supply."""
-        if np.isfinite(value):
-            buffer = self.surroundings[name]
-            newest_ns = buffer.newest_ns
-            if newest_ns is not None and stamp_ns < newest_ns - BEFORE_NS:
-                buffer.clear()
-            buffer.add(np.array([stamp_ns]), np.array([[value]]))
+    def add_surroundings(self, name: str, stamp_ns: np.ndarray, values: np.ndarray) -> None:
+        """Add temperatures or supplies, (n, 1), with their stamps, ns, (n,)."""
+        _add_finite(self.surroundings[name], stamp_ns, values, BEFORE_NS)
 
     def motion(self, origin_ns: int) -> Motion:
         """Return the motion whose time begins at a stamp, ns; it follows the prepared blocks."""
         self._origin_ns = origin_ns
-        temperature_c = _Surrounding(self, 'temperature_c', NOMINAL_TEMPERATURE_C)
-        supply_v = _Surrounding(self, 'supply_v', NOMINAL_SUPPLY_V)
+
+        def joint(number: int) -> Path:
+            return lambda time_s, order=0: self._paths[number](time_s, order)
+
+        def surrounding(name: str, default: float) -> Path:
+            return lambda time_s, order=0: self._surrounding(name, time_s, default)
+
+        temperature_c = surrounding('temperature_c', NOMINAL_TEMPERATURE_C)
+        supply_v = surrounding('supply_v', NOMINAL_SUPPLY_V)
         if self.kind is ReferenceKind.IMU:
-            return Motion(np.inf, force=self._force_at, internal_rate_hz=max(
+            return Motion(np.inf, force=lambda time_s: self._force(time_s), internal_rate_hz=max(
                 INTERNAL_RATE_HZ, self._sensor.rate_hz), temperature_c=temperature_c,
                           supply_v=supply_v)
-        alpha, beta, shift = (_Joint(self, joint) for joint in range(3))
-        return Motion(np.inf, alpha, beta, shift, temperature_c=temperature_c, supply_v=supply_v)
+        return Motion(np.inf, joint(0), joint(1), joint(2), temperature_c=temperature_c,
+                      supply_v=supply_v)
 
     def prepare(self, begin_ns: int, end_ns: int) -> BlockMotion | None:
         """Make the paths of a block."""
@@ -215,10 +197,6 @@ class ReferenceStream:
         return BlockMotion(bool((changes > largest).any()), self._encoder_error_mps2(
             (begin_ns - self._origin_ns) * 1e-9, (end_ns - self._origin_ns) * 1e-9))
 
-    def path(self, joint: int) -> Path:
-        """Return the path of a joint in the newest prepared block."""
-        return self._paths[joint]
-
     def _encoder_error_mps2(self, begin_s: float, end_s: float) -> np.ndarray:
         """Return what the steps of the encoder make of the force in a block, m/s², (3,)."""
         time_s = np.linspace(begin_s, end_s, 3)
@@ -230,58 +208,32 @@ class ReferenceStream:
         by_beta = np.array(specific_force(alpha, beta + beta_std, gravity_mps2)) - force
         return np.asarray(np.sqrt((by_alpha ** 2 + by_beta ** 2).mean(axis=1)))
 
-    def _force_at(self, time_s: np.ndarray) -> list[np.ndarray]:
-        """Return the force of a simulator at times, s, (n,): three components, m/s²."""
-        assert self._force is not None, 'a block is prepared before it is simulated'
-        return list(self._force(time_s))
-
-    def surrounding(self, name: str, time_s: np.ndarray, default: float) -> np.ndarray:
-        """
-        Return the temperature or the supply at times.
-
-        time_s: times of the motion, s, (n,); returns: values, (n,).
-        """
+    def _surrounding(self, name: str, time_s: np.ndarray, default: float) -> np.ndarray:
+        """Return the temperature or the supply at times of the motion, s, (n,)."""
         buffer = self.surroundings[name]
-        if not len(buffer):
+        if buffer.newest_ns is None:
             return np.full(len(time_s), default)
         at_ns = self._origin_ns + time_s * 1e9
-        stamps_ns, values = buffer.between(int(at_ns[0]) - _SURROUNDINGS_NS,
-                                           int(at_ns[-1]) + _SURROUNDINGS_NS)
-        if not len(stamps_ns):
-            newest_ns = buffer.newest_ns or 0
-            stamps_ns, values = buffer.between(newest_ns, newest_ns + 1)
+        stamps_ns, values = buffer.between(
+            min(int(at_ns[0]) - _SURROUNDINGS_NS, buffer.newest_ns),
+            max(int(at_ns[-1]) + _SURROUNDINGS_NS, buffer.newest_ns + 1))
         return np.interp(at_ns, stamps_ns, values[:, 0])
+
+
+def _add_finite(buffer: StreamBuffer, stamp_ns: np.ndarray, rows: np.ndarray, longest_ns: int
+                ) -> None:
+    """Add the finite rows; stamps that jump back by more than a time begin a new stream."""
+    finite = np.isfinite(rows).all(axis=1)
+    stamp_ns, newest_ns = stamp_ns[finite], buffer.newest_ns
+    if len(stamp_ns) and newest_ns is not None and stamp_ns[-1] < newest_ns - longest_ns:
+        buffer.clear()
+    buffer.add(stamp_ns, rows[finite])
 
 
 def _path_std(path: Path, time_s: np.ndarray) -> np.ndarray:
     """Return the standard deviation of a path at times, s, (n,), by the steps of its encoder."""
     errors = path.errors(time_s) if isinstance(path, SmoothedPath) else None
     return np.zeros(len(time_s)) if errors is None else errors.std
-
-
-@dataclass(frozen=True)
-class _Surrounding:
-    """Temperature or supply over time."""
-
-    stream: ReferenceStream
-    name: str
-    default: float
-
-    def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
-        """Return the values at times, s, (n,)."""
-        return self.stream.surrounding(self.name, time_s, self.default)
-
-
-@dataclass(frozen=True)
-class _Joint:
-    """The path of one joint, which changes from block to block."""
-
-    stream: ReferenceStream
-    joint: int
-
-    def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
-        """Return a derivative; see `simulate.motion.Path`."""
-        return self.stream.path(self.joint)(time_s, order)
 
 
 @dataclass(frozen=True)
@@ -307,24 +259,24 @@ class Prediction:
     """The output of a sensor on the reference, from block to block."""
 
     def __init__(self, sensor: Sensor, reference: ReferenceStream) -> None:
-        stage = [name for name in sensor.effects if _needs_stage(name)]
         # Effects that need the angles of a stage, which the reference has not
-        self.left_out = tuple(stage) if reference.kind is ReferenceKind.IMU else ()
+        self.left_out = tuple(name for name in sensor.effects if _needs_stage(name)) \
+            if reference.kind is ReferenceKind.IMU else ()
         effects = tuple(name for name in sensor.effects if name not in self.left_out)
         self._sensor, self._reference = sensor, reference
-        self._modelled = noiseless(replace(sensor, effects=effects))
-        self._datasheet = noiseless(replace(sensor, effects=(), values={}))
-        self._responses: tuple[Response, Response] | None = None
+        self._sensors = [noiseless(replace(sensor, effects=effects)),
+                         noiseless(replace(sensor, effects=(), values={}))]
+        self._responses: list[Response] = []
         self._origin_ns = 0
 
     def restart(self) -> None:
         """Let the next block be the first one."""
-        self._responses = None
+        self._responses = []
 
     @property
     def is_running(self) -> bool:
         """Return whether a block has been predicted since the last start."""
-        return self._responses is not None
+        return bool(self._responses)
 
     def start(self, begin_ns: int) -> None:
         """Put the sensors, settled, at the begin of a block, ns; it is to be prepared then."""
@@ -338,16 +290,14 @@ class Prediction:
 
         stamp_ns: stamps, ns, (n,); accel_mps2: samples by nominal conversion, m/s², (n, m).
         """
-        if self._responses is None:
-            self._responses = (Response(self._modelled, self._motion, 0),
-                               Response(self._datasheet, self._motion, 0))
+        self._responses = self._responses or [
+            Response(sensor, self._motion, 0) for sensor in self._sensors]
         time_s = (stamp_ns - self._origin_ns) * 1e-9
         modelled, datasheet = (accel_mps2 - to_nominal_mps2(respond(time_s), self._sensor)
                                for respond in self._responses)
         mean_mps2 = _clean_mean(modelled)
-        count = len(stamp_ns)
-        independent = float(noise.effective_samples(count, 1 / self._sensor.rate_hz,
-                                                    self._sensor.rc_s))
+        independent = float(noise.effective_samples(
+            len(stamp_ns), 1 / self._sensor.rate_hz, self._sensor.rc_s))
         freedom = max(1 - 1 / max(independent, 1.0), 0.5)
         return Block(
             end_ns, mean_mps2, (modelled ** 2).mean(axis=0),

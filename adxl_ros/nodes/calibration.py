@@ -11,40 +11,25 @@ import math
 import os
 from pathlib import Path
 
-from adxl_ros.calibrate.guided import pose_plan
-from adxl_ros.calibrate.guided.controller import (
-    Answer,
-    Controller,
-    ControllerState,
-    Resume,
-    Severity,
-)
-from adxl_ros.calibrate.guided.guide import NextPose
+from adxl_ros.calibrate.guided import controller, pose_plan
+from adxl_ros.calibrate.guided.controller import Answer, ControllerState
 from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, StageMode
 from adxl_ros.calibrate.guided.session import SessionSettings
 from adxl_ros.calibrate.guided.thermal_guide import ThermalSettings
-from adxl_ros.files.stream_info import StreamInfo
+from adxl_ros.compensate.live_stream import UNKNOWN_ANGLE_RAD2
+from adxl_ros.files import cdr
+from adxl_ros.model.sensor import Sensor, to_volts
+from adxl_ros.nodes import parameters, topics
 from adxl_ros.nodes.display import Announcer, DisplayPublisher
-from adxl_ros.nodes.node_help import NodeHelp
-from adxl_ros.nodes.parameters import declare_all, low_and_high, numbers, parameter_error
-from adxl_ros.nodes.run_node import run
-from adxl_ros.nodes.samples_in import joint_readings, Samples
-from adxl_ros.nodes.sensor_parameters import anonymous_sensor, declare_sensor, make_sensor
+from adxl_ros.nodes.run_node import NodeHelp, run
 from adxl_ros.nodes.settings import CalibrationSettings, check_given_parameters, given_link
-from adxl_ros.nodes.topics import (
-    create_subscription,
-    DiagnosticsReporter,
-    Inbox,
-    Level,
-    Status,
-    STEADY,
-)
+from adxl_ros.nodes.topics import Level, Status, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
-from sensor_msgs.msg import BatteryState, JointState, Temperature
+from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
 from std_srvs.srv import Trigger
 
 _POLL_S = 0.02
@@ -67,6 +52,95 @@ _EXAMPLES = {
     'a three-axis sensor without a stage': '--ros-args -p mode:=gravity -p output:=unit.yaml',
 }
 """Examples of arguments, by their purpose."""
+_SAMPLES = 'imu/data_raw'
+"""Topic of the samples, relative to the namespace of the node."""
+_YAW_VARIANCE = 8
+"""Place of the variance of yaw in an orientation's covariance of 9 numbers, from 0."""
+_SILENT_S = 3.0
+"""Time without samples after which the stream is silent, s; chosen."""
+_SAMPLES_QUEUE = 20000
+"""Samples that are kept: 20 s at 1 kHz, longer than a fit takes."""
+
+
+class Samples:
+    """Takes the serialized messages that wait, and decodes many at once."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._raw: list[bytes] = []
+        self.fault = ''  # Why the newest samples cannot be used, or ''
+        self.restart_silence()
+        self._subscription = topics.Inbox(node, Imu, _SAMPLES, _SAMPLES_QUEUE)
+
+    def restart_silence(self) -> None:
+        """Restart the time without samples."""
+        self._heard_ns = STEADY.now().nanoseconds
+
+    def keep_newest(self, count: int = _SAMPLES_QUEUE) -> None:
+        """Forget all samples but the newest, as many as the queue holds."""
+        self._receive()
+        del self._raw[:max(len(self._raw) - count, 0)]
+
+    def clear(self) -> None:
+        """Forget all samples so far."""
+        self.keep_newest(0)
+
+    def waiting(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the samples that wait: stamps, ns, (n,), and m/s², (n, 3), finite; keep them."""
+        self._receive()
+        return topics.finite_samples(self._raw)
+
+    def take(self, unit: Sensor) -> tuple[np.ndarray, np.ndarray]:
+        """Return the samples since the last call: stamps, ns, (n,), and volts, (n, m), finite."""
+        self._receive()
+        batch, self._raw = self._raw, []
+        stamps, fields = topics.decoded(batch, cdr.imu, linear_acceleration=3,
+                                        orientation_covariance=9)
+        accel, covariance = fields['linear_acceleration'], fields['orientation_covariance']
+        # -1 in the first place means that a message has no orientation.
+        yaw_rad2 = np.where(covariance[:, 0] >= 0, covariance[:, _YAW_VARIANCE], 0.0)
+        accel = accel[:, :len(unit.axes)]
+        finite = np.isfinite(accel)
+        if batch:
+            self.fault = self._fault(bool((yaw_rad2 != UNKNOWN_ANGLE_RAD2).all()), finite, unit)
+        complete = finite.all(axis=1)
+        return stamps[complete], to_volts(accel[complete], unit)
+
+    def _receive(self) -> None:
+        """Take the messages that have come since the last call."""
+        new = self._subscription.take()
+        self._raw += new
+        if new:
+            self.restart_silence()
+
+    @property
+    def is_mixed(self) -> bool:
+        """Return whether several nodes publish the samples, so that none is taken."""
+        return bool(self._subscription.fault())
+
+    def _fault(self, is_raw: bool, finite: np.ndarray, unit: Sensor) -> str:
+        """Return why samples with these finite values, (n, m), cannot be used, or ''."""
+        if not is_raw:
+            return (f'{self._node.resolve_topic_name(_SAMPLES)}: this stream is already '
+                    'compensated (it carries an orientation, as imu/data does); remap it to '
+                    'imu/data_raw of the driver')
+        if finite.all(axis=1).any():
+            return ''
+        dead = ' and '.join(axis for axis, lives in zip(unit.axes, np.asarray(finite.any(axis=0)))
+                            if not lives)
+        return f'{dead or "one axis or another"} is not a number in all samples; check its ' \
+               'wiring and the driver'
+
+    def silence(self) -> str:
+        """Return in words why or for how long no sample has come; '' while samples come."""
+        if self.is_mixed:
+            return self._subscription.fault()
+        silent_s = (STEADY.now().nanoseconds - self._heard_ns) * 1e-9
+        if silent_s < _SILENT_S:
+            return ''
+        topic = self._node.resolve_topic_name(_SAMPLES)
+        publishers = '' if self._node.count_publishers(topic) else ', and nobody publishes it'
+        return f'nothing on {topic} for {silent_s:.0f} s{publishers}'
 
 
 class Calibration(Node):
@@ -79,51 +153,36 @@ class Calibration(Node):
     def __init__(self) -> None:
         super().__init__('calibration')
         check_given_parameters(self)
-        flat, link = declare_sensor(self), given_link(self)
-        sensor = replace(make_sensor(flat, may_measure=True), link=link)
-        anonymous = replace(anonymous_sensor(self, flat), link=link)
-        self._own = own = declare_all(self, CalibrationSettings)
+        flat, link = parameters.declare_sensor(self), given_link(self)
+        sensor = replace(parameters.make_sensor(flat, may_measure=True), link=link)
+        anonymous = replace(parameters.anonymous_sensor(self, flat), link=link)
+        self._own = own = parameters.declare_all(self, CalibrationSettings)
         settings = _session_settings(own)
         self._has_stage = settings.mode == 'stage'
         self._captures: list[Future] = []
-        self._announcer = Announcer(self, self._has_stage)
+        announcer = Announcer(self, self._has_stage)
+        # What the controller asks of a node
+        self.announce, self.withdraw_pose = announcer.announce, announcer.withdraw
         self._samples = Samples(self)
-        self._controller = Controller(settings, sensor, Resume(own.resume), self._samples, self,
-                                      anonymous)
+        self._controller = controller.Controller(
+            settings, sensor, controller.Resume(own.resume), self._samples, self, anonymous)
         if own.autostart:
             self._controller.wait_for_sensor()
         self._connect()
         self._has_run = False
         self._idle_since_ns: int | None = None
         self._display = DisplayPublisher(self, self._controller, own.screen)
+        self.show_fit = self._display.show_fit
 
-    def log(self, severity: Severity, text: str) -> None:
+    def log(self, severity: controller.Severity, text: str) -> None:
         """Log a line."""
-        # rclpy allows one severity for each place in the code.
-        if severity is Severity.INFO:
-            self.get_logger().info(text)
-        elif severity is Severity.WARNING:
-            self.get_logger().warning(text)
-        else:
-            self.get_logger().error(text)
+        topics.log(self, severity.name, text)
 
     def answer_captures(self, answer: Answer) -> None:
         """Answer all calls of ~/capture that wait."""
         for future in self._captures:
             future.set_result(answer)
         self._captures.clear()
-
-    def announce(self, pose: NextPose) -> None:
-        """Announce the pose to go to."""
-        self._announcer.announce(pose)
-
-    def withdraw_pose(self, reason: str) -> None:
-        """Take the announced pose back."""
-        self._announcer.withdraw(reason)
-
-    def show_fit(self, text: str) -> None:
-        """Show that the fit begins."""
-        self._display.show_fit(text)
 
     def close(self) -> None:
         """Close the journal and the screen."""
@@ -132,13 +191,18 @@ class Calibration(Node):
 
     def _connect(self) -> None:
         """Make diagnostics, subscriptions, services and the timer."""
-        self._diagnostics = DiagnosticsReporter(self, {'calibration': self._status})
-        create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
+        self._diagnostics = topics.DiagnosticsReporter(self, 'calibration', self._status)
+        topics.create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1,
+                                   latched=True)
         if self._has_stage:
-            self._stage = Inbox(self, JointState, 'stage/joint_states', _STAGE_QUEUE)
-            create_subscription(self, JointState, 'stage/command', self._on_command, _QUEUE)
-        create_subscription(self, Temperature, 'temperature', self._on_temperature, _QUEUE)
-        create_subscription(self, BatteryState, 'supply', self._on_supply, _QUEUE)
+            self._stage = topics.Inbox(self, JointState, 'stage/joint_states', _STAGE_QUEUE)
+            topics.create_subscription(self, JointState, 'stage/command', self._on_command, _QUEUE)
+        topics.create_subscription(
+            self, Temperature, 'temperature', lambda message: self._controller.read_temperature(
+                _stamp_ns(message), message.temperature), _QUEUE)
+        topics.create_subscription(
+            self, BatteryState, 'supply', lambda message: self._controller.read_supply(
+                _stamp_ns(message), message.voltage), _QUEUE)
         start = self._controller.start
         requests: dict[str, Callable[[], Answer]] = {
             'start': start, 'resume': partial(start, start_over=False),
@@ -151,7 +215,8 @@ class Calibration(Node):
         self.create_service(Trigger, '~/capture', self._on_capture,
                             callback_group=ReentrantCallbackGroup())
         self.create_timer(_POLL_S, self._poll, clock=STEADY)
-        self.create_timer(_NOTICE_S, self._notice, clock=STEADY)
+        self.create_timer(_NOTICE_S, lambda: self._diagnostics.notice(
+            self._level(self._controller.status().late)), clock=STEADY)
 
     def _poll(self) -> None:
         self._read_stage()
@@ -160,9 +225,6 @@ class Calibration(Node):
         self._controller.poll()
         if self._own.exit_when_done:
             self._exit_when_done()
-
-    def _notice(self) -> None:
-        self._diagnostics.notice('calibration', self._level(self._controller.status().late))
 
     def _exit_when_done(self) -> None:
         """End the node after a calibration, when its last report has been received."""
@@ -185,24 +247,17 @@ class Calibration(Node):
         return Level.WARN if late else Level.OK
 
     def _on_info(self, message: DiagnosticStatus) -> None:
-        texts = {pair.key: pair.value for pair in message.values}
-        self._controller.read_sensor_info(StreamInfo(texts, 'sensor_info'))
+        self._controller.read_sensor_info(topics.stream_info(message, 'sensor_info'))
 
     def _read_stage(self) -> None:
         """Give the angles of the stage that have come to the controller."""
-        for reading in joint_readings(self._stage.take() if self._has_stage else ()):
+        for reading in topics.joint_readings(self._stage.take() if self._has_stage else ()):
             alpha_rad, beta_rad = _angles(reading.position)
             if math.isfinite(alpha_rad) and math.isfinite(beta_rad):
                 self._controller.read_stage(reading.stamp_ns, alpha_rad, beta_rad)
 
     def _on_command(self, message: JointState) -> None:
         self._controller.read_command(*_angles(dict(zip(message.name, message.position))))
-
-    def _on_temperature(self, message: Temperature) -> None:
-        self._controller.read_temperature(_stamp_ns(message), message.temperature)
-
-    def _on_supply(self, message: BatteryState) -> None:
-        self._controller.read_supply(_stamp_ns(message), message.voltage)
 
     def _service(self, request: Callable[[], Answer]) -> Callable[..., Trigger.Response]:
         """Make the callback of a service that calls a request of the controller."""
@@ -230,12 +285,12 @@ def _session_settings(own: CalibrationSettings) -> SessionSettings:
     output = Path(own.output)
     journal = Path(own.journal or f'{output}.journal')
     if own.mode == 'thermal' and own.report:
-        raise parameter_error('report', 'mode thermal writes no page; leave it empty')
+        raise parameters.parameter_error('report', 'mode thermal writes no page; leave it empty')
     for name, path in (('output', output), ('journal', journal)):
         if path.is_dir():
-            raise parameter_error(name, f'{path} is a directory; name a file')
-    planes_rad = tuple(np.radians(numbers('sweep.planes_deg', own.planes_deg or [],
-                                          '[30.0, 60.0, 90.0]')).tolist())
+            raise parameters.parameter_error(name, f'{path} is a directory; name a file')
+    planes_rad = tuple(np.radians(parameters.numbers('sweep.planes_deg', own.planes_deg or [],
+                                                     '[30.0, 60.0, 90.0]')).tolist())
     step_rad = float(np.radians(own.step_deg))
     capture = CaptureSettings(own.dwell_s, own.tolerance_rad, own.timeout_s,
                               StageMode(own.stage_mode), float(np.radians(own.near_deg)),
@@ -252,8 +307,8 @@ def _session_settings(own: CalibrationSettings) -> SessionSettings:
         tilt_error_rad=float(np.radians(own.tilt_error_deg)),
         check_poses=_CHECK_POSES[kind] if own.check_poses < 0 else own.check_poses,
         capture=capture, output=output, journal=journal, report=own.report, store=own.store,
-        thermal=ThermalSettings(
-            low_and_high('thermal.range_c', own.range_c, ThermalSettings.range_c), own.block_s))
+        thermal=ThermalSettings(parameters.low_and_high(
+            'thermal.range_c', own.range_c, ThermalSettings.range_c), own.block_s))
 
 
 def _angles(position_rad: dict[str, float]) -> tuple[float, float]:

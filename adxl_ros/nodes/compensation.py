@@ -9,42 +9,27 @@ The topic tilt has three angles in a Vector3Stamped, so tf2 must not transform i
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import isfinite
-from typing import Any
 
 from adxl_ros.compensate import filter_inversion
 from adxl_ros.compensate.compensation_policy import CompensationPolicy, Interval, State, Topics
 from adxl_ros.compensate.live_stream import COUNTS, LiveStream
 from adxl_ros.errors import UserError
-from adxl_ros.files import imu_message
-from adxl_ros.files.stream_info import StreamInfo
+from adxl_ros.files import imu_message, parameter_file
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.tilt import Mounting
-from adxl_ros.nodes.node_help import NodeHelp
-from adxl_ros.nodes.parameters import declare_all, parameter_error
-from adxl_ros.nodes.run_node import run
+from adxl_ros.nodes import parameters, topics
+from adxl_ros.nodes.run_node import NodeHelp, run
 from adxl_ros.nodes.sample_output import SampleAges
-from adxl_ros.nodes.samples_in import finite_samples
-from adxl_ros.nodes.sensor_parameters import ExchangeableSensor, is_from_file
 from adxl_ros.nodes.settings import check_given_parameters, CompensationSettings
-from adxl_ros.nodes.topics import (
-    create_publisher,
-    create_subscription,
-    DiagnosticsReporter,
-    Inbox,
-    Level,
-    RepeatingThread,
-    Status,
-    STEADY,
-)
+from adxl_ros.nodes.topics import Level, Status, STEADY
 from adxl_ros.signals.recorded_sensor import unit_of_stream
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 import numpy as np
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -70,30 +55,27 @@ class MountingParameters:
     def __init__(self, node: Node, stream: LiveStream, settings: CompensationSettings) -> None:
         self._node, self._stream = node, stream
         self._frame_id = settings.mounting_frame_id
-        self._mounting = _mounting(settings.rpy_rad)
         self._waiting: Future | None = None
-        stream.mount(self._mounting, self._frame_id)
-        node.add_on_set_parameters_callback(_check)
-        node.add_post_set_parameters_callback(self._apply)
+        self._mount(_mounting(settings.rpy_rad, parameters.parameter_error))
+        # The file of the parameters has no part in what is set while the node runs.
+        parameters.on_change(node, _RPY, lambda value: _mounting(
+            value, lambda name, reason: UserError(f'{name}: {reason}')), self._mount)
         # The answer comes after a second of samples, which the node takes meanwhile.
         node.create_service(Trigger, '~/level', self._on_level,
                             callback_group=ReentrantCallbackGroup())
 
-    def _apply(self, parameters: Sequence[Parameter]) -> None:
-        for parameter in parameters:
-            if parameter.name == _RPY:
-                self._mounting = _mounting(parameter.value)
-                self._stream.mount(self._mounting, self._frame_id)
+    def _mount(self, mounting: Mounting) -> None:
+        self._mounting = mounting
+        self._stream.mount(mounting, self._frame_id)
 
     async def _on_level(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._waiting is not None:
             response.message = 'a rest is being averaged; wait for its answer'
             return response
-        self._waiting = Future()
+        self._waiting = waiting = Future()
         self._stream.collect()
-        timer = self._node.create_timer(_LEVEL_S, self._waiting_ends,
-                                        clock=STEADY)
-        await self._waiting
+        timer = self._node.create_timer(_LEVEL_S, lambda: waiting.set_result(True), clock=STEADY)
+        await waiting
         self._node.destroy_timer(timer)
         forces_mps2, self._waiting = self._stream.collected(), None
         self._stream.stop_collecting()
@@ -113,10 +95,6 @@ class MountingParameters:
             f"{{{_RPY}: {yaml}}}}}' into a file and start it with --params-file")
         self._node.get_logger().info(response.message)
         return response
-
-    def _waiting_ends(self) -> None:
-        if self._waiting is not None and not self._waiting.done():
-            self._waiting.set_result(True)
 
 
 def level(mounting: Mounting, forces_mps2: np.ndarray, sensor: Sensor) -> Mounting:
@@ -143,30 +121,16 @@ def level(mounting: Mounting, forces_mps2: np.ndarray, sensor: Sensor) -> Mounti
     return mounting.levelled(mean_mps2.tolist())
 
 
-def _mounting(rpy_rad: Sequence[float]) -> Mounting:
-    if _fault(rpy_rad):
-        raise parameter_error(_RPY, _fault(rpy_rad))
-    roll, pitch, yaw = rpy_rad
-    return Mounting((float(roll), float(pitch), float(yaw)))
-
-
-def _fault(rpy_rad: Sequence[float]) -> str:
-    """Return why a rotation is not three angles in rad; empty where it is."""
+def _mounting(rpy_rad: Sequence[float], refusal: Callable[[str, str], UserError]) -> Mounting:
+    """Return the mounting of a parameter; refuse what is not three angles in rad."""
     if len(rpy_rad) != 3 or not np.isfinite(rpy_rad).all():
-        return f'{list(rpy_rad)} is not roll, pitch and yaw in rad'
+        raise refusal(_RPY, f'{list(rpy_rad)} is not roll, pitch and yaw in rad')
     if np.abs(rpy_rad).max() > 2 * np.pi:
         in_rad = ', '.join(f'{angle:.6g}' for angle in np.radians(rpy_rad))
-        return f'{list(rpy_rad)} is more than a turn in rad; if it is in degrees, write [{in_rad}]'
-    return ''
-
-
-def _check(parameters: Sequence[Parameter]) -> SetParametersResult:
-    """Refuse a rotation that is not three angles in rad."""
-    for parameter in parameters:
-        fault = _fault(parameter.value) if parameter.name == _RPY else ''
-        if fault:
-            return SetParametersResult(successful=False, reason=f'{_RPY}: {fault}')
-    return SetParametersResult(successful=True)
+        raise refusal(_RPY, f'{list(rpy_rad)} is more than a turn in rad; if it is in degrees, '
+                      f'write [{in_rad}]')
+    roll, pitch, yaw = map(float, rpy_rad)
+    return Mounting((roll, pitch, yaw))
 
 
 _DEPTH = 100
@@ -195,38 +159,44 @@ class Compensation(Node):
     def __init__(self) -> None:
         super().__init__('compensation')
         check_given_parameters(self)
-        self._settings = settings = declare_all(self, CompensationSettings)
+        self._settings = settings = parameters.declare_all(self, CompensationSettings)
         paper = settings.inverse == 'paper'
         self._heard_ns: dict[str, int] = {}
         self._named: tuple[Sensor, str]
         self._obstacle = ''
         self._reported: Counter[str] = Counter()
         self._reported_ns = STEADY.now().nanoseconds
-        self._diagnostics = DiagnosticsReporter(self, {'compensation': self._status})
+        self._diagnostics = topics.DiagnosticsReporter(self, 'compensation', self._status)
         self._ages = SampleAges()
-        self._data = create_publisher(self, Imu, 'imu/data', _DEPTH)
-        tilt = create_publisher(self, Vector3Stamped, 'tilt', _DEPTH)
-        free = create_publisher(self, Vector3Stamped, 'imu/linear_acceleration_free', _DEPTH) \
+        self._data = topics.create_publisher(self, Imu, 'imu/data', _DEPTH)
+        tilt = topics.create_publisher(self, Vector3Stamped, 'tilt', _DEPTH)
+        free = topics.create_publisher(
+            self, Vector3Stamped, 'imu/linear_acceleration_free', _DEPTH) \
             if settings.free_acceleration else None
         self._stream = LiveStream(
             paper, settings.undo_filter, self._publish, tilt.publish,
             settings.orientation == 'keep', free.publish if free else None,
             settings.output_rate_hz)
-        self._policy = CompensationPolicy(paper, settings.store, Topics(
-            data_raw=self.resolve_topic_name('imu/data_raw'),
-            sensor_info=self.resolve_topic_name('sensor_info'),
-            temperature=self.resolve_topic_name('temperature'),
-            supply=self.resolve_topic_name('supply')))
-        self._samples = Inbox(self, Imu, 'imu/data_raw', _DEPTH)
-        self._sensor = ExchangeableSensor(
-            self, settings.calibration, self._policy.check, self._use)
+        self._policy = CompensationPolicy(paper, settings.store, Topics(**{
+            name.replace('imu/', ''): self.resolve_topic_name(name)
+            for name in ('imu/data_raw', 'sensor_info', 'temperature', 'supply')}))
+        self._samples = topics.Inbox(self, Imu, 'imu/data_raw', _DEPTH)
+        self._flat = parameters.given_sensor(self)
+        own = parameters.make_sensor(self._flat, may_measure=True), (
+            'the parameters given' if parameters.is_from_file(self) else
+            f'the nominal {parameter_file.nominal_path()}')
+        self._use(*(self._load(settings.calibration) or own))
+        parameters.on_change(self, 'calibration', self._load, self._exchange)
         MountingParameters(self, self._stream, settings)
         self.create_timer(_LOOK_S, self._look, clock=STEADY)
-        create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
-        create_subscription(self, Temperature, 'temperature', self._on_temperature, 1)
-        create_subscription(self, BatteryState, 'supply', self._on_supply, 1)
-        self._thread = RepeatingThread(self, lambda: self._samples.receive(self._stream),
-                                       'imu/data_raw')
+        topics.create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1,
+                                   latched=True)
+        topics.create_subscription(self, Temperature, 'temperature', lambda message:
+                                   self._surround('temperature_c', message.temperature), 1)
+        topics.create_subscription(self, BatteryState, 'supply', lambda message:
+                                   self._surround('supply_v', message.voltage), 1)
+        self._thread = topics.RepeatingThread(
+            self, lambda: self._samples.receive(self._stream), 'imu/data_raw')
 
     def close(self) -> None:
         """End the thread that receives."""
@@ -238,11 +208,23 @@ class Compensation(Node):
         stamp_s, _ = imu_message.read(raw)
         self._ages.add((self.get_clock().now().nanoseconds * 1e-9 - stamp_s,))
 
+    def _load(self, path: str) -> tuple[Sensor, str] | None:
+        """Load the file of `calibration`, if one is named; it is refused if it does not fit."""
+        if not path:
+            return None
+        sensor = parameter_file.load(path)
+        self._policy.check(sensor)
+        return sensor, path
+
+    def _exchange(self, loaded: tuple[Sensor, str] | None) -> None:
+        if loaded is not None:
+            self._use(*loaded)
+
     def _use(self, sensor: Sensor, source: str) -> None:
         """Correct samples by a sensor from the next one on; `source` says where it is from."""
         self._named = sensor, source
         self._stream.release()
-        is_named = sensor.effects or self._calibration() or is_from_file(self)
+        is_named = sensor.effects or self._calibration() or parameters.is_from_file(self)
         self._stream.may_be_foreign = not (is_named or self._policy.info)
         if sensor.unstated:
             self._stream.hold()
@@ -264,8 +246,8 @@ class Compensation(Node):
             return
         named, _ = self._named
         try:
-            unit, lines = unit_of_stream(
-                named if named.unstated else self._sensor.anonymous(), *finite_samples([*samples]))
+            sensor = named if named.unstated else parameters.anonymous_sensor(self, self._flat)
+            unit, lines = unit_of_stream(sensor, *topics.finite_samples([*samples]))
         except UserError as error:
             self._obstacle = f'{error}'
             return
@@ -274,8 +256,7 @@ class Compensation(Node):
         self._correct_by(unit, 'what the stream shows')
 
     def _on_info(self, message: DiagnosticStatus) -> None:
-        self._policy.info = StreamInfo({pair.key: pair.value for pair in message.values},
-                                       self.resolve_topic_name('sensor_info'))
+        self._policy.info = topics.stream_info(message, self.resolve_topic_name('sensor_info'))
         if self._stream.may_be_foreign or self._policy.sensor is not self._named[0]:
             self._use(*self._named)
         self._take_from_store()
@@ -300,56 +281,38 @@ class Compensation(Node):
 
     def _assess(self) -> None:
         """Publish only if the coefficients are those of the stream's unit; log a change."""
-        changed = self._policy.assess()
-        refusal = self._policy.refusal
+        changed, refusal = self._policy.assess(), self._policy.refusal
         self._stream.refused = bool(refusal)
         if not changed:
             return
-        if refusal:
-            self.get_logger().error(f'publishing nothing: {refusal}')
-        else:
-            self.get_logger().info('publishing again')
-        self._diagnostics.notice('compensation', Level.ERROR if refusal else Level.OK)
+        topics.log(self, 'ERROR' if refusal else 'INFO',
+                   f'publishing nothing: {refusal}' if refusal else 'publishing again')
+        self._diagnostics.notice(Level.ERROR if refusal else Level.OK)
 
-    def _on_temperature(self, message: Temperature) -> None:
-        self._set_surroundings('temperature_c', message.temperature)
-
-    def _on_supply(self, message: BatteryState) -> None:
-        self._set_surroundings('supply_v', message.voltage)
-
-    def _set_surroundings(self, name: str, value: float) -> None:
+    def _surround(self, name: str, value: float) -> None:
         """Use a temperature, °C, or supply, V, from the next sample on; ignore NaN."""
         if isfinite(value):
             self._stream.surround(name, value)
             self._heard_ns[name] = self.get_clock().now().nanoseconds
 
     def _status(self) -> Status:
-        interval = self._interval()
+        steady_ns, ros_ns = STEADY.now().nanoseconds, self.get_clock().now().nanoseconds
+        totals = {name: self._stream.counts[name] for name in COUNTS}
+        duration_s = (steady_ns - self._reported_ns) * 1e-9
+        counts = {name: total - self._reported[name] for name, total in totals.items()}
+        self._reported, self._reported_ns = Counter(totals), steady_ns
+        interval = Interval(
+            duration_s, counts, self._stream.outside, self._stream.surroundings.copy(),
+            {name: (ros_ns - ns) * 1e-9 for name, ns in self._heard_ns.items()},
+            self._obstacle if self._stream.unknown is not None else '')
         newer = self._policy.newer()
         state, text = self._policy.status(interval, newer, self._calibration())
-        counts, duration_s = interval.counts, interval.duration_s
         late = filter_inversion.HALF if self._settings.undo_filter else 0
-        values: dict[str, Any] = {
-            'rate_in_hz': round(counts['received'] / duration_s, 1),
-            'rate_out_hz': round(counts['published'] / duration_s, 1),
-            **{name: self._reported[name] for name in COUNTS},
-            'delay_s': late / self._policy.rate_hz, **self._ages.report(),
-            **self._policy.values(interval, newer)}
+        values = {'rate_in_hz': round(counts['received'] / duration_s, 1),
+                  'rate_out_hz': round(counts['published'] / duration_s, 1), **totals,
+                  'delay_s': late / self._policy.rate_hz, **self._ages.report(),
+                  **self._policy.values(interval, newer)}
         return Status(_LEVELS.get(state, Level.WARN), text, self._policy.sensor.serial, values)
-
-    def _interval(self) -> Interval:
-        """Return what the stream has shown since the last report, and begin a new interval."""
-        steady_ns, ros_ns = STEADY.now().nanoseconds, self.get_clock().now().nanoseconds
-        counts = Counter({name: self._stream.counts[name] for name in COUNTS})
-        interval = Interval(
-            duration_s=(steady_ns - self._reported_ns) * 1e-9,
-            counts={name: counts[name] - self._reported[name] for name in COUNTS},
-            outside=self._stream.outside,
-            surroundings=self._stream.surroundings.copy(),
-            ages_s={name: (ros_ns - ns) * 1e-9 for name, ns in self._heard_ns.items()},
-            obstacle=self._obstacle if self._stream.unknown is not None else '')
-        self._reported, self._reported_ns = counts, steady_ns
-        return interval
 
 
 def main() -> int:

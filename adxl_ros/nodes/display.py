@@ -14,9 +14,9 @@ import termios
 
 from adxl_ros.calibrate.guided.controller import Controller, ControllerState, IDLE_TEXT
 from adxl_ros.calibrate.guided.guide import NextPose
-from adxl_ros.calibrate.guided.screen_contents import KeyAction, LiveReading, Phase, ScreenContents
+from adxl_ros.calibrate.guided.screen_contents import KeyAction, Phase, ScreenContents
 from adxl_ros.calibrate.guided.session import live_reading, Session, SessionDisplay
-from adxl_ros.nodes.run_node import executable, held_output
+from adxl_ros.nodes.jobs import executable, held_output
 from adxl_ros.nodes.topics import create_publisher, Level, Status, status_message, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
@@ -31,24 +31,19 @@ _RESET = b'\x1b[?1049l\x1b[?2004l\x1b[?25h\x1b[0m'
 
 
 def open_screen(node_name: str) -> tuple[OwnScreen | None, str]:
-    """Start a screen if this process has a terminal."""
+    """Start a screen if this process has a terminal, and is no background job of it."""
     is_terminal = all(stream and stream.isatty() for stream in (sys.stdin, sys.stdout))
-    if not is_terminal or os.environ.get('TERM') == 'dumb' or _in_background():
+    if not is_terminal or os.environ.get('TERM') == 'dumb':
         return None, ''
+    # A terminal that does not control this process has no background.
+    with suppress(OSError):
+        if os.tcgetpgrp(sys.stdin.fileno()) != os.getpgrp():
+            return None, ''
     try:
         import prompt_toolkit  # noqa: F401
     except ImportError:
         return None, 'no screen, plain lines: it needs prompt_toolkit; pip install prompt_toolkit'
     return OwnScreen(node_name), ''
-
-
-def _in_background() -> bool:
-    """Return whether this process is a background job of its terminal."""
-    try:
-        return os.tcgetpgrp(sys.stdin.fileno()) != os.getpgrp()
-    except OSError:
-        # A terminal that does not control this process has no background.
-        return False
 
 
 class OwnScreen:
@@ -142,10 +137,11 @@ _RUNNING = (KeyAction('r', 'redo', 'redo'), KeyAction('s', 'skip', 'skip'),
 """Keys while a session runs."""
 _BY_HAND = (KeyAction('c', 'capture', 'capture'), *_RUNNING)
 """Keys while a session runs whose poses an operator captures."""
-_IDLE = (KeyAction('b', 'begin', 'start'),)
-"""Keys while no session runs."""
-_ASKING = (KeyAction('y', 'go on', 'resume'), KeyAction('n', 'begin again', 'start_over'), _ABORT)
-"""Keys that answer the question what to do with an interrupted calibration."""
+_KEYS = {ControllerState.IDLE: (KeyAction('b', 'begin', 'start'),),
+         ControllerState.WAITING_FOR_SENSOR: (_ABORT,),
+         ControllerState.ASKING: (KeyAction('y', 'go on', 'resume'),
+                                  KeyAction('n', 'begin again', 'start_over'), _ABORT)}
+"""Keys while no session runs, by the state."""
 
 
 class DisplayPublisher:
@@ -195,38 +191,21 @@ class DisplayPublisher:
 
     def _publish(self, phase: Phase, text: str) -> None:
         controller, unit = self._controller, self._controller.unit
-        display = self._session_display()
-        keys = () if phase is Phase.FIT else self._keys()
+        if controller.session is not self._session:
+            self._session = controller.session
+            self._display = SessionDisplay(self._session) if self._session else None
+        display, newest = self._display, controller.newest
+        keys = _KEYS.get(controller.state,
+                         _BY_HAND if controller.settings.operator_captures else _RUNNING)
+        live = None
+        if display is not None:
+            live = display.live()
+        elif newest is not None and unit is not None:
+            live = live_reading(newest, unit, newest.stillness())
         self._publisher.publish(String(data=ScreenContents(
             phase=phase.value, text=text, unit=f'{unit.serial} ({unit.axes})' if unit else '',
-            output=str(controller.settings.output), keys=keys,
-            live=self._idle_reading() if display is None else display.live(),
+            output=str(controller.settings.output),
+            keys=() if phase is Phase.FIT else keys, live=live,
             progress=None if display is None else display.progress(),
             estimate=None if display is None else display.estimate(),
             outcome=controller.outcome).to_json()))
-
-    def _session_display(self) -> SessionDisplay | None:
-        """Return the display of the running session; None while there is none."""
-        session = self._controller.session
-        if session is not self._session:
-            self._session = session
-            self._display = None if session is None else SessionDisplay(session)
-        return self._display
-
-    def _idle_reading(self) -> LiveReading | None:
-        """Return what the sensor reads while no session runs; None before the first samples."""
-        newest, unit = self._controller.newest, self._controller.unit
-        if newest is None or unit is None:
-            return None
-        return live_reading(newest, unit, newest.stillness())
-
-    def _keys(self) -> tuple[KeyAction, ...]:
-        """Return the keys that have an action now."""
-        controller = self._controller
-        if controller.state is ControllerState.ASKING:
-            return _ASKING
-        if controller.state is ControllerState.WAITING_FOR_SENSOR:
-            return (_ABORT,)
-        if controller.state is ControllerState.IDLE:
-            return _IDLE
-        return _BY_HAND if controller.settings.operator_captures else _RUNNING

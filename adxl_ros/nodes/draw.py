@@ -4,27 +4,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain
 from textwrap import wrap
 from typing import NamedTuple
 
-from adxl_ros.calibrate.guided.screen_contents import (
-    CoefficientRow,
-    Estimate,
-    KeyAction,
-    LiveReading,
-    Progress,
-    RestReading,
-    ScreenContents,
-)
+from adxl_ros.calibrate.guided import screen_contents as screen
 
 Line = list[tuple[str, str]]
 """A line of the screen: styles of prompt_toolkit, each with its text."""
+Row = tuple[str, str, str]
+"""Label, text and style of a row."""
 
 _COLOURS = {'dwell': 'ansigreen', 'refused': 'ansired', 'silent': 'ansired',
             'question': 'ansiyellow', 'rest': 'ansiyellow', 'stage': 'ansiyellow',
             'operator': 'bold ansicyan', 'fit': 'ansigreen'}
 """Styles by phase."""
+_MOTIONS = {'rms': 'moving', 'drift': 'drifting'}
+"""What a sensor does that is not at rest, by the quantity that shows it."""
 _LEAST_WIDTH = 20
 """A narrower terminal is drawn as if it had this width, columns."""
 _LEAST_LINES = 4
@@ -60,12 +57,14 @@ class LogLine(NamedTuple):
     style: str = 'ansibrightblack'  # Its style
 
 
-def draw(contents: ScreenContents, log: Sequence[LogLine], columns: int, rows: int) -> list[Line]:
+def draw(contents: screen.ScreenContents, log: Sequence[LogLine], columns: int, rows: int
+         ) -> list[Line]:
     """Lay the contents out."""
     width = max(columns - 1, _LEAST_WIDTH)
-    top = [*_head(contents, width), *_pose(contents.progress, width),
-           *_reading(contents.live, contents.progress),
-           *_progress(contents.progress, contents.estimate, width)]
+    rows_of_text = chain(_readings(contents.progress, contents.live),
+                         _progress(contents.progress, contents.estimate))
+    top = [*_head(contents, width),
+           *(line for row in rows_of_text for line in _labelled(width, *row))]
     bottom = [*_log(log, width), _keys(contents.keys)]
     middle = _outcome(contents.outcome, width) or _coefficients(contents.estimate, width)
     lines = [*top, *_shorten(middle, rows - len(top) - len(bottom))]
@@ -83,7 +82,7 @@ def _shorten(lines: list[Line], room: int) -> list[Line]:
     return [*lines[:kept], _text(f'… {len(lines) - kept} more lines in a taller window')][:room]
 
 
-def _head(contents: ScreenContents, width: int) -> list[Line]:
+def _head(contents: screen.ScreenContents, width: int) -> list[Line]:
     task = f' of {contents.unit or "no sensor yet"} into {contents.output}'
     title = f' calibration{task if contents.output else ""}'
     style = _COLOURS.get(contents.phase, 'bold')
@@ -91,88 +90,69 @@ def _head(contents: ScreenContents, width: int) -> list[Line]:
             *(_text(line, style) for line in wrap(contents.text, width)[:_TEXT_LINES])]
 
 
-def _pose(progress: Progress | None, width: int) -> list[Line]:
-    if progress is None:
-        return []
-    total = '' if progress.remaining_s is None else f' of {progress.total}'
-    lines = _wrapped('pose', f'{progress.number}{total}: {progress.destination}', width)
-    if progress.position:
-        lines.append(_row('now', progress.position))
-    return lines
-
-
-def _reading(live: LiveReading | None, progress: Progress | None) -> list[Line]:
+def _readings(progress: screen.Progress | None, live: screen.LiveReading | None) -> Iterator[Row]:
+    """Yield the pose, where the stage is, and what the sensor reads."""
+    if progress is not None:
+        total = '' if progress.remaining_s is None else f' of {progress.total}'
+        yield 'pose', f'{progress.number}{total}: {progress.destination}', ''
+        if progress.position:
+            yield 'now', progress.position, ''
     if live is None:
-        return []
+        return
     axes = '  '.join(f'{axis.axis} {axis.mean_mps2:+.3f} ± {axis.rms_mps2:.3f}'
                      for axis in live.axes)
     rate = '' if live.rate_hz is None else f'  {live.rate_hz:.0f} Hz'
-    lines = [_row('reads', f'{axes} m/s²{rate}')]
-    if live.rest is not None:
-        lines.append(_rest(live.rest))
+    yield 'reads', f'{axes} m/s²{rate}', ''
+    if (rest := live.rest) is not None:
+        share = rest.value_mps2 / rest.limit_mps2 if rest.limit_mps2 else 1.0
+        motion = 'at rest' if rest.at_rest else _MOTIONS[rest.quantity]
+        yield 'rest', (
+            f'{_bar(share)} {motion}: {rest.value_mps2:.2g} m/s² {rest.quantity} on {rest.axis}, '
+            f'must be below {rest.limit_mps2:.2g}'), 'green' if rest.at_rest else 'yellow'
     if progress is not None and progress.dwell_s is not None and progress.dwelt_s is not None:
-        bar = _bar(progress.dwelt_s / progress.dwell_s, _BAR_WIDTH)
-        lines.append(_row('dwell', f'{bar} {progress.dwelt_s:.1f} of {progress.dwell_s:g} s'))
-    return lines
+        bar = _bar(progress.dwelt_s / progress.dwell_s)
+        yield 'dwell', f'{bar} {progress.dwelt_s:.1f} of {progress.dwell_s:g} s', ''
 
 
-def _rest(rest: RestReading) -> Line:
-    share = rest.value_mps2 / rest.limit_mps2 if rest.limit_mps2 else 1.0
-    motion = 'at rest' if rest.at_rest else {'rms': 'moving', 'drift': 'drifting'}[rest.quantity]
-    return _row('rest', f'{_bar(share, _BAR_WIDTH)} {motion}: {rest.value_mps2:.2g} m/s² '
-                f'{rest.quantity} on {rest.axis}, must be below {rest.limit_mps2:.2g}',
-                'green' if rest.at_rest else 'yellow')
-
-
-def _progress(progress: Progress | None, estimate: Estimate | None, width: int) -> list[Line]:
+def _progress(progress: screen.Progress | None, estimate: screen.Estimate | None) -> Iterator[Row]:
+    """Yield how many poses are done, what they cover, and how good the fit will be."""
     if progress is None or estimate is None:
-        return []
-    lines = [_row('parts' if estimate.range_error else 'poses', _counts(progress))]
-    covered = ', '.join(f'{row.group} {row.accepted}/{row.total}' for row in estimate.coverage)
-    if estimate.covered_faces:
-        covered += f' ({estimate.covered_faces} up)'
-    lines += _wrapped('coverage', covered, width)
-    if estimate.range_error:
-        return [*lines, *_wrapped('error', estimate.range_error, width)]
-    if estimate.tilt_error_deg is None:
-        return [*lines, _row('tilt error', 'no pose shows both angles to one axis')]
-    final = '' if estimate.final_tilt_error_deg is None else \
-        f', {estimate.final_tilt_error_deg:.2g}° after all poses'
-    return [*lines, _row('tilt error', f'{estimate.tilt_error_deg:.2g}° expected now{final}',
-                         'bold')]
-
-
-def _counts(progress: Progress) -> str:
+        return
     closed = progress.accepted + progress.skipped
     skipped = f'{progress.skipped} left out, ' if progress.skipped else ''
     time = ' for a good fit' if progress.remaining_s is None else \
         f', about {_span(progress.remaining_s)}'
-    return (f'{_bar(closed / progress.total, _BAR_WIDTH)} {progress.accepted} done, {skipped}'
-            f'{max(progress.total - closed, 0)} left{time}')
+    yield 'parts' if estimate.range_error else 'poses', (
+        f'{_bar(closed / progress.total)} {progress.accepted} done, {skipped}'
+        f'{max(progress.total - closed, 0)} left{time}'), ''
+    covered = ', '.join(f'{row.group} {row.accepted}/{row.total}' for row in estimate.coverage)
+    faces = f' ({estimate.covered_faces} up)' if estimate.covered_faces else ''
+    yield 'coverage', covered + faces, ''
+    if estimate.range_error:
+        yield 'error', estimate.range_error, ''
+    elif estimate.tilt_error_deg is None:
+        yield 'tilt error', 'no pose shows both angles to one axis', ''
+    else:
+        final = '' if estimate.final_tilt_error_deg is None else \
+            f', {estimate.final_tilt_error_deg:.2g}° after all poses'
+        yield 'tilt error', f'{estimate.tilt_error_deg:.2g}° expected now{final}', 'bold'
 
 
-def _coefficients(estimate: Estimate | None, width: int) -> list[Line]:
+def _coefficients(estimate: screen.Estimate | None, width: int) -> list[Line]:
     """Return a row for each coefficient: name, bar and intervals, shortened to the width."""
     if estimate is None:
         return []
     rows, bar_width = estimate.coefficients, _COEFFICIENT_BAR_WIDTH
-    names, texts = [row.name for row in rows], ['  '.join(row.intervals) for row in rows]
-    if any(len(name) > _name_room(text, bar_width, width) for name, text in zip(names, texts)):
+    texts = {row.name: '  '.join(row.intervals) for row in rows}
+    if any(len(name) > _name_room(text, bar_width, width) for name, text in texts.items()):
         # Intervals of three axes are long. The name of a parameter has its unit, too.
         bar_width = _NARROW_BAR_WIDTH
-        names, texts = [row.name.split(',')[0] for row in rows], [_narrow(row) for row in rows]
-    widest = max(map(len, names), default=0)
-    lines = []
-    for row, name, text in zip(rows, names, texts):
-        room = min(_name_room(text, bar_width, width), widest)
-        bar = _bar(row.determined, bar_width)
-        lines.append(_text(f'{_cut(name, room):{room}} {bar} {text}'))
-    return lines
-
-
-def _narrow(row: CoefficientRow) -> str:
-    """Return the intervals of a coefficient with few spaces."""
-    return ' '.join(interval.replace(' ± ', '±') for interval in row.intervals)
+        texts = {row.name.split(',')[0]: ' '.join(row.intervals).replace(' ± ', '±')
+                 for row in rows}
+    widest = max(map(len, texts), default=0)
+    rooms = [min(_name_room(text, bar_width, width), widest) for text in texts.values()]
+    return [_text(f'{_cut(name, room):{room}} {_bar(row.determined, bar_width)} {text}')
+            for row, (name, text), room in zip(rows, texts.items(), rooms)]
 
 
 def _name_room(text: str, bar_width: int, width: int) -> int:
@@ -186,11 +166,9 @@ def _cut(text: str, width: int) -> str:
 
 
 def _outcome(outcome: Sequence[str], width: int) -> list[Line]:
-    lines: list[str] = []
-    for line in outcome:
-        # A line that fits keeps its spaces.
-        lines += [line] if len(line) <= width else wrap(line, width)
-    return [_text(line) for line in lines]
+    # A line that fits keeps its spaces.
+    return [_text(line) for text in outcome
+            for line in ([text] if len(text) <= width else wrap(text, width))]
 
 
 def _log(log: Sequence[LogLine], width: int) -> list[Line]:
@@ -204,20 +182,17 @@ def _log(log: Sequence[LogLine], width: int) -> list[Line]:
     return lines
 
 
-def _keys(keys: Iterable[KeyAction]) -> Line:
+def _keys(keys: Iterable[screen.KeyAction]) -> Line:
     actions = [(key.key, key.action) for key in keys] + [('q', 'quit')]
     return [part for key, action in actions
             for part in (('reverse', f' {key} '), ('', f' {action}  '))]
 
 
-def _row(label: str, text: str, style: str = '') -> Line:
-    return _text(f'{label:{_LABEL_WIDTH}} {text}', style)
-
-
-def _wrapped(label: str, text: str, width: int) -> list[Line]:
+def _labelled(width: int, label: str, text: str, style: str) -> list[Line]:
     """Return the first lines of a text beside its label."""
-    first, *others = wrap(text, max(width - _LABEL_WIDTH - 1, _LEAST_TEXT_WIDTH)) or ['']
-    return [_row(label, first), *(_row('', line) for line in others[:_LABELLED_LINES - 1])]
+    lines = wrap(text, max(width - _LABEL_WIDTH - 1, _LEAST_TEXT_WIDTH)) or ['']
+    return [_text(f'{first:{_LABEL_WIDTH}} {line}', style)
+            for first, line in zip((label, *[''] * (_LABELLED_LINES - 1)), lines)]
 
 
 def _text(text: str, style: str = '') -> Line:
@@ -233,7 +208,7 @@ def _cut_line(line: Line, width: int) -> Line:
     return parts
 
 
-def _bar(share: float, width: int) -> str:
+def _bar(share: float, width: int = _BAR_WIDTH) -> str:
     """Return a bar of a width in columns, of which a share from 0 to 1 is full."""
     full = round(min(max(share, 0.0), 1.0) * width)
     return '█' * full + '░' * (width - full)

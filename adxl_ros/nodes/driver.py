@@ -4,16 +4,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 import traceback
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.links.support import base
 from adxl_ros.nodes.link_reader import LinkReader
-from adxl_ros.nodes.node_help import NodeHelp
-from adxl_ros.nodes.run_node import run
+from adxl_ros.nodes.parameters import declare_sensor, make_sensor
+from adxl_ros.nodes.run_node import NodeHelp, run
 from adxl_ros.nodes.sample_output import SampleOutput, Tally
-from adxl_ros.nodes.sensor_parameters import declare_sensor, make_sensor
 from adxl_ros.nodes.settings import check_given_parameters, declare_driver, DriverSettings
 from adxl_ros.nodes.topics import DiagnosticsReporter, Level, Status, STEADY
 from rclpy.clock import Clock, ClockType
@@ -33,6 +32,13 @@ _EXAMPLES = {
 """Examples of arguments, by their purpose."""
 
 
+def _transition(goal: str, *acts: str) -> Callable[..., TransitionCallbackReturn]:
+    """Return the callback of a transition to a state, which calls methods of the driver."""
+    def callback(node: Driver, _: LifecycleState) -> TransitionCallbackReturn:
+        return node.change(goal, acts)
+    return callback
+
+
 class Driver(LifecycleNode):
     """
     The node of the driver.
@@ -41,13 +47,21 @@ class Driver(LifecycleNode):
     the active node reads the link. It configures and activates itself unless `autostart` is false.
     """
 
+    on_configure = _transition('inactive', 'configure')
+    on_activate = _transition('active', 'activate')
+    on_deactivate = _transition('inactive', 'close')
+    on_cleanup = _transition('unconfigured', 'clean_up')
+    on_shutdown = _transition('finalized', 'close', 'clean_up')
+    # The node can be configured again.
+    on_error = _transition('unconfigured', 'close', 'clean_up')
+
     def __init__(self) -> None:
         super().__init__('driver')
         check_given_parameters(self)
         self._sensor = make_sensor(declare_sensor(self))
-        own, self._link = declare_driver(self, self._sensor.serial)
+        own, self._module, self._settings = declare_driver(self, self._sensor.serial)
         self._delay_ns = round(1e9 * own.stamp_offset_s)
-        settings = self._link.settings
+        settings, self._link = self._settings, own.link
         has_frame = isinstance(settings, base.SimulatorSettings) and not settings.turns_case
         self._frame_id = own.frame_id or ('' if has_frame else _FRAME)
         paced = isinstance(settings, base.PacedSettings)
@@ -58,13 +72,14 @@ class Driver(LifecycleNode):
         # A real device lives in real time, whatever the clock of the graph is.
         self._stamp_clock = self.get_clock() if paced or isinstance(
             settings, base.SimulatorSettings) else Clock(clock_type=ClockType.SYSTEM_TIME)
+        self._simulates = self._link == base.DEFAULT_LINK
         self._tally = Tally(STEADY.now().nanoseconds)
         self._fault = ''
         self._refusal: UserError | None = None
         self._announces = not own.autostart
         self._output: SampleOutput | None = None
         self._reader: LinkReader | None = None
-        self._diagnostics = DiagnosticsReporter(self, {'link': self._status})
+        self._diagnostics = DiagnosticsReporter(self, 'link', self._status)
         if not own.autostart:
             self._announce('unconfigured')
         elif self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
@@ -73,32 +88,20 @@ class Driver(LifecycleNode):
             raise self._refusal
         self._announces = True
 
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def configure(self) -> None:
         """Create the topics."""
-        return self._transition(self._configure, super().on_configure, state, 'inactive')
+        self._fault = ''
+        self._output = SampleOutput(self, self._sensor, self._frame_id, self._delay_ns,
+                                    self._is_clock, self._stamp_clock, self._tally)
 
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def activate(self) -> None:
         """Open the link and read it from now on; a failure leaves no link open."""
-        result = self._transition(self._activate, super().on_activate, state, 'active')
-        if result != TransitionCallbackReturn.SUCCESS:
-            self.close()
-        return result
-
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Close the link."""
-        return self._transition(self.close, super().on_deactivate, state, 'inactive')
-
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Remove the topics."""
-        return self._transition(self._clean_up, super().on_cleanup, state, 'unconfigured')
-
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Close the link and remove the topics."""
-        return self._transition(self._release, super().on_shutdown, state, 'finalized')
-
-    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Close the link and remove the topics, so that the node can be configured again."""
-        return self._transition(self._release, super().on_error, state, 'unconfigured')
+        assert self._output is not None, 'the life cycle configures a node before it activates it'
+        self._fault = ''
+        link = self._module.open_link(self._sensor, self._settings)
+        self._reader = LinkReader(
+            self, link, self._output, self._settings, self._fail,
+            lambda level: self._diagnostics.notice(Level[level.name]))
 
     def close(self) -> None:
         """End the thread and close the link."""
@@ -106,14 +109,19 @@ class Driver(LifecycleNode):
         if reader is not None:
             reader.close()
 
-    def _transition(self, act: Callable[[], None],
-                    parent: Callable[[LifecycleState], TransitionCallbackReturn],
-                    state: LifecycleState, goal: str) -> TransitionCallbackReturn:
+    def clean_up(self) -> None:
+        """Remove the topics."""
+        output, self._output = self._output, None
+        if output is not None:
+            output.destroy()
+
+    def change(self, goal: str, acts: Sequence[str]) -> TransitionCallbackReturn:
         """Do what the transition to a goal asks for; rclpy would not report why it fails."""
         try:
-            act()
-            result = parent(state)
+            for act in acts:
+                getattr(self, act)()
         except Exception as error:
+            self.close()
             if not self.context.ok():
                 # A signal has ended the context, and whatever was being made failed by that.
                 return TransitionCallbackReturn.FAILURE
@@ -126,12 +134,12 @@ class Driver(LifecycleNode):
                 return TransitionCallbackReturn.FAILURE
             self._fault = f'the driver has failed: {one_line(error)}'
             self.get_logger().fatal(traceback.format_exc())
-            self._diagnostics.notice('link', Level.ERROR)
+            self._diagnostics.notice(Level.ERROR)
             return TransitionCallbackReturn.ERROR
         if goal == 'active' or self._announces:
             self._announce(goal)
-        self._diagnostics.notice('link', self._level())
-        return result
+        self._diagnostics.notice(self._level())
+        return TransitionCallbackReturn.SUCCESS
 
     def _announce(self, state: str) -> None:
         """Log a state of the life cycle: link, unit, rate and topic; warn where it simulates."""
@@ -139,40 +147,16 @@ class Driver(LifecycleNode):
             return
         sensor = self._output.sensor if self._output else self._sensor
         topic = self.resolve_topic_name('imu/data_raw')
-        self.get_logger().info(f'{state}: link {self._link.name}, unit {sensor.serial}, '
+        self.get_logger().info(f'{state}: link {self._link}, unit {sensor.serial}, '
                                f'{sensor.rate_hz:g} Hz, topic {topic}')
         if state == 'active' and self._simulates:
             self.get_logger().warning(f'{_SIMULATED}: no sensor is read')
-
-    def _configure(self) -> None:
-        self._fault = ''
-        self._output = SampleOutput(self, self._sensor, self._frame_id, self._delay_ns,
-                                    self._is_clock, self._stamp_clock, self._tally)
-
-    def _activate(self) -> None:
-        assert self._output is not None, 'the life cycle configures a node before it activates it'
-        self._fault = ''
-        link = self._link.module.open_link(self._sensor, self._link.settings)
-        self._reader = LinkReader(self, link, self._output, self._link.settings, self._fail,
-                                  self._on_level)
-
-    def _clean_up(self) -> None:
-        if self._output is not None:
-            self._output.destroy()
-            self._output = None
-
-    def _release(self) -> None:
-        self.close()
-        self._clean_up()
 
     def _fail(self, error: UserError) -> None:
         """Report why there are no samples, and stay up."""
         self._fault = str(error)
         self.get_logger().error(self._fault)
-        self._diagnostics.notice('link', Level.ERROR)
-
-    def _on_level(self, level: base.Level) -> None:
-        self._diagnostics.notice('link', Level[level.name])
+        self._diagnostics.notice(Level.ERROR)
 
     def _status(self) -> Status:
         link = self._link_status()
@@ -182,23 +166,17 @@ class Driver(LifecycleNode):
             sensor_ns = self._stamp_clock.now().nanoseconds or sensor_ns
         values, warning = self._tally.report(STEADY.now().nanoseconds, sensor_ns)
         topic = self.resolve_topic_name('imu/data_raw')
-        publishers = self.count_publishers(topic)
-        if publishers > 1:
+        if (publishers := self.count_publishers(topic)) > 1:
             several = f'{publishers} nodes publish {topic}; end all but one'
-            warning = f'{several}, {warning}' if warning else several
+            warning = ', '.join(filter(None, (several, warning)))
         level = self._level()
         if warning and level is Level.OK:
             level = Level.WARN
-        kind = _SIMULATED if self._simulates else self._link.name
+        kind = _SIMULATED if self._simulates else self._link
         text = ', '.join(filter(None, (f'{kind}: {link.text}', warning)))
         serial = (self._output.sensor if self._output else self._sensor).serial
         return Status(level, text, serial, {
-            **values, 'link_type': self._link.name, 'link_state': link.text, **link.values()})
-
-    @property
-    def _simulates(self) -> bool:
-        """Whether the samples are those of no sensor."""
-        return self._link.name == base.DEFAULT_LINK
+            **values, 'link_type': self._link, 'link_state': link.text, **link.values()})
 
     def _level(self) -> Level:
         """Return the level of the link; a simulated sensor is a warning at least."""

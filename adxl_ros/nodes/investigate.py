@@ -9,32 +9,20 @@ from functools import partial
 from pathlib import Path
 import shlex
 import signal
-import sys
 from textwrap import wrap
-from typing import Any
 
 from adxl_ros.files.bag_writer import LiveBag
 from adxl_ros.investigate.background import BackgroundDiagnoser, OutputFolder
-from adxl_ros.investigate.diagnosis_round import Answer, hypothesis_text, Outcome
+from adxl_ros.investigate.diagnosis_round import Answer, hypothesis_text, listed, Outcome
 from adxl_ros.investigate.investigation import Investigation, State, Status as Situation
 from adxl_ros.investigate.manoeuvres import description, Pose, StageLimits
 from adxl_ros.links.support.waiting import Watchdog
-from adxl_ros.nodes.node_help import NodeHelp
-from adxl_ros.nodes.parameters import declare_all, low_and_high
-from adxl_ros.nodes.run_node import run
-from adxl_ros.nodes.sensor_parameters import declare_sensor, make_sensor
+from adxl_ros.nodes import topics
+from adxl_ros.nodes.jobs import LiveLine
+from adxl_ros.nodes.parameters import declare_all, declare_sensor, low_and_high, make_sensor
+from adxl_ros.nodes.run_node import command_lines, NodeHelp, run
 from adxl_ros.nodes.settings import check_given_parameters, InvestigateSettings
-from adxl_ros.nodes.steps import drawable
-from adxl_ros.nodes.topics import (
-    create_publisher,
-    create_subscription,
-    DiagnosticsReporter,
-    Inbox,
-    Level,
-    RepeatingThread,
-    Status,
-    STEADY,
-)
+from adxl_ros.nodes.topics import Level, Status
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.clock import Clock, ClockType
@@ -46,54 +34,12 @@ from std_srvs.srv import Trigger
 
 _COLUMNS = 79
 """Columns of a line."""
-_TIME_COLUMNS = 11
-"""Columns of the time at the beginning of a line."""
+_INDENT = 11 * ' '
+"""Spaces in place of the time at the beginning of a line."""
+_MOST_NAMED = 3
+"""Largest number of hypotheses in a line; chosen: a reader keeps them in mind."""
 _SMALLEST_SHOWN = 0.01
 """Probability below which a hypothesis is not named. Chosen: the smallest number that is shown."""
-
-
-class InvestigationScreen:
-    """Prints lines; in a terminal that can draw, the last line shows what happens now."""
-
-    def __init__(self, folder: Path, limits: StageLimits, minutes: float) -> None:
-        """Print what is about to happen."""
-        self._live: Any = None
-        self._text = ''
-        if drawable():
-            from rich.console import Console
-            from rich.live import Live
-            self._live = Live('', console=Console(file=sys.stdout, highlight=False,
-                                                  markup=False, emoji=False), transient=True)
-            self._live.start()
-        for line in opening_lines(folder, limits, minutes):
-            self._print(line)
-
-    def show_answer(self, minutes: float, answer: Answer) -> None:
-        """Print the probabilities after a diagnosis, and what follows."""
-        for line in answer_lines(minutes, answer):
-            self._print(line)
-
-    def show_status(self, status: Situation) -> None:
-        """Show what happens now, where the terminal can draw."""
-        if self._live is None:
-            return
-        text = status_line(status)
-        if text != self._text:
-            from rich.text import Text
-            self._live.update(Text(text))
-            self._text = text
-
-    def close(self) -> None:
-        """Stop drawing."""
-        if self._live is not None:
-            self._live.stop()
-            self._live = None
-
-    def _print(self, line: str) -> None:
-        if self._live is None:
-            print(line, flush=True)
-        else:
-            self._live.console.print(line, soft_wrap=True)
 
 
 def opening_lines(folder: Path, limits: StageLimits, minutes: float) -> list[str]:
@@ -105,21 +51,17 @@ def opening_lines(folder: Path, limits: StageLimits, minutes: float) -> list[str
 
 
 def answer_lines(minutes: float, answer: Answer) -> list[str]:
-    """Return the lines of one diagnosis."""
-    line, rest = f'{minutes:5.1f} min ', 1.0
-    for hypothesis in answer.hypotheses:
-        if hypothesis.probability < _SMALLEST_SHOWN:
-            break
-        part = f' {hypothesis_text(hypothesis.effects)} {_percent(hypothesis.probability)} '
-        other = f' others {_percent(rest - hypothesis.probability)}'
-        if len(line) + len(part) + len(other) > _COLUMNS:
-            break
-        line, rest = line + part, rest - hypothesis.probability
-    if rest >= _SMALLEST_SHOWN / 2:
-        line += f' others {_percent(rest)}'
-    lines = [line.rstrip()]
+    """Return the probabilities after a diagnosis, and what follows."""
+    named = [hypothesis for hypothesis in answer.hypotheses[:_MOST_NAMED]
+             if hypothesis.probability >= _SMALLEST_SHOWN]
+    parts = [f'{hypothesis_text(h.effects)} {_percent(h.probability)}' for h in named]
+    others = 1 - sum(hypothesis.probability for hypothesis in named)
+    if others >= _SMALLEST_SHOWN / 2:
+        parts.append(f'others {_percent(others)}')
+    lines = wrap(f'{minutes:5.1f} min  {"  ".join(parts)}', _COLUMNS, subsequent_indent=_INDENT)
     if answer.outcome is Outcome.GO_ON:
-        lines += _indented(f'next: {description(answer.manoeuvre)}')
+        lines += wrap(f'next: {description(answer.manoeuvre)}', _COLUMNS, initial_indent=_INDENT,
+                      subsequent_indent=_INDENT)
     return lines
 
 
@@ -135,29 +77,22 @@ def closing_lines(investigation: Investigation, folder: OutputFolder) -> list[st
     """Return the result, where the files are, and what to do next."""
     bag, baseline, gap, parameters = (shlex.quote(str(path)) for path in (
         folder.bag, folder.baseline, folder.path / 'gap', folder.parameters))
-    diagnose = ['ros2 run adxl_ros diagnose', bag, f'--params {baseline}', f'-o {gap}']
-    files = [('Report', folder.report), ('Parameters', folder.parameters), ('Bag', folder.bag)]
-    named = [f' {name:11} {path}' for name, path in files if path.exists()]
+    files = {'Report': folder.report, 'Parameters': folder.parameters, 'Bag': folder.bag}
+    named = ['', *(f' {name:11} {path}' for name, path in files.items() if path.exists())]
     if investigation.state is State.STOPPED:
-        return ['', *wrap(f'Stopped without a verdict: {investigation.reason}', _COLUMNS), '',
-                *named, *(_command(diagnose) if investigation.has_moved else [])]
+        stopped = wrap(f'Stopped without a verdict: {investigation.reason}', _COLUMNS)
+        return ['', *stopped, *named, *(_next(
+            f'diagnose {bag} --params {baseline} -o {gap}') if investigation.has_moved else [])]
     answer = investigation.answers[-1][1]
-    lines = ['', *wrap(answer.sentence, _COLUMNS)]
-    if answer.hidden:
-        lines += wrap(f'It cannot show {_listed(answer.hidden)}.', _COLUMNS)
-    simulate = ['ros2 run adxl_ros simulate rich', f'--params {parameters}', '-o sim.csv']
-    return [*lines, '', *named, *_command(simulate)]
+    hidden = f'It cannot show {listed(answer.hidden)}.' if answer.hidden else ''
+    return ['', *wrap(answer.sentence, _COLUMNS), *wrap(hidden, _COLUMNS), *named,
+            *_next(f'simulate rich --params {parameters} -o sim.csv')]
 
 
-def _command(words: Sequence[str]) -> list[str]:
-    """Return a command for the terminal; it goes on in the next line where it is long."""
-    lines = [f' {"Next":11}']
-    for word in words:
-        if len(lines[-1]) + len(word) + len(' \\') >= _COLUMNS:
-            lines[-1] += ' \\'
-            lines.append(' ' * 15)
-        lines[-1] += f' {word}'
-    return lines
+def _next(arguments: str) -> list[str]:
+    """Return a command for the terminal."""
+    first, *others = command_lines(arguments, 13, 15)
+    return [f' {"Next":12}{first[13:]}', *others]
 
 
 def _percent(probability: float) -> str:
@@ -166,26 +101,15 @@ def _percent(probability: float) -> str:
     return f'{min(percent, 99) if probability < 0.9995 else percent:.0f} %'
 
 
-def _listed(names: Sequence[str]) -> str:
-    return ', '.join(names[:-1]) + ' or ' * (len(names) > 1) + names[-1]
-
-
-def _indented(text: str) -> list[str]:
-    return [' ' * _TIME_COLUMNS + line for line in wrap(text, _COLUMNS - _TIME_COLUMNS)]
-
-
 _SAMPLES = 'imu/data_raw'
 """Topic of the samples."""
 _SAMPLES_QUEUE = 20000
 """Samples that are kept while the thread is busy: 20 s at 1 kHz."""
 _SLOW_QUEUE = 1000
 """Messages of a slow topic that wait meanwhile; chosen: 10 s of a stage."""
-_KINDS = {'stage/joint_states': (JointState, 'sensor_msgs/msg/JointState'),
-          'stage/command': (JointState, 'sensor_msgs/msg/JointState'),
-          'temperature': (Temperature, 'sensor_msgs/msg/Temperature'),
-          'supply': (BatteryState, 'sensor_msgs/msg/BatteryState'),
-          'sensor_info': (DiagnosticStatus, 'diagnostic_msgs/msg/DiagnosticStatus')}
-"""Class and name of the type of each topic beside the samples."""
+_KINDS = {'stage/joint_states': JointState, 'stage/command': JointState,
+          'temperature': Temperature, 'supply': BatteryState, 'sensor_info': DiagnosticStatus}
+"""Type of each topic beside the samples."""
 
 
 class BagRecorder:
@@ -193,64 +117,54 @@ class BagRecorder:
 
     def __init__(self, node: Node, watchdog: Watchdog) -> None:
         """Subscribe; nothing is kept before `start`."""
-        self._node = node
+        self._node, self._watchdog = node, watchdog
         self.has_samples = False  # Whether a sample has come
-        self._bag: LiveBag | None = None
-        self._thread: RepeatingThread | None = None
+        self.bag: LiveBag | None = None  # None before `start`
+        self._thread: topics.RepeatingThread | None = None
         self._system = Clock(clock_type=ClockType.SYSTEM_TIME)
-        self._watchdog = watchdog
-        # Its message comes once, perhaps before the bag is open.
-        self._early: list[tuple[str, str, bytes]] = []
-        for topic, (kind, name) in _KINDS.items():
-            create_subscription(node, kind, topic, partial(self._write, topic, name), _SLOW_QUEUE,
-                                latched=topic == 'sensor_info', raw=True)
-        self._samples = Inbox(node, Imu, _SAMPLES, _SAMPLES_QUEUE)
-
-    @property
-    def is_writing(self) -> bool:
-        """Return whether there is a bag."""
-        return self._bag is not None
+        # The message of sensor_info comes once, perhaps before the bag is open.
+        self._info = b''
+        for topic, kind in _KINDS.items():
+            topics.create_subscription(node, kind, topic, partial(self._write, topic), _SLOW_QUEUE,
+                                       latched=topic == 'sensor_info', raw=True)
+        self.samples = topics.Inbox(node, Imu, _SAMPLES, _SAMPLES_QUEUE)
 
     def listen(self) -> None:
         """Take samples, so that `has_samples` shows them."""
-        self._thread = RepeatingThread(
-            self._node, lambda: self._samples.receive(self._write_sample), _SAMPLES)
+        self._thread = topics.RepeatingThread(
+            self._node, lambda: self.samples.receive(self._write_sample), _SAMPLES)
 
     def start(self, path: Path) -> None:
         """Begin to write."""
-        self._bag = LiveBag(path)
-        for topic, kind, data in self._early:
-            self._write(topic, kind, data)
-
-    def fault(self) -> str:
-        """Return that several nodes publish samples, so that none is written, or ''."""
-        return self._samples.fault()
+        self.bag = LiveBag(path)
+        if self._info:
+            self._write('sensor_info', self._info)
 
     def flush(self) -> None:
         """Write the messages so far to the file."""
-        if self._bag is not None:
-            self._bag.flush()
+        if self.bag is not None:
+            self.bag.flush()
 
     def close(self) -> None:
         """End the thread, and write the end of the bag."""
         if self._thread is not None:
             self._thread.close()
             self._thread = None
-        if self._bag is not None:
-            self._bag.close()
+        if self.bag is not None:
+            self.bag.close()
 
     def _write_sample(self, data: bytes) -> None:
         self.has_samples = True
         self._watchdog.feed()
-        self._write(_SAMPLES, 'sensor_msgs/msg/Imu', data)
+        self._write(_SAMPLES, data)
 
-    def _write(self, topic: str, kind: str, data: bytes) -> None:
-        if self._bag is None:
-            if topic == 'sensor_info':
-                self._early = [(topic, kind, data)]
-            return
-        self._bag.write(self._node.resolve_topic_name(topic), kind, data,
-                        self._system.now().nanoseconds)
+    def _write(self, topic: str, data: bytes) -> None:
+        if self.bag is not None:
+            package, _, name = topics.type_name(_KINDS.get(topic, Imu)).partition('/')
+            self.bag.write(self._node.resolve_topic_name(topic), f'{package}/msg/{name}', data,
+                           self._system.now().nanoseconds)
+        elif topic == 'sensor_info':
+            self._info = data
 
 
 _POLL_S = 0.02
@@ -263,8 +177,6 @@ _FAREWELL_S = 0.5
 """Time for which the last command is repeated at the end, s; chosen: the stage has it then."""
 _COMMAND_QUEUE = 10
 """Commands that are kept for a slow subscriber; chosen."""
-_STAGE_QUEUE = 1000
-"""Poses of the stage that wait while the node is busy; chosen: 10 s."""
 _EXAMPLES = {
     'a simulated stage, driver and stage running': '',
     'a unit by its parameter file, within limits':
@@ -288,54 +200,52 @@ class Investigate(Node):
         self._settings = own = declare_all(self, InvestigateSettings)
         alpha_deg = low_and_high('limits.alpha_deg', own.alpha_deg, (0.0, 180.0))
         beta_deg = low_and_high('limits.beta_deg', own.beta_deg, (0.0, 360.0))
-        self._limits = StageLimits(_radians(alpha_deg), _radians(beta_deg),
-                                   float(np.radians(own.rate_deg_s)))
-        self._commands = create_publisher(self, JointState, 'stage/command', _COMMAND_QUEUE)
+        self._limits = limits = StageLimits(_radians(alpha_deg), _radians(beta_deg),
+                                            float(np.radians(own.rate_deg_s)))
+        self._commands = topics.create_publisher(self, JointState, 'stage/command', _COMMAND_QUEUE)
         self.create_service(Trigger, '~/abort', self._on_abort)
-        create_subscription(self, JointState, 'stage/joint_states', self._on_stage, _STAGE_QUEUE)
+        topics.create_subscription(self, JointState, 'stage/joint_states', self._on_stage,
+                                   _SLOW_QUEUE)
         self._pose: Pose | None = None
         self._watchdogs = {topic: Watchdog(_LONGEST_TURN_S)
                            for topic in ('imu/data_raw', 'stage/joint_states')}
-        self._diagnostics = DiagnosticsReporter(self, {'investigate': self._status})
+        self._diagnostics = topics.DiagnosticsReporter(self, 'investigate', self._status)
         self._recorder = BagRecorder(self, self._watchdogs['imu/data_raw'])
-        self._investigation: Investigation | None = None
-        self._screen: InvestigationScreen | None = None
+        self._folder = OutputFolder.free(Path(own.output))
+        self._investigation = Investigation(
+            limits, own.minutes, BackgroundDiagnoser(self._folder, limits, own.seed),
+            lambda minutes, answer: self._print(answer_lines(minutes, answer)),
+            self._recorder.flush)
+        self._screen: LiveLine | None = None
         self._ended_ns: int | None = None
         self._request = ''
 
-    def request_stop(self, reason: str) -> None:
+    def request_stop(self, name: str, *_: object) -> None:
         """Stop the investigation at the next turn; a signal may come at any time."""
-        self._request = reason
+        self._request = name
 
     def begin(self) -> None:
         """Wait for sensor and stage; the files are made when both are there."""
-        settings = self._settings
-        self._folder = OutputFolder.free(Path(settings.output))
-        self._screen = InvestigationScreen(self._folder.path, self._limits, settings.minutes)
-        self._investigation = Investigation(
-            self._limits, settings.minutes,
-            BackgroundDiagnoser(self._folder, self._limits, settings.seed),
-            self._screen.show_answer, self._recorder.flush)
+        self._screen = LiveLine()
+        self._print(opening_lines(self._folder.path, self._limits, self._settings.minutes))
         self._recorder.listen()
-        self.create_timer(_POLL_S, self._poll, clock=STEADY)
-
-    def stop(self, reason: str) -> None:
-        """Stop the investigation; the stage holds its pose."""
-        if self._investigation is not None:
-            self._investigation.stop(reason)
+        self.create_timer(_POLL_S, self._poll, clock=topics.STEADY)
 
     def close(self) -> None:
         """Write the end of the bag, and end the screen and the diagnosis."""
-        self.stop('the node has ended')
+        self._investigation.stop('the node has ended')
         self._recorder.close()
         if self._screen is not None:
             self._screen.close()
 
+    def _print(self, lines: Sequence[str]) -> None:
+        if self._screen is not None:
+            self._screen.add(*lines)
+
     def _poll(self) -> None:
-        investigation, screen = self._investigation, self._screen
-        assert investigation is not None and screen is not None
+        investigation = self._investigation
         if self._request:
-            self.stop(self._request)
+            investigation.stop(self._request)
         if not investigation.has_ended:
             self._check_streams(investigation)
         now_s = self.get_clock().now().nanoseconds * 1e-9
@@ -344,20 +254,19 @@ class Investigate(Node):
             self._commands.publish(JointState(
                 header=Header(stamp=self.get_clock().now().to_msg()), name=['alpha', 'beta'],
                 position=list(command), velocity=list(investigation.speed or ())))
-        screen.show_status(investigation.status())
+        if self._screen is not None:
+            self._screen.show(status_line(investigation.status()))
         if investigation.has_ended:
             self._end(investigation)
 
     def _end(self, investigation: Investigation) -> None:
         """End the node when the stage has its last command."""
-        now_ns = STEADY.now().nanoseconds
+        now_ns = topics.STEADY.now().nanoseconds
         if self._ended_ns is None:
             self._ended_ns = now_ns
         elif now_ns - self._ended_ns > _FAREWELL_S * 1e9:
-            assert self._screen is not None
-            self._recorder.close()
-            self._screen.close()
-            print('\n'.join(closing_lines(investigation, self._folder)), flush=True)
+            self.close()
+            self._print(closing_lines(investigation, self._folder))
             raise SystemExit(0 if investigation.has_verdict else 1)
 
     def _check_streams(self, investigation: Investigation) -> None:
@@ -365,12 +274,12 @@ class Investigate(Node):
         if investigation.state is State.RECORDING:
             if not self._recorder.has_samples:
                 self._pose = None
-            elif self._pose is not None and not self._recorder.is_writing:
+            elif self._pose is not None and self._recorder.bag is None:
                 self._folder.make(self._sensor)
                 self._recorder.start(self._folder.bag)
             return
-        if self._recorder.fault():
-            investigation.stop(f'{self._recorder.fault()}; the stage holds its pose')
+        if fault := self._recorder.samples.fault():
+            investigation.stop(f'{fault}; the stage holds its pose')
         for topic, watchdog in self._watchdogs.items():
             silent_s = watchdog.check()
             if silent_s > _SILENT_S:
@@ -385,13 +294,11 @@ class Investigate(Node):
             self._watchdogs['stage/joint_states'].feed()
 
     def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self.stop('~/abort was called')
+        self._request = '~/abort was called'
         response.success, response.message = True, 'stopped; the stage holds its pose'
         return response
 
     def _status(self) -> Status:
-        if self._investigation is None:
-            return Status(Level.OK, 'not begun', self._sensor.serial, {})
         status = self._investigation.status()
         level = Level.WARN if status.state in (State.STOPPED, State.RECORDING) else Level.OK
         answers = self._investigation.answers
@@ -412,13 +319,9 @@ def _work(node: Investigate, executor: Executor) -> None:
     """Run the node; a signal stops the stage before the node ends."""
     # A handler of rclpy would end the graph before the stage has its last command.
     for number, name in ((signal.SIGINT, 'Ctrl-C'), (signal.SIGTERM, 'SIGTERM')):
-        signal.signal(number, partial(_stop_by_signal, node, name))
+        signal.signal(number, partial(node.request_stop, name))
     node.begin()
     executor.spin()
-
-
-def _stop_by_signal(node: Investigate, name: str, *_: object) -> None:
-    node.request_stop(name)
 
 
 def main() -> int:

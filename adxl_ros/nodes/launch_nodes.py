@@ -13,14 +13,8 @@ from typing import Any, NamedTuple
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.links.support.base import link_names
+from adxl_ros.nodes import settings
 from adxl_ros.nodes.parameters import given_text, has_section, Spec, specs_of
-from adxl_ros.nodes.settings import (
-    BridgeSettings,
-    DriverSettings,
-    link_specs,
-    links_by_parameter,
-    StageSettings,
-)
 from launch.action import Action
 from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction, Shutdown
 from launch.events.process import ProcessExited
@@ -50,7 +44,7 @@ class Argument(NamedTuple):
 
     def declared(self) -> DeclareLaunchArgument:
         """Return the action that declares it; an empty value leaves the parameter as it is."""
-        links = links_by_parameter().get(self.spec.name)
+        links = settings.links_by_parameter().get(self.spec.name)
         used_by = f'{" and ".join(links)}: ' if links else ''
         return DeclareLaunchArgument(
             self.name, default_value='', description=f'{used_by}{self.spec.meaning}; not given: '
@@ -60,14 +54,12 @@ class Argument(NamedTuple):
     def value(self, text: str) -> Any:
         """Return the value of the parameter."""
         default = self.spec.default
+        # A list of numbers has a unit; names with commas stay one text.
+        kind = str if default == () and not self.spec.unit else type(default)
+        convert, expected = _KINDS.get(kind, (str, ''))
         try:
-            if default == ():
-                # A list of numbers has a unit; names with commas stay one text.
-                return _numbers(text) if self.spec.unit else text
-            return type(default)(text) if isinstance(default, int | float) else text
+            return convert(text)
         except ValueError:
-            expected = {int: 'a whole number', float: 'a number'}.get(
-                type(default), 'numbers with commas, such as 30,60,90')
             raise UserError(f'{self.name}:={text}: expected {expected}') from None
 
 
@@ -75,57 +67,61 @@ def _numbers(text: str) -> list[float]:
     return [float(part) for part in text.strip('[]').split(',')]
 
 
-def arguments(settings: type, *parameters: str, **renamed: str) -> tuple[Argument, ...]:
+_KINDS: dict[type, tuple[Callable[[str], Any], str]] = {
+    int: (int, 'a whole number'), float: (float, 'a number'),
+    tuple: (_numbers, 'numbers with commas, such as 30,60,90')}
+"""Conversion of an argument, and what is expected, by the type of the default."""
+
+
+def arguments(own: type, *parameters: str, **renamed: str) -> tuple[Argument, ...]:
     """
     Return arguments for parameters of a dataclass; those of the driver may be of any link.
 
     Dots in the name of a parameter become underscores, unless it is renamed.
     """
-    specs = {spec.name: spec for spec in specs_of(settings)}
-    if settings is DriverSettings:
+    specs = {spec.name: spec for spec in specs_of(own)}
+    if own is settings.DriverSettings:
         for link in link_names():
-            specs = {spec.name: spec for spec in link_specs(link)} | specs
+            specs = {spec.name: spec for spec in settings.link_specs(link)} | specs
     names = {parameter.replace('.', '_'): parameter for parameter in parameters} | renamed
     return tuple(Argument(name, specs[parameter]) for name, parameter in names.items())
 
 
-LINK = arguments(DriverSettings, 'link.type', 'link.port', 'link.baud', 'link.uri', 'link.device',
-                 'link.channels', 'link.recording')
+LINK = arguments(settings.DriverSettings, 'link.type', 'link.port', 'link.baud', 'link.uri',
+                 'link.device', 'link.channels', 'link.recording')
 """Arguments of the link."""
-STAGE = (*arguments(StageSettings, 'stage.type'),
-         *arguments(BridgeSettings, *(spec.name for spec in specs_of(BridgeSettings))))
+STAGE = (*arguments(settings.StageSettings, 'stage.type'), *arguments(
+    settings.BridgeSettings, *(spec.name for spec in specs_of(settings.BridgeSettings))))
 """Arguments of the stage."""
-SPEED = arguments(DriverSettings, speed='link.speed')
+SPEED = arguments(settings.DriverSettings, speed='link.speed')
 """Speed of a simulated sensor."""
 
 
+def declared(name: str, default: str, description: str, *choices: str) -> DeclareLaunchArgument:
+    """Declare an argument of a launch that gives no parameter of a node."""
+    return DeclareLaunchArgument(name, default_value=default, description=description,
+                                 choices=choices or None)
+
+
 TRANSFORM = (
-    DeclareLaunchArgument('base_frame', default_value='', description='frame of the robot, such '
-                          'as base_link, of which the static transform to frame_id is published; '
-                          'empty: none'),
-    DeclareLaunchArgument('mounting_xyz_m', default_value='0,0,0',
-                          description='place of the case in base_frame, m'),
-    DeclareLaunchArgument('mounting_rpy_rad', default_value='0,0,0',
-                          description='roll, pitch and yaw of the case in base_frame, rad'),
-)
+    declared('base_frame', '', 'frame of the robot, such as base_link, of which the static '
+             'transform to frame_id is published; empty: none'),
+    declared('mounting_xyz_m', '0,0,0', 'place of the case in base_frame, m'),
+    declared('mounting_rpy_rad', '0,0,0', 'roll, pitch and yaw of the case in base_frame, rad'))
 """Arguments of the static transform."""
 
 
 def common_arguments(*own: Argument, frame_id: str = 'imu_link') -> list[DeclareLaunchArgument]:
     """Return the arguments that all launch files have."""
     return [
-        DeclareLaunchArgument('params_file', default_value=str(parameter_file.nominal_path()),
-                              description='parameter file of the sensor, its link and the nodes'),
-        DeclareLaunchArgument('namespace', default_value='',
-                              description='namespace of the nodes and their topics'),
-        DeclareLaunchArgument('frame_id', default_value=frame_id,
-                              description='frame of the case'
-                              + ("; '': that of the ideal samples" if not frame_id else '')),
-        DeclareLaunchArgument('log_level', default_value='info', choices=_LOG_LEVELS,
-                              description='log level'),
-        DeclareLaunchArgument('enclave', default_value='', description='folder of the enclaves of '
-                              'SROS 2, such as /adxl_ros; each node has one of its name there; '
-                              'empty: none'),
+        declared('params_file', str(parameter_file.nominal_path()),
+                 'parameter file of the sensor, its link and the nodes'),
+        declared('namespace', '', 'namespace of the nodes and their topics'),
+        declared('frame_id', frame_id, 'frame of the case' + (
+            '' if frame_id else "; '': that of the ideal samples")),
+        declared('log_level', 'info', 'log level', *_LOG_LEVELS),
+        declared('enclave', '', 'folder of the enclaves of SROS 2, such as /adxl_ros; each node '
+                 'has one of its name there; empty: none'),
         *(argument.declared() for argument in own)]
 
 
@@ -161,8 +157,7 @@ def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, A
         raise UserError(f'{path}: has no parameters of the node {name}; begin the file with /**: '
                         f'or {name}:')
     link = [argument for argument in LINK if argument.name in context.launch_configurations]
-    given = {'frame_id': text(context, 'frame_id'), **given_parameters(context, link),
-             **overrides}
+    given = {'frame_id': text(context, 'frame_id'), **given_parameters(context, link), **overrides}
     # The last argument counts. rcl takes the name of a node without its namespace.
     node = '' if namespace.strip('/') else f'{executable}:'
     rules = [part for key, value in given.items() for part in (
@@ -184,17 +179,15 @@ def _enclave(context: LaunchContext, executable: str) -> list[str]:
 
 def static_transform(context: LaunchContext) -> list[Action]:
     """Publish where the case is on the robot, if the launch names the frame of the robot."""
-    base_frame = text(context, 'base_frame')
+    base_frame, executable = text(context, 'base_frame'), 'static_transform_publisher'
     if not base_frame:
         return []
-    values = [*three_numbers(context, 'mounting_xyz_m'),
-              *three_numbers(context, 'mounting_rpy_rad')]
-    options = zip(('x', 'y', 'z', 'roll', 'pitch', 'yaw'), values)
-    executable = 'static_transform_publisher'
-    return [Node(package='tf2_ros', executable=executable, ros_arguments=_enclave(
-        context, executable), arguments=[
-        *(part for name, value in options for part in (f'--{name}', repr(value))),
-        '--frame-id', base_frame, '--child-frame-id', text(context, 'frame_id')])]
+    options = dict(zip(('--x', '--y', '--z', '--roll', '--pitch', '--yaw'), map(repr, (
+        *three_numbers(context, 'mounting_xyz_m'), *three_numbers(context, 'mounting_rpy_rad')))))
+    options |= {'--frame-id': base_frame, '--child-frame-id': text(context, 'frame_id')}
+    return [Node(package='tf2_ros', executable=executable,
+                 ros_arguments=_enclave(context, executable),
+                 arguments=[part for option in options.items() for part in option])]
 
 
 def three_numbers(context: LaunchContext, name: str) -> list[float]:
@@ -236,23 +229,19 @@ def simulated_link(context: LaunchContext, speed: Mapping[str, Any]) -> dict[str
     return {'link.type': link or 'sim', **speed} if speed else {}
 
 
-class GiveUp:
-    """Ends a launch with an error when a node refuses to start again and again."""
+def give_up(most_refusals: int = _MOST_REFUSALS) -> Callable[[ProcessExited, LaunchContext], None]:
+    """Return a function that ends a launch when a node refuses to start again and again."""
+    refusals_s: list[float] = []
 
-    def __init__(self, most_refusals: int = _MOST_REFUSALS) -> None:
-        self._most_refusals = most_refusals
-        self._refusals_s: list[float] = []
-
-    def __call__(self, event: ProcessExited, context: LaunchContext) -> None:
-        """Count the refused starts of a node."""
+    def count(event: ProcessExited, context: LaunchContext) -> None:
         if context.is_shutdown or event.returncode not in _REFUSED_START:
             return
-        now_s = time.monotonic()
-        self._refusals_s = [s for s in self._refusals_s if now_s - s < _REFUSALS_S] + [now_s]
-        if len(self._refusals_s) >= self._most_refusals:
-            times = f' {self._most_refusals} times' if self._most_refusals > 1 else ''
+        refusals_s.append(time.monotonic())
+        if sum(refusals_s[-1] - s < _REFUSALS_S for s in refusals_s) >= most_refusals:
+            times = f' {most_refusals} times' if most_refusals > 1 else ''
             raise UserError(f'{event.process_name} has refused to start{times}; its own line '
                             'above says why')
+    return count
 
 
 def end_with(success: str, failure: str) -> Callable[[ProcessExited, LaunchContext], list[Action]]:
@@ -265,3 +254,13 @@ def end_with(success: str, failure: str) -> Callable[[ProcessExited, LaunchConte
                             f'{failure}')
         return [LogInfo(msg=success), Shutdown(reason=f'{event.process_name} is done')]
     return end
+
+
+def refuse_simulated_stage(context: LaunchContext, others: str = '') -> None:
+    """Refuse a stage that would be simulated beside a real sensor."""
+    link = given_anywhere(context, 'link.type', 'driver')
+    if link not in ('', 'sim') and not given_anywhere(context, 'stage.type', 'stage'):
+        raise UserError(
+            f'link_type is {link}, but the stage would be simulated; set stage_type:=trajectory '
+            'or joint_state with bridge_alpha_joint and bridge_beta_joint for a stage that turns '
+            f'itself, {others}or stage_type:=simulated')

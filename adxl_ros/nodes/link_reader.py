@@ -13,15 +13,11 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.links.support.base import ImuLink, Level, Link, LinkStatus, StageLink
 from adxl_ros.links.support.waiting import Watchdog
-from adxl_ros.nodes.rclpy_internals import NotForExecutors, take_messages
+from adxl_ros.nodes import topics
 from adxl_ros.nodes.sample_output import References, SampleOutput
-from adxl_ros.nodes.samples_in import decoded, joint_readings
-from adxl_ros.nodes.topics import create_subscription, Inbox, RepeatingThread
 from rclpy.clock import ROSClock
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile
-from rclpy.subscription import Subscription
 from sensor_msgs.msg import Imu, JointState, Temperature
 
 _SIMULATOR_QUEUE = 1000
@@ -49,13 +45,12 @@ class SimulatorInput:
 
     def __init__(self, node: Node, link: ImuLink) -> None:
         self._node, self._link = node, link
-        self._raw: list[bytes] = []
         self.frame_id = ''  # Frame of the newest samples
         self._foreign = Watchdog(_LONGEST_TURN_S)
         self._is_warned = False
         self._due_s = self._counted_s = time.monotonic()
-        self._inbox = Inbox(node, Imu, link.imu_topic, _SIMULATOR_QUEUE)
-        self._temperature = create_subscription(
+        self._inbox = topics.Inbox(node, Imu, link.imu_topic, _SIMULATOR_QUEUE)
+        self._temperature = topics.create_subscription(
             node, Temperature, link.temperature_topic,
             lambda message: link.sense_temperature(message.temperature), 1)
 
@@ -67,20 +62,18 @@ class SimulatorInput:
     def wait(self) -> None:
         """Pause after the last samples, wait for others for up to 0.1 s, give all to the link."""
         time.sleep(max(self._due_s - time.monotonic(), 0))
-        self._inbox.receive(self._raw.append)
+        self._inbox.wait()
         self._due_s = time.monotonic() + _PAUSE_S
-        raws = self._raw[:]
-        self._raw.clear()
+        raws = self._inbox.take()
         if not raws or self._due_s > self._counted_s + _COUNT_S:
             topic = self._node.resolve_topic_name(self._link.imu_topic)
             self._link.sense_publishers(self._node.count_publishers(topic), self._inbox.fault())
             self._counted_s = self._due_s
-        if not raws:
-            return
-        stamps_ns, fields = decoded(raws, cdr.imu, **_FIELDS)
-        self.frame_id = cdr.imu(raws[-1]).texts['frame_id']
-        self._warn_of_clock(int(stamps_ns[-1]))
-        self._link.sense_imu(stamps_ns, fields)
+        if raws:
+            stamps_ns, fields = topics.decoded(raws, cdr.imu, **_FIELDS)
+            self.frame_id = cdr.imu(raws[-1]).texts['frame_id']
+            self._warn_of_clock(int(stamps_ns[-1]))
+            self._link.sense_imu(stamps_ns, fields)
 
     def _warn_of_clock(self, stamp_ns: int) -> None:
         """Warn once of samples that belong to another clock than the node's and go on to."""
@@ -125,48 +118,40 @@ class LinkReader:
     def __init__(self, node: Node, link: Link, output: SampleOutput, settings: Any,
                  on_error: Callable[[UserError], None], on_level: Callable[[Level], None]) -> None:
         self._node, self._link, self._output, self._settings = node, link, output, settings
-        self._on_error, self._on_level = on_error, on_level
+        self._on_level = on_level
         ros = node.get_clock()
         assert isinstance(ros, ROSClock), 'the clock of a node is that of ROS'
         self._ros = ros
-        self._failed = self._clock_is_searched = self._is_real_time = False
+        self._clock_is_searched = self._is_real_time = False
         self._now_ns: int | None = None
         self._subscribed_ns = 0
         self._ticked_ns = self._searched_ns = time.monotonic_ns()
         self._due_s = time.monotonic()
         self._newest_ns: int | None = None
-        self._stage: Subscription | None = None
-        self._stage_link: StageLink | None = None
+        self._stage: topics.Inbox | None = None
         self._simulator: SimulatorInput | None = None
         with ExitStack() as on_close:
             on_close.callback(link.close)
-            self._start(on_close)
+            if isinstance(link, ImuLink):
+                self._simulator = SimulatorInput(node, link)
+                on_close.callback(self._simulator.destroy)
+            elif link.live and node.get_parameter('use_sim_time').value:
+                node.get_logger().warning('use_sim_time: a real device lives in real time; its '
+                                          'samples are stamped by the system clock')
+            self._references = References(node, output.frame_id, link.references)
+            on_close.callback(self._references.destroy)
+            status = link.status()
+            self._level = status.level
+            self._log = StatusLog(node, status.text)
+            if link.sensor is not None:
+                output.use(link.sensor)
+            if isinstance(link, StageLink):
+                self._stage = topics.Inbox(node, JointState, link.joint_state_topic, _QUEUE,
+                                           reliable=True)
+                on_close.callback(self._stage.destroy)
+            on_close.callback(topics.RepeatingThread(
+                node, self._live_turn if link.live else self._paced_turn, 'link', on_error).close)
             self._on_close = on_close.pop_all()
-
-    def _start(self, on_close: ExitStack) -> None:
-        """Make the topics and the thread; `on_close` gets what ends them."""
-        node, link = self._node, self._link
-        if isinstance(link, ImuLink):
-            self._simulator = SimulatorInput(node, link)
-            on_close.callback(self._simulator.destroy)
-        elif link.live and node.get_parameter('use_sim_time').value:
-            node.get_logger().warning('use_sim_time: a real device lives in real time; its '
-                                      'samples are stamped by the system clock')
-        self._references = References(node, self._output.frame_id, link.references)
-        on_close.callback(self._references.destroy)
-        status = link.status()
-        self._level = status.level
-        self._log = StatusLog(node, status.text)
-        if link.sensor is not None:
-            self._output.use(link.sensor)
-        if isinstance(link, StageLink):
-            self._stage_link = link
-            self._stage = node.create_subscription(
-                JointState, link.joint_state_topic, lambda _: None, QoSProfile(depth=_QUEUE),
-                raw=True, callback_group=NotForExecutors())
-            on_close.callback(node.destroy_subscription, self._stage)
-        turn = self._live_turn if link.live else self._paced_turn
-        on_close.callback(RepeatingThread(node, turn, 'link').close)
 
     def close(self) -> None:
         """End the thread and close the link."""
@@ -184,17 +169,10 @@ class LinkReader:
 
     def _live_turn(self) -> None:
         """Publish what a device sends; the link waits for it."""
-        if self._failed:
-            time.sleep(_PERIOD_S)
-            return
-        try:
-            if self._simulator is not None:
-                self._simulator.wait()
-                self._output.follow_frame(self._simulator.frame_id)
-            samples = self._link.read(time.time_ns())
-        except UserError as error:
-            self._fail(error)
-            return
+        if self._simulator is not None:
+            self._simulator.wait()
+            self._output.follow_frame(self._simulator.frame_id)
+        samples = self._link.read(time.time_ns())
         if not self._node.context.ok():
             return
         sensor = self._link.sensor
@@ -241,8 +219,6 @@ class LinkReader:
 
     def _tick(self) -> None:
         """Publish the samples that are due."""
-        if self._failed:
-            return
         steady_ns = time.monotonic_ns()
         step_ns, self._ticked_ns = steady_ns - self._ticked_ns, steady_ns
         is_searched = self._search_clock(steady_ns)
@@ -250,11 +226,7 @@ class LinkReader:
             if not is_searched or not self._may_begin(step_ns):
                 return
             self._now_ns = self._begin()
-        try:
-            samples = self._link.read(self._due_ns(self._now_ns, step_ns))
-        except UserError as error:
-            self._fail(error)
-            return
+        samples = self._link.read(self._due_ns(self._now_ns, step_ns))
         self._now_ns = samples.until_ns
         if len(samples.stamp_ns):
             self._newest_ns = int(samples.stamp_ns[-1])
@@ -297,7 +269,7 @@ class LinkReader:
         ros_ns = time.time_ns() if self._is_real_time else self._ros.now().nanoseconds
         jump_ns = ros_ns - now_ns
         if not -_PERIOD_S * 1e9 < jump_ns < _JUMP_NS:
-            self._output.tally.missing += self._link.begin(ros_ns)
+            self._output.tally.counts['missing'] += self._link.begin(ros_ns)
             self._output.tally.begin(ros_ns)
             self._node.get_logger().warning(f'the clock jumped by {jump_ns * 1e-9:+.3f} s; '
                                             'the samples go on from there')
@@ -305,23 +277,18 @@ class LinkReader:
 
     def _take_motion(self) -> None:
         """Give the motion that has come to a link on the stage."""
-        if self._stage is None or self._stage_link is None or self._now_ns is None:
+        if self._stage is None or self._now_ns is None:
             return
-        messages = list(take_messages(self._stage, JointState, True, _QUEUE))
-        for reading in joint_readings(messages):
-            self._stage_link.sense_stage(*reading)
-
-    def _fail(self, error: UserError) -> None:
-        """Read no more, and report why."""
-        self._failed = True
-        self._on_error(error)
+        assert isinstance(self._link, StageLink), 'only a link on the stage takes its motion'
+        for reading in topics.joint_readings(self._stage.take()):
+            self._link.sense_stage(*reading)
 
 
 class StatusLog:
     """Logs the status of a link when its text or an event is new, once a second at most."""
 
     def __init__(self, node: Node, text: str) -> None:
-        self._logger, self._text = node.get_logger(), text
+        self._node, self._text = node, text
         self._logged_s = -_LOG_INTERVAL_S
         self._counts: dict[str, int] = {}
 
@@ -330,21 +297,10 @@ class StatusLog:
         now_s = time.monotonic()
         if now_s - self._logged_s < _LOG_INTERVAL_S:
             return
-        new_events = [event for event in status.events
-                      if event.count > self._counts.get(event.message, 0)]
-        new_text = status.text != self._text
-        if not new_events and not new_text:
-            return
-        for event in new_events:
-            self._logger.warning(event.message)
-            self._counts[event.message] = event.count
-        self._text, self._logged_s = status.text, now_s
-        if not new_text:
-            return
-        # rclpy permits one severity for each line of code.
-        if status.level is Level.OK:
-            self._logger.info(status.text)
-        elif status.level is Level.WARN:
-            self._logger.warning(status.text)
-        else:
-            self._logger.error(status.text)
+        for event in status.events:
+            if event.count > self._counts.get(event.message, 0):
+                topics.log(self._node, 'WARN', event.message)
+                self._counts[event.message], self._logged_s = event.count, now_s
+        if status.text != self._text:
+            self._text, self._logged_s = status.text, now_s
+            topics.log(self._node, status.level.name, status.text)

@@ -4,8 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime, UTC
 from pathlib import Path
 import time
@@ -14,29 +13,16 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.files.recording_columns import check_unit, unit_of
 from adxl_ros.files.stream_info import NO_UNIT, StreamInfo
-from adxl_ros.model.sensor import Sensor
 from adxl_ros.monitor import records
-from adxl_ros.monitor.live_gap import AxisGap, GapChange, GapSettings, LiveGap
+from adxl_ros.monitor.live_gap import AxisGap, GapSettings, LiveGap
 from adxl_ros.monitor.records import DiagnosisResult, DiagnosisRun, iso_time
-from adxl_ros.monitor.reference_stream import ReferenceKind
-from adxl_ros.nodes.node_help import NodeHelp
-from adxl_ros.nodes.parameters import declare_all
+from adxl_ros.monitor.reference_stream import ReferenceKind, ReferenceStream
+from adxl_ros.nodes import topics
+from adxl_ros.nodes.parameters import declare_all, declare_sensor, make_sensor
 from adxl_ros.nodes.rclpy_internals import NotForExecutors, take_request
-from adxl_ros.nodes.run_node import run
-from adxl_ros.nodes.samples_in import decoded, imu_samples, joint_readings
-from adxl_ros.nodes.sensor_parameters import declare_sensor, make_sensor
+from adxl_ros.nodes.run_node import NodeHelp, run
 from adxl_ros.nodes.settings import check_given_parameters, MonitorSettings
-from adxl_ros.nodes.topics import (
-    create_publisher,
-    create_subscription,
-    DiagnosticsReporter,
-    Inbox,
-    Level,
-    stamp,
-    Status,
-    status_message,
-    STEADY,
-)
+from adxl_ros.nodes.topics import Inbox, Level, Status
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import numpy as np
 from rclpy.node import Node
@@ -47,85 +33,63 @@ _TOGETHER_NS = 120_000_000_000
 """Time within which changes are one event, ns; chosen: slow axes are found later."""
 
 
-@dataclass(frozen=True)
 class GapState:
-    """What the monitor knows at one moment."""
+    """What the monitor knows at one moment: text, level and values of its reports."""
 
-    serial: str  # Serial number of the sensor
-    stamp_ns: int  # Stamp of the newest sample, ns; 0 before the first
-    obstacle: str  # Why nothing is compared; empty where it is
-    axes: Sequence[AxisGap]  # The gap by axis; empty before the first seconds
-    changes: Sequence[GapChange]  # Changes so far
-    likely: DiagnosisResult | None  # The newest diagnosis; None before it
-    window_s: float  # Time over which the gap is taken, s
-
-    @property
-    def event(self) -> list[GapChange]:
-        """Return the changes of the newest event, the earliest first."""
-        if not self.changes:
-            return []
-        newest_ns = max(change.since_ns for change in self.changes)
-        event = [change for change in self.changes if newest_ns - change.since_ns < _TOGETHER_NS]
-        return sorted(event, key=lambda change: change.since_ns)
-
-    @property
-    def level(self) -> Level:
-        """Return OK where the gap is no larger than the floor, and nothing has changed."""
-        fine = not self.obstacle and self.axes and not self.changes
-        return Level.OK if fine and not any(gap.is_open for gap in self.axes) else Level.WARN
-
-    def text(self) -> str:
-        """Return the state in one line."""
-        if self.obstacle:
-            return self.obstacle
-        if not self.axes:
-            return 'comparing; the first result takes some seconds'
-        gaps = ', '.join(f'{gap.axis} {gap.gap.value:.3g}' for gap in self.axes)
-        floors = ', '.join(f'{gap.axis} {gap.floor.value:.3g}' for gap in self.axes)
-        parts = [f'gap {gaps} mg, floor {floors} mg']
-        event = self.event
+    def __init__(self, live: LiveGap, obstacle: str, likely: DiagnosisResult | None,
+                 window_s: float) -> None:
+        """Put together why nothing is compared, if so, the gap, and the newest diagnosis."""
+        self._live, self._obstacle = live, obstacle
+        self._axes = live.report()
+        newest_ns = max((change.since_ns for change in live.changes), default=0)
+        event = sorted((change for change in live.changes
+                        if newest_ns - change.since_ns < _TOGETHER_NS),
+                       key=lambda change: change.since_ns)
+        is_fine = not obstacle and self._axes and not live.changes
+        self.level = Level.OK if is_fine and not any(gap.is_open for gap in self._axes) \
+            else Level.WARN
+        self.text = obstacle or 'comparing; the first result takes some seconds'
+        self.values: dict[str, object] = {'window_s': window_s, 'changes': len(live.changes)}
+        parts = []
+        if self._axes:
+            gaps, floors = (', '.join(
+                f'{gap.axis} {getattr(gap, name).value:.3g}' for gap in self._axes)
+                for name in ('gap', 'floor'))
+            parts.append(f'gap {gaps} mg, floor {floors} mg')
         if event:
             latest = {(change.axis, change.quantity): change.text() for change in event}
-            parts.append(f'changed since {iso_time(event[0].since_ns)}: '
-                         f'{", ".join(latest.values())}')
-        if self.likely is not None:
-            parts.append(f'likely {self.likely.text}' if self.likely.effects
-                         else self.likely.text)
-        return '; '.join(parts)
+            since = iso_time(event[0].since_ns)
+            parts.append(f'changed since {since}: {", ".join(latest.values())}')
+            self.values |= {'changed_since': since, 'changed_since_s': event[0].since_ns * 1e-9,
+                            'detected_s': event[0].detected_ns * 1e-9}
+        if likely is not None:
+            parts.append('likely ' * bool(likely.effects) + likely.text)
+            self.values |= {'likely_effect': ', '.join(likely.effects),
+                            'probability': likely.probability, 'report': likely.report}
+        if self._axes and not obstacle:
+            self.text = '; '.join(parts)
 
-    def values(self) -> dict[str, object]:
-        """Return the values of the summary by key."""
-        values: dict[str, object] = {'window_s': self.window_s, 'changes': len(self.changes)}
-        event = self.event
-        if event:
-            values |= {'changed_since': iso_time(event[0].since_ns),
-                       'changed_since_s': event[0].since_ns * 1e-9,
-                       'detected_s': event[0].detected_ns * 1e-9}
-        if self.likely is not None:
-            values |= {'likely_effect': ', '.join(self.likely.effects),
-                       'probability': self.likely.probability, 'report': self.likely.report}
-        return values
+    def axes(self) -> dict[str, Status]:
+        """Return the state of each axis; nothing where nothing is compared."""
+        return {} if self._obstacle else {gap.axis: Status(
+            Level.WARN if gap.is_open else Level.OK, _axis_text(gap), self._live.sensor.serial,
+            _axis_values(gap)) for gap in self._axes}
 
     def message(self) -> DiagnosticArray:
         """Return the message of the topic `gap`: the summary, then one status for each axis."""
-        array = DiagnosticArray()
-        array.header.stamp = stamp(self.stamp_ns)
-        array.status.append(status_message('gap', Status(
-            self.level, self.text(), self.serial, self.values())))
-        for gap in () if self.obstacle else self.axes:
-            array.status.append(status_message(f'gap: {gap.axis}', Status(
-                Level.WARN if gap.is_open else Level.OK, _axis_text(gap), self.serial,
-                axis_values(gap))))
+        summary = Status(self.level, self.text, self._live.sensor.serial, self.values)
+        parts = {'gap': summary} | {f'gap: {axis}': part for axis, part in self.axes().items()}
+        array = DiagnosticArray(status=[topics.status_message(*part) for part in parts.items()])
+        array.header.stamp = topics.stamp(self._live.newest_ns)
         return array
 
 
-def axis_values(gap: AxisGap) -> dict[str, object]:
+def _axis_values(gap: AxisGap) -> dict[str, object]:
     """Return the values of an axis by key; `explained` is absent where nothing is to explain."""
-    values: dict[str, object] = {
-        'gap_mg': gap.gap.value, 'gap_low_mg': gap.gap.low, 'gap_high_mg': gap.gap.high,
-        'floor_mg': gap.floor.value, 'floor_low_mg': gap.floor.low,
-        'floor_high_mg': gap.floor.high, 'offset_mg': gap.offset_mg,
-        'floor_source': gap.floor_source}
+    values: dict[str, object] = {'offset_mg': gap.offset_mg, 'floor_source': gap.floor_source}
+    for name, interval in (('gap', gap.gap), ('floor', gap.floor)):
+        values |= {f'{name}_mg': interval.value, f'{name}_low_mg': interval.low,
+                   f'{name}_high_mg': interval.high}
     return values if gap.explained is None else values | {'explained': gap.explained}
 
 
@@ -154,30 +118,27 @@ class MonitorStreams:
 
     def take_samples(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the samples that wait: stamps, ns, (n,), and acceleration, m/s², (n, 3)."""
-        return imu_samples(self._samples.take())
+        return topics.imu_samples(self._samples.take())
 
     def fault(self) -> str:
         """Return that several nodes publish samples or reference, so that none count, or ''."""
         return self._samples.fault() or self._reference.fault()
 
-    def take_others(self, live: LiveGap) -> int:
-        """Give reference and surroundings that wait to a comparison; return how many came."""
-        reference = live.reference
-        for name, field, subscription, layout in (
+    def take_others(self, reference: ReferenceStream) -> int:
+        """Add reference and surroundings that wait; return how many messages of it came."""
+        for name, field, inbox, layout in (
                 ('temperature_c', 'temperature', self._temperature, cdr.temperature),
                 ('supply_v', 'voltage', self._supply, cdr.battery_state)):
-            stamps_ns, fields = decoded(subscription.take(), layout, **{field: 1})
-            for stamp_ns, value in zip(stamps_ns.tolist(), fields[field][:, 0].tolist()):
-                reference.add_surroundings(name, stamp_ns, value)
+            stamps_ns, fields = topics.decoded(inbox.take(), layout, **{field: 1})
+            reference.add_surroundings(name, stamps_ns, fields[field])
+        messages = self._reference.take()
         if self._kind is ReferenceKind.IMU:
-            stamps_ns, force = imu_samples(self._reference.take())
-            reference.add_readings(stamps_ns, force)
-            return len(stamps_ns)
-        raws = self._reference.take()
-        for reading in joint_readings(raws):
-            if reading.position:
-                reference.add_joints(reading.stamp_ns, reading.position)
-        return len(raws)
+            reference.add_readings(*topics.imu_samples(messages))
+        else:
+            readings = [reading for reading in topics.joint_readings(messages) if reading.position]
+            reference.add_joints([reading.stamp_ns for reading in readings],
+                                 [reading.position for reading in readings])
+        return len(messages)
 
 
 _TURN_S = 0.05
@@ -221,55 +182,49 @@ class Monitor(Node):
         self._settings = GapSettings(own.window_s, own.false_alarms_per_day, own.history_s,
                                      own.wait_s)
         self._output = Path(own.output).expanduser()
-        self._live: LiveGap | None = None
-        self._info: StreamInfo | None = None
+        self._live = LiveGap(self._file_sensor, self._kind, self._settings)
+        self._info: StreamInfo | None = None  # None until samples are compared
         self._refusal = ''
         self._run: DiagnosisRun | None = None
         self._result: DiagnosisResult | None = None
         self._headers: list[object] = []
-        self._changed_ns: int | None = None
+        self._changed_ns = 0  # Begin of a change that is not diagnosed yet, ns; 0 without one
         self._diagnosed_s = -_PAUSE_S
-        self._begun_s = self._sampled_s = self._referenced_s = self._heard_s = 0.0
+        self._begun_s = self._sampled_s = self._referenced_s = 0.0
         self._streams = MonitorStreams(self, self._kind, self._reference_topic)
-        self._publisher = create_publisher(self, DiagnosticArray, 'gap', _QUEUE)
+        self._publisher = topics.create_publisher(self, DiagnosticArray, 'gap', _QUEUE)
         self._service = self.create_service(Trigger, '~/diagnose', lambda _, answer: answer,
                                             callback_group=NotForExecutors())
-        self._diagnostics = DiagnosticsReporter(self, {'gap': self._status})
-        create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
-        self.create_timer(_TURN_S, self._turn, clock=STEADY)
-        self.create_timer(_PERIOD_S, self._publish, clock=STEADY)
+        self._diagnostics = topics.DiagnosticsReporter(self, 'gap', self._status)
+        self._info_topic = self.resolve_topic_name('sensor_info')
+        topics.create_subscription(
+            self, DiagnosticStatus, 'sensor_info', lambda message: self._compare_by(
+                topics.stream_info(message, self._info_topic)), 1, latched=True)
+        self.create_timer(_TURN_S, self._turn, clock=topics.STEADY)
+        self.create_timer(_PERIOD_S, self._publish, clock=topics.STEADY)
 
     def close(self) -> None:
         """End a diagnosis that runs."""
         if self._run is not None:
             self._run.close()
 
-    def _on_info(self, message: DiagnosticStatus) -> None:
-        """Compare by what the stream states of its sensor; begin again if that has changed."""
-        texts = {pair.key: pair.value for pair in message.values}
-        if self._info is not None and self._info.texts == texts:
-            return
-        self._info = StreamInfo(texts, self.resolve_topic_name('sensor_info'))
-        self._compare_by(self._info)
-
     def _compare_by(self, info: StreamInfo) -> None:
-        """Begin a comparison with the parameters, as far as they fit the stream."""
-        sensor = self._file_sensor
+        """Begin a comparison with the parameters, as far as they fit what a stream states."""
+        if self._info is not None and self._info.texts == info.texts:
+            return
+        self._info, self._refusal, sensor = info, '', self._file_sensor
         try:
             if sensor.effects or sensor.serial != NO_UNIT:
                 check_unit(info, info.axes or sensor.axes, sensor)
                 sensor = replace(sensor, rate_hz=info.rate_hz or sensor.rate_hz)
             else:
                 sensor = unit_of(sensor, info)
-            self._use(sensor)
         except UserError as error:
-            self._live, self._refusal = None, str(error)
+            self._refusal = str(error)
             self.get_logger().error(self._refusal)
-
-    def _use(self, sensor: Sensor) -> None:
-        """Begin a comparison with a sensor."""
-        self._live, self._refusal = LiveGap(sensor, self._kind, self._settings), ''
-        self._changed_ns = self._result = None
+            return
+        self._live = LiveGap(sensor, self._kind, self._settings)
+        self._changed_ns, self._result = 0, None
         effects = ', '.join(sensor.effects) or 'no effects'
         self.get_logger().info(
             f'comparing {self.resolve_topic_name("imu/data_raw")} of {sensor.serial} ({effects}) '
@@ -285,83 +240,76 @@ class Monitor(Node):
         if len(stamps_ns):
             self._begun_s = self._begun_s or now_s
             self._sampled_s = now_s
-        if self._live is None and not self._refusal and self._begun_s \
-                and now_s - self._begun_s > _INFO_S:
-            self._compare_by(StreamInfo({}, self.resolve_topic_name('sensor_info')))
-        if self._live is not None:
+        if self._info is None and self._begun_s and now_s - self._begun_s > _INFO_S:
+            self._compare_by(StreamInfo({}, self._info_topic))
+        if self._info is not None and not self._refusal:
             self._live.add_samples(stamps_ns, accel_mps2)
-            if self._streams.take_others(self._live):
+            if self._streams.take_others(self._live.reference):
                 self._referenced_s = now_s
-            self._advance(self._live)
+            self._advance()
         self._serve()
 
-    def _advance(self, live: LiveGap) -> None:
+    def _advance(self) -> None:
         """Compare, and put changes on disk before they are published."""
-        changes = live.advance()
+        changes = self._live.advance()
         for change in changes:
             self.get_logger().warning(
                 f'changed since {records.iso_time(change.since_ns)}: {change.text()}')
             try:
                 self._output.mkdir(parents=True, exist_ok=True)
-                records.append(self._output, change, live.sensor.serial)
+                records.append(self._output, change, self._live.sensor.serial)
             except (UserError, OSError) as error:
                 self.get_logger().error(f'{self._output}: the change is not on disk: {error}')
         if changes:
             # The waiting time of a diagnosis does not start again with a further change.
             self._changed_ns = self._changed_ns or min(change.since_ns for change in changes)
-            self._diagnostics.notice('gap', Level.WARN)
+            self._diagnostics.notice(Level.WARN)
 
-    def _diagnose_if_due(self, live: LiveGap) -> None:
+    def _diagnose_if_due(self) -> None:
         """Diagnose a change, or the first open gap, once there are enough samples."""
-        if not self._own.automatic or self._run is not None \
-                or time.monotonic() - self._diagnosed_s < _PAUSE_S \
-                or live.span_s(self._changed_ns or 0) < self._settings.wait_s:
-            return
-        if self._changed_ns or (self._result is None and any(g.is_open for g in live.report())):
-            begin_ns, self._changed_ns = self._changed_ns or 0, None
-            self._diagnosed_s = time.monotonic()
-            self._begin_diagnosis(live, begin_ns)
+        is_due = self._own.automatic and self._run is None \
+            and time.monotonic() - self._diagnosed_s >= _PAUSE_S \
+            and self._live.span_s(self._changed_ns) >= self._settings.wait_s
+        if is_due and (self._changed_ns or (self._result is None and any(
+                gap.is_open for gap in self._live.report()))):
+            self._begin_diagnosis(self._changed_ns)
+            self._changed_ns, self._diagnosed_s = 0, time.monotonic()
 
-    def _begin_diagnosis(self, live: LiveGap, begin_ns: int) -> None:
+    def _begin_diagnosis(self, begin_ns: int) -> None:
         """Begin a diagnosis of the samples since a stamp, ns."""
         name = datetime.now(UTC).strftime('diagnosis_%Y%m%dT%H%M%S_%fZ')
-        self._run = DiagnosisRun(self._output / name, live.diagnosis_input(begin_ns),
+        self._run = DiagnosisRun(self._output / name, self._live.diagnosis_input(begin_ns),
                                  'adxl_ros.tools.diagnose', self._own.budget_s)
 
     def _serve(self) -> None:
         """Take requests of ~/diagnose, and answer them when the diagnosis ends."""
         while (request := take_request(self._service, Trigger)) is not None:
             self._headers.append(request[1])
-            live = self._live
-            if self._run is None and live is not None and live.span_s() >= _SHORTEST_S:
-                self._begin_diagnosis(live, 0)
+            if self._run is None and self._live.span_s() >= _SHORTEST_S:
+                self._begin_diagnosis(0)
             elif self._run is None:
-                self._answer(DiagnosisResult(False, f'less than {_SHORTEST_S:g} s of samples; '
-                                             'ask again later'))
-        if self._run is None or self._run.result is None:
-            return
-        result, self._run = self._run.result, None
-        if result.is_done:
-            self._result = result
-        self.get_logger().info(f'diagnosis: {result.text}; {result.report}'.rstrip('; '))
-        self._answer(result)
+                self._answer(False, f'less than {_SHORTEST_S:g} s of samples; ask again later')
+        if self._run is not None and (result := self._run.result) is not None:
+            self._run = None
+            self._result = result if result.is_done else self._result
+            self.get_logger().info(f'diagnosis: {result.text}; {result.report}'.rstrip('; '))
+            report = f'; report: {result.report}' if result.report else ''
+            self._answer(result.is_done, result.text + report)
 
-    def _answer(self, result: DiagnosisResult) -> None:
+    def _answer(self, success: bool, text: str) -> None:
         """Answer all requests that wait."""
-        text = f'{result.text}; report: {result.report}' if result.report else result.text
         for header in self._headers:
-            self._service.send_response(Trigger.Response(success=result.is_done, message=text),
-                                        header)
+            self._service.send_response(Trigger.Response(success=success, message=text), header)
         self._headers.clear()
 
     def _obstacle(self) -> str:
         """Return why nothing is compared; empty where samples are."""
         now_s = time.monotonic()
-        if self._refusal or self._streams.fault():
-            return self._refusal or self._streams.fault()
+        if fault := self._refusal or self._streams.fault():
+            return fault
         if now_s - self._sampled_s > _SILENT_S:
             return self._silence('imu/data_raw')
-        if self._live is None:
+        if self._info is None:
             return 'waiting for sensor_info'
         if now_s - self._referenced_s > _SILENT_S:
             return f'{self._silence(self._reference_topic)}: no reference'
@@ -375,29 +323,23 @@ class Monitor(Node):
 
     def _state(self) -> GapState:
         """Return what is known now."""
-        live = self._live
-        sensor = live.sensor if live else self._file_sensor
-        return GapState(sensor.serial, (live.newest_ns or 0) if live else 0, self._obstacle(),
-                        live.report() if live else (), live.changes if live else (),
-                        self._result, self._settings.window_s)
+        return GapState(self._live, self._obstacle(), self._result, self._settings.window_s)
 
     def _publish(self) -> None:
         self._publisher.publish(self._state().message())
-        if self._live is not None:
-            self._diagnose_if_due(self._live)
+        if self._info is not None:
+            self._diagnose_if_due()
 
     def _status(self) -> Status:
         """Return the state for /diagnostics, with counts."""
         state = self._state()
-        values = state.values()
-        for gap in () if state.obstacle else state.axes:
-            values |= {f'{gap.axis}_{key}': value for key, value in axis_values(gap).items()}
-        if self._live is not None:
-            values |= vars(self._live.counts)
-        values |= {'false_alarms_per_day': self._settings.false_alarms_per_day,
-                   'diagnosis_runs': self._run is not None}
+        values = state.values | {
+            f'{axis}_{key}': value for axis, status in state.axes().items()
+            for key, value in status.values.items()}
+        values |= {**vars(self._live.counts), 'diagnosis_runs': self._run is not None,
+                   'false_alarms_per_day': self._settings.false_alarms_per_day}
         level = Level.ERROR if self._refusal or self._streams.fault() else state.level
-        return Status(level, state.text(), state.serial, values)
+        return Status(level, state.text, self._live.sensor.serial, values)
 
 
 def main() -> int:

@@ -4,12 +4,13 @@
 Parameters of nodes: each is described once, by a `Spec`.
 
 Descriptors, `--help`, launch arguments and the known names all come from it. `settings.py` has
-the parameters of each node, `links` those of each link, and a parameter file those of a sensor.
+the parameters of each node, `links` those of each link, and `sensor_specs` those of a sensor,
+which are those of its parameter file.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import field, fields
 from difflib import get_close_matches
 from itertools import pairwise
@@ -18,11 +19,14 @@ import re
 import sys
 from typing import Any, NamedTuple, TypeVar
 
-from adxl_ros.errors import UserError
-from adxl_ros.files.parameter_file import compose
+from adxl_ros.errors import one_line, UserError
+from adxl_ros.files import parameter_file
+from adxl_ros.model.effects import library
+from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes.rclpy_internals import given_parameters, store_empty
 import numpy as np
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces import msg
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -93,17 +97,16 @@ def declare_all(node: Node, settings: type[T]) -> T:
 def declare(node: Node, spec: Spec) -> Any:
     """Declare one parameter with its descriptor and return its value."""
     name, kind = spec.name, spec.kind
-    descriptor = ParameterDescriptor(
+    descriptor = msg.ParameterDescriptor(
         description=spec.meaning, read_only=not spec.live, dynamic_typing=spec.default == (),
         additional_constraints=spec.limits)
-    if spec.lower is not None and spec.upper is not None:
-        # ROS has no range for lists.
-        if kind == Kind.DOUBLE:
-            descriptor.floating_point_range = [FloatingPointRange(
-                from_value=float(spec.lower), to_value=float(spec.upper))]
-        elif kind == Kind.INTEGER:
-            descriptor.integer_range = [IntegerRange(
-                from_value=int(spec.lower), to_value=int(spec.upper))]
+    # ROS has no range for lists.
+    if spec.lower is not None and spec.upper is not None and kind == Kind.DOUBLE:
+        descriptor.floating_point_range = [msg.FloatingPointRange(
+            from_value=float(spec.lower), to_value=float(spec.upper))]
+    elif spec.lower is not None and spec.upper is not None and kind == Kind.INTEGER:
+        descriptor.integer_range = [msg.IntegerRange(
+            from_value=int(spec.lower), to_value=int(spec.upper))]
     try:
         value = node.declare_parameter(
             name, '' if spec.default == () else spec.default, descriptor).value
@@ -174,9 +177,8 @@ def _place_of(key: str) -> str:
             return 'parameters of the launch file: ' if _is_of_launch(value) else \
                 f'{value}:{marks[0].line + 1}:{marks[0].column + 1}: '
     files = [path for path in reversed(_paths()) if not _is_of_launch(path)]
-    return next((f'{path}: ' for path in files
-                 if any(name == 'format' for _, name, _ in _entries(path))),
-                f'{files[0]}: ' if files else '')
+    of_sensor = [path for path in files if any(name == 'format' for _, name, _ in _entries(path))]
+    return ''.join(f'{path}: ' for path in [*of_sensor, *files][:1])
 
 
 def _is_of_launch(path: str) -> bool:
@@ -204,7 +206,7 @@ def _entries(path: str) -> Iterator[tuple[str, str, yaml.Node]]:
                 yield from inside(value, section, '')
             else:
                 yield from inside(value, f'{section}/{name.value.strip("/")}', None)
-    return inside(compose(path), '', None)
+    return inside(parameter_file.compose(path), '', None)
 
 
 def check_params_files() -> None:
@@ -245,3 +247,109 @@ def _matches(pattern: str, node_name: str) -> bool:
     wild = {'*': r'/[^/]+', '**': r'(/[^/]+)*'}
     parts = [wild.get(part, f'/{re.escape(part)}') for part in pattern.strip('/').split('/')]
     return bool(re.fullmatch(''.join(parts), node_name))
+
+
+_FIELD_KINDS = {'np.ndarray': Kind.DOUBLE_ARRAY, 'float': Kind.DOUBLE, 'int': Kind.INTEGER,
+                'str': Kind.STRING}
+"""Parameter types by the annotations of `Sensor`'s fields."""
+_DATASHEET_KINDS = {'name': Kind.STRING, 'figures': Kind.STRING_ARRAY}
+"""Parameter types of `datasheet.*`; the others are arrays of numbers."""
+
+
+def declare_sensor(node: Node) -> dict[str, Any]:
+    """
+    Declare everything that a parameter file holds and return what is given.
+
+    Where `format` is given the parameters come from a parameter file, and `make_sensor` refuses
+    what the file lacks. Otherwise the installed nominal sensor gives the default values.
+    """
+    specs = sensor_specs() if is_from_file(node) else nominal_specs()
+    flat = {spec.name: declare(node, spec) for spec in specs}
+    return {name: value for name, value in flat.items() if value is not None}
+
+
+def nominal_specs() -> list[Spec]:
+    """Return the parameters of a sensor, with the values of the nominal one as defaults."""
+    nominal = parameter_file.to_flat(parameter_file.load(parameter_file.nominal_path()))
+    return [spec._replace(default=nominal.get(spec.name, spec.default)) for spec in sensor_specs()]
+
+
+def is_from_file(node: Node) -> bool:
+    """Return whether the given parameters are those of a parameter file, which has a format."""
+    return any(name == 'format' for name, _ in given_parameters(node))
+
+
+def sensor_keys() -> set[str]:
+    """Return the names of all parameters that `declare_sensor` declares."""
+    return {spec.name for spec in sensor_specs()}
+
+
+def sensor_specs() -> Iterator[Spec]:
+    """Yield the parameters of a parameter file."""
+    yield Spec('format', parameter_file.FORMAT, 'version of the parameter file')
+    yield Spec('units', parameter_file.UNITS, 'units of the coefficients')
+    for name, described in parameter_file.SENSOR_FIELDS.items():
+        about = described.metadata
+        yield Spec(name, _FIELD_KINDS[str(described.type)], about['doc'], about['unit'],
+                   about['lower'], about['upper'], about['choices'])
+    yield Spec('effects', Kind.STRING_ARRAY, 'effects that this unit has')
+    for effect in library().values():
+        for p in effect.parameters:
+            yield Spec(str(Coefficient(effect.name, p.name)),
+                       Kind.DOUBLE_ARRAY if p.axes else Kind.DOUBLE,
+                       f'{p.doc}, by axis' if p.axes else p.doc, p.unit, p.lower, p.upper,
+                       empty=p.neutral)
+    yield Spec('covariance_names', Kind.STRING_ARRAY, 'coefficients in the covariance')
+    yield Spec('covariance', Kind.DOUBLE_ARRAY, 'covariance of the coefficients, rows flattened')
+    for name, description in parameter_file.ENVELOPE.items():
+        kind = Kind.DOUBLE_ARRAY if name in parameter_file.ENVELOPE_LISTS else Kind.DOUBLE
+        yield Spec(f'envelope.{name}', kind, description)
+    for name, description in parameter_file.DATASHEET.items():
+        yield Spec(f'datasheet.{name}', _DATASHEET_KINDS.get(name, Kind.DOUBLE_ARRAY), description)
+
+
+def make_sensor(flat: Mapping[str, Any], may_measure: bool = False) -> Sensor:
+    """Check the parameters of a sensor and make it; effects that are not listed do not count."""
+    used = dict(flat)
+    for effect in library().values():
+        if effect.name not in flat.get('effects', []):
+            for p in effect.parameters:
+                used.pop(str(Coefficient(effect.name, p.name)), None)
+    return parameter_file.from_flat(used, parameter_error, may_measure)
+
+
+def anonymous_sensor(node: Node, flat: Mapping[str, Any]) -> Sensor:
+    """Return the sensor of a stream that states nothing of itself."""
+    if is_from_file(node):
+        return make_sensor(flat, may_measure=True)
+    any_imu = parameter_file.load(parameter_file.any_imu_path(), may_measure=True)
+    given = {name: flat[name] for name, _ in given_parameters(node) if name in flat}
+    return make_sensor(parameter_file.to_flat(any_imu) | given, may_measure=True)
+
+
+def given_sensor(node: Node) -> dict[str, Any]:
+    """Declare what a parameter file holds; return what is given, its provenance among it."""
+    # The keys of a provenance are free, so that they cannot be declared.
+    return declare_sensor(node) | {name: str(value) for name, value in given_parameters(node)
+                                   if name.startswith('provenance.')}
+
+
+def on_change(node: Node, name: str, prepare: Callable[[Any], T], use: Callable[[T], None]
+              ) -> None:
+    """Prepare and use what is set while the node runs; an error of `prepare` refuses it."""
+    prepared: list[T] = []
+
+    def check(changed: Sequence[Parameter]) -> msg.SetParametersResult:
+        prepared.clear()
+        try:
+            prepared.extend(prepare(p.value) for p in changed if p.name == name)
+        except UserError as error:
+            return msg.SetParametersResult(successful=False, reason=one_line(error))
+        return msg.SetParametersResult(successful=True)
+
+    def apply(_: Sequence[Parameter]) -> None:
+        while prepared:
+            use(prepared.pop())
+
+    node.add_on_set_parameters_callback(check)
+    node.add_post_set_parameters_callback(apply)

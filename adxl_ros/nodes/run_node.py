@@ -1,30 +1,198 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""One node as an executable, and the processes of a job that runs several."""
+"""
+One node as an executable: its start and end, its errors, and its help text.
+
+The help text states parameters by their description, and topics and services of a node that is
+made, but not run. It does not discover other nodes, so that no graph sees it.
+"""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from itertools import chain
 import os
 from pathlib import Path
-import shutil
+import re
 import signal
-import subprocess
 import sys
-from tempfile import TemporaryFile
-from typing import Any, Protocol, runtime_checkable
+import textwrap
+from typing import Any, NamedTuple
 
 from adxl_ros.closed_output import ended_by_closed_output
 from adxl_ros.errors import UserError
+from adxl_ros.links.support import base
 from adxl_ros.nodes import rclpy_internals
-from adxl_ros.nodes.node_help import NodeHelp, print_if_asked
-from adxl_ros.nodes.parameters import check_params_files
+from adxl_ros.nodes.parameters import check_params_files, Kind, nominal_specs, Spec, specs_of
+from adxl_ros.nodes.settings import DriverSettings, link_specs
+from adxl_ros.nodes.topics import type_name
+from adxl_ros.package_version import package_version
 import rclpy
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
+
+_COLUMNS = 79
+"""Columns of a terminal that the text uses."""
+_QUIET = ('--ros-args', '--log-level', 'fatal', '--disable-rosout-logs',
+          '--disable-external-lib-logs')
+"""Arguments of a node that logs nothing."""
+_ANY_TOPIC = ('/parameter_events', '/rosout')
+"""Topics that every node has."""
+_LISTED_OF_SENSOR = ('sensor.', 'stage.')
+"""Begins of the names of those parameters of a file that are listed one by one."""
+_TYPES = {Kind.DOUBLE: 'float', Kind.INTEGER: 'int', Kind.STRING: 'text', Kind.BOOL: 'bool',
+          Kind.DOUBLE_ARRAY: 'floats', Kind.STRING_ARRAY: 'texts'}
+"""Words for the types of parameters."""
+
+
+class NodeHelp(NamedTuple):
+    """What the help text of a node has beside its topics."""
+
+    description: str | None  # Purpose of the node
+    examples: Mapping[str, str]  # Arguments of each example, by its purpose
+    settings: Sequence[type] = ()  # Dataclasses of its parameters
+    has_sensor: bool = True  # Whether it has those of a sensor, too
+    variants: Mapping[str, type] = {}  # Dataclasses of further parameters, by what needs them
+
+
+def print_if_asked(arguments: Sequence[str], make_node: Callable[[], Node], node_help: NodeHelp
+                   ) -> bool:
+    """Print version or help where the command line has that option."""
+    if '--version' in arguments:
+        print(f'adxl_ros {package_version()}')
+        return True
+    if {'-h', '--help'} & set(arguments):
+        name = os.path.basename(sys.argv[0])
+        print('\n'.join(_help_lines(name, make_node, node_help)))
+        return True
+    return False
+
+
+def program_parser(name: str, description: str | None, examples: Mapping[str, str]
+                   ) -> argparse.ArgumentParser:
+    """Make the parser of a program that starts nodes, with `--version` and examples."""
+    parser = argparse.ArgumentParser(
+        prog=name, description='\n'.join(_wrapped(_purpose(description))),
+        epilog='\n'.join(_example_lines(name, examples)[1:]),
+        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--version', action='version', version=f'adxl_ros {package_version()}')
+    return parser
+
+
+def _purpose(description: str | None) -> str:
+    """Return a docstring as one line."""
+    return ' '.join((description or '').split())
+
+
+def _help_lines(name: str, make_node: Callable[[], Node], node_help: NodeHelp) -> list[str]:
+    """Lay out the help text."""
+    own = list(chain.from_iterable(map(specs_of, node_help.settings)))
+    lines = [f'usage: {name} [--help] [--version] [--ros-args -p NAME:=VALUE ...',
+             f'{"":{len(name) + 8}}--params-file FILE -r FROM:=TO ...]', '',
+             *_wrapped(_purpose(node_help.description)), '',
+             'parameters: type, default, meaning', *_spec_lines(own)]
+    variants = {title: specs_of(part) for title, part in node_help.variants.items()}
+    if DriverSettings in node_help.settings:
+        variants |= {f'link.type:={link}': link_specs(link) for link in base.link_names()}
+    for title, specs in variants.items():
+        lines += ['', f'with {title}', *_spec_lines(specs)]
+    if node_help.has_sensor:
+        of_file = nominal_specs()
+        listed = [spec for spec in of_file if spec.name.startswith(_LISTED_OF_SENSOR)]
+        lines += ['', 'parameters of the sensor, usually from --params-file', *_spec_lines(listed),
+                  *_wrapped(
+                      f'and {len(of_file) - len(listed)} others of a parameter file: effects, '
+                      'their coefficients with covariance, and the datasheet; "ros2 param '
+                      f'describe /{name} NAME" shows each', 2)]
+    try:
+        topics = _topics(make_node)
+    except UserError as error:
+        lines += ['', *_wrapped(f'The topics can not be listed here: {error}')]
+        topics = {}
+    for direction, names in topics.items():
+        if names:
+            lines += ['', direction, *(f'  {topic:28} {kind}' for topic, kind in names.items())]
+    return lines + _example_lines(name, node_help.examples)
+
+
+def _topics(make_node: Callable[[], Node]) -> dict[str, dict[str, str]]:
+    """Make a node that no other one discovers; return types by topic or service, by direction."""
+    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
+    # A node in a terminal would open its screen.
+    os.dup2(os.open(os.devnull, os.O_RDONLY), sys.stdin.fileno())
+    rclpy.init(args=list(_QUIET))
+    node = make_node()
+    try:
+        return {'publishes': _typed(node.publishers), 'subscribes': _typed(node.subscriptions),
+                'services': {service.srv_name: type_name(service.srv_type)
+                             for service in node.services if service.srv_name.startswith('~/')}}
+    finally:
+        _close(node)
+        node.destroy_node()
+        rclpy.shutdown()
+
+
+def _close(node: Node) -> None:
+    """Close what a node holds open."""
+    if hasattr(node, 'close'):
+        node.close()
+
+
+def _typed(endpoints: Iterable[Any]) -> dict[str, str]:
+    """Return the types of topics by name, without those of every node."""
+    return {endpoint.topic_name.removeprefix('/'): type_name(endpoint.msg_type)
+            for endpoint in endpoints if endpoint.topic_name not in _ANY_TOPIC}
+
+
+def _example_lines(name: str, examples: Mapping[str, str]) -> list[str]:
+    """Lay out the examples."""
+    lines = ['', 'examples:']
+    for purpose, arguments in examples.items():
+        lines += [f'  {purpose}:', *command_lines(f'{name} {arguments}'.rstrip(), 4, 8)]
+    return lines
+
+
+def command_lines(arguments: str, indent: int, further: int) -> list[str]:
+    """Lay out a command of this package; a backslash joins the lines of a long one."""
+    *first, last = _wrapped(f'ros2 run adxl_ros {arguments}', indent, further, 2)
+    return [*(f'{line} \\' for line in first), last]
+
+
+def _wrapped(text: str, indent: int = 0, further: int | None = None, reserve: int = 0
+             ) -> list[str]:
+    """Wrap a text between words, all lines or further ones with an indent."""
+    return textwrap.wrap(text, _COLUMNS - reserve, initial_indent=indent * ' ',
+                         subsequent_indent=(indent if further is None else further) * ' ',
+                         break_long_words=False, break_on_hyphens=False)
+
+
+def _spec_lines(specs: Iterable[Spec]) -> list[str]:
+    """Lay out parameters: for each a line with type and default, and its meaning below."""
+    lines = []
+    for spec in sorted(specs):
+        kind = 'texts' if spec.default == () and not spec.unit else \
+            'floats' if spec.default == () else _TYPES[spec.kind]
+        default = '' if isinstance(spec.default, Kind) else _value_text(spec.default)
+        limits = f' ({spec.limits})' if spec.limits else ''
+        lines += [f'  {spec.name}  {kind}' + (f', {default}' if default else ''),
+                  *_wrapped(spec.meaning + limits, 6)]
+    return lines
+
+
+def _value_text(value: Any) -> str:
+    """Return a default as it is written on the command line; empty without one."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        return f'{value:.6g}'
+    if isinstance(value, str | int):
+        return re.sub(f'^{re.escape(os.path.expanduser("~"))}', '~', str(value))
+    items = [_value_text(item) for item in value]
+    return f'[{", ".join(items)}]' if items else ''
+
 
 _SWITCH_S = 0.0005
 """Time after which a thread of Python gives way to one that waits, s. Chosen: a sample that comes
@@ -35,14 +203,6 @@ _SLACK_NS = '1000'
 """Largest such delay, ns; chosen: far below the period of samples. The default is 50 µs."""
 _USAGE = '%(prog)s [--ros-args -p NAME:=VALUE ... --params-file FILE -r FROM:=TO ...]'
 """Usage that follows an unknown argument."""
-
-
-@runtime_checkable
-class Closable(Protocol):
-    """A node that holds something open."""
-
-    def close(self) -> None:
-        """Close it."""
 
 
 @ended_by_closed_output()
@@ -79,8 +239,7 @@ def run(make_node: Callable[[], Node], node_help: NodeHelp,
     try:
         _spin(node, work)
     finally:
-        if isinstance(node, Closable):
-            node.close()
+        _close(node)
         rclpy.try_shutdown()
         # A launch passes Ctrl-C on, although the terminal has sent it too. The second signal may
         # come after Python has removed its handlers.
@@ -107,81 +266,3 @@ def _spin(node: Node, work: Callable[[Any, Executor], None]) -> None:
         # After the signal nothing can be published: a failure then belongs to the end.
         if rclpy.ok():
             raise
-
-
-_KILL_S = 10.0
-"""Longest time that a process may take to end, s; chosen: a node ends within 1 s."""
-_FIRST_DOMAIN = 60
-"""First ROS domain of jobs; chosen: beyond those that robots use."""
-_DOMAINS = 40
-"""Number of ROS domains of jobs; chosen: the last one is below 101, the last safe one."""
-_USER_TIME = 11
-"""Place of the user time in /proc/PID/stat, from 0, behind the command's name (man 5 proc)."""
-_SYSTEM_TIME = 12
-"""Place of the system time, counted in the same way."""
-
-
-def use_own_graph() -> None:
-    """Give this job a ROS graph of its own on this machine, so that it cannot move a robot."""
-    os.environ.setdefault('ROS_DOMAIN_ID', str(_FIRST_DOMAIN + os.getpid() % _DOMAINS))
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-
-
-def executable(name: str) -> str:
-    """Return the path of an executable, which stands beside the running one."""
-    return str(Path(sys.argv[0]).with_name(name))
-
-
-@contextmanager
-def running(commands: Sequence[Sequence[str]]) -> Iterator[list[subprocess.Popen]]:
-    """Yield the processes of commands, without their error output, and stop them at the end."""
-    processes = [subprocess.Popen(command, stderr=subprocess.DEVNULL) for command in commands]
-    try:
-        yield processes
-    finally:
-        stop(processes)
-
-
-def stop(processes: Sequence[subprocess.Popen]) -> None:
-    """Interrupt processes, and kill those that do not end within 10 s."""
-    for process in processes:
-        process.send_signal(signal.SIGINT)
-    for process in processes:
-        try:
-            process.wait(_KILL_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-
-
-def cpu_time_s(pid: int) -> float:
-    """Return the time that a process has spent on a core so far, s."""
-    fields = Path(f'/proc/{pid}/stat').read_text().rsplit(')', 1)[1].split()
-    return (int(fields[_USER_TIME]) + int(fields[_SYSTEM_TIME])) / os.sysconf('SC_CLK_TCK')
-
-
-@contextmanager
-def held_output() -> Iterator[None]:
-    """Keep what this process prints, and print it at the end: lines would tear the screen."""
-    _flush()
-    with TemporaryFile() as file:
-        originals = {stream: os.dup(stream) for stream in (1, 2)}
-        for stream in originals:
-            os.dup2(file.fileno(), stream)
-        try:
-            yield
-        finally:
-            _flush()
-            for stream, original in originals.items():
-                os.dup2(original, stream)
-                os.close(original)
-            file.seek(0)
-            with suppress(OSError):
-                shutil.copyfileobj(file, sys.stderr.buffer)
-            _flush()
-
-
-def _flush() -> None:
-    for stream in (sys.stdout, sys.stderr):
-        # A terminal that has hung up takes nothing.
-        with suppress(OSError):
-            stream.flush()

@@ -4,10 +4,10 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable, Mapping
-import struct
-from typing import Any, NamedTuple
+import math
+from typing import Any
 
 from adxl_ros.files import cdr
 from adxl_ros.files.recording_columns import JOINTS
@@ -17,12 +17,11 @@ from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.nodes.topics import create_publisher, Level, stamp, Status, status_message
+from adxl_ros.nodes import topics
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.clock import Clock as StampClock
 from rclpy.node import Node
-from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
 
@@ -49,17 +48,6 @@ class SampleAges:
         return {'age_p50_ms': round(float(p50_ms), 3), 'age_p99_ms': round(float(p99_ms), 3)}
 
 
-class _Totals(NamedTuple):
-    """Times and counts at one report; the next report is about the differences."""
-
-    steady_ns: int
-    sensor_ns: int
-    samples: int
-    missing: int
-    estimated: int
-    saturated: int
-
-
 class Tally:
     """
     Counts samples, and what went wrong with them, between two reports.
@@ -72,46 +60,45 @@ class Tally:
     def __init__(self, steady_ns: int) -> None:
         # Sensor time up to which samples have been read, ns; None before the first one
         self.now_ns: int | None = None
-        self.samples = self.missing = self.estimated = self.saturated = 0
+        self.counts: Counter[str] = Counter()  # By the names above
         self.ages = SampleAges()  # Ages of the samples on publication
         self._newest_ns: int | None = None
-        self._reported = _Totals(steady_ns, 0, 0, 0, 0, 0)
+        # Times and counts at the last report
+        self._reported = Counter(steady_ns=steady_ns)
 
     def begin(self, now_ns: int) -> None:
         """Let the next report count sensor time from `now_ns`, ns."""
-        self._reported = self._reported._replace(sensor_ns=now_ns)
+        self._reported['sensor_ns'] = now_ns
 
-    def count(self, stamps_ns: np.ndarray, saturated: int, missing: int, estimated: int) -> None:
+    def count(self, stamps_ns: np.ndarray, **counts: int) -> None:
         """
         Add samples.
 
-        stamps_ns: stamps of the published ones, ns, (n,).
+        stamps_ns: stamps of the published ones, ns, (n,); counts: numbers of others by name.
         """
-        self.samples += len(stamps_ns)
-        self.saturated += saturated
-        self.missing += missing
-        self.estimated += estimated
+        self.counts.update(samples=len(stamps_ns), **counts)
         if len(stamps_ns):
             self._newest_ns = int(stamps_ns[-1])
 
     def report(self, steady_ns: int, sensor_ns: int) -> tuple[dict[str, Any], str]:
         """Report what has been counted since the last report."""
-        totals = _Totals(steady_ns, sensor_ns, self.samples, self.missing, self.estimated,
-                         self.saturated)
-        new = _Totals(*(now - before for now, before in zip(totals, self._reported)))
+        totals = Counter({**self.counts, 'steady_ns': steady_ns, 'sensor_ns': sensor_ns})
+        new = totals.copy()
+        new.subtract(self._reported)
         self._reported = totals
-        values = {'rate_hz': round(new.samples / new.sensor_ns * 1e9, 3)
-                  if new.sensor_ns > 0 else 0.0,
-                  'missing': self.missing, 'missing_estimated': self.estimated,
-                  'saturated': self.saturated, 'samples': self.samples,
-                  'speed': round(new.sensor_ns / new.steady_ns, 3) if new.steady_ns > 0 else 0.0}
+        elapsed_ns, counts = new['sensor_ns'], self.counts
+        values: dict[str, Any] = {
+            name: counts[name] for name in ('missing', 'saturated', 'samples')}
+        values |= {'missing_estimated': counts['estimated'], 'rate_hz': 0.0, 'speed': 0.0}
+        if elapsed_ns > 0:
+            values |= {'rate_hz': round(new['samples'] / elapsed_ns * 1e9, 3),
+                       'speed': round(elapsed_ns / new['steady_ns'], 3)}
         if self._newest_ns is not None:
             values['age_s'] = round((sensor_ns - self._newest_ns) * 1e-9, 6)
-        values |= self.ages.report()
-        estimated = f', {new.estimated} of them estimated' if new.estimated else ''
-        warnings = [f'{new.missing} samples missing{estimated}'] if new.missing else []
-        warnings += [f'{new.saturated} samples saturated'] if new.saturated else []
-        return values, ', '.join(warnings)
+        estimated = f', {new["estimated"]} of them estimated' if new['estimated'] else ''
+        return values | self.ages.report(), ', '.join(
+            f'{new[name]} samples {name}{estimated * (name == "missing")}'
+            for name in ('missing', 'saturated') if new[name])
 
 
 _REFERENCE_QUEUE = 1000
@@ -122,10 +109,10 @@ controller sends."""
 _SCALAR_PERIOD_NS = 1_000_000_000
 """Longest time between two messages with the same temperature or supply, ns; chosen."""
 
-_JOINTS = 'stage'
-"""Key of the publisher of the stage angles, which have several columns."""
-_SCALARS = {'temperature_c': (Temperature, 'temperature'), 'supply_v': (BatteryState, 'supply')}
-"""Message type and topic of what has one value a sample, by the column of a recording."""
+_STAGE = 'stage/joint_states'
+"""Topic of the stage angles, which have several columns."""
+_SCALARS = {'temperature': ('temperature_c', Temperature), 'supply': ('supply_v', BatteryState)}
+"""Column of a recording and message type of what has one value a sample, by topic."""
 
 
 class References:
@@ -133,15 +120,16 @@ class References:
 
     def __init__(self, node: Node, frame_id: str, columns: tuple[str, ...]) -> None:
         self._node, self._frame_id = node, frame_id
-        self._published: dict[str, tuple[int, np.ndarray]] = {}
         self._joints = {column: joint for joint, column in JOINTS.items() if column in columns}
-        self._publishers = {}
-        if self._joints:
-            self._publishers[_JOINTS] = create_publisher(
-                node, JointState, 'stage/joint_states', _REFERENCE_QUEUE)
-        for column, (kind, topic) in _SCALARS.items():
-            if column in columns:
-                self._publishers[column] = create_publisher(node, kind, topic, _REFERENCE_QUEUE)
+        # Columns by topic
+        self._columns = {_STAGE: [*self._joints]} if self._joints else {}
+        self._columns |= {topic: [column] for topic, (column, _) in _SCALARS.items()
+                          if column in columns}
+        self._published = {topic: (-1, np.full(len(of_topic), np.inf))
+                           for topic, of_topic in self._columns.items()}
+        self._publishers = {topic: topics.create_publisher(
+            node, JointState if topic == _STAGE else _SCALARS[topic][1], topic, _REFERENCE_QUEUE)
+            for topic in self._columns}
 
     def destroy(self) -> None:
         """Remove the topics."""
@@ -156,41 +144,34 @@ class References:
         """
         if not len(stamps_ns):
             return
-        for name, publisher in self._publishers.items():
-            if name == _JOINTS:
-                values = np.column_stack([columns[column] for column in self._joints])
-                for i in self._new_rows(name, stamps_ns, values, _STAGE_PERIOD_NS):
-                    publisher.publish(self._joint_state(stamps_ns[i], values[i]))
-            else:
-                values = columns[name][:, None]
-                for i in self._new_rows(name, stamps_ns, values, _SCALAR_PERIOD_NS):
-                    publisher.publish(self._scalar(name, stamps_ns[i], float(values[i, 0])))
+        for topic, publisher in self._publishers.items():
+            values = np.column_stack([columns[column] for column in self._columns[topic]])
+            for i in self._new_rows(topic, stamps_ns, values):
+                message = self._message(topic, values[i].tolist())
+                message.header.stamp = topics.stamp(stamps_ns[i])
+                publisher.publish(message)
 
-    def _new_rows(self, name: str, stamps_ns: np.ndarray, values: np.ndarray, period_ns: int
-                  ) -> np.ndarray:
+    def _new_rows(self, topic: str, stamps_ns: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return the rows of values, (n, k), that differ from the row before or begin a period."""
         rows = np.flatnonzero(np.isfinite(values).any(axis=1))
         if not len(rows):
             return rows
+        period_ns = _STAGE_PERIOD_NS if topic == _STAGE else _SCALAR_PERIOD_NS
         values, period = values[rows], stamps_ns[rows] // period_ns
-        last_period, last = self._published.get(name, (-1, np.full(values.shape[1], np.inf)))
+        last_period, last = self._published[topic]
         changed = (np.diff(values, axis=0, prepend=last[None]) != 0).any(axis=1)
-        self._published[name] = int(period[-1]), values[-1]
+        self._published[topic] = int(period[-1]), values[-1]
         return rows[changed | (np.diff(period, prepend=last_period) != 0)]
 
-    def _joint_state(self, stamp_ns: int, values: np.ndarray) -> JointState:
-        """Make the message of the joints that have a value, rad or m, (k,)."""
-        angles = {joint: float(value) for joint, value in zip(self._joints.values(), values)
-                  if np.isfinite(value)}
-        message = JointState(name=list(angles), position=list(angles.values()))
-        message.header.stamp = stamp(stamp_ns)
-        return message
-
-    def _scalar(self, name: str, stamp_ns: int, value: float) -> Temperature | BatteryState:
-        """Make the message of a temperature, °C, or supply, V, by the column of a recording."""
-        message = Temperature(temperature=value) if name == 'temperature_c' else \
-            BatteryState(voltage=value, present=True)
-        message.header.stamp, message.header.frame_id = stamp(stamp_ns), self._frame_id
+    def _message(self, topic: str, values: list[float]) -> Any:
+        """Make the message of the joints that have a value, or of a temperature or supply."""
+        if topic == _STAGE:
+            angles = {joint: value for joint, value in zip(self._joints.values(), values)
+                      if math.isfinite(value)}
+            return JointState(name=list(angles), position=list(angles.values()))
+        message = Temperature(temperature=values[0]) if topic == 'temperature' else \
+            BatteryState(voltage=values[0], present=True)
+        message.header.frame_id = self._frame_id
         return message
 
 
@@ -200,47 +181,10 @@ _UNKNOWN_NODE = '_NODE_NAME_UNKNOWN_'
 """Name that the middleware gives a node that it has not discovered yet (rmw_dds_common)."""
 
 
-class ImuWriter:
-    """
-    Makes serialized messages, by replacing numbers in the bytes of a template.
-
-    A sample is one of two or few that have just come, after a pause of the processor. Calls of
-    numpy are slow then: these messages would take twice the time.
-    """
-
-    def __init__(self, sensor: Sensor, frame_id: str) -> None:
-        self._sensor = sensor
-        self._template = serialize_message(imu_message(sensor, frame_id))
-        layout = cdr.imu(self._template)
-        self._stamp = struct.Struct(f'{layout.order}iI')
-        self._stamp_offset = layout.fields['sec'].offset
-        counts = {name: field.count for name, field in layout.fields.items()
-                  if field.code == 'f8'} | {'linear_acceleration': len(sensor.axes)}
-        self._fields = {name: (struct.Struct(f'{layout.order}{count}d'),
-                               layout.fields[name].offset) for name, count in counts.items()}
-
-    def messages(self, stamp_ns: np.ndarray, volts: np.ndarray,
-                 imu_fields: Mapping[str, np.ndarray]) -> list[bytes]:
-        """
-        Serialize samples.
-
-        stamp_ns: stamps, ns, (n,); volts: output by axis, V, (n, m); imu_fields: further fields of
-        the messages by name, (n, k) each.
-        """
-        values = {**imu_fields, 'linear_acceleration': to_nominal_mps2(volts, self._sensor)}
-        columns = [(*self._fields[name], rows.tolist()) for name, rows in values.items()]
-        messages = []
-        for i, time_ns in enumerate(stamp_ns.tolist()):
-            message = bytearray(self._template)
-            self._stamp.pack_into(message, self._stamp_offset, *divmod(time_ns, 10 ** 9))
-            for packer, offset, rows in columns:
-                packer.pack_into(message, offset, *rows[i])
-            messages.append(bytes(message))
-        return messages
-
-    def saturated(self, volts: np.ndarray) -> np.ndarray:
-        """Return which samples, V, (n, m), are at a rail of the ADC or beyond the range, (n,)."""
-        return np.asarray(self._sensor.saturated(volts).any(axis=1))
+def imu_writer(sensor: Sensor, frame_id: str) -> topics.MessageWriter:
+    """Return what writes the measured axes of samples, and further fields."""
+    return topics.MessageWriter(imu_message(sensor, frame_id), cdr.imu,
+                                linear_acceleration=len(sensor.axes))
 
 
 def imu_message(sensor: Sensor, frame_id: str) -> Imu:
@@ -268,10 +212,11 @@ class SampleOutput:
         self._node, self._delay_ns, self._stamp_clock = node, delay_ns, clock
         self.sensor, self.frame_id, self.is_clock, self.tally = sensor, frame_id, is_clock, tally
         self._follows_frame = not frame_id
-        self._writer = ImuWriter(sensor, frame_id)
-        self._data = create_publisher(node, Imu, 'imu/data_raw', _QUEUE)
-        self._info = create_publisher(node, DiagnosticStatus, 'sensor_info', 1, latched=True)
-        self._clock = create_publisher(node, Clock, '/clock', 1) if is_clock else None
+        self._writer = imu_writer(sensor, frame_id)
+        self._data = topics.create_publisher(node, Imu, 'imu/data_raw', _QUEUE)
+        self._info = topics.create_publisher(node, DiagnosticStatus, 'sensor_info', 1,
+                                             latched=True)
+        self._clock = topics.create_publisher(node, Clock, '/clock', 1) if is_clock else None
 
     def destroy(self) -> None:
         """Remove the topics."""
@@ -282,13 +227,13 @@ class SampleOutput:
         """Stop being the clock if another node is; the one that sorts first stays."""
         if self._clock is None:
             return ''
-        own_name = self._node.get_fully_qualified_name()
+        own = self._node.get_fully_qualified_name()
         # A publisher may be discovered before the name of its node; the next search has it.
-        names = [f'{info.node_namespace.rstrip("/")}/{info.node_name}'
-                 for info in self._node.get_publishers_info_by_topic(self._clock.topic_name)
-                 if info.node_name != _UNKNOWN_NODE]
-        others = [name for name in names if name != own_name
-                  and (name.split('/')[-1] != self._node.get_name() or name < own_name)]
+        others = [name for name in (
+            f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in
+            self._node.get_publishers_info_by_topic(self._clock.topic_name)
+            if info.node_name != _UNKNOWN_NODE) if name != own
+            and (name.split('/')[-1] != self._node.get_name() or name < own)]
         if not others:
             return ''
         self._node.destroy_publisher(self._clock)
@@ -298,15 +243,15 @@ class SampleOutput:
     def use(self, sensor: Sensor) -> None:
         """Convert samples by the nominal values of a sensor, and publish these."""
         self.sensor = sensor
-        self._writer = ImuWriter(sensor, self.frame_id)
-        self._info.publish(status_message('sensor_info', Status(
-            Level.OK, '', sensor.serial, sensor_info(sensor))))
+        self._writer = imu_writer(sensor, self.frame_id)
+        self._info.publish(topics.status_message('sensor_info', topics.Status(
+            topics.Level.OK, '', sensor.serial, sensor_info(sensor))))
 
     def follow_frame(self, frame_id: str) -> None:
         """Publish in the frame of a simulator's samples, unless a frame was given."""
         if self._follows_frame and frame_id != self.frame_id:
             self.frame_id = frame_id
-            self._writer = ImuWriter(self.sensor, frame_id)
+            self._writer = imu_writer(self.sensor, frame_id)
 
     def subscribed(self) -> bool:
         """Return whether the samples have a subscriber."""
@@ -316,14 +261,17 @@ class SampleOutput:
         """Publish samples and what was recorded beside them."""
         finite = samples.finite()
         published_ns = finite.stamp_ns - self._delay_ns
-        for message in self._writer.messages(published_ns, finite.volts, finite.imu_fields):
+        fields = {**finite.imu_fields,
+                  'linear_acceleration': to_nominal_mps2(finite.volts, self.sensor)}
+        for message in self._writer.messages(published_ns, **fields):
             self._data.publish(message)
         # The age of a sample is the time until here: all that can wait comes after it.
         now_ns = samples.until_ns if self.is_clock else self._stamp_clock.now().nanoseconds
         references.publish(samples.stamp_ns, samples.references)
         self.tally.ages.add(((now_ns - published_ns) * 1e-9).tolist())
-        self.tally.count(finite.stamp_ns, int(self._writer.saturated(finite.volts).sum()),
-                         finite.missing, finite.estimated)
+        self.tally.count(
+            finite.stamp_ns, missing=finite.missing, estimated=finite.estimated,
+            saturated=int(self.sensor.saturated(finite.volts).any(axis=1).sum()))
         self.tally.now_ns = samples.until_ns
         if self._clock is not None:
-            self._clock.publish(Clock(clock=stamp(samples.until_ns)))
+            self._clock.publish(Clock(clock=topics.stamp(samples.until_ns)))

@@ -18,16 +18,15 @@ from typing import TextIO, TYPE_CHECKING
 from adxl_ros.calibrate.guided.screen_contents import ScreenContents
 from adxl_ros.errors import UserError
 from adxl_ros.nodes.draw import draw, Line, LogLine
-from adxl_ros.nodes.node_help import NodeHelp
+from adxl_ros.nodes.jobs import held_output
 from adxl_ros.nodes.parameters import declare_all
-from adxl_ros.nodes.run_node import held_output, run
+from adxl_ros.nodes.run_node import NodeHelp, run
 from adxl_ros.nodes.settings import ScreenSettings
 from adxl_ros.nodes.topics import create_subscription
 from rcl_interfaces.msg import Log
 import rclpy
 from rclpy.executors import Executor
 from rclpy.node import Node
-from rclpy.task import Future
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -116,7 +115,9 @@ class Screen(Node):
         self._contents, self._received_s = ScreenContents('info', ''), 0.0
         self._log: deque[LogLine] = deque(maxlen=_MESSAGES)
         self._finish_is_confirmed = False
-        self._application = full_screen(self._lines, self._press, self._leave)
+        self._application = full_screen(
+            lambda columns, rows: draw(self._shown(), self._log, columns, rows), self._press,
+            self._leave)
         create_subscription(self, String, f'{name}/display', self._on_display, 1, latched=True)
         create_subscription(self, Log, '/rosout', self._on_log, _QUEUE, latched=True)
         self._keyed = {service: self.create_client(Trigger, f'{name}/{service}')
@@ -154,13 +155,11 @@ class Screen(Node):
             if self._application.is_running and not self._application.is_done:
                 self._application.exit()
 
-    def _lines(self, columns: int, rows: int) -> list[Line]:
-        return draw(self._shown(), self._log, columns, rows)
-
     def _shown(self) -> ScreenContents:
         """Return the newest contents, or what the screen waits for."""
         if self._is_fresh():
             return self._contents
+        text = f'waiting for {self._target}; is it running in this ROS domain?'
         if self._received_s and self._is_there():
             silent_s = time.monotonic() - self._received_s
             text = f'nothing from {self._target} for {silent_s:.0f} s; waiting for it'
@@ -168,8 +167,6 @@ class Screen(Node):
             text = f'{self._target} has ended; waiting until it is started again'
         elif self._node_pid:
             text = 'starting'
-        else:
-            text = f'waiting for {self._target}; is it running in this ROS domain?'
         return replace(self._contents, phase='silent', text=text, keys=())
 
     def _is_fresh(self) -> bool:
@@ -194,7 +191,7 @@ class Screen(Node):
         self._finish_is_confirmed = False
         if service is not None:
             answer = self._keyed[service].call_async(Trigger.Request())
-            answer.add_done_callback(self._on_answer)
+            answer.add_done_callback(lambda future: self._say(future.result().message))
 
     def _leave(self) -> None:
         """End the node, too, if it has started this screen."""
@@ -211,11 +208,7 @@ class Screen(Node):
 
     def _on_log(self, message: Log) -> None:
         if message.name == self._target.strip('/').replace('/', '.'):
-            style = _STYLES.get(message.level)
-            self._log.append(LogLine(message.msg, style) if style else LogLine(message.msg))
-
-    def _on_answer(self, future: Future) -> None:
-        self._say(future.result().message)
+            self._log.append(LogLine(message.msg, _STYLES.get(message.level, LogLine('').style)))
 
     def _say(self, text: str) -> None:
         """Show a line unless the log shows it."""

@@ -4,33 +4,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from itertools import chain
-from typing import Any, NamedTuple
+from typing import Any
 
 from adxl_ros.compensate.filter_inversion import HALF
 from adxl_ros.files import calibration_store
 from adxl_ros.files.parameter_file import SENSOR_FIELDS
 from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.links.support import base
-from adxl_ros.nodes.parameters import (
-    declare,
-    declare_all,
-    Kind,
-    nearest,
-    parameter,
-    parameter_error,
-    refuse_files_of_others,
-    Spec,
-    specs_of,
-)
+from adxl_ros.nodes import parameters
+from adxl_ros.nodes.parameters import declare, Kind, nearest, parameter, parameter_error, Spec
 from adxl_ros.nodes.rclpy_internals import given_parameters
-from adxl_ros.nodes.sensor_parameters import sensor_keys
 import numpy as np
 from rclpy.node import Node
 
 LINK = 'link.'
 """Begin of the names of all parameters of a link; the driver alone has them."""
+_TYPE = 'link.type'
+"""Parameter that chooses the link."""
 _ANY_NODE = ('use_sim_time', 'start_type_description_service')
 """Parameters of every node of rclpy."""
 _FREE_PREFIXES = ('provenance.', 'qos_overrides.', LINK)
@@ -52,9 +44,8 @@ class DriverSettings:
     stamp_offset_s: float = parameter(
         'stamp_offset', 0.0, 'delay of the sensor, such as that of its RC filter, that is taken '
         'out of the stamps: they are earlier by this', 's', -10.0, 10.0)
-    frame_id: str = parameter(
-        'frame_id', '', 'frame of the case; empty: imu_link, or that of the samples of a '
-        'simulator')
+    frame_id: str = parameter('frame_id', '', 'frame of the case; empty: imu_link, or that of the '
+                              'samples of a simulator')
     autostart: bool = parameter(
         'autostart', True, 'configure and activate at the start; else a system manager does')
 
@@ -115,9 +106,8 @@ class BridgeSettings:
     beta_offset_rad: float = _offset('beta')
     joint_states: str = parameter('bridge.joint_states', '/joint_states',
                                   "topic of the controller's joint states")
-    command: str = parameter(
-        'bridge.command', '', 'topic on which the controller listens; empty: /joint_commands, or '
-        '/joint_trajectory_controller/joint_trajectory')
+    command: str = parameter('bridge.command', '', 'topic on which the controller listens; empty: '
+                             '/joint_commands, or /joint_trajectory_controller/joint_trajectory')
     speed_rad_s: float = parameter('bridge.speed_rad_s', 0.3, 'speed of a trajectory', 'rad/s',
                                    1e-4, 10.0)
 
@@ -129,19 +119,15 @@ class CalibrationSettings:
     mode: str = parameter('mode', 'stage', 'what the reference is',
                           choices=('stage', 'gravity', 'thermal'))
     autostart: bool = parameter('autostart', False, 'start without a call of ~/start')
-    resume: str = parameter(
-        'resume', 'ask', 'go on with an interrupted calibration; ask where there is a screen, '
-        'else go on', choices=('ask', 'continue', 'anew'))
-    exit_when_done: bool = parameter(
-        'exit_when_done', False, 'end the node after a calibration: status 0 where it wrote its '
-        'file, else 1')
-    screen: bool = parameter('screen', True,
-                             'show a screen, where the node runs in a terminal')
+    resume: str = parameter('resume', 'ask', 'go on with an interrupted calibration; ask where '
+                            'there is a screen, else go on', choices=('ask', 'continue', 'anew'))
+    exit_when_done: bool = parameter('exit_when_done', False, 'end the node after a calibration: '
+                                     'status 0 where it wrote its file, else 1')
+    screen: bool = parameter('screen', True, 'show a screen, where the node runs in a terminal')
     output: str = parameter('output', 'calibration.yaml', 'parameter file to write')
     journal: str = parameter('journal', '', 'file of accepted poses; empty: beside the output')
     report: str = parameter('report', '', 'directory for the report; empty: none')
-    store: str = parameter('store', _STORE,
-                           'folder of calibrations that gets a copy; empty: none')
+    store: str = parameter('store', _STORE, 'folder of calibrations that gets a copy; empty: none')
     dwell_s: float = parameter('sweep.dwell_s', 5.0, 'time at rest a pose', 's', 0.5, 3600.0)
     # A stage of 5 arcmin arrives within this default.
     tolerance_rad: float = parameter('stage.tolerance_rad', float(np.radians(0.2)),
@@ -165,15 +151,12 @@ class CalibrationSettings:
         '150, or 0 to 180 for a sensor with a z axis', 'deg')
     step_deg: float = parameter('sweep.step_deg', 30.0, 'step of beta of the plan full', 'deg',
                                 0.5, 90.0)
-    check_poses: int = parameter(
-        'sweep.check_poses', -1, 'poses kept out of the fit for the verdict; -1: 16, or 8 in the '
-        'plan quick', '', -1, 1000)
-    tilt_error_deg: float = parameter(
-        'sweep.tilt_error_deg', 0.1, 'rms tilt error that the plan quick is to reach', 'deg', 1e-3,
-        10.0)
-    range_c: Any = parameter(
-        'thermal.range_c', (), 'lowest and highest temperature that mode thermal is to cover, a '
-        'list of numbers; empty: 0 to 50', 'degC')
+    check_poses: int = parameter('sweep.check_poses', -1, 'poses kept out of the fit for the '
+                                 'verdict; -1: 16, or 8 in the plan quick', '', -1, 1000)
+    tilt_error_deg: float = parameter('sweep.tilt_error_deg', 0.1, 'rms tilt error that the plan '
+                                      'quick is to reach', 'deg', 1e-3, 10.0)
+    range_c: Any = parameter('thermal.range_c', (), 'lowest and highest temperature that mode '
+                             'thermal is to cover, a list of numbers; empty: 0 to 50', 'degC')
     block_s: float = parameter('thermal.block_s', 10.0, 'length of a block of samples in mode '
                                'thermal', 's', 0.5, 600.0)
 
@@ -182,21 +165,18 @@ class CalibrationSettings:
 class CompensationSettings:
     """The compensation."""
 
-    calibration: str = parameter(
-        'calibration', '', 'parameter file to use; setting it loads the whole file or nothing of '
-        'it', live=True)
-    inverse: str = parameter(
-        'inverse', 'exact', "inverse of the model: exact, or the paper's approximation",
-        choices=('exact', 'paper'))
+    calibration: str = parameter('calibration', '', 'parameter file to use; setting it loads the '
+                                 'whole file or nothing of it', live=True)
+    inverse: str = parameter('inverse', 'exact', "inverse of the model: exact, or the paper's "
+                             'approximation', choices=('exact', 'paper'))
     undo_filter: bool = parameter(
         'undo_filter', False, 'take the RC filter out, amplitude and phase; a sample is published '
         f'{HALF} samples late, with its own stamp')
     orientation: str = parameter(
         'orientation', 'keep', 'keep: a sample that states an orientation keeps it; tilt: '
         'imu/data has that of the tilt', choices=('keep', 'tilt'))
-    store: str = parameter(
-        'store', _STORE, 'folder of calibrations, of which the newest of the unit is taken where '
-        'none is named; empty: none')
+    store: str = parameter('store', _STORE, 'folder of calibrations, of which the newest of the '
+                           'unit is taken where none is named; empty: none')
     output_rate_hz: float = parameter(
         'output_rate_hz', 0.0, 'rate of imu/data and tilt: one sample of so many is published as '
         'it is, so that vibration above half of this rate folds into it; 0: every sample', 'Hz',
@@ -207,9 +187,8 @@ class CompensationSettings:
     rpy_rad: Any = parameter(
         'mounting.rpy_rad', [0.0, 0.0, 0.0], 'roll, pitch and yaw of the case in the frame of the '
         'robot, as in a URDF joint', 'rad', live=True)
-    mounting_frame_id: str = parameter(
-        'mounting.frame_id', 'base_link', 'frame of the robot, in the header where the case is '
-        'turned')
+    mounting_frame_id: str = parameter('mounting.frame_id', 'base_link', 'frame of the robot, in '
+                                       'the header where the case is turned')
 
 
 @dataclass(frozen=True)
@@ -241,17 +220,15 @@ class MonitorSettings:
                                      'stage/joint_states, or imu/ideal')
     window_s: float = parameter('window_s', 60.0, 'time over which gap and floor are taken', 's',
                                 5.0, 3600.0)
-    false_alarms_per_day: float = parameter(
-        'false_alarms_per_day', 0.0333, 'largest rate of reported changes that are none', '1/day',
-        1e-5, 10.0)
+    false_alarms_per_day: float = parameter('false_alarms_per_day', 0.0333, 'largest rate of '
+                                            'reported changes that are none', '1/day', 1e-5, 10.0)
     history_s: float = parameter('history_s', 600.0, 'time that is kept for a diagnosis', 's',
                                  60.0, 3600.0)
     wait_s: float = parameter(
         'diagnose.wait_s', 120.0, 'time of samples that an automatic diagnosis needs; changes of '
         'an axis within it are one', 's', 20.0, 3600.0)
-    output: str = parameter(
-        'output', str(calibration_store.default_folder().with_name('monitor')),
-        'folder of the record of changes and of the diagnoses')
+    output: str = parameter('output', str(calibration_store.default_folder().with_name('monitor')),
+                            'folder of the record of changes and of the diagnoses')
     automatic: bool = parameter('diagnose.automatic', True,
                                 'diagnose a change, or a gap, once enough is seen')
     budget_s: float = parameter('diagnose.budget_s', 300.0, 'longest time of a diagnosis', 's',
@@ -277,27 +254,19 @@ NODES: dict[str, tuple[type, ...]] = {
 
 def check_given_parameters(node: Node) -> None:
     """Refuse parameters that no node of this package has, and files that name other nodes."""
-    refuse_files_of_others(node.get_fully_qualified_name())
-    of_nodes = (spec.name for part in chain(*NODES.values()) for spec in specs_of(part))
-    names = {*_ANY_NODE, *sensor_keys(), *of_nodes}
+    parameters.refuse_files_of_others(node.get_fully_qualified_name())
+    of_nodes = (spec.name for part in chain(*NODES.values()) for spec in parameters.specs_of(part))
+    names = {*_ANY_NODE, *parameters.sensor_keys(), *of_nodes}
     for name, _ in given_parameters(node):
         if name not in names and not name.startswith(_FREE_PREFIXES):
             raise parameter_error(name, 'no node has a parameter of this name; did you mean '
                                   f'{nearest(name, names)}?')
 
 
-class ChosenLink(NamedTuple):
-    """The link that the parameters choose."""
-
-    name: str  # Value of `link.type`
-    module: base.LinkModule  # Module of the link
-    settings: Any  # Instance of the module's `Settings`
-
-
 def link_specs(link: str) -> list[Spec]:
     """Return the parameters of a link, `link.type` aside."""
-    return [Spec(f'{LINK}{option.name}', option.default, option.doc, option.unit, option.lower,
-                 option.upper) for option in base.options(base.link_module(link).Settings)]
+    return [Spec(f'{LINK}{name}', *description) for name, *description in map(
+        astuple, base.options(base.link_module(link).Settings))]
 
 
 def links_by_parameter() -> dict[str, list[str]]:
@@ -315,35 +284,31 @@ def given_link(node: Node) -> dict[str, Any]:
             if name.startswith(LINK)}
 
 
-def declare_driver(node: Node, serial: str) -> tuple[DriverSettings, ChosenLink]:
-    """Declare the parameters of the driver and of its link; no real unit gets simulated data."""
-    given = [f'{LINK}{name}' for name in given_link(node)]
-    if 'link.type' not in given:
-        _refuse_to_guess(given, serial)
-    settings = declare_all(node, DriverSettings)
+def declare_driver(node: Node, serial: str) -> tuple[DriverSettings, base.LinkModule, Any]:
+    """
+    Declare the parameters of the driver and of its link, which are returned with its module.
+
+    No real unit gets simulated data: a link must then be named.
+    """
+    given, links = [f'{LINK}{name}' for name in given_link(node)], links_by_parameter()
+    is_chosen = _TYPE in given
+    for name in given:
+        if not is_chosen and name not in links:
+            raise parameter_error(name, 'is no parameter of any link; did you mean '
+                                  f'{nearest(name, [_TYPE, *links])}?')
+    reason = f'{given[0]} is given' if given else \
+        f'the sensor is the unit {serial}' if serial != NO_UNIT else ''
+    if reason and not is_chosen:
+        devices = [name for name in base.link_names() if name != base.DEFAULT_LINK]
+        raise parameter_error(_TYPE, f'is not set, but {reason}; set it to {", ".join(devices)}, '
+                              f'or to {base.DEFAULT_LINK} for a simulated sensor')
+    settings = parameters.declare_all(node, DriverSettings)
     module, specs = base.link_module(settings.link), link_specs(settings.link)
-    own = ['link.type', *(spec.name for spec in specs)]
+    own = [_TYPE, *(spec.name for spec in specs)]
     for name in given:
         if name not in own:
-            links = links_by_parameter().get(name)
-            hint = f'link.type {" or ".join(links)} has it' if links else \
+            hint = f'link.type {" or ".join(links[name])} has it' if name in links else \
                 f'did you mean {nearest(name, own)}?'
             raise parameter_error(name, f'the link {settings.link} has no such parameter; {hint}')
     values = {spec.name.removeprefix(LINK): declare(node, spec) for spec in specs}
-    return settings, ChosenLink(settings.link, module, module.Settings(**values))
-
-
-def _refuse_to_guess(given: list[str], serial: str) -> None:
-    """Refuse the default link, which simulates, where the parameters mean a real sensor."""
-    names = ['link.type', *links_by_parameter()] if given else []
-    for name in given:
-        if name not in names:
-            raise parameter_error(name, f'is no parameter of any link; did you mean '
-                                  f'{nearest(name, names)}?')
-    reason = f'{given[0]} is given' if given else \
-        f'the sensor is the unit {serial}' if serial != NO_UNIT else ''
-    if reason:
-        devices = [name for name in base.link_names() if name != base.DEFAULT_LINK]
-        raise parameter_error('link.type', f'is not set, but {reason}; set it to '
-                              f'{", ".join(devices)}, or to {base.DEFAULT_LINK} for a '
-                              'simulated sensor')
+    return settings, module, module.Settings(**values)

@@ -9,24 +9,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.nodes.node_help import NodeHelp
+from adxl_ros.files import cdr
+from adxl_ros.nodes import settings, topics
 from adxl_ros.nodes.parameters import declare_all, parameter_error
-from adxl_ros.nodes.run_node import run
-from adxl_ros.nodes.samples_in import JointStateWriter
-from adxl_ros.nodes.settings import (
-    BridgeSettings,
-    check_given_parameters,
-    SimulatedStageSettings,
-    StageSettings,
-)
-from adxl_ros.nodes.topics import (
-    create_publisher,
-    create_subscription,
-    DiagnosticsReporter,
-    Level,
-    Status,
-    STEADY,
-)
+from adxl_ros.nodes.run_node import NodeHelp, run
+from adxl_ros.nodes.topics import Level, Status, STEADY
 from adxl_ros.simulate.simulated_stage import JOINTS, SimulatedStage
 from builtin_interfaces.msg import Duration
 import numpy as np
@@ -54,23 +41,25 @@ class SimulatedStageNode:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        own = declare_all(node, SimulatedStageSettings)
+        own = declare_all(node, settings.SimulatedStageSettings)
         self._stage = SimulatedStage(
             np.array([own.alpha_rad, own.beta_rad, own.shift_m]),
             np.array([own.slew_rate_rad_s, own.slew_rate_rad_s, own.slew_rate_m_s]),
             own.settling_time_s, np.array([own.resolution_rad, own.resolution_rad, 0.0]), own.seed)
         self._delay_ns = round(1e9 * own.delay_s)
         self._unshown: deque[tuple[int, bytes]] = deque()
-        self._writer = JointStateWriter(JOINTS)
+        zeros = [0.0] * len(JOINTS)
+        self._writer = topics.MessageWriter(
+            JointState(name=list(JOINTS), position=zeros, velocity=zeros), cdr.joint_state)
         self._simulated_ns = 0
         self._is_commanded = False
         self._refusal_count = 0
         self._refusal = ''
-        self._encoders = create_publisher(node, JointState, 'stage/joint_states', _QUEUE)
-        self._true = create_publisher(node, JointState, 'stage/true_joint_states', _QUEUE)
-        self._diagnostics = DiagnosticsReporter(node, {'stage': self._status})
-        create_subscription(node, JointState, 'stage/command', self._on_command,
-                            _COMMAND_QUEUE)
+        self._encoders = topics.create_publisher(node, JointState, 'stage/joint_states', _QUEUE)
+        self._true = topics.create_publisher(node, JointState, 'stage/true_joint_states', _QUEUE)
+        self._diagnostics = topics.DiagnosticsReporter(node, 'stage', self._status)
+        topics.create_subscription(node, JointState, 'stage/command', self._on_command,
+                                   _COMMAND_QUEUE)
         limits = (f'{name} {node.get_parameter(name).value:g}' for name in _LIMITS)
         pose = ', '.join(f'{name} {p:.4g}' for name, p in zip(JOINTS, self._stage.encoder()))
         node.get_logger().info(
@@ -80,21 +69,22 @@ class SimulatedStageNode:
         node.create_timer(_STEP_NS * 1e-9, self._tick)
 
     def _on_command(self, message: JointState) -> None:
+        positions = dict(zip(message.name, message.position))
         try:
             if len(message.name) != len(message.position):
                 raise UserError(f'{len(message.name)} names, but {len(message.position)} '
                                 'positions')
-            positions = dict(zip(message.name, message.position))
             self._stage.command(positions, dict(zip(message.name, message.velocity)))
-            if not self._is_commanded:
-                self._is_commanded = True
-                self._node.get_logger().info(f'first command: {positions}')
         except UserError as error:
             self._refusal_count += 1
             self._refusal = f'{self._node.resolve_topic_name("stage/command")}: {error}'
             self._node.get_logger().warning(
                 f'{self._refusal}; the stage stays with the command before')
-            self._diagnostics.notice('stage', Level.WARN)
+            self._diagnostics.notice(Level.WARN)
+            return
+        if not self._is_commanded:
+            self._is_commanded = True
+            self._node.get_logger().info(f'first command: {positions}')
 
     def _tick(self) -> None:
         """Simulate up to the time at which a new command may take effect; show what is due."""
@@ -119,16 +109,15 @@ class SimulatedStageNode:
             self._stage.step(_STEP_NS * 1e-9)
             position[i], velocity[i] = self._stage.position, self._stage.velocity
             encoder[i] = self._stage.encoder()
-        for message in self._writer.messages(stamps_ns, position, velocity):
+        for message in self._writer.messages(stamps_ns, position=position, velocity=velocity):
             self._true.publish(message)
-        self._unshown.extend(zip(stamps_ns.tolist(),
-                                 self._writer.messages(stamps_ns, encoder, velocity)))
+        self._unshown.extend(zip(stamps_ns.tolist(), self._writer.messages(
+            stamps_ns, position=encoder, velocity=velocity)))
 
     def _status(self) -> Status:
         level, text = Level.OK, 'moving' if self._stage.moving() else 'at rest'
         if self._refusal:
-            level, text = Level.WARN, f'refused {self._refusal}'
-        self._refusal = ''
+            level, text, self._refusal = Level.WARN, f'refused {self._refusal}', ''
         values = {name: float(p) for name, p in zip(JOINTS, self._stage.encoder())}
         return Status(level, text, 'simulated', {**values, 'refused': self._refusal_count})
 
@@ -163,10 +152,6 @@ class _Joint:
     offset_rad: float  # Stage angle where the controller's joint is at 0, rad
     angle_rad: float | None = None  # Stage angle, rad; None before the first joint state
 
-    def to_controller(self, stage_rad: float) -> float:
-        """Convert a stage angle to the controller's, rad."""
-        return self.sign * (stage_rad - self.offset_rad)
-
     def update(self, position_rad: float) -> None:
         """Take an angle of the controller, rad, and unwrap it."""
         angle = self.sign * position_rad + self.offset_rad
@@ -193,7 +178,7 @@ class StageBridge:
 
     def __init__(self, node: Node, kind: str) -> None:
         self._node, self._kind = node, kind
-        own = declare_all(node, BridgeSettings)
+        own = declare_all(node, settings.BridgeSettings)
         self._joints = {'alpha': _Joint(own.alpha_joint, own.alpha_sign, own.alpha_offset_rad),
                         'beta': _Joint(own.beta_joint, own.beta_sign, own.beta_offset_rad)}
         for name, joint in self._joints.items():
@@ -202,29 +187,27 @@ class StageBridge:
                                       "is not set; name the controller's joint")
             if joint.sign == 0:
                 raise parameter_error(f'bridge.{name}.sign', '0 is not 1 or -1')
-        self._states_topic, self._speed_rad_s = own.joint_states, own.speed_rad_s
+        self._states_topic = node.resolve_topic_name(own.joint_states)
+        self._speed_rad_s = own.speed_rad_s
         self._goal: dict[str, float] = {}
-        self._heard_ns = 0
-        self._resend_ns = 0
-        self._commanded_ns = 0
-        self._late_ns = 0
+        self._heard_ns = self._resend_ns = self._commanded_ns = self._late_ns = 0
         self._controller_joints: set[str] = set()
         self._refusal = ''
-        self._positions = create_publisher(node, JointState, 'stage/joint_states', _BRIDGE_QUEUE)
-        self._commands = create_publisher(
+        self._positions = topics.create_publisher(node, JointState, 'stage/joint_states',
+                                                  _BRIDGE_QUEUE)
+        self._commands = topics.create_publisher(
             node, JointTrajectory if kind == 'trajectory' else JointState,
-            own.command or _DEFAULT_COMMANDS[kind],
-            _COMMAND_QUEUE)
-        self._diagnostics = DiagnosticsReporter(node, {'stage': self._status})
-        create_subscription(node, JointState, 'stage/command', self._on_command,
-                            _COMMAND_QUEUE)
-        create_subscription(node, JointState, self._states_topic, self._on_states,
-                            _STATES_QUEUE)
+            own.command or _DEFAULT_COMMANDS[kind], _COMMAND_QUEUE)
+        self._diagnostics = topics.DiagnosticsReporter(node, 'stage', self._status)
+        topics.create_subscription(node, JointState, 'stage/command', self._on_command,
+                                   _COMMAND_QUEUE)
+        topics.create_subscription(node, JointState, own.joint_states, self._on_states,
+                                   _STATES_QUEUE)
         joints = ', '.join(f'{name} is {joint.name}' for name, joint in self._joints.items())
         speed = f' at most {self._speed_rad_s:g} rad/s' if kind == 'trajectory' else ''
         node.get_logger().info(
             f'bridge ({kind}){speed}: {joints}; commands go to {self._commands.topic_name}, '
-            f'positions come from {node.resolve_topic_name(self._states_topic)}; waiting for '
+            f'positions come from {self._states_topic}; waiting for '
             f'{node.resolve_topic_name("stage/command")}')
 
     def _on_command(self, message: JointState) -> None:
@@ -246,7 +229,10 @@ class StageBridge:
             return
         if not self._goal:
             self._node.get_logger().info(f'first command: {positions}')
-        duration_s = self._duration_s(goal)
+        # The longer way to the goal counts, or half a turn where it is unknown.
+        ways_rad = [abs(goal[name] - joint.angle_rad) for name, joint in self._joints.items()
+                    if joint.angle_rad is not None]
+        duration_s = max(max(ways_rad, default=np.pi) / self._speed_rad_s, _SHORTEST_S)
         self._resend_ns = now_ns + round(duration_s * 1e9) + _GRACE_NS
         if goal != self._goal:
             self._commanded_ns, self._late_ns = now_ns, self._resend_ns
@@ -256,7 +242,7 @@ class StageBridge:
     def _send(self, duration_s: float) -> None:
         """Send the goal to the controller, as a motion of a duration, s."""
         names = [joint.name for joint in self._joints.values()]
-        positions = [float(joint.to_controller(self._goal[name]))
+        positions = [joint.sign * (self._goal[name] - joint.offset_rad)
                      for name, joint in self._joints.items()]
         if self._kind == 'joint_state':
             message = JointState(name=names, position=positions)
@@ -267,12 +253,6 @@ class StageBridge:
             message = JointTrajectory(joint_names=names, points=[JointTrajectoryPoint(
                 positions=positions, time_from_start=Duration(sec=sec, nanosec=nanosec))])
         self._commands.publish(message)
-
-    def _duration_s(self, goal: dict[str, float]) -> float:
-        """Return the time that the longer way to a goal takes; half a turn if it is unknown."""
-        ways_rad = [abs(goal[name] - joint.angle_rad) for name, joint in self._joints.items()
-                    if joint.angle_rad is not None]
-        return max(max(ways_rad, default=np.pi) / self._speed_rad_s, _SHORTEST_S)
 
     def _late(self) -> bool:
         """Return whether the stage has not reached its goal in time."""
@@ -287,14 +267,14 @@ class StageBridge:
     def _on_states(self, message: JointState) -> None:
         positions = dict(zip(message.name, message.position))
         self._controller_joints |= set(positions)
-        joints = [joint for joint in self._joints.values() if joint.name in positions
-                  and np.isfinite(positions[joint.name])]
-        for joint in joints:
+        known = [joint for joint in self._joints.values()
+                 if np.isfinite(positions.get(joint.name, np.nan))]
+        for joint in known:
             joint.update(positions[joint.name])
         if self._late():
             for name, joint in self._joints.items():
                 joint.unwrap_to(self._goal[name])
-        if not joints or any(joint.angle_rad is None for joint in self._joints.values()):
+        if not known or any(joint.angle_rad is None for joint in self._joints.values()):
             return
         self._heard_ns = STEADY.now().nanoseconds
         stage = JointState(name=list(self._joints),
@@ -307,7 +287,7 @@ class StageBridge:
         if reason != self._refusal:
             self._node.get_logger().warning(reason)
         self._refusal = reason
-        self._diagnostics.notice('stage', Level.WARN)
+        self._diagnostics.notice(Level.WARN)
 
     def _status(self) -> Status:
         values = {name: joint.angle_rad for name, joint in self._joints.items()
@@ -316,30 +296,26 @@ class StageBridge:
 
     def _state(self) -> tuple[Level, str]:
         """Return the level and one line: the motion, or why there is none."""
-        topic = self._node.resolve_topic_name(self._states_topic)
         missing = [joint.name for joint in self._joints.values() if joint.angle_rad is None]
+        now_ns = STEADY.now().nanoseconds
         if self._refusal:
             return Level.WARN, f'refused {self._refusal}'
         if missing and self._controller_joints:
             return Level.ERROR, (
-                f'{topic}: no joint {", ".join(missing)}; it has '
+                f'{self._states_topic}: no joint {", ".join(missing)}; it has '
                 f'{", ".join(sorted(self._controller_joints))}; correct bridge.alpha.joint and '
                 'bridge.beta.joint')
-        if STEADY.now().nanoseconds - self._heard_ns > _SILENT_NS:
-            return Level.WARN, f'nothing on {topic}; is the controller running?'
+        if now_ns - self._heard_ns > _SILENT_NS:
+            return Level.WARN, f'nothing on {self._states_topic}; is the controller running?'
         if not self._node.count_subscribers(self._commands.topic_name):
             return Level.WARN, f'nobody listens to {self._commands.topic_name}'
         if self._late():
-            return Level.WARN, self._delay_text()
+            angles = ', '.join(f'{name} is at {np.degrees(joint.angle_rad or 0.0):.1f}° of '
+                               f'{np.degrees(self._goal[name]):.1f}°'
+                               for name, joint in self._joints.items())
+            late_s = (now_ns - self._commanded_ns) * 1e-9
+            return Level.WARN, f'the controller has not followed for {late_s:.0f} s: {angles}'
         return Level.OK, 'on the way' if self._goal and not self._arrived() else 'at rest'
-
-    def _delay_text(self) -> str:
-        late_s = (STEADY.now().nanoseconds - self._commanded_ns) * 1e-9
-        angles = ', '.join(f'{name} is at {np.degrees(joint.angle_rad):.1f}° of '
-                           f'{np.degrees(self._goal[name]):.1f}°'
-                           for name, joint in self._joints.items()
-                           if joint.angle_rad is not None)
-        return f'the controller has not followed for {late_s:.0f} s: {angles}'
 
 
 _EXAMPLES = {
@@ -356,13 +332,14 @@ class Stage(Node):
 
     def __init__(self) -> None:
         super().__init__('stage')
-        check_given_parameters(self)
-        kind = declare_all(self, StageSettings).kind
+        settings.check_given_parameters(self)
+        kind = declare_all(self, settings.StageSettings).kind
         self._stage = SimulatedStageNode(self) if kind == 'simulated' else StageBridge(self, kind)
 
 
 def main() -> int:
     """Run the node."""
     return run(Stage, NodeHelp(
-        __doc__, _EXAMPLES, (StageSettings, SimulatedStageSettings), has_sensor=False,
-        variants={'stage.type:=trajectory, or joint_state': BridgeSettings}))
+        __doc__, _EXAMPLES, (settings.StageSettings, settings.SimulatedStageSettings),
+        has_sensor=False,
+        variants={'stage.type:=trajectory, or joint_state': settings.BridgeSettings}))

@@ -80,7 +80,7 @@ class World:
             angles = [float(joint(time_s[i:i + 1])[0]) for joint in self._joints]
             if self._step_rad:
                 angles = [round(angle / self._step_rad) * self._step_rad for angle in angles]
-            reference.add_joints(stamp, dict(zip(('alpha', 'beta'), angles)))
+            reference.add_joints([stamp], [dict(zip(('alpha', 'beta'), angles))])
 
 
 def gaps(world: World) -> list[float]:
@@ -155,4 +155,4 @@ def test_memory_is_bounded_and_the_recording_has_the_newest_samples() -> None:
     assert recording.time_s[-1] == pytest.approx(60, abs=0.1)
     assert {'ax_mps2', 'alpha_rad', 'beta_rad'} <= set(recording.columns)
     assert np.isfinite(recording.columns['alpha_rad'][100:-100]).all()
-    assert len(world.live._samples._stamps) < 5 * 60 * RATE_HZ
+    assert len(world.live._samples) < 5 * 60 * RATE_HZ

@@ -12,7 +12,7 @@ import time
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import sweep_journal
-from adxl_ros.nodes import demo, steps
+from adxl_ros.nodes import demo, jobs
 from processes import children, executable, REPO
 import pytest
 from terminal import Terminal
@@ -27,12 +27,12 @@ def test_titles() -> None:
 def test_steps_without_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     out = io.StringIO()
     monkeypatch.setattr(sys, 'stdout', out)
-    with steps.step('1/2 sweep', 'starting', 146) as step:
+    with jobs.step('1/2 sweep', 'starting', 146) as step:
         for count in range(1, 147):
             step.show(f'{count} of 146 poses', count)
-    with steps.step('2/2 fit', '130 poses') as step:
+    with jobs.step('2/2 fit', '130 poses') as step:
         step.show('130 poses, full model')
-    with pytest.raises(UserError), steps.step('3/3 check', '16 poses'):
+    with pytest.raises(UserError), jobs.step('3/3 check', '16 poses'):
         raise UserError('it fails')
     lines = out.getvalue().splitlines()
     assert [line.split()[2] for line in lines[:10]] == [
@@ -56,10 +56,10 @@ def test_live(ros_env, tmp_path) -> None:
     """
     In a terminal of 80 columns no line of steps, tables, acceptance and files wraps.
 
-    No sample of a pose is lost, although the calibration is stopped for 7 s of sensor time. The
+    No sample of a pose is lost, although the calibration is stopped for 12 s of sensor time. The
     speed leaves a busy machine time to send again what was lost meanwhile.
     """
-    terminal = Terminal([executable('demo'), '--speed', '15'], ros_env, tmp_path, lines=60,
+    terminal = Terminal([executable('demo'), '--speed', '25'], ros_env, tmp_path, lines=60,
                         columns=80)
     try:
         terminal.wait_for('1/3 sweep', 'of 146 poses', '━', timeout_s=60.0)

@@ -7,7 +7,7 @@ import time
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model import noise
 from adxl_ros.model.sensor import to_nominal_mps2, to_volts
-from adxl_ros.nodes.sample_output import imu_message, ImuWriter
+from adxl_ros.nodes.sample_output import imu_message, imu_writer
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from graph import accel, Graph, stamp_ns
@@ -44,8 +44,9 @@ def test_serialized_samples_are_what_rclpy_serializes(axes):
     volts = np.linspace(1.1, 3.9, 5 * len(axes)).reshape(5, -1)
     stamps = 1_700_000_000_999_999_990 + 5 * np.arange(5)
     template = imu_message(sensor, 'imu_link')
-    for message, stamp, a in zip(ImuWriter(sensor, 'imu_link').messages(stamps, volts, {}), stamps,
-                                 to_nominal_mps2(volts, sensor)):
+    accel = to_nominal_mps2(volts, sensor)
+    messages = imu_writer(sensor, 'imu_link').messages(stamps, linear_acceleration=accel)
+    for message, stamp, a in zip(messages, stamps, accel):
         template.header.stamp.sec, template.header.stamp.nanosec = map(
             int, divmod(stamp, 10 ** 9))
         for axis, value in zip('xyz', [*map(float, a), 0.0, 0.0]):
@@ -58,10 +59,8 @@ def test_serialized_samples_are_what_rclpy_serializes(axes):
 
 def test_saturation_is_reported_at_the_rails_and_beyond_the_range():
     volts = np.array([[2.5, 2.5], [0.0, 2.5], [2.5, 5 * (1 - 2 ** -16)], [2.5, 4.3], [4.1, 0.9]])
-    writer = ImuWriter(nominal(), 'imu_link')
-    assert writer.saturated(volts).tolist() == [False, True, True, True, False]
-    digital = ImuWriter(nominal(adc_bits=0, range_g=16.0), 'imu_link')
-    assert not digital.saturated(volts).any()
+    assert nominal().saturated(volts).any(axis=1).tolist() == [False, True, True, True, False]
+    assert not nominal(adc_bits=0, range_g=16.0).saturated(volts).any()
 
 
 def test_sim_publishes_every_sample_as_documented(start):

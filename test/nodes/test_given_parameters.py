@@ -5,8 +5,7 @@
 from pathlib import Path
 
 from adxl_ros.files import parameter_file
-from adxl_ros.nodes.parameters import specs_of
-from adxl_ros.nodes.sensor_parameters import sensor_keys
+from adxl_ros.nodes.parameters import sensor_keys, specs_of
 from adxl_ros.nodes.settings import NODES
 from diagnostic_msgs.msg import DiagnosticStatus
 from graph import Graph
@@ -118,18 +117,21 @@ def test_a_file_for_another_node_is_refused(start, tmp_path, node):
     assert f'other.yaml: has parameters of /other, but none of the node /{node}' in line
 
 
-@pytest.mark.parametrize('section', ['/*', '/**/driver', 'driver', '/arm/driver', '/arm/**'])
-def test_the_sections_of_a_file_are_those_of_ros(start, tmp_path, section):
+def test_the_sections_of_a_file_are_those_of_ros(start, tmp_path):
     """The frame of the samples comes from the section, or the file is refused."""
-    (tmp_path / 'own.yaml').write_text(
-        f'{section}:\n  ros__parameters:\n    frame_id: case\n')
-    namespace = '/arm' if 'arm' in section or '**' in section else '/'
-    driver = start('driver', ROS, '--params-file', 'own.yaml', '-r', f'__ns:={namespace}')
+    drivers, topics = [], []
+    for number, section in enumerate(('/*', '/**/driver', 'driver', '/arm/driver', '/arm/**')):
+        path = tmp_path / f'{number}.yaml'
+        path.write_text(f'{section}:\n  ros__parameters:\n    frame_id: case\n')
+        namespace = '/arm' if 'arm' in section or '**' in section else '/'
+        topics.append(f'/samples_{number}')
+        drivers.append(start('driver', ROS, '--params-file', path, '-r', f'__ns:={namespace}',
+                             '-r', f'imu/data_raw:={topics[-1]}'))
     with Graph() as graph:
-        samples = graph.listen(Imu, f'{namespace.rstrip("/")}/imu/data_raw')
-        graph.spin_until(lambda: samples, 30, 'a sample')
-    assert samples[0].header.frame_id == 'case'
-    assert driver.popen.poll() is None
+        samples = [graph.listen(Imu, topic) for topic in topics]
+        graph.spin_until(lambda: all(samples), 30, 'a sample of each')
+    assert {received[0].header.frame_id for received in samples} == {'case'}
+    assert all(driver.popen.poll() is None for driver in drivers)
 
 
 def test_all_nodes_with_one_file(start, tmp_path):

@@ -130,16 +130,13 @@ def test_whatever_ends_an_investigation_leaves_the_stage_at_rest_and_the_bag_who
     def killed(node):
         os.kill(node.popen.pid, signal.SIGKILL)
 
-    def interrupted(node):
-        os.kill(node.popen.pid, signal.SIGINT)
-
     def terminated(node):
         os.kill(node.popen.pid, signal.SIGTERM)
 
     def aborted(_):
         assert laboratory.call(Trigger, '/investigate/abort', Trigger.Request()).success
 
-    for number, end in enumerate((killed, interrupted, terminated, aborted)):
+    for number, end in enumerate((killed, terminated, aborted)):
         node = laboratory.investigate('-p', f'output:=run{number}', *LONG)
         laboratory.wait_for_motion()
         before = np.array(laboratory.states[-1].position[:2])
@@ -158,7 +155,7 @@ def test_whatever_ends_an_investigation_leaves_the_stage_at_rest_and_the_bag_who
         assert bool(read.cut) is (end is killed)
         assert len(read) == messages_of(bag) > 1000
         assert np.diff(read.time_s).max() == pytest.approx(0.005, abs=1e-6)
-    laboratory.check_commands(4)
+    laboratory.check_commands(3)
 
 
 @pytest.mark.kills

@@ -201,7 +201,7 @@ def test_no_sample_at_1_khz_is_lost(start, graph) -> None:
     start('driver', '--ros-args', '-p', 'link.type:=sim', '-p',
           'qos_overrides./imu/data_raw.publisher.depth:=20000')
     graph.spin_until(lambda: graph.reports('monitor', 'gap x'), 40, 'the gap')
-    graph.spin_until(lambda: int(graph.value('monitor', 'samples')) > 12000, 40, '12000 samples')
+    graph.spin_until(lambda: int(graph.value('monitor', 'samples')) > 8000, 40, '8000 samples')
     assert (graph.value('monitor', 'missing'), graph.value('monitor', 'dropped')) == ('0', '0')
     assert 0.5 < float(graph.value('monitor', 'x_gap_mg')) / float(
         graph.value('monitor', 'x_floor_mg')) < 1.1, 'the floor includes steps of the encoder'

@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""A job that runs nodes in processes of their own, and what a terminal shows of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+import os
+from pathlib import Path
+import shutil
+import signal
+import subprocess
+import sys
+from tempfile import TemporaryFile
+import time
+from typing import Any
+
+_KILL_S = 10.0
+"""Longest time that a process may take to end, s; chosen: a node ends within 1 s."""
+_FIRST_DOMAIN = 60
+"""First ROS domain of jobs; chosen: beyond those that robots use."""
+_DOMAINS = 40
+"""Number of ROS domains of jobs; chosen: the last one is below 101, the last safe one."""
+_USER_TIME = 11
+"""Place of the user time in /proc/PID/stat, from 0, behind the command's name (man 5 proc)."""
+_SYSTEM_TIME = 12
+"""Place of the system time, counted in the same way."""
+
+
+def use_own_graph() -> None:
+    """Give this job a ROS graph of its own on this machine, so that it cannot move a robot."""
+    os.environ.setdefault('ROS_DOMAIN_ID', str(_FIRST_DOMAIN + os.getpid() % _DOMAINS))
+    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+
+
+def executable(name: str) -> str:
+    """Return the path of an executable, which stands beside the running one."""
+    return str(Path(sys.argv[0]).with_name(name))
+
+
+@contextmanager
+def running(commands: Sequence[Sequence[str]]) -> Iterator[list[subprocess.Popen]]:
+    """Yield the processes of commands, without their error output, and stop them at the end."""
+    processes = [subprocess.Popen(command, stderr=subprocess.DEVNULL) for command in commands]
+    try:
+        yield processes
+    finally:
+        stop(processes)
+
+
+def stop(processes: Sequence[subprocess.Popen]) -> None:
+    """Interrupt processes, and kill those that do not end within 10 s."""
+    for process in processes:
+        process.send_signal(signal.SIGINT)
+    for process in processes:
+        try:
+            process.wait(_KILL_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+
+
+def cpu_time_s(pid: int) -> float:
+    """Return the time that a process has spent on a core so far, s."""
+    fields = Path(f'/proc/{pid}/stat').read_text().rsplit(')', 1)[1].split()
+    return (int(fields[_USER_TIME]) + int(fields[_SYSTEM_TIME])) / os.sysconf('SC_CLK_TCK')
+
+
+@contextmanager
+def held_output() -> Iterator[None]:
+    """Keep what this process prints, and print it at the end: lines would tear the screen."""
+    _flush()
+    with TemporaryFile() as file:
+        originals = {stream: os.dup(stream) for stream in (1, 2)}
+        for stream in originals:
+            os.dup2(file.fileno(), stream)
+        try:
+            yield
+        finally:
+            _flush()
+            for stream, original in originals.items():
+                os.dup2(original, stream)
+                os.close(original)
+            file.seek(0)
+            with suppress(OSError):
+                shutil.copyfileobj(file, sys.stderr.buffer)
+            _flush()
+
+
+def _flush() -> None:
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal that has hung up takes nothing.
+        with suppress(OSError):
+            stream.flush()
+
+
+_BAR_WIDTH = 30
+"""Columns of the bar. A line with its bar has 79 columns."""
+_NAME_WIDTH = 11
+"""Columns of the name of a step."""
+_TEXT_WIDTH = 16
+"""Columns of the text beside a bar."""
+_LINE_WIDTH = 69
+"""Columns of a line without a bar, before its time."""
+_TENTHS = 10
+"""Largest number of lines of a step where there is no terminal."""
+
+
+@contextmanager
+def step(name: str, text: str, total: int = 0) -> Iterator[Step]:
+    """
+    Show one step of a job while it runs.
+
+    A terminal shows one line with the time and, where the total is known, a bar. Elsewhere, and
+    without rich, there is a line for each tenth of the total and one at the end.
+    """
+    shown, succeeded = Step(name, text, total), False
+    try:
+        yield shown
+        succeeded = True
+    finally:
+        shown.close(succeeded)
+
+
+def drawable() -> bool:
+    """Return whether stdout is a terminal that can draw, and rich is installed."""
+    if not sys.stdout.isatty() or os.environ.get('TERM') == 'dumb':
+        return False
+    try:
+        import rich  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+class LiveLine:
+    """Prints lines; in a terminal that can draw, a last one shows what happens now."""
+
+    def __init__(self, columns: Sequence[str] = (), total: int = 0) -> None:
+        """Begin to draw: the text, then columns of rich's `Progress`, as its text or a bar."""
+        self._progress: Any = None
+        if drawable():
+            from rich.console import Console
+            from rich.progress import BarColumn, Progress, TextColumn
+            console = Console(file=sys.stdout, highlight=False, markup=False, emoji=False)
+            drawn = [BarColumn(_BAR_WIDTH) if text == 'bar' else TextColumn(text, markup=False)
+                     for text in ('{task.description}', *columns)]
+            self._progress = Progress(*drawn, console=console, transient=not columns)
+            self._task = self._progress.add_task('', total=total or None)
+            self._progress.start()
+
+    def add(self, *lines: str) -> None:
+        """Print lines above the one that changes."""
+        for line in lines:
+            if self._progress is None:
+                print(line, flush=True)
+            else:
+                self._progress.console.print(line, soft_wrap=True)
+
+    def show(self, text: str, done: int = 0) -> bool:
+        """Show what happens now; return whether it is drawn."""
+        if self._progress is not None:
+            self._progress.update(self._task, description=text, completed=done)
+        return self._progress is not None
+
+    def close(self) -> None:
+        """Stop drawing."""
+        if self._progress is not None:
+            self._progress.stop()
+            self._progress = None
+
+
+class Step:
+    """One step, wherever it is shown."""
+
+    def __init__(self, name: str, text: str, total: int) -> None:
+        self._name, self._total = name, total
+        self._begin_s, self._tenth = time.monotonic(), 0
+        bar = ('bar', '{task.percentage:3.0f} %') if total else ()
+        self._line = LiveLine((*bar, '{task.elapsed:4.0f} s'), total)
+        self.show(text)
+
+    def show(self, text: str, done: int = 0) -> None:
+        """Show how far the step is: a line for each tenth where nothing is drawn."""
+        width = _TEXT_WIDTH if self._total else _LINE_WIDTH - _NAME_WIDTH - 2
+        self._text, self._done = f' {self._name:{_NAME_WIDTH}} {text:{width}}', done
+        tenth = _TENTHS * done // self._total if self._total else 0
+        if not self._line.show(self._text, done) and self._tenth < tenth < _TENTHS:
+            self._print()
+        self._tenth = max(tenth, self._tenth)
+
+    def close(self, succeeded: bool) -> None:
+        """Stop drawing."""
+        if succeeded and not drawable():
+            self._print()
+        self._line.close()
+
+    def _print(self) -> None:
+        share = f' {100 * self._done / self._total:3.0f} %' if self._total else ''
+        print(f'{self._text}{share} {time.monotonic() - self._begin_s:4.0f} s', flush=True)
