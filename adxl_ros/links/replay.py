@@ -31,9 +31,7 @@ _MAX_CLOCK_NS = 2 ** 31 * 10 ** 9
 class Settings(PacedSettings):
     """Settings of the link."""
 
-    # Path of the recording
     recording: str = option('', 'the recording to play: a rosbag2 directory, .mcap or CSV')
-    # Whether the recording starts again at its end
     loop: bool = option(False, 'whether the recording starts again at its end')
 
 

@@ -4,11 +4,10 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 import time
-from typing import NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.links.support import channels
@@ -21,7 +20,7 @@ from adxl_ros.links.support.base import (
     option,
     Samples,
 )
-from adxl_ros.links.support.channels import clock_events, Stamper
+from adxl_ros.links.support.channels import Stamper
 from adxl_ros.links.support.clock_sync import ClockMap
 from adxl_ros.links.support.serial_port import import_pyserial, SerialPort, SILENT
 from adxl_ros.links.support.wire_format import (
@@ -76,72 +75,17 @@ _UNSTATED_RATE_HZ = 1000.0
 class Settings(DeviceSettings):
     """Settings of the link."""
 
-    # Device path or pyserial URL
     port: str = option('', 'device path, such as /dev/ttyACM0, or a pyserial URL')
-    # Baud rate of a UART, Bd
     baud: int = option(115200, 'baud rate of a UART; USB and network ports ignore it', 'Bd', 50,
                        100_000_000)
-    # Roles of the channels of a frame: a list of strings, or one string with commas. Empty for x,
-    # y, z, supply.
+    # A list of strings, or one string with commas
     channels: str | Sequence[str] = option(
         (), 'roles of the channels of a frame: x, y, z, supply, temperature, or - for unused; '
         'empty: the first channels are x, y, z, supply')
-    # Output of the temperature sensor at 0 degC, V
     temperature_zero_v: float = option(0.5, 'output of the temperature sensor at 0 degC', 'V',
                                        -10.0, 10.0)
-    # Slope of the temperature sensor, V/degC
     temperature_v_per_c: float = option(0.01, 'slope of the temperature sensor', 'V/degC',
                                         -10.0, 10.0)
-
-
-@dataclass(frozen=True)
-class Statistics:
-    """Counts of the link, as diagnostics show them."""
-
-    frames: int  # Whole frames
-    bad_frames: int  # Frames that are damaged or contradict the info frame
-    # Bytes received
-    bytes: int  # noqa: A003
-    skipped_bytes: int  # Bytes of runs that are too long for a frame
-    # Samples that came before the board had described itself, or do not fit the sensor
-    held_back: int
-    repeated: int  # Samples of frames that came twice or late
-    device_overruns: int  # Samples that the board itself dropped
-    frame_ms: float  # Duration of the newest frame, ms: its first sample waited for as long
-    rail_frames: int  # Frames with a code at a rail of the ADC
-    resets: int  # How often a new count has begun
-    connections: int  # How often the port was opened
-
-
-@dataclass(frozen=True)
-class _Conversion:
-    """How the codes of a board become samples."""
-
-    # gain, offset: Value of a channel is gain · code + offset, V or degC, (m,)
-    gain: np.ndarray
-    offset: np.ndarray
-    axes: slice | list[int]  # Channels of the axes of the sensor
-    # Channel of each reference by column; None where no channel has it
-    reference_channels: Mapping[str, int | None]
-    steps_ns: np.ndarray  # Times of the samples of a frame after its first one, ns, int64, (256,)
-    max_code: int  # Largest code
-
-    def block(self, frame: SampleFrame) -> channels.Block:
-        """Return the samples of a frame."""
-        values = frame.codes.astype(float)
-        values *= self.gain
-        values += self.offset
-        references = {column: channels.absent(len(values)) if i is None else values[:, i]
-                      for column, i in self.reference_channels.items()}
-        return channels.Block(frame.time_us * 1000 + self.steps_ns[:len(values)],
-                              values[:, self.axes], references)
-
-
-class _Arrival(NamedTuple):
-    """A decoded frame, and the monotonic time of its arrival, ns."""
-
-    frame: BoardInfo | SampleFrame
-    arrived_ns: int
 
 
 def open_link(sensor: Sensor, settings: Settings) -> SerialLink:
@@ -152,6 +96,113 @@ def open_link(sensor: Sensor, settings: Settings) -> SerialLink:
         raise UserError('link.temperature_v_per_c: is 0; set the slope of the temperature sensor')
     import_pyserial()
     return SerialLink(sensor, settings)
+
+
+@dataclass(frozen=True)
+class _Conversion:
+    """How the codes of a board become samples."""
+
+    # Value of a channel is gain · code + offset, V or degC, (m,)
+    gain: np.ndarray
+    offset: np.ndarray
+    axes: slice | list[int]  # Channels of the axes of the sensor
+    references: Mapping[str, int]  # Channel of each reference by column
+    steps_ns: np.ndarray  # Times of the samples of a frame after its first one, ns, int64, (256,)
+    max_code: int  # Largest code
+
+    def block(self, frame: SampleFrame, lost: int) -> channels.Block:
+        """Return the samples of a frame."""
+        values = frame.codes.astype(float)
+        values *= self.gain
+        values += self.offset
+        return channels.Block(frame.time_us * 1000 + self.steps_ns[:len(values)],
+                              values[:, self.axes],
+                              {column: values[:, i] for column, i in self.references.items()},
+                              lost)
+
+
+def _conversion(info: BoardInfo, roles: Sequence[str], axes: str, settings: Settings
+                ) -> _Conversion:
+    """Return how the codes of a board become samples; raises `UserError` where they cannot."""
+    if len(roles) > info.channels:
+        raise UserError(f'link.channels: {len(roles)} are named, the board has {info.channels}')
+    channels.check_roles(roles, axes)
+    gain, offset = np.full(info.channels, info.vref_v / 2 ** info.bits), np.zeros(info.channels)
+    for i, role in enumerate(roles):
+        if role == channels.SUPPLY:
+            gain[i] *= settings.supply_scale
+        elif role == channels.TEMPERATURE:
+            gain[i] /= settings.temperature_v_per_c
+            offset[i] = -settings.temperature_zero_v / settings.temperature_v_per_c
+    places = [roles.index(axis) for axis in axes]
+    # A slice takes no copy.
+    together = slice(places[0], places[0] + len(axes))
+    return _Conversion(
+        gain, offset, together if places == list(range(len(roles)))[together] else places,
+        {column: roles.index(role) for role, column in channels.COLUMNS.items() if role in roles},
+        np.rint(np.arange(MAX_COUNT + 1) * (1e9 / info.rate_hz)).astype(np.int64),
+        2 ** info.bits - 1)
+
+
+class _FrameSize:
+    """
+    Asks a board for frames that are as short as the latency, unless it does not obey.
+
+    Only a device that has sent a frame gets bytes: another one could take them for its own
+    commands. A board answers with its info frame, so that the first samples need not wait.
+    """
+
+    def __init__(self, settings: Settings, port: SerialPort) -> None:
+        self._settings, self._port = settings, port
+        self._newest = self._sent = self._ignored = 0
+        self._due_s = 0.0
+        self.duration_s = 0.0  # Duration of the newest frame, s
+
+    def take(self, count: int, rate_hz: float) -> None:
+        """Take the number of samples of a frame, and their rate."""
+        self._newest, self.duration_s = count, count / rate_hz
+
+    def forget(self) -> None:
+        """Begin again with a board that may obey."""
+        self._ignored = 0
+
+    def command(self, info: BoardInfo | None) -> None:
+        """Send a command where the newest frame is not as it shall be."""
+        count, self._newest = self._newest, 0
+        if not count:
+            return
+        latency_us = round(self._settings.latency_ms * 1e3)
+        if info is not None:
+            wanted = self._possible(info)
+            if count == wanted:
+                self._ignored = 0
+                return
+            latency_us = max(latency_us, round(wanted / info.rate_hz * 1e6))
+        now_s = time.monotonic()
+        if self._ignored < _COMMANDS and now_s >= self._due_s:
+            self._port.write(encode_command(self._sent, latency_us))
+            self._sent += 1
+            self._ignored += 1
+            self._due_s = now_s + _COMMAND_PAUSE_S
+
+    def why_long(self, info: BoardInfo) -> str:
+        """Return why frames are longer than `link.latency_ms`; '' where they are not."""
+        settings, frame_ms = self._settings, self.duration_s * 1e3
+        if frame_ms <= settings.latency_ms:
+            return ''
+        possible = self._possible(info)
+        if possible > settings.samples_together(info.rate_hz):
+            possible_ms = min(possible / info.rate_hz * 1e3, frame_ms)
+            return (f' in frames of {possible_ms:.3g} ms: {settings.baud} Bd carry none of '
+                    f'{settings.latency_ms:g} ms')
+        if self._ignored >= _COMMANDS:
+            return f' in frames of {frame_ms:.3g} ms: the firmware does not obey link.latency_ms'
+        return ''
+
+    def _possible(self, info: BoardInfo) -> int:
+        """Return how many samples a frame shall have."""
+        return samples_that_fit(self._settings.samples_together(info.rate_hz), info,
+                                self._port.uart_bytes_per_s)
 
 
 class SerialLink:
@@ -173,23 +224,21 @@ class SerialLink:
         self._stated_roles = channels.parse_channels(settings.channels)
         if self._stated_roles:
             channels.check_roles(self._stated_roles, sensor.axes)
-        self.references = channels.reference_columns(self._stated_roles or _DEFAULT_ROLES)
+        self.references = tuple(column for role, column in channels.COLUMNS.items()
+                                if role in (self._stated_roles or _DEFAULT_ROLES))
         self._port = SerialPort(settings.port, settings.baud)
         self._splitter = Splitter()
-        self._arrivals: deque[_Arrival] = deque()
+        # Decoded frames with the monotonic times of their arrivals, ns
+        self._arrivals: deque[tuple[BoardInfo | SampleFrame, int]] = deque()
         self._info: BoardInfo | None = None
         self._conversion: _Conversion | None = None
         self._misfit = self._version_error = ''
         self._counter = FrameCounter()
-        self._stamper = Stamper(ClockMap(settings.delay))
-        self._frames = self._bad_frames = self._held_back = self._resets = self._rail_frames = 0
+        self._stamper = Stamper(ClockMap(settings.delay), self.references)
+        self._size = _FrameSize(settings, self._port)
+        self._counts: Counter[str] = Counter()
         self._last_frame_s = self._created_s = time.monotonic()
-        self._longest_frame_s = 0.0
-        self._commands = self._ignored_commands = 0
-        self._command_due_s = 0.0
-        self._busy_until_s = 0.0
-        self._unpaid = 0, 0
-        self._newest_count = 0
+        self._busy_until_s = self._unpaid_s = 0.0
 
     def begin(self, now_ns: int) -> int:
         """Do nothing: samples before the beginning do not count as lost."""
@@ -199,7 +248,7 @@ class SerialLink:
         """Wait for bytes, at most 50 ms, and return the samples that they complete."""
         # What need not precede the samples of the last call follows them.
         self._throttle()
-        self._command()
+        self._size.command(self._info)
         if not self._arrivals:
             self._receive()
         while self._arrivals:
@@ -219,15 +268,18 @@ class SerialLink:
     def status(self) -> LinkStatus:
         """Return how the port, the frames and the clock work."""
         level, text = self._condition()
-        clock = self._stamper.statistics()
-        statistics = Statistics(
-            frames=self._frames, bad_frames=self._bad_frames, bytes=self._port.received_bytes,
-            skipped_bytes=self._splitter.skipped, held_back=self._held_back,
-            repeated=self._counter.repeated, device_overruns=self._counter.overruns,
-            frame_ms=round(self._longest_frame_s * 1e3, 3), rail_frames=self._rail_frames,
-            resets=self._resets, connections=self._port.connections)
-        reset = Event('the device was reset or is another one: a new count begins', self._resets)
-        return LinkStatus(level, text, (statistics, clock), (reset, *clock_events(clock)))
+        counts = self._counts
+        statistics = {
+            'frames': counts['frames'], 'bad_frames': counts['bad_frames'],
+            'bytes': self._port.received_bytes, 'skipped_bytes': self._splitter.skipped,
+            'held_back': counts['held_back'], 'repeated': self._counter.repeated,
+            'device_overruns': self._counter.overruns,
+            'frame_ms': round(self._size.duration_s * 1e3, 3),
+            'rail_frames': counts['rail_frames'], 'resets': counts['resets'],
+            'connections': self._port.connections, **self._stamper.statistics()}
+        reset = Event('the device was reset or is another one: a new count begins',
+                      counts['resets'])
+        return LinkStatus(level, text, statistics, (reset, *self._stamper.events()))
 
     def close(self) -> None:
         """Close the port."""
@@ -235,52 +287,30 @@ class SerialLink:
 
     def _condition(self) -> tuple[Level, str]:
         """Return level and text of the status: the first fault of port, frames and channels."""
-        if self._port.error:
-            return Level.ERROR, self._port.error
-        if self._version_error:
-            return Level.ERROR, self._version_error
-        now_s = time.monotonic()
-        port = self._settings.port
+        if self._port.error or self._version_error:
+            return Level.ERROR, self._port.error or self._version_error
+        now_s, port, info = time.monotonic(), self._settings.port, self._info
         opened_s = max(self._port.opened_s, self._created_s)
-        if self._info is None and now_s - opened_s < _INFO_WAIT_S:
+        if info is None and now_s - opened_s < _INFO_WAIT_S:
             return Level.OK, 'connecting'
+        long_s = _SILENT_FRAMES * self._size.duration_s
         silent_s = now_s - max(self._port.last_byte_s, self._created_s)
-        if silent_s > max(_SILENT_S, _SILENT_FRAMES * self._longest_frame_s):
+        if silent_s > max(_SILENT_S, long_s):
             return Level.WARN, f'{port}: {SILENT}'
-        if now_s - self._last_frame_s > max(_NO_FRAME_S, _SILENT_FRAMES * self._longest_frame_s):
+        if now_s - self._last_frame_s > max(_NO_FRAME_S, long_s):
             return Level.WARN, (f'{port}: bytes, but no frame of wire format 1: is link.baud '
                                 f'({self._settings.baud}) that of the board?')
         if self._misfit:
             return Level.ERROR, self._misfit
-        if self._info is None:
+        if info is None:
             return Level.WARN, f'{port}: waiting for the info frame of the board'
-        return Level.OK, self._streaming(self._info)
-
-    def _streaming(self, info: BoardInfo) -> str:
-        """Return the text of a working link, with frames that are long and axes without use."""
-        return '; '.join(filter(None, (
-            f'streaming{self._why_long(info)}', self._unused_channels(info))))
-
-    def _why_long(self, info: BoardInfo) -> str:
-        """Return why frames are longer than `link.latency_ms`; '' where they are not."""
-        settings = self._settings
-        wanted, possible = settings.samples_together(info.rate_hz), self._wanted_samples(info)
-        frame_ms = self._longest_frame_s * 1e3
-        if possible > wanted and frame_ms > settings.latency_ms:
-            possible_ms = min(possible / info.rate_hz * 1e3, frame_ms)
-            return (f' in frames of {possible_ms:.3g} ms: {settings.baud} Bd carry none of '
-                    f'{settings.latency_ms:g} ms')
-        if self._ignored_commands >= _COMMANDS and frame_ms > settings.latency_ms:
-            return f' in frames of {frame_ms:.3g} ms: the firmware does not obey link.latency_ms'
-        return ''
-
-    def _unused_channels(self, info: BoardInfo) -> str:
-        """Return which channels of a board are not read; '' where all are."""
-        unused = [axis for axis in AXES[:info.channels] if axis not in self._declared.axes]
-        if self._stated_roles or not unused:
-            return ''
-        return (f'the channel of {", ".join(unused)} is not used: sensor.axes is '
-                f'{self._declared.axes} (link.channels can say that it is the supply)')
+        axes = self._declared.axes
+        unused = [] if self._stated_roles else [axis for axis in AXES[:info.channels]
+                                                if axis not in axes]
+        text = f'streaming{self._size.why_long(info)}'
+        return Level.OK, text if not unused else (
+            f'{text}; the channel of {", ".join(unused)} is not used: sensor.axes is {axes} '
+            '(link.channels can say that it is the supply)')
 
     def _receive(self) -> None:
         """Read bytes and queue the frames that they complete."""
@@ -289,7 +319,7 @@ class SerialLink:
             # The port opens again, perhaps on another board: an incomplete frame stays incomplete.
             self._splitter.restart()
             self._counter.reopened()
-            self._ignored_commands = 0
+            self._size.forget()
             return
         arrived_ns = time.monotonic_ns()
         samples = 0
@@ -297,8 +327,9 @@ class SerialLink:
             frame = self._decoded(raw)
             if frame is not None:
                 samples += len(frame.codes) if isinstance(frame, SampleFrame) else 1
-                self._arrivals.append(_Arrival(frame, arrived_ns))
-        self._unpaid = len(chunk), samples
+                self._arrivals.append((frame, arrived_ns))
+        rate_hz = self._info.rate_hz if self._info else _UNSTATED_RATE_HZ
+        self._unpaid_s = len(chunk) / _MAX_BYTES_PER_S + samples / (_MAX_RATE_RATIO * rate_hz)
 
     def _decoded(self, raw: bytes) -> BoardInfo | SampleFrame | None:
         """Decode and count a frame; None for one that cannot be read."""
@@ -309,21 +340,19 @@ class SerialLink:
                                    'driver reads 1; use the firmware of this version')
             return None
         except WireError:
-            self._bad_frames += 1
+            self._counts['bad_frames'] += 1
             return None
         self._version_error = ''
-        self._frames += 1
+        self._counts['frames'] += 1
         self._last_frame_s = time.monotonic()
         self._port.confirm()
         return frame
 
     def _throttle(self) -> None:
         """Pause so that bytes and samples stay below their largest rates (a leaky bucket)."""
-        (size, samples), self._unpaid = self._unpaid, (0, 0)
-        rate_hz = self._info.rate_hz if self._info else _UNSTATED_RATE_HZ
         now_s = time.monotonic()
-        cost_s = size / _MAX_BYTES_PER_S + samples / (_MAX_RATE_RATIO * rate_hz)
-        self._busy_until_s = max(self._busy_until_s, now_s - _CREDIT_S) + cost_s
+        self._busy_until_s = max(self._busy_until_s, now_s - _CREDIT_S) + self._unpaid_s
+        self._unpaid_s = 0.0
         if self._busy_until_s > now_s:
             time.sleep(min(self._busy_until_s - now_s, _MAX_PAUSE_S))
 
@@ -332,110 +361,40 @@ class SerialLink:
         changed = info != self._info
         if not changed and not info.flags & AFTER_RESET:
             return
-        self._info = info
-        self._ignored_commands = 0
+        self._info, self._conversion, self._misfit = info, None, ''
+        self._size.forget()
         self._counter.restart(info.rate_hz)
-        self._misfit = self._why_unfit(info)
-        self._conversion = None if self._misfit else self._make_conversion(info)
-        if changed and not self._misfit:
+        axes = self._declared.axes
+        roles = self._stated_roles or [
+            channels.UNUSED if role in AXES and role not in axes else role
+            for role in _DEFAULT_ROLES[:info.channels]]
+        try:
+            self._conversion = _conversion(info, roles, axes, self._settings)
+        except UserError as error:
+            self._misfit = str(error)
+            return
+        if changed:
             self.sensor = replace(self._declared, rate_hz=info.rate_hz, adc_bits=info.bits,
                                   adc_vref_v=info.vref_v,
                                   serial=info.serial or self._declared.serial)
 
-    def _roles(self, info: BoardInfo) -> Sequence[str]:
-        """Return the roles of a board's channels, in their order."""
-        return self._stated_roles or _DEFAULT_ROLES[:info.channels]
-
-    def _why_unfit(self, info: BoardInfo) -> str:
-        """Return why the channels of a board do not fit the sensor; '' where they do."""
-        axes = self._declared.axes
-        roles = self._roles(info)
-        if len(roles) > info.channels:
-            return f'link.channels: {len(roles)} are named, the board has {info.channels}'
-        if not self._stated_roles:
-            roles = [role for role in roles if role not in AXES or role in axes]
-        try:
-            channels.check_roles(roles, axes)
-        except UserError as error:
-            return str(error)
-        return ''
-
     def _on_samples(self, frame: SampleFrame, arrived_ns: int) -> None:
         """Check, count and stamp the samples of a frame."""
-        info = self._info
-        rate_hz = info.rate_hz if info else _UNSTATED_RATE_HZ
-        self._longest_frame_s = len(frame.codes) / rate_hz
-        self._newest_count = len(frame.codes)
-        conversion = self._conversion
+        info, conversion, count = self._info, self._conversion, len(frame.codes)
+        self._size.take(count, info.rate_hz if info else _UNSTATED_RATE_HZ)
         if info is None or conversion is None:
-            self._held_back += len(frame.codes)
+            self._counts['held_back'] += count
             return
-        if frame.codes.shape[1] != info.channels or _largest(frame.codes) > conversion.max_code:
-            self._bad_frames += 1  # whole, but it contradicts the info frame
+        # The largest of few numbers takes Python half the time of numpy's first call.
+        if frame.codes.shape[1] != info.channels \
+                or max(map(max, frame.codes.tolist())) > conversion.max_code:
+            self._counts['bad_frames'] += 1  # whole, but it contradicts the info frame
             return
         for accepted in self._counter.accept(frame, arrived_ns):
             if accepted.lost is None:
-                self._resets += self._stamper.period_ns > 0
+                self._counts['resets'] += self._stamper.period_ns > 0
                 self._stamper.restart(1e9 / info.rate_hz)
             elif accepted.stepped:
                 self._stamper.step()
-            self._rail_frames += accepted.frame.flags & RAIL
-            self._stamper.add(conversion.block(accepted.frame), arrived_ns, accepted.lost or 0)
-
-    def _wanted_samples(self, info: BoardInfo) -> int:
-        """Return how many samples a frame shall have."""
-        wanted = self._settings.samples_together(info.rate_hz)
-        return samples_that_fit(wanted, info, self._port.uart_bytes_per_s)
-
-    def _command(self) -> None:
-        """
-        Ask the board for small frames, unless it sends them or does not obey.
-
-        Only a device that has sent a frame gets bytes: another one could take them for its own
-        commands. A board answers with its info frame, so that the first samples need not wait.
-        """
-        count, self._newest_count = self._newest_count, 0
-        if not count:
-            return
-        latency_us = round(self._settings.latency_ms * 1e3)
-        if self._info is not None:
-            wanted = self._wanted_samples(self._info)
-            if count == wanted:
-                self._ignored_commands = 0
-                return
-            latency_us = max(latency_us, round(wanted / self._info.rate_hz * 1e6))
-        now_s = time.monotonic()
-        if self._ignored_commands < _COMMANDS and now_s >= self._command_due_s:
-            self._port.write(encode_command(self._commands, latency_us))
-            self._commands += 1
-            self._ignored_commands += 1
-            self._command_due_s = now_s + _COMMAND_PAUSE_S
-
-    def _make_conversion(self, info: BoardInfo) -> _Conversion:
-        """Return how the codes of a board become samples."""
-        roles, settings = self._roles(info), self._settings
-        gain, offset = np.full(info.channels, info.vref_v / 2 ** info.bits), np.zeros(
-            info.channels)
-        for i, role in enumerate(roles):
-            if role == channels.SUPPLY:
-                gain[i] *= settings.supply_scale
-            elif role == channels.TEMPERATURE:
-                gain[i] /= settings.temperature_v_per_c
-                offset[i] = -settings.temperature_zero_v / settings.temperature_v_per_c
-        return _Conversion(
-            gain, offset, _columns([roles.index(axis) for axis in self._declared.axes]),
-            {column: roles.index(role) if role in roles else None
-             for role, column in channels.COLUMNS.items() if column in self.references},
-            np.rint(np.arange(MAX_COUNT + 1) * (1e9 / info.rate_hz)).astype(np.int64),
-            2 ** info.bits - 1)
-
-
-def _columns(places: list[int]) -> slice | list[int]:
-    """Return what takes columns from an array; a slice, where it can be one, takes no copy."""
-    consecutive = range(places[0], places[-1] + 1)
-    return slice(consecutive.start, consecutive.stop) if places == list(consecutive) else places
-
-
-def _largest(codes: np.ndarray) -> int:
-    """Return the largest code; few numbers take Python half the time of numpy's first call."""
-    return max(map(max, codes.tolist()))
+            self._counts['rail_frames'] += accepted.frame.flags & RAIL
+            self._stamper.add(conversion.block(accepted.frame, accepted.lost or 0), arrived_ns)

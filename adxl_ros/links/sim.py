@@ -10,8 +10,14 @@ from functools import partial
 from math import inf
 from typing import NamedTuple
 
-from adxl_ros.links.support.base import Level, LinkStatus, option, PacedSettings, Samples
-from adxl_ros.links.support.waiting import Watchdog
+from adxl_ros.links.support.base import (
+    Level,
+    LinkStatus,
+    option,
+    PacedSettings,
+    Samples,
+    Watchdog,
+)
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
@@ -43,7 +49,7 @@ _FOREVER_NS = 2 ** 63 - 1
 class Settings(PacedSettings):
     """Settings of the link."""
 
-    seed: int = option(0, 'seed of the noise', '', 0, 2 ** 31 - 1)  # Seed of the noise
+    seed: int = option(0, 'seed of the noise', '', 0, 2 ** 31 - 1)
     # alpha_rad, beta_rad: Pose without a stage, rad
     alpha_rad: float = option(0.0, 'pose without a stage', 'rad', -100.0, 100.0)
     beta_rad: float = option(0.0, 'pose without a stage', 'rad', -100.0, 100.0)

@@ -193,7 +193,7 @@ class Driver(LifecycleNode):
         text = ', '.join(filter(None, (f'{kind}: {link.text}', warning)))
         serial = (self._output.sensor if self._output else self._sensor).serial
         return Status(level, text, serial, {
-            **values, 'link_type': self._link.name, 'link_state': link.text, **link.values()})
+            **values, 'link_type': self._link.name, 'link_state': link.text, **link.statistics})
 
     @property
     def _simulates(self) -> bool:

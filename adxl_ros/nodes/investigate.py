@@ -18,7 +18,7 @@ from adxl_ros.investigate.background import BackgroundDiagnoser, OutputFolder
 from adxl_ros.investigate.diagnosis_round import Answer, hypothesis_text, Outcome
 from adxl_ros.investigate.investigation import Investigation, State, Status as Situation
 from adxl_ros.investigate.manoeuvres import description, Pose, StageLimits
-from adxl_ros.links.support.waiting import Watchdog
+from adxl_ros.links.support.base import Watchdog
 from adxl_ros.nodes.node_help import NodeHelp
 from adxl_ros.nodes.parameters import declare_all, low_and_high
 from adxl_ros.nodes.run_node import run

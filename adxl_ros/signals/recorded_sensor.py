@@ -17,12 +17,15 @@ from adxl_ros.model.coefficients import names_of, put, with_neutral
 from adxl_ros.model.constants import AXES, MEASURED_AXES
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor, to_volts, with_axes
-from adxl_ros.signals.block_statistics import block_samples, BlockCutter, Blocks, true_runs
-from adxl_ros.signals.noise_limits import (
+from adxl_ros.signals.block_statistics import (
     adc_step,
+    block_samples,
+    BlockCutter,
+    Blocks,
     quiet_blocks,
     quiet_variance,
     Spans,
+    true_runs,
     window_variance,
 )
 import numpy as np
@@ -126,7 +129,7 @@ def measure(time_s: np.ndarray, volts: np.ndarray, sensor: Sensor) -> MeasuredVa
     time_s: stamps, s, (n,); volts: samples, V, (n, m).
     """
     cutter = BlockCutter(sensor.rate_hz, len(sensor.axes))
-    blocks, spans = cutter.feed(time_s, volts), Spans.for_rate(sensor.rate_hz)
+    blocks, spans = cutter.feed(time_s, volts), Spans(sensor.rate_hz)
     windows = window_variance(blocks, spans)
     if len(time_s) < _FEWEST_SAMPLES or not np.isfinite(windows).any():
         raise UserError(f'{len(time_s)} samples at {sensor.rate_hz:g} Hz do not show the noise of '

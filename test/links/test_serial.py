@@ -106,7 +106,7 @@ class ConnectedBoard:
 
     def value(self, name):
         """Return one of the link's statistics."""
-        return self.link.status().values()[name]
+        return self.link.status().statistics[name]
 
     def close(self):
         """Close the link, then the terminal."""
@@ -372,7 +372,7 @@ def test_a_board_on_a_terminal_is_read_to_the_last_sample(tmp_path):
         assert np.abs(volts - np.column_stack([columns['x_v'], columns['y_v']])).max() <= \
             sensor.lsb_v
         assert link.sensor.serial == 'S5'
-        assert link.status().values()['frame_ms'] == 2.0, 'the board obeys link.latency_ms'
+        assert link.status().statistics['frame_ms'] == 2.0, 'the board obeys link.latency_ms'
         link.close()
     assert not os.path.lexists(path)
 

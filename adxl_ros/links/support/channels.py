@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 import time
+from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.links.support.base import Event, Samples
@@ -60,11 +61,6 @@ def check_roles(roles: Sequence[str], axes: str) -> None:
                         f'{", ".join(roles) or "none"}, sensor.axes is {axes}')
 
 
-def reference_columns(roles: Sequence[str]) -> tuple[str, ...]:
-    """Return the columns of the references among the roles."""
-    return tuple(column for role, column in COLUMNS.items() if role in roles)
-
-
 @lru_cache(_KEPT_COUNTS)
 def absent(count: int) -> np.ndarray:
     """Return values that are not there: NaN, (count,), not to be written."""
@@ -79,71 +75,40 @@ class Block:
 
     device_ns: np.ndarray  # Device time, ns, (n,) int64, ascending
     volts: np.ndarray  # Output of the sensor by axis, V, (n, m)
-    references: Mapping[str, np.ndarray]  # References by column, (n,) each
-
-
-@dataclass(frozen=True)
-class Layout:
-    """How the channels of a device become samples."""
-
-    axes: str  # Axes of the sensor
-    columns: tuple[str, ...]  # Columns of the references; NaN where no channel has them
-    supply_scale: float  # Supply voltage by the voltage of its channel, V/V
-
-    def block(self, device_ns: np.ndarray, values: Mapping[str, np.ndarray]) -> Block:
-        """
-        Arrange the values of channels as samples.
-
-        device_ns: device time, ns, (n,) int64, ascending; values: volts, or degC for the
-        temperature, by role, (n,) each.
-        """
-        volts = np.array([values[axis] for axis in self.axes]).T
-        references = {column: absent(len(device_ns)) for column in self.columns}
-        if SUPPLY in values:
-            references[COLUMNS[SUPPLY]] = values[SUPPLY] * self.supply_scale
-        if TEMPERATURE in values:
-            references[COLUMNS[TEMPERATURE]] = values[TEMPERATURE]
-        return Block(device_ns, volts, references)
+    references: Mapping[str, np.ndarray]  # References that the device has, by column, (n,) each
+    lost: int | None = None  # Samples lost before it; None where only time shows them
 
 
 class PeriodMeans:
-    """Replaces slow references by their means over 0.1 s, each at the first sample after it."""
+    """Replaces slow references by their means over 0.1 s, each at the next sample that comes."""
 
-    def __init__(self) -> None:
+    def __init__(self, columns: Sequence[str]) -> None:
         """Begin without values."""
-        self._parts: dict[str, list[np.ndarray]] = {}
+        self._held: dict[str, list[np.ndarray]] = {column: [] for column in columns}
         self._period = 0
 
     def thin(self, host_ns: np.ndarray, references: Mapping[str, np.ndarray]
              ) -> dict[str, np.ndarray]:
         """
-        Return the means in a few rows, and NaN in the others.
+        Return the means of all columns in the first row of a period, and NaN in other rows.
 
-        host_ns: times of the samples, ns, (n,), ascending from call to call; references:
-        references by column, (n,) each; returns: means by column, (n,) each.
+        host_ns: times of the samples, ns, (n,), ascending from call to call; references: values by
+        column, (n,) each.
         """
-        begins: list[int] = []
-        if int(host_ns[-1]) // _PERIOD_NS != self._period:
-            periods = host_ns // _PERIOD_NS
-            begins = np.flatnonzero(np.diff(periods, prepend=self._period)).tolist()
-            self._period = int(periods[-1])
-        means = {}
+        period = int(host_ns[-1]) // _PERIOD_NS
+        means = dict.fromkeys(self._held, absent(len(host_ns)))
+        if period != self._period:
+            self._period = period
+            for column, parts in self._held.items():
+                values = np.concatenate([*parts, absent(1)])
+                values = values[np.isfinite(values)]
+                parts.clear()
+                if len(values):
+                    means[column] = np.full(len(host_ns), np.nan)
+                    means[column][0] = values.mean()
         for column, values in references.items():
-            means[column] = np.full(len(host_ns), np.nan) if begins else absent(len(host_ns))
-            parts = self._parts.setdefault(column, [])
-            stops = [*begins, len(values)]
-            parts.append(values[:stops[0]])
-            for begin, stop in zip(begins, stops[1:]):
-                means[column][begin] = _finite_mean(parts)
-                parts[:] = [values[begin:stop]]
+            self._held[column].append(values)
         return means
-
-
-def _finite_mean(parts: list[np.ndarray]) -> float:
-    """Return the mean of the finite values of some arrays; NaN without any."""
-    values = np.concatenate([*parts, np.zeros(0)])
-    finite = values[np.isfinite(values)]
-    return float(finite.mean()) if len(finite) else np.nan
 
 
 _FOLLOW_NS = 10_000_000
@@ -153,38 +118,20 @@ _FOREVER_NS = 2 ** 63 - 1
 """Largest time, ns: any waiting time is over by then."""
 
 
-@dataclass(frozen=True)
-class ClockStatistics:
-    """How the clocks work, as diagnostics show it."""
-
-    clock: str  # `settled` or `settling`
-    clock_drift_ppm: float  # Drift of the device's clock against the host's, ppm
-    clock_jitter_us: float  # Median distance of the earliest arrivals from the line of the map, µs
-    clock_steps: int  # How often the device's clock has stepped
-    system_clock_steps: int  # How often the system clock was set
-
-
-def clock_events(clock: ClockStatistics) -> tuple[Event, Event]:
-    """Return the events of the clocks, for the status of a link."""
-    return (Event('the clock of the device has stepped: a new map of it begins',
-                  clock.clock_steps),
-            Event('the system clock was set: the stamps follow it', clock.system_clock_steps))
-
-
 class Stamper:
     """Holds samples until the device's clock is known, stamps them and counts lost ones."""
 
-    def __init__(self, clock: ClockMap | IdentityMap) -> None:
-        """Begin without samples."""
+    def __init__(self, clock: ClockMap | IdentityMap, references: Sequence[str]) -> None:
+        """Begin without samples; `references` are the columns that all samples have."""
         self.clock = clock  # Map of the device's clock
         self.period_ns = 0.0  # Sample period, ns; 0 before the first `restart`
         self._system_clock = SystemClockMap()
         self._followed_ns = 0
-        self._means = PeriodMeans()
+        self._means = PeriodMeans(references)
         self._unstamped: list[Block] = []
         self._stamped: list[Samples] = []
         self._last_ns: int | None = None
-        self._last_device_ns: int | None = None
+        self._last_device_ns = 0
         self._new_clock = True
         self._counted = self._estimated = 0
 
@@ -195,8 +142,7 @@ class Stamper:
 
     def restart(self, period_ns: float) -> None:
         """Begin a new clock or device; time gives an estimate of the samples lost before."""
-        self.flush()
-        self.clock.restart()
+        self.step()
         self.period_ns = period_ns
         self._new_clock = True
 
@@ -205,16 +151,19 @@ class Stamper:
         self.flush()
         self.clock.restart()
 
-    def add(self, block: Block, arrived_ns: int, lost: int | None) -> None:
+    def add(self, block: Block, arrived_ns: int) -> None:
         """Take samples."""
-        stepped = self.clock.observe(int(block.device_ns[-1]), arrived_ns)
-        if lost is None:
+        newest_ns = int(block.device_ns[-1])
+        stepped = self.clock.observe(newest_ns, arrived_ns)
+        if block.lost is None:
             self._new_clock |= stepped
             if not self._new_clock:
-                self._estimated += self._gaps(block.device_ns)
-            self._last_device_ns = int(block.device_ns[-1])
+                steps_ns = np.diff(block.device_ns, prepend=self._last_device_ns)
+                self._estimated += sum(max(round(step_ns / self.period_ns) - 1, 0)
+                                       for step_ns in steps_ns.tolist())
+            self._last_device_ns = newest_ns
         else:
-            self._counted += lost
+            self._counted += block.lost
         self._unstamped.append(block)
         if self.clock.ready(arrived_ns):
             self._stamp()
@@ -242,12 +191,19 @@ class Stamper:
              for name in parts[0].references},
             sum(part.estimated for part in parts))
 
-    def statistics(self) -> ClockStatistics:
-        """Return how the clocks work."""
+    def statistics(self) -> dict[str, Any]:
+        """Return how the clocks work, as diagnostics show it."""
         clock = self.clock
-        return ClockStatistics(
-            'settled' if clock.settled else 'settling', round(clock.drift_ppm, 2),
-            round(clock.jitter_ns * 1e-3, 1), clock.steps, self._system_clock.steps)
+        return {'clock': 'settled' if clock.settled else 'settling',
+                'clock_drift_ppm': round(clock.drift_ppm, 2),
+                'clock_jitter_us': round(clock.jitter_ns * 1e-3, 1),
+                'clock_steps': clock.steps, 'system_clock_steps': self._system_clock.steps}
+
+    def events(self) -> tuple[Event, Event]:
+        """Return the events of the clocks, for the status of a link."""
+        return (Event('the clock of the device has stepped: a new map of it begins',
+                      self.clock.steps),
+                Event('the system clock was set: the stamps follow it', self._system_clock.steps))
 
     def _stamp(self) -> None:
         """Stamp the waiting samples, with the number of samples that are missing before them."""
@@ -268,12 +224,3 @@ class Stamper:
                 self._estimated))
             self._counted = self._estimated = 0
         self._unstamped.clear()
-
-    def _gaps(self, device_ns: np.ndarray) -> int:
-        """Count the samples that are missing by the device's stamps."""
-        assert self._last_device_ns is not None, 'gaps are counted after a first block'
-        before_ns, missing = self._last_device_ns, 0
-        for stamp_ns in device_ns.tolist():
-            missing += max(round((stamp_ns - before_ns) / self.period_ns) - 1, 0)
-            before_ns = stamp_ns
-        return missing

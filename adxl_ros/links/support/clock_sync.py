@@ -79,14 +79,14 @@ class _Window(NamedTuple):
 class _LateArrivals:
     """Arrivals far too late: their samples were delayed, or the device's clock stopped."""
 
-    # first_ns, last_ns: Host times of the first and the last one, ns
+    # Host time and device time of the first one, ns
     first_ns: int
-    # first_device_ns, last_device_ns: Their device times, ns
     first_device_ns: int
-    last_device_ns: int
+    # The same of the last one, ns
     last_ns: int
+    last_device_ns: int
     min_lag_ns: int  # Smallest lag of device time behind host time, ns
-    count: int = 1  # Number of arrivals
+    count: int = 1
 
 
 class ClockMap:
@@ -124,7 +124,9 @@ class ClockMap:
     def observe(self, device_ns: int, arrived_ns: int) -> bool:
         """Take an arrival."""
         lag_ns = arrived_ns - self._delay_ns - device_ns
-        is_early = self._is_early(device_ns, arrived_ns)
+        # How far the arrival lies above the line; far below it, the device's clock stepped forward
+        lateness_ns = lag_ns + device_ns - self._line(device_ns)
+        is_early = self.settled and lateness_ns < -_EARLY_NS
         if is_early or self._is_shifted(lag_ns):
             former_ns = self._former_lag_ns
             # Samples that a busy host read late have looked like those of a clock that stopped.
@@ -134,7 +136,7 @@ class ClockMap:
             self._former_lag_ns = former_ns if was_delayed else None
             self.observe(device_ns, arrived_ns)
             return not was_delayed
-        if self.settled and self._is_late(device_ns, arrived_ns, lag_ns):
+        if self.settled and self._is_late(device_ns, arrived_ns, lateness_ns):
             return False
         if self._first_arrived_ns is None:
             self._first_arrived_ns = arrived_ns
@@ -176,10 +178,6 @@ class ClockMap:
     def _line(self, device_ns: Any) -> Any:
         """Map device times, ns, to host times, ns: an array or one number."""
         return self._line_host_ns + (device_ns - self._line_device_ns) * self._slope
-
-    def _lateness_ns(self, device_ns: int, arrived_ns: int) -> float:
-        """Return how far an arrival lies above the line, ns."""
-        return arrived_ns - self._delay_ns - self._line(device_ns)
 
     def _update_window(self, device_ns: int, lag_ns: int) -> None:
         """Add an arrival to the open window; a window that ends corrects the line."""
@@ -241,24 +239,17 @@ class ClockMap:
         ahead_s = (device_ns - origin.device_ns) * 1e-9
         return origin.lag_ns + round(offset_ns + slope * ahead_s)
 
-    def _is_early(self, device_ns: int, arrived_ns: int) -> bool:
-        """Return whether an arrival is so early that the device's clock has stepped forward."""
-        return self.settled and self._lateness_ns(device_ns, arrived_ns) < -_EARLY_NS
-
-    def _is_late(self, device_ns: int, arrived_ns: int, lag_ns: int) -> bool:
+    def _is_late(self, device_ns: int, arrived_ns: int, lateness_ns: float) -> bool:
         """Keep an arrival that is far too late out of the windows, until later ones explain it."""
-        lateness_ns = self._lateness_ns(device_ns, arrived_ns)
-        late = self._late
-        if late is None:
-            if lateness_ns < _STOPPED_NS:
-                return False
-            self._late = _LateArrivals(arrived_ns, device_ns, device_ns, arrived_ns, lag_ns)
-            return True
-        if lateness_ns < _SHIFT_NS:
-            # The delayed samples have been delivered: the clock did not stop.
+        late, lag_ns = self._late, arrived_ns - self._delay_ns - device_ns
+        if lateness_ns < (_STOPPED_NS if late is None else _SHIFT_NS):
+            # Delayed samples, if there were some, have been delivered: the clock did not stop.
             self._late = None
             return False
-        late.last_device_ns, late.last_ns = device_ns, arrived_ns
+        if late is None:
+            self._late = _LateArrivals(arrived_ns, device_ns, arrived_ns, device_ns, lag_ns)
+            return True
+        late.last_ns, late.last_device_ns = arrived_ns, device_ns
         late.min_lag_ns = min(late.min_lag_ns, lag_ns)
         late.count += 1
         return True
@@ -291,7 +282,7 @@ class ClockMap:
 class IdentityMap:
     """Map for a device that stamps by the host's own monotonic clock."""
 
-    # steps, settled, drift_ppm, jitter_ns: As those of `ClockMap`, and constant
+    # As those of `ClockMap`, and constant
     steps = 0
     settled = True
     drift_ppm = jitter_ns = 0.0
@@ -312,53 +303,44 @@ class IdentityMap:
         return device_ns
 
 
+_STEP_NS = 1_000_000
+"""Change of the system clock's offset that counts as a step, ns. Chosen: slewing by NTP is slower.
+"""
+_TRIES = 3
+"""Readings of which the least interrupted one counts."""
+_MAX_UNCERTAINTY_NS = 20_000
+"""Uncertainty above which a reading is ignored, ns: the process was interrupted."""
+_GAIN = 0.05
+"""Share of a small difference that an update takes up."""
+
+
 class SystemClockMap:
     """Map from the host's monotonic clock, which is never set, to ROS time, the system clock."""
-
-    _STEP_NS = 1_000_000
-    """Change of the offset that counts as a step, ns. Chosen: slewing by NTP is slower."""
-    _TRIES = 3
-    """Readings of which the least interrupted one counts."""
-    _MAX_UNCERTAINTY_NS = 20_000
-    """Uncertainty above which a reading is ignored, ns: the process was interrupted."""
-    _GAIN = 0.05
-    """Share of a small difference that an update takes up."""
 
     def __init__(self) -> None:
         """Read both clocks."""
         self.steps = 0  # How often the system clock was set since the map began
-        self._offset_ns = float(self._read().offset_ns)
+        self._offset_ns = float(_system_offset()[1])
 
-    def update(self) -> int:
-        """Follow the system clock; return by how much it was set since the last call, ns, or 0."""
-        reading = self._read()
-        if reading.uncertainty_ns > self._MAX_UNCERTAINTY_NS:
-            return 0
-        difference_ns = reading.offset_ns - self._offset_ns
-        if abs(difference_ns) < self._STEP_NS:
-            self._offset_ns += self._GAIN * difference_ns
-            return 0
-        self._offset_ns += difference_ns
-        self.steps += 1
-        return round(difference_ns)
+    def update(self) -> None:
+        """Follow the system clock."""
+        uncertainty_ns, offset_ns = _system_offset()
+        if uncertainty_ns > _MAX_UNCERTAINTY_NS:
+            return
+        difference_ns = offset_ns - self._offset_ns
+        is_step = abs(difference_ns) >= _STEP_NS
+        self._offset_ns += difference_ns if is_step else _GAIN * difference_ns
+        self.steps += is_step
 
     def ros_ns(self, host_ns: np.ndarray) -> np.ndarray:
         """Return the ROS times of monotonic times, ns."""
         return host_ns + round(self._offset_ns)
 
-    def _read(self) -> _OffsetReading:
-        """Read the offset of the system clock, the least interrupted of some tries."""
-        readings = []
-        for _ in range(self._TRIES):
-            before_ns, system_ns, after_ns = (
-                time.monotonic_ns(), time.time_ns(), time.monotonic_ns())
-            readings.append(_OffsetReading(after_ns - before_ns,
-                                           system_ns - (before_ns + after_ns) // 2))
-        return min(readings, key=lambda reading: reading.uncertainty_ns)
 
-
-class _OffsetReading(NamedTuple):
-    """Offset of the system clock from the monotonic clock, and its uncertainty, ns."""
-
-    uncertainty_ns: int
-    offset_ns: int
+def _system_offset() -> tuple[int, int]:
+    """Return uncertainty and offset of the system clock from the monotonic clock, ns."""
+    readings = []
+    for _ in range(_TRIES):
+        before_ns, system_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        readings.append((after_ns - before_ns, system_ns - (before_ns + after_ns) // 2))
+    return min(readings)

@@ -21,6 +21,8 @@ from adxl_ros.links.support.wire_format import (
     BoardInfo,
     decode_command,
     Encoder,
+    MAX_BITS,
+    MAX_SERIAL,
     Splitter,
     WireError,
 )
@@ -40,10 +42,6 @@ _TEMPERATURE_ZERO_V = 0.5
 """Output of the temperature sensor at 0 degC, V, as a TMP36 has it."""
 _TEMPERATURE_V_PER_C = 0.01
 """Slope of the temperature sensor, V/degC, as a TMP36 has it."""
-_MAX_BITS = 16
-"""Largest resolution of the codes of wire format 1, bit."""
-_MAX_SERIAL = 16
-"""Most characters of a serial number in wire format 1."""
 
 
 class Board:
@@ -72,7 +70,9 @@ class Board:
 
         columns: volts by axis, such as `x_v`, and `supply_v` and `temperature_c`, (n,) each.
         """
-        codes = self._codes(columns)
+        volts = np.column_stack([_volts(role, columns) for role in self._roles])
+        codes = np.rint(volts / self._sensor.lsb_v).clip(
+            0, 2 ** self._sensor.adc_bits - 1).astype(np.uint16)
         if self._began_s is None:
             self._began_s = time.monotonic()
         while len(codes):
@@ -101,12 +101,6 @@ class Board:
                 self._frame_samples = min(samples_within(latency_s, self._sensor.rate_hz),
                                           _FRAME_SAMPLES)
                 self._informed_s = -_INFO_S
-
-    def _codes(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return the ADC codes of all channels, (n, m)."""
-        volts = np.column_stack([_volts(role, columns) for role in self._roles])
-        codes = np.rint(volts / self._sensor.lsb_v)
-        return codes.clip(0, 2 ** self._sensor.adc_bits - 1).astype(np.uint16)
 
     def _write(self, frame: bytes) -> bool:
         """Write a frame, after the rest of a previous one; return whether it was taken."""
@@ -148,49 +142,35 @@ def driver_command(port: str, roles: list[str]) -> str:
 
 def check_sensor(sensor: Sensor) -> None:
     """Raise `UserError` for a sensor that wire format 1 cannot describe."""
-    if not 1 <= sensor.adc_bits <= _MAX_BITS:
+    if not 1 <= sensor.adc_bits <= MAX_BITS:
         raise UserError(f'sensor.adc_bits: {sensor.adc_bits}: a board sends codes of 1 to '
-                        f'{_MAX_BITS} bits')
-    if len(sensor.serial) > _MAX_SERIAL or not sensor.serial.isascii():
-        raise UserError(f'sensor.serial: {sensor.serial!r}: a board has room for {_MAX_SERIAL} '
+                        f'{MAX_BITS} bits')
+    if len(sensor.serial) > MAX_SERIAL or not sensor.serial.isascii():
+        raise UserError(f'sensor.serial: {sensor.serial!r}: a board has room for {MAX_SERIAL} '
                         'ASCII characters')
 
 
 @contextmanager
 def open_terminal(port: str) -> Iterator[int]:
     """Open the end of a terminal that a board writes to."""
-    path = Path(port)
-    if path.exists():
-        if not stat.S_ISCHR(path.stat().st_mode):
-            raise UserError(f'--port {port}: is no terminal device; name one, or a path that '
-                            'does not exist for a new pseudo-terminal')
-        fd = _open_existing(path)
-        try:
-            yield fd
-        finally:
-            os.close(fd)
-        return
-    board_fd, driver_fd = pty.openpty()
+    path, fds = Path(port), []
+    is_new = not path.exists()
+    if not is_new and not stat.S_ISCHR(path.stat().st_mode):
+        raise UserError(f'--port {port}: is no terminal device; name one, or a path that does not '
+                        'exist for a new pseudo-terminal')
     try:
-        tty.setraw(driver_fd)
-        os.set_blocking(board_fd, False)
-        path.unlink(missing_ok=True)  # the name of an earlier board
-        path.symlink_to(os.ttyname(driver_fd))
-        yield board_fd
-    except OSError as error:
-        raise UserError(f'--port {port}: {error.strerror}') from None
-    finally:
-        if path.is_symlink() and os.readlink(path) == os.ttyname(driver_fd):
-            path.unlink()
-        os.close(board_fd)
-        os.close(driver_fd)
-
-
-def _open_existing(path: Path) -> int:
-    """Open a terminal device for raw bytes; return its file descriptor, which does not block."""
-    try:
-        fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-        tty.setraw(fd)
+        fds = [*pty.openpty()] if is_new else [os.open(
+            path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)]
+        tty.setraw(fds[-1])
+        os.set_blocking(fds[0], False)
+        if is_new:
+            path.unlink(missing_ok=True)  # the name of an earlier board
+            path.symlink_to(os.ttyname(fds[-1]))
+        yield fds[0]
     except (OSError, termios.error) as error:
-        raise UserError(f'--port {path}: cannot be opened: {error}') from None
-    return fd
+        raise UserError(f'--port {port}: cannot be opened: {error}') from None
+    finally:
+        if is_new and fds and path.is_symlink() and os.readlink(path) == os.ttyname(fds[-1]):
+            path.unlink()
+        for fd in fds:
+            os.close(fd)

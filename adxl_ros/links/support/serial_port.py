@@ -16,7 +16,7 @@ import time
 from typing import Any
 
 from adxl_ros.errors import install_hint, UserError
-from adxl_ros.links.support.waiting import Backoff
+from adxl_ros.links.support.base import Backoff
 
 SILENT = 'silent, the board sends nothing'
 """Error of a port that is open but delivers nothing."""
