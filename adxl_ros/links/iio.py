@@ -14,16 +14,7 @@ import time
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import install_hint, UserError
-from adxl_ros.links.support import channels
-from adxl_ros.links.support.base import (
-    Backoff,
-    DeviceSettings,
-    Level,
-    LinkStatus,
-    no_samples,
-    option,
-    Samples,
-)
+from adxl_ros.links.support import base, channels
 from adxl_ros.links.support.channels import Stamper
 from adxl_ros.links.support.clock_sync import ClockMap, IdentityMap
 from adxl_ros.links.support.wire_format import RATES_HZ
@@ -84,14 +75,14 @@ _INSTALL = ('link.type iio needs the Python package pylibiio and the library lib
 
 
 @dataclass(frozen=True)
-class Settings(DeviceSettings):
+class Settings(base.DeviceSettings):
     """Settings of the link."""
 
-    uri: str = option('local:', 'URI of libiio: local:, ip:HOST or ip:HOST:PORT, usb:...')
-    device: str = option('', 'name, id or label of the ADC; empty: the only one that has buffered '
-                         'channels')
+    uri: str = base.option('local:', 'URI of libiio: local:, ip:HOST or ip:HOST:PORT, usb:...')
+    device: str = base.option('', 'name, id or label of the ADC; empty: the only one that has '
+                              'buffered channels')
     # A list of strings, or one string with commas
-    channels: str | Sequence[str] = option(
+    channels: str | Sequence[str] = base.option(
         (), 'ids or labels of x, y, z as the sensor has them, supply, temperature, or ROLE=ID; '
         'empty: the channels with these labels, else the first voltages')
 
@@ -126,7 +117,7 @@ class IioLink:
         self._entries = channels.parse_channels(settings.channels)
         self._stream: _Stream | None = None
         self._stamper = Stamper(ClockMap(settings.delay, _DECISION_S), self.references)
-        self._backoff = Backoff()
+        self._backoff = base.Backoff()
         self._error = ''
         self._adc: _Adc | None = None
         self._connections = self._repeated = 0
@@ -138,7 +129,7 @@ class IioLink:
         """Do nothing: samples before the beginning do not count as lost."""
         return 0
 
-    def read(self, now_ns: int) -> Samples:
+    def read(self, now_ns: int) -> base.Samples:
         """Wait for a buffer and return its samples; without a device, wait for the device."""
         if self._stream is None:
             if self._backoff.wait():
@@ -152,13 +143,13 @@ class IioLink:
                 self.close()
                 self._backoff.fail()
         samples = self._stamper.take()
-        return no_samples(self._declared, time.time_ns()) if samples is None else samples
+        return base.no_samples(self._declared, time.time_ns()) if samples is None else samples
 
-    def status(self) -> LinkStatus:
+    def status(self) -> base.LinkStatus:
         """Return how the device and the clock work."""
         level, text = self._condition()
         buffer_s = self._stream.buffer_s if self._stream else 0.0
-        return LinkStatus(level, text, {
+        return base.LinkStatus(level, text, {
             'connections': self._connections, 'repeated': self._repeated,
             'buffer_ms': round(buffer_s * 1e3, 3), **self._stamper.statistics()},
             self._stamper.events())
@@ -169,21 +160,21 @@ class IioLink:
             self._stream.close()
             self._stream = None
 
-    def _condition(self) -> tuple[Level, str]:
+    def _condition(self) -> tuple[base.Level, str]:
         """Return level and text of the status."""
         # The URI of this machine is only a kind and a colon.
         uri, stream = self._settings.uri.removesuffix(':'), self._stream
         if self._error:
-            return Level.ERROR, f'{uri}: {self._error}'
+            return base.Level.ERROR, f'{uri}: {self._error}'
         if stream is None:
-            return Level.OK, 'connecting'
+            return base.Level.OK, 'connecting'
         silent_s = time.monotonic() - self._last_buffer_s
         if silent_s > max(_SILENT_S, _SILENT_BUFFERS * stream.buffer_s):
-            return Level.WARN, f'{uri}: silent, {stream.name} gives no samples'
+            return base.Level.WARN, f'{uri}: silent, {stream.name} gives no samples'
         rate_hz, wanted_hz = stream.adc.rate_hz, self._declared.rate_hz
         difference = '' if abs(rate_hz / wanted_hz - 1) < _RATE_TOLERANCE else \
             f' ({wanted_hz:g} Hz were asked for)'
-        return Level.OK, f'streaming at {rate_hz:g} Hz{difference}'
+        return base.Level.OK, f'streaming at {rate_hz:g} Hz{difference}'
 
     def _open(self) -> None:
         """Try to open the device; a new ADC begins a new clock."""

@@ -10,33 +10,11 @@ from dataclasses import dataclass, replace
 import time
 
 from adxl_ros.errors import UserError
-from adxl_ros.links.support import channels
-from adxl_ros.links.support.base import (
-    DeviceSettings,
-    Event,
-    Level,
-    LinkStatus,
-    no_samples,
-    option,
-    Samples,
-)
+from adxl_ros.links.support import base, channels, wire_format
 from adxl_ros.links.support.channels import Stamper
 from adxl_ros.links.support.clock_sync import ClockMap
 from adxl_ros.links.support.serial_port import import_pyserial, SerialPort, SILENT
-from adxl_ros.links.support.wire_format import (
-    AFTER_RESET,
-    BoardInfo,
-    decode,
-    encode_command,
-    FrameCounter,
-    MAX_COUNT,
-    RAIL,
-    SampleFrame,
-    samples_that_fit,
-    Splitter,
-    VersionError,
-    WireError,
-)
+from adxl_ros.links.support.wire_format import BoardInfo, SampleFrame
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -72,20 +50,20 @@ _UNSTATED_RATE_HZ = 1000.0
 
 
 @dataclass(frozen=True)
-class Settings(DeviceSettings):
+class Settings(base.DeviceSettings):
     """Settings of the link."""
 
-    port: str = option('', 'device path, such as /dev/ttyACM0, or a pyserial URL')
-    baud: int = option(115200, 'baud rate of a UART; USB and network ports ignore it', 'Bd', 50,
-                       100_000_000)
+    port: str = base.option('', 'device path, such as /dev/ttyACM0, or a pyserial URL')
+    baud: int = base.option(115200, 'baud rate of a UART; USB and network ports ignore it', 'Bd',
+                            50, 100_000_000)
     # A list of strings, or one string with commas
-    channels: str | Sequence[str] = option(
+    channels: str | Sequence[str] = base.option(
         (), 'roles of the channels of a frame: x, y, z, supply, temperature, or - for unused; '
         'empty: the first channels are x, y, z, supply')
-    temperature_zero_v: float = option(0.5, 'output of the temperature sensor at 0 degC', 'V',
-                                       -10.0, 10.0)
-    temperature_v_per_c: float = option(0.01, 'slope of the temperature sensor', 'V/degC',
-                                        -10.0, 10.0)
+    temperature_zero_v: float = base.option(0.5, 'output of the temperature sensor at 0 degC', 'V',
+                                            -10.0, 10.0)
+    temperature_v_per_c: float = base.option(0.01, 'slope of the temperature sensor', 'V/degC',
+                                             -10.0, 10.0)
 
 
 def open_link(sensor: Sensor, settings: Settings) -> SerialLink:
@@ -140,7 +118,7 @@ def _conversion(info: BoardInfo, roles: Sequence[str], axes: str, settings: Sett
     return _Conversion(
         gain, offset, together if places == list(range(len(roles)))[together] else places,
         {column: roles.index(role) for role, column in channels.COLUMNS.items() if role in roles},
-        np.rint(np.arange(MAX_COUNT + 1) * (1e9 / info.rate_hz)).astype(np.int64),
+        np.rint(np.arange(wire_format.MAX_COUNT + 1) * (1e9 / info.rate_hz)).astype(np.int64),
         2 ** info.bits - 1)
 
 
@@ -180,7 +158,7 @@ class _FrameSize:
             latency_us = max(latency_us, round(wanted / info.rate_hz * 1e6))
         now_s = time.monotonic()
         if self._ignored < _COMMANDS and now_s >= self._due_s:
-            self._port.write(encode_command(self._sent, latency_us))
+            self._port.write(wire_format.encode_command(self._sent, latency_us))
             self._sent += 1
             self._ignored += 1
             self._due_s = now_s + _COMMAND_PAUSE_S
@@ -201,8 +179,8 @@ class _FrameSize:
 
     def _possible(self, info: BoardInfo) -> int:
         """Return how many samples a frame shall have."""
-        return samples_that_fit(self._settings.samples_together(info.rate_hz), info,
-                                self._port.uart_bytes_per_s)
+        return wire_format.samples_that_fit(self._settings.samples_together(info.rate_hz), info,
+                                            self._port.uart_bytes_per_s)
 
 
 class SerialLink:
@@ -227,13 +205,13 @@ class SerialLink:
         self.references = tuple(column for role, column in channels.COLUMNS.items()
                                 if role in (self._stated_roles or _DEFAULT_ROLES))
         self._port = SerialPort(settings.port, settings.baud)
-        self._splitter = Splitter()
+        self._splitter = wire_format.Splitter()
         # Decoded frames with the monotonic times of their arrivals, ns
         self._arrivals: deque[tuple[BoardInfo | SampleFrame, int]] = deque()
         self._info: BoardInfo | None = None
         self._conversion: _Conversion | None = None
         self._misfit = self._version_error = ''
-        self._counter = FrameCounter()
+        self._counter = wire_format.FrameCounter()
         self._stamper = Stamper(ClockMap(settings.delay), self.references)
         self._size = _FrameSize(settings, self._port)
         self._counts: Counter[str] = Counter()
@@ -244,7 +222,7 @@ class SerialLink:
         """Do nothing: samples before the beginning do not count as lost."""
         return 0
 
-    def read(self, now_ns: int) -> Samples:
+    def read(self, now_ns: int) -> base.Samples:
         """Wait for bytes, at most 50 ms, and return the samples that they complete."""
         # What need not precede the samples of the last call follows them.
         self._throttle()
@@ -263,9 +241,9 @@ class SerialLink:
             else:
                 self._on_samples(frame, arrived_ns)
         samples = self._stamper.take()
-        return no_samples(self._declared, time.time_ns()) if samples is None else samples
+        return base.no_samples(self._declared, time.time_ns()) if samples is None else samples
 
-    def status(self) -> LinkStatus:
+    def status(self) -> base.LinkStatus:
         """Return how the port, the frames and the clock work."""
         level, text = self._condition()
         counts = self._counts
@@ -277,38 +255,38 @@ class SerialLink:
             'frame_ms': round(self._size.duration_s * 1e3, 3),
             'rail_frames': counts['rail_frames'], 'resets': counts['resets'],
             'connections': self._port.connections, **self._stamper.statistics()}
-        reset = Event('the device was reset or is another one: a new count begins',
-                      counts['resets'])
-        return LinkStatus(level, text, statistics, (reset, *self._stamper.events()))
+        reset = base.Event('the device was reset or is another one: a new count begins',
+                           counts['resets'])
+        return base.LinkStatus(level, text, statistics, (reset, *self._stamper.events()))
 
     def close(self) -> None:
         """Close the port."""
         self._port.close()
 
-    def _condition(self) -> tuple[Level, str]:
+    def _condition(self) -> tuple[base.Level, str]:
         """Return level and text of the status: the first fault of port, frames and channels."""
         if self._port.error or self._version_error:
-            return Level.ERROR, self._port.error or self._version_error
+            return base.Level.ERROR, self._port.error or self._version_error
         now_s, port, info = time.monotonic(), self._settings.port, self._info
         opened_s = max(self._port.opened_s, self._created_s)
         if info is None and now_s - opened_s < _INFO_WAIT_S:
-            return Level.OK, 'connecting'
+            return base.Level.OK, 'connecting'
         long_s = _SILENT_FRAMES * self._size.duration_s
         silent_s = now_s - max(self._port.last_byte_s, self._created_s)
         if silent_s > max(_SILENT_S, long_s):
-            return Level.WARN, f'{port}: {SILENT}'
+            return base.Level.WARN, f'{port}: {SILENT}'
         if now_s - self._last_frame_s > max(_NO_FRAME_S, long_s):
-            return Level.WARN, (f'{port}: bytes, but no frame of wire format 1: is link.baud '
-                                f'({self._settings.baud}) that of the board?')
+            return base.Level.WARN, (f'{port}: bytes, but no frame of wire format 1: is link.baud '
+                                     f'({self._settings.baud}) that of the board?')
         if self._misfit:
-            return Level.ERROR, self._misfit
+            return base.Level.ERROR, self._misfit
         if info is None:
-            return Level.WARN, f'{port}: waiting for the info frame of the board'
+            return base.Level.WARN, f'{port}: waiting for the info frame of the board'
         axes = self._declared.axes
         unused = [] if self._stated_roles else [axis for axis in AXES[:info.channels]
                                                 if axis not in axes]
         text = f'streaming{self._size.why_long(info)}'
-        return Level.OK, text if not unused else (
+        return base.Level.OK, text if not unused else (
             f'{text}; the channel of {", ".join(unused)} is not used: sensor.axes is {axes} '
             '(link.channels can say that it is the supply)')
 
@@ -334,12 +312,12 @@ class SerialLink:
     def _decoded(self, raw: bytes) -> BoardInfo | SampleFrame | None:
         """Decode and count a frame; None for one that cannot be read."""
         try:
-            frame = decode(raw)
-        except VersionError as error:
+            frame = wire_format.decode(raw)
+        except wire_format.VersionError as error:
             self._version_error = (f'{self._settings.port}: the board speaks {error}, this '
                                    'driver reads 1; use the firmware of this version')
             return None
-        except WireError:
+        except wire_format.WireError:
             self._counts['bad_frames'] += 1
             return None
         self._version_error = ''
@@ -359,7 +337,7 @@ class SerialLink:
     def _on_info(self, info: BoardInfo) -> None:
         """Take the description of the board, where it is new or follows a reset."""
         changed = info != self._info
-        if not changed and not info.flags & AFTER_RESET:
+        if not changed and not info.flags & wire_format.AFTER_RESET:
             return
         self._info, self._conversion, self._misfit = info, None, ''
         self._size.forget()
@@ -396,5 +374,5 @@ class SerialLink:
                 self._stamper.restart(1e9 / info.rate_hz)
             elif accepted.stepped:
                 self._stamper.step()
-            self._counts['rail_frames'] += accepted.frame.flags & RAIL
+            self._counts['rail_frames'] += accepted.frame.flags & wire_format.RAIL
             self._stamper.add(conversion.block(accepted.frame, accepted.lost or 0), arrived_ns)

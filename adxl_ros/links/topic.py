@@ -12,15 +12,7 @@ import time
 from typing import NamedTuple
 
 from adxl_ros.files.recording_columns import is_even, stamped_rate_hz
-from adxl_ros.links.support.base import (
-    Event,
-    Level,
-    LinkStatus,
-    no_samples,
-    option,
-    Samples,
-    SimulatorSettings,
-)
+from adxl_ros.links.support import base
 from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import Motion
@@ -65,18 +57,18 @@ _ABSENT = {'orientation': np.array([0.0, 0.0, 0.0, 1.0]), 'angular_velocity': np
 
 
 @dataclass(frozen=True)
-class Settings(SimulatorSettings):
+class Settings(base.SimulatorSettings):
     """Settings of the link."""
 
-    topic: str = option('imu/ideal', 'topic of the ideal sensor_msgs/Imu of a simulator: specific '
-                        'force')
-    temperature_topic: str = option('temperature', 'topic of the temperature of the sensor, '
-                                    'sensor_msgs/Temperature; 25 °C until it comes')
-    seed: int = option(0, 'seed of the noise', '', 0, 2 ** 31 - 1)
-    roll_rad: float = option(0.0, 'roll of the case in the frame of the ideal samples', 'rad',
-                             -7.0, 7.0)
-    pitch_rad: float = option(0.0, 'pitch of the case in that frame', 'rad', -7.0, 7.0)
-    yaw_rad: float = option(0.0, 'yaw of the case in that frame', 'rad', -7.0, 7.0)
+    topic: str = base.option('imu/ideal', 'topic of the ideal sensor_msgs/Imu of a simulator: '
+                             'specific force')
+    temperature_topic: str = base.option('temperature', 'topic of the temperature of the sensor, '
+                                         'sensor_msgs/Temperature; 25 °C until it comes')
+    seed: int = base.option(0, 'seed of the noise', '', 0, 2 ** 31 - 1)
+    roll_rad: float = base.option(0.0, 'roll of the case in the frame of the ideal samples', 'rad',
+                                  -7.0, 7.0)
+    pitch_rad: float = base.option(0.0, 'pitch of the case in that frame', 'rad', -7.0, 7.0)
+    yaw_rad: float = base.option(0.0, 'yaw of the case in that frame', 'rad', -7.0, 7.0)
 
     @property
     def turns_case(self) -> bool:
@@ -213,47 +205,47 @@ class EmulatedSensor:
         """Return 0: stamps are those of the simulator, and no sample is lost."""
         return 0
 
-    def read(self, now_ns: int) -> Samples:
+    def read(self, now_ns: int) -> base.Samples:
         """Return the samples since the last call."""
         made, self._made = self._made, []
         missing, self._missing = self._missing, 0
         if not made:
-            empty = no_samples(self._unit, self._newest_ns or 0)
+            empty = base.no_samples(self._unit, self._newest_ns or 0)
             return replace(empty, missing=missing, estimated=missing)
         passed = {name: np.array([ideal.fields[name] for ideal, _ in made])
                   for name in made[0][0].fields if name != 'linear_acceleration'}
-        return Samples(np.array([ideal.stamp_ns for ideal, _ in made], np.int64),
-                       np.array([volts for _, volts in made]), made[-1][0].stamp_ns, missing,
-                       estimated=missing, imu_fields=passed)
+        return base.Samples(np.array([ideal.stamp_ns for ideal, _ in made], np.int64),
+                            np.array([volts for _, volts in made]), made[-1][0].stamp_ns, missing,
+                            estimated=missing, imu_fields=passed)
 
-    def status(self) -> LinkStatus:
+    def status(self) -> base.LinkStatus:
         """Return whether the simulator sends samples."""
         counts = dict(self._counts)
-        events = (Event(f'not emulated: {self._left_out}', int(bool(self._left_out))),
-                  Event('the simulation was reset; the sensor is at its power-on',
-                        counts['resets']),
-                  Event('the rate of the simulator changed; the sensor is at its power-on',
-                        counts['rate_changes']),
-                  Event(f'{self.imu_topic}: a sample is not a number; check the simulation',
-                        counts['not_finite']))
-        return LinkStatus(*self._condition(), counts, events)
+        events = (base.Event(f'not emulated: {self._left_out}', int(bool(self._left_out))),
+                  base.Event('the simulation was reset; the sensor is at its power-on',
+                             counts['resets']),
+                  base.Event('the rate of the simulator changed; the sensor is at its power-on',
+                             counts['rate_changes']),
+                  base.Event(f'{self.imu_topic}: a sample is not a number; check the simulation',
+                             counts['not_finite']))
+        return base.LinkStatus(*self._condition(), counts, events)
 
     def close(self) -> None:
         """Do nothing: the link holds nothing open."""
 
-    def _condition(self) -> tuple[Level, str]:
+    def _condition(self) -> tuple[base.Level, str]:
         """Return level and text of the status."""
         topic, sensor = self.imu_topic, self.sensor
         if self._mixture:
-            return Level.ERROR, self._mixture
+            return base.Level.ERROR, self._mixture
         if self._newest_ns is None or time.monotonic() - self._heard_s > _SILENT_S:
-            return Level.WARN, f'{topic}: ' + (
+            return base.Level.WARN, f'{topic}: ' + (
                 'waiting for a sample' if self._publishers is None
                 else 'no samples; is the simulation paused?' if self._publishers
                 else 'nobody publishes it; start the simulator, or set link.topic')
         if self._chain is None or sensor is None:
-            return Level.WARN, f'{topic}: measuring the rate'
-        return Level.OK, f'emulates {self._unit.serial} on {topic} at {sensor.rate_hz:.6g} Hz'
+            return base.Level.WARN, f'{topic}: measuring the rate'
+        return base.Level.OK, f'emulates {self._unit.serial} on {topic} at {sensor.rate_hz:.6g} Hz'
 
     def _restart(self) -> None:
         """Put the sensor at its power-on, at a rate that the next samples determine."""
@@ -265,7 +257,7 @@ class EmulatedSensor:
         self._since = 0
 
     def _sense(self, ideal: _Ideal) -> None:
-        """Hold a sample for the chain, or drop it; a reset and a long gap put it at its power-on."""
+        """Hold a sample for the chain, or drop it; a reset and a long gap begin anew."""
         step_ns = 1 if self._newest_ns is None else ideal.stamp_ns - self._newest_ns
         if step_ns <= 0:
             if step_ns >= -_LATE_PERIODS * self._period_ns:
@@ -284,11 +276,11 @@ class EmulatedSensor:
         self._held.append(ideal)
 
     def _has_chain(self) -> bool:
-        """Return whether there is a chain; make it once the samples that are held show the rate."""
+        """Return whether there is a chain; it is made once the held samples show the rate."""
         if self._chain is None and self._held:
             count, time_s = len(self._held), _seconds([held.stamp_ns for held in self._held])
             is_long = time_s[-1] >= _FIRST_S and count >= _MIN_FIRST
-            if is_long or count >= _FIRST_UNEVEN or count >= _FIRST and is_even(time_s):
+            if is_long or count >= _FIRST_UNEVEN or (count >= _FIRST and is_even(time_s)):
                 rate_hz = stamped_rate_hz(time_s)
                 self._shows_losses = _show_losses(np.diff(time_s) * rate_hz)
                 self.sensor = replace(self._unit, rate_hz=rate_hz)

@@ -12,16 +12,9 @@ from adxl_ros.files.exports import kalibr_settings
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.signals import noise_parameters
 from adxl_ros.signals.allan_deviation import StillStretch
-from adxl_ros.signals.noise_parameters import (
-    coefficient_variances,
-    Drift,
-    Estimate,
-    find_drift,
-    fit_noise,
-    needed_time_s,
-    NoiseFit,
-)
+from adxl_ros.signals.noise_parameters import Drift, Estimate, NoiseFit
 import numpy as np
 
 TERMS = ('white', 'instability', 'walk')
@@ -84,14 +77,14 @@ class RecordingNoise:
 def recording_noise(path: str, rest: StillStretch, axes: str, show: Callable[[float], None]
                     ) -> RecordingNoise:
     """Fit the noise of all axes."""
-    variances = coefficient_variances(len(rest.means), rest.step_s)
+    variances = noise_parameters.coefficient_variances(len(rest.means), rest.step_s)
     noises = []
     for i, axis in enumerate(axes):
         means = rest.means[:, i]
-        fit = fit_noise(means, rest.step_s, variances)
-        drift = find_drift(means, rest.step_s, variances, fit, rest.temperature_c)
-        needed_s = {name: needed_time_s(fit, term, rest.span_s) for term, name in enumerate(TERMS)
-                    if not getattr(fit, name).is_seen}
+        fit = noise_parameters.fit_noise(means, rest.step_s, variances)
+        drift = noise_parameters.find_drift(means, rest.step_s, variances, fit, rest.temperature_c)
+        needed_s = {name: noise_parameters.needed_time_s(fit, term, rest.span_s)
+                    for term, name in enumerate(TERMS) if not getattr(fit, name).is_seen}
         deviation = rest.allan.deviation[:, i]
         lowest = int(np.argmin(deviation))
         std, resolution = float(rest.sample_std[i]), float(rest.resolution[i])

@@ -349,17 +349,3 @@ def half_differences(blocks: Blocks, usable: np.ndarray,
     unusable = np.concatenate([[0], np.cumsum(~usable)])
     gapless = blocks.run[2 * half - 1:] == blocks.run[:places]
     return differences, gapless & (unusable[2 * half:] == unusable[:-2 * half])
-
-
-def batch_scatter(means: np.ndarray, length: int) -> tuple[np.ndarray, int]:
-    """
-    Return the scatter of batches of so many means of blocks, (k, m), about their mean.
-
-    It is the sum of squared deviations times `length`, (m,), and its degrees of freedom. Their
-    ratio is the long-run variance of a block's mean.
-    """
-    count = len(means) // length
-    if count < 2:
-        return np.zeros(means.shape[1]), 0
-    batches = means[:count * length].reshape(count, length, -1).mean(axis=1)
-    return length * ((batches - batches.mean(axis=0)) ** 2).sum(axis=0), count - 1

@@ -17,17 +17,8 @@ from adxl_ros.model.coefficients import names_of, put, with_neutral
 from adxl_ros.model.constants import AXES, MEASURED_AXES
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor, to_volts, with_axes
-from adxl_ros.signals.block_statistics import (
-    adc_step,
-    block_samples,
-    BlockCutter,
-    Blocks,
-    quiet_blocks,
-    quiet_variance,
-    Spans,
-    true_runs,
-    window_variance,
-)
+from adxl_ros.signals import block_statistics as stats
+from adxl_ros.signals.block_statistics import Blocks, Spans
 import numpy as np
 import scipy
 
@@ -128,16 +119,16 @@ def measure(time_s: np.ndarray, volts: np.ndarray, sensor: Sensor) -> MeasuredVa
 
     time_s: stamps, s, (n,); volts: samples, V, (n, m).
     """
-    cutter = BlockCutter(sensor.rate_hz, len(sensor.axes))
+    cutter = stats.BlockCutter(sensor.rate_hz, len(sensor.axes))
     blocks, spans = cutter.feed(time_s, volts), Spans(sensor.rate_hz)
-    windows = window_variance(blocks, spans)
+    windows = stats.window_variance(blocks, spans)
     if len(time_s) < _FEWEST_SAMPLES or not np.isfinite(windows).any():
         raise UserError(f'{len(time_s)} samples at {sensor.rate_hz:g} Hz do not show the noise of '
                         f'the sensor; record at least {SHORTEST_S:g} s, or state '
                         'sensor.noise_density_g_per_rthz in the parameter file')
-    step_v = adc_step(blocks)
-    variance_v2, limit_v2 = quiet_variance(blocks, windows, step_v)
-    quiet = quiet_blocks(blocks, windows, limit_v2, spans.window)
+    step_v = stats.adc_step(blocks)
+    variance_v2, limit_v2 = stats.quiet_variance(blocks, windows, step_v)
+    quiet = stats.quiet_blocks(blocks, windows, limit_v2, spans.window)
     readings_g = np.abs(volts - sensor.nominal_zero_g_v) / sensor.nominal_scale_v_per_g
     return MeasuredValues(np.sqrt(variance_v2), step_v,
                           _filter_s(volts, blocks, quiet, sensor, float(np.max(step_v))),
@@ -147,9 +138,9 @@ def measure(time_s: np.ndarray, volts: np.ndarray, sensor: Sensor) -> MeasuredVa
 def _filter_s(volts: np.ndarray, blocks: Blocks, quiet: np.ndarray, sensor: Sensor,
               step_v: float) -> float:
     """Return the mean time constant of the axes, s; 0 where the noise of one shows no filter."""
-    size = block_samples(sensor.rate_hz)
+    size = stats.block_samples(sensor.rate_hz)
     rests = [volts[blocks.start[begin]:blocks.start[end - 1] + size]
-             for begin, end in true_runs(quiet, blocks.run)]
+             for begin, end in stats.true_runs(quiet, blocks.run)]
     time_constants = []
     for axis in range(volts.shape[1]):
         estimate = estimate_filter([rest[:, axis] for rest in rests], sensor.rate_hz,

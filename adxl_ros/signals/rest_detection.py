@@ -23,22 +23,8 @@ from adxl_ros.files.recording_columns import JOINTS, Recording
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.noise import effective_samples, sample_std_v
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.block_statistics import (
-    adc_step,
-    angle_bounds,
-    batch_scatter,
-    BlockCutter,
-    Blocks,
-    DRIFT_OCTAVES,
-    half_differences,
-    MIN_VARIANCE_RATIO,
-    quiet_blocks,
-    quiet_variance,
-    Spans,
-    true_runs,
-    undithered,
-    window_variance,
-)
+from adxl_ros.signals import block_statistics as stats
+from adxl_ros.signals.block_statistics import Blocks, Spans
 import numpy as np
 import scipy
 
@@ -105,7 +91,7 @@ class NoiseLimits:
     def flicker(self) -> np.ndarray:
         """Return the standard deviation of the difference of two very long means, (m,)."""
         # The longest halves have 2^(DRIFT_OCTAVES − 1) times the length of the shortest.
-        white = self.drift[0] ** 2 / (1 << DRIFT_OCTAVES - 1)
+        white = self.drift[0] ** 2 / (1 << stats.DRIFT_OCTAVES - 1)
         return np.sqrt(np.maximum(self.drift[-1] ** 2 - white, 0))
 
     def block_noise(self, spans: Spans) -> np.ndarray:
@@ -134,11 +120,11 @@ def stated_limits(noise: Noise, step: np.ndarray, spans: Spans) -> NoiseLimits:
     """
     a = np.exp(-1 / (spans.rate_hz * noise.tau_s)) if noise.tau_s else 0.0
     freedom = max((spans.window * spans.size - 1) * (1 - a * a) / (1 + a * a), 1.0)
-    ratio = max(scipy.special.chdtri(freedom, _FALSE_ALARM) / freedom, MIN_VARIANCE_RATIO)
+    ratio = max(scipy.special.chdtri(freedom, _FALSE_ALARM) / freedom, stats.MIN_VARIANCE_RATIO)
     sigma = np.hypot(noise.sigma, step / np.sqrt(12))
-    halves = spans.half * spans.size << np.arange(DRIFT_OCTAVES)
+    halves = spans.half * spans.size << np.arange(stats.DRIFT_OCTAVES)
     drift = np.sqrt(2 / effective_samples(halves, 1 / spans.rate_hz, noise.tau_s))[:, None] * sigma
-    return NoiseLimits(ratio * sigma ** 2, drift, undithered(step, sigma))
+    return NoiseLimits(ratio * sigma ** 2, drift, stats.undithered(step, sigma))
 
 
 def learned_limits(blocks: Blocks, windows: np.ndarray, step: np.ndarray,
@@ -150,19 +136,19 @@ def learned_limits(blocks: Blocks, windows: np.ndarray, step: np.ndarray,
     """
     if len(blocks) < max(spans.window, 2 * spans.half) or not blocks.count.any():
         return None
-    variance, limit = quiet_variance(blocks, windows, step)
-    quiet = quiet_blocks(blocks, windows, limit, spans.window)
-    drift = np.empty((DRIFT_OCTAVES, len(step)))
-    for octave in range(DRIFT_OCTAVES):
+    variance, limit = stats.quiet_variance(blocks, windows, step)
+    quiet = stats.quiet_blocks(blocks, windows, limit, spans.window)
+    drift = np.empty((stats.DRIFT_OCTAVES, len(step)))
+    for octave in range(stats.DRIFT_OCTAVES):
         half = spans.half << octave
-        noise = _drift_noise(*half_differences(blocks, quiet, half), half)
+        noise = _drift_noise(*stats.half_differences(blocks, quiet, half), half)
         white = np.sqrt(2 * variance / (half * spans.size))
         if octave:
             # Noise falls with the length, by no more than that of white noise.
             shorter = drift[octave - 1]
             noise = shorter / np.sqrt(2) if noise is None else np.minimum(noise, shorter)
         drift[octave] = white if noise is None else np.maximum(noise, white)
-    return NoiseLimits(limit, drift, undithered(step, np.sqrt(variance)))
+    return NoiseLimits(limit, drift, stats.undithered(step, np.sqrt(variance)))
 
 
 def _drift_noise(differences: np.ndarray, valid: np.ndarray, half: int) -> np.ndarray | None:
@@ -271,7 +257,7 @@ class RestFinder:
         # A motion that has decayed below the limits may still be in the first block.
         settle_s = _SETTLE_TAUS * noise.tau_s if noise is not None else 0.0
         self._settle = max(int(np.ceil(settle_s / self._spans.block_s)), 1)
-        self._cutter = BlockCutter(rate_hz, axes, 0 if angle_tolerance_rad is None else 2)
+        self._cutter = stats.BlockCutter(rate_hz, axes, 0 if angle_tolerance_rad is None else 2)
         self._parts = [self._cutter.none()]
         self._result: tuple[int, NoiseLimits | None, list[Rest]] | None = None
 
@@ -313,7 +299,7 @@ class RestFinder:
         newest = self.blocks()[-count:]
         if limits is None or len(newest) < count or newest.run[0] != newest.run[-1]:
             return None
-        rms = np.sqrt(window_variance(newest, self._spans)[-1])
+        rms = np.sqrt(stats.window_variance(newest, self._spans)[-1])
         halves = newest.mean[-2 * half:].reshape(2, half, -1).mean(axis=1)
         values = np.nan_to_num(np.concatenate([rms, np.abs(halves[1] - halves[0])]), nan=np.inf)
         allowed = np.concatenate([np.sqrt(limits.variance),
@@ -327,7 +313,7 @@ class RestFinder:
         """Find limits and rests of the stream so far; search again only after a new block."""
         blocks = self.blocks()
         if self._result is None or self._result[0] != len(blocks):
-            windows, step = window_variance(blocks, self._spans), adc_step(blocks)
+            windows, step = stats.window_variance(blocks, self._spans), stats.adc_step(blocks)
             found = [stated_limits(self.noise, step, self._spans) if self.noise else None,
                      learned_limits(blocks, windows, step, self._spans) if self.learn else None]
             limits = _largest([each for each in found if each is not None])
@@ -337,11 +323,11 @@ class RestFinder:
 
     def _rests(self, blocks: Blocks, windows: np.ndarray, limits: NoiseLimits) -> list[Rest]:
         """Find the rests among the blocks of the whole stream."""
-        quiet = quiet_blocks(blocks, windows, limits.variance, self._spans.window)
+        quiet = stats.quiet_blocks(blocks, windows, limits.variance, self._spans.window)
         still = quiet & ~self._drifting(blocks, quiet, limits)
-        bounds = None if self.angle_tolerance_rad is None else angle_bounds(blocks)
+        bounds = None if self.angle_tolerance_rad is None else stats.angle_bounds(blocks)
         parts = []
-        for run in true_runs(still, blocks.run):
+        for run in stats.true_runs(still, blocks.run):
             for first, stop in self._split_by_angle(bounds, *run):
                 first, stop = self._without_ends(blocks.mean, first + self._settle, stop, limits)
                 if stop - first >= self._spans.window:
@@ -366,16 +352,16 @@ class RestFinder:
         between two marked parts are marked as well, unless they are enough for the longest halves.
         """
         drifting = np.zeros(len(blocks), bool)
-        for octave in range(DRIFT_OCTAVES):
+        for octave in range(stats.DRIFT_OCTAVES):
             half = self._spans.half << octave
-            differences, valid = half_differences(blocks, quiet & ~drifting, half)
+            differences, valid = stats.half_differences(blocks, quiet & ~drifting, half)
             allowed = _DRIFT_SIGMAS * limits.drift[octave] + limits.step
             places = half + np.flatnonzero(valid & (np.abs(differences) > allowed).any(axis=1))
             marks = np.zeros(len(blocks) + 1)
             np.add.at(marks, places - half // 2, 1)
             np.add.at(marks, places + half // 2, -1)
             drifting |= np.cumsum(marks)[:-1] > 0
-        for first, stop in true_runs(quiet & ~drifting, blocks.run):
+        for first, stop in stats.true_runs(quiet & ~drifting, blocks.run):
             between = first and stop < len(blocks) and drifting[first - 1] and drifting[stop]
             if between and stop - first < self._spans.longest:
                 drifting[first:stop] = True
@@ -507,7 +493,7 @@ def rest_means(time_s: np.ndarray, samples: np.ndarray, rests: list[Rest], rate_
     each, in the unit of the samples. The standard deviation is that by the scatter between parts
     of the rest, and at least that of the given noise.
     """
-    parts = [BlockCutter(rate_hz, samples.shape[1]).feed(
+    parts = [stats.BlockCutter(rate_hz, samples.shape[1]).feed(
         time_s[rest.start:rest.stop], samples[rest.start:rest.stop]) for rest in rests]
     for rest, part in zip(rests, parts):
         if not part.count.sum():
@@ -520,7 +506,7 @@ def _means(parts: list[Blocks], spans: Spans,
            noise: Noise | None) -> tuple[np.ndarray, np.ndarray]:
     """Average the blocks of each rest; mean and standard deviation, (k, m) each."""
     # The step is that of all rests: a rest with constant codes does not show it.
-    step = adc_step(Blocks.join(parts)) if parts else np.empty(0)
+    step = stats.adc_step(Blocks.join(parts)) if parts else np.empty(0)
     pairs = [_mean(_without_knocks(part, step, spans), step, spans, noise) for part in parts]
     mean, error = zip(*pairs) if pairs else ((), ())
     return np.array(mean), np.array(error)
@@ -536,19 +522,24 @@ def _mean(part: Blocks, step: np.ndarray, spans: Spans,
     """
     mean = part.count @ part.mean / part.count.sum()
     white = part.squares.sum(axis=0) / max((part.count - 1).sum(), 1)
-    squares, freedom = batch_scatter(part.mean, max(-(-len(part) // _BATCHES), _MIN_BATCH_BLOCKS))
-    variance = np.maximum(squares / max(freedom, 1), white / spans.size) / len(part)
+    length = max(-(-len(part) // _BATCHES), _MIN_BATCH_BLOCKS)
+    count = len(part) // length
+    long_run = np.zeros(len(mean))
+    if count > 1:
+        batches = part.mean[:count * length].reshape(count, length, -1).mean(axis=1)
+        long_run = length * batches.var(axis=0, ddof=1)
+    variance = np.maximum(long_run, white / spans.size) / len(part)
     if noise is not None:
-        count = effective_samples(len(part) * spans.size, 1 / spans.rate_hz, noise.tau_s)
-        variance = np.maximum(variance, noise.sigma ** 2 / count)
-    rounding = undithered(step, np.sqrt(white)) ** 2 / 12
+        independent = effective_samples(len(part) * spans.size, 1 / spans.rate_hz, noise.tau_s)
+        variance = np.maximum(variance, noise.sigma ** 2 / independent)
+    rounding = stats.undithered(step, np.sqrt(white)) ** 2 / 12
     return mean, np.sqrt(variance + rounding)
 
 
 def _without_knocks(part: Blocks, step: np.ndarray, spans: Spans) -> Blocks:
     """Leave out the blocks of a rest whose variance differs from that of most blocks."""
     part = part[part.count > 0]
-    windows = window_variance(part, spans)
-    _, limit = quiet_variance(part, windows, step)
-    calm = part[quiet_blocks(part, windows, limit, spans.window)]
+    windows = stats.window_variance(part, spans)
+    _, limit = stats.quiet_variance(part, windows, step)
+    calm = part[stats.quiet_blocks(part, windows, limit, spans.window)]
     return calm if 2 * len(calm) > len(part) else part

@@ -124,7 +124,8 @@ class LinkStatus:
     # One or two words, or one line with the reason. It changes only when the condition of the link
     # changes.
     text: str
-    statistics: Mapping[str, Any] = field(default_factory=dict)  # Counts of link and clock, by name
+    # Counts of the link and of its clock, by name
+    statistics: Mapping[str, Any] = field(default_factory=dict)
     events: tuple[Event, ...] = ()  # Events that are logged when their count rises
 
 

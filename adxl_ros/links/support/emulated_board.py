@@ -15,17 +15,8 @@ import time
 import tty
 
 from adxl_ros.errors import UserError
-from adxl_ros.links.support import channels
+from adxl_ros.links.support import channels, wire_format
 from adxl_ros.links.support.base import samples_within
-from adxl_ros.links.support.wire_format import (
-    BoardInfo,
-    decode_command,
-    Encoder,
-    MAX_BITS,
-    MAX_SERIAL,
-    Splitter,
-    WireError,
-)
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -55,13 +46,13 @@ class Board:
     def __init__(self, sensor: Sensor, roles: list[str], fd: int) -> None:
         """Begin as after a reset."""
         self._sensor, self._roles, self._fd = sensor, roles, fd
-        self._encoder = Encoder(BoardInfo(sensor.rate_hz, sensor.adc_bits, len(roles),
-                                          sensor.adc_vref_v, sensor.serial))
+        self._encoder = wire_format.Encoder(wire_format.BoardInfo(
+            sensor.rate_hz, sensor.adc_bits, len(roles), sensor.adc_vref_v, sensor.serial))
         self._began_s: float | None = None
         self._index = self._overruns = 0
         self._informed_s = -_INFO_S
         self._unsent = b''
-        self._splitter = Splitter()
+        self._splitter = wire_format.Splitter()
         self._frame_samples = _FRAME_SAMPLES
 
     def send(self, columns: Mapping[str, np.ndarray]) -> None:
@@ -96,8 +87,8 @@ class Board:
         except OSError:
             return  # nothing has come; a terminal that is gone shows in the next write
         for raw in self._splitter.split(received):
-            with suppress(WireError):
-                latency_s = decode_command(raw) * 1e-6
+            with suppress(wire_format.WireError):
+                latency_s = wire_format.decode_command(raw) * 1e-6
                 self._frame_samples = min(samples_within(latency_s, self._sensor.rate_hz),
                                           _FRAME_SAMPLES)
                 self._informed_s = -_INFO_S
@@ -142,12 +133,12 @@ def driver_command(port: str, roles: list[str]) -> str:
 
 def check_sensor(sensor: Sensor) -> None:
     """Raise `UserError` for a sensor that wire format 1 cannot describe."""
-    if not 1 <= sensor.adc_bits <= MAX_BITS:
+    if not 1 <= sensor.adc_bits <= wire_format.MAX_BITS:
         raise UserError(f'sensor.adc_bits: {sensor.adc_bits}: a board sends codes of 1 to '
-                        f'{MAX_BITS} bits')
-    if len(sensor.serial) > MAX_SERIAL or not sensor.serial.isascii():
-        raise UserError(f'sensor.serial: {sensor.serial!r}: a board has room for {MAX_SERIAL} '
-                        'ASCII characters')
+                        f'{wire_format.MAX_BITS} bits')
+    if len(sensor.serial) > wire_format.MAX_SERIAL or not sensor.serial.isascii():
+        raise UserError(f'sensor.serial: {sensor.serial!r}: a board has room for '
+                        f'{wire_format.MAX_SERIAL} ASCII characters')
 
 
 @contextmanager

@@ -32,8 +32,8 @@ MAX_CHANNELS = 8
 """Most channels of a board; a frame with more of them is invalid."""
 
 _SAMPLES = struct.Struct('<BBHIQIHBB')
-"""A payload with samples: type, version, flags, block_seq, time, index, overruns, counts of samples
-and channels."""
+"""A payload with samples: type, version, flags, block_seq, time, index, overruns, numbers of
+samples and channels."""
 _INFO = struct.Struct('<BBHIfBBf16s')
 """An info payload: the same four, then sample rate, bits, channels, vref, serial number."""
 _COMMAND = struct.Struct('<BBHII')
@@ -343,7 +343,7 @@ class FrameCounter:
 
     def _follow(self, frame: SampleFrame, arrived_us: float) -> AcceptedFrame | None:
         """Compare a frame with the previous one; None where the next one must decide."""
-        if self._previous is None or frame.flags & AFTER_RESET and not self._is_first(frame):
+        if self._previous is None or (frame.flags & AFTER_RESET and not self._is_first(frame)):
             return AcceptedFrame(frame, None)
         ahead, passed_us = self._step(self._previous, frame)
         in_step = self._agree(ahead, passed_us)
