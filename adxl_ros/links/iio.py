@@ -311,7 +311,7 @@ class _Stream:
                 column.channel.read(self._buffer), column.dtype)) for column in self._columns}
             values |= self._poll(len(device_ns))
         except OSError as error:
-            raise _ReadError(f'{self.name}: lost: {_reason(error)}') from None
+            raise _ReadError(f'{self.name}: lost: {base.reason(error)}') from None
         lengths = {len(device_ns), *map(len, values.values())}
         if len(lengths) != 1 or not len(device_ns) or not all(
                 0 <= stamp_ns < _MAX_STAMP_NS for stamp_ns in device_ns.tolist()):
@@ -344,14 +344,14 @@ def _open_stream(settings: Settings, entries: Sequence[str], sensor: Sensor) -> 
         with _quiet_stderr():
             context = iio.Context(settings.uri)
     except (OSError, ValueError) as error:
-        raise _ReadError(_reason(error)) from None
+        raise _ReadError(base.reason(error)) from None
     try:
         device = _find_device(context, settings.device)
         columns = [_column(role, channel, sensor, settings.supply_scale)
                    for role, channel in _assign_roles(device, entries, sensor.axes).items()]
         return _Stream(context, device, columns, settings, sensor)
     except (OSError, ValueError) as error:
-        raise _ReadError(f'{settings.device}: cannot be read: {_reason(error)}') from None
+        raise _ReadError(f'{settings.device}: cannot be read: {base.reason(error)}') from None
 
 
 @contextmanager
@@ -477,7 +477,7 @@ def _number(channel: Any, name: str) -> float:
         raise UserError(f'{channel.id} has no attribute {name}: its volts are not known'
                         ) from None
     except OSError as error:
-        raise UserError(f'{channel.id}: its attribute {name} cannot be read: {_reason(error)}'
+        raise UserError(f'{channel.id}: its attribute {name} cannot be read: {base.reason(error)}'
                         ) from None
     with suppress(ValueError):
         if isfinite(float(text)):
@@ -523,13 +523,6 @@ def _set_rate(context: Any, device: Any, columns: Sequence[_Column], rate_hz: fl
         if RATES_HZ[0] <= float(text) <= RATES_HZ[1]:
             return float(text)
     raise UserError(f'{_name(device)}: its sampling_frequency is {text!r}')
-
-
-def _reason(error: OSError | ValueError) -> str:
-    """Return in one line why libiio failed; its error numbers may be negative."""
-    if isinstance(error, OSError) and error.errno:
-        return os.strerror(abs(error.errno))
-    return ' '.join(str(error).split())
 
 
 def import_libiio() -> Any:

@@ -13,10 +13,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from enum import Enum
 from importlib import import_module
+import os
 import pkgutil
 import time
 from typing import Any, cast, Protocol, runtime_checkable
 
+from adxl_ros.errors import one_line
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -257,6 +259,12 @@ _SLOW_S = 1.0
 """Waiting time for a device that is there but does not fit the parameters, s."""
 _MAX_WAIT_S = 0.05
 """Longest wait of one call, s, so that the driver reacts to its end."""
+
+
+def reason(error: Exception) -> str:
+    """Return why a device does not open, in one line; error numbers of libiio are negative."""
+    code = getattr(error, 'errno', None)
+    return os.strerror(abs(code)) if code else one_line(error)
 
 
 class Backoff:

@@ -11,7 +11,6 @@ this line smoothly and never go backwards.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 import time
 from typing import Any, NamedTuple
 
@@ -75,20 +74,6 @@ class _Window(NamedTuple):
     lag_ns: int
 
 
-@dataclass
-class _LateArrivals:
-    """Arrivals far too late: their samples were delayed, or the device's clock stopped."""
-
-    # Host time and device time of the first one, ns
-    first_ns: int
-    first_device_ns: int
-    # The same of the last one, ns
-    last_ns: int
-    last_device_ns: int
-    min_lag_ns: int  # Smallest lag of device time behind host time, ns
-    count: int = 1
-
-
 class ClockMap:
     """
     Map of a device's clock by the arrivals of its samples.
@@ -115,7 +100,9 @@ class ClockMap:
         self._open: _Window | None = None
         self._opened_ns = self._seen_ns = self._count = 0
         self._first_arrived_ns: int | None = None
-        self._late: _LateArrivals | None = None
+        # Arrivals far too late, device time and host time, ns: their samples were delayed, or the
+        # device's clock stopped
+        self._late: list[tuple[int, int]] = []
         self._former_lag_ns: float | None = None
         # The stamps lie on a line through this point, device time and host time, ns.
         self._line_device_ns = self._line_host_ns = 0
@@ -136,8 +123,12 @@ class ClockMap:
             self._former_lag_ns = former_ns if was_delayed else None
             self.observe(device_ns, arrived_ns)
             return not was_delayed
-        if self.settled and self._is_late(device_ns, arrived_ns, lateness_ns):
-            return False
+        if self.settled:
+            if lateness_ns > (_SHIFT_NS if self._late else _STOPPED_NS):
+                # It stays out of the windows, until later ones explain it.
+                self._late.append((device_ns, arrived_ns))
+                return False
+            self._late.clear()  # the delayed samples have been delivered
         if self._first_arrived_ns is None:
             self._first_arrived_ns = arrived_ns
         self._update_window(device_ns, lag_ns)
@@ -145,17 +136,15 @@ class ClockMap:
 
     def ready(self, now_ns: int) -> bool:
         """Return whether samples can be stamped at a host time, ns."""
-        late = self._late
-        if late is not None and late.count > 1 \
-                and now_ns - late.first_ns >= self._decision_s * 1e9:
-            self._resolve(late)
+        if len(self._late) > 1 and now_ns - self._late[0][1] >= self._decision_s * 1e9:
+            self._resolve()
         if not self.settled and self._open is not None and self._first_arrived_ns is not None \
                 and now_ns - self._first_arrived_ns >= self._wait_s * 1e9:
             self.settled = True
             self._wait_s = _LATER_WAIT_S
             self._line_device_ns = self._open.device_ns
             self._line_host_ns = self._line_device_ns + self._fit(self._line_device_ns)
-        return self.settled and self._late is None
+        return self.settled and not self._late
 
     def host_ns(self, device_ns: np.ndarray) -> np.ndarray:
         """
@@ -239,36 +228,22 @@ class ClockMap:
         ahead_s = (device_ns - origin.device_ns) * 1e-9
         return origin.lag_ns + round(offset_ns + slope * ahead_s)
 
-    def _is_late(self, device_ns: int, arrived_ns: int, lateness_ns: float) -> bool:
-        """Keep an arrival that is far too late out of the windows, until later ones explain it."""
-        late, lag_ns = self._late, arrived_ns - self._delay_ns - device_ns
-        if lateness_ns < (_STOPPED_NS if late is None else _SHIFT_NS):
-            # Delayed samples, if there were some, have been delivered: the clock did not stop.
-            self._late = None
-            return False
-        if late is None:
-            self._late = _LateArrivals(arrived_ns, device_ns, arrived_ns, device_ns, lag_ns)
-            return True
-        late.last_ns, late.last_device_ns = arrived_ns, device_ns
-        late.min_lag_ns = min(late.min_lag_ns, lag_ns)
-        late.count += 1
-        return True
-
-    def _resolve(self, late: _LateArrivals) -> None:
+    def _resolve(self) -> None:
         """Begin a new clock if the late samples come at the pace of time: the clock stopped."""
-        self._late = None
-        taken_ns = late.last_device_ns - late.first_device_ns
-        if taken_ns > _CATCH_UP_RATIO * (late.last_ns - late.first_ns):
+        late, self._late = self._late, []
+        (first_device_ns, first_ns), (last_device_ns, last_ns) = late[0], late[-1]
+        if last_device_ns - first_device_ns > _CATCH_UP_RATIO * (last_ns - first_ns):
             return
         self.steps += 1
         former_ns = self._former_lag_ns
         if former_ns is None:
-            former_ns = self._line(late.first_device_ns) - late.first_device_ns
+            former_ns = self._line(first_device_ns) - first_device_ns
         self.restart()
         self._former_lag_ns = former_ns
-        self._first_arrived_ns = late.first_ns
-        self._open = _Window(late.last_device_ns, late.min_lag_ns)
-        self._opened_ns, self._count = late.last_device_ns, 1
+        self._first_arrived_ns = first_ns
+        self._open = _Window(last_device_ns, min(
+            arrived_ns - self._delay_ns - device_ns for device_ns, arrived_ns in late))
+        self._opened_ns, self._count = last_device_ns, 1
 
     def _is_shifted(self, lag_ns: int) -> bool:
         """Return whether the last two windows are late by the same amount: a backward step."""

@@ -16,7 +16,7 @@ import time
 from typing import Any
 
 from adxl_ros.errors import install_hint, UserError
-from adxl_ros.links.support.base import Backoff
+from adxl_ros.links.support.base import Backoff, reason
 
 SILENT = 'silent, the board sends nothing'
 """Error of a port that is open but delivers nothing."""
@@ -33,6 +33,8 @@ _SYSFS = Path('/sys/dev/char')
 """Devices of the kernel by their numbers."""
 _USB_DRIVER = 'cdc_acm'
 """Driver of boards that are USB devices themselves: they ignore the baud rate."""
+_LOCKED = (errno.EAGAIN, errno.EBUSY)
+"""Errors of a port that another process has locked."""
 _RECONNECT_S = 3.0
 """Silence after which a network connection is made again, s: a lost peer sends no error."""
 
@@ -68,28 +70,26 @@ class SerialPort:
             return None
         try:
             chunk = self._read()
+            now_s = time.monotonic()
+            if chunk:
+                self.received_bytes += len(chunk)
+                self.last_byte_s = now_s
+            elif now_s - max(self.last_byte_s, self._checked_s) > _CHECK_S:
+                self._checked_s = now_s
+                self._check_device(now_s)
         except OSError as error:
             self._lose(f'unplugged: {error.strerror or error}')
             return None
-        now_s = time.monotonic()
-        if chunk:
-            self.received_bytes += len(chunk)
-            self.last_byte_s = now_s
-        elif now_s - max(self.last_byte_s, self._checked_s) > _CHECK_S:
-            self._checked_s = now_s
-            self._check_device(now_s)
         return chunk
 
     def write(self, raw: bytes) -> None:
         """Send bytes without waiting; what does not fit in the port's buffer is lost."""
-        if self._port is None:
-            return
         # A port that is gone shows in the next read.
         with suppress(OSError):
-            if self._poll is None:
-                self._port.write(raw)
-            else:
+            if self._poll is not None:
                 os.write(self._port.fileno(), raw)
+            elif self._port is not None:
+                self._port.write(raw)
 
     def confirm(self) -> None:
         """Take note that the bytes made sense: the next failure is retried soon."""
@@ -97,10 +97,10 @@ class SerialPort:
 
     def close(self) -> None:
         """Close the port."""
-        if self._port is not None:
+        port, self._port, self._poll = self._port, None, None
+        if port is not None:
             with suppress(OSError):  # an unplugged port may not close
-                self._port.close()
-            self._port = None
+                port.close()
 
     def _open(self) -> None:
         """Try to open the port; `error` has the reason of a failure."""
@@ -108,9 +108,8 @@ class SerialPort:
             self._port = self._pyserial.serial_for_url(self._name, self._baud, timeout=0,
                                                        exclusive=True)
         except (OSError, ValueError, termios.error) as error:
-            self._port = None
-            self._backoff.fail()
-            self.error = f'{self._name}: {_reason(error)}'
+            self._lose('in use: another process has locked it'
+                       if getattr(error, 'errno', None) in _LOCKED else reason(error))
             return
         self.connections += 1
         self.opened_s = time.monotonic()
@@ -118,31 +117,24 @@ class SerialPort:
         # An FTDI chip would keep bytes for 16 ms. Most other devices have no such setting.
         with suppress(OSError, ValueError, AttributeError):
             self._port.set_low_latency_mode(True)
-        self.uart_bytes_per_s = self._baud / _BITS_PER_BYTE if self._is_uart() else inf
         try:
+            number = os.fstat(self._port.fileno()).st_rdev
             self._poll = select.poll()
             self._poll.register(self._port.fileno(), select.POLLIN)
         except (OSError, AttributeError):
-            self._poll = None  # a URL without a file: pyserial's own time-out applies
+            # A URL without a file: pyserial's own time-out applies.
             self._port.timeout = self._port.write_timeout = _WAIT_MS * 1e-3
-
-    def _is_uart(self) -> bool:
-        """Return whether the open port is a UART, on this machine or at the end of a USB cable."""
-        try:
-            number = os.fstat(self._port.fileno()).st_rdev
-            driver = (_SYSFS / f'{os.major(number)}:{os.minor(number)}' / 'device'
-                      / 'driver').resolve(strict=True)
-        except (OSError, AttributeError):
-            return False  # a pseudo-terminal or a network port
-        return driver.name != _USB_DRIVER
+            return
+        # A pseudo-terminal and a network port have no driver, and need no baud rate.
+        driver = _SYSFS / f'{os.major(number)}:{os.minor(number)}' / 'device' / 'driver'
+        is_uart = driver.exists() and driver.resolve().name != _USB_DRIVER
+        self.uart_bytes_per_s = self._baud / _BITS_PER_BYTE if is_uart else inf
 
     def _read(self) -> bytes:
         """Wait for bytes; raises `OSError` where the device or the other side is gone."""
         if self._poll is None:
             first = self._port.read(1)
-            if not first:
-                return b''
-            return first + self._port.read(min(self._port.in_waiting, _MAX_READ))
+            return first and first + self._port.read(min(self._port.in_waiting, _MAX_READ))
         if not self._poll.poll(_WAIT_MS):
             return b''
         # pyserial's own read takes one byte at a time from a socket.
@@ -154,39 +146,22 @@ class SerialPort:
             raise OSError('the other side has closed')
         return chunk
 
-    def _lose(self, reason: str) -> None:
+    def _lose(self, why: str) -> None:
         """Close the port for a reason; the next `read` opens it again."""
-        self.error = f'{self._name}: {reason}'
+        self.error = f'{self._name}: {why}'
         self.close()
         self._backoff.fail()
 
     def _check_device(self, now_s: float) -> None:
         """Close a silent port whose name stands for another device, or for none."""
-        try:
-            opened = os.fstat(self._port.fileno())
-        except (OSError, AttributeError):
+        if self._poll is None:
             return
+        opened = os.fstat(self._port.fileno())
         if stat.S_ISSOCK(opened.st_mode):
             if now_s - max(self.last_byte_s, self.opened_s) > _RECONNECT_S:
                 self._lose(SILENT)
-            return
-        try:
-            named = os.stat(self._name)
-        except OSError:
-            self._lose('unplugged: its name is gone')
-            return
-        if named.st_rdev != opened.st_rdev:
-            self._lose('its name stands for another device now')
-
-
-def _reason(error: Exception) -> str:
-    """Return why a port does not open, in words that are the same at each attempt."""
-    code = error.errno if isinstance(error, OSError) else None
-    if code in (errno.EAGAIN, errno.EBUSY):  # EAGAIN is the answer of the lock
-        return 'in use: another process has locked it'
-    if code:
-        return os.strerror(code)
-    return ' '.join(str(error).split())
+        elif not os.path.exists(self._name) or os.stat(self._name).st_rdev != opened.st_rdev:
+            self._lose('unplugged: its name is gone, or stands for another device now')
 
 
 def import_pyserial() -> Any:
