@@ -14,9 +14,8 @@ import time
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import install_hint, UserError
-from adxl_ros.links.support import base, channels
-from adxl_ros.links.support.channels import Stamper
-from adxl_ros.links.support.clock_sync import ClockMap, IdentityMap
+from adxl_ros.links.support import base, stamping
+from adxl_ros.links.support.stamping import ClockMap, IdentityMap, Stamper
 from adxl_ros.links.support.wire_format import RATES_HZ
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
@@ -109,12 +108,12 @@ class IioLink:
     waits_for_listener = False
     start_ns = None
     sensor: Sensor | None = None
-    references = tuple(channels.COLUMNS.values())
+    references = tuple(base.COLUMNS.values())
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
         """Prepare the link without opening the device."""
         self._declared, self._settings = sensor, settings
-        self._entries = channels.parse_channels(settings.channels)
+        self._entries = base.parse_channels(settings.channels)
         self._stream: _Stream | None = None
         self._stamper = Stamper(ClockMap(settings.delay, _DECISION_S), self.references)
         self._backoff = base.Backoff()
@@ -224,9 +223,9 @@ class IioLink:
         self._repeated += len(new) - int(new.sum())
         if new.any():
             volts = np.array([values[axis][new] for axis in self._declared.axes]).T
-            references = {column: values[role][new] for role, column in channels.COLUMNS.items()
+            references = {column: values[role][new] for role, column in base.COLUMNS.items()
                           if role in values}
-            self._stamper.add(channels.Block(device_ns[new], volts, references), arrived_ns)
+            self._stamper.add(stamping.Block(device_ns[new], volts, references), arrived_ns)
 
 
 class _ReadError(Exception):
@@ -406,7 +405,7 @@ def _inputs(device: Any) -> list[Any]:
 
 def _assign_roles(device: Any, entries: Sequence[str], axes: str) -> dict[str, Any]:
     """Return the channels of a device by role."""
-    inputs, order = _inputs(device), [*axes, channels.SUPPLY, channels.TEMPERATURE]
+    inputs, order = _inputs(device), [*axes, base.SUPPLY, base.TEMPERATURE]
     labels = {channel.id: _label(channel) for channel in inputs}
     if not entries:
         by_label = {labels[channel.id]: channel for channel in inputs}
@@ -434,7 +433,7 @@ def _assign_roles(device: Any, entries: Sequence[str], axes: str) -> dict[str, A
         assigned.append(named[0])
         if role in axes and not named[0].scan_element:
             raise UserError(f'link.channels: {named[0].id} has no place in the buffer')
-    channels.check_roles(roles, axes)
+    base.check_roles(roles, axes)
     return dict(zip(roles, assigned))
 
 
@@ -462,10 +461,10 @@ def _column(role: str, channel: Any, sensor: Sensor, supply_scale: float) -> _Co
         return _Column(role, channel, dtype, offset,
                        scale / G0_MPS2 * float(sensor.nominal_scale_v_per_g[axis]),
                        float(sensor.nominal_zero_g_v[axis]))
-    if kind != ('IIO_TEMP' if role == channels.TEMPERATURE else 'IIO_VOLTAGE'):
+    if kind != ('IIO_TEMP' if role == base.TEMPERATURE else 'IIO_VOLTAGE'):
         raise UserError(f'link.channels: {channel.id} cannot be {role}: it is {kind}')
     # IIO scales to mV and m°C.
-    divider = supply_scale if role == channels.SUPPLY else 1.0
+    divider = supply_scale if role == base.SUPPLY else 1.0
     return _Column(role, channel, dtype, offset, scale * 1e-3 * divider)
 
 

@@ -6,20 +6,27 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+import errno
+from math import inf
+import os
+from pathlib import Path
+import select
+import stat
+import termios
 import time
+from typing import Any
 
-from adxl_ros.errors import UserError
-from adxl_ros.links.support import base, channels, wire_format
-from adxl_ros.links.support.channels import Stamper
-from adxl_ros.links.support.clock_sync import ClockMap
-from adxl_ros.links.support.serial_port import import_pyserial, SerialPort, SILENT
+from adxl_ros.errors import install_hint, UserError
+from adxl_ros.links.support import base, stamping, wire_format
+from adxl_ros.links.support.stamping import ClockMap, Stamper
 from adxl_ros.links.support.wire_format import BoardInfo, SampleFrame
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_DEFAULT_ROLES = (*AXES, channels.SUPPLY)
+_DEFAULT_ROLES = (*AXES, base.SUPPLY)
 """Roles of the first channels where the parameters state none."""
 _SILENT_S = 0.5
 """Silence after which a board counts as silent, s. Chosen: 50 frames of the firmware."""
@@ -47,6 +54,25 @@ _MAX_PAUSE_S = 0.05
 """Longest pause of one read, s, so that the driver reacts to its end."""
 _UNSTATED_RATE_HZ = 1000.0
 """Sample rate before the info frame, Hz: that of the firmware."""
+_SILENT = 'silent, the board sends nothing'
+"""Error of a port that is open but delivers nothing."""
+
+_WAIT_MS = 50
+"""Longest wait for bytes, ms, so that the driver reacts to its end."""
+_MAX_READ = 65536
+"""Most bytes of one read: more than a terminal or a socket usually holds."""
+_CHECK_S = 0.1
+"""Period of the check of a silent port, s: its name may stand for another device by now."""
+_BITS_PER_BYTE = 10
+"""Bits of a byte on a UART: 8 and start and stop bit."""
+_SYSFS = Path('/sys/dev/char')
+"""Devices of the kernel by their numbers."""
+_USB_DRIVER = 'cdc_acm'
+"""Driver of boards that are USB devices themselves: they ignore the baud rate."""
+_LOCKED = (errno.EAGAIN, errno.EBUSY)
+"""Errors of a port that another process has locked."""
+_RECONNECT_S = 3.0
+"""Silence after which a network connection is made again, s: a lost peer sends no error."""
 
 
 @dataclass(frozen=True)
@@ -88,12 +114,12 @@ class _Conversion:
     steps_ns: np.ndarray  # Times of the samples of a frame after its first one, ns, int64, (256,)
     max_code: int  # Largest code
 
-    def block(self, frame: SampleFrame, lost: int) -> channels.Block:
+    def block(self, frame: SampleFrame, lost: int) -> stamping.Block:
         """Return the samples of a frame."""
         values = frame.codes.astype(float)
         values *= self.gain
         values += self.offset
-        return channels.Block(frame.time_us * 1000 + self.steps_ns[:len(values)],
+        return stamping.Block(frame.time_us * 1000 + self.steps_ns[:len(values)],
                               values[:, self.axes],
                               {column: values[:, i] for column, i in self.references.items()},
                               lost)
@@ -104,12 +130,12 @@ def _conversion(info: BoardInfo, roles: Sequence[str], axes: str, settings: Sett
     """Return how the codes of a board become samples; raises `UserError` where they cannot."""
     if len(roles) > info.channels:
         raise UserError(f'link.channels: {len(roles)} are named, the board has {info.channels}')
-    channels.check_roles(roles, axes)
+    base.check_roles(roles, axes)
     gain, offset = np.full(info.channels, info.vref_v / 2 ** info.bits), np.zeros(info.channels)
     for i, role in enumerate(roles):
-        if role == channels.SUPPLY:
+        if role == base.SUPPLY:
             gain[i] *= settings.supply_scale
-        elif role == channels.TEMPERATURE:
+        elif role == base.TEMPERATURE:
             gain[i] /= settings.temperature_v_per_c
             offset[i] = -settings.temperature_zero_v / settings.temperature_v_per_c
     places = [roles.index(axis) for axis in axes]
@@ -117,7 +143,7 @@ def _conversion(info: BoardInfo, roles: Sequence[str], axes: str, settings: Sett
     together = slice(places[0], places[0] + len(axes))
     return _Conversion(
         gain, offset, together if places == list(range(len(roles)))[together] else places,
-        {column: roles.index(role) for role, column in channels.COLUMNS.items() if role in roles},
+        {column: roles.index(role) for role, column in base.COLUMNS.items() if role in roles},
         np.rint(np.arange(wire_format.MAX_COUNT + 1) * (1e9 / info.rate_hz)).astype(np.int64),
         2 ** info.bits - 1)
 
@@ -130,7 +156,7 @@ class _FrameSize:
     commands. A board answers with its info frame, so that the first samples need not wait.
     """
 
-    def __init__(self, settings: Settings, port: SerialPort) -> None:
+    def __init__(self, settings: Settings, port: _Port) -> None:
         self._settings, self._port = settings, port
         self._newest = self._sent = self._ignored = 0
         self._due_s = 0.0
@@ -199,12 +225,12 @@ class SerialLink:
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
         """Prepare the link without opening the port."""
         self._declared, self._settings = sensor, settings
-        self._stated_roles = channels.parse_channels(settings.channels)
+        self._stated_roles = base.parse_channels(settings.channels)
         if self._stated_roles:
-            channels.check_roles(self._stated_roles, sensor.axes)
-        self.references = tuple(column for role, column in channels.COLUMNS.items()
+            base.check_roles(self._stated_roles, sensor.axes)
+        self.references = tuple(column for role, column in base.COLUMNS.items()
                                 if role in (self._stated_roles or _DEFAULT_ROLES))
-        self._port = SerialPort(settings.port, settings.baud)
+        self._port = _Port(settings.port, settings.baud)
         self._splitter = wire_format.Splitter()
         # Decoded frames with the monotonic times of their arrivals, ns
         self._arrivals: deque[tuple[BoardInfo | SampleFrame, int]] = deque()
@@ -274,7 +300,7 @@ class SerialLink:
         long_s = _SILENT_FRAMES * self._size.duration_s
         silent_s = now_s - max(self._port.last_byte_s, self._created_s)
         if silent_s > max(_SILENT_S, long_s):
-            return base.Level.WARN, f'{port}: {SILENT}'
+            return base.Level.WARN, f'{port}: {_SILENT}'
         if now_s - self._last_frame_s > max(_NO_FRAME_S, long_s):
             return base.Level.WARN, (f'{port}: bytes, but no frame of wire format 1: is link.baud '
                                      f'({self._settings.baud}) that of the board?')
@@ -344,7 +370,7 @@ class SerialLink:
         self._counter.restart(info.rate_hz)
         axes = self._declared.axes
         roles = self._stated_roles or [
-            channels.UNUSED if role in AXES and role not in axes else role
+            base.UNUSED if role in AXES and role not in axes else role
             for role in _DEFAULT_ROLES[:info.channels]]
         try:
             self._conversion = _conversion(info, roles, axes, self._settings)
@@ -376,3 +402,138 @@ class SerialLink:
                 self._stamper.step()
             self._counts['rail_frames'] += accepted.frame.flags & wire_format.RAIL
             self._stamper.add(conversion.block(accepted.frame, accepted.lost or 0), arrived_ns)
+
+
+class _Port:
+    """
+    Bytes from a device path or a pyserial URL.
+
+    connections: how often the port was opened; opened_s: monotonic time of the last opening, s;
+    received_bytes: bytes so far; last_byte_s: monotonic time of the last bytes, s.
+    """
+
+    def __init__(self, name: str, baud: int) -> None:
+        """Prepare the port; the first `read` opens it."""
+        self.connections = self.received_bytes = 0
+        self.last_byte_s = self.opened_s = 0.0
+        # Bytes that the open port carries per second; infinite where the baud rate has no meaning
+        self.uart_bytes_per_s = inf
+        self._name, self._baud = name, baud
+        self._pyserial = import_pyserial()
+        self._port: Any = None
+        self._poll: Any = None
+        self._backoff = base.Backoff()
+        self._checked_s = 0.0
+        # Why the port is not open, in one line; '' while it is open and before the first attempt
+        self.error = ''
+
+    def read(self) -> bytes | None:
+        """Return the bytes that have come, b'' after 50 ms; None where the port was not open."""
+        if self._port is None:
+            if self._backoff.wait():
+                self._open()
+            return None
+        try:
+            chunk = self._read()
+            now_s = time.monotonic()
+            if chunk:
+                self.received_bytes += len(chunk)
+                self.last_byte_s = now_s
+            elif now_s - max(self.last_byte_s, self._checked_s) > _CHECK_S:
+                self._checked_s = now_s
+                self._check_device(now_s)
+        except OSError as error:
+            self._lose(f'unplugged: {error.strerror or error}')
+            return None
+        return chunk
+
+    def write(self, raw: bytes) -> None:
+        """Send bytes without waiting; what does not fit in the port's buffer is lost."""
+        # A port that is gone shows in the next read.
+        with suppress(OSError):
+            if self._poll is not None:
+                os.write(self._port.fileno(), raw)
+            elif self._port is not None:
+                self._port.write(raw)
+
+    def confirm(self) -> None:
+        """Take note that the bytes made sense: the next failure is retried soon."""
+        self._backoff.reset()
+
+    def close(self) -> None:
+        """Close the port."""
+        port, self._port, self._poll = self._port, None, None
+        if port is not None:
+            with suppress(OSError):  # an unplugged port may not close
+                port.close()
+
+    def _open(self) -> None:
+        """Try to open the port; `error` has the reason of a failure."""
+        try:
+            self._port = self._pyserial.serial_for_url(self._name, self._baud, timeout=0,
+                                                       exclusive=True)
+        except (OSError, ValueError, termios.error) as error:
+            self._lose('in use: another process has locked it'
+                       if getattr(error, 'errno', None) in _LOCKED else base.reason(error))
+            return
+        self.connections += 1
+        self.opened_s = time.monotonic()
+        self.error = ''
+        # An FTDI chip would keep bytes for 16 ms. Most other devices have no such setting.
+        with suppress(OSError, ValueError, AttributeError):
+            self._port.set_low_latency_mode(True)
+        try:
+            number = os.fstat(self._port.fileno()).st_rdev
+            self._poll = select.poll()
+            self._poll.register(self._port.fileno(), select.POLLIN)
+        except (OSError, AttributeError):
+            # A URL without a file: pyserial's own time-out applies.
+            self._port.timeout = self._port.write_timeout = _WAIT_MS * 1e-3
+            return
+        # A pseudo-terminal and a network port have no driver, and need no baud rate.
+        driver = _SYSFS / f'{os.major(number)}:{os.minor(number)}' / 'device' / 'driver'
+        is_uart = driver.exists() and driver.resolve().name != _USB_DRIVER
+        self.uart_bytes_per_s = self._baud / _BITS_PER_BYTE if is_uart else inf
+
+    def _read(self) -> bytes:
+        """Wait for bytes; raises `OSError` where the device or the other side is gone."""
+        if self._poll is None:
+            first = self._port.read(1)
+            return first and first + self._port.read(min(self._port.in_waiting, _MAX_READ))
+        if not self._poll.poll(_WAIT_MS):
+            return b''
+        # pyserial's own read takes one byte at a time from a socket.
+        try:
+            chunk = os.read(self._port.fileno(), _MAX_READ)
+        except (BlockingIOError, InterruptedError):
+            return b''
+        if not chunk:
+            raise OSError('the other side has closed')
+        return chunk
+
+    def _lose(self, why: str) -> None:
+        """Close the port for a reason; the next `read` opens it again."""
+        self.error = f'{self._name}: {why}'
+        self.close()
+        self._backoff.fail()
+
+    def _check_device(self, now_s: float) -> None:
+        """Close a silent port whose name stands for another device, or for none."""
+        if self._poll is None:
+            return
+        opened = os.fstat(self._port.fileno())
+        if stat.S_ISSOCK(opened.st_mode):
+            if now_s - max(self.last_byte_s, self.opened_s) > _RECONNECT_S:
+                self._lose(_SILENT)
+        elif not os.path.exists(self._name) or os.stat(self._name).st_rdev != opened.st_rdev:
+            self._lose('unplugged: its name is gone, or stands for another device now')
+
+
+def import_pyserial() -> Any:
+    """Return the module serial; raises `UserError` where it is not installed."""
+    try:
+        import serial
+    except ImportError:
+        raise UserError('link.type serial needs the Python package pyserial: '
+                        + install_hint('pyserial')) from None
+    return serial

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from adxl_ros.errors import UserError
 from adxl_ros.links.support import emulated_board
-from adxl_ros.links.support.clock_sync import ClockMap
+from adxl_ros.links.support.stamping import ClockMap
 from adxl_ros.links.support.wire_format import AFTER_RESET, FrameCounter, SampleFrame
 from hypothesis import given, settings, strategies as st
 import numpy as np

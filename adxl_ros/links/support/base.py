@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What a link is: a source of samples, and how it waits for a device.
+What a link is: a source of samples; how it waits for a device, and what its channels carry.
 
 Each module of the package `links` is one link, found by its file name. It holds the dataclass
 `Settings` and the function `open_link`.
@@ -9,7 +9,7 @@ Each module of the package `links` is one link, found by its file name. It holds
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from enum import Enum
 from importlib import import_module
@@ -18,7 +18,8 @@ import pkgutil
 import time
 from typing import Any, cast, Protocol, runtime_checkable
 
-from adxl_ros.errors import one_line
+from adxl_ros.errors import one_line, UserError
+from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -316,3 +317,43 @@ class Watchdog:
         self._silent_s += min(now_s - self._checked_s, self._longest_turn_s)
         self._checked_s = now_s
         return self._silent_s
+
+
+SUPPLY = 'supply'
+"""Role of the channel with the supply voltage."""
+TEMPERATURE = 'temperature'
+"""Role of the channel with the temperature."""
+UNUSED = '-'
+"""Role of a channel that is not read."""
+ROLES = (*AXES, SUPPLY, TEMPERATURE)
+"""All roles of channels that are read."""
+COLUMNS = {SUPPLY: 'supply_v', TEMPERATURE: 'temperature_c'}
+"""Column of a recording by the role of a reference channel."""
+
+
+def parse_channels(value: str | Sequence[str]) -> list[str]:
+    """
+    Parse `link.channels`: a list of strings, or one string with commas.
+
+    The string is for the command line, where YAML reads a bare y in a list as a boolean.
+    """
+    parts = value.split(',') if isinstance(value, str) else value
+    if not isinstance(parts, Sequence) or not all(isinstance(part, str) for part in parts):
+        raise UserError(f'link.channels: {value!r} is not a list of strings')
+    return [part.strip() for part in parts if part.strip()]
+
+
+def check_roles(roles: Sequence[str], axes: str) -> None:
+    """Check that the channels make a sensor readable."""
+    for role in roles:
+        if role not in (*ROLES, UNUSED):
+            raise UserError(f'link.channels: {role!r} is none of {", ".join(ROLES)}, or - for '
+                            'a channel that is not used')
+        if role != UNUSED and list(roles).count(role) > 1:
+            raise UserError(f'link.channels: {role} is there twice')
+        if role in AXES and role not in axes:
+            raise UserError(f'link.channels: the sensor has no axis {role}: sensor.axes is {axes}')
+    lacking = [axis for axis in axes if axis not in roles]
+    if lacking:
+        raise UserError(f'link.channels: no channel for {", ".join(lacking)}: the channels are '
+                        f'{", ".join(roles) or "none"}, sensor.axes is {axes}')

@@ -15,7 +15,7 @@ import time
 import tty
 
 from adxl_ros.errors import UserError
-from adxl_ros.links.support import channels, wire_format
+from adxl_ros.links.support import base, wire_format
 from adxl_ros.links.support.base import samples_within
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -110,23 +110,23 @@ class Board:
 
 def _volts(role: str, columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return the voltage of a channel, V, (n,)."""
-    if role == channels.SUPPLY:
-        return columns[channels.COLUMNS[role]] / _SUPPLY_SCALE
-    if role == channels.TEMPERATURE:
-        return _TEMPERATURE_ZERO_V + _TEMPERATURE_V_PER_C * columns[channels.COLUMNS[role]]
+    if role == base.SUPPLY:
+        return columns[base.COLUMNS[role]] / _SUPPLY_SCALE
+    if role == base.TEMPERATURE:
+        return _TEMPERATURE_ZERO_V + _TEMPERATURE_V_PER_C * columns[base.COLUMNS[role]]
     return columns[f'{role}_v']
 
 
 def roles_of(sensor: Sensor, columns: Mapping[str, np.ndarray]) -> list[str]:
     """Return the roles of the channels for columns of samples."""
-    references = [role for role, column in channels.COLUMNS.items() if column in columns]
+    references = [role for role, column in base.COLUMNS.items() if column in columns]
     return [*sensor.axes, *references]
 
 
 def driver_command(port: str, roles: list[str]) -> str:
     """Return the command of a driver that reads this board."""
     options = [f'-p link.type:=serial -p link.port:={port} -p link.channels:={",".join(roles)}']
-    if channels.SUPPLY in roles:
+    if base.SUPPLY in roles:
         options.append(f'-p link.supply_scale:={_SUPPLY_SCALE}')
     return f'ros2 run adxl_ros driver --ros-args {" ".join(options)}'
 
