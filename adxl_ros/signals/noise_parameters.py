@@ -21,8 +21,8 @@ import numpy as np
 import scipy
 
 _DROP = 2.705543454095404
-"""Twice the drop of the log likelihood at the ends of a 90 % interval: that quantile of χ² with one
-degree of freedom."""
+"""Twice the drop of the log likelihood at the ends of a 90 % interval: the quantile of χ² with
+one degree of freedom."""
 _SINGLE = 64
 """Coefficients of the lowest frequencies that are fitted one by one. Chosen: the terms change
 little between the further ones."""
