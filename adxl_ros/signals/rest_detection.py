@@ -527,7 +527,8 @@ def _mean(part: Blocks, step: np.ndarray, spans: Spans,
     long_run = np.zeros(len(mean))
     if count > 1:
         batches = part.mean[:count * length].reshape(count, length, -1).mean(axis=1)
-        long_run = length * batches.var(axis=0, ddof=1)
+        squares = ((batches - batches.mean(axis=0)) ** 2).sum(axis=0)
+        long_run = length * squares / (count - 1)
     variance = np.maximum(long_run, white / spans.size) / len(part)
     if noise is not None:
         independent = effective_samples(len(part) * spans.size, 1 / spans.rate_hz, noise.tau_s)
