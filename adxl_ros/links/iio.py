@@ -96,7 +96,7 @@ def open_link(sensor: Sensor, settings: Settings) -> IioLink:
     return IioLink(sensor, settings)
 
 
-class IioLink:
+class IioLink(base.DeviceLink):
     """
     The samples of a buffered IIO device, stamped by its timestamp channel.
 
@@ -104,10 +104,6 @@ class IioLink:
     samples is an estimate.
     """
 
-    live = True
-    waits_for_listener = False
-    start_ns = None
-    sensor: Sensor | None = None
     references = tuple(base.COLUMNS.values())
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
@@ -124,10 +120,6 @@ class IioLink:
         self._is_behind = False
         self._last_buffer_s = time.monotonic()
 
-    def begin(self, now_ns: int) -> int:
-        """Do nothing: samples before the beginning do not count as lost."""
-        return 0
-
     def read(self, now_ns: int) -> base.Samples:
         """Wait for a buffer and return its samples; without a device, wait for the device."""
         if self._stream is None:
@@ -141,8 +133,7 @@ class IioLink:
                 self._error = str(error)
                 self.close()
                 self._backoff.fail()
-        samples = self._stamper.take()
-        return base.no_samples(self._declared, time.time_ns()) if samples is None else samples
+        return self._stamper.take(self._declared)
 
     def status(self) -> base.LinkStatus:
         """Return how the device and the clock work."""

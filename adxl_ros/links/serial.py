@@ -209,18 +209,13 @@ class _FrameSize:
                                             self._port.uart_bytes_per_s)
 
 
-class SerialLink:
+class SerialLink(base.DeviceLink):
     """
     The samples of a board, each once and in order, stamped by the clock of the board.
 
     Bytes that are no whole frame are skipped. The numbers of the board show which samples are
     lost.
     """
-
-    live = True
-    waits_for_listener = False
-    start_ns = None
-    sensor: Sensor | None = None
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
         """Prepare the link without opening the port."""
@@ -244,10 +239,6 @@ class SerialLink:
         self._last_frame_s = self._created_s = time.monotonic()
         self._busy_until_s = self._unpaid_s = 0.0
 
-    def begin(self, now_ns: int) -> int:
-        """Do nothing: samples before the beginning do not count as lost."""
-        return 0
-
     def read(self, now_ns: int) -> base.Samples:
         """Wait for bytes, at most 50 ms, and return the samples that they complete."""
         # What need not precede the samples of the last call follows them.
@@ -266,8 +257,7 @@ class SerialLink:
                 self._on_info(frame)
             else:
                 self._on_samples(frame, arrived_ns)
-        samples = self._stamper.take()
-        return base.no_samples(self._declared, time.time_ns()) if samples is None else samples
+        return self._stamper.take(self._declared)
 
     def status(self) -> base.LinkStatus:
         """Return how the port, the frames and the clock work."""

@@ -138,7 +138,7 @@ def open_link(sensor: Sensor, settings: Settings) -> EmulatedSensor:
     return EmulatedSensor(sensor, settings)
 
 
-class EmulatedSensor:
+class EmulatedSensor(base.DeviceLink):
     """
     The signal chain behind the ideal samples of a simulator.
 
@@ -147,14 +147,8 @@ class EmulatedSensor:
     simulation and a new rate put the sensor at its power-on.
     """
 
-    live = True
-    references = ()
-    waits_for_listener = False
-    start_ns = None
-
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
         """Wait for the first sample."""
-        self.sensor: Sensor | None = None
         self.imu_topic, self.temperature_topic = settings.topic, settings.temperature_topic
         self._seed = settings.seed
         # Fixed axes (REP-103), as in a URDF joint.
@@ -201,10 +195,6 @@ class EmulatedSensor:
                 {name: values[i] for name, values in fields.items()}, self._case)))
         self._run_chain()
 
-    def begin(self, now_ns: int) -> int:
-        """Return 0: stamps are those of the simulator, and no sample is lost."""
-        return 0
-
     def read(self, now_ns: int) -> base.Samples:
         """Return the samples since the last call."""
         made, self._made = self._made, []
@@ -229,9 +219,6 @@ class EmulatedSensor:
                   base.Event(f'{self.imu_topic}: a sample is not a number; check the simulation',
                              counts['not_finite']))
         return base.LinkStatus(*self._condition(), counts, events)
-
-    def close(self) -> None:
-        """Do nothing: the link holds nothing open."""
 
     def _condition(self) -> tuple[base.Level, str]:
         """Return level and text of the status."""

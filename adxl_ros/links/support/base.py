@@ -194,6 +194,23 @@ class Link(Protocol):
         """Close what the link holds open."""
 
 
+class DeviceLink:
+    """What links to a device have in common, for their classes to inherit."""
+
+    live = True
+    waits_for_listener = False
+    start_ns: int | None = None
+    references: tuple[str, ...] = ()
+    sensor: Sensor | None = None
+
+    def begin(self, now_ns: int) -> int:
+        """Do nothing: samples before the beginning do not count as lost."""
+        return 0
+
+    def close(self) -> None:
+        """Do nothing: the link holds nothing open."""
+
+
 @runtime_checkable
 class StageLink(Protocol):
     """A link whose sensor senses the motion of the stage."""

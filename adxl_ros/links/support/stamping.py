@@ -17,7 +17,8 @@ from functools import lru_cache
 import time
 from typing import Any, NamedTuple
 
-from adxl_ros.links.support.base import Event, Samples
+from adxl_ros.links.support.base import Event, no_samples, Samples
+from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 # Limits and time constants without a source are chosen for links of 0.1 to 5 ms of jitter at
@@ -444,12 +445,12 @@ class Stamper:
             self.clock.ready(_FOREVER_NS)
             self._stamp()
 
-    def take(self) -> Samples | None:
-        """Return the samples stamped since the last call; None without any."""
+    def take(self, sensor: Sensor) -> Samples:
+        """Return the samples of a sensor that were stamped since the last call."""
         if self._unstamped and self.clock.ready(time.monotonic_ns()):
             self._stamp()
         if not self._stamped:
-            return None
+            return no_samples(sensor, time.time_ns())
         parts, self._stamped = self._stamped, []
         if len(parts) == 1:
             return parts[0]
