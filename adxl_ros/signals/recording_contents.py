@@ -126,7 +126,9 @@ def examine(blocks: Iterable[Recording], unit_of: Callable[[Recording], Sensor],
     if first is None:
         raise UserError('the recording holds no samples')
     unit, stamps = unit_of(first), _Stamps(first)
-    values = _Values(first.sensor_columns, stamps.period_s)
+    axes = [_Axis(name, stamps.period_s) for name in first.sensor_columns]
+    held = _Held(_HELD_S / stamps.period_s)  # of all axes together
+    last = first.accel_mps2(unit)[:1]
     rests = RecordedRests(unit, first)
     # Lowest and highest value, sum and count of each reference by block
     references: dict[str, list[tuple[float, float, float, int]]] = {}
@@ -134,16 +136,20 @@ def examine(blocks: Iterable[Recording], unit_of: Callable[[Recording], Sensor],
         if not len(block):
             continue
         stamps.feed(block.time_s)
-        values.feed(block.accel_mps2(unit))
+        accel_mps2 = np.concatenate([last, block.accel_mps2(unit)])
+        last = accel_mps2[-1:]
+        held.feed((np.diff(accel_mps2, axis=0) != 0).any(axis=1))
+        for axis, values in zip(axes, accel_mps2.T):
+            axis.feed(values)
         rests.feed(block)
-        for name in set(REFERENCES) & set(block.columns):
-            read = block.columns[name][np.isfinite(block.columns[name])]
-            if len(read):
+        for name, values in block.columns.items():
+            read = values[np.isfinite(values)]
+            if name in REFERENCES and len(read):
                 references.setdefault(name, []).append(
                     (float(read.min()), float(read.max()), float(read.sum()), len(read)))
     rests.take()
-    # By reference in the order of the columns: lowest and highest values, sums, counts
-    parts = {name: list(zip(*references[name])) for name in block.columns if name in references}
+    # By reference: lowest and highest values, sums, counts
+    parts = {name: list(zip(*rows)) for name, rows in references.items()}
     spans_s = [rest.span_s for rest, _ in rests.detected]
     means_mps2 = [to_nominal_mps2(mean_v, unit) for _, mean_v in rests.detected]
     lengths_g = np.linalg.norm(means_mps2, axis=-1) / G0_MPS2
@@ -152,7 +158,8 @@ def examine(blocks: Iterable[Recording], unit_of: Callable[[Recording], Sensor],
         path=block.path, samples=stamps.count, span_s=span_s,
         rate_hz=round(1 / stamps.period_s, 6), jitter_s=stamps.jitter_s, burst=stamps.burst,
         missing=stamps.missing, gaps=stamps.gaps, longest_gap_s=stamps.longest_gap_s,
-        bad_stamps=block.bad_stamps, axes=values.axes(), held_s=values.held_s,
+        bad_stamps=block.bad_stamps, axes=tuple(axis.result() for axis in axes),
+        held_s=held.samples * stamps.period_s,
         rest_share=min(sum(spans_s) / span_s, 1.0), longest_rest_s=max(spans_s, default=0.0),
         rests=len(spans_s), poses=_count_poses(means_mps2),
         length_g=float(np.median(lengths_g)) if spans_s and len(unit.axes) == len(AXES) else None,
@@ -294,33 +301,6 @@ class _Axis:
         return AxisRange(self._name, -self._largest[-1.0], self._largest[1.0],
                          sum(self._clipped.values()), not self._held.changes,
                          self._held.samples * self._period_s)
-
-
-class _Values:
-    """The axes together."""
-
-    def __init__(self, names: tuple[str, ...], period_s: float) -> None:
-        self._period_s = period_s
-        self._last: np.ndarray | None = None
-        self._held = _Held(_HELD_S / period_s)
-        self._axes = [_Axis(name, period_s) for name in names]
-
-    @property
-    def held_s(self) -> float:
-        """Return the longest time in which no axis changes, s; 0 for none."""
-        return self._held.samples * self._period_s
-
-    def feed(self, accel: np.ndarray) -> None:
-        """Add further samples, m/s², (n, m)."""
-        rows = np.vstack([accel[0] if self._last is None else self._last, accel])
-        self._held.feed((np.diff(rows, axis=0) != 0).any(axis=1))
-        for axis, values in zip(self._axes, rows.T):
-            axis.feed(values)
-        self._last = accel[-1]
-
-    def axes(self) -> tuple[AxisRange, ...]:
-        """Return the ranges by axis."""
-        return tuple(axis.result() for axis in self._axes)
 
 
 def _count_poses(means_mps2: Sequence[np.ndarray]) -> int:
