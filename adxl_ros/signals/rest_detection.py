@@ -18,9 +18,8 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 
-from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import JOINTS, Recording
-from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import effective_samples, sample_std_v
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals import block_statistics as stats
@@ -224,17 +223,13 @@ class Stillness:
     value: float
     limit: float
 
-    def describe(self, unit: str, scale: float = 1.0, axes: str = AXES) -> str:
-        """Return one line with the statistic and its limit."""
+    def describe_mps2(self, sensor: Sensor) -> str:
+        """Return one line in m/s², for samples that are volts of a sensor."""
+        scale = G0_MPS2 / float(sensor.nominal_scale_v_per_g[self.axis])
         state = 'at rest' if self.at_rest else \
             {'rms': 'moving', 'drift': 'drifting'}[self.statistic]
-        return (f'{state}: {self.value * scale:.2g} {unit} on {axes[self.axis]}, '
+        return (f'{state}: {self.value * scale:.2g} m/s² on {sensor.axes[self.axis]}, '
                 f'must be below {self.limit * scale:.2g}')
-
-    def describe_mps2(self, sensor: Sensor) -> str:
-        """Return the line of `describe` in m/s², for samples that are volts of a sensor."""
-        scale = G0_MPS2 / float(sensor.nominal_scale_v_per_g[self.axis])
-        return self.describe('m/s²', scale, sensor.axes)
 
 
 class RestFinder:
@@ -495,10 +490,6 @@ def rest_means(time_s: np.ndarray, samples: np.ndarray, rests: list[Rest], rate_
     """
     parts = [stats.BlockCutter(rate_hz, samples.shape[1]).feed(
         time_s[rest.start:rest.stop], samples[rest.start:rest.stop]) for rest in rests]
-    for rest, part in zip(rests, parts):
-        if not part.count.sum():
-            raise UserError(f'the rest from {rest.time_start_s:.3f} s to {rest.time_stop_s:.3f} '
-                            's holds no samples: name rests of this recording')
     return _means(parts, Spans(rate_hz), noise)
 
 
