@@ -18,8 +18,13 @@ from adxl_ros.files.recording_columns import COMMANDS, JOINTS, Recording
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals import recorded_sensor
-from adxl_ros.signals.noise_limits import datasheet_noise
-from adxl_ros.signals.rest_detection import recording_finder, Rest, rest_means, SAME_ANGLE_RAD
+from adxl_ros.signals.rest_detection import (
+    datasheet_noise,
+    recording_finder,
+    Rest,
+    rest_means,
+    SAME_ANGLE_RAD,
+)
 import numpy as np
 
 ENCODER_STEPS = 1.5

@@ -4,32 +4,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from math import ceil, isfinite
+import os
+import socket
 import time
+from typing import Any, NamedTuple
 
-from adxl_ros.errors import UserError
-from adxl_ros.links.support import channels
-from adxl_ros.links.support.base import (
-    DeviceSettings,
-    Level,
-    LinkStatus,
-    no_samples,
-    option,
-    Samples,
-)
-from adxl_ros.links.support.channels import clock_events, Stamper
-from adxl_ros.links.support.clock_sync import ClockMap, IdentityMap
-from adxl_ros.links.support.iio_stream import (
-    AdcInfo,
-    BufferSamples,
-    import_libiio,
-    open_stream,
-    ReadError,
-    Stream,
-)
-from adxl_ros.links.support.waiting import Backoff
+from adxl_ros.errors import install_hint, UserError
+from adxl_ros.links.support import base, stamping
+from adxl_ros.links.support.stamping import ClockMap, IdentityMap, Stamper
+from adxl_ros.links.support.wire_format import RATES_HZ
+from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
+import numpy as np
 
 _SILENT_S = 0.5
 """Time without a buffer after which a device counts as silent, s. Chosen: 250 buffers."""
@@ -51,29 +41,49 @@ _RATE_TOLERANCE = 1e-3
 """Relative difference from the declared rate above which the status names both."""
 
 
+_KEPT_S = 0.32
+"""Duration of the samples that the kernel keeps while nobody reads, s; chosen: a busy machine
+delays a read by less."""
+_MIN_KERNEL_BUFFERS = 4
+"""Fewest buffers of the kernel, the default of libiio."""
+_MAX_KERNEL_BUFFERS = 320
+"""Most buffers of the kernel; chosen: single samples at 1 kHz are kept as long as others, and its
+memory has a bound at high rates."""
+_ANSWERS = 20
+"""Answers of a device that are timed when it is opened."""
+_ROUND_TRIPS = 4.0
+"""Shortest duration of a buffer by the mean time of an answer. Chosen: each buffer needs one,
+so that the reads catch up with four times the sample rate after a delay."""
+_MAX_BUFFER = 2000
+"""Most samples of a buffer."""
+_TIMEOUT_S = 1.0
+"""Lateness after which a buffer will not come, s: the server was killed or stopped."""
+_IIOD_PORT = '30431'
+"""TCP port of iiod without another one in the URI."""
+_PROBE_S = 0.5
+"""Longest wait for the answer of an iiod, s; libiio itself waits for five seconds."""
+_POLL_S = 1.0
+"""Period in which attributes are read that have no place in the buffer, s."""
+_CLOCK_ATTRIBUTE = 'current_timestamp_clock'
+"""Attribute of the kernel that selects the clock of the time stamps."""
+_MAX_STAMP_NS = 2 ** 62
+"""Largest plausible time stamp, ns."""
+_INSTALL = ('link.type iio needs the Python package pylibiio and the library libiio 0.x: '
+            f'{install_hint("pylibiio<1")} and sudo apt install libiio0')
+"""What a user is told where libiio is not installed."""
+
+
 @dataclass(frozen=True)
-class Settings(DeviceSettings):
+class Settings(base.DeviceSettings):
     """Settings of the link."""
 
-    # URI of the libiio context
-    uri: str = option('local:', 'URI of libiio: local:, ip:HOST or ip:HOST:PORT, usb:...')
-    # Name, id or label of the ADC; '' for the only one with buffered channels
-    device: str = option('', 'name, id or label of the ADC; empty: the only one that has buffered '
-                         'channels')
-    # Ids or labels of the channels, or ROLE=ID: a list of strings, or one string with commas
-    channels: str | Sequence[str] = option(
+    uri: str = base.option('local:', 'URI of libiio: local:, ip:HOST or ip:HOST:PORT, usb:...')
+    device: str = base.option('', 'name, id or label of the ADC; empty: the only one that has '
+                              'buffered channels')
+    # A list of strings, or one string with commas
+    channels: str | Sequence[str] = base.option(
         (), 'ids or labels of x, y, z as the sensor has them, supply, temperature, or ROLE=ID; '
         'empty: the channels with these labels, else the first voltages')
-
-
-@dataclass(frozen=True)
-class Statistics:
-    """Counts of the link, as diagnostics show them."""
-
-    connections: int  # How often the device was opened
-    repeated: int  # Samples that came twice
-    # Duration of a buffer, ms: its first sample waits for as long; 0 without a device
-    buffer_ms: float
 
 
 def open_link(sensor: Sensor, settings: Settings) -> IioLink:
@@ -86,7 +96,7 @@ def open_link(sensor: Sensor, settings: Settings) -> IioLink:
     return IioLink(sensor, settings)
 
 
-class IioLink:
+class IioLink(base.DeviceLink):
     """
     The samples of a buffered IIO device, stamped by its timestamp channel.
 
@@ -94,32 +104,23 @@ class IioLink:
     samples is an estimate.
     """
 
-    live = True
-    waits_for_listener = False
-    start_ns = None
-    sensor: Sensor | None = None
-    references = tuple(channels.COLUMNS.values())
+    references = tuple(base.COLUMNS.values())
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
         """Prepare the link without opening the device."""
         self._declared, self._settings = sensor, settings
-        self._entries = channels.parse_channels(settings.channels)
-        self._layout = channels.Layout(sensor.axes, self.references, settings.supply_scale)
-        self._stream: Stream | None = None
-        self._stamper = Stamper(ClockMap(settings.delay, _DECISION_S))
-        self._backoff = Backoff()
+        self._entries = base.parse_channels(settings.channels)
+        self._stream: _Stream | None = None
+        self._stamper = Stamper(ClockMap(settings.delay, _DECISION_S), self.references)
+        self._backoff = base.Backoff()
         self._error = ''
-        self._adc: AdcInfo | None = None
+        self._adc: _Adc | None = None
         self._connections = self._repeated = 0
-        self._last_ns: int | None = None
+        self._newest_ns = -1
         self._is_behind = False
         self._last_buffer_s = time.monotonic()
 
-    def begin(self, now_ns: int) -> int:
-        """Do nothing: samples before the beginning do not count as lost."""
-        return 0
-
-    def read(self, now_ns: int) -> Samples:
+    def read(self, now_ns: int) -> base.Samples:
         """Wait for a buffer and return its samples; without a device, wait for the device."""
         if self._stream is None:
             if self._backoff.wait():
@@ -127,21 +128,21 @@ class IioLink:
         else:
             try:
                 self._receive(self._stream)
-            except (ReadError, UserError) as error:
+            except (_ReadError, UserError) as error:
                 # After a time-out the stream is not reliable: everything is opened again.
                 self._error = str(error)
                 self.close()
                 self._backoff.fail()
-        samples = self._stamper.take()
-        return no_samples(self._declared, time.time_ns()) if samples is None else samples
+        return self._stamper.take(self._declared)
 
-    def status(self) -> LinkStatus:
+    def status(self) -> base.LinkStatus:
         """Return how the device and the clock work."""
         level, text = self._condition()
-        clock = self._stamper.statistics()
         buffer_s = self._stream.buffer_s if self._stream else 0.0
-        statistics = Statistics(self._connections, self._repeated, round(buffer_s * 1e3, 3))
-        return LinkStatus(level, text, (statistics, clock), clock_events(clock))
+        return base.LinkStatus(level, text, {
+            'connections': self._connections, 'repeated': self._repeated,
+            'buffer_ms': round(buffer_s * 1e3, 3), **self._stamper.statistics()},
+            self._stamper.events())
 
     def close(self) -> None:
         """Close the device."""
@@ -149,73 +150,375 @@ class IioLink:
             self._stream.close()
             self._stream = None
 
-    def _condition(self) -> tuple[Level, str]:
+    def _condition(self) -> tuple[base.Level, str]:
         """Return level and text of the status."""
         # The URI of this machine is only a kind and a colon.
         uri, stream = self._settings.uri.removesuffix(':'), self._stream
         if self._error:
-            return Level.ERROR, f'{uri}: {self._error}'
+            return base.Level.ERROR, f'{uri}: {self._error}'
         if stream is None:
-            return Level.OK, 'connecting'
+            return base.Level.OK, 'connecting'
         silent_s = time.monotonic() - self._last_buffer_s
         if silent_s > max(_SILENT_S, _SILENT_BUFFERS * stream.buffer_s):
-            return Level.WARN, f'{uri}: silent, {stream.name} gives no samples'
+            return base.Level.WARN, f'{uri}: silent, {stream.name} gives no samples'
         rate_hz, wanted_hz = stream.adc.rate_hz, self._declared.rate_hz
         difference = '' if abs(rate_hz / wanted_hz - 1) < _RATE_TOLERANCE else \
             f' ({wanted_hz:g} Hz were asked for)'
-        return Level.OK, f'streaming at {rate_hz:g} Hz{difference}'
+        return base.Level.OK, f'streaming at {rate_hz:g} Hz{difference}'
 
     def _open(self) -> None:
         """Try to open the device; a new ADC begins a new clock."""
+        uri = self._settings.uri
         try:
-            stream = open_stream(self._settings.uri, self._settings.device, self._entries,
-                                 self._declared, self._settings)
-        except (ReadError, UserError) as error:
+            stream = _open_stream(self._settings, self._entries, self._declared)
+        except (_ReadError, UserError) as error:
             self._error = str(error)
             # To look for a USB device, libiio asks all that are on the bus.
-            is_usb = self._settings.uri.startswith('usb:')
-            self._backoff.fail(slow=is_usb or isinstance(error, UserError))
+            self._backoff.fail(slow=uri.startswith('usb:') or isinstance(error, UserError))
             return
         self._stream, self._error = stream, ''
         self._connections += 1
         self._last_buffer_s = time.monotonic()
-        if stream.adc != self._adc:
-            self._adc = stream.adc
-            self.sensor = stream.adc.apply(self._declared)
+        adc = stream.adc
+        if adc != self._adc:
+            self._adc = adc
+            self.sensor = replace(
+                self._declared, rate_hz=adc.rate_hz, adc_bits=adc.bits,
+                adc_vref_v=self._declared.adc_vref_v if adc.vref_v is None else adc.vref_v)
             if stream.by_host_clock:
                 self._stamper.clock = IdentityMap()
-            self._stamper.restart(1e9 / stream.adc.rate_hz)
-            self._last_ns = None
+            self._stamper.restart(1e9 / adc.rate_hz)
+            self._newest_ns = -1
 
-    def _receive(self, stream: Stream) -> None:
+    def _receive(self, stream: _Stream) -> None:
         """Read a buffer; where two in a row have waited for the reader, those behind them, too."""
         for _ in range(max(round(_BATCH_S / stream.buffer_s), 1)):
             began_s = time.monotonic()
-            self._add(stream.read())
+            self._add(*stream.read())
             was_behind = self._is_behind
             self._is_behind = time.monotonic() - began_s < _WAITING_SHARE * stream.buffer_s
             if not (was_behind and self._is_behind):
                 return
 
-    def _add(self, samples: BufferSamples) -> None:
+    def _add(self, device_ns: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
         """Pass the samples of a buffer on, without those that came before."""
         arrived_ns = time.monotonic_ns()
         self._last_buffer_s = time.monotonic()
         self._backoff.reset()
-        device_ns, values = samples.device_ns, samples.values
-        newest_ns = -1 if self._last_ns is None else self._last_ns
-        if device_ns[0] < newest_ns - _BACK_NS:
+        if device_ns[0] < self._newest_ns - _BACK_NS:
             self._stamper.restart(self._stamper.period_ns)
-            newest_ns = -1
-        new = []
-        for stamp_ns in device_ns.tolist():
-            new.append(stamp_ns > newest_ns)
-            newest_ns = max(newest_ns, stamp_ns)
-        self._repeated += len(new) - sum(new)
-        if not any(new):
-            return
-        self._last_ns = newest_ns
-        if not all(new):
-            device_ns = device_ns[new]
-            values = {role: column[new] for role, column in values.items()}
-        self._stamper.add(self._layout.block(device_ns, values), arrived_ns, None)
+            self._newest_ns = -1
+        newest_ns = np.maximum.accumulate(np.append(self._newest_ns, device_ns))
+        new = device_ns > newest_ns[:-1]
+        self._newest_ns = int(newest_ns[-1])
+        self._repeated += len(new) - int(new.sum())
+        if new.any():
+            volts = np.array([values[axis][new] for axis in self._declared.axes]).T
+            references = {column: values[role][new] for role, column in base.COLUMNS.items()
+                          if role in values}
+            self._stamper.add(stamping.Block(device_ns[new], volts, references), arrived_ns)
+
+
+class _ReadError(Exception):
+    """The device is absent or lost; another attempt may find it."""
+
+
+class _Adc(NamedTuple):
+    """What a device states about its ADC."""
+
+    rate_hz: float  # Sample rate, Hz
+    bits: int  # Resolution, bit; 0 where the codes do not begin at 0 V
+    vref_v: float | None = None  # Full scale, V; None where it is not known
+
+
+@dataclass(frozen=True)
+class _Column:
+    """A channel, with the conversion of its codes to V or degC: (code + offset) * scale + zero."""
+
+    role: str
+    channel: Any  # The channel of libiio
+    dtype: str  # numpy type of its codes
+    offset: float  # Offset, in codes
+    scale: float  # Scale, V or degC per code
+    zero: float = 0.0  # Zero-g of a digital sensor's pseudo-volts, V
+
+    def convert(self, codes: Any) -> Any:
+        """Return V or degC for a code or an array of codes."""
+        return (codes + self.offset) * self.scale + self.zero
+
+    def adc(self, rate_hz: float) -> _Adc:
+        """Return the ADC of this channel, as far as the format determines it."""
+        if self.zero or self.offset:
+            return _Adc(rate_hz, 0)
+        form = self.channel.data_format
+        bits = int(form.bits - form.is_signed)
+        return _Adc(rate_hz, bits, self.scale * 2.0 ** bits)
+
+
+class _Stream:
+    """
+    A device whose buffer is running.
+
+    adc: its ADC; by_host_clock: whether its time stamps are those of this machine's monotonic
+    clock; buffer_s: duration of a buffer, s.
+    """
+
+    def __init__(self, context: Any, device: Any, columns: Sequence[_Column], settings: Settings,
+                 sensor: Sensor) -> None:
+        """Start the buffer."""
+        self.name = _name(device)
+        self._context, self._device = context, device
+        self._timestamp = device.find_channel('timestamp')
+        if self._timestamp is None or not self._timestamp.scan_element:
+            raise UserError(f'{self.name} has no channel timestamp: without it lost samples '
+                            'cannot be counted')
+        self.by_host_clock = _select_monotonic_clock(device) and settings.uri.startswith('local:')
+        axis = next(column for column in columns if column.role in sensor.axes)
+        self.adc = axis.adc(_set_rate(context, device, columns, sensor.rate_hz))
+        rate_hz = self.adc.rate_hz
+        count = min(max(settings.samples_together(rate_hz),
+                        ceil(_ROUND_TRIPS * _answer_s(axis.channel) * rate_hz)),
+                    _MAX_BUFFER)
+        self.buffer_s = count / rate_hz
+        self._columns = [column for column in columns if column.channel.scan_element]
+        self._polled = [column for column in columns if not column.channel.scan_element]
+        self._polled_s = 0.0
+        for channel in [self._timestamp, *(column.channel for column in self._columns)]:
+            channel.enabled = True
+        # Some kernels cannot set this number; a network server cannot once its buffer runs.
+        with suppress(OSError):
+            device.set_kernel_buffers_count(
+                min(max(ceil(_KEPT_S / self.buffer_s), _MIN_KERNEL_BUFFERS), _MAX_KERNEL_BUFFERS))
+        context.set_timeout(round((_TIMEOUT_S + 2 * self.buffer_s) * 1000))
+        self._buffer = import_libiio().Buffer(device, count)
+
+    def read(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Wait for a buffer; return device times, ns, (n,), and V or degC by role, (n,) each."""
+        try:
+            self._buffer.refill()
+            device_ns = np.frombuffer(self._timestamp.read(self._buffer), np.int64)
+            values = {column.role: column.convert(np.frombuffer(
+                column.channel.read(self._buffer), column.dtype)) for column in self._columns}
+            values |= self._poll(len(device_ns))
+        except OSError as error:
+            raise _ReadError(f'{self.name}: lost: {base.reason(error)}') from None
+        lengths = {len(device_ns), *map(len, values.values())}
+        if len(lengths) != 1 or not len(device_ns) or not all(
+                0 <= stamp_ns < _MAX_STAMP_NS for stamp_ns in device_ns.tolist()):
+            raise _ReadError(f'{self.name}: a buffer that makes no sense')
+        return device_ns, values
+
+    def close(self) -> None:
+        """Delete buffer, channels, device and context in this order; libiio crashes in others."""
+        self._buffer = None
+        self._timestamp = None
+        self._columns.clear()
+        self._polled.clear()
+        self._device = None
+        self._context = None
+
+    def _poll(self, count: int) -> dict[str, np.ndarray]:
+        """Read the channels without a place in the buffer once a second; NaN in between."""
+        is_due = bool(self._polled) and time.monotonic() - self._polled_s >= _POLL_S
+        if is_due:
+            self._polled_s = time.monotonic()
+        return {column.role: np.full(count, column.convert(_number(column.channel, 'raw'))
+                                     if is_due else np.nan) for column in self._polled}
+
+
+def _open_stream(settings: Settings, entries: Sequence[str], sensor: Sensor) -> _Stream:
+    """Open a device and start its buffer."""
+    iio = import_libiio()
+    try:
+        _probe(settings.uri)
+        with _quiet_stderr():
+            context = iio.Context(settings.uri)
+    except (OSError, ValueError) as error:
+        raise _ReadError(base.reason(error)) from None
+    try:
+        device = _find_device(context, settings.device)
+        columns = [_column(role, channel, sensor, settings.supply_scale)
+                   for role, channel in _assign_roles(device, entries, sensor.axes).items()]
+        return _Stream(context, device, columns, settings, sensor)
+    except (OSError, ValueError) as error:
+        raise _ReadError(f'{settings.device}: cannot be read: {base.reason(error)}') from None
+
+
+@contextmanager
+def _quiet_stderr() -> Iterator[None]:
+    """Drop what libiio itself writes to stderr: each attempt would write the same line."""
+    original, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nothing, 2)
+        yield
+    finally:
+        os.dup2(original, 2)
+        os.close(original)
+        os.close(nothing)
+
+
+def _probe(uri: str) -> None:
+    """Check that an iiod answers."""
+    kind, _, address = uri.partition(':')
+    if kind != 'ip':
+        return
+    host, colon, port = address.rpartition(':')
+    if not colon or (':' in host and not host.endswith(']')):
+        host, port = address, _IIOD_PORT
+    with socket.create_connection((host.strip('[]'), int(port)), _PROBE_S) as connection:
+        connection.sendall(b'VERSION\r\n')
+        if not connection.recv(64):
+            raise OSError('the other side has closed')
+
+
+def _name(device: Any) -> str:
+    return device.name or device.id
+
+
+def _find_device(context: Any, name: str) -> Any:
+    """Return the device with a name, id or label, or the only buffered one."""
+    device = context.find_device(name) if name and name.isascii() else None
+    if device is not None:
+        return device
+    buffered = [device for device in context.devices
+                if any(channel.scan_element for channel in _inputs(device))]
+    if not name and len(buffered) == 1:
+        return buffered[0]
+    raise UserError(f'link.device: {name!r} is not there; with buffered channels there are: '
+                    f'{", ".join(map(_name, buffered)) or "none"}')
+
+
+def _inputs(device: Any) -> list[Any]:
+    """Return the input channels of a device without its time stamps."""
+    return [channel for channel in device.channels
+            if not channel.output and channel.id != 'timestamp']
+
+
+def _assign_roles(device: Any, entries: Sequence[str], axes: str) -> dict[str, Any]:
+    """Return the channels of a device by role."""
+    inputs, order = _inputs(device), [*axes, base.SUPPLY, base.TEMPERATURE]
+    labels = {channel.id: _label(channel) for channel in inputs}
+    if not entries:
+        by_label = {labels[channel.id]: channel for channel in inputs}
+        if all(axis in by_label for axis in axes):
+            return {role: by_label[role] for role in order if role in by_label}
+        measured = [channel for channel in inputs if channel.scan_element
+                    and channel.type.name in ('IIO_VOLTAGE', 'IIO_ACCEL')]
+        entries = [channel.id for channel
+                   in sorted(measured, key=lambda channel: channel.index)[:len(axes)]]
+    roles: list[str] = []
+    assigned = []
+    for entry in entries:
+        role, equals, name = entry.rpartition('=')
+        named = [channel for channel in inputs
+                 if name in (channel.id, labels[channel.id], channel.name)]
+        if not named:
+            available = ', '.join(f'{key} ({label})' if label else key
+                                  for key, label in labels.items())
+            raise UserError(f'link.channels: {_name(device)} has no channel {name!r}; it has '
+                            f'{available}')
+        if not equals:
+            free = [candidate for candidate in order if candidate not in roles]
+            role = name if name in free or not free else free[0]
+        roles.append(role)
+        assigned.append(named[0])
+        if role in axes and not named[0].scan_element:
+            raise UserError(f'link.channels: {named[0].id} has no place in the buffer')
+    base.check_roles(roles, axes)
+    return dict(zip(roles, assigned))
+
+
+def _label(channel: Any) -> str:
+    """Return the label of a channel; '' without one."""
+    with suppress(OSError, KeyError):
+        return channel.attrs['label'].value.strip()
+    return ''
+
+
+def _column(role: str, channel: Any, sensor: Sensor, supply_scale: float) -> _Column:
+    """Read how the codes of a channel become V or degC."""
+    form = channel.data_format
+    if channel.scan_element and (form.repeat > 1 or form.length not in (8, 16, 32, 64)):
+        raise UserError(f'{channel.id}: a format of {form.length} bits, {form.repeat} times, '
+                        'cannot be read')
+    dtype = f'{"i" if form.is_signed else "u"}{form.length // 8}'
+    # The kernel omits an offset of 0, but never a scale.
+    offset = _number(channel, 'offset') if 'offset' in channel.attrs else 0.0
+    scale = _number(channel, 'scale')
+    kind = channel.type.name
+    if kind == 'IIO_ACCEL' and role in sensor.axes:
+        # A digital sensor in m/s²: pseudo-volts by the nominal scale factor and zero-g.
+        axis = sensor.axes.index(role)
+        return _Column(role, channel, dtype, offset,
+                       scale / G0_MPS2 * float(sensor.nominal_scale_v_per_g[axis]),
+                       float(sensor.nominal_zero_g_v[axis]))
+    if kind != ('IIO_TEMP' if role == base.TEMPERATURE else 'IIO_VOLTAGE'):
+        raise UserError(f'link.channels: {channel.id} cannot be {role}: it is {kind}')
+    # IIO scales to mV and m°C.
+    divider = supply_scale if role == base.SUPPLY else 1.0
+    return _Column(role, channel, dtype, offset, scale * 1e-3 * divider)
+
+
+def _number(channel: Any, name: str) -> float:
+    """Read an attribute; raises `UserError` where it is not a finite number."""
+    try:
+        text = channel.attrs[name].value
+    except KeyError:
+        raise UserError(f'{channel.id} has no attribute {name}: its volts are not known'
+                        ) from None
+    except OSError as error:
+        raise UserError(f'{channel.id}: its attribute {name} cannot be read: {base.reason(error)}'
+                        ) from None
+    with suppress(ValueError):
+        if isfinite(float(text)):
+            return float(text)
+    raise UserError(f'{channel.id}: its attribute {name} is {text!r}, not a number')
+
+
+def _answer_s(channel: Any) -> float:
+    """Return how long a device takes for an answer, s: to what the scale of a channel is."""
+    began_s = time.perf_counter()
+    for _ in range(_ANSWERS):
+        _number(channel, 'scale')
+    return (time.perf_counter() - began_s) / _ANSWERS
+
+
+def _select_monotonic_clock(device: Any) -> bool:
+    """Select time stamps of the monotonic clock; return whether the device has them."""
+    attribute = device.attrs.get(_CLOCK_ATTRIBUTE)
+    if attribute is None:
+        return False
+    with suppress(OSError):
+        attribute.value = 'monotonic'
+    return attribute.value.strip() == 'monotonic'
+
+
+def _set_rate(context: Any, device: Any, columns: Sequence[_Column], rate_hz: float) -> float:
+    """
+    Set the sample rate of the device, of a channel or of the only trigger.
+
+    returns: sample rate that the device states then, Hz; `rate_hz` where it states none.
+    """
+    triggers = [d for d in context.devices if isinstance(d, import_libiio().Trigger)]
+    places = [device, *(column.channel for column in columns)]
+    places += triggers if len(triggers) == 1 else []
+    attributes = [place.attrs['sampling_frequency'] for place in places
+                  if 'sampling_frequency' in place.attrs]
+    if not attributes:
+        return rate_hz
+    with suppress(OSError):
+        attributes[0].value = f'{rate_hz:g}'
+    text = attributes[0].value
+    with suppress(ValueError):
+        if RATES_HZ[0] <= float(text) <= RATES_HZ[1]:
+            return float(text)
+    raise UserError(f'{_name(device)}: its sampling_frequency is {text!r}')
+
+
+def import_libiio() -> Any:
+    """Return the module iio; raises `UserError` where it, or libiio, is not installed."""
+    try:
+        import iio
+    except (ImportError, OSError, AttributeError):
+        raise UserError(_INSTALL) from None
+    return iio

@@ -10,14 +10,7 @@ from dataclasses import dataclass, replace
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
 from adxl_ros.files.recording_columns import Recording, REFERENCES, uncalibrated
-from adxl_ros.links.support.base import (
-    Level,
-    LinkStatus,
-    no_samples,
-    option,
-    PacedSettings,
-    Samples,
-)
+from adxl_ros.links.support import base
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -28,13 +21,11 @@ _MAX_CLOCK_NS = 2 ** 31 * 10 ** 9
 
 
 @dataclass(frozen=True)
-class Settings(PacedSettings):
+class Settings(base.PacedSettings):
     """Settings of the link."""
 
-    # Path of the recording
-    recording: str = option('', 'the recording to play: a rosbag2 directory, .mcap or CSV')
-    # Whether the recording starts again at its end
-    loop: bool = option(False, 'whether the recording starts again at its end')
+    recording: str = base.option('', 'the recording to play: a rosbag2 directory, .mcap or CSV')
+    loop: bool = base.option(False, 'whether the recording starts again at its end')
 
 
 def open_link(sensor: Sensor, settings: Settings) -> Replay:
@@ -62,7 +53,7 @@ class Replay:
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
         """Read the first rows."""
         self._path, self._loop = settings.recording, settings.loop
-        self._blocks: Generator[Recording, None, None] = recording.blocks(self._path, _ROWS)
+        self._blocks = self._all_blocks()
         first = next(self._blocks)
         self.sensor = _recorded_sensor(sensor, first)
         self.references = tuple(name for name in REFERENCES if name in first.columns)
@@ -81,28 +72,29 @@ class Replay:
             self._last_ns = now_ns - self._period_ns
         return 0
 
-    def read(self, now_ns: int) -> Samples:
+    def read(self, now_ns: int) -> base.Samples:
         """Return the rows that are due, at most to the end of a block."""
-        if self._block is None:
-            return no_samples(self.sensor, now_ns)
+        block = self._block
+        if block is None:
+            return base.no_samples(self.sensor, now_ns)
         end = int(np.searchsorted(self._stamps, now_ns - self._offset_ns, 'right'))
         rows = slice(self._row, max(end, self._row))
         stamps = self._stamps[rows] + self._offset_ns
         periods = np.rint(np.diff(stamps, prepend=self._last_ns) / self._period_ns)
-        samples = Samples(stamps, self._volts[rows], now_ns, int((periods - 1).clip(0).sum()),
-                          {name: self._block.columns[name][rows] for name in self.references})
+        samples = base.Samples(stamps, self._volts[rows], now_ns, int((periods - 1).clip(0).sum()),
+                               {name: block.columns[name][rows] for name in self.references})
         self._row = rows.stop
         if len(stamps):
             self._last_ns = int(stamps[-1])
-        if self._row == len(self._stamps):
-            self._load_next()
+        if self._row == len(block):
+            self._load(next(self._blocks, None))
             if self._block is not None and self._stamps[0] + self._offset_ns <= now_ns:
                 samples = replace(samples, until_ns=self._last_ns)
         return samples
 
-    def status(self) -> LinkStatus:
+    def status(self) -> base.LinkStatus:
         """Return whether the recording plays."""
-        return LinkStatus(Level.OK, 'playing' if self._block is not None else 'ended')
+        return base.LinkStatus(base.Level.OK, 'playing' if self._block is not None else 'ended')
 
     def close(self) -> None:
         """Close the file."""
@@ -114,13 +106,12 @@ class Replay:
         if block is not None:
             self._stamps, self._volts = block.stamp_ns, block.volts(self.sensor)
 
-    def _load_next(self) -> None:
-        """Load the next block, the first block again, or none at the end."""
-        self._load(next(self._blocks, None))
-        if self._block is None and self._loop:
-            self._blocks = recording.blocks(self._path, _ROWS)
-            self._load(next(self._blocks))
+    def _all_blocks(self) -> Generator[Recording, None, None]:
+        """Yield the blocks of the recording, again and again where it starts again at its end."""
+        yield from recording.blocks(self._path, _ROWS)
+        while self._loop:
             self._offset_ns = self._last_ns + self._period_ns - self._first_ns
+            yield from recording.blocks(self._path, _ROWS)
 
 
 def _recorded_sensor(sensor: Sensor, first: Recording) -> Sensor:

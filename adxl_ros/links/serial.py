@@ -4,45 +4,29 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+import errno
+from math import inf
+import os
+from pathlib import Path
+import select
+import stat
+import termios
 import time
-from typing import NamedTuple
+from typing import Any
 
-from adxl_ros.errors import UserError
-from adxl_ros.links.support import channels
-from adxl_ros.links.support.base import (
-    DeviceSettings,
-    Event,
-    Level,
-    LinkStatus,
-    no_samples,
-    option,
-    Samples,
-)
-from adxl_ros.links.support.channels import clock_events, Stamper
-from adxl_ros.links.support.clock_sync import ClockMap
-from adxl_ros.links.support.serial_port import import_pyserial, SerialPort, SILENT
-from adxl_ros.links.support.wire_format import (
-    AFTER_RESET,
-    BoardInfo,
-    decode,
-    encode_command,
-    FrameCounter,
-    MAX_COUNT,
-    RAIL,
-    SampleFrame,
-    samples_that_fit,
-    Splitter,
-    VersionError,
-    WireError,
-)
+from adxl_ros.errors import install_hint, UserError
+from adxl_ros.links.support import base, stamping, wire_format
+from adxl_ros.links.support.stamping import ClockMap, Stamper
+from adxl_ros.links.support.wire_format import BoardInfo, SampleFrame
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_DEFAULT_ROLES = (*AXES, channels.SUPPLY)
+_DEFAULT_ROLES = (*AXES, base.SUPPLY)
 """Roles of the first channels where the parameters state none."""
 _SILENT_S = 0.5
 """Silence after which a board counts as silent, s. Chosen: 50 frames of the firmware."""
@@ -70,78 +54,42 @@ _MAX_PAUSE_S = 0.05
 """Longest pause of one read, s, so that the driver reacts to its end."""
 _UNSTATED_RATE_HZ = 1000.0
 """Sample rate before the info frame, Hz: that of the firmware."""
+_SILENT = 'silent, the board sends nothing'
+"""Error of a port that is open but delivers nothing."""
+
+_WAIT_MS = 50
+"""Longest wait for bytes, ms, so that the driver reacts to its end."""
+_MAX_READ = 65536
+"""Most bytes of one read: more than a terminal or a socket usually holds."""
+_CHECK_S = 0.1
+"""Period of the check of a silent port, s: its name may stand for another device by now."""
+_BITS_PER_BYTE = 10
+"""Bits of a byte on a UART: 8 and start and stop bit."""
+_SYSFS = Path('/sys/dev/char')
+"""Devices of the kernel by their numbers."""
+_USB_DRIVER = 'cdc_acm'
+"""Driver of boards that are USB devices themselves: they ignore the baud rate."""
+_LOCKED = (errno.EAGAIN, errno.EBUSY)
+"""Errors of a port that another process has locked."""
+_RECONNECT_S = 3.0
+"""Silence after which a network connection is made again, s: a lost peer sends no error."""
 
 
 @dataclass(frozen=True)
-class Settings(DeviceSettings):
+class Settings(base.DeviceSettings):
     """Settings of the link."""
 
-    # Device path or pyserial URL
-    port: str = option('', 'device path, such as /dev/ttyACM0, or a pyserial URL')
-    # Baud rate of a UART, Bd
-    baud: int = option(115200, 'baud rate of a UART; USB and network ports ignore it', 'Bd', 50,
-                       100_000_000)
-    # Roles of the channels of a frame: a list of strings, or one string with commas. Empty for x,
-    # y, z, supply.
-    channels: str | Sequence[str] = option(
+    port: str = base.option('', 'device path, such as /dev/ttyACM0, or a pyserial URL')
+    baud: int = base.option(115200, 'baud rate of a UART; USB and network ports ignore it', 'Bd',
+                            50, 100_000_000)
+    # A list of strings, or one string with commas
+    channels: str | Sequence[str] = base.option(
         (), 'roles of the channels of a frame: x, y, z, supply, temperature, or - for unused; '
         'empty: the first channels are x, y, z, supply')
-    # Output of the temperature sensor at 0 degC, V
-    temperature_zero_v: float = option(0.5, 'output of the temperature sensor at 0 degC', 'V',
-                                       -10.0, 10.0)
-    # Slope of the temperature sensor, V/degC
-    temperature_v_per_c: float = option(0.01, 'slope of the temperature sensor', 'V/degC',
-                                        -10.0, 10.0)
-
-
-@dataclass(frozen=True)
-class Statistics:
-    """Counts of the link, as diagnostics show them."""
-
-    frames: int  # Whole frames
-    bad_frames: int  # Frames that are damaged or contradict the info frame
-    # Bytes received
-    bytes: int  # noqa: A003
-    skipped_bytes: int  # Bytes of runs that are too long for a frame
-    # Samples that came before the board had described itself, or do not fit the sensor
-    held_back: int
-    repeated: int  # Samples of frames that came twice or late
-    device_overruns: int  # Samples that the board itself dropped
-    frame_ms: float  # Duration of the newest frame, ms: its first sample waited for as long
-    rail_frames: int  # Frames with a code at a rail of the ADC
-    resets: int  # How often a new count has begun
-    connections: int  # How often the port was opened
-
-
-@dataclass(frozen=True)
-class _Conversion:
-    """How the codes of a board become samples."""
-
-    # gain, offset: Value of a channel is gain · code + offset, V or degC, (m,)
-    gain: np.ndarray
-    offset: np.ndarray
-    axes: slice | list[int]  # Channels of the axes of the sensor
-    # Channel of each reference by column; None where no channel has it
-    reference_channels: Mapping[str, int | None]
-    steps_ns: np.ndarray  # Times of the samples of a frame after its first one, ns, int64, (256,)
-    max_code: int  # Largest code
-
-    def block(self, frame: SampleFrame) -> channels.Block:
-        """Return the samples of a frame."""
-        values = frame.codes.astype(float)
-        values *= self.gain
-        values += self.offset
-        references = {column: channels.absent(len(values)) if i is None else values[:, i]
-                      for column, i in self.reference_channels.items()}
-        return channels.Block(frame.time_us * 1000 + self.steps_ns[:len(values)],
-                              values[:, self.axes], references)
-
-
-class _Arrival(NamedTuple):
-    """A decoded frame, and the monotonic time of its arrival, ns."""
-
-    frame: BoardInfo | SampleFrame
-    arrived_ns: int
+    temperature_zero_v: float = base.option(0.5, 'output of the temperature sensor at 0 degC', 'V',
+                                            -10.0, 10.0)
+    temperature_v_per_c: float = base.option(0.01, 'slope of the temperature sensor', 'V/degC',
+                                             -10.0, 10.0)
 
 
 def open_link(sensor: Sensor, settings: Settings) -> SerialLink:
@@ -154,7 +102,114 @@ def open_link(sensor: Sensor, settings: Settings) -> SerialLink:
     return SerialLink(sensor, settings)
 
 
-class SerialLink:
+@dataclass(frozen=True)
+class _Conversion:
+    """How the codes of a board become samples."""
+
+    # Value of a channel is gain · code + offset, V or degC, (m,)
+    gain: np.ndarray
+    offset: np.ndarray
+    axes: slice | list[int]  # Channels of the axes of the sensor
+    references: Mapping[str, int]  # Channel of each reference by column
+    steps_ns: np.ndarray  # Times of the samples of a frame after its first one, ns, int64, (256,)
+    max_code: int  # Largest code
+
+    def block(self, frame: SampleFrame, lost: int) -> stamping.Block:
+        """Return the samples of a frame."""
+        values = frame.codes.astype(float)
+        values *= self.gain
+        values += self.offset
+        return stamping.Block(frame.time_us * 1000 + self.steps_ns[:len(values)],
+                              values[:, self.axes],
+                              {column: values[:, i] for column, i in self.references.items()},
+                              lost)
+
+
+def _conversion(info: BoardInfo, roles: Sequence[str], axes: str, settings: Settings
+                ) -> _Conversion:
+    """Return how the codes of a board become samples; raises `UserError` where they cannot."""
+    if len(roles) > info.channels:
+        raise UserError(f'link.channels: {len(roles)} are named, the board has {info.channels}')
+    base.check_roles(roles, axes)
+    gain, offset = np.full(info.channels, info.vref_v / 2 ** info.bits), np.zeros(info.channels)
+    for i, role in enumerate(roles):
+        if role == base.SUPPLY:
+            gain[i] *= settings.supply_scale
+        elif role == base.TEMPERATURE:
+            gain[i] /= settings.temperature_v_per_c
+            offset[i] = -settings.temperature_zero_v / settings.temperature_v_per_c
+    places = [roles.index(axis) for axis in axes]
+    # A slice takes no copy.
+    together = slice(places[0], places[0] + len(axes))
+    return _Conversion(
+        gain, offset, together if places == list(range(len(roles)))[together] else places,
+        {column: roles.index(role) for role, column in base.COLUMNS.items() if role in roles},
+        np.rint(np.arange(wire_format.MAX_COUNT + 1) * (1e9 / info.rate_hz)).astype(np.int64),
+        2 ** info.bits - 1)
+
+
+class _FrameSize:
+    """
+    Asks a board for frames that are as short as the latency, unless it does not obey.
+
+    Only a device that has sent a frame gets bytes: another one could take them for its own
+    commands. A board answers with its info frame, so that the first samples need not wait.
+    """
+
+    def __init__(self, settings: Settings, port: _Port) -> None:
+        self._settings, self._port = settings, port
+        self._newest = self._sent = self._ignored = 0
+        self._due_s = 0.0
+        self.duration_s = 0.0  # Duration of the newest frame, s
+
+    def take(self, count: int, rate_hz: float) -> None:
+        """Take the number of samples of a frame, and their rate."""
+        self._newest, self.duration_s = count, count / rate_hz
+
+    def forget(self) -> None:
+        """Begin again with a board that may obey."""
+        self._ignored = 0
+
+    def command(self, info: BoardInfo | None) -> None:
+        """Send a command where the newest frame is not as it shall be."""
+        count, self._newest = self._newest, 0
+        if not count:
+            return
+        latency_us = round(self._settings.latency_ms * 1e3)
+        if info is not None:
+            wanted = self._possible(info)
+            if count == wanted:
+                self._ignored = 0
+                return
+            latency_us = max(latency_us, round(wanted / info.rate_hz * 1e6))
+        now_s = time.monotonic()
+        if self._ignored < _COMMANDS and now_s >= self._due_s:
+            self._port.write(wire_format.encode_command(self._sent, latency_us))
+            self._sent += 1
+            self._ignored += 1
+            self._due_s = now_s + _COMMAND_PAUSE_S
+
+    def why_long(self, info: BoardInfo) -> str:
+        """Return why frames are longer than `link.latency_ms`; '' where they are not."""
+        settings, frame_ms = self._settings, self.duration_s * 1e3
+        if frame_ms <= settings.latency_ms:
+            return ''
+        possible = self._possible(info)
+        if possible > settings.samples_together(info.rate_hz):
+            possible_ms = min(possible / info.rate_hz * 1e3, frame_ms)
+            return (f' in frames of {possible_ms:.3g} ms: {settings.baud} Bd carry none of '
+                    f'{settings.latency_ms:g} ms')
+        if self._ignored >= _COMMANDS:
+            return f' in frames of {frame_ms:.3g} ms: the firmware does not obey link.latency_ms'
+        return ''
+
+    def _possible(self, info: BoardInfo) -> int:
+        """Return how many samples a frame shall have."""
+        return wire_format.samples_that_fit(self._settings.samples_together(info.rate_hz), info,
+                                            self._port.uart_bytes_per_s)
+
+
+class SerialLink(base.DeviceLink):
     """
     The samples of a board, each once and in order, stamped by the clock of the board.
 
@@ -162,44 +217,33 @@ class SerialLink:
     lost.
     """
 
-    live = True
-    waits_for_listener = False
-    start_ns = None
-    sensor: Sensor | None = None
-
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
         """Prepare the link without opening the port."""
         self._declared, self._settings = sensor, settings
-        self._stated_roles = channels.parse_channels(settings.channels)
+        self._stated_roles = base.parse_channels(settings.channels)
         if self._stated_roles:
-            channels.check_roles(self._stated_roles, sensor.axes)
-        self.references = channels.reference_columns(self._stated_roles or _DEFAULT_ROLES)
-        self._port = SerialPort(settings.port, settings.baud)
-        self._splitter = Splitter()
-        self._arrivals: deque[_Arrival] = deque()
+            base.check_roles(self._stated_roles, sensor.axes)
+        self.references = tuple(column for role, column in base.COLUMNS.items()
+                                if role in (self._stated_roles or _DEFAULT_ROLES))
+        self._port = _Port(settings.port, settings.baud)
+        self._splitter = wire_format.Splitter()
+        # Decoded frames with the monotonic times of their arrivals, ns
+        self._arrivals: deque[tuple[BoardInfo | SampleFrame, int]] = deque()
         self._info: BoardInfo | None = None
         self._conversion: _Conversion | None = None
         self._misfit = self._version_error = ''
-        self._counter = FrameCounter()
-        self._stamper = Stamper(ClockMap(settings.delay))
-        self._frames = self._bad_frames = self._held_back = self._resets = self._rail_frames = 0
+        self._counter = wire_format.FrameCounter()
+        self._stamper = Stamper(ClockMap(settings.delay), self.references)
+        self._size = _FrameSize(settings, self._port)
+        self._counts: Counter[str] = Counter()
         self._last_frame_s = self._created_s = time.monotonic()
-        self._longest_frame_s = 0.0
-        self._commands = self._ignored_commands = 0
-        self._command_due_s = 0.0
-        self._busy_until_s = 0.0
-        self._unpaid = 0, 0
-        self._newest_count = 0
+        self._busy_until_s = self._unpaid_s = 0.0
 
-    def begin(self, now_ns: int) -> int:
-        """Do nothing: samples before the beginning do not count as lost."""
-        return 0
-
-    def read(self, now_ns: int) -> Samples:
+    def read(self, now_ns: int) -> base.Samples:
         """Wait for bytes, at most 50 ms, and return the samples that they complete."""
         # What need not precede the samples of the last call follows them.
         self._throttle()
-        self._command()
+        self._size.command(self._info)
         if not self._arrivals:
             self._receive()
         while self._arrivals:
@@ -213,74 +257,54 @@ class SerialLink:
                 self._on_info(frame)
             else:
                 self._on_samples(frame, arrived_ns)
-        samples = self._stamper.take()
-        return no_samples(self._declared, time.time_ns()) if samples is None else samples
+        return self._stamper.take(self._declared)
 
-    def status(self) -> LinkStatus:
+    def status(self) -> base.LinkStatus:
         """Return how the port, the frames and the clock work."""
         level, text = self._condition()
-        clock = self._stamper.statistics()
-        statistics = Statistics(
-            frames=self._frames, bad_frames=self._bad_frames, bytes=self._port.received_bytes,
-            skipped_bytes=self._splitter.skipped, held_back=self._held_back,
-            repeated=self._counter.repeated, device_overruns=self._counter.overruns,
-            frame_ms=round(self._longest_frame_s * 1e3, 3), rail_frames=self._rail_frames,
-            resets=self._resets, connections=self._port.connections)
-        reset = Event('the device was reset or is another one: a new count begins', self._resets)
-        return LinkStatus(level, text, (statistics, clock), (reset, *clock_events(clock)))
+        counts = self._counts
+        statistics = {
+            'frames': counts['frames'], 'bad_frames': counts['bad_frames'],
+            'bytes': self._port.received_bytes, 'skipped_bytes': self._splitter.skipped,
+            'held_back': counts['held_back'], 'repeated': self._counter.repeated,
+            'device_overruns': self._counter.overruns,
+            'frame_ms': round(self._size.duration_s * 1e3, 3),
+            'rail_frames': counts['rail_frames'], 'resets': counts['resets'],
+            'connections': self._port.connections, **self._stamper.statistics()}
+        reset = base.Event('the device was reset or is another one: a new count begins',
+                           counts['resets'])
+        return base.LinkStatus(level, text, statistics, (reset, *self._stamper.events()))
 
     def close(self) -> None:
         """Close the port."""
         self._port.close()
 
-    def _condition(self) -> tuple[Level, str]:
+    def _condition(self) -> tuple[base.Level, str]:
         """Return level and text of the status: the first fault of port, frames and channels."""
-        if self._port.error:
-            return Level.ERROR, self._port.error
-        if self._version_error:
-            return Level.ERROR, self._version_error
-        now_s = time.monotonic()
-        port = self._settings.port
+        if self._port.error or self._version_error:
+            return base.Level.ERROR, self._port.error or self._version_error
+        now_s, port, info = time.monotonic(), self._settings.port, self._info
         opened_s = max(self._port.opened_s, self._created_s)
-        if self._info is None and now_s - opened_s < _INFO_WAIT_S:
-            return Level.OK, 'connecting'
+        if info is None and now_s - opened_s < _INFO_WAIT_S:
+            return base.Level.OK, 'connecting'
+        long_s = _SILENT_FRAMES * self._size.duration_s
         silent_s = now_s - max(self._port.last_byte_s, self._created_s)
-        if silent_s > max(_SILENT_S, _SILENT_FRAMES * self._longest_frame_s):
-            return Level.WARN, f'{port}: {SILENT}'
-        if now_s - self._last_frame_s > max(_NO_FRAME_S, _SILENT_FRAMES * self._longest_frame_s):
-            return Level.WARN, (f'{port}: bytes, but no frame of wire format 1: is link.baud '
-                                f'({self._settings.baud}) that of the board?')
+        if silent_s > max(_SILENT_S, long_s):
+            return base.Level.WARN, f'{port}: {_SILENT}'
+        if now_s - self._last_frame_s > max(_NO_FRAME_S, long_s):
+            return base.Level.WARN, (f'{port}: bytes, but no frame of wire format 1: is link.baud '
+                                     f'({self._settings.baud}) that of the board?')
         if self._misfit:
-            return Level.ERROR, self._misfit
-        if self._info is None:
-            return Level.WARN, f'{port}: waiting for the info frame of the board'
-        return Level.OK, self._streaming(self._info)
-
-    def _streaming(self, info: BoardInfo) -> str:
-        """Return the text of a working link, with frames that are long and axes without use."""
-        return '; '.join(filter(None, (
-            f'streaming{self._why_long(info)}', self._unused_channels(info))))
-
-    def _why_long(self, info: BoardInfo) -> str:
-        """Return why frames are longer than `link.latency_ms`; '' where they are not."""
-        settings = self._settings
-        wanted, possible = settings.samples_together(info.rate_hz), self._wanted_samples(info)
-        frame_ms = self._longest_frame_s * 1e3
-        if possible > wanted and frame_ms > settings.latency_ms:
-            possible_ms = min(possible / info.rate_hz * 1e3, frame_ms)
-            return (f' in frames of {possible_ms:.3g} ms: {settings.baud} Bd carry none of '
-                    f'{settings.latency_ms:g} ms')
-        if self._ignored_commands >= _COMMANDS and frame_ms > settings.latency_ms:
-            return f' in frames of {frame_ms:.3g} ms: the firmware does not obey link.latency_ms'
-        return ''
-
-    def _unused_channels(self, info: BoardInfo) -> str:
-        """Return which channels of a board are not read; '' where all are."""
-        unused = [axis for axis in AXES[:info.channels] if axis not in self._declared.axes]
-        if self._stated_roles or not unused:
-            return ''
-        return (f'the channel of {", ".join(unused)} is not used: sensor.axes is '
-                f'{self._declared.axes} (link.channels can say that it is the supply)')
+            return base.Level.ERROR, self._misfit
+        if info is None:
+            return base.Level.WARN, f'{port}: waiting for the info frame of the board'
+        axes = self._declared.axes
+        unused = [] if self._stated_roles else [axis for axis in AXES[:info.channels]
+                                                if axis not in axes]
+        text = f'streaming{self._size.why_long(info)}'
+        return base.Level.OK, text if not unused else (
+            f'{text}; the channel of {", ".join(unused)} is not used: sensor.axes is {axes} '
+            '(link.channels can say that it is the supply)')
 
     def _receive(self) -> None:
         """Read bytes and queue the frames that they complete."""
@@ -289,7 +313,7 @@ class SerialLink:
             # The port opens again, perhaps on another board: an incomplete frame stays incomplete.
             self._splitter.restart()
             self._counter.reopened()
-            self._ignored_commands = 0
+            self._size.forget()
             return
         arrived_ns = time.monotonic_ns()
         samples = 0
@@ -297,145 +321,209 @@ class SerialLink:
             frame = self._decoded(raw)
             if frame is not None:
                 samples += len(frame.codes) if isinstance(frame, SampleFrame) else 1
-                self._arrivals.append(_Arrival(frame, arrived_ns))
-        self._unpaid = len(chunk), samples
+                self._arrivals.append((frame, arrived_ns))
+        rate_hz = self._info.rate_hz if self._info else _UNSTATED_RATE_HZ
+        self._unpaid_s = len(chunk) / _MAX_BYTES_PER_S + samples / (_MAX_RATE_RATIO * rate_hz)
 
     def _decoded(self, raw: bytes) -> BoardInfo | SampleFrame | None:
         """Decode and count a frame; None for one that cannot be read."""
         try:
-            frame = decode(raw)
-        except VersionError as error:
+            frame = wire_format.decode(raw)
+        except wire_format.VersionError as error:
             self._version_error = (f'{self._settings.port}: the board speaks {error}, this '
                                    'driver reads 1; use the firmware of this version')
             return None
-        except WireError:
-            self._bad_frames += 1
+        except wire_format.WireError:
+            self._counts['bad_frames'] += 1
             return None
         self._version_error = ''
-        self._frames += 1
+        self._counts['frames'] += 1
         self._last_frame_s = time.monotonic()
         self._port.confirm()
         return frame
 
     def _throttle(self) -> None:
         """Pause so that bytes and samples stay below their largest rates (a leaky bucket)."""
-        (size, samples), self._unpaid = self._unpaid, (0, 0)
-        rate_hz = self._info.rate_hz if self._info else _UNSTATED_RATE_HZ
         now_s = time.monotonic()
-        cost_s = size / _MAX_BYTES_PER_S + samples / (_MAX_RATE_RATIO * rate_hz)
-        self._busy_until_s = max(self._busy_until_s, now_s - _CREDIT_S) + cost_s
+        self._busy_until_s = max(self._busy_until_s, now_s - _CREDIT_S) + self._unpaid_s
+        self._unpaid_s = 0.0
         if self._busy_until_s > now_s:
             time.sleep(min(self._busy_until_s - now_s, _MAX_PAUSE_S))
 
     def _on_info(self, info: BoardInfo) -> None:
         """Take the description of the board, where it is new or follows a reset."""
         changed = info != self._info
-        if not changed and not info.flags & AFTER_RESET:
+        if not changed and not info.flags & wire_format.AFTER_RESET:
             return
-        self._info = info
-        self._ignored_commands = 0
+        self._info, self._conversion, self._misfit = info, None, ''
+        self._size.forget()
         self._counter.restart(info.rate_hz)
-        self._misfit = self._why_unfit(info)
-        self._conversion = None if self._misfit else self._make_conversion(info)
-        if changed and not self._misfit:
+        axes = self._declared.axes
+        roles = self._stated_roles or [
+            base.UNUSED if role in AXES and role not in axes else role
+            for role in _DEFAULT_ROLES[:info.channels]]
+        try:
+            self._conversion = _conversion(info, roles, axes, self._settings)
+        except UserError as error:
+            self._misfit = str(error)
+            return
+        if changed:
             self.sensor = replace(self._declared, rate_hz=info.rate_hz, adc_bits=info.bits,
                                   adc_vref_v=info.vref_v,
                                   serial=info.serial or self._declared.serial)
 
-    def _roles(self, info: BoardInfo) -> Sequence[str]:
-        """Return the roles of a board's channels, in their order."""
-        return self._stated_roles or _DEFAULT_ROLES[:info.channels]
-
-    def _why_unfit(self, info: BoardInfo) -> str:
-        """Return why the channels of a board do not fit the sensor; '' where they do."""
-        axes = self._declared.axes
-        roles = self._roles(info)
-        if len(roles) > info.channels:
-            return f'link.channels: {len(roles)} are named, the board has {info.channels}'
-        if not self._stated_roles:
-            roles = [role for role in roles if role not in AXES or role in axes]
-        try:
-            channels.check_roles(roles, axes)
-        except UserError as error:
-            return str(error)
-        return ''
-
     def _on_samples(self, frame: SampleFrame, arrived_ns: int) -> None:
         """Check, count and stamp the samples of a frame."""
-        info = self._info
-        rate_hz = info.rate_hz if info else _UNSTATED_RATE_HZ
-        self._longest_frame_s = len(frame.codes) / rate_hz
-        self._newest_count = len(frame.codes)
-        conversion = self._conversion
+        info, conversion, count = self._info, self._conversion, len(frame.codes)
+        self._size.take(count, info.rate_hz if info else _UNSTATED_RATE_HZ)
         if info is None or conversion is None:
-            self._held_back += len(frame.codes)
+            self._counts['held_back'] += count
             return
-        if frame.codes.shape[1] != info.channels or _largest(frame.codes) > conversion.max_code:
-            self._bad_frames += 1  # whole, but it contradicts the info frame
+        # The largest of few numbers takes Python half the time of numpy's first call.
+        if frame.codes.shape[1] != info.channels \
+                or max(map(max, frame.codes.tolist())) > conversion.max_code:
+            self._counts['bad_frames'] += 1  # whole, but it contradicts the info frame
             return
         for accepted in self._counter.accept(frame, arrived_ns):
             if accepted.lost is None:
-                self._resets += self._stamper.period_ns > 0
+                self._counts['resets'] += self._stamper.period_ns > 0
                 self._stamper.restart(1e9 / info.rate_hz)
             elif accepted.stepped:
                 self._stamper.step()
-            self._rail_frames += accepted.frame.flags & RAIL
-            self._stamper.add(conversion.block(accepted.frame), arrived_ns, accepted.lost or 0)
+            self._counts['rail_frames'] += accepted.frame.flags & wire_format.RAIL
+            self._stamper.add(conversion.block(accepted.frame, accepted.lost or 0), arrived_ns)
 
-    def _wanted_samples(self, info: BoardInfo) -> int:
-        """Return how many samples a frame shall have."""
-        wanted = self._settings.samples_together(info.rate_hz)
-        return samples_that_fit(wanted, info, self._port.uart_bytes_per_s)
 
-    def _command(self) -> None:
-        """
-        Ask the board for small frames, unless it sends them or does not obey.
+class _Port:
+    """
+    Bytes from a device path or a pyserial URL.
 
-        Only a device that has sent a frame gets bytes: another one could take them for its own
-        commands. A board answers with its info frame, so that the first samples need not wait.
-        """
-        count, self._newest_count = self._newest_count, 0
-        if not count:
+    connections: how often the port was opened; opened_s: monotonic time of the last opening, s;
+    received_bytes: bytes so far; last_byte_s: monotonic time of the last bytes, s.
+    """
+
+    def __init__(self, name: str, baud: int) -> None:
+        """Prepare the port; the first `read` opens it."""
+        self.connections = self.received_bytes = 0
+        self.last_byte_s = self.opened_s = 0.0
+        # Bytes that the open port carries per second; infinite where the baud rate has no meaning
+        self.uart_bytes_per_s = inf
+        self._name, self._baud = name, baud
+        self._pyserial = import_pyserial()
+        self._port: Any = None
+        self._poll: Any = None
+        self._backoff = base.Backoff()
+        self._checked_s = 0.0
+        # Why the port is not open, in one line; '' while it is open and before the first attempt
+        self.error = ''
+
+    def read(self) -> bytes | None:
+        """Return the bytes that have come, b'' after 50 ms; None where the port was not open."""
+        if self._port is None:
+            if self._backoff.wait():
+                self._open()
+            return None
+        try:
+            chunk = self._read()
+            now_s = time.monotonic()
+            if chunk:
+                self.received_bytes += len(chunk)
+                self.last_byte_s = now_s
+            elif now_s - max(self.last_byte_s, self._checked_s) > _CHECK_S:
+                self._checked_s = now_s
+                self._check_device(now_s)
+        except OSError as error:
+            self._lose(f'unplugged: {error.strerror or error}')
+            return None
+        return chunk
+
+    def write(self, raw: bytes) -> None:
+        """Send bytes without waiting; what does not fit in the port's buffer is lost."""
+        # A port that is gone shows in the next read.
+        with suppress(OSError):
+            if self._poll is not None:
+                os.write(self._port.fileno(), raw)
+            elif self._port is not None:
+                self._port.write(raw)
+
+    def confirm(self) -> None:
+        """Take note that the bytes made sense: the next failure is retried soon."""
+        self._backoff.reset()
+
+    def close(self) -> None:
+        """Close the port."""
+        port, self._port, self._poll = self._port, None, None
+        if port is not None:
+            with suppress(OSError):  # an unplugged port may not close
+                port.close()
+
+    def _open(self) -> None:
+        """Try to open the port; `error` has the reason of a failure."""
+        try:
+            self._port = self._pyserial.serial_for_url(self._name, self._baud, timeout=0,
+                                                       exclusive=True)
+        except (OSError, ValueError, termios.error) as error:
+            self._lose('in use: another process has locked it'
+                       if getattr(error, 'errno', None) in _LOCKED else base.reason(error))
             return
-        latency_us = round(self._settings.latency_ms * 1e3)
-        if self._info is not None:
-            wanted = self._wanted_samples(self._info)
-            if count == wanted:
-                self._ignored_commands = 0
-                return
-            latency_us = max(latency_us, round(wanted / self._info.rate_hz * 1e6))
-        now_s = time.monotonic()
-        if self._ignored_commands < _COMMANDS and now_s >= self._command_due_s:
-            self._port.write(encode_command(self._commands, latency_us))
-            self._commands += 1
-            self._ignored_commands += 1
-            self._command_due_s = now_s + _COMMAND_PAUSE_S
+        self.connections += 1
+        self.opened_s = time.monotonic()
+        self.error = ''
+        # An FTDI chip would keep bytes for 16 ms. Most other devices have no such setting.
+        with suppress(OSError, ValueError, AttributeError):
+            self._port.set_low_latency_mode(True)
+        try:
+            number = os.fstat(self._port.fileno()).st_rdev
+            self._poll = select.poll()
+            self._poll.register(self._port.fileno(), select.POLLIN)
+        except (OSError, AttributeError):
+            # A URL without a file: pyserial's own time-out applies.
+            self._port.timeout = self._port.write_timeout = _WAIT_MS * 1e-3
+            return
+        # A pseudo-terminal and a network port have no driver, and need no baud rate.
+        driver = _SYSFS / f'{os.major(number)}:{os.minor(number)}' / 'device' / 'driver'
+        is_uart = driver.exists() and driver.resolve().name != _USB_DRIVER
+        self.uart_bytes_per_s = self._baud / _BITS_PER_BYTE if is_uart else inf
 
-    def _make_conversion(self, info: BoardInfo) -> _Conversion:
-        """Return how the codes of a board become samples."""
-        roles, settings = self._roles(info), self._settings
-        gain, offset = np.full(info.channels, info.vref_v / 2 ** info.bits), np.zeros(
-            info.channels)
-        for i, role in enumerate(roles):
-            if role == channels.SUPPLY:
-                gain[i] *= settings.supply_scale
-            elif role == channels.TEMPERATURE:
-                gain[i] /= settings.temperature_v_per_c
-                offset[i] = -settings.temperature_zero_v / settings.temperature_v_per_c
-        return _Conversion(
-            gain, offset, _columns([roles.index(axis) for axis in self._declared.axes]),
-            {column: roles.index(role) if role in roles else None
-             for role, column in channels.COLUMNS.items() if column in self.references},
-            np.rint(np.arange(MAX_COUNT + 1) * (1e9 / info.rate_hz)).astype(np.int64),
-            2 ** info.bits - 1)
+    def _read(self) -> bytes:
+        """Wait for bytes; raises `OSError` where the device or the other side is gone."""
+        if self._poll is None:
+            first = self._port.read(1)
+            return first and first + self._port.read(min(self._port.in_waiting, _MAX_READ))
+        if not self._poll.poll(_WAIT_MS):
+            return b''
+        # pyserial's own read takes one byte at a time from a socket.
+        try:
+            chunk = os.read(self._port.fileno(), _MAX_READ)
+        except (BlockingIOError, InterruptedError):
+            return b''
+        if not chunk:
+            raise OSError('the other side has closed')
+        return chunk
+
+    def _lose(self, why: str) -> None:
+        """Close the port for a reason; the next `read` opens it again."""
+        self.error = f'{self._name}: {why}'
+        self.close()
+        self._backoff.fail()
+
+    def _check_device(self, now_s: float) -> None:
+        """Close a silent port whose name stands for another device, or for none."""
+        if self._poll is None:
+            return
+        opened = os.fstat(self._port.fileno())
+        if stat.S_ISSOCK(opened.st_mode):
+            if now_s - max(self.last_byte_s, self.opened_s) > _RECONNECT_S:
+                self._lose(_SILENT)
+        elif not os.path.exists(self._name) or os.stat(self._name).st_rdev != opened.st_rdev:
+            self._lose('unplugged: its name is gone, or stands for another device now')
 
 
-def _columns(places: list[int]) -> slice | list[int]:
-    """Return what takes columns from an array; a slice, where it can be one, takes no copy."""
-    consecutive = range(places[0], places[-1] + 1)
-    return slice(consecutive.start, consecutive.stop) if places == list(consecutive) else places
-
-
-def _largest(codes: np.ndarray) -> int:
-    """Return the largest code; few numbers take Python half the time of numpy's first call."""
-    return max(map(max, codes.tolist()))
+def import_pyserial() -> Any:
+    """Return the module serial; raises `UserError` where it is not installed."""
+    try:
+        import serial
+    except ImportError:
+        raise UserError('link.type serial needs the Python package pyserial: '
+                        + install_hint('pyserial')) from None
+    return serial

@@ -10,8 +10,7 @@ from functools import partial
 from math import inf
 from typing import NamedTuple
 
-from adxl_ros.links.support.base import Level, LinkStatus, option, PacedSettings, Samples
-from adxl_ros.links.support.waiting import Watchdog
+from adxl_ros.links.support import base
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
@@ -40,13 +39,13 @@ _FOREVER_NS = 2 ** 63 - 1
 
 
 @dataclass(frozen=True)
-class Settings(PacedSettings):
+class Settings(base.PacedSettings):
     """Settings of the link."""
 
-    seed: int = option(0, 'seed of the noise', '', 0, 2 ** 31 - 1)  # Seed of the noise
+    seed: int = base.option(0, 'seed of the noise', '', 0, 2 ** 31 - 1)
     # alpha_rad, beta_rad: Pose without a stage, rad
-    alpha_rad: float = option(0.0, 'pose without a stage', 'rad', -100.0, 100.0)
-    beta_rad: float = option(0.0, 'pose without a stage', 'rad', -100.0, 100.0)
+    alpha_rad: float = base.option(0.0, 'pose without a stage', 'rad', -100.0, 100.0)
+    beta_rad: float = base.option(0.0, 'pose without a stage', 'rad', -100.0, 100.0)
 
 
 class _Knot(NamedTuple):
@@ -83,8 +82,8 @@ class SimulatedSensor:
         self._seed = settings.seed
         self._knots = [_resting((settings.alpha_rad, settings.beta_rad, 0.0))]
         self._respond = self._settled_response()
-        self._watchdog: Watchdog | None = None
-        self._status = LinkStatus(Level.OK, 'at rest, no stage')
+        self._watchdog: base.Watchdog | None = None
+        self._status = base.LinkStatus(base.Level.OK, 'at rest, no stage')
         self._origin_ns = self._made = self._until_ns = self._next_ns = 0
         self._stamps = np.zeros(0, np.int64)
         self._volts = np.zeros((0, len(sensor.axes)))
@@ -93,12 +92,12 @@ class SimulatedSensor:
                     velocity: Mapping[str, float]) -> None:
         """Take the true motion of the stage at a stamp, which may lie ahead."""
         if not np.isfinite([*position.values(), *velocity.values()]).all():
-            self._status = LinkStatus(
-                Level.WARN, f'{self.joint_state_topic}: not finite: {position}')
+            self._status = base.LinkStatus(
+                base.Level.WARN, f'{self.joint_state_topic}: not finite: {position}')
             return
         if abs(stamp_ns - self._until_ns) > _FOREIGN_NS:
-            self._status = LinkStatus(
-                Level.WARN, 'the stage lives by another clock, '
+            self._status = base.LinkStatus(
+                base.Level.WARN, 'the stage lives by another clock, '
                 f'{(stamp_ns - self._until_ns) * 1e-9:+.1f} s from the sensor; set use_sim_time '
                 'for both or for none')
             return
@@ -110,9 +109,9 @@ class SimulatedSensor:
             stamp_ns,
             tuple(position.get(joint, previous[i]) for i, joint in enumerate(JOINTS)),
             tuple(velocity.get(joint, 0.0) for joint in JOINTS)))
-        self._watchdog = self._watchdog or Watchdog(_LONGEST_TURN_S)
+        self._watchdog = self._watchdog or base.Watchdog(_LONGEST_TURN_S)
         self._watchdog.feed()
-        self._status = LinkStatus(Level.OK, 'on the stage')
+        self._status = base.LinkStatus(base.Level.OK, 'on the stage')
 
     def begin(self, now_ns: int) -> int:
         """Make the next sample due now; return the number of samples that are skipped."""
@@ -124,18 +123,18 @@ class SimulatedSensor:
         self._respond = self._settled_response()
         return skipped
 
-    def read(self, now_ns: int) -> Samples:
+    def read(self, now_ns: int) -> base.Samples:
         """Return the samples up to now, or up to the newest stamp of the stage's motion."""
         until_ns = max(self._until_ns, min(now_ns, self._motion_until_ns()))
         while until_ns >= self._next_ns:
             self._make(until_ns)
         due = int(self._stamps.searchsorted(until_ns, 'right'))
-        samples = Samples(self._stamps[:due], self._volts[:due], until_ns)
+        samples = base.Samples(self._stamps[:due], self._volts[:due], until_ns)
         self._stamps, self._volts = self._stamps[due:], self._volts[due:]
         self._until_ns = until_ns
         return samples
 
-    def status(self) -> LinkStatus:
+    def status(self) -> base.LinkStatus:
         """Return whether a stage moves the sensor."""
         return self._status
 
@@ -158,9 +157,9 @@ class SimulatedSensor:
         if self._watchdog.check() < _LOST_S:
             return self._knots[-1].stamp_ns
         self._watchdog = None
-        self._status = LinkStatus(
-            Level.WARN, f'stage lost: nothing on {self.joint_state_topic} for {_LOST_S:g} s, its '
-            'last pose is held')
+        self._status = base.LinkStatus(
+            base.Level.WARN, f'stage lost: nothing on {self.joint_state_topic} for {_LOST_S:g} '
+            's, its last pose is held')
         return _FOREVER_NS
 
     def _make(self, until_ns: int) -> None:

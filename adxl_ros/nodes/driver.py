@@ -176,7 +176,7 @@ class Driver(LifecycleNode):
         text = ', '.join(filter(None, (f'{kind}: {link.text}', warning)))
         serial = (self._output.sensor if self._output else self._sensor).serial
         return Status(level, text, serial, {
-            **values, 'link_type': self._link, 'link_state': link.text, **link.values()})
+            **values, 'link_type': self._link, 'link_state': link.text, **link.statistics})
 
     def _level(self) -> Level:
         """Return the level of the link; a simulated sensor is a warning at least."""

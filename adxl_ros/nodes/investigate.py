@@ -16,7 +16,7 @@ from adxl_ros.investigate.background import BackgroundDiagnoser, OutputFolder
 from adxl_ros.investigate.diagnosis_round import Answer, hypothesis_text, listed, Outcome
 from adxl_ros.investigate.investigation import Investigation, State, Status as Situation
 from adxl_ros.investigate.manoeuvres import description, Pose, StageLimits
-from adxl_ros.links.support.waiting import Watchdog
+from adxl_ros.links.support.base import Watchdog
 from adxl_ros.nodes import topics
 from adxl_ros.nodes.jobs import LiveLine
 from adxl_ros.nodes.parameters import declare_all, declare_sensor, low_and_high, make_sensor

@@ -11,8 +11,14 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
-from adxl_ros.links.support.base import ImuLink, Level, Link, LinkStatus, StageLink
-from adxl_ros.links.support.waiting import Watchdog
+from adxl_ros.links.support.base import (
+    ImuLink,
+    Level,
+    Link,
+    LinkStatus,
+    StageLink,
+    Watchdog,
+)
 from adxl_ros.nodes import topics
 from adxl_ros.nodes.sample_output import References, SampleOutput
 from rclpy.clock import ROSClock

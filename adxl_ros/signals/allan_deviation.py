@@ -47,12 +47,6 @@ class CellMeans:
 
     Where there are too many cells, neighbours are joined. The memory is bounded so, and cells of
     a short stream are short.
-
-    Parameters
-    ----------
-    columns
-        Number of columns of the stream.
-
     """
 
     def __init__(self, columns: int) -> None:
@@ -87,6 +81,14 @@ class CellMeans:
                 self._join()
         self._leftover = rows.copy()
 
+    def variance(self, width: int) -> np.ndarray:
+        """Return the variance of the rows in windows of so many cells, by column, (w, c)."""
+        count = self.count // width
+        means = self.means[:count * width].reshape(count, width, -1)
+        squares = self.squares[:count * width].reshape(count, width, -1).sum(axis=1)
+        between = ((means - means.mean(axis=1, keepdims=True)) ** 2).sum(axis=1) * self.size
+        return (squares + between) / max(width * self.size - 1, 1)
+
     def _join(self) -> None:
         """Join each cell with its neighbour."""
         half = self.count // 2
@@ -105,35 +107,37 @@ class AllanStream:
 
     Up to an averaging time of 2²⁰ samples, all overlaps are used. Longer times come from the
     means of cells, in steps of a cell, which is less than a hundredth of such a time.
-
-    Parameters
-    ----------
-    axes
-        Number of axes, m.
-
     """
 
     def __init__(self, axes: int) -> None:
+        # Sum of squared second differences by axis, and their number, by octave
         self._sums: list[np.ndarray] = []
         self._counts: list[int] = []
-        self._phase = np.zeros((axes, 1))
+        # Running sums of the samples, of which the newest are kept
+        self._phase = np.zeros((axes, 3 * _LONGEST))
         self._kept = 1
         self._offset: np.ndarray | None = None
         self.count = 0
 
     def feed(self, samples: np.ndarray) -> None:
         """Add the next samples of the stream, (n, m)."""
-        if not len(samples):
-            return
-        if self._offset is None:
-            self._offset = samples[0].copy()
-        steps = np.cumsum((samples - self._offset).T, axis=1)
-        self._append(steps)
-        self.count += len(samples)
-        size = 1
-        while 2 * size <= self.count and size <= _LONGEST:
-            self._add(size, len(samples))
-            size *= 2
+        for begin in range(0, len(samples), _LONGEST):
+            part = samples[begin:begin + _LONGEST]
+            if self._offset is None:
+                self._offset = part[0].copy()
+            if self._kept + len(part) > self._phase.shape[1]:
+                # The longest octave needs twice its length.
+                self._phase[:, :2 * _LONGEST] = \
+                    self._phase[:, self._kept - 2 * _LONGEST:self._kept].copy()
+                self._kept = 2 * _LONGEST
+            last, self._kept = self._kept - 1, self._kept + len(part)
+            self._phase[:, last + 1:self._kept] = (
+                np.cumsum((part - self._offset).T, axis=1) + self._phase[:, [last]])
+            self.count += len(part)
+            size = 1
+            while 2 * size <= self.count and size <= _LONGEST:
+                self._add(size, len(part))
+                size *= 2
 
     def result(self, rate_hz: float, cells: CellMeans) -> AllanDeviation:
         """Return the Allan deviation of the samples so far."""
@@ -148,18 +152,6 @@ class AllanStream:
             size *= 2
         tau = np.array(sizes) / rate_hz
         return AllanDeviation(tau, np.sqrt(np.array(variances)), self.count / np.array(sizes))
-
-    def _append(self, steps: np.ndarray) -> None:
-        """Append sums (m, n), counted from the last one; forget what no octave needs."""
-        new = steps.shape[1]
-        if self._kept + new > self._phase.shape[1]:
-            keep = min(self._kept, 2 * _LONGEST)
-            capacity = min(2 * (keep + new), 3 * _LONGEST + new)
-            larger = np.empty((len(self._phase), max(capacity, keep + new)))
-            larger[:, :keep] = self._phase[:, self._kept - keep:self._kept]
-            self._phase, self._kept = larger, keep
-        self._phase[:, self._kept:self._kept + new] = steps + self._phase[:, [self._kept - 1]]
-        self._kept += new
 
     def _add(self, size: int, new: int) -> None:
         """Add the second differences over `size` samples that end in the `new` newest ones."""
@@ -177,11 +169,7 @@ class AllanStream:
 
 
 def _sum_of_squares(phase: np.ndarray, size: int, start: int, stop: int) -> float:
-    """
-    Return the sum of squares of second differences.
-
-    phase: sums of the samples, (n,).
-    """
+    """Return the sum of squares of second differences of sums of samples, (n,)."""
     total = 0.0
     for begin in range(start, stop, _AT_ONCE):
         end = min(begin + _AT_ONCE, stop)
@@ -218,9 +206,8 @@ SHORTEST_S = 10.0
 class StillStretch:
     """The samples of the longest rest."""
 
-    # start_s, stop_s: Its first and last stamp, s
-    start_s: float
-    stop_s: float
+    start_s: float  # Its first stamp, s
+    stop_s: float  # Its last stamp, s
     rate_hz: float  # Sample rate by its stamps, Hz
     count: int  # Number of its samples
     filled: int  # Samples among them that were missing, and lie on a line between their neighbours
@@ -257,64 +244,59 @@ def longest_rest(read: Callable[[], Iterable[Recording]], unit_of: Callable[[Rec
     survey = _read(read, unit_of, None)
     rests = [rest for rest, _ in survey.rests.detected]
     rest = max(rests, key=lambda rest: rest.span_s, default=Rest(0, 0, 0.0, 0.0))
-    shortest_s = shortest_rest_s(survey.segment.nominal_hz)
+    shortest_s = shortest_rest_s(survey.nominal_hz)
     if rest.span_s < shortest_s:
         raise UserError(f'{survey.path}: rests for {rest.span_s:.4g} s at most, expected '
                         f'{shortest_s:.3g} s at least; record longer, and do not touch the sensor')
-    edges_s = np.array([survey.start_s, *(time_s for each in rests for time_s in
-                                          (each.time_start_s, each.time_stop_s)), survey.stop_s])
+    edges_s = np.array([survey.first_s, *(time_s for each in rests for time_s in
+                                          (each.time_start_s, each.time_stop_s)), survey.last_s])
     motion_s = [(start_s, stop_s) for start_s, stop_s in edges_s.reshape(-1, 2).tolist()
                 if stop_s - start_s > _LARGEST_END_S]
-    if not motion_s and not rest.disturbed_s:
-        _check_axes(survey)
-        return _stretch(survey, survey, motion_s)
-    rest_only = _read(read, unit_of, rest)
-    _check_axes(rest_only, f' from {rest.time_start_s:.4g} s to {rest.time_stop_s:.4g} s')
-    return _stretch(survey, rest_only, motion_s)
+    still, span = survey, ''
+    if motion_s or rest.disturbed_s:
+        still = _read(read, unit_of, rest)
+        span = f' from {rest.time_start_s:.4g} s to {rest.time_stop_s:.4g} s'
+    return still.stretch(span, survey.last_s - survey.first_s, motion_s)
 
 
-class _Segment:
-    """Samples of a rest, as far as they have been read; gaps are filled by straight lines."""
+class _Samples:
+    """The samples of a recording, or of one of its rests; gaps are filled by straight lines."""
 
-    def __init__(self, columns: int, rate_hz: float) -> None:
-        self.nominal_hz = rate_hz
-        self.allan = AllanStream(columns - 1)
-        self.cells = CellMeans(columns)
-        self.resolution = np.full(columns - 1, np.inf)
-        self.filled = 0
-        self.start_s = self.stop_s = np.nan
-        self.is_whole = True
+    def __init__(self, block: Recording, unit: Sensor) -> None:
+        if len(block) < 2:
+            raise UserError(f'{block.path}: {len(block)} samples; record longer')
+        self.path, self._names, self.nominal_hz = block.path, block.sensor_columns, block.rate_hz
+        columns = len(self._names)
+        self.rests = RecordedRests(unit, block)
+        self.first_s = self.last_s = np.nan  # Stamps of all samples
+        self._allan = AllanStream(columns)
+        self._cells = CellMeans(columns + 1)
+        self._resolution = np.full(columns, np.inf)
+        self._filled = 0
+        self._is_whole = True
+        # Stamps and newest row of the samples until a gap that is too long to be filled
+        self._start_s = self._stop_s = np.nan
         self._last: np.ndarray | None = None
-
-    @property
-    def count(self) -> int:
-        """Count of the samples."""
-        return self.allan.count
-
-    @property
-    def rate_hz(self) -> float:
-        """Sample rate by the stamps, Hz."""
-        return (self.count - 1) / (self.stop_s - self.start_s)
 
     def feed(self, time_s: np.ndarray, rows: np.ndarray) -> None:
         """Add rows, (n, c), whose gaps are to be filled; the last column is the temperature."""
-        # Nothing is added after a gap that is too long to be filled.
-        steps_s = np.diff(time_s, prepend=time_s[0] if self._last is None else self.stop_s)
-        self.is_whole &= bool((steps_s <= _FILLED_GAPS * gap_s(self.nominal_hz)).all())
-        if not self.is_whole:
-            return
         is_first = self._last is None
-        if self._last is None:
-            self.start_s = float(time_s[0])
-        else:
-            time_s, rows = np.append(self.stop_s, time_s), np.vstack([self._last, rows])
+        self.last_s = float(time_s[-1])
+        if is_first:
+            self.first_s = self._start_s = float(time_s[0])
+        steps_s = np.diff(time_s, prepend=time_s[0] if is_first else self._stop_s)
+        self._is_whole &= bool((steps_s <= _FILLED_GAPS * gap_s(self.nominal_hz)).all())
+        if not self._is_whole:
+            return
+        if self._last is not None:
+            time_s, rows = np.append(self._stop_s, time_s), np.vstack([self._last, rows])
         changes = np.abs(np.diff(rows[:, :-1], axis=0))
-        self.resolution = np.minimum(self.resolution, np.where(changes > 0, changes, np.inf).min(
-            axis=0, initial=np.inf))
-        self._last, self.stop_s = rows[-1], float(time_s[-1])
+        self._resolution = np.minimum(self._resolution, np.where(
+            changes > 0, changes, np.inf).min(axis=0, initial=np.inf))
+        self._last, self._stop_s = rows[-1], float(time_s[-1])
         rows = self._evenly(time_s, rows)[0 if is_first else 1:]
-        self.allan.feed(rows[:, :-1])
-        self.cells.feed(rows)
+        self._allan.feed(rows[:, :-1])
+        self._cells.feed(rows)
 
     def _evenly(self, time_s: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Return the rows with gaps filled."""
@@ -325,100 +307,61 @@ class _Segment:
         advance = np.where(gaps, np.maximum(np.rint(steps_s * self.nominal_hz), 1), 1)
         number = np.concatenate([[0], np.cumsum(advance)])
         full = np.arange(number[-1] + 1)
-        self.filled += len(full) - len(rows)
+        self._filled += len(full) - len(rows)
         return np.column_stack([np.interp(full, number, column) for column in rows.T])
 
-
-@dataclass
-class _Survey:
-    """What a pass over a recording, or over one of its rests, has found."""
-
-    path: str
-    names: tuple[str, ...]
-    start_s: float
-    stop_s: float
-    segment: _Segment
-    rests: RecordedRests
+    def stretch(self, span: str, recorded_s: float, motion_s: list[tuple[float, float]]
+                ) -> StillStretch:
+        """Return the samples as a rest; refuse an axis that never changes in a span, in words."""
+        for name, resolution in zip(self._names, self._resolution):
+            if not np.isfinite(resolution):
+                raise UserError(f'{self.path}: {name} never changes{span}; the axis is stuck, or '
+                                'not connected')
+        cells, count = self._cells, self._allan.count
+        rate_hz = (count - 1) / (self._stop_s - self._start_s)
+        width = min(max(int(np.ceil(_WINDOW_S * rate_hz / cells.size)), 1), cells.count)
+        temperature = cells.means[:, -1]
+        return StillStretch(
+            self._start_s, self._stop_s, rate_hz, count, self._filled,
+            self._allan.result(rate_hz, cells), cells.size / rate_hz, cells.means[:, :-1],
+            temperature if np.isfinite(temperature).all() else None,
+            np.sqrt(cells.variance(width)[:, :-1].mean(axis=0)), self._resolution, recorded_s,
+            motion_s)
 
 
 def _read(read: Callable[[], Iterable[Recording]], unit_of: Callable[[Recording], Sensor],
-          rest: Rest | None) -> _Survey:
+          rest: Rest | None) -> _Samples:
     """Read the undisturbed samples of a rest; those of the whole recording where it is None."""
-    survey: _Survey | None = None
+    samples: _Samples | None = None
     held = np.nan
     for block in read():
-        inside = np.ones(len(block), bool) if rest is None else _is_inside(block.time_s, rest)
+        unit, time_s = unit_of(block), block.time_s
         temperature, held = _held(block, held)
-        unit = unit_of(block)
-        rows = np.column_stack([block.accel_mps2(unit), temperature])[inside]
+        rows = np.column_stack([block.accel_mps2(unit), temperature])
+        if rest is not None:
+            inside = (time_s >= rest.time_start_s) & (time_s <= rest.time_stop_s)
+            for start_s, stop_s in rest.disturbed_s:
+                inside &= (time_s <= start_s) | (time_s >= stop_s)
+            time_s, rows = time_s[inside], rows[inside]
         if not len(rows):
             continue
-        time_s = block.time_s[inside]
-        if survey is None:
-            if len(block) < 2:
-                raise UserError(f'{block.path}: {len(block)} samples; record longer')
-            survey = _Survey(block.path, block.sensor_columns, float(time_s[0]), 0.0,
-                             _Segment(rows.shape[1], block.rate_hz), RecordedRests(unit, block))
-        survey.segment.feed(time_s, rows)
+        samples = samples or _Samples(block, unit)
+        samples.feed(time_s, rows)
         if rest is None:
-            survey.rests.feed(block)
-        survey.stop_s = float(time_s[-1])
-    if survey is None:
+            samples.rests.feed(block)
+    if samples is None:
         raise UserError('the recording holds no samples')
     if rest is None:
-        survey.rests.take()
-    return survey
-
-
-def _is_inside(time_s: np.ndarray, rest: Rest) -> np.ndarray:
-    """Return which samples belong to a rest and are not disturbed, (n,) bool."""
-    inside = (time_s >= rest.time_start_s) & (time_s <= rest.time_stop_s)
-    for start_s, stop_s in rest.disturbed_s:
-        inside &= (time_s <= start_s) | (time_s >= stop_s)
-    return inside
+        samples.rests.take()
+    return samples
 
 
 def _held(block: Recording, last: float) -> tuple[np.ndarray, float]:
     """Return the temperature, °C, (n,), which holds between its readings, and the newest one."""
-    values = block.columns.get('temperature_c')
-    if values is None:
-        return np.full(len(block), np.nan), np.nan
+    values = block.columns.get('temperature_c', np.full(len(block), np.nan))
     is_read = np.isfinite(values)
     if not is_read.any():
         return np.full(len(block), last), last
     place = np.maximum.accumulate(np.where(is_read, np.arange(len(values)), -1))
     first = last if np.isfinite(last) else float(values[is_read][0])
     return np.where(place < 0, first, values[place]), float(values[is_read][-1])
-
-
-def _check_axes(survey: _Survey, span: str = '') -> None:
-    """Refuse an axis that never changes; `span` names the part of the recording."""
-    for name, resolution in zip(survey.names, survey.segment.resolution):
-        if not np.isfinite(resolution):
-            raise UserError(f'{survey.path}: {name} never changes{span}; the axis is stuck, or '
-                            'not connected')
-
-
-def _window_variance(cells: CellMeans, width: int, first: int = 0) -> np.ndarray:
-    """Return the variance of the samples in windows of cells from the first by axis, (w, m)."""
-    count = (cells.count - first) // width
-    part = slice(first, first + count * width)
-    means = cells.means[part, :-1].reshape(count, width, -1)
-    squares = cells.squares[part, :-1].reshape(count, width, -1).sum(axis=1)
-    between = ((means - means.mean(axis=1, keepdims=True)) ** 2).sum(axis=1) * cells.size
-    return (squares + between) / max(width * cells.size - 1, 1)
-
-
-def _stretch(survey: _Survey, rest: _Survey, motion_s: list[tuple[float, float]]
-             ) -> StillStretch:
-    """Return the rest that a pass has read."""
-    segment = rest.segment
-    cells, rate_hz = segment.cells, segment.rate_hz
-    width = max(int(np.ceil(_WINDOW_S * rate_hz / cells.size)), 1)
-    temperature = cells.means[:, -1]
-    return StillStretch(
-        segment.start_s, segment.stop_s, rate_hz, segment.count, segment.filled,
-        segment.allan.result(rate_hz, cells), cells.size / rate_hz, cells.means[:, :-1],
-        temperature if np.isfinite(temperature).all() else None,
-        np.sqrt(_window_variance(cells, min(width, cells.count)).mean(axis=0)),
-        segment.resolution, survey.stop_s - survey.start_s, motion_s)

@@ -12,16 +12,9 @@ from adxl_ros.files.exports import kalibr_settings
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.signals import noise_parameters
 from adxl_ros.signals.allan_deviation import StillStretch
-from adxl_ros.signals.noise_parameters import (
-    coefficient_variances,
-    Drift,
-    Estimate,
-    find_drift,
-    fit_noise,
-    needed_time_s,
-    NoiseFit,
-)
+from adxl_ros.signals.noise_parameters import Drift, Estimate, NoiseFit
 import numpy as np
 
 TERMS = ('white', 'instability', 'walk')
@@ -84,14 +77,14 @@ class RecordingNoise:
 def recording_noise(path: str, rest: StillStretch, axes: str, show: Callable[[float], None]
                     ) -> RecordingNoise:
     """Fit the noise of all axes."""
-    variances = coefficient_variances(len(rest.means), rest.step_s)
+    variances = noise_parameters.coefficient_variances(len(rest.means), rest.step_s)
     noises = []
     for i, axis in enumerate(axes):
         means = rest.means[:, i]
-        fit = fit_noise(means, rest.step_s, variances)
-        drift = find_drift(means, rest.step_s, variances, fit, rest.temperature_c)
-        needed_s = {name: needed_time_s(fit, term, rest.span_s) for term, name in enumerate(TERMS)
-                    if not getattr(fit, name).is_seen}
+        fit = noise_parameters.fit_noise(means, rest.step_s, variances)
+        drift = noise_parameters.find_drift(means, rest.step_s, variances, fit, rest.temperature_c)
+        needed_s = {name: noise_parameters.needed_time_s(fit, term, rest.span_s)
+                    for term, name in enumerate(TERMS) if not getattr(fit, name).is_seen}
         deviation = rest.allan.deviation[:, i]
         lowest = int(np.argmin(deviation))
         std, resolution = float(rest.sample_std[i]), float(rest.resolution[i])
@@ -205,8 +198,8 @@ _PX4_HZ = 100.0
 class Setting:
     """A line of another program's settings."""
 
-    name: str  # Name of the setting
-    values: tuple[float, ...]  # Its values: one, or nine of a matrix
+    name: str
+    values: tuple[float, ...]  # One, or nine of a matrix
     unit: str  # Their unit, and what they are
 
     def lines(self) -> list[str]:
@@ -215,8 +208,8 @@ class Setting:
         if len(texts) == 1:
             return [f'{self.name}: {texts[0]}  # {self.unit}']
         rows = [', '.join(texts[i:i + 3]) for i in range(0, len(texts), 3)]
-        return [f'{self.name}:  # {self.unit}', f'  [{rows[0]},',
-                *(f'   {row},' for row in rows[1:-1]), f'   {rows[-1]}]']
+        return [f'{self.name}:  # {self.unit}',
+                *('  [' + ',\n   '.join(rows) + ']').split('\n')]
 
 
 def _yaml_number(value: float) -> str:
@@ -235,29 +228,13 @@ def settings(noises: list[AxisNoise], rate_hz: float) -> dict[str, list[Setting]
     square of the time step, so they take N·√rate and K·√rate, at the rate of their filter.
     robot_localization takes the variance of a sample from the message. Programs that have one
     value for all axes get the largest one. A term that is not seen is its upper limit.
-
-    Parameters
-    ----------
-    noises
-        The noise by axis.
-    rate_hz
-        Sample rate, Hz.
-
-    Returns
-    -------
-    dict
-        Settings by program.
-
     """
     loudest = max(noises, key=lambda noise: noise.sample_white)
-    white = loudest.sample_white
+    white, walks = loudest.sample_white, [noise.fit.walk for noise in noises]
     white_limit = '' if loudest.fit.white.is_seen else ', an upper limit'
-    walk = max((noise.fit.walk for noise in noises), key=lambda walk: walk.value)
-    limit = ''
-    if not walk.is_seen:
-        walk = max((noise.fit.walk for noise in noises), key=lambda walk: walk.high)
-        limit = ', an upper limit'
-    k = walk.value if walk.is_seen else walk.high
+    walk = max(walks, key=lambda walk: walk.value)
+    limit = '' if walk.is_seen else ', an upper limit'
+    k = walk.value if walk.is_seen else max(walk.high for walk in walks)
     variances = [noise.sample_std ** 2 for noise in noises]
     matrix = np.diag((variances + [1e6] * 3)[:3]).ravel()
     return {

@@ -1,13 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Statistics of a stream of samples in short blocks, from which rests are found."""
+"""
+Statistics of a stream of samples in short blocks, from which rests and noise are found.
+
+A window is some blocks in a row. It is quiet if the variance in it is that of the noise, which the
+quietest windows of a stream have in common.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from itertools import pairwise
 
+from adxl_ros.model.constants import MAD_TO_STD
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 BLOCK_S = 0.05
 """Length of a block, s. Chosen: well below a rest, and above the sample period of most sensors."""
@@ -169,3 +176,176 @@ def true_runs(mask: np.ndarray, group: np.ndarray | None = None) -> list[tuple[i
     number = np.where(mask, 0 if group is None else group, -1)
     edges = np.flatnonzero(np.diff(number, prepend=-2, append=-2))
     return [(int(first), int(stop)) for first, stop in pairwise(edges) if mask[first]]
+
+
+_WINDOW_S = 0.25
+"""Length of the window of a variance, s. Chosen: under half of the shortest rest."""
+_WINDOW_SAMPLES = 8
+"""Smallest number of samples in that window. Chosen: fewer do not show a variance."""
+_HALF_S = 0.5
+"""Shortest length of the neighbouring halves whose means are compared, s. Chosen: two windows."""
+DRIFT_OCTAVES = 4
+"""Number of lengths of halves: 0.5, 1, 2 and 4 s. Chosen: beyond, a sensor's flicker dominates."""
+MIN_VARIANCE_RATIO = 2.25
+"""Smallest limit of a variance, relative to that of the noise: 1.5 times its rms."""
+_MAX_VARIANCE_RATIO = 9.0
+"""Largest limit of a variance, relative to that of the noise: 3 times its rms."""
+_QUIETEST_SHARE = 0.05
+"""Quantile of the windows' variances at which the search for the variance of noise begins."""
+_QUIET_RATIO = 3.0
+"""Largest variance of a quiet window, relative to that of the noise."""
+_QUIET_STEPS = 50
+"""Largest number of steps of that search."""
+_QUIET_DEVIATIONS = 5.0
+"""Distance of a variance's limit from the noise, standard deviations of ln(variance)."""
+_ROUNDING = 1e-9
+"""Relative rounding error of samples without noise."""
+_TINY_VARIANCE = 1e-300
+"""Lower bound of a variance, in squares of any unit, so that its logarithm is finite."""
+
+
+@dataclass(frozen=True)
+class Spans:
+    """Lengths of windows in blocks, for a sample rate."""
+
+    rate_hz: float
+
+    @property
+    def size(self) -> int:
+        """Return the number of samples in a block."""
+        return block_samples(self.rate_hz)
+
+    @property
+    def block_s(self) -> float:
+        """Return the length of a block, s."""
+        return self.size / self.rate_hz
+
+    @property
+    def window(self) -> int:
+        """Return the blocks of the window of a variance; odd, so that one is in the middle."""
+        return max(round(_WINDOW_S / self.block_s), -(-_WINDOW_SAMPLES // self.size)) // 2 * 2 + 1
+
+    @property
+    def half(self) -> int:
+        """Return the blocks of the shortest halves whose means are compared."""
+        return max(round(_HALF_S / self.block_s), 4)
+
+    @property
+    def longest(self) -> int:
+        """Return the number of blocks in both longest halves together."""
+        return self.half << DRIFT_OCTAVES
+
+
+def quiet_variance(blocks: Blocks, windows: np.ndarray,
+                   step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Learn the variance that the quietest windows have in common, and its limit, (m,) each.
+
+    Noise below the ADC's step, (m,), makes at most two neighbouring codes equally frequent: a
+    variance of a quarter of the squared step. Samples without any noise still have a rounding
+    error.
+    """
+    middle = np.median(np.abs(blocks.mean), axis=0)
+    smallest = step ** 2 / 4 + (_ROUNDING * middle) ** 2 + _TINY_VARIANCE
+    variance, ratio = np.array([_quietest(variances, limit)
+                                for variances, limit in zip(windows.T, smallest)]).T
+    return variance, ratio * variance
+
+
+def _quietest(variances: np.ndarray, smallest: float) -> tuple[float, float]:
+    """
+    Return the variance that the quiet windows have in common, and the ratio of its limit.
+
+    The search begins at the 5 % quantile. Each step goes to the median of all variances below
+    three times the present one. Variances of motion spread over decades, those of noise do not.
+    """
+    values = np.sort(np.maximum(variances[np.isfinite(variances)], smallest))
+    if not len(values):
+        return smallest, MIN_VARIANCE_RATIO
+    centre = values[int(_QUIETEST_SHARE * len(values))]
+    for _ in range(_QUIET_STEPS):
+        near = values[:np.searchsorted(values, _QUIET_RATIO * centre)]
+        centre, before = np.median(near), centre
+        if centre == before:
+            break
+    logs = np.log(values[:np.searchsorted(values, _QUIET_RATIO * centre)])
+    scatter = MAD_TO_STD * np.median(np.abs(logs - np.log(centre)))
+    return float(centre), float(np.clip(np.exp(_QUIET_DEVIATIONS * scatter),
+                                        MIN_VARIANCE_RATIO, _MAX_VARIANCE_RATIO))
+
+
+def adc_step(blocks: Blocks) -> np.ndarray:
+    """Return the smallest change of the samples, (m,); 0 where they never change."""
+    changes = blocks.step
+    if len(blocks) > 1 and (blocks.count <= 1).all():
+        changes = np.abs(np.diff(blocks.mean, axis=0))
+    smallest = np.where(changes > 0, changes, np.inf).min(axis=0, initial=np.inf)
+    return np.where(np.isfinite(smallest), smallest, 0.0)
+
+
+def undithered(step: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """
+    Return the rounding error of a mean that noise does not average out, (m,).
+
+    Noise of a standard deviation, (m,), multiplies the first harmonic of the rounding error by
+    exp(−2π²σ²/step²) (Widrow's quantisation theorem). A scatter of up to half a step is no
+    evidence of noise: without noise the codes may alternate between two values.
+    """
+    noise = np.maximum(sigma ** 2 - step ** 2 / 4, 0)
+    return step * np.exp(-2 * np.pi ** 2 * noise / np.where(step > 0, step, np.inf) ** 2)
+
+
+def window_variance(blocks: Blocks, spans: Spans) -> np.ndarray:
+    """
+    Return the variance of the samples in every window, (k − window + 1, m).
+
+    It is inf across a gap, and where half of the samples are missing.
+    """
+    window = spans.window
+    if len(blocks) < window:
+        return np.empty((0, blocks.mean.shape[1]))
+    means = sliding_window_view(blocks.mean, window, axis=0)
+    counts = sliding_window_view(blocks.count, window)[:, None, :]
+    rows = counts.sum(axis=2)
+    with np.errstate(over='ignore', invalid='ignore'):
+        centre = (means * counts).sum(axis=2) / np.maximum(rows, 1)
+        between = (counts * (means - centre[..., None]) ** 2).sum(axis=2)
+        within = sliding_window_view(blocks.squares, window, axis=0).sum(axis=2)
+        variance = (within + between) / np.maximum(rows - 1, 1)
+    gapless = blocks.run[window - 1:] == blocks.run[:len(blocks) - window + 1]
+    usable = gapless[:, None] & (2 * rows > window * spans.size)
+    return np.where(usable & np.isfinite(variance), variance, np.inf)
+
+
+def quiet_blocks(blocks: Blocks, windows: np.ndarray, limit: np.ndarray,
+                 window: int) -> np.ndarray:
+    """Mark the blocks, (k,), in whose window no variance is above the limit, (m,)."""
+    quiet: np.ndarray = np.all(windows <= limit, axis=1)
+    if not len(quiet):
+        return np.zeros(len(blocks), bool)
+    # A block near an end of its run takes the outermost window, which is not centred on it.
+    begin = np.searchsorted(blocks.run, blocks.run, side='left')
+    end = np.searchsorted(blocks.run, blocks.run, side='right')
+    first = np.clip(np.arange(len(blocks)) - window // 2, begin, np.maximum(end - window, begin))
+    return (end - begin >= window) & quiet[np.minimum(first, len(quiet) - 1)]
+
+
+def half_differences(blocks: Blocks, usable: np.ndarray,
+                     half: int) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Compare the means of `half` blocks before and after each place.
+
+    Returns differences, (k − 2·half + 1, m), the first one at block `half`; and whether all blocks
+    of both halves are marked as usable, (k,) bool, and without a gap.
+    """
+    places = len(blocks) - 2 * half + 1
+    if places < 1:
+        return np.empty((0, blocks.mean.shape[1])), np.zeros(0, bool)
+    # Only usable blocks are summed: a spike of 1e38 would absorb all later terms.
+    centre = np.median(blocks.mean[usable], axis=0) if usable.any() else 0.0
+    total = np.zeros((len(blocks) + 1, blocks.mean.shape[1]))
+    np.cumsum(np.where(usable[:, None], blocks.mean - centre, 0), axis=0, out=total[1:])
+    differences = (total[2 * half:] - 2 * total[half:-half] + total[:-2 * half]) / half
+    unusable = np.concatenate([[0], np.cumsum(~usable)])
+    gapless = blocks.run[2 * half - 1:] == blocks.run[:places]
+    return differences, gapless & (unusable[2 * half:] == unusable[:-2 * half])

@@ -15,14 +15,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import Enum
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 import scipy
 
-INTERVAL = 0.90
-"""Probability of an interval. The usual one of the package."""
+_DROP = 2.705543454095404
+"""Twice the drop of the log likelihood at the ends of a 90 % interval: the quantile of χ² with
+one degree of freedom."""
 _SINGLE = 64
 """Coefficients of the lowest frequencies that are fitted one by one. Chosen: the terms change
 little between the further ones."""
@@ -30,6 +30,8 @@ _WIDTH = 1.03
 """Ratio of the frequencies of a group of further coefficients. Chosen: a term changes by 6 %."""
 _ROUNDS = 60
 """Largest number of rounds of a fit. Chosen: usual are ten."""
+_HALVINGS = 20
+"""Largest number of halvings of a step that does not raise the likelihood."""
 _CONVERGED = 1e-9
 """Change of twice the log likelihood at which a fit ends."""
 _SMALLEST = 1e-4
@@ -67,10 +69,8 @@ class Estimate(NamedTuple):
     """A value with its interval."""
 
     value: float  # The most likely value
-    # low, high: Ends of the 90 % interval. Where `low` is 0 the term is not seen, and `high` is an
-    # upper limit.
-    low: float
-    high: float
+    low: float  # Lower end of the 90 % interval; 0 where the term is not seen
+    high: float  # Upper end; an upper limit where the term is not seen
 
     @property
     def is_seen(self) -> bool:
@@ -85,7 +85,6 @@ class Estimate(NamedTuple):
 class Octave(NamedTuple):
     """An octave of frequency whose power contradicts the fitted terms."""
 
-    # low_hz, high_hz: Its bounds, Hz
     low_hz: float
     high_hz: float
     ratio: float  # Measured power divided by the fitted power
@@ -195,18 +194,7 @@ def coefficient_variances(count: int, step_s: float) -> np.ndarray:
     the factor (2 + cos ω)/3. For 1/f noise the diagonal of its covariance is computed. That
     covariance is −B²/π·ln|t| up to a constant, averaged over two cells.
 
-    Parameters
-    ----------
-    count
-        Number of cells, n.
-    step_s
-        Length of a cell, s.
-
-    Returns
-    -------
-    ndarray
-        By coefficient and term, (n − 1, 3), in s⁻¹, 1 and s.
-
+    Returned by coefficient and term for `count` cells, (n − 1, 3), in s⁻¹, 1 and s.
     """
     k = np.arange(1, count)
     omega = np.pi * k / count
@@ -227,24 +215,10 @@ def coefficient_variances(count: int, step_s: float) -> np.ndarray:
 def fit_noise(means: np.ndarray, step_s: float, variances: np.ndarray | None = None,
               like: NoiseFit | None = None) -> NoiseFit:
     """
-    Fit white noise, bias instability and random walk to the means of cells.
+    Fit white noise, bias instability and random walk to the means of neighbouring cells, u, (n,).
 
-    Parameters
-    ----------
-    means
-        Means of neighbouring cells, u, (n,).
-    step_s
-        Length of a cell, s.
-    variances
-        Those of `coefficient_variances`, which axes of one recording share.
-    like
-        Fit whose coefficients to use; None leaves out those at which a filter or vibration shows.
-
-    Returns
-    -------
-    NoiseFit
-        The three terms with intervals.
-
+    variances: those of `coefficient_variances`, which axes of one recording share; like: fit whose
+    coefficients to use; None leaves out those at which a filter or vibration shows.
     """
     if variances is None:
         variances = coefficient_variances(len(means), step_s)
@@ -277,7 +251,7 @@ def _walks(groups: _Groups, span_s: float, highest: int
     free = _fit(groups)[1]
     if 2 * (likelihoods.max() - free) < scipy.stats.chi2.isf(_BOUND_PROBABILITY, 1):
         return [groups], None
-    inside = np.flatnonzero(2 * (likelihoods.max() - likelihoods) < _drop())
+    inside = np.flatnonzero(2 * (likelihoods.max() - likelihoods) < _DROP)
     low, high = max(inside[0] - 1, 0), min(inside[-1] + 1, len(times_s) - 1)
     return models[low:high + 1], Estimate(float(times_s[likelihoods.argmax()]),
                                           float(times_s[low]), float(times_s[high]))
@@ -291,24 +265,10 @@ def _best(models: list[_Groups], fixed: int | None = None, value: float = 0.0
 
 def needed_time_s(fit: NoiseFit, term: int, span_s: float) -> float:
     """
-    Return how long a recording must be to show half of a term's upper limit.
+    Return how long a recording must be to show half of a term's upper limit, s.
 
-    The Fisher information of the cosine coefficients tells when the interval excludes 0.
-
-    Parameters
-    ----------
-    fit
-        The noise of a recording.
-    term
-        Index of the term: N, B or K.
-    span_s
-        Time of the recording, s.
-
-    Returns
-    -------
-    float
-        Time, s; `inf` beyond a thousand times that of the recording.
-
+    The Fisher information of the cosine coefficients tells when the interval excludes 0. It is
+    `inf` beyond a thousand times the time of the recording.
     """
     squares = fit.squares
     squares[term] = ((fit.white, fit.instability, fit.walk)[term].high / 2) ** 2
@@ -353,16 +313,12 @@ def _log_likelihood(groups: _Groups, theta: np.ndarray) -> float:
 
 def _fit(groups: _Groups, fixed: int | None = None, value: float = 0.0
          ) -> tuple[np.ndarray, float]:
-    """
-    Maximise the likelihood over N², B² and K² of 0 or more by Fisher scoring.
-
-    returns: n², B² and K², (3,). The log likelihood there.
-    """
+    """Return the likeliest N², B² and K² of 0 or more, (3,), by Fisher scoring; and how likely."""
     free = [term for term in range(3) if term != fixed]
-    offset = groups.shapes[:, fixed] * value if fixed is not None else np.zeros(len(groups.power))
     theta = np.zeros(3)
     if fixed is not None:
         theta[fixed] = value
+    offset = groups.shapes @ theta
     white = max(float(np.median(groups.power - offset)), float(groups.power.min()))
     theta[free[0]] = white / float(np.median(groups.shapes[:, free[0]]))
     likelihood = _log_likelihood(groups, theta)
@@ -371,20 +327,16 @@ def _fit(groups: _Groups, fixed: int | None = None, value: float = 0.0
         design = groups.shapes[:, free] * weight[:, None]
         norm = np.linalg.norm(design, axis=0)
         solution, _ = scipy.optimize.nnls(design / norm, (groups.power - offset) * weight)
-        step = -theta
-        step[free] += solution / norm
-        if fixed is not None:
-            step[fixed] = 0.0
-        better, gained = theta, 0.0
-        for halving in range(20):
+        step = np.zeros(3)
+        step[free] = solution / norm - theta[free]
+        for halving in range(_HALVINGS):
             trial = theta + step * 0.5 ** halving
             gained = _log_likelihood(groups, trial) - likelihood
             if gained > 0:
-                better = trial
                 break
-        if gained <= 0:
+        else:
             break
-        theta, likelihood = better, likelihood + gained
+        theta, likelihood = trial, likelihood + gained
         if 2 * gained < _CONVERGED:
             break
     return theta, likelihood
@@ -394,13 +346,13 @@ def _interval(models: list[_Groups], theta: np.ndarray, likelihood: float, term:
     """Return a term with the ends of its interval by the profile likelihood over models."""
     def excess(logarithm: float) -> float:
         """Return twice the drop of the profile likelihood, minus its limit."""
-        return 2 * (likelihood - _best(models, term, np.exp(logarithm))[1]) - _drop()
+        return 2 * (likelihood - _best(models, term, np.exp(logarithm))[1]) - _DROP
 
     scale = float(np.min(models[0].shapes @ theta / models[0].shapes[:, term]))
     best = float(theta[term])
     low = 0.0
     begin = np.log(best if best > 0 else scale * _SMALLEST)
-    if best > 0 and 2 * (likelihood - _best(models, term, 0.0)[1]) > _drop():
+    if best > 0 and 2 * (likelihood - _best(models, term, 0.0)[1]) > _DROP:
         bottom = begin - 1.0
         while excess(bottom) < 0:
             bottom -= 1.0
@@ -440,15 +392,6 @@ def _is_expected(octave: _Groups, lower: _Groups, theta: np.ndarray) -> bool:
     return bool(scipy.stats.chi2.sf(excess ** 2 / variance, 1) > _OCTAVE_PROBABILITY)
 
 
-def _octave_probability(groups: _Groups, theta: np.ndarray, first: int) -> float:
-    """Return the two-sided probability of the power from coefficient `first` on."""
-    kept = groups.first >= first
-    freedom = int(groups.count[kept].sum())
-    total = float(groups.count[kept] @ (groups.power[kept] / (groups.shapes[kept] @ theta)))
-    tails = scipy.stats.chi2.cdf(total, freedom), scipy.stats.chi2.sf(total, freedom)
-    return 2 * float(min(tails))
-
-
 def _contradictions(groups: _Groups, theta: np.ndarray, highest: int, span_s: float
                     ) -> tuple[Octave, ...]:
     """
@@ -459,23 +402,18 @@ def _contradictions(groups: _Groups, theta: np.ndarray, highest: int, span_s: fl
     octaves: list[Octave] = []
     stop = int(groups.first[-1] + groups.count[-1])
     while stop > _FEWEST:
-        octave = groups.below(stop)
         begin = stop // 2
-        kept = octave.first >= begin
-        if kept.any() and _octave_probability(octave, theta, begin) < _OCTAVE_PROBABILITY:
-            counts = octave.count[kept]
-            ratio = float(counts @ (octave.power[kept] / (octave.shapes[kept] @ theta))
-                          / counts.sum())
-            if ratio > 1 or stop <= highest:
-                octaves.append(Octave(begin / span_s, stop / span_s, ratio))
+        octave = groups.below(stop)
+        octave = octave.where(octave.first >= begin)
+        freedom = int(octave.count.sum())
+        if freedom:
+            total = float(octave.count @ (octave.power / (octave.shapes @ theta)))
+            chance = 2 * min(scipy.stats.chi2.cdf(total, freedom),
+                             scipy.stats.chi2.sf(total, freedom))
+            if chance < _OCTAVE_PROBABILITY and (total > freedom or stop <= highest):
+                octaves.append(Octave(begin / span_s, stop / span_s, total / freedom))
         stop = begin
     return tuple(octaves[::-1])
-
-
-@cache
-def _drop() -> float:
-    """Return twice the drop of the log likelihood at the ends of an interval."""
-    return float(scipy.stats.chi2.ppf(INTERVAL, 1))
 
 
 _TREND_GAIN = 12.0
@@ -510,51 +448,29 @@ class Drift:
 def find_drift(means: np.ndarray, step_s: float, variances: np.ndarray, fit: NoiseFit,
                temperature_c: np.ndarray | None) -> Drift | None:
     """
-    Find the drift that explains most of the slow motion of a signal.
+    Find the drift that explains most of the slow motion of a signal; None where noise does.
 
-    Parameters
-    ----------
-    means
-        Means of cells, u, (n,).
-    step_s
-        Length of a cell, s.
-    variances
-        Those of `coefficient_variances`.
-    fit
-        The noise of the same cells.
-    temperature_c
-        Temperature of the cells, °C, (n,); None where it is not measured.
-
-    Returns
-    -------
-    Drift or None
-        None where noise explains everything.
-
+    means: means of cells, u, (n,); variances: those of `coefficient_variances`; fit: the noise of
+    the same cells; temperature_c: temperature of the cells, (n,), None where it is not measured.
     """
     number = np.arange(len(means), dtype=float)
-    shapes = {DriftKind.TREND: number * step_s}
+    cell = _likely_step(coefficients(means), variances, fit)
+    shapes = {DriftKind.TREND: number * step_s, DriftKind.STEP: (number >= cell).astype(float)}
     if temperature_c is not None and np.ptp(temperature_c) > 0:
         shapes[DriftKind.TEMPERATURE] = temperature_c
-    cell = _likely_step(coefficients(means), variances, fit)
-    shapes[DriftKind.STEP] = (number >= cell).astype(float)
-    drifts = {}
+    gains, drifts = {}, {}
     for kind, shape in shapes.items():
         size, without = _without(means, shape, step_s, variances, fit)
-        limit = _STEP_GAIN if kind is DriftKind.STEP else _TREND_GAIN
-        if _gain(without, fit) > limit:
+        gain = 2 * (without.log_likelihood - fit.log_likelihood)
+        if gain > (_STEP_GAIN if kind is DriftKind.STEP else _TREND_GAIN):
+            gains[kind] = gain
             drifts[kind] = Drift(kind, size, cell if kind is DriftKind.STEP else 0, without)
     if not drifts:
         return None
-    best = max(drifts.values(), key=lambda drift: _gain(drift.without, fit))
-    warm = drifts.get(DriftKind.TEMPERATURE)
-    if warm and _gain(warm.without, fit) > _TEMPERATURE_SHARE * _gain(best.without, fit):
-        return warm
-    return best
-
-
-def _gain(fit: NoiseFit, before: NoiseFit) -> float:
-    """Return the gain of twice the log likelihood."""
-    return 2 * (fit.log_likelihood - before.log_likelihood)
+    best = max(gains, key=lambda kind: gains[kind])
+    if gains.get(DriftKind.TEMPERATURE, 0.0) > _TEMPERATURE_SHARE * gains[best]:
+        best = DriftKind.TEMPERATURE
+    return drifts[best]
 
 
 def _without(means: np.ndarray, shape: np.ndarray, step_s: float, variances: np.ndarray,

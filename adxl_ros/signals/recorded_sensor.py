@@ -8,7 +8,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from math import ceil, log2
 from pathlib import Path
-from typing import NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
@@ -17,14 +16,8 @@ from adxl_ros.model.coefficients import names_of, put, with_neutral
 from adxl_ros.model.constants import AXES, MEASURED_AXES
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor, to_volts, with_axes
-from adxl_ros.signals.block_statistics import block_samples, BlockCutter, Blocks, true_runs
-from adxl_ros.signals.noise_limits import (
-    adc_step,
-    quiet_blocks,
-    quiet_variance,
-    Spans,
-    window_variance,
-)
+from adxl_ros.signals import block_statistics as stats
+from adxl_ros.signals.block_statistics import Spans
 import numpy as np
 import scipy
 
@@ -50,9 +43,7 @@ def measure_unstated(sensor: Sensor, read: Recording) -> tuple[Sensor, list[str]
     unit = sensor if sensor.effects else with_axes(sensor, read.axes)
     if 'noise_density_g_per_rthz' in sensor.unstated:
         unit = replace(unit, provenance={**unit.provenance, 'noise_from': name})
-    values = measure(read.time_s, read.volts(unit), unit)
-    return (with_measured_values(unit, values),
-            describe(unit, values))
+    return _measured(unit, read.time_s, read.volts(unit))
 
 
 def listed(measured: list[str]) -> list[str]:
@@ -69,11 +60,7 @@ class BeyondRange:
         self._samples, self._largest_g = 0, 0.0
 
     def add(self, volts: np.ndarray, sensor: Sensor) -> None:
-        """
-        Count further samples.
-
-        volts: samples, V, (n, m).
-        """
+        """Count further samples, V, (n, m)."""
         readings_g = np.abs(volts - sensor.nominal_zero_g_v) / sensor.nominal_scale_v_per_g
         beyond = readings_g > sensor.range_g
         if beyond.any():
@@ -103,73 +90,63 @@ _RESISTANCE_OHM = 1.0e4
 """Resistor that a measured filter is written with, Ω: only its product with C has a meaning."""
 
 
-class MeasuredValues(NamedTuple):
-    """What samples show of their sensor."""
-
-    noise_v: np.ndarray  # Standard deviation of one sample at rest by axis, V, (m,)
-    step_v: np.ndarray  # Smallest change of the samples by axis, V, (m,)
-    rc_s: float  # Time constant of the filter, s; 0 where the noise shows none
-    largest_g: float  # Magnitude of the largest reading of an axis, g
-
-    @property
-    def range_g(self) -> float:
-        """Return the next power of two above the largest reading, g: a common range."""
-        return max(_SMALLEST_RANGE_G, 2.0 ** ceil(log2(max(self.largest_g, _SMALLEST_RANGE_G))))
-
-
-def measure(time_s: np.ndarray, volts: np.ndarray, sensor: Sensor) -> MeasuredValues:
+def _measured(unit: Sensor, time_s: np.ndarray, volts: np.ndarray) -> tuple[Sensor, list[str]]:
     """
-    Measure noise, step, filter and largest reading.
+    Fill in what a parameter file leaves out; return the unit, and what is measured, for people.
 
     The noise is that of the quietest quarter seconds, so that the samples may hold motion.
 
     time_s: stamps, s, (n,); volts: samples, V, (n, m).
     """
-    cutter = BlockCutter(sensor.rate_hz, len(sensor.axes))
-    blocks, spans = cutter.feed(time_s, volts), Spans.for_rate(sensor.rate_hz)
-    windows = window_variance(blocks, spans)
+    scale_v_per_g, spans = unit.nominal_scale_v_per_g, Spans(unit.rate_hz)
+    blocks = stats.BlockCutter(unit.rate_hz, len(unit.axes)).feed(time_s, volts)
+    windows = stats.window_variance(blocks, spans)
     if len(time_s) < _FEWEST_SAMPLES or not np.isfinite(windows).any():
-        raise UserError(f'{len(time_s)} samples at {sensor.rate_hz:g} Hz do not show the noise of '
+        raise UserError(f'{len(time_s)} samples at {unit.rate_hz:g} Hz do not show the noise of '
                         f'the sensor; record at least {SHORTEST_S:g} s, or state '
                         'sensor.noise_density_g_per_rthz in the parameter file')
-    step_v = adc_step(blocks)
-    variance_v2, limit_v2 = quiet_variance(blocks, windows, step_v)
-    quiet = quiet_blocks(blocks, windows, limit_v2, spans.window)
-    readings_g = np.abs(volts - sensor.nominal_zero_g_v) / sensor.nominal_scale_v_per_g
-    return MeasuredValues(np.sqrt(variance_v2), step_v,
-                          _filter_s(volts, blocks, quiet, sensor, float(np.max(step_v))),
-                          float(np.nanmax(readings_g)))
+    step_v = stats.adc_step(blocks)
+    variance_v2, limit_v2 = stats.quiet_variance(blocks, windows, step_v)
+    rc_s = unit.rc_s
+    states_filter = not {'rc_resistance_ohm', 'rc_capacitance_f'} & set(unit.unstated)
+    if not states_filter:
+        quiet = stats.quiet_blocks(blocks, windows, limit_v2, spans.window)
+        rests = [volts[blocks.start[begin]:blocks.start[end - 1] + spans.size]
+                 for begin, end in stats.true_runs(quiet, blocks.run)]
+        rc_s = _filter_s(rests, unit.rate_hz, float(np.max(step_v)))
+    noise_g = np.sqrt(variance_v2) / scale_v_per_g
+    largest_g = float(np.nanmax(np.abs(volts - unit.nominal_zero_g_v) / scale_v_per_g))
+    # A common range: a power of two
+    range_g = 2.0 ** ceil(log2(max(largest_g, _SMALLEST_RANGE_G)))
+    bandwidth_hz = 0.25 / rc_s if rc_s else unit.rate_hz / 2
+    values = {'noise_density_g_per_rthz': np.minimum(noise_g / np.sqrt(bandwidth_hz),
+                                                     _MAX_NOISE_G_PER_RTHZ),
+              'range_g': range_g, 'rc_resistance_ohm': _RESISTANCE_OHM,
+              'rc_capacitance_f': rc_s / _RESISTANCE_OHM}
+    lines = []
+    if 'noise_density_g_per_rthz' in unit.unstated:
+        lines.append('noise of a sample: ' + _by_axis(unit, noise_g))
+    if 'adc_bits' in unit.unstated:
+        lines.append('resolution: ' + _by_axis(unit, step_v / scale_v_per_g))
+    if not states_filter:
+        lines.append(f'filter: {rc_s * 1e3:.3g} ms' if rc_s else
+                     'filter: the noise at rest shows none')
+    if 'range_g' in unit.unstated:
+        lines.append(f'range: ±{range_g:g} g (largest reading {largest_g:.3g} g)')
+    used = {name: value for name, value in values.items() if name in unit.unstated}
+    return replace(unit, unstated=(), measured=unit.unstated, **used), lines
 
 
-def _filter_s(volts: np.ndarray, blocks: Blocks, quiet: np.ndarray, sensor: Sensor,
-              step_v: float) -> float:
+def _filter_s(rests: list[np.ndarray], rate_hz: float, step_v: float) -> float:
     """Return the mean time constant of the axes, s; 0 where the noise of one shows no filter."""
-    size = block_samples(sensor.rate_hz)
-    rests = [volts[blocks.start[begin]:blocks.start[end - 1] + size]
-             for begin, end in true_runs(quiet, blocks.run)]
     time_constants = []
-    for axis in range(volts.shape[1]):
-        estimate = estimate_filter([rest[:, axis] for rest in rests], sensor.rate_hz,
-                                   _FILTER_START_SAMPLES / sensor.rate_hz, step_v)
+    for axis in range(rests[0].shape[1] if rests else 0):
+        estimate = estimate_filter([rest[:, axis] for rest in rests], rate_hz,
+                                   _FILTER_START_SAMPLES / rate_hz, step_v)
         if estimate is None or not estimate.credible:
             return 0.0
         time_constants.append(estimate.rc_s)
-    return float(np.mean(time_constants))
-
-
-def with_measured_values(sensor: Sensor, values: MeasuredValues) -> Sensor:
-    """Fill in what the parameter file of a sensor leaves out."""
-    rc_s = sensor.rc_s if _states_filter(sensor) else values.rc_s
-    bandwidth_hz = 0.25 / rc_s if rc_s else sensor.rate_hz / 2
-    density = values.noise_v / sensor.nominal_scale_v_per_g / np.sqrt(bandwidth_hz)
-    measured = {
-        'noise_density_g_per_rthz': np.minimum(density, _MAX_NOISE_G_PER_RTHZ),
-        'range_g': values.range_g}
-    if not _states_filter(sensor):
-        measured |= {'rc_resistance_ohm': _RESISTANCE_OHM,
-                     'rc_capacitance_f': rc_s / _RESISTANCE_OHM}
-    used = {name: value for name, value in measured.items() if name in sensor.unstated}
-    return replace(sensor, unstated=(), measured=sensor.unstated, **used)
+    return float(np.mean(time_constants)) if time_constants else 0.0
 
 
 def unit_of_stream(sensor: Sensor, stamps_ns: np.ndarray, accel_mps2: np.ndarray
@@ -193,31 +170,9 @@ def unit_of_stream(sensor: Sensor, stamps_ns: np.ndarray, accel_mps2: np.ndarray
     unit = sensor if sensor.effects else with_axes(sensor, axes)
     unit = replace(unit, rate_hz=round(rate_hz, 3))
     volts = to_volts(accel_mps2[:, :len(unit.axes)], unit)
-    values = measure((stamps_ns - stamps_ns[0]) * 1e-9, volts, unit)
-    unit, lines = with_measured_values(unit, values), describe(unit, values)
+    unit, lines = _measured(unit, (stamps_ns - stamps_ns[0]) * 1e-9, volts)
     return (replace(unit, measured=(*unit.measured, 'rate_hz')),
             [f'rate: {unit.rate_hz:.4g} Hz, axes: {unit.axes}', *lines])
-
-
-def _states_filter(sensor: Sensor) -> bool:
-    """Return whether the file states resistor and capacitor."""
-    return not {'rc_resistance_ohm', 'rc_capacitance_f'} & set(sensor.unstated)
-
-
-def describe(sensor: Sensor, values: MeasuredValues) -> list[str]:
-    """Return what is measured in place of the file, for people."""
-    lines = []
-    scale_v_per_g = sensor.nominal_scale_v_per_g
-    if 'noise_density_g_per_rthz' in sensor.unstated:
-        lines.append('noise of a sample: ' + _by_axis(sensor, values.noise_v / scale_v_per_g))
-    if 'adc_bits' in sensor.unstated:
-        lines.append('resolution: ' + _by_axis(sensor, values.step_v / scale_v_per_g))
-    if not _states_filter(sensor):
-        lines.append(f'filter: {values.rc_s * 1e3:.3g} ms' if values.rc_s else
-                     'filter: the noise at rest shows none')
-    if 'range_g' in sensor.unstated:
-        lines.append(f'range: ±{values.range_g:g} g (largest reading {values.largest_g:.3g} g)')
-    return lines
 
 
 def _by_axis(sensor: Sensor, values_g: np.ndarray) -> str:
@@ -325,13 +280,12 @@ def estimate_filter(rests: Iterable[np.ndarray], rate_hz: float, rc_s: float, ls
 def _mean_periodogram(rests: Iterable[np.ndarray], window: np.ndarray) -> tuple[np.ndarray, int]:
     """Return the mean periodogram of all segments, V², and their number."""
     size = len(window)
-    total, count = np.zeros(size // 2 + 1), 0
-    for volts in rests:
-        for begin in range(0, len(volts) - size + 1, size // 2):
-            part = volts[begin:begin + size]
-            total += np.abs(np.fft.rfft(window * (part - part.mean()))) ** 2
-            count += 1
-    return total / max(count, 1), count
+    parts = [volts[begin:begin + size] for volts in rests
+             for begin in range(0, len(volts) - size + 1, size // 2)]
+    total = np.zeros(size // 2 + 1)
+    for part in parts:
+        total += np.abs(np.fft.rfft(window * (part - part.mean()))) ** 2
+    return total / max(len(parts), 1), len(parts)
 
 
 def _expected(x: np.ndarray, lags: np.ndarray) -> np.ndarray:
@@ -383,8 +337,7 @@ class PolarityFault:
     """An axis that does not follow its reference."""
 
     axis: int  # Index of the measured axis
-    # Index of the reference axis that it follows: its own reference if it is inverted
-    follows: int
+    follows: int  # Index of the reference axis that it follows: its own if it is inverted
     correlation: float  # Correlation with that reference, −1 to 1
 
     def describe(self, axis: str, reference: str) -> str:

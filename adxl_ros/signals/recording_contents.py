@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import (
@@ -66,9 +67,8 @@ class AxisRange:
     """The samples of one axis."""
 
     name: str  # Its column
-    # lowest_mps2, highest_mps2: Its extreme values, m/s²
-    lowest_mps2: float
-    highest_mps2: float
+    lowest_mps2: float  # Its lowest value, m/s²
+    highest_mps2: float  # Its highest value, m/s²
     clipped: int  # Times at which it stays at an extreme value in motion
     is_stuck: bool  # Whether it never changes
     # Longest time in which it does not change although it usually does, s; 0 for none
@@ -121,37 +121,52 @@ class RecordingContents:
 def examine(blocks: Iterable[Recording], unit_of: Callable[[Recording], Sensor],
             delay: LogDelay | None) -> RecordingContents:
     """Find what a recording holds."""
-    stamps = values = rests = block = unit = None
-    references: dict[str, _Reference] = {}
-    for block in blocks:
+    blocks = iter(blocks)
+    first = next((block for block in blocks if len(block)), None)
+    if first is None:
+        raise UserError('the recording holds no samples')
+    unit, stamps = unit_of(first), _Stamps(first)
+    axes = [_Axis(name, stamps.period_s) for name in first.sensor_columns]
+    held = _Held(_HELD_S / stamps.period_s)  # of all axes together
+    last = first.accel_mps2(unit)[:1]
+    rests = RecordedRests(unit, first)
+    # Lowest and highest value, sum and count of each reference by block
+    references: dict[str, list[tuple[float, float, float, int]]] = {}
+    for block in chain([first], blocks):
         if not len(block):
             continue
-        if stamps is None or values is None or rests is None or unit is None:
-            stamps = _Stamps(block)
-            values = _Values(block.sensor_columns, stamps.period_s)
-            unit = unit_of(block)
-            rests = RecordedRests(unit, block)
         stamps.feed(block.time_s)
-        values.feed(block.accel_mps2(unit))
+        accel_mps2 = np.concatenate([last, block.accel_mps2(unit)])
+        last = accel_mps2[-1:]
+        held.feed((np.diff(accel_mps2, axis=0) != 0).any(axis=1))
+        for axis, values in zip(axes, accel_mps2.T):
+            axis.feed(values)
         rests.feed(block)
-        _add_references(references, block)
-    if block is None or stamps is None or values is None or rests is None or unit is None:
-        raise UserError('the recording holds no samples')
+        for name, values in block.columns.items():
+            read = values[np.isfinite(values)]
+            if name in REFERENCES and len(read):
+                references.setdefault(name, []).append(
+                    (float(read.min()), float(read.max()), float(read.sum()), len(read)))
     rests.take()
+    # By reference: lowest and highest values, sums, counts
+    parts = {name: list(zip(*rows)) for name, rows in references.items()}
     spans_s = [rest.span_s for rest, _ in rests.detected]
     means_mps2 = [to_nominal_mps2(mean_v, unit) for _, mean_v in rests.detected]
     lengths_g = np.linalg.norm(means_mps2, axis=-1) / G0_MPS2
     span_s = stamps.last_s - stamps.first_s
     return RecordingContents(
-        block.path, stamps.count, span_s, round(1 / stamps.period_s, 6), stamps.jitter_s,
-        stamps.burst, stamps.missing, stamps.gaps, stamps.longest_gap_s, block.bad_stamps,
-        values.axes(), values.held_s,
-        min(sum(spans_s) / span_s, 1.0), max(spans_s, default=0.0), len(spans_s),
-        _count_poses(means_mps2),
-        float(np.median(lengths_g)) if spans_s and len(unit.axes) == len(AXES) else None,
-        {name: (reference.low, reference.high) for name, reference in references.items()},
-        {name: reference.total / reference.count for name, reference in references.items()}, delay,
-        block.remarks, block.cut)
+        path=block.path, samples=stamps.count, span_s=span_s,
+        rate_hz=round(1 / stamps.period_s, 6), jitter_s=stamps.jitter_s, burst=stamps.burst,
+        missing=stamps.missing, gaps=stamps.gaps, longest_gap_s=stamps.longest_gap_s,
+        bad_stamps=block.bad_stamps, axes=tuple(axis.result() for axis in axes),
+        held_s=held.samples * stamps.period_s,
+        rest_share=min(sum(spans_s) / span_s, 1.0), longest_rest_s=max(spans_s, default=0.0),
+        rests=len(spans_s), poses=_count_poses(means_mps2),
+        length_g=float(np.median(lengths_g)) if spans_s and len(unit.axes) == len(AXES) else None,
+        reference_ranges={name: (min(low), max(high)) for name, (low, high, *_) in parts.items()},
+        reference_means={name: sum(total) / sum(count)
+                         for name, (_, _, total, count) in parts.items()},
+        delay=delay, remarks=block.remarks, cut=block.cut)
 
 
 def log_delay(times_ns: Iterable[np.ndarray]) -> LogDelay | None:
@@ -176,38 +191,39 @@ class _Stamps:
 
     def __init__(self, first: Recording) -> None:
         if len(first) < 2:
+            left_out = sum(first.bad_stamps)
+            hint = f': the stamps of {left_out} samples do not increase; --rate HZ stamps by ' \
+                'index' if left_out else ''
             raise UserError(f'{first.path}: {len(first)} sample with a usable stamp; at least 2 '
-                            f'are needed{_stamp_hint(first)}')
+                            f'are needed{hint}')
         time_s = first.time_s
         self.burst = burst_samples(time_s)
         self.period_s = period_s(time_s)
         self.first_s = float(time_s[0])
-        self.last_s = np.nan
+        self.last_s = self.first_s - self.period_s
         self.count = self.missing = self.gaps = 0
         self.longest_gap_s = 0.0
         self._squares, self._usual = 0.0, 0
-        self._gap_periods = self._find_gap_periods(np.diff(time_s))
-
-    def _find_gap_periods(self, steps_s: np.ndarray) -> float:
-        """Return the shortest gap, periods, by the scatter of the first steps, s, (n,)."""
-        if self.burst > 1:
-            return _SHORTEST_GAP * self.burst
+        steps_s = np.diff(time_s)
         scatter = float(np.quantile(np.abs(steps_s / self.period_s - 1), _SCATTER_QUANTILE))
-        if scatter > _LARGE_SCATTER:
+        # The shortest gap, periods
+        self._gap_periods = max(_LONG_STEPS[0] + _LONG_STEPS[1] * scatter, _SHORTEST_GAP)
+        if self.burst > 1:
+            self._gap_periods = _SHORTEST_GAP * self.burst
+        elif scatter > _LARGE_SCATTER:
             self.period_s = float(np.mean(steps_s[steps_s < _OUTLYING_STEP * self.period_s]))
-        return max(_LONG_STEPS[0] + _LONG_STEPS[1] * scatter, _SHORTEST_GAP)
 
     def feed(self, time_s: np.ndarray) -> None:
         """Add further stamps."""
-        before = time_s[0] - self.period_s if np.isnan(self.last_s) else self.last_s
-        steps = np.diff(time_s, prepend=before) / self.period_s
+        before_s = self.last_s if self.count else time_s[0] - self.period_s
+        steps = np.diff(time_s, prepend=before_s) / self.period_s
         self.count += len(time_s)
         self.last_s = float(time_s[-1])
         is_gap = steps > self._gap_periods
         self.missing += int((np.rint(steps[is_gap]) - self.burst).sum())
         self.gaps += int(is_gap.sum())
-        if is_gap.any():
-            self.longest_gap_s = max(self.longest_gap_s, float(steps.max()) * self.period_s)
+        self.longest_gap_s = max(self.longest_gap_s,
+                                 float(steps[is_gap].max(initial=0.0)) * self.period_s)
         usual = steps[~is_gap]
         self._squares += float(((usual - 1) ** 2).sum())
         self._usual += len(usual)
@@ -218,110 +234,73 @@ class _Stamps:
         return self.period_s * float(np.sqrt(self._squares / max(self._usual, 1)))
 
 
-def _stamp_hint(first: Recording) -> str:
-    """Return what is wrong with the stamps, for a message."""
-    left_out = sum(first.bad_stamps)
-    return f': the stamps of {left_out} samples do not increase; --rate HZ stamps by index' \
-        if left_out else ''
-
-
-@dataclass
 class _Held:
     """The longest time without change of samples that usually change."""
 
-    shortest: float
-    _changes: int = 0
-    _count: int = 0
-    _samples: int = 0
-    _longest: int = 0
+    def __init__(self, shortest: float) -> None:
+        self._shortest = max(shortest, _HELD_SAMPLES)
+        self.changes = self._count = self._samples = self._longest = 0
 
     def feed(self, is_new: np.ndarray) -> None:
         """Add whether each further sample differs from the one before, (n,)."""
-        self._changes += int(is_new.sum())
+        self.changes += int(is_new.sum())
         self._count += len(is_new)
-        places = np.flatnonzero(is_new)
-        if not len(places):
-            self._samples += len(is_new)
-        else:
-            inner = int(np.diff(places).max(initial=1)) - 1
-            self._longest = max(self._longest, self._samples + int(places[0]), inner)
-            self._samples = len(is_new) - 1 - int(places[-1])
-        self._longest = max(self._longest, self._samples)
+        # Samples from one change to the next, the first and last of which continue elsewhere
+        runs = np.diff(np.flatnonzero(is_new), prepend=-1 - self._samples, append=len(is_new)) - 1
+        self._samples = int(runs[-1])
+        self._longest = max(self._longest, int(runs.max()))
 
     @property
     def samples(self) -> int:
         """Return the number of samples without change; 0 where it is usual or short."""
-        is_held = (self._longest >= max(self.shortest, _HELD_SAMPLES)
-                   and self._changes > _CHANGING * (self._count - self._longest))
+        is_held = (self._longest >= self._shortest
+                   and self.changes > _CHANGING * (self._count - self._longest))
         return self._longest if is_held else 0
 
 
-class _Values:
-    """Extreme values of each axis, and times without change."""
+class _Axis:
+    """Extreme values of an axis, and times without change."""
 
-    def __init__(self, names: tuple[str, ...], period_s: float) -> None:
-        self._names, self._period_s = names, period_s
-        self._last: np.ndarray | None = None
-        self._extremes = [[np.inf, -np.inf] for _ in names]
-        self._clipped = [[0, 0] for _ in names]
-        self._has_changed = np.zeros(len(names), bool)
-        self._held = _Held(_HELD_S / period_s)
-        self._held_axes = [_Held(_STUCK_S / period_s) for _ in names]
+    def __init__(self, name: str, period_s: float) -> None:
+        self._name, self._period_s = name, period_s
+        # By sign: largest value times the sign, and how often the axis stays there in motion
+        self._largest = dict.fromkeys((-1.0, 1.0), -np.inf)
+        self._clipped = dict.fromkeys((-1.0, 1.0), 0)
+        self._held = _Held(_STUCK_S / period_s)
 
-    @property
-    def held_s(self) -> float:
-        """Return the longest time in which no axis changes, s; 0 for none."""
-        return self._held.samples * self._period_s
-
-    def feed(self, accel: np.ndarray) -> None:
-        """Add further samples, m/s², (n, m)."""
-        rows = np.vstack([accel[0] if self._last is None else self._last, accel])
-        changed = np.diff(rows, axis=0) != 0
-        self._has_changed |= changed.any(axis=0)
-        self._held.feed(changed.any(axis=1))
-        for axis, held in enumerate(self._held_axes):
-            held.feed(changed[:, axis])
-            for side, sign in enumerate((-1.0, 1.0)):
-                self._add_extreme(axis, side, sign * rows[:, axis], sign)
-        self._last = accel[-1]
-
-    def _add_extreme(self, axis: int, side: int, values: np.ndarray, sign: float) -> None:
-        """
-        Count how often an axis stays at its largest value; `values` has the sign of the side.
-
-        A new extreme value begins the count again.
-        """
-        largest = float(values.max())
-        if largest < sign * self._extremes[axis][side]:
-            return
-        if largest > sign * self._extremes[axis][side]:
-            self._extremes[axis][side], self._clipped[axis][side] = sign * largest, 0
+    def feed(self, values: np.ndarray) -> None:
+        """Add further samples, m/s², behind the last one before, (1 + n,)."""
         steps = np.abs(np.diff(values))
+        self._held.feed(steps != 0)
         smooth = _CLIPPED_CODES * float(steps[steps > 0].min(initial=np.inf))
-        for first, stop in true_runs(values == largest):
-            if stop - first < _CLIPPED_SAMPLES:
+        for sign in self._largest:
+            largest = float((sign * values).max())
+            if largest < self._largest[sign]:
                 continue
-            jump = largest - _lowest_beside(values, first, stop, 1)
-            window = min(stop - first, round(_CLIPPED_WINDOW_S / self._period_s))
-            slope = largest - _lowest_beside(values, first, stop, max(window, 1))
-            if jump > _CLIPPED_STEP_G * G0_MPS2 or \
-                    slope > max(_CLIPPED_STEP_G * G0_MPS2, smooth):
-                self._clipped[axis][side] += 1
+            if largest > self._largest[sign]:
+                self._largest[sign], self._clipped[sign] = largest, 0
+            self._clipped[sign] += sum(
+                self._is_clipped(sign * values, largest, first, stop, smooth)
+                for first, stop in true_runs(sign * values == largest)
+                if stop - first >= _CLIPPED_SAMPLES)
 
-    def axes(self) -> tuple[AxisRange, ...]:
-        """Return the ranges by axis."""
-        return tuple(
-            AxisRange(name, low, high, sum(clipped), not has_changed,
-                      held.samples * self._period_s)
-            for name, (low, high), clipped, has_changed, held in zip(
-                self._names, self._extremes, self._clipped, self._has_changed.tolist(),
-                self._held_axes))
+    def _is_clipped(self, values: np.ndarray, largest: float, first: int, stop: int,
+                    smooth: float) -> bool:
+        """Return whether the axis moves before or after it stays at its largest value."""
+        def drop(count: int) -> float:
+            """Return how far the axis falls within `count` samples before or after."""
+            beside = np.append(values[max(first - count, 0):first], values[stop:stop + count])
+            return largest - float(beside.min(initial=largest))
 
+        window = min(stop - first, round(_CLIPPED_WINDOW_S / self._period_s))
+        step = _CLIPPED_STEP_G * G0_MPS2
+        return drop(1) > step or drop(max(window, 1)) > max(step, smooth)
 
-def _lowest_beside(values: np.ndarray, first: int, stop: int, count: int) -> float:
-    """Return the lowest of `count` values before, and after, those from `first` to `stop`."""
-    neighbours = np.concatenate([values[max(first - count, 0):first], values[stop:stop + count]])
-    return float(neighbours.min(initial=values[first]))
+    def result(self) -> AxisRange:
+        """Return the range of the axis."""
+        return AxisRange(self._name, -self._largest[-1.0], self._largest[1.0],
+                         sum(self._clipped.values()), not self._held.changes,
+                         self._held.samples * self._period_s)
 
 
 def _count_poses(means_mps2: Sequence[np.ndarray]) -> int:
@@ -332,30 +311,3 @@ def _count_poses(means_mps2: Sequence[np.ndarray]) -> int:
         if is_new and len(poses) < _MOST_POSES:
             poses.append(mean)
     return len(poses)
-
-
-@dataclass
-class _Reference:
-    """Range, sum and number of the values of a reference."""
-
-    low: float = np.inf
-    high: float = -np.inf
-    total: float = 0.0
-    count: int = 0
-
-    def feed(self, values: np.ndarray) -> None:
-        """Add further values, (n,)."""
-        self.low = min(self.low, float(values.min()))
-        self.high = max(self.high, float(values.max()))
-        self.total += float(values.sum())
-        self.count += len(values)
-
-
-def _add_references(references: dict[str, _Reference], block: Recording) -> None:
-    """Add the references of a block."""
-    for name, values in block.columns.items():
-        if name not in REFERENCES:
-            continue
-        finite = values[np.isfinite(values)]
-        if len(finite):
-            references.setdefault(name, _Reference()).feed(finite)

@@ -15,34 +15,17 @@ that of the datasheet, learned from the quietest parts of the stream, or the lar
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 
-from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import JOINTS, Recording
-from adxl_ros.model.constants import AXES, G0_MPS2
-from adxl_ros.model.noise import effective_samples
+from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.noise import effective_samples, sample_std_v
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.block_statistics import angle_bounds, BlockCutter, Blocks, true_runs
-from adxl_ros.signals.noise_limits import (
-    adc_step,
-    batch_scatter,
-    datasheet_noise,
-    differing_start,
-    DRIFT_OCTAVES,
-    END_SIGMAS,
-    half_differences,
-    learned_limits,
-    Noise,
-    NoiseLimits,
-    quiet_blocks,
-    quiet_variance,
-    Spans,
-    stated_limits,
-    undithered,
-    window_variance,
-)
+from adxl_ros.signals import block_statistics as stats
+from adxl_ros.signals.block_statistics import Blocks, Spans
 import numpy as np
+import scipy
 
 SAME_ANGLE_RAD = 1e-5
 """Angles that differ by less are equal, rad. Chosen: above the rounding of angles in a file, and
@@ -71,6 +54,142 @@ _ANGLES = (JOINTS['alpha'], JOINTS['beta'])
 """Columns of the encoder angles."""
 _ROUNDING = 1e-9
 """Relative excess over the angle tolerance that rounding explains."""
+_FALSE_ALARM = 1e-6
+"""Probability that the variance of noise exceeds its limit."""
+_QUARTILE_TO_STD = 0.3186
+"""First quartile of a normal deviate's magnitude, relative to its standard deviation."""
+_END_SIGMAS = 3.5
+"""Difference of an end of a rest from its middle beyond which it is cut, standard deviations."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of one sample."""
+
+    sigma: np.ndarray  # Standard deviation by axis, in the unit of the samples, (m,)
+    tau_s: float = 0.0  # Time constant of the filter that correlates it, s
+
+
+def datasheet_noise(sensor: Sensor) -> Noise:
+    """Return the noise of a sample by the datasheet values of a sensor, V."""
+    return Noise(sample_std_v(sensor), sensor.rc_s)
+
+
+@dataclass(frozen=True)
+class NoiseLimits:
+    """Limits of what noise explains, for m axes."""
+
+    variance: np.ndarray  # Largest variance within a window, (m,)
+    # Standard deviation of the difference of two neighbouring halves, by octaves of their length,
+    # (DRIFT_OCTAVES, m)
+    drift: np.ndarray
+    # Largest change of a mean by rounding of the ADC, where the input does not change, (m,)
+    step: np.ndarray
+
+    @property
+    def flicker(self) -> np.ndarray:
+        """Return the standard deviation of the difference of two very long means, (m,)."""
+        # The longest halves have 2^(DRIFT_OCTAVES − 1) times the length of the shortest.
+        white = self.drift[0] ** 2 / (1 << stats.DRIFT_OCTAVES - 1)
+        return np.sqrt(np.maximum(self.drift[-1] ** 2 - white, 0))
+
+    def block_noise(self, spans: Spans) -> np.ndarray:
+        """Return the standard deviation of the mean of one block, (m,)."""
+        return self.drift[0] * np.sqrt(spans.half / 2)
+
+    def differ(self, before: np.ndarray, after: np.ndarray, spans: Spans) -> bool:
+        """Return whether two sequences of means of blocks, (k, m), differ by more than noise."""
+        white = self.block_noise(spans) ** 2 * (1 / len(before) + 1 / len(after))
+        allowed = _END_SIGMAS * np.sqrt(white + self.flicker ** 2) + self.step
+        return bool((np.abs(before.mean(axis=0) - after.mean(axis=0)) > allowed).any())
+
+
+def _largest(limits: list[NoiseLimits]) -> NoiseLimits | None:
+    """Return the largest of each limit; None without any."""
+    return NoiseLimits(*(np.maximum.reduce([getattr(each, f.name) for each in limits])
+                         for f in fields(NoiseLimits))) if limits else None
+
+
+def stated_limits(noise: Noise, step: np.ndarray, spans: Spans) -> NoiseLimits:
+    """
+    Return the limits for a given noise, whose sample variance is chi-squared.
+
+    A first-order filter correlates neighbours by a = exp(−dt/τ). The variance of n such samples
+    scatters as the variance of n·(1 − a²)/(1 + a²) independent samples.
+    """
+    a = np.exp(-1 / (spans.rate_hz * noise.tau_s)) if noise.tau_s else 0.0
+    freedom = max((spans.window * spans.size - 1) * (1 - a * a) / (1 + a * a), 1.0)
+    ratio = max(scipy.special.chdtri(freedom, _FALSE_ALARM) / freedom, stats.MIN_VARIANCE_RATIO)
+    sigma = np.hypot(noise.sigma, step / np.sqrt(12))
+    halves = spans.half * spans.size << np.arange(stats.DRIFT_OCTAVES)
+    drift = np.sqrt(2 / effective_samples(halves, 1 / spans.rate_hz, noise.tau_s))[:, None] * sigma
+    return NoiseLimits(ratio * sigma ** 2, drift, stats.undithered(step, sigma))
+
+
+def learned_limits(blocks: Blocks, windows: np.ndarray, step: np.ndarray,
+                   spans: Spans) -> NoiseLimits | None:
+    """
+    Learn the limits from the quietest windows; None while the stream is too short.
+
+    windows: `window_variance` of the blocks; step: step of the ADC, (m,).
+    """
+    if len(blocks) < max(spans.window, 2 * spans.half) or not blocks.count.any():
+        return None
+    variance, limit = stats.quiet_variance(blocks, windows, step)
+    quiet = stats.quiet_blocks(blocks, windows, limit, spans.window)
+    drift = np.empty((stats.DRIFT_OCTAVES, len(step)))
+    for octave in range(stats.DRIFT_OCTAVES):
+        half = spans.half << octave
+        noise = _drift_noise(*stats.half_differences(blocks, quiet, half), half)
+        white = np.sqrt(2 * variance / (half * spans.size))
+        if octave:
+            # Noise falls with the length, by no more than that of white noise.
+            shorter = drift[octave - 1]
+            noise = shorter / np.sqrt(2) if noise is None else np.minimum(noise, shorter)
+        drift[octave] = white if noise is None else np.maximum(noise, white)
+    return NoiseLimits(limit, drift, stats.undithered(step, np.sqrt(variance)))
+
+
+def _drift_noise(differences: np.ndarray, valid: np.ndarray, half: int) -> np.ndarray | None:
+    """
+    Learn the standard deviation of the valid differences of halves, (m,); None if none is valid.
+
+    A steady turn adds the same to all differences. Differences of two differences remove it. The
+    first quartile of the magnitude is right even if most quiet blocks are no rest.
+    """
+    both = valid[:-2 * half] & valid[2 * half:]
+    if both.any():
+        noise = (differences[2 * half:] - differences[:-2 * half])[both] / np.sqrt(2)
+    elif valid.any():
+        noise = differences[valid]
+    else:
+        return None
+    return np.quantile(np.abs(noise), 0.25, axis=0) / _QUARTILE_TO_STD
+
+
+def differing_start(means: np.ndarray, longest: int, white: np.ndarray, flicker: np.ndarray,
+                    step: np.ndarray) -> int:
+    """
+    Count the blocks at the start of a rest whose mean differs from the mean of the others.
+
+    Starts of 1, 2, 4, … of the means, (k, m), are compared with the remainder of the rest. A start
+    that differs is cut, up to `longest` blocks, and the search begins again after it. The noise is
+    `white` for the mean of one block and `flicker` for the difference of very long means.
+    """
+    total = np.cumsum(means, axis=0)
+    lengths = 1 << np.arange(max(longest, 1).bit_length())
+    cut = 0
+    while (lengths := lengths[cut + lengths <= longest]).size:
+        remaining = len(means) - cut - lengths
+        start_total = total[cut + lengths - 1]
+        start_mean = (start_total - (total[cut - 1] if cut else 0.0)) / lengths[:, None]
+        remaining_mean = (total[-1] - start_total) / remaining[:, None]
+        noise = np.sqrt(white ** 2 * (1 / lengths + 1 / remaining)[:, None] + flicker ** 2)
+        differs = (np.abs(start_mean - remaining_mean) > _END_SIGMAS * noise + step).any(axis=1)
+        if not differs.any():
+            break
+        cut += int(lengths[differs.argmax()])
+    return cut
 
 
 @dataclass(frozen=True)
@@ -104,17 +223,13 @@ class Stillness:
     value: float
     limit: float
 
-    def describe(self, unit: str, scale: float = 1.0, axes: str = AXES) -> str:
-        """Return one line with the statistic and its limit."""
+    def describe_mps2(self, sensor: Sensor) -> str:
+        """Return one line in m/s², for samples that are volts of a sensor."""
+        scale = G0_MPS2 / float(sensor.nominal_scale_v_per_g[self.axis])
         state = 'at rest' if self.at_rest else \
             {'rms': 'moving', 'drift': 'drifting'}[self.statistic]
-        return (f'{state}: {self.value * scale:.2g} {unit} on {axes[self.axis]}, '
+        return (f'{state}: {self.value * scale:.2g} m/s² on {sensor.axes[self.axis]}, '
                 f'must be below {self.limit * scale:.2g}')
-
-    def describe_mps2(self, sensor: Sensor) -> str:
-        """Return the line of `describe` in m/s², for samples that are volts of a sensor."""
-        scale = G0_MPS2 / float(sensor.nominal_scale_v_per_g[self.axis])
-        return self.describe('m/s²', scale, sensor.axes)
 
 
 class RestFinder:
@@ -131,13 +246,13 @@ class RestFinder:
         self.learn = noise is None if learn is None else learn
         on_stage = not self.learn or angle_tolerance_rad is not None
         self.angle_tolerance_rad = angle_tolerance_rad
-        self._spans = Spans.for_rate(rate_hz)
+        self._spans = Spans(rate_hz)
         shortest_s = (_STAGE_S if on_stage else _HAND_HELD_S) if min_rest_s is None else min_rest_s
         self._min_blocks = max(round(shortest_s / self._spans.block_s), self._spans.window)
         # A motion that has decayed below the limits may still be in the first block.
         settle_s = _SETTLE_TAUS * noise.tau_s if noise is not None else 0.0
         self._settle = max(int(np.ceil(settle_s / self._spans.block_s)), 1)
-        self._cutter = BlockCutter(rate_hz, axes, 0 if angle_tolerance_rad is None else 2)
+        self._cutter = stats.BlockCutter(rate_hz, axes, 0 if angle_tolerance_rad is None else 2)
         self._parts = [self._cutter.none()]
         self._result: tuple[int, NoiseLimits | None, list[Rest]] | None = None
 
@@ -179,7 +294,7 @@ class RestFinder:
         newest = self.blocks()[-count:]
         if limits is None or len(newest) < count or newest.run[0] != newest.run[-1]:
             return None
-        rms = np.sqrt(window_variance(newest, self._spans)[-1])
+        rms = np.sqrt(stats.window_variance(newest, self._spans)[-1])
         halves = newest.mean[-2 * half:].reshape(2, half, -1).mean(axis=1)
         values = np.nan_to_num(np.concatenate([rms, np.abs(halves[1] - halves[0])]), nan=np.inf)
         allowed = np.concatenate([np.sqrt(limits.variance),
@@ -193,26 +308,21 @@ class RestFinder:
         """Find limits and rests of the stream so far; search again only after a new block."""
         blocks = self.blocks()
         if self._result is None or self._result[0] != len(blocks):
-            windows = window_variance(blocks, self._spans)
-            limits = self._limits(blocks, windows)
+            windows, step = stats.window_variance(blocks, self._spans), stats.adc_step(blocks)
+            found = [stated_limits(self.noise, step, self._spans) if self.noise else None,
+                     learned_limits(blocks, windows, step, self._spans) if self.learn else None]
+            limits = _largest([each for each in found if each is not None])
             rests = [] if limits is None else self._rests(blocks, windows, limits)
             self._result = len(blocks), limits, rests
         return self._result[1:]
 
-    def _limits(self, blocks: Blocks, windows: np.ndarray) -> NoiseLimits | None:
-        """Return stated limits, learned limits or the larger ones; None without either."""
-        step = adc_step(blocks)
-        stated = stated_limits(self.noise, step, self._spans) if self.noise is not None else None
-        learned = learned_limits(blocks, windows, step, self._spans) if self.learn else None
-        return stated.larger(learned) if stated and learned else stated or learned
-
     def _rests(self, blocks: Blocks, windows: np.ndarray, limits: NoiseLimits) -> list[Rest]:
         """Find the rests among the blocks of the whole stream."""
-        quiet = quiet_blocks(blocks, windows, limits.variance, self._spans.window)
+        quiet = stats.quiet_blocks(blocks, windows, limits.variance, self._spans.window)
         still = quiet & ~self._drifting(blocks, quiet, limits)
-        bounds = None if self.angle_tolerance_rad is None else angle_bounds(blocks)
+        bounds = None if self.angle_tolerance_rad is None else stats.angle_bounds(blocks)
         parts = []
-        for run in true_runs(still, blocks.run):
+        for run in stats.true_runs(still, blocks.run):
             for first, stop in self._split_by_angle(bounds, *run):
                 first, stop = self._without_ends(blocks.mean, first + self._settle, stop, limits)
                 if stop - first >= self._spans.window:
@@ -237,16 +347,16 @@ class RestFinder:
         between two marked parts are marked as well, unless they are enough for the longest halves.
         """
         drifting = np.zeros(len(blocks), bool)
-        for octave in range(DRIFT_OCTAVES):
+        for octave in range(stats.DRIFT_OCTAVES):
             half = self._spans.half << octave
-            differences, valid = half_differences(blocks, quiet & ~drifting, half)
+            differences, valid = stats.half_differences(blocks, quiet & ~drifting, half)
             allowed = _DRIFT_SIGMAS * limits.drift[octave] + limits.step
             places = half + np.flatnonzero(valid & (np.abs(differences) > allowed).any(axis=1))
             marks = np.zeros(len(blocks) + 1)
             np.add.at(marks, places - half // 2, 1)
             np.add.at(marks, places + half // 2, -1)
             drifting |= np.cumsum(marks)[:-1] > 0
-        for first, stop in true_runs(quiet & ~drifting, blocks.run):
+        for first, stop in stats.true_runs(quiet & ~drifting, blocks.run):
             between = first and stop < len(blocks) and drifting[first - 1] and drifting[stop]
             if between and stop - first < self._spans.longest:
                 drifting[first:stop] = True
@@ -269,18 +379,12 @@ class RestFinder:
             return [(first, stop)]
         parts, begin, widest = [], first, bounds[first]
         changed = (bounds[first + 1:stop] != bounds[first:stop - 1]).any(axis=(1, 2))
-        for i in first + 1 + np.flatnonzero(changed):
+        for i in (first + 1 + np.flatnonzero(changed)).tolist():
             widest = np.fmax(widest, bounds[i])
             if not self._is_one_pose(widest):
-                parts.append((begin, int(i)))
-                begin, widest = int(i), bounds[i]
+                parts.append((begin, i))
+                begin, widest = i, bounds[i]
         return [*parts, (begin, stop)]
-
-    def _is_one_pose(self, bounds: np.ndarray) -> bool:
-        """Return whether the angles within (−lowest, highest), (2, a), are those of one pose."""
-        assert self.angle_tolerance_rad is not None
-        allowed = 2 * self.angle_tolerance_rad * (1 + _ROUNDING)
-        return not (bounds.sum(axis=0) > allowed).any()
 
     def _join_across_knocks(self, blocks: Blocks, bounds: np.ndarray | None,
                             parts: list[tuple[int, int]], limits: NoiseLimits, quiet: np.ndarray
@@ -290,33 +394,32 @@ class RestFinder:
 
         A drift without motion that returns to the same mean is noise, and part of the rest.
         """
+        spans, means = self._spans, blocks.mean
+        longest_s = (max(_KNOCK_S / spans.block_s, spans.window) + 1) * spans.block_s
+        reach = spans.longest // 2
         groups: list[list[tuple[int, int]]] = []
         for first, stop in parts:
-            begin, end = (groups[-1][0][0], groups[-1][-1][1]) if groups else (0, 0)
-            has_drifted = first - end <= self._spans.longest and quiet[end:first].all() and \
-                bool(groups) and blocks.run[end - 1] == blocks.run[first]
-            if (groups and (has_drifted or self._is_soon_after(blocks, end, first))
-                    and (bounds is None or self._is_one_pose(np.fmax.reduce(bounds[begin:stop])))
-                    and not self._mean_changed(blocks.mean, (begin, end), (first, stop), limits)):
-                start = groups[-1].pop()[0] if has_drifted else first
-                groups[-1].append((start, stop))
-            else:
-                groups.append([(first, stop)])
+            if groups:
+                begin, end = groups[-1][0][0], groups[-1][-1][1]
+                has_drifted = (first - end <= spans.longest and quiet[end:first].all()
+                               and blocks.run[end - 1] == blocks.run[first])
+                between_s = float(blocks.time_s[first, 0] - blocks.time_s[end - 1, 1])
+                if ((has_drifted or 0 <= between_s <= longest_s)
+                        and (bounds is None
+                             or self._is_one_pose(np.fmax.reduce(bounds[begin:stop])))
+                        and not limits.differ(means[max(begin, end - reach):end],
+                                              means[first:min(stop, first + reach)], spans)):
+                    start = groups[-1].pop()[0] if has_drifted else first
+                    groups[-1].append((start, stop))
+                    continue
+            groups.append([(first, stop)])
         return groups
 
-    def _is_soon_after(self, blocks: Blocks, end: int, first: int) -> bool:
-        """Return whether block `first` follows the part before block `end` within a knock."""
-        longest = max(_KNOCK_S / self._spans.block_s, self._spans.window) + 1
-        between_s = float(blocks.time_s[first, 0] - blocks.time_s[end - 1, 1])
-        return 0 <= between_s <= longest * self._spans.block_s
-
-    def _mean_changed(self, means: np.ndarray, before: tuple[int, int], after: tuple[int, int],
-                      limits: NoiseLimits) -> bool:
-        """Return whether the mean before a disturbance differs from that after it."""
-        reach = self._spans.longest // 2
-        return limits.differ(means[max(before[0], before[1] - reach):before[1]],
-                             means[after[0]:min(after[1], after[0] + reach)],
-                             self._spans, END_SIGMAS)
+    def _is_one_pose(self, bounds: np.ndarray) -> bool:
+        """Return whether the angles within (−lowest, highest), (2, a), are those of one pose."""
+        assert self.angle_tolerance_rad is not None, 'angles have a tolerance'
+        allowed = 2 * self.angle_tolerance_rad * (1 + _ROUNDING)
+        return not (bounds.sum(axis=0) > allowed).any()
 
 
 def recording_finder(unit: Sensor, has_angles: bool) -> RestFinder:
@@ -385,20 +488,16 @@ def rest_means(time_s: np.ndarray, samples: np.ndarray, rests: list[Rest], rate_
     each, in the unit of the samples. The standard deviation is that by the scatter between parts
     of the rest, and at least that of the given noise.
     """
-    parts = [BlockCutter(rate_hz, samples.shape[1]).feed(
+    parts = [stats.BlockCutter(rate_hz, samples.shape[1]).feed(
         time_s[rest.start:rest.stop], samples[rest.start:rest.stop]) for rest in rests]
-    for rest, part in zip(rests, parts):
-        if not part.count.sum():
-            raise UserError(f'the rest from {rest.time_start_s:.3f} s to {rest.time_stop_s:.3f} '
-                            's holds no samples: name rests of this recording')
-    return _means(parts, Spans.for_rate(rate_hz), noise)
+    return _means(parts, Spans(rate_hz), noise)
 
 
 def _means(parts: list[Blocks], spans: Spans,
            noise: Noise | None) -> tuple[np.ndarray, np.ndarray]:
     """Average the blocks of each rest; mean and standard deviation, (k, m) each."""
     # The step is that of all rests: a rest with constant codes does not show it.
-    step = adc_step(Blocks.join(parts)) if parts else np.empty(0)
+    step = stats.adc_step(Blocks.join(parts)) if parts else np.empty(0)
     pairs = [_mean(_without_knocks(part, step, spans), step, spans, noise) for part in parts]
     mean, error = zip(*pairs) if pairs else ((), ())
     return np.array(mean), np.array(error)
@@ -414,19 +513,25 @@ def _mean(part: Blocks, step: np.ndarray, spans: Spans,
     """
     mean = part.count @ part.mean / part.count.sum()
     white = part.squares.sum(axis=0) / max((part.count - 1).sum(), 1)
-    squares, freedom = batch_scatter(part.mean, max(-(-len(part) // _BATCHES), _MIN_BATCH_BLOCKS))
-    variance = np.maximum(squares / max(freedom, 1), white / spans.size) / len(part)
+    length = max(-(-len(part) // _BATCHES), _MIN_BATCH_BLOCKS)
+    count = len(part) // length
+    long_run = np.zeros(len(mean))
+    if count > 1:
+        batches = part.mean[:count * length].reshape(count, length, -1).mean(axis=1)
+        squares = ((batches - batches.mean(axis=0)) ** 2).sum(axis=0)
+        long_run = length * squares / (count - 1)
+    variance = np.maximum(long_run, white / spans.size) / len(part)
     if noise is not None:
-        count = effective_samples(len(part) * spans.size, spans.dt_s, noise.tau_s)
-        variance = np.maximum(variance, noise.sigma ** 2 / count)
-    rounding = undithered(step, np.sqrt(white)) ** 2 / 12
+        independent = effective_samples(len(part) * spans.size, 1 / spans.rate_hz, noise.tau_s)
+        variance = np.maximum(variance, noise.sigma ** 2 / independent)
+    rounding = stats.undithered(step, np.sqrt(white)) ** 2 / 12
     return mean, np.sqrt(variance + rounding)
 
 
 def _without_knocks(part: Blocks, step: np.ndarray, spans: Spans) -> Blocks:
     """Leave out the blocks of a rest whose variance differs from that of most blocks."""
     part = part[part.count > 0]
-    windows = window_variance(part, spans)
-    _, limit = quiet_variance(part, windows, step)
-    calm = part[quiet_blocks(part, windows, limit, spans.window)]
+    windows = stats.window_variance(part, spans)
+    _, limit = stats.quiet_variance(part, windows, step)
+    calm = part[stats.quiet_blocks(part, windows, limit, spans.window)]
     return calm if 2 * len(calm) > len(part) else part

@@ -7,7 +7,6 @@ import time
 
 from adxl_ros.errors import UserError
 from adxl_ros.links import iio
-from adxl_ros.links.support import iio_stream
 from adxl_ros.links.support.base import Level
 import iiod
 import numpy as np
@@ -22,7 +21,7 @@ pytestmark = pytest.mark.long
 @pytest.fixture(scope='module', autouse=True)
 def library():
     try:
-        iio_stream.import_libiio()
+        iio.import_libiio()
     except UserError as error:
         pytest.skip(str(error))
 
@@ -141,7 +140,7 @@ def test_a_buffer_is_as_long_as_the_latency(served):
     for latency_ms in (2.0, 100.0):
         _, link = served(latency_ms=latency_ms)
         read_samples(link, 400)
-        durations_ms.append(link.status().values()['buffer_ms'])
+        durations_ms.append(link.status().statistics['buffer_ms'])
     # A busy machine answers late, which makes buffers longer.
     assert 2.0 <= durations_ms[0] < 100.0 <= durations_ms[1]
 

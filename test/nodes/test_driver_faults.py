@@ -12,7 +12,8 @@ import time
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
-from adxl_ros.links.support import emulated_board, iio_stream
+from adxl_ros.links import iio
+from adxl_ros.links.support import emulated_board
 from adxl_ros.model.effects import effect_named
 from faults import byte_fault, Fault, IIO_FAULTS, run_fault, SERIAL_FAULTS
 from graph import accel, Graph
@@ -85,7 +86,7 @@ def test_every_fault_of_a_board_is_counted_exactly(start, tmp_path):
 
 def test_every_fault_of_an_iiod_is_survived(start, tmp_path):
     try:
-        iio_stream.import_libiio()
+        iio.import_libiio()
     except UserError as error:
         pytest.skip(str(error))
     with Graph() as graph, IioRig(graph) as rig:

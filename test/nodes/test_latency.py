@@ -4,7 +4,7 @@
 
 
 from adxl_ros.errors import UserError
-from adxl_ros.links.support import iio_stream
+from adxl_ros.links import iio
 from graph import Graph
 import numpy as np
 import pytest
@@ -78,7 +78,7 @@ def test_old_firmware_is_read_and_reported(start, tmp_path):
 
 def test_the_buffers_of_an_iio_device_obey(start):
     try:
-        iio_stream.import_libiio()
+        iio.import_libiio()
     except UserError as error:
         pytest.skip(str(error))
     with Graph() as graph, IioRig(graph) as rig:

@@ -33,7 +33,7 @@ class HalfOpen:
 
     def __init__(self, link: serial_link.SerialLink, failure: Exception | None) -> None:
         self._link, self._failure = link, failure
-        while not link.read(0).until_ns or link.status().values()['connections'] == 0:
+        while not link.read(0).until_ns or link.status().statistics['connections'] == 0:
             pass
 
     def __getattr__(self, name: str) -> object:

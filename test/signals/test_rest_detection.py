@@ -4,8 +4,7 @@
 
 from adxl_ros.files import recording
 from adxl_ros.model.constants import G0_MPS2
-from adxl_ros.signals.noise_limits import Noise
-from adxl_ros.signals.rest_detection import find_rests, Rest, rest_means, RestFinder
+from adxl_ros.signals.rest_detection import find_rests, Noise, Rest, rest_means, RestFinder
 from hypothesis import given, settings, strategies
 import numpy as np
 from pace import within

@@ -18,8 +18,7 @@ from adxl_ros.calibrate.guided.screen_contents import Estimate, Progress, Status
 from adxl_ros.files.recording_columns import stamped_rate_hz
 from adxl_ros.files.sweep_journal import JournalEntry, PoseRecord
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.signals.noise_limits import datasheet_noise
-from adxl_ros.signals.rest_detection import RestFinder, Stillness
+from adxl_ros.signals.rest_detection import datasheet_noise, RestFinder, Stillness
 import numpy as np
 
 _REST_WINDOW_S = 1.2

@@ -25,8 +25,7 @@ from adxl_ros.calibrate.guided.guide import NewestSamples, NextPose, StagelessGu
 from adxl_ros.calibrate.guided.screen_contents import Estimate, Phase, Progress, Status
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.noise_limits import datasheet_noise
-from adxl_ros.signals.rest_detection import Rest, RestFinder, Stillness
+from adxl_ros.signals.rest_detection import datasheet_noise, Rest, RestFinder, Stillness
 import numpy as np
 
 ENOUGH_RESTS = 24

@@ -23,8 +23,13 @@ from adxl_ros.calibrate.guided.running_estimate import in_g, RunningEstimate
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.noise_limits import datasheet_noise
-from adxl_ros.signals.rest_detection import Rest, rest_means, RestFinder, Stillness
+from adxl_ros.signals.rest_detection import (
+    datasheet_noise,
+    Rest,
+    rest_means,
+    RestFinder,
+    Stillness,
+)
 import numpy as np
 
 

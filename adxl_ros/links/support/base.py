@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What a link is: a source of samples.
+What a link is: a source of samples; how it waits for a device, and what its channels carry.
 
 Each module of the package `links` is one link, found by its file name. It holds the dataclass
 `Settings` and the function `open_link`.
@@ -9,13 +9,17 @@ Each module of the package `links` is one link, found by its file name. It holds
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from enum import Enum
 from importlib import import_module
+import os
 import pkgutil
+import time
 from typing import Any, cast, Protocol, runtime_checkable
 
+from adxl_ros.errors import one_line, UserError
+from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -45,22 +49,9 @@ class Option:
 
 def option(default: bool | int | float | str | tuple[()], doc: str, unit: str = '',
            lower: float | None = None, upper: float | None = None) -> Any:
-    """
-    Declare one field of a link's `Settings`.
-
-    Parameters
-    ----------
-    default, doc, unit, lower, upper
-        As the attributes of `Option`.
-
-    Returns
-    -------
-    dataclasses.Field
-        The field, with the description in its metadata.
-
-    """
-    return field(default=default,
-                 metadata={'doc': doc, 'unit': unit, 'lower': lower, 'upper': upper})
+    """Declare one field of a link's `Settings`, by the attributes of `Option`."""
+    return field(default=default, metadata={'doc': doc, 'unit': unit, 'lower': lower,
+                                            'upper': upper})
 
 
 def options(settings: type) -> tuple[Option, ...]:
@@ -72,7 +63,6 @@ def options(settings: type) -> tuple[Option, ...]:
 class LatencySettings:
     """Settings of every link of this package."""
 
-    # Longest time for which samples are collected before they are passed on, ms
     latency_ms: float = option(2.0, 'longest time for which samples are collected before they '
                                'are passed on together; 0: each sample alone', 'ms', 0.0, 1000.0)
 
@@ -85,7 +75,6 @@ class LatencySettings:
 class PacedSettings(LatencySettings):
     """Settings of a link that makes its own time."""
 
-    # Sensor time by real time
     speed: float = option(1.0, 'sensor time by real time; other than 1 the driver publishes '
                           '/clock', '', 0.01, 1000.0)
 
@@ -94,9 +83,7 @@ class PacedSettings(LatencySettings):
 class DeviceSettings(LatencySettings):
     """Settings of a link that reads a device."""
 
-    # Shortest time from a sample to its arrival, s
     delay: float = option(0.0, 'shortest time from a sample to its arrival', 's', 0.0, 1.0)
-    # Supply voltage by the voltage of its channel, V/V: the ratio of its divider
     supply_scale: float = option(1.0, 'supply voltage by the voltage of its channel: the ratio '
                                  'of its divider', 'V/V', 1e-3, 1e3)
 
@@ -112,22 +99,7 @@ class SimulatorSettings:
 
 
 def samples_within(latency_s: float, rate_hz: float) -> int:
-    """
-    Return how many samples are collected, at least one.
-
-    Parameters
-    ----------
-    latency_s
-        Longest time for which they are collected, s.
-    rate_hz
-        Sample rate, Hz.
-
-    Returns
-    -------
-    int
-        Number of samples.
-
-    """
+    """Return how many samples at a rate, Hz, are collected within a time, s: at least one."""
     return max(int(latency_s * rate_hz + _MAX_SHARE), 1)
 
 
@@ -155,15 +127,9 @@ class LinkStatus:
     # One or two words, or one line with the reason. It changes only when the condition of the link
     # changes.
     text: str
-    statistics: tuple[Any, ...] = ()  # Dataclasses with the counts of the link and of its clock
+    # Counts of the link and of its clock, by name
+    statistics: Mapping[str, Any] = field(default_factory=dict)
     events: tuple[Event, ...] = ()  # Events that are logged when their count rises
-
-    def values(self) -> dict[str, Any]:
-        """Return the statistics by name, as diagnostics show them."""
-        values: dict[str, Any] = {}
-        for part in self.statistics:
-            values |= asdict(part)
-        return values
 
 
 @dataclass(frozen=True)
@@ -194,22 +160,7 @@ class Samples:
 
 
 def no_samples(sensor: Sensor, until_ns: int) -> Samples:
-    """
-    Return an empty set of samples.
-
-    Parameters
-    ----------
-    sensor
-        Sensor whose axes give the number of columns.
-    until_ns
-        Time up to which the link has no samples, ns.
-
-    Returns
-    -------
-    Samples
-        No rows.
-
-    """
+    """Return no samples of a sensor, up to a time, ns."""
     return Samples(np.zeros(0, np.int64), np.zeros((0, len(sensor.axes))), until_ns)
 
 
@@ -243,6 +194,23 @@ class Link(Protocol):
         """Close what the link holds open."""
 
 
+class DeviceLink:
+    """What links to a device have in common, for their classes to inherit."""
+
+    live = True
+    waits_for_listener = False
+    start_ns: int | None = None
+    references: tuple[str, ...] = ()
+    sensor: Sensor | None = None
+
+    def begin(self, now_ns: int) -> int:
+        """Do nothing: samples before the beginning do not count as lost."""
+        return 0
+
+    def close(self) -> None:
+        """Do nothing: the link holds nothing open."""
+
+
 @runtime_checkable
 class StageLink(Protocol):
     """A link whose sensor senses the motion of the stage."""
@@ -252,17 +220,10 @@ class StageLink(Protocol):
     def sense_stage(self, stamp_ns: int, position: Mapping[str, float],
                     velocity: Mapping[str, float]) -> None:
         """
-        Take the true motion of the stage at a stamp, which may lie ahead.
+        Take the true motion of the stage at a ROS time, ns, which may lie ahead.
 
-        Parameters
-        ----------
-        stamp_ns
-            ROS time, ns.
-        position
-            Position by joint, rad or m. A joint that is not named stays.
-        velocity
-            Velocity by joint, rad/s or m/s.
-
+        Positions are in rad or m, by joint, and velocities in rad/s or m/s. A joint that is not
+        named stays.
         """
 
 
@@ -274,33 +235,13 @@ class ImuLink(Protocol):
     temperature_topic: str  # Topic of the temperature of the sensor
 
     def sense_imu(self, stamp_ns: np.ndarray, fields: Mapping[str, np.ndarray]) -> None:
-        """
-        Take ideal samples.
-
-        Parameters
-        ----------
-        stamp_ns
-            Their stamps, ns, (n,).
-        fields
-            Number fields of sensor_msgs/Imu by name, (n, k) each.
-
-        """
+        """Take samples: stamps, ns, (n,), and number fields of sensor_msgs/Imu, (n, k) each."""
 
     def sense_temperature(self, temperature_c: float) -> None:
         """Use a temperature, °C, from the next sample on."""
 
     def sense_publishers(self, count: int, mixture: str) -> None:
-        """
-        Take who publishes the ideal samples.
-
-        Parameters
-        ----------
-        count
-            Number of nodes that publish them.
-        mixture
-            That the samples of several nodes mix, in words, or ''.
-
-        """
+        """Take how many nodes publish the samples, and that several mix, in words, or ''."""
 
 
 class LinkModule(Protocol):
@@ -310,25 +251,9 @@ class LinkModule(Protocol):
 
     def open_link(self, sensor: Sensor, settings: Any) -> Link:
         """
-        Open the link.
+        Open the link of the driver's sensor; a device that is not there yet is opened by reading.
 
-        Parameters
-        ----------
-        sensor
-            Sensor of the driver's parameters.
-        settings
-            Instance of `Settings`.
-
-        Returns
-        -------
-        Link
-            The link; a device that is not there yet is opened later, by reading.
-
-        Raises
-        ------
-        UserError
-            The link cannot work with these settings.
-
+        Raises `UserError` where the link cannot work with these settings.
         """
 
 
@@ -342,3 +267,110 @@ def link_names() -> tuple[str, ...]:
 def link_module(name: str) -> LinkModule:
     """Import the module of a link."""
     return cast(LinkModule, import_module(f'{_LINKS}.{name}'))
+
+
+_FIRST_S = 0.01
+"""First waiting time, s; each failure doubles it."""
+_LONGEST_S = 0.08
+"""Longest waiting time, s: a device that is back is noticed within it."""
+_SLOW_S = 1.0
+"""Waiting time for a device that is there but does not fit the parameters, s."""
+_MAX_WAIT_S = 0.05
+"""Longest wait of one call, s, so that the driver reacts to its end."""
+
+
+def reason(error: Exception) -> str:
+    """Return why a device does not open, in one line; error numbers of libiio are negative."""
+    code = getattr(error, 'errno', None)
+    return os.strerror(abs(code)) if code else one_line(error)
+
+
+class Backoff:
+    """An exponential back-off that a success resets."""
+
+    def __init__(self) -> None:
+        """Make the first attempt due at once."""
+        self._wait_s = _FIRST_S
+        self._due_s = 0.0
+
+    def wait(self) -> bool:
+        """Wait for the next attempt, at most 50 ms; return whether it is due."""
+        remaining_s = self._due_s - time.monotonic()
+        if remaining_s > 0:
+            time.sleep(min(remaining_s, _MAX_WAIT_S))
+        return remaining_s <= _MAX_WAIT_S
+
+    def fail(self, slow: bool = False) -> None:
+        """Schedule the next attempt; `slow` where an early one is not likely to help."""
+        self._due_s = time.monotonic() + (_SLOW_S if slow else self._wait_s)
+        self._wait_s = min(2 * self._wait_s, _LONGEST_S)
+
+    def reset(self) -> None:
+        """Retry soon after the next failure."""
+        self._wait_s = _FIRST_S
+
+
+class Watchdog:
+    """
+    Measures for how long nothing has come, in time during which the node could listen.
+
+    A node that was held up for seconds finds its messages waiting: they were not missing. And a
+    machine that was held up has stopped whoever publishes them, too. So a turn counts as
+    `longest_turn_s` at most.
+    """
+
+    def __init__(self, longest_turn_s: float) -> None:
+        self._longest_turn_s = longest_turn_s
+        self._checked_s = time.monotonic()
+        self._silent_s = 0.0
+
+    def feed(self) -> None:
+        """Note that a message has come; any thread may call this."""
+        self._silent_s = 0.0
+
+    def check(self) -> float:
+        """Return for how long nothing has come, s; to be called in every turn of the node."""
+        now_s = time.monotonic()
+        self._silent_s += min(now_s - self._checked_s, self._longest_turn_s)
+        self._checked_s = now_s
+        return self._silent_s
+
+
+SUPPLY = 'supply'
+"""Role of the channel with the supply voltage."""
+TEMPERATURE = 'temperature'
+"""Role of the channel with the temperature."""
+UNUSED = '-'
+"""Role of a channel that is not read."""
+ROLES = (*AXES, SUPPLY, TEMPERATURE)
+"""All roles of channels that are read."""
+COLUMNS = {SUPPLY: 'supply_v', TEMPERATURE: 'temperature_c'}
+"""Column of a recording by the role of a reference channel."""
+
+
+def parse_channels(value: str | Sequence[str]) -> list[str]:
+    """
+    Parse `link.channels`: a list of strings, or one string with commas.
+
+    The string is for the command line, where YAML reads a bare y in a list as a boolean.
+    """
+    parts = value.split(',') if isinstance(value, str) else value
+    if not isinstance(parts, Sequence) or not all(isinstance(part, str) for part in parts):
+        raise UserError(f'link.channels: {value!r} is not a list of strings')
+    return [part.strip() for part in parts if part.strip()]
+
+
+def check_roles(roles: Sequence[str], axes: str) -> None:
+    """Check that the channels make a sensor readable."""
+    for role in roles:
+        if role not in (*ROLES, UNUSED):
+            raise UserError(f'link.channels: {role!r} is none of {", ".join(ROLES)}, or - for '
+                            'a channel that is not used')
+        if role != UNUSED and list(roles).count(role) > 1:
+            raise UserError(f'link.channels: {role} is there twice')
+        if role in AXES and role not in axes:
+            raise UserError(f'link.channels: the sensor has no axis {role}: sensor.axes is {axes}')
+    lacking = [axis for axis in axes if axis not in roles]
+    if lacking:
+        raise UserError(f'link.channels: no channel for {", ".join(lacking)}: the channels are '
+                        f'{", ".join(roles) or "none"}, sensor.axes is {axes}')

@@ -15,15 +15,8 @@ import time
 import tty
 
 from adxl_ros.errors import UserError
-from adxl_ros.links.support import channels
+from adxl_ros.links.support import base, wire_format
 from adxl_ros.links.support.base import samples_within
-from adxl_ros.links.support.wire_format import (
-    BoardInfo,
-    decode_command,
-    Encoder,
-    Splitter,
-    WireError,
-)
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -40,10 +33,6 @@ _TEMPERATURE_ZERO_V = 0.5
 """Output of the temperature sensor at 0 degC, V, as a TMP36 has it."""
 _TEMPERATURE_V_PER_C = 0.01
 """Slope of the temperature sensor, V/degC, as a TMP36 has it."""
-_MAX_BITS = 16
-"""Largest resolution of the codes of wire format 1, bit."""
-_MAX_SERIAL = 16
-"""Most characters of a serial number in wire format 1."""
 
 
 class Board:
@@ -57,13 +46,13 @@ class Board:
     def __init__(self, sensor: Sensor, roles: list[str], fd: int) -> None:
         """Begin as after a reset."""
         self._sensor, self._roles, self._fd = sensor, roles, fd
-        self._encoder = Encoder(BoardInfo(sensor.rate_hz, sensor.adc_bits, len(roles),
-                                          sensor.adc_vref_v, sensor.serial))
+        self._encoder = wire_format.Encoder(wire_format.BoardInfo(
+            sensor.rate_hz, sensor.adc_bits, len(roles), sensor.adc_vref_v, sensor.serial))
         self._began_s: float | None = None
         self._index = self._overruns = 0
         self._informed_s = -_INFO_S
         self._unsent = b''
-        self._splitter = Splitter()
+        self._splitter = wire_format.Splitter()
         self._frame_samples = _FRAME_SAMPLES
 
     def send(self, columns: Mapping[str, np.ndarray]) -> None:
@@ -72,7 +61,9 @@ class Board:
 
         columns: volts by axis, such as `x_v`, and `supply_v` and `temperature_c`, (n,) each.
         """
-        codes = self._codes(columns)
+        volts = np.column_stack([_volts(role, columns) for role in self._roles])
+        codes = np.rint(volts / self._sensor.lsb_v).clip(
+            0, 2 ** self._sensor.adc_bits - 1).astype(np.uint16)
         if self._began_s is None:
             self._began_s = time.monotonic()
         while len(codes):
@@ -96,17 +87,11 @@ class Board:
         except OSError:
             return  # nothing has come; a terminal that is gone shows in the next write
         for raw in self._splitter.split(received):
-            with suppress(WireError):
-                latency_s = decode_command(raw) * 1e-6
+            with suppress(wire_format.WireError):
+                latency_s = wire_format.decode_command(raw) * 1e-6
                 self._frame_samples = min(samples_within(latency_s, self._sensor.rate_hz),
                                           _FRAME_SAMPLES)
                 self._informed_s = -_INFO_S
-
-    def _codes(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return the ADC codes of all channels, (n, m)."""
-        volts = np.column_stack([_volts(role, columns) for role in self._roles])
-        codes = np.rint(volts / self._sensor.lsb_v)
-        return codes.clip(0, 2 ** self._sensor.adc_bits - 1).astype(np.uint16)
 
     def _write(self, frame: bytes) -> bool:
         """Write a frame, after the rest of a previous one; return whether it was taken."""
@@ -125,72 +110,58 @@ class Board:
 
 def _volts(role: str, columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return the voltage of a channel, V, (n,)."""
-    if role == channels.SUPPLY:
-        return columns[channels.COLUMNS[role]] / _SUPPLY_SCALE
-    if role == channels.TEMPERATURE:
-        return _TEMPERATURE_ZERO_V + _TEMPERATURE_V_PER_C * columns[channels.COLUMNS[role]]
+    if role == base.SUPPLY:
+        return columns[base.COLUMNS[role]] / _SUPPLY_SCALE
+    if role == base.TEMPERATURE:
+        return _TEMPERATURE_ZERO_V + _TEMPERATURE_V_PER_C * columns[base.COLUMNS[role]]
     return columns[f'{role}_v']
 
 
 def roles_of(sensor: Sensor, columns: Mapping[str, np.ndarray]) -> list[str]:
     """Return the roles of the channels for columns of samples."""
-    references = [role for role, column in channels.COLUMNS.items() if column in columns]
+    references = [role for role, column in base.COLUMNS.items() if column in columns]
     return [*sensor.axes, *references]
 
 
 def driver_command(port: str, roles: list[str]) -> str:
     """Return the command of a driver that reads this board."""
     options = [f'-p link.type:=serial -p link.port:={port} -p link.channels:={",".join(roles)}']
-    if channels.SUPPLY in roles:
+    if base.SUPPLY in roles:
         options.append(f'-p link.supply_scale:={_SUPPLY_SCALE}')
     return f'ros2 run adxl_ros driver --ros-args {" ".join(options)}'
 
 
 def check_sensor(sensor: Sensor) -> None:
     """Raise `UserError` for a sensor that wire format 1 cannot describe."""
-    if not 1 <= sensor.adc_bits <= _MAX_BITS:
+    if not 1 <= sensor.adc_bits <= wire_format.MAX_BITS:
         raise UserError(f'sensor.adc_bits: {sensor.adc_bits}: a board sends codes of 1 to '
-                        f'{_MAX_BITS} bits')
-    if len(sensor.serial) > _MAX_SERIAL or not sensor.serial.isascii():
-        raise UserError(f'sensor.serial: {sensor.serial!r}: a board has room for {_MAX_SERIAL} '
-                        'ASCII characters')
+                        f'{wire_format.MAX_BITS} bits')
+    if len(sensor.serial) > wire_format.MAX_SERIAL or not sensor.serial.isascii():
+        raise UserError(f'sensor.serial: {sensor.serial!r}: a board has room for '
+                        f'{wire_format.MAX_SERIAL} ASCII characters')
 
 
 @contextmanager
 def open_terminal(port: str) -> Iterator[int]:
     """Open the end of a terminal that a board writes to."""
-    path = Path(port)
-    if path.exists():
-        if not stat.S_ISCHR(path.stat().st_mode):
-            raise UserError(f'--port {port}: is no terminal device; name one, or a path that '
-                            'does not exist for a new pseudo-terminal')
-        fd = _open_existing(path)
-        try:
-            yield fd
-        finally:
-            os.close(fd)
-        return
-    board_fd, driver_fd = pty.openpty()
+    path, fds = Path(port), []
+    is_new = not path.exists()
+    if not is_new and not stat.S_ISCHR(path.stat().st_mode):
+        raise UserError(f'--port {port}: is no terminal device; name one, or a path that does not '
+                        'exist for a new pseudo-terminal')
     try:
-        tty.setraw(driver_fd)
-        os.set_blocking(board_fd, False)
-        path.unlink(missing_ok=True)  # the name of an earlier board
-        path.symlink_to(os.ttyname(driver_fd))
-        yield board_fd
-    except OSError as error:
-        raise UserError(f'--port {port}: {error.strerror}') from None
-    finally:
-        if path.is_symlink() and os.readlink(path) == os.ttyname(driver_fd):
-            path.unlink()
-        os.close(board_fd)
-        os.close(driver_fd)
-
-
-def _open_existing(path: Path) -> int:
-    """Open a terminal device for raw bytes; return its file descriptor, which does not block."""
-    try:
-        fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-        tty.setraw(fd)
+        fds = [*pty.openpty()] if is_new else [os.open(
+            path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)]
+        tty.setraw(fds[-1])
+        os.set_blocking(fds[0], False)
+        if is_new:
+            path.unlink(missing_ok=True)  # the name of an earlier board
+            path.symlink_to(os.ttyname(fds[-1]))
+        yield fds[0]
     except (OSError, termios.error) as error:
-        raise UserError(f'--port {path}: cannot be opened: {error}') from None
-    return fd
+        raise UserError(f'--port {port}: cannot be opened: {error}') from None
+    finally:
+        if is_new and fds and path.is_symlink() and os.readlink(path) == os.ttyname(fds[-1]):
+            path.unlink()
+        for fd in fds:
+            os.close(fd)

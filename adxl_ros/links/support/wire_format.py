@@ -10,11 +10,8 @@ encoder in C.
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, field
-from math import isfinite
 import struct
-from typing import NamedTuple
 import zlib
 
 import numpy as np
@@ -34,14 +31,13 @@ AFTER_RESET = 2
 MAX_CHANNELS = 8
 """Most channels of a board; a frame with more of them is invalid."""
 
-_COMMON = struct.Struct('<BBHI')
-"""type, version, flags, block_seq: the first fields of every payload."""
 _SAMPLES = struct.Struct('<BBHIQIHBB')
-"""Fields of a payload with samples: the common ones, time, index, overruns, samples, channels."""
+"""A payload with samples: type, version, flags, block_seq, time, index, overruns, numbers of
+samples and channels."""
 _INFO = struct.Struct('<BBHIfBBf16s')
-"""Fields of an info payload: the common ones, sample rate, bits, channels, vref, serial number."""
+"""An info payload: the same four, then sample rate, bits, channels, vref, serial number."""
 _COMMAND = struct.Struct('<BBHII')
-"""Fields of a command: the common ones, latency in µs."""
+"""A command, the shortest payload: the same four, then latency in µs."""
 _CRC = struct.Struct('<I')
 """CRC-32 behind the payload, as zlib computes it."""
 MAX_COUNT = 255
@@ -57,18 +53,14 @@ _MAX_LOAD = 0.85
 baud rates, 5 %, need the other part."""
 _MAX_TIME_US = 2 ** 53
 """Largest time of a device clock, µs: 285 years."""
-_MIN_RATE_HZ = 0.01
-"""Smallest sample rate, Hz, as `sensor.rate_hz` permits."""
-_MAX_RATE_HZ = 1e5
-"""Largest sample rate, Hz, as `sensor.rate_hz` permits."""
-_MIN_VREF_V = 0.1
-"""Smallest reference voltage, V, as `sensor.adc_vref_v` permits."""
-_MAX_VREF_V = 100.0
-"""Largest reference voltage, V, as `sensor.adc_vref_v` permits."""
-_MAX_BITS = 16
+RATES_HZ = (0.01, 1e5)
+"""Bounds of the sample rate, Hz, as `sensor.rate_hz` permits."""
+_VREFS_V = (0.1, 100.0)
+"""Bounds of the reference voltage, V, as `sensor.adc_vref_v` permits."""
+MAX_BITS = 16
 """Largest resolution of the ADC, bit: codes are u16."""
-_PRINTABLE = range(32, 127)
-"""Codes of the printable ASCII characters."""
+MAX_SERIAL = 16
+"""Most characters of a serial number."""
 
 
 class WireError(Exception):
@@ -102,7 +94,6 @@ class SampleFrame:
     index: int  # Number of the first sample, dropped samples included, wraps at 2^32
     overruns: int  # Samples that the device itself has dropped since its reset, wraps at 2^16
     codes: np.ndarray  # ADC codes, (n, m) uint16
-    check: int = 0  # CRC-32 of the payload, which identifies the frame
 
 
 class Encoder:
@@ -110,7 +101,7 @@ class Encoder:
 
     def __init__(self, info: BoardInfo) -> None:
         """Begin as after a reset."""
-        self.info = info  # Description of the board
+        self.info = info
         self._sequence = 0
         self._flags = AFTER_RESET
 
@@ -123,11 +114,7 @@ class Encoder:
 
     def sample_frame(self, time_us: int, index: int, codes: np.ndarray, overruns: int = 0,
                      flags: int = 0) -> bytes:
-        """
-        Encode a frame of samples.
-
-        codes: ADC codes, (n, m); n and m are at most 255.
-        """
+        """Encode ADC codes, (n, m), n and m at most 255, as a frame of samples."""
         rail = RAIL if (codes == 0).any() or (codes >= 2 ** self.info.bits - 1).any() else 0
         flags |= self._flags | rail
         self._flags = 0
@@ -148,13 +135,12 @@ def encode_payload(payload: bytes) -> bytes:
 
 def decode(raw: bytes) -> BoardInfo | SampleFrame:
     """Decode one frame."""
-    payload, check = _checked_payload(raw)
-    kind = payload[0]
-    if kind == INFO_TYPE:
+    payload = _checked_payload(raw)
+    if payload[0] == INFO_TYPE:
         return _decode_info(payload)
-    if kind == SAMPLES_TYPE:
-        return _decode_samples(payload, check)
-    raise WireError(f'unknown type {kind}')
+    if payload[0] == SAMPLES_TYPE:
+        return _decode_samples(payload)
+    raise WireError(f'unknown type {payload[0]}')
 
 
 def encode_command(sequence: int, latency_us: int) -> bytes:
@@ -165,8 +151,8 @@ def encode_command(sequence: int, latency_us: int) -> bytes:
 
 
 def decode_command(raw: bytes) -> int:
-    """Decode a frame from the host, as a board does."""
-    payload, _ = _checked_payload(raw)
+    """Decode a frame from the host, as a board does; return its latency, µs."""
+    payload = _checked_payload(raw)
     if payload[0] != COMMAND_TYPE or len(payload) != _COMMAND.size:
         raise WireError('no command')
     return int(_COMMAND.unpack(payload)[-1])
@@ -176,7 +162,7 @@ def samples_that_fit(count: int, info: BoardInfo, bytes_per_s: float) -> int:
     """Return the smallest number of samples of a frame that a wire carries with a margin."""
     for samples in range(count, MAX_COUNT):
         payload = _SAMPLES.size + 2 * samples * info.channels + _CRC.size
-        frame_bytes = payload + 2 + payload // 254
+        frame_bytes = payload + 2 + payload // _BLOCK
         if frame_bytes * info.rate_hz / samples <= _MAX_LOAD * bytes_per_s:
             return samples
     return MAX_COUNT
@@ -215,16 +201,15 @@ def _unstuff(raw: bytes) -> bytes:
     return b''.join(parts)
 
 
-def _checked_payload(raw: bytes) -> tuple[bytes, int]:
-    """Return payload and CRC of a frame; raise `WireError` unless whole and of this version."""
+def _checked_payload(raw: bytes) -> bytes:
+    """Return the payload of a frame; raise `WireError` unless whole and of this version."""
     decoded = _unstuff(raw)
-    payload = decoded[:-_CRC.size]
-    check = zlib.crc32(payload)
-    if len(payload) < _COMMON.size or decoded[-_CRC.size:] != _CRC.pack(check):
+    payload, check = decoded[:-_CRC.size], decoded[-_CRC.size:]
+    if len(payload) < _COMMAND.size or check != _CRC.pack(zlib.crc32(payload)):
         raise WireError('the CRC does not match')
     if payload[1] != VERSION:
         raise VersionError(f'wire format {payload[1]}')
-    return payload, check
+    return payload
 
 
 def _decode_info(payload: bytes) -> BoardInfo:
@@ -232,16 +217,15 @@ def _decode_info(payload: bytes) -> BoardInfo:
         raise WireError(f'an info frame of {len(payload)} bytes')
     _, _, flags, _, rate_hz, bits, channels, vref_v, serial = _INFO.unpack(payload)
     name = serial.rstrip(b'\0')
-    if not (isfinite(rate_hz) and _MIN_RATE_HZ <= rate_hz <= _MAX_RATE_HZ
-            and 1 <= bits <= _MAX_BITS and 1 <= channels <= MAX_CHANNELS
-            and isfinite(vref_v) and _MIN_VREF_V <= vref_v <= _MAX_VREF_V
-            and all(byte in _PRINTABLE for byte in name)):
+    if not (RATES_HZ[0] <= rate_hz <= RATES_HZ[1] and _VREFS_V[0] <= vref_v <= _VREFS_V[1]
+            and 1 <= bits <= MAX_BITS and 1 <= channels <= MAX_CHANNELS
+            and all(32 <= byte < 127 for byte in name)):
         raise WireError(f'an info frame with {rate_hz:g} Hz, {bits} bits, {channels} channels, '
                         f'{vref_v:g} V, {name!r}')
     return BoardInfo(rate_hz, bits, channels, vref_v, name.decode('ascii').strip(), flags)
 
 
-def _decode_samples(payload: bytes, check: int) -> SampleFrame:
+def _decode_samples(payload: bytes) -> SampleFrame:
     if len(payload) < _SAMPLES.size:
         raise WireError(f'a data frame of {len(payload)} bytes')
     (_, _, flags, sequence, time_us, index, overruns, count,
@@ -251,7 +235,7 @@ def _decode_samples(payload: bytes, check: int) -> SampleFrame:
         raise WireError(f'a data frame of {count} samples of {channels} channels in '
                         f'{len(payload)} bytes at {time_us} us')
     codes = np.frombuffer(payload, '<u2', offset=_SAMPLES.size).reshape(count, channels)
-    return SampleFrame(flags, sequence, time_us, index, overruns, codes, check)
+    return SampleFrame(flags, sequence, time_us, index, overruns, codes)
 
 
 class Splitter:
@@ -285,17 +269,11 @@ class Splitter:
         self._incomplete, self._skipping = b'', False
 
 
-_REMEMBERED = 20_000
-"""Frames that are recognised when they come twice. Chosen: 40 s of frames of 2 ms."""
 _TOLERANCE_US = 1000.0
 """Absolute tolerance between the device's clock and its count, µs."""
 _TOLERANCE = 0.002
 """Relative tolerance between the device's clock and its count. Chosen: a real rate differs from
 the stated one by less."""
-_RESTART_US = 500e3
-"""Duration of known frames at the pace of time that shows a board which begins again, µs."""
-_RESTART_TOLERANCE = 0.1
-"""Relative tolerance of that pace."""
 _AWAY_TOLERANCE_US = 250e3
 """Tolerance between the clocks of device and host while a port was closed, µs."""
 
@@ -304,17 +282,10 @@ _AWAY_TOLERANCE_US = 250e3
 class AcceptedFrame:
     """A frame whose samples are published."""
 
-    frame: SampleFrame  # The frame
+    frame: SampleFrame
     # Number of samples that are missing before it, exactly; None where a new count begins
     lost: int | None
     stepped: bool = False  # Whether the device's clock has stepped since the previous frame
-
-
-class _Repetition(NamedTuple):
-    """First of a run of repeated frames: its lag behind host time and its arrival, µs."""
-
-    lag_us: float
-    arrived_us: float
 
 
 class FrameCounter:
@@ -329,72 +300,52 @@ class FrameCounter:
         """Begin without a count."""
         self.repeated = self.overruns = 0
         self._period_us = 0.0
-        self._next_index = self._next_time_us = self._device_overruns = 0
-        self._begun = False
-        self._closed_us: float | None = None
+        self._first: SampleFrame | None = None  # First frame of the count
+        self._previous: SampleFrame | None = None
         self._arrived_us = 0.0
+        self._closed_us: float | None = None
+        # A frame of another count, until the next frame tells whether it is late or after a reset
         self._pending: SampleFrame | None = None
-        self._repetition: _Repetition | None = None
-        self._checks: set[int] = set()
-        self._check_order: deque[int] = deque()
 
     def restart(self, rate_hz: float) -> None:
         """Let the next frame begin a new count, at a sample rate, Hz."""
         self._period_us = 1e6 / rate_hz
-        self._begun = False
-        self._pending = None
-        self._forget()
+        self._previous = self._pending = None
 
     def reopened(self) -> None:
         """Take note that the next frames may come from another device."""
         if self._closed_us is None:
             self._closed_us = self._arrived_us
         self._pending = None
-        self._forget()
 
     def accept(self, frame: SampleFrame, arrived_ns: int) -> list[AcceptedFrame]:
-        """Take the next frame of the stream."""
+        """Take the next frame of the stream; return the frames whose samples are published."""
         arrived_us = arrived_ns * 1e-3
-        is_repeated = frame.check in self._checks
         pending, self._pending = self._pending, None
-        accepted = self._after_restart(frame, arrived_us) if is_repeated \
-            else self._after_previous(frame, arrived_us)
-        if accepted is None and pending is not None and self._are_consecutive(pending, frame):
-            # Two frames in a row have another count: the device was reset without a message.
-            self._register(pending, arrived_us, True)
-            following = self._after_previous(frame, arrived_us)
-            self._register(frame, arrived_us)
-            first = AcceptedFrame(pending, None)
-            return [first] if following is None else [first, following]
+        following = self._follow(frame, arrived_us)
+        accepted = [] if following is None else [following]
         if pending is not None:
-            self.repeated += len(pending.codes)
-        if accepted is not None:
-            self._register(frame, arrived_us, accepted.lost is None)
-            return [accepted]
-        if is_repeated and not frame.flags & AFTER_RESET:
-            self.repeated += len(frame.codes)
-        else:
+            ahead, passed_us = self._step(pending, frame)
+            if following is None and ahead >= 0 and self._agree(ahead, passed_us):
+                # Two frames in a row have another count: the device was reset without a message.
+                accepted = [AcceptedFrame(pending, None), AcceptedFrame(frame, ahead)]
+            else:
+                self.repeated += len(pending.codes)
+        if not accepted:
             self._pending = frame
-        return []
+        for part in accepted:
+            if part.lost is None:
+                self._first = part.frame
+            elif self._previous is not None:
+                self.overruns += (part.frame.overruns - self._previous.overruns) % 2 ** 16
+            self._previous, self._closed_us, self._arrived_us = part.frame, None, arrived_us
+        return accepted
 
-    def _after_restart(self, frame: SampleFrame, arrived_us: float) -> AcceptedFrame | None:
-        """Accept a repeated frame only where such frames come at the pace of time."""
-        lag_us = arrived_us - frame.time_us
-        if self._repetition is None:
-            self._repetition = _Repetition(lag_us, arrived_us)
-        duration_us = arrived_us - self._repetition.arrived_us
-        if duration_us < _RESTART_US \
-                or abs(lag_us - self._repetition.lag_us) > _RESTART_TOLERANCE * duration_us:
-            return None
-        # An emulated board does after its reset exactly what it did before.
-        return AcceptedFrame(frame, None)
-
-    def _after_previous(self, frame: SampleFrame, arrived_us: float) -> AcceptedFrame | None:
+    def _follow(self, frame: SampleFrame, arrived_us: float) -> AcceptedFrame | None:
         """Compare a frame with the previous one; None where the next one must decide."""
-        if not self._begun or frame.flags & AFTER_RESET:
+        if self._previous is None or (frame.flags & AFTER_RESET and not self._is_first(frame)):
             return AcceptedFrame(frame, None)
-        ahead = _signed(frame.index - self._next_index)
-        passed_us = frame.time_us - self._next_time_us
+        ahead, passed_us = self._step(self._previous, frame)
         in_step = self._agree(ahead, passed_us)
         if ahead == 0:
             return AcceptedFrame(frame, 0, not in_step)
@@ -405,40 +356,20 @@ class FrameCounter:
             return None
         return AcceptedFrame(frame, ahead if ahead > 0 and in_step else None)
 
-    def _are_consecutive(self, first: SampleFrame, second: SampleFrame) -> bool:
-        """Return whether count and clock lead from the first frame to the second."""
+    def _is_first(self, frame: SampleFrame) -> bool:
+        """Return whether a frame is the first one of the count, again."""
+        first = self._first
+        return first is not None and (frame.sequence, frame.time_us, frame.index) == (
+            first.sequence, first.time_us, first.index)
+
+    def _step(self, first: SampleFrame, second: SampleFrame) -> tuple[int, float]:
+        """Return the samples and the time, µs, from the end of a frame to another one."""
         count = len(first.codes)
-        ahead = _signed(second.index - first.index - count)
-        passed_us = second.time_us - first.time_us - count * self._period_us
-        return ahead >= 0 and self._agree(ahead, passed_us)
+        # The numbers of samples wrap at 2^32.
+        ahead = (second.index - first.index - count + 2 ** 31) % 2 ** 32 - 2 ** 31
+        return ahead, second.time_us - first.time_us - count * self._period_us
 
     def _agree(self, samples: int, passed_us: float) -> bool:
         """Return whether a number of samples fits a time by the device's clock, µs."""
         tolerance_us = _TOLERANCE_US + 0.5 * self._period_us + _TOLERANCE * abs(passed_us)
         return abs(passed_us - samples * self._period_us) < tolerance_us
-
-    def _register(self, frame: SampleFrame, arrived_us: float, is_new: bool = False) -> None:
-        """Make a frame the previous one; `is_new` begins a new count with it."""
-        if is_new:
-            self._forget()
-        self._repetition = None
-        count = len(frame.codes)
-        resumed = self._begun and not frame.flags & AFTER_RESET
-        self.overruns += (frame.overruns - self._device_overruns) % 2 ** 16 if resumed else 0
-        self._device_overruns = frame.overruns
-        self._next_index = (frame.index + count) % 2 ** 32
-        self._next_time_us = frame.time_us + round(count * self._period_us)
-        self._begun, self._closed_us, self._arrived_us = True, None, arrived_us
-        self._checks.add(frame.check)
-        self._check_order.append(frame.check)
-        if len(self._check_order) > _REMEMBERED:
-            self._checks.discard(self._check_order.popleft())
-
-    def _forget(self) -> None:
-        self._checks.clear()
-        self._check_order.clear()
-
-
-def _signed(difference: int) -> int:
-    """Return a difference of numbers that wrap at 2^32, from -2^31 to 2^31 - 1."""
-    return (difference + 2 ** 31) % 2 ** 32 - 2 ** 31

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Maps from the clock of a device to the host's monotonic clock, and from there to ROS time.
+Stamps of samples: from the clock of a device to the host's monotonic clock, and to ROS time.
 
 A sample arrives later than it was taken, never earlier. So the clock of the device, seen on the
 host's clock, is the line just below the arrivals: it has an offset and a drift. The stamps follow
@@ -11,10 +11,14 @@ this line smoothly and never go backwards.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 import time
 from typing import Any, NamedTuple
 
+from adxl_ros.links.support.base import Event, no_samples, Samples
+from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 # Limits and time constants without a source are chosen for links of 0.1 to 5 ms of jitter at
@@ -75,20 +79,6 @@ class _Window(NamedTuple):
     lag_ns: int
 
 
-@dataclass
-class _LateArrivals:
-    """Arrivals far too late: their samples were delayed, or the device's clock stopped."""
-
-    # first_ns, last_ns: Host times of the first and the last one, ns
-    first_ns: int
-    # first_device_ns, last_device_ns: Their device times, ns
-    first_device_ns: int
-    last_device_ns: int
-    last_ns: int
-    min_lag_ns: int  # Smallest lag of device time behind host time, ns
-    count: int = 1  # Number of arrivals
-
-
 class ClockMap:
     """
     Map of a device's clock by the arrivals of its samples.
@@ -115,7 +105,9 @@ class ClockMap:
         self._open: _Window | None = None
         self._opened_ns = self._seen_ns = self._count = 0
         self._first_arrived_ns: int | None = None
-        self._late: _LateArrivals | None = None
+        # Arrivals far too late, device time and host time, ns: their samples were delayed, or the
+        # device's clock stopped
+        self._late: list[tuple[int, int]] = []
         self._former_lag_ns: float | None = None
         # The stamps lie on a line through this point, device time and host time, ns.
         self._line_device_ns = self._line_host_ns = 0
@@ -124,7 +116,9 @@ class ClockMap:
     def observe(self, device_ns: int, arrived_ns: int) -> bool:
         """Take an arrival."""
         lag_ns = arrived_ns - self._delay_ns - device_ns
-        is_early = self._is_early(device_ns, arrived_ns)
+        # How far the arrival lies above the line; far below it, the device's clock stepped forward
+        lateness_ns = lag_ns + device_ns - self._line(device_ns)
+        is_early = self.settled and lateness_ns < -_EARLY_NS
         if is_early or self._is_shifted(lag_ns):
             former_ns = self._former_lag_ns
             # Samples that a busy host read late have looked like those of a clock that stopped.
@@ -134,8 +128,12 @@ class ClockMap:
             self._former_lag_ns = former_ns if was_delayed else None
             self.observe(device_ns, arrived_ns)
             return not was_delayed
-        if self.settled and self._is_late(device_ns, arrived_ns, lag_ns):
-            return False
+        if self.settled:
+            if lateness_ns > (_SHIFT_NS if self._late else _STOPPED_NS):
+                # It stays out of the windows, until later ones explain it.
+                self._late.append((device_ns, arrived_ns))
+                return False
+            self._late.clear()  # the delayed samples have been delivered
         if self._first_arrived_ns is None:
             self._first_arrived_ns = arrived_ns
         self._update_window(device_ns, lag_ns)
@@ -143,17 +141,15 @@ class ClockMap:
 
     def ready(self, now_ns: int) -> bool:
         """Return whether samples can be stamped at a host time, ns."""
-        late = self._late
-        if late is not None and late.count > 1 \
-                and now_ns - late.first_ns >= self._decision_s * 1e9:
-            self._resolve(late)
+        if len(self._late) > 1 and now_ns - self._late[0][1] >= self._decision_s * 1e9:
+            self._resolve()
         if not self.settled and self._open is not None and self._first_arrived_ns is not None \
                 and now_ns - self._first_arrived_ns >= self._wait_s * 1e9:
             self.settled = True
             self._wait_s = _LATER_WAIT_S
             self._line_device_ns = self._open.device_ns
             self._line_host_ns = self._line_device_ns + self._fit(self._line_device_ns)
-        return self.settled and self._late is None
+        return self.settled and not self._late
 
     def host_ns(self, device_ns: np.ndarray) -> np.ndarray:
         """
@@ -176,10 +172,6 @@ class ClockMap:
     def _line(self, device_ns: Any) -> Any:
         """Map device times, ns, to host times, ns: an array or one number."""
         return self._line_host_ns + (device_ns - self._line_device_ns) * self._slope
-
-    def _lateness_ns(self, device_ns: int, arrived_ns: int) -> float:
-        """Return how far an arrival lies above the line, ns."""
-        return arrived_ns - self._delay_ns - self._line(device_ns)
 
     def _update_window(self, device_ns: int, lag_ns: int) -> None:
         """Add an arrival to the open window; a window that ends corrects the line."""
@@ -241,43 +233,22 @@ class ClockMap:
         ahead_s = (device_ns - origin.device_ns) * 1e-9
         return origin.lag_ns + round(offset_ns + slope * ahead_s)
 
-    def _is_early(self, device_ns: int, arrived_ns: int) -> bool:
-        """Return whether an arrival is so early that the device's clock has stepped forward."""
-        return self.settled and self._lateness_ns(device_ns, arrived_ns) < -_EARLY_NS
-
-    def _is_late(self, device_ns: int, arrived_ns: int, lag_ns: int) -> bool:
-        """Keep an arrival that is far too late out of the windows, until later ones explain it."""
-        lateness_ns = self._lateness_ns(device_ns, arrived_ns)
-        late = self._late
-        if late is None:
-            if lateness_ns < _STOPPED_NS:
-                return False
-            self._late = _LateArrivals(arrived_ns, device_ns, device_ns, arrived_ns, lag_ns)
-            return True
-        if lateness_ns < _SHIFT_NS:
-            # The delayed samples have been delivered: the clock did not stop.
-            self._late = None
-            return False
-        late.last_device_ns, late.last_ns = device_ns, arrived_ns
-        late.min_lag_ns = min(late.min_lag_ns, lag_ns)
-        late.count += 1
-        return True
-
-    def _resolve(self, late: _LateArrivals) -> None:
+    def _resolve(self) -> None:
         """Begin a new clock if the late samples come at the pace of time: the clock stopped."""
-        self._late = None
-        taken_ns = late.last_device_ns - late.first_device_ns
-        if taken_ns > _CATCH_UP_RATIO * (late.last_ns - late.first_ns):
+        late, self._late = self._late, []
+        (first_device_ns, first_ns), (last_device_ns, last_ns) = late[0], late[-1]
+        if last_device_ns - first_device_ns > _CATCH_UP_RATIO * (last_ns - first_ns):
             return
         self.steps += 1
         former_ns = self._former_lag_ns
         if former_ns is None:
-            former_ns = self._line(late.first_device_ns) - late.first_device_ns
+            former_ns = self._line(first_device_ns) - first_device_ns
         self.restart()
         self._former_lag_ns = former_ns
-        self._first_arrived_ns = late.first_ns
-        self._open = _Window(late.last_device_ns, late.min_lag_ns)
-        self._opened_ns, self._count = late.last_device_ns, 1
+        self._first_arrived_ns = first_ns
+        self._open = _Window(last_device_ns, min(
+            arrived_ns - self._delay_ns - device_ns for device_ns, arrived_ns in late))
+        self._opened_ns, self._count = last_device_ns, 1
 
     def _is_shifted(self, lag_ns: int) -> bool:
         """Return whether the last two windows are late by the same amount: a backward step."""
@@ -291,7 +262,7 @@ class ClockMap:
 class IdentityMap:
     """Map for a device that stamps by the host's own monotonic clock."""
 
-    # steps, settled, drift_ppm, jitter_ns: As those of `ClockMap`, and constant
+    # As those of `ClockMap`, and constant
     steps = 0
     settled = True
     drift_ppm = jitter_ns = 0.0
@@ -312,53 +283,215 @@ class IdentityMap:
         return device_ns
 
 
+_STEP_NS = 1_000_000
+"""Change of the system clock's offset that counts as a step, ns. Chosen: slewing by NTP is slower.
+"""
+_TRIES = 3
+"""Readings of which the least interrupted one counts."""
+_MAX_UNCERTAINTY_NS = 20_000
+"""Uncertainty above which a reading is ignored, ns: the process was interrupted."""
+_GAIN = 0.05
+"""Share of a small difference that an update takes up."""
+
+
 class SystemClockMap:
     """Map from the host's monotonic clock, which is never set, to ROS time, the system clock."""
-
-    _STEP_NS = 1_000_000
-    """Change of the offset that counts as a step, ns. Chosen: slewing by NTP is slower."""
-    _TRIES = 3
-    """Readings of which the least interrupted one counts."""
-    _MAX_UNCERTAINTY_NS = 20_000
-    """Uncertainty above which a reading is ignored, ns: the process was interrupted."""
-    _GAIN = 0.05
-    """Share of a small difference that an update takes up."""
 
     def __init__(self) -> None:
         """Read both clocks."""
         self.steps = 0  # How often the system clock was set since the map began
-        self._offset_ns = float(self._read().offset_ns)
+        self._offset_ns = float(_system_offset()[1])
 
-    def update(self) -> int:
-        """Follow the system clock; return by how much it was set since the last call, ns, or 0."""
-        reading = self._read()
-        if reading.uncertainty_ns > self._MAX_UNCERTAINTY_NS:
-            return 0
-        difference_ns = reading.offset_ns - self._offset_ns
-        if abs(difference_ns) < self._STEP_NS:
-            self._offset_ns += self._GAIN * difference_ns
-            return 0
-        self._offset_ns += difference_ns
-        self.steps += 1
-        return round(difference_ns)
+    def update(self) -> None:
+        """Follow the system clock."""
+        uncertainty_ns, offset_ns = _system_offset()
+        if uncertainty_ns > _MAX_UNCERTAINTY_NS:
+            return
+        difference_ns = offset_ns - self._offset_ns
+        is_step = abs(difference_ns) >= _STEP_NS
+        self._offset_ns += difference_ns if is_step else _GAIN * difference_ns
+        self.steps += is_step
 
     def ros_ns(self, host_ns: np.ndarray) -> np.ndarray:
         """Return the ROS times of monotonic times, ns."""
         return host_ns + round(self._offset_ns)
 
-    def _read(self) -> _OffsetReading:
-        """Read the offset of the system clock, the least interrupted of some tries."""
-        readings = []
-        for _ in range(self._TRIES):
-            before_ns, system_ns, after_ns = (
-                time.monotonic_ns(), time.time_ns(), time.monotonic_ns())
-            readings.append(_OffsetReading(after_ns - before_ns,
-                                           system_ns - (before_ns + after_ns) // 2))
-        return min(readings, key=lambda reading: reading.uncertainty_ns)
+
+def _system_offset() -> tuple[int, int]:
+    """Return uncertainty and offset of the system clock from the monotonic clock, ns."""
+    readings = []
+    for _ in range(_TRIES):
+        before_ns, system_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        readings.append((after_ns - before_ns, system_ns - (before_ns + after_ns) // 2))
+    return min(readings)
 
 
-class _OffsetReading(NamedTuple):
-    """Offset of the system clock from the monotonic clock, and its uncertainty, ns."""
+_PERIOD_NS = 100_000_000
+"""Period of the means of supply and temperature, ns. Chosen: both change slowly."""
+_KEPT_COUNTS = 8
+"""Numbers of samples for which absent values are kept. Chosen: a device has one or two."""
 
-    uncertainty_ns: int
-    offset_ns: int
+
+@lru_cache(_KEPT_COUNTS)
+def absent(count: int) -> np.ndarray:
+    """Return values that are not there: NaN, (count,), not to be written."""
+    values = np.full(count, np.nan)
+    values.flags.writeable = False
+    return values
+
+
+@dataclass(frozen=True)
+class Block:
+    """Samples as a device sends them."""
+
+    device_ns: np.ndarray  # Device time, ns, (n,) int64, ascending
+    volts: np.ndarray  # Output of the sensor by axis, V, (n, m)
+    references: Mapping[str, np.ndarray]  # References that the device has, by column, (n,) each
+    lost: int | None = None  # Samples lost before it; None where only time shows them
+
+
+class PeriodMeans:
+    """Replaces slow references by their means over 0.1 s, each at the next sample that comes."""
+
+    def __init__(self, columns: Sequence[str]) -> None:
+        """Begin without values."""
+        self._held: dict[str, list[np.ndarray]] = {column: [] for column in columns}
+        self._period = 0
+
+    def thin(self, host_ns: np.ndarray, references: Mapping[str, np.ndarray]
+             ) -> dict[str, np.ndarray]:
+        """
+        Return the means of all columns in the first row of a period, and NaN in other rows.
+
+        host_ns: times of the samples, ns, (n,), ascending from call to call; references: values by
+        column, (n,) each.
+        """
+        period = int(host_ns[-1]) // _PERIOD_NS
+        means = dict.fromkeys(self._held, absent(len(host_ns)))
+        if period != self._period:
+            self._period = period
+            for column, parts in self._held.items():
+                values = np.concatenate([*parts, absent(1)])
+                values = values[np.isfinite(values)]
+                parts.clear()
+                if len(values):
+                    means[column] = np.full(len(host_ns), np.nan)
+                    means[column][0] = values.mean()
+        for column, values in references.items():
+            self._held[column].append(values)
+        return means
+
+
+_FOLLOW_NS = 10_000_000
+"""Time between two readings of the system clock, ns; chosen: a reading takes several microseconds,
+and nobody sees a clock that was set 10 ms later."""
+_FOREVER_NS = 2 ** 63 - 1
+"""Largest time, ns: any waiting time is over by then."""
+
+
+class Stamper:
+    """Holds samples until the device's clock is known, stamps them and counts lost ones."""
+
+    def __init__(self, clock: ClockMap | IdentityMap, references: Sequence[str]) -> None:
+        """Begin without samples; `references` are the columns that all samples have."""
+        self.clock = clock  # Map of the device's clock
+        self.period_ns = 0.0  # Sample period, ns; 0 before the first `restart`
+        self._system_clock = SystemClockMap()
+        self._followed_ns = 0
+        self._means = PeriodMeans(references)
+        self._unstamped: list[Block] = []
+        self._stamped: list[Samples] = []
+        self._last_ns: int | None = None
+        self._last_device_ns = 0
+        self._new_clock = True
+        self._counted = self._estimated = 0
+
+    @property
+    def waiting(self) -> bool:
+        """Whether `take` would return samples."""
+        return bool(self._stamped)
+
+    def restart(self, period_ns: float) -> None:
+        """Begin a new clock or device; time gives an estimate of the samples lost before."""
+        self.step()
+        self.period_ns = period_ns
+        self._new_clock = True
+
+    def step(self) -> None:
+        """Begin a new clock for samples that follow the previous ones without a loss."""
+        self.flush()
+        self.clock.restart()
+
+    def add(self, block: Block, arrived_ns: int) -> None:
+        """Take samples."""
+        newest_ns = int(block.device_ns[-1])
+        stepped = self.clock.observe(newest_ns, arrived_ns)
+        if block.lost is None:
+            self._new_clock |= stepped
+            if not self._new_clock:
+                steps_ns = np.diff(block.device_ns, prepend=self._last_device_ns)
+                self._estimated += sum(max(round(step_ns / self.period_ns) - 1, 0)
+                                       for step_ns in steps_ns.tolist())
+            self._last_device_ns = newest_ns
+        else:
+            self._counted += block.lost
+        self._unstamped.append(block)
+        if self.clock.ready(arrived_ns):
+            self._stamp()
+
+    def flush(self) -> None:
+        """Stamp all samples now, by what is known of the clock."""
+        if self._unstamped:
+            self.clock.ready(_FOREVER_NS)
+            self._stamp()
+
+    def take(self, sensor: Sensor) -> Samples:
+        """Return the samples of a sensor that were stamped since the last call."""
+        if self._unstamped and self.clock.ready(time.monotonic_ns()):
+            self._stamp()
+        if not self._stamped:
+            return no_samples(sensor, time.time_ns())
+        parts, self._stamped = self._stamped, []
+        if len(parts) == 1:
+            return parts[0]
+        return Samples(
+            np.concatenate([part.stamp_ns for part in parts]),
+            np.concatenate([part.volts for part in parts]),
+            time.time_ns(), sum(part.missing for part in parts),
+            {name: np.concatenate([part.references[name] for part in parts])
+             for name in parts[0].references},
+            sum(part.estimated for part in parts))
+
+    def statistics(self) -> dict[str, Any]:
+        """Return how the clocks work, as diagnostics show it."""
+        clock = self.clock
+        return {'clock': 'settled' if clock.settled else 'settling',
+                'clock_drift_ppm': round(clock.drift_ppm, 2),
+                'clock_jitter_us': round(clock.jitter_ns * 1e-3, 1),
+                'clock_steps': clock.steps, 'system_clock_steps': self._system_clock.steps}
+
+    def events(self) -> tuple[Event, Event]:
+        """Return the events of the clocks, for the status of a link."""
+        return (Event('the clock of the device has stepped: a new map of it begins',
+                      self.clock.steps),
+                Event('the system clock was set: the stamps follow it', self._system_clock.steps))
+
+    def _stamp(self) -> None:
+        """Stamp the waiting samples, with the number of samples that are missing before them."""
+        now_ns = time.monotonic_ns()
+        if now_ns - self._followed_ns >= _FOLLOW_NS:
+            self._followed_ns = now_ns
+            self._system_clock.update()
+        for block in self._unstamped:
+            host_ns = self.clock.host_ns(block.device_ns)
+            if self._new_clock and self._last_ns is not None:
+                periods = (int(host_ns[0]) - self._last_ns) / self.period_ns
+                self._estimated += max(round(periods) - 1, 0)
+            self._new_clock = False
+            self._last_ns = int(host_ns[-1])
+            self._stamped.append(Samples(
+                self._system_clock.ros_ns(host_ns), block.volts, time.time_ns(),
+                self._counted + self._estimated, self._means.thin(host_ns, block.references),
+                self._estimated))
+            self._counted = self._estimated = 0
+        self._unstamped.clear()
