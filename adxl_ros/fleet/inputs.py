@@ -11,14 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
 import csv
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 import hashlib
-import math
 import os
 from pathlib import Path, PurePosixPath
+import re
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
@@ -34,13 +33,11 @@ _ENDINGS = ('.csv', '.mcap', '.db3')
 """Ends of the names of recordings in a folder, beside those of other tables."""
 _BAG = 'metadata.yaml'
 """File that makes a folder a bag."""
-_GLOB = frozenset('*?[')
-"""Characters of a glob."""
-_STAMPS = ('ETag', 'etag', 'e_tag', 'md5Hash', 'Content-MD5', 'Digest', 'mtime', 'created', 'ino',
-           'LastModified', 'last_modified', 'Last-Modified', 'updated', 'modified')
-"""Properties of an object that change with its content, by the names of file systems."""
 _TIMES = ('mtime', 'LastModified', 'last_modified', 'updated', 'modified')
-"""Properties that are the time of the last change."""
+"""Properties of an object that are the time of the last change, by the names of file systems."""
+_STAMPS = ('ETag', 'etag', 'e_tag', 'md5Hash', 'Content-MD5', 'Digest', 'created', 'ino',
+           'Last-Modified', *_TIMES)
+"""Properties of an object that change with its content."""
 _THREADS = 32
 """Objects of a manifest that are looked up at once. Chosen: a server answers in 0.1 s."""
 _SILENCE_S = 60.0
@@ -50,16 +47,16 @@ _CONNECT_S = 30.0
 """Time in which a web server must accept a connection, s: that of aiohttp."""
 _HEAD_BYTES = 4096
 """Begin of a CSV file that is read for serial number and date, byte. Chosen: its comments fit."""
+_COMMENT = re.compile(r'^#\s*(\w+)\s*:\s*(.*?)\s*$', re.MULTILINE)
+"""A comment of a CSV file that states something."""
 _DATES_S = (946684800.0, 4102444800.0)
 """Stamps between these count from 1970, s: the years 2000 to 2100. Others count from a start."""
 NO_FILE = 'no such file'
 """Fault of a recording that is not there."""
-_WEB_BAG = 'is a bag on a web server, which cannot be read as a whole; name a copy or its file'
-"""Fault of a bag whose address begins with http."""
 _DELIMITERS = ',;\t'
 """Characters between the columns of a manifest; the header has the one that it uses."""
-_MANIFEST_COLUMNS = ('serial', 'params', 'date')
-"""Columns of a manifest beside `url`."""
+_MANIFEST_COLUMNS = ('url', 'serial', 'params', 'date')
+"""Columns of a manifest."""
 
 
 class Unreachable(UserError):
@@ -92,31 +89,27 @@ def file_system(url: str, secret: str = '') -> tuple[Any, str]:
         from fsspec.implementations.local import LocalFileSystem
     except ImportError:
         raise UserError(f'fleet needs fsspec; {install_hint("adxl_ros[fleet]")}') from None
+    address = secret if _is_web(secret) else url
+    # A path of this machine may have two colons, which join addresses.
+    if '://' not in address:
+        path = LocalFileSystem._strip_protocol(address)
+        # One file has one address.
+        is_long = '..' in PurePosixPath(path).parts
+        return LocalFileSystem(), os.path.realpath(path) if is_long else str(PurePosixPath(path))
     try:
-        address = secret if _is_web(secret) else url
-        options = {'password': secret} if secret and address == url else _web_options(address)
-        # A path of this machine may have two colons, which join addresses.
-        fs, path = url_to_fs(address, **options) if '://' in address else \
-            (LocalFileSystem(), LocalFileSystem._strip_protocol(address))
+        options: dict[str, Any] = {}
+        if _is_web(address):
+            from aiohttp import ClientTimeout
+            options = {'client_kwargs': {'timeout': ClientTimeout(
+                total=None, sock_connect=_CONNECT_S, sock_read=_SILENCE_S)}}
+        elif secret:
+            options = {'password': secret}
+        return url_to_fs(address, **options)
     except (ImportError, ValueError) as error:
         raise UserError(without_secrets(f'{url}: {one_line(error)}')) from None
     except Exception as error:
         raise Unreachable(
             without_secrets(f'{url}: cannot be opened: {one_line(error)}')) from None
-    if not isinstance(fs, LocalFileSystem):
-        return fs, path
-    # One file has one address.
-    pure = PurePosixPath(path)
-    return fs, os.path.realpath(path) if '..' in pure.parts else str(pure)
-
-
-def _web_options(url: str) -> dict[str, Any]:
-    """Return how a web server is read: as long as it sends; empty for another address."""
-    if not _is_web(url):
-        return {}
-    from aiohttp import ClientTimeout
-    return {'client_kwargs': {'timeout': ClientTimeout(
-        total=None, sock_connect=_CONNECT_S, sock_read=_SILENCE_S)}}
 
 
 def _is_web(url: str) -> bool:
@@ -142,37 +135,40 @@ def _of_input(text: str) -> Iterator[Source]:
     try:
         fs, path = file_system(text)
     except Unreachable as error:
-        if _is_glob(text) or not _is_recording_name(text):
+        if _wild_characters(text) or not _is_recording_name(text):
             raise
         yield _unreachable(text, error)
         return
-    if _is_glob(path) and not os.path.exists(path):
-        listed = _listed(text, lambda: fs.glob(path, detail=True))
-        names = [name for name in listed
-                 if PurePosixPath(name).name != _BAG and not _is_hidden_to(path, name)
-                 and not _is_of_fleet(fs, name)]
-        if not names:
-            raise UserError(f'{text}: matches nothing')
-        for name in sorted(names):
-            info = listed[name]
-            if info['type'] == 'directory':
-                yield from _of_folder(fs, name, may_be_empty=True)
-            else:
-                yield _of_info(fs, name, info)
-    elif _is_special(path):
-        yield look_up(fs, path, text)
+    is_here = os.path.exists(path)
+    if _wild_characters(path) and not is_here:
+        yield from _of_glob(text, fs, path)
+    elif is_here and not (os.path.isfile(path) or os.path.isdir(path)):
+        # A pipe or a device may never end.
+        yield look_up(fs, path)
     elif _is_recording_name(path) and not os.path.isdir(path):
         rows = _manifest_rows(text, fs, path)
-        yield from [look_up(fs, path, text)] if rows is None else _of_manifest(text, rows)
+        yield from [look_up(fs, path)] if rows is None else _of_manifest(text, rows)
     elif _listed(text, lambda: fs.isdir(path)):
         yield from _of_folder(fs, path)
     else:
-        yield look_up(fs, path, text)
+        yield look_up(fs, path)
 
 
-def _is_special(path: str) -> bool:
-    """Return whether a path of this machine is a pipe or a device, which may never end."""
-    return os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path))
+def _of_glob(text: str, fs: Any, path: str) -> Iterator[Source]:
+    """Yield the recordings that match a glob; it names hidden ones, or does not match them."""
+    listed = _listed(text, lambda: fs.glob(path, detail=True))
+    wild = min(path.index(letter) for letter in _wild_characters(path))
+    fixed = path[:path.rfind('/', 0, wild) + 1]
+    names_hidden = '/.' in f'/{path.removeprefix(fixed)}'
+    names = [name for name in sorted(listed) if file_name(name) != _BAG
+             and (names_hidden or not _is_hidden(name, fixed)) and not _is_of_fleet(fs, name)]
+    if not names:
+        raise UserError(f'{text}: matches nothing')
+    for name in names:
+        if listed[name]['type'] == 'directory':
+            yield from _of_folder(fs, name, may_be_empty=True)
+        else:
+            yield _of_info(fs, name, listed[name])
 
 
 def _unreachable(url: str, error: UserError) -> Source:
@@ -181,9 +177,9 @@ def _unreachable(url: str, error: UserError) -> Source:
     return Source(plain, fault=one_line(error).removeprefix(f'{plain}: '))
 
 
-def _is_glob(path: str) -> bool:
-    """Return whether a path has characters of a glob; in a web address only * is one."""
-    return bool(set(path) & (set('*') if '://' in path else _GLOB))
+def _wild_characters(path: str) -> set[str]:
+    """Return the characters of a glob in a path; in a web address only * is one."""
+    return set(path) & set('*' if '://' in path else '*?[')
 
 
 def file_name(path: str) -> str:
@@ -216,38 +212,26 @@ def _is_of_fleet(fs: Any, name: str) -> bool:
 def _of_folder(fs: Any, folder: str, may_be_empty: bool = False) -> Iterator[Source]:
     """Yield the recordings in a folder, those of its folders too; a bag is one recording."""
     files = _listed(folder, lambda: fs.find(folder, detail=True))
-    bags = {name.rpartition('/')[0] for name in files
-            if PurePosixPath(name).name == _BAG and not _is_hidden(name, folder)}
-    by_bag: dict[str, dict[str, Any]] = {bag: {} for bag in sorted(bags)}
-    count = 0
+    bags: dict[str, dict[str, Any]] = {name.rpartition('/')[0]: {} for name in sorted(files)
+        if file_name(name) == _BAG and not _is_hidden(name, folder)}
+    count = len(bags)
     for name in sorted(files):
-        parent = next((above for above in _folders(name) if above in bags), None)
-        if parent is not None:
-            by_bag[parent][name] = files[name]
+        bag = next((above for above in _folders(name) if above in bags), None)
+        if bag is not None:
+            bags[bag][name] = files[name]
         elif _is_recording_name(name) and not _is_hidden(name, folder) \
                 and not _is_of_fleet(fs, name):
             count += 1
             yield _of_info(fs, name, files[name])
-    for bag, content in by_bag.items():
-        count += 1
-        # A web server does not say that this is a folder.
-        yield Source(_url(fs, bag), fault=_WEB_BAG) if _is_web(bag) else _of_bag(fs, bag, content)
+    for bag, content in bags.items():
+        yield _of_bag(fs, bag, content)
     if not count and not may_be_empty:
         raise UserError(f'{folder}: has no recording (*{", *".join(_ENDINGS)}, a bag or a table)')
 
 
 def _is_hidden(name: str, folder: str) -> bool:
     """Return whether a file lies in a hidden folder below a folder, or is hidden itself."""
-    below = name.removeprefix(folder.rstrip('/'))
-    return any(part.startswith('.') for part in below.split('/'))
-
-
-def _is_hidden_to(glob: str, name: str) -> bool:
-    """Return whether a file is hidden to a glob, which may ask for hidden ones."""
-    parts = glob.split('/')
-    wild = next(i for i, part in enumerate(parts) if _is_glob(part))
-    return not any(part.startswith('.') for part in parts[wild:]) and \
-        _is_hidden(name, '/'.join(parts[:wild]))
+    return '/.' in f'/{name.removeprefix(folder).lstrip("/")}'
 
 
 def _folders(name: str) -> Iterator[str]:
@@ -257,13 +241,13 @@ def _folders(name: str) -> Iterator[str]:
         yield name
 
 
-def look_up(fs: Any, path: str, url: str) -> Source:
+def look_up(fs: Any, path: str) -> Source:
     """Look up one recording."""
     try:
         info = fs.info(path)
         if info['type'] == 'directory':
             files = fs.find(path, detail=True)
-            if not any(PurePosixPath(name).name == _BAG for name in files):
+            if _BAG not in map(file_name, files):
                 return Source(_url(fs, path), fault=f'is a folder without {_BAG}, not a recording')
             return _of_bag(fs, path, files)
         return _of_info(fs, path, info)
@@ -372,15 +356,10 @@ def _manifest_rows(text: str, fs: Any, path: str) -> dict[int, dict[str, str]] |
     try:
         if suffix == '.csv':
             with fs.open(path, 'r', encoding='utf-8-sig', newline='') as file:
-                begin, head = next(((number, line) for number, line in enumerate(file, 1)
-                                    if line.strip() and not _is_comment(line)), (0, ''))
-                delimiter = max(_DELIMITERS, key=head.count)
-                names = [name.strip().lower()
-                         for name in next(csv.reader([head], delimiter=delimiter), [])]
-                return _csv_rows(text, names, begin, csv.reader(file, delimiter=delimiter)) \
-                    if 'url' in names else None
+                return _csv_rows(text, file)
         if suffix in ('.parquet', '.pq'):
-            return _parquet_rows(fs, path)
+            with fs.open(path, 'rb') as file:
+                return _parquet_rows(file)
     except UserError:
         raise
     except Exception:
@@ -389,47 +368,46 @@ def _manifest_rows(text: str, fs: Any, path: str) -> dict[int, dict[str, str]] |
     return None
 
 
-def _is_comment(line: str) -> bool:
-    """Return whether a line of a manifest is a comment."""
-    return line.lstrip().startswith('#')
-
-
-def _csv_rows(text: str, names: list[str], begin: int, rows: Any) -> dict[int, dict[str, str]]:
-    """Return the rows of a manifest below its header in line `begin`, by number and column."""
-    result = {}
-    for cells in rows:
-        if not any(map(str.strip, cells)) or _is_comment(cells[0]):
-            continue
-        number = begin + rows.line_num
-        if len(cells) != len(names):
-            raise UserError(f'{text}: row {number}: {len(cells)} columns, expected {len(names)}')
-        result[number] = {name: cell.strip() for name, cell in zip(names, cells)}
+def _csv_rows(text: str, file: Iterable[str]) -> dict[int, dict[str, str]] | None:
+    """Return the rows of a manifest, by line and column; None for a recording."""
+    lines = iter(file)
+    begin, head = next(((number, line) for number, line in enumerate(lines, 1)
+                        if line.strip() and not line.lstrip().startswith('#')), (0, ''))
+    delimiter = max(_DELIMITERS, key=head.count)
+    names = [name.strip().lower() for name in next(csv.reader([head], delimiter=delimiter), [])]
+    if 'url' not in names:
+        return None
+    result, reader = {}, csv.reader(lines, delimiter=delimiter)
+    for cells in reader:
+        if any(map(str.strip, cells)) and not cells[0].lstrip().startswith('#'):
+            number = begin + reader.line_num
+            if len(cells) != len(names):
+                raise UserError(
+                    f'{text}: row {number}: {len(cells)} columns, expected {len(names)}')
+            result[number] = dict(zip(names, map(str.strip, cells)))
     return result
 
 
-def _parquet_rows(fs: Any, path: str) -> dict[int, dict[str, str]] | None:
-    """Return the rows of a manifest by number; None for a recording."""
+def _parquet_rows(file: Any) -> dict[int, dict[str, str]] | None:
+    """Return the rows of a manifest by number and column; None for a recording."""
     from pyarrow import parquet
-    with fs.open(path, 'rb') as file:
-        content = parquet.ParquetFile(file)
-        if 'url' not in content.schema_arrow.names:
-            return None
-        names = [name for name in ('url', *_MANIFEST_COLUMNS)
-                 if name in content.schema_arrow.names]
-        rows = content.read(names).to_pylist()
-    return {number: {name: '' if value is None else _text(value) for name, value in row.items()}
-            for number, row in enumerate(rows, 1)}
+    content = parquet.ParquetFile(file)
+    names = [name for name in _MANIFEST_COLUMNS if name in content.schema_arrow.names]
+    if 'url' not in names:
+        return None
+    return {number: {name: _text(value) for name, value in row.items()}
+            for number, row in enumerate(content.read(names).to_pylist(), 1)}
 
 
 def _text(value: Any) -> str:
     """Return a value of a manifest as text; a column with empty cells has floats."""
-    if isinstance(value, float):
-        return '' if math.isnan(value) else str(int(value)) if value.is_integer() else str(value)
-    return value.isoformat() if isinstance(value, datetime) else str(value)
+    if value is None or value != value:
+        return ''
+    return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
 
 
-def _of_manifest(text: str, rows: dict[int, dict[str, str]]) -> list[Source]:
-    """Return the recordings that a manifest lists."""
+def _of_manifest(text: str, rows: dict[int, dict[str, str]]) -> Iterable[Source]:
+    """Return the recordings that a manifest lists, each once."""
     folder = text.rpartition('/')[0]
     if not rows:
         raise UserError(f'{text}: the manifest has no row below its header')
@@ -441,34 +419,24 @@ def _of_manifest(text: str, rows: dict[int, dict[str, str]]) -> list[Source]:
                             'for example 2026-11-01T10:00:00Z')
 
     def source(row: dict[str, str]) -> Source:
-        params = row.get('params', '')
-        if set(params) & set('/.'):
-            params = _beside(folder, params)
-        url = _beside(folder, row['url'])
+        url, params = _beside(folder, row['url']), row.get('params', '')
         try:
-            recorded = look_up(*file_system(url), row['url'])
+            recorded = look_up(*file_system(url))
         except UserError as error:
             recorded = _unreachable(url, error)
         serial = row.get('serial', '')
-        return replace(recorded, serial='' if serial == NO_UNIT else serial, params=params,
+        return replace(recorded, serial='' if serial == NO_UNIT else serial,
+                       params=_beside(folder, params) if set(params) & set('/.') else params,
                        date=as_date(row.get('date', '')) or '')
 
+    result: dict[str, Source] = {}
     with ThreadPoolExecutor(_THREADS) as pool:
-        return _once(text, zip(rows, pool.map(source, rows.values())))
-
-
-def _once(text: str, sources: Iterable[tuple[int, Source]]) -> list[Source]:
-    """Return the recordings of a manifest's rows, each once, with what any row states of it."""
-    first: dict[str, tuple[int, Source]] = {}
-    for number, source in sources:
-        before, earlier = first.get(source.url, (number, source))
-        if earlier.serial and source.serial not in ('', earlier.serial):
-            raise UserError(f'{text}: rows {before} and {number}: the serial of {source.url} is '
-                            f'{earlier.serial} and {source.serial}, expected one')
-        first[source.url] = (before if earlier.serial else number, replace(
-            source, serial=source.serial or earlier.serial, params=source.params or earlier.params,
-            date=source.date or earlier.date))
-    return [source for _, source in first.values()]
+        for number, found in zip(rows, pool.map(source, rows.values())):
+            first = result.setdefault(found.url, found)
+            if found.serial and found.serial != first.serial:
+                raise UserError(f'{text}: row {number}: the serial of {found.url} is '
+                                f'{found.serial}, but an earlier row says {first.serial!r}')
+    return result.values()
 
 
 def is_manifest(path: Path) -> bool:
@@ -502,13 +470,10 @@ def _stated(source: Source) -> Stated:
         stated = Stated()
         if path.lower().endswith('.csv'):
             head = fs.cat_file(path, 0, _HEAD_BYTES).decode('utf-8', 'replace')
-            comments = dict(line[1:].partition(':')[::2] for line in head.splitlines()
-                            if line.startswith('#'))
-            texts = {name.strip(): text.strip() for name, text in comments.items()}
+            texts = dict(_COMMENT.findall(head))
             stated = Stated(texts.get('serial', ''), as_date(texts.get('date', '')) or '')
         if not all(stated) and '://' not in source.url:
-            with closing(recording.blocks(path, 1)) as blocks:
-                first = next(blocks)
+            first = next(recording.blocks(path, 1))
             stated = Stated(first.stream_info.texts.get('serial', ''), begin_of(first)[0])
         return stated
     except Exception:
