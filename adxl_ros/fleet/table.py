@@ -1,27 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The table of a fleet as arrays, in the order of units and time, and what it says.
+The table of a fleet in the order of units and time, and what it says.
 
 Each quantity has trends, a population and outliers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import os
-from typing import Any
 
 from adxl_ros.errors import install_hint, UserError
-from adxl_ros.fleet.report.populations import (
+from adxl_ros.fleet.populations import (
     bad_batch,
     BadBatch,
     MIN_UNITS,
     random_effects,
     RandomEffects,
 )
-from adxl_ros.fleet.report.trends import (
+from adxl_ros.fleet.trends import (
     are_outliers,
     claimed,
     fit_trends,
@@ -33,16 +32,13 @@ from adxl_ros.fleet.report.trends import (
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.population import Population
 import numpy as np
+import pandas as pd
 
-_TEXTS = ('url', 'hash', 'serial', 'outcome', 'refusal', 'refused_by', 'calibration_id', 'status',
-          'report', 'version')
+_TEXTS = ['url', 'hash', 'serial', 'outcome', 'refusal', 'refused_by', 'calibration_id', 'status',
+          'report', 'version']
 """Columns of texts that the page uses."""
-_LISTS = ('effects', 'groups')
-"""Columns of lists that the page uses."""
-_NUMBERS = ('duration_s', 'size_bytes', 'calibration_age_days', 'gap_before_mps2',
-            'gap_before_low_mps2', 'gap_before_high_mps2', 'gap_after_mps2', 'gap_floor_mps2',
-            'seconds', 'memory_mb')
-"""Columns of numbers that the page uses, beside those of the quantities."""
+_OTHERS = ['date', 'effects', 'calibration_age_days', 'gap_floor_mps2', 'seconds']
+"""Columns that the page uses, beside those of the quantities."""
 _YEAR = np.timedelta64(31_557_600_000_000, 'us')
 """A year of 365.25 days."""
 TOLERANCE_MG = 3.5
@@ -60,9 +56,8 @@ class Quantity:
     unit: str  # Unit of the column
     shown_unit: str  # Unit on the page
     factor: float  # Factor from the column's unit to that of the page
-    std_column: str = ''  # Column of its standard deviation; empty where there is an interval
-    # Columns of both ends of its 90 % interval; empty where there is a standard deviation
-    interval_columns: tuple[str, ...] = ()
+    # Column of its standard deviation, or columns of both ends of its 90 % interval
+    error_columns: tuple[str, ...]
     is_coefficient: bool = True  # Whether the units of a fleet have a population of it
 
     @property
@@ -75,8 +70,7 @@ class Quantity:
 class FleetTable:
     """The recordings of n rows, in the order of serial numbers and dates."""
 
-    # Values by column, (n,): numbers are float with NaN, texts are '' where there is none
-    columns: dict[str, np.ndarray]
+    frame: pd.DataFrame  # The columns that the page uses; a text is '' where there is none
     serials: tuple[str, ...]  # Serial numbers of the units, (m,)
     unit: np.ndarray  # Number of the unit of each row, (n,); −1 without a serial number
     years: np.ndarray  # Dates in years since 1970, (n,); NaN without a date
@@ -88,7 +82,7 @@ class FleetTable:
         return len(self.unit)
 
     def __getitem__(self, column: str) -> np.ndarray:
-        return self.columns[column]
+        return self.frame[column].to_numpy()
 
     def rows_of(self, unit: int) -> np.ndarray:
         """Return the numbers of the rows of a unit, in the order of time."""
@@ -98,15 +92,11 @@ class FleetTable:
     def recordings(self, quantity: Quantity) -> tuple[np.ndarray, Recordings]:
         """Return a quantity in the recordings that have it."""
         value = self[quantity.column]
-        if quantity.std_column:
-            std = self[quantity.std_column]
-        else:
-            low, high = (self[name] for name in quantity.interval_columns)
-            std = (high - low) / (2 * Z_90)
+        low, *high = (self[name] for name in quantity.error_columns)
+        std = (high[0] - low) / (2 * Z_90) if high else low
         used = np.isfinite(value) & np.isfinite(self.years) & (self.unit >= 0) & self.first
         rows = np.flatnonzero(used & np.isfinite(std) & (std >= 0))
-        table = Recordings(self.unit, self.period, self.years, value, std)
-        return rows, table[rows]
+        return rows, Recordings(self.unit, self.period, self.years, value, std)[rows]
 
 
 def read(path: str | os.PathLike) -> FleetTable:
@@ -116,98 +106,52 @@ def read(path: str | os.PathLike) -> FleetTable:
         import pyarrow.parquet as pq
     except ImportError:
         raise UserError(f'{path}: Parquet needs pyarrow; {install_hint("pyarrow")}') from None
-    names = [*_TEXTS, *_LISTS, *_NUMBERS, 'date', *_quantity_columns()]
+    numbers = [name for quantity in quantities(None)
+               for name in (quantity.column, *quantity.error_columns)]
     try:
-        return from_arrow(pq.read_table(path, columns=list(dict.fromkeys(names))))
+        frame = pq.read_table(path, columns=[*_TEXTS, *_OTHERS, *numbers]).to_pandas()
     except (OSError, KeyError, pa.ArrowException) as error:
         reason = str(error).splitlines()[0]
         raise UserError(f'{path}: not a table of `fleet`: {reason}') from None
-
-
-def from_arrow(table: Any) -> FleetTable:
-    """Return the recordings of a table of pyarrow."""
-    columns: dict[str, np.ndarray] = {}
-    for name in _TEXTS:
-        columns[name] = np.array([text or '' for text in table[name].to_pylist()], object)
-    for name in _LISTS:
-        lists = table[name].to_pylist()
-        columns[name] = np.empty(len(lists), object)
-        columns[name][:] = [value or [] for value in lists]
-    for name in dict.fromkeys((*_NUMBERS, *_quantity_columns())):
-        columns[name] = np.asarray(table[name].to_numpy(zero_copy_only=False), float)
-    date = table['date'].to_numpy().astype('datetime64[us]')
-    serial = columns['serial'].astype(str) if len(table) else np.zeros(0, str)
-    order = np.lexsort((date, serial))
-    columns = {name: values[order] for name, values in columns.items()}
-    date, serial = date[order], serial[order]
-    serials, unit = np.unique(serial, return_inverse=True)
+    frame[_TEXTS] = frame[_TEXTS].astype(object).fillna('')
+    frame = frame.sort_values(['serial', 'date'], kind='stable', ignore_index=True)
+    serials, unit = np.unique(frame['serial'].to_numpy(str), return_inverse=True)
     if len(serials) and not serials[0]:
         serials, unit = serials[1:], unit - 1
-    years = np.where(np.isnat(date), np.nan, (date - np.datetime64(0, 'us')) / _YEAR)
-    return FleetTable(columns, tuple(map(str, serials)), unit, years,
-                      _periods(unit, columns['calibration_id']),
-                      _first_of_content(unit, columns['hash']))
-
-
-def _periods(unit: np.ndarray, calibration: np.ndarray) -> np.ndarray:
-    """Count the periods of units between changes of their calibration, (n,)."""
-    begins = np.zeros(len(unit), bool)
-    last_unit, last_calibration = -2, ''
-    for i, (number, name) in enumerate(zip(unit, calibration)):
-        begins[i] = number != last_unit or bool(name and last_calibration
-                                                and name != last_calibration)
-        if number != last_unit or name:
-            last_calibration = name
-        last_unit = number
-    return np.cumsum(begins) - 1
-
-
-def _first_of_content(unit: np.ndarray, content: np.ndarray) -> np.ndarray:
-    """Mark rows whose content is new to the unit, (n,) bool; a copy says nothing twice."""
-    seen: set[tuple[int, str]] = set()
-    result = np.ones(len(unit), bool)
-    for i, key in enumerate(zip(unit, content)):
-        result[i] = not key[1] or key not in seen
-        seen.add(key)
-    return result
-
-
-def _quantity_columns() -> Iterator[str]:
-    """Name the columns of all quantities."""
-    for quantity in quantities(None):
-        yield from filter(None, (quantity.column, quantity.std_column,
-                                 *quantity.interval_columns))
+    date = frame['date'].dt.tz_localize(None).to_numpy('datetime64[us]')
+    # A period ends where the unit is calibrated again, and lasts where none is stated.
+    named = frame['calibration_id'].mask(frame['calibration_id'] == '').groupby(unit).ffill()
+    last = named.shift()
+    begins = (np.diff(unit, prepend=-2) != 0) | (
+        named.notna() & last.notna() & (named != last)).to_numpy(bool)
+    # A copy says nothing twice.
+    first = ~frame.assign(unit=unit).duplicated(['unit', 'hash']) | (frame['hash'] == '')
+    return FleetTable(frame, tuple(map(str, serials)), unit,
+                      (date - np.datetime64(0, 'us')) / _YEAR, np.cumsum(begins) - 1,
+                      first.to_numpy(bool))
 
 
 def quantities(table: FleetTable | None) -> tuple[Quantity, ...]:
     """Return all quantities of a table."""
-    listed = [Quantity(
-        'gap_before_mps2', 'gap', 'm/s²', 'mg', MG, is_coefficient=False,
-        interval_columns=('gap_before_low_mps2', 'gap_before_high_mps2'))]
+    listed = [Quantity('gap_before_mps2', 'gap', 'm/s²', 'mg', MG,
+                       ('gap_before_low_mps2', 'gap_before_high_mps2'), is_coefficient=False)]
     for axis in AXES:
-        mg_per_v = 1e3 / _median_scale(table, axis)
-        listed.append(Quantity(f'zero_g_{axis}_v', f'zero-g {axis}', 'V', 'mg', mg_per_v,
-                               f'zero_g_std_{axis}_v'))
-        listed.append(Quantity(f'scale_{axis}_v_per_g', f'scale factor {axis}', 'V/g', 'mg/g',
-                               mg_per_v, f'scale_std_{axis}_v_per_g'))
-    for axis in AXES:
-        listed.append(_noise_term('n', axis, f'white noise {axis}', 'mps2_per_rthz', '/√Hz'))
-        listed.append(_noise_term('b', axis, f'bias instability {axis}', 'mps2', ''))
-        listed.append(_noise_term('k', axis, f'random walk {axis}', 'mps2_per_rts', '/√s'))
+        scales = np.zeros(0) if table is None else table[f'scale_{axis}_v_per_g']
+        scales = scales[scales > 0]
+        mg_per_v = 1e3 / float(np.median(scales)) if len(scales) else 1e3
+        listed += [
+            Quantity(f'zero_g_{axis}_v', f'zero-g {axis}', 'V', 'mg', mg_per_v,
+                     (f'zero_g_std_{axis}_v',)),
+            Quantity(f'scale_{axis}_v_per_g', f'scale factor {axis}', 'V/g', 'mg/g', mg_per_v,
+                     (f'scale_std_{axis}_v_per_g',))]
+    listed += [
+        Quantity(f'noise_{letter}_{axis}_{name}', f'{label} {axis}', f'm/s²{per}', f'µg{per}',
+                 1e6 / G0_MPS2, (f'noise_{letter}_low_{axis}_{name}',
+                                 f'noise_{letter}_high_{axis}_{name}'))
+        for axis in AXES for letter, label, name, per in (
+            ('n', 'white noise', 'mps2_per_rthz', '/√Hz'), ('b', 'bias instability', 'mps2', ''),
+            ('k', 'random walk', 'mps2_per_rts', '/√s'))]
     return tuple(listed)
-
-
-def _median_scale(table: FleetTable | None, axis: str) -> float:
-    """Return the usual scale factor of an axis, V/g; 1 where no recording has one."""
-    values = np.zeros(0) if table is None else table[f'scale_{axis}_v_per_g']
-    values = values[values > 0]
-    return float(np.median(values)) if len(values) else 1.0
-
-
-def _noise_term(letter: str, axis: str, label: str, unit_name: str, per: str) -> Quantity:
-    interval = tuple(f'noise_{letter}_{end}_{axis}_{unit_name}' for end in ('low', 'high'))
-    return Quantity(f'noise_{letter}_{axis}_{unit_name}', label, f'm/s²{per}', f'µg{per}',
-                    1e6 / G0_MPS2, interval_columns=interval)
 
 
 @dataclass(frozen=True)
@@ -248,8 +192,8 @@ def analyse(table: FleetTable) -> list[QuantityResult]:
     for quantity, rows, recordings in measured:
         distance, freedom = outlier_distances(recordings)
         is_outlier = are_outliers(distance, freedom, values)
-        kept = recordings[~is_outlier]
-        trends, units = fit_trends(kept), np.unique(table.unit[rows[~is_outlier]])
+        trends = fit_trends(recordings[~is_outlier])
+        units = np.unique(table.unit[rows[~is_outlier]])
         population, batch = None, None
         if quantity.is_coefficient and len(units) >= MIN_UNITS:
             batch = bad_batch([table.serials[unit] for unit in units], trends.level,
@@ -259,7 +203,15 @@ def analyse(table: FleetTable) -> list[QuantityResult]:
         none = np.zeros(len(units), bool)
         results.append(QuantityResult(quantity, rows, recordings, distance, is_outlier, units,
                                       trends, none, np.zeros(len(units)), population, batch))
-    return _with_claims(results)
+    if not results:
+        return []
+    # The false discovery rate is controlled over all slopes together.
+    is_claimed = claimed(np.concatenate([result.trends.p_values for result in results]))
+    factor = interval_factor(np.concatenate([r.trends.freedom for r in results]), is_claimed)
+    splits = np.cumsum([len(result.units) for result in results])[:-1]
+    return [replace(result, is_claimed=claims, half_width=factors * result.trends.slope_std)
+            for result, claims, factors in zip(results, np.split(is_claimed, splits),
+                                               np.split(factor, splits))]
 
 
 def _population(trends: Trends, batch: BadBatch | None, tests: int) -> RandomEffects:
@@ -273,18 +225,6 @@ def _population(trends: Trends, batch: BadBatch | None, tests: int) -> RandomEff
     return RandomEffects(of_others.pooled, trends.level, trends.level_std, is_far_out)
 
 
-def _with_claims(results: Sequence[QuantityResult]) -> list[QuantityResult]:
-    """Control the false discovery rate over all slopes together."""
-    if not results:
-        return []
-    splits = np.cumsum([len(result.units) for result in results])[:-1]
-    is_claimed = claimed(np.concatenate([result.trends.p_values for result in results]))
-    factor = interval_factor(np.concatenate([r.trends.freedom for r in results]), is_claimed)
-    return [replace(result, is_claimed=claims, half_width=factors * result.trends.slope_std)
-            for result, claims, factors in zip(results, np.split(is_claimed, splits),
-                                               np.split(factor, splits))]
-
-
 def population_of(results: Sequence[QuantityResult], name: str) -> Population:
     """Return what the units of a fleet are like."""
     return Population(name, {
@@ -294,11 +234,7 @@ def population_of(results: Sequence[QuantityResult], name: str) -> Population:
 
 def far_out(results: Sequence[QuantityResult], serials: Sequence[str]
             ) -> list[dict[str, str | float]]:
-    """
-    Return the units that are not of the population, the farthest first.
-
-    serials: serial numbers of the units, (m,).
-    """
+    """Return the units that are not of the population, the farthest first."""
     units: list[dict[str, str | float]] = [
         {'serial': serials[result.units[i]], 'coefficient': result.quantity.column,
          'value': float(result.population.estimates[i]),

@@ -14,7 +14,7 @@ from typing import Any
 
 from adxl_ros.files import population_file
 from adxl_ros.files.atomic_write import write_text
-from adxl_ros.fleet.report.findings import (
+from adxl_ros.fleet.findings import (
     effect_matrix,
     EffectMatrix,
     number,
@@ -22,7 +22,7 @@ from adxl_ros.fleet.report.findings import (
     State,
     UnitState,
 )
-from adxl_ros.fleet.report.fleet_table import (
+from adxl_ros.fleet.table import (
     analyse,
     far_out,
     FleetTable,
@@ -32,7 +32,7 @@ from adxl_ros.fleet.report.fleet_table import (
     read,
     TOLERANCE_MG,
 )
-from adxl_ros.fleet.report.trends import FALSE_DISCOVERY_RATE, Scatter
+from adxl_ros.fleet.trends import FALSE_DISCOVERY_RATE, Scatter
 from adxl_ros.fleet.row import PAGE, POPULATION, reason_kind, TABLE, UNITS
 from adxl_ros.model.constants import AXES, Z_90
 from adxl_ros.report import figures as plotly, page as html_page
@@ -259,7 +259,7 @@ def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> 
     if effects.effects:
         figures['matrix'] = _matrix_figure(table, effects)
     counts = Counter(unit.state for unit in units)
-    return html_page.render('adxl_ros.fleet.report', 'fleet.html', {
+    return html_page.render('adxl_ros.fleet', 'fleet.html', {
         'title': 'Fleet', 'about': _about(table), 'badge': _badge(table, units, counts),
         'tiles': _tiles(table, units, counts), 'shown': _SHOWN, 'figures': figures,
         'units': [_unit_row(unit, folder) for unit in units],

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from adxl_ros.fleet.report.populations import moderated
+from adxl_ros.fleet.populations import moderated
 from adxl_ros.model.constants import MAD_TO_STD
 import numpy as np
 import scipy

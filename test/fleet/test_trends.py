@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Slopes of units: least squares, the share of false claims, weak drifts, and recalibrations."""
 
-from adxl_ros.fleet.report.trends import (
+from adxl_ros.fleet.trends import (
     are_outliers,
     claimed,
     fit_trends,
