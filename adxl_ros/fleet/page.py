@@ -5,10 +5,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-import csv
+from collections.abc import Iterable, Sequence
 from datetime import datetime, timedelta, timezone
-import io
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -28,15 +27,17 @@ from adxl_ros.fleet.table import (
     FleetTable,
     MG,
     population_of,
+    Quantity,
     QuantityResult,
     read,
     TOLERANCE_MG,
 )
-from adxl_ros.fleet.trends import FALSE_DISCOVERY_RATE, Scatter
+from adxl_ros.fleet.trends import FALSE_DISCOVERY_RATE
 from adxl_ros.fleet.row import PAGE, POPULATION, reason_kind, TABLE, UNITS
 from adxl_ros.model.constants import AXES, Z_90
 from adxl_ros.report import figures as plotly, page as html_page
 import numpy as np
+import pandas as pd
 import scipy
 
 _TREND_HEIGHT = 190
@@ -85,15 +86,12 @@ _SENTENCES = {
 
 def date_text(year: float) -> str:
     """Return the day of a date in years since 1970; '-' for NaN."""
-    return f'{_date(year):%Y-%m-%d}' if np.isfinite(year) else '-'
+    return _stamps([year])[0][:10] if np.isfinite(year) else '-'
 
 
-def _date(year: float) -> datetime:
-    return _EPOCH + timedelta(days=float(year) * _DAYS_PER_YEAR)
-
-
-def _stamps(years: np.ndarray) -> list[str]:
-    return [f'{_date(year):%Y-%m-%d %H:%M}' for year in years]
+def _stamps(years: Iterable[float]) -> list[str]:
+    return [f'{_EPOCH + timedelta(days=float(year) * _DAYS_PER_YEAR):%Y-%m-%d %H:%M}'
+            for year in years]
 
 
 def _trend_figure(table: FleetTable, result: QuantityResult, unit: int) -> plotly.Figure:
@@ -120,48 +118,35 @@ def _trend_figure(table: FleetTable, result: QuantityResult, unit: int) -> plotl
     marks = [{'type': 'line', 'x0': stamp, 'x1': stamp, 'yref': 'paper', 'y0': 0, 'y1': 1,
               'line': {'color': plotly.QUIET_COLOUR, 'width': 1.2, 'dash': 'dash'}}
              for stamp in _stamps(calibration_years(table, unit))]
+    title = result.quantity.shown_unit + ' from the mean' * _is_relative(result.quantity)
     return plotly.figure(traces, _TREND_HEIGHT, showlegend=False, shapes=marks,
                          xaxis={'type': 'date', 'nticks': 3, 'tickangle': 0,
                                 'tickformat': '%b %Y'},
-                         yaxis={'title': {'text': _axis_title(result)}, 'nticks': 5})
+                         yaxis={'title': {'text': title}, 'nticks': 5})
 
 
 def _origin(result: QuantityResult, unit: int) -> float:
     """Return the value that a plot has at 0: the mean of a unit where units differ by far more."""
     place = result.place_of(unit)
     return float(result.trends.level[place]) \
-        if _is_relative(result) and place is not None else 0.0
+        if _is_relative(result.quantity) and place is not None else 0.0
 
 
-def _is_relative(result: QuantityResult) -> bool:
-    return result.quantity.is_coefficient and result.quantity.is_force
-
-
-def _axis_title(result: QuantityResult) -> str:
-    unit = result.quantity.shown_unit
-    return f'{unit} from the mean' if _is_relative(result) else unit
+def _is_relative(quantity: Quantity) -> bool:
+    return quantity.is_coefficient and quantity.is_force
 
 
 def calibration_years(table: FleetTable, unit: int) -> np.ndarray:
-    """Return when the calibrations of a unit changed."""
+    """Return when the calibrations of a unit were made."""
     rows = table.rows_of(unit)
-    rows = rows[np.isfinite(table.years[rows])]
-    if not len(rows):
-        return np.zeros(0)
-    begins = np.flatnonzero(np.diff(table.period[rows], prepend=-1))
-    age = table['calibration_age_days'][rows]
-    years = []
-    for i, begin in enumerate(begins):
-        end = begins[i + 1] if i + 1 < len(begins) else len(rows)
-        dated = begin + np.flatnonzero(np.isfinite(age[begin:end]))
-        if len(dated):
-            years.append(table.years[rows[dated[0]]] - age[dated[0]] / _DAYS_PER_YEAR)
-        elif i:
-            years.append(table.years[rows[begin]])
-    first = table.years[rows[0]]
+    made = table.years[rows] - table['calibration_age_days'][rows] / _DAYS_PER_YEAR
+    dated = np.flatnonzero(np.isfinite(made))
+    if not len(dated):
+        return made[dated]
+    made = made[dated[np.unique(table.period[rows[dated]], return_index=True)[1]]]
+    first, last = np.nanmin(table.years[rows]), np.nanmax(table.years[rows])
     # A calibration long before the first recording would compress the plot.
-    return np.array([year for year in years
-                     if year > first - 0.1 * max(table.years[rows[-1]] - first, 0.01)])
+    return made[made > first - 0.1 * max(last - first, 0.01)]
 
 
 def _lines(result: QuantityResult, unit: int, times: np.ndarray, periods: np.ndarray
@@ -228,22 +213,17 @@ def write(folder: Path) -> list[Path]:
 
 def _units_csv(results: Sequence[QuantityResult], serials: Sequence[str]) -> str:
     """Return the estimates of all units, with and without the population."""
-    text = io.StringIO()
-    rows = csv.writer(text, lineterminator='\n')
-    rows.writerow(['serial', 'coefficient', 'unit', 'estimate', 'std', 'shrunken',
-                   'shrunken_std', 'distance', 'is_far_out'])
+    columns = ('serial', 'coefficient', 'unit', 'estimate', 'std', 'shrunken', 'shrunken_std',
+               'distance', 'is_far_out')
+    rows: list[tuple] = []
     for result in results:
-        population = result.population
-        if population is None:
-            continue
-        shrunken, shrunken_std = population.shrunken()
-        columns = (population.estimates, population.std, shrunken, shrunken_std,
-                   population.distances())
-        for i, unit in enumerate(result.units):
-            rows.writerow([serials[unit], result.quantity.column, result.quantity.unit,
-                           *(f'{values[i]:.9g}' for values in columns),
-                           str(bool(population.is_far_out[i])).lower()])
-    return text.getvalue()
+        if (population := result.population) is not None:
+            rows += zip([serials[unit] for unit in result.units], repeat(result.quantity.column),
+                        repeat(result.quantity.unit), population.estimates, population.std,
+                        *population.shrunken(), population.distances(),
+                        ['true' if far else 'false' for far in population.is_far_out])
+    return pd.DataFrame(rows, columns=columns).to_csv(
+        index=False, float_format='%.9g', lineterminator='\n')
 
 
 def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> str:
@@ -265,7 +245,9 @@ def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> 
         'units': [_unit_row(unit, folder) for unit in units],
         'without_unit': _rows_without_unit(table, folder),
         'without_unit_count': int((table.unit < 0).sum()),
-        'trends': [_trend_caption(i, unit, result) for i, (unit, result) in enumerate(plotted)],
+        'trends': [{'figure': f'trend-{i}', 'title': f'{unit.serial}: {result.quantity.label}',
+                    'text': f'{unit.drifts[0].text}.' if unit.drifts else 'No slope is claimed.'}
+                   for i, (unit, result) in enumerate(plotted)],
         'findings': [*_batches(results), *effects.findings], 'has_effects': bool(effects.effects),
         'judged': len(effects.units), 'populations': _population_rows(results),
         'far_out': _far_out_rows(distant, results),
@@ -359,12 +341,8 @@ def _rows_without_unit(table: FleetTable, folder: Path) -> list[dict[str, str]]:
 
 def _link(report: str, folder: Path) -> str:
     """Return the address of a single report: its page where there is one; empty for none."""
-    if not report:
-        return ''
-    for name in ('diagnose/report.html', 'report.html', 'fit/report.html', 'noise/report.html'):
-        if (folder / report / name).is_file():
-            return f'{report}/{name}'
-    return report if (folder / report).is_dir() else ''
+    return next((name for name in (f'{report}/report.html', report)
+                 if report and (folder / name).exists()), '')
 
 
 def _plotted_quantity(unit: UnitState, results: Sequence[QuantityResult]
@@ -375,49 +353,30 @@ def _plotted_quantity(unit: UnitState, results: Sequence[QuantityResult]
     return next((result for result in results if result.place_of(unit.unit) is not None), None)
 
 
-def _trend_caption(i: int, unit: UnitState, result: QuantityResult) -> dict[str, str]:
-    text = next((drift.text for drift in unit.drifts if drift.result is result), '')
-    return {'figure': f'trend-{i}', 'title': f'{unit.serial}: {result.quantity.label}',
-            'text': f'{text}.' if text else 'No slope is claimed.'}
-
-
 def _population_rows(results: Sequence[QuantityResult]) -> list[list[str]]:
     rows = []
     for result in results:
-        population, quantity = result.population, result.quantity
+        population, quantity, scatter = result.population, result.quantity, result.trends.scatter
         if population is None:
             continue
-        pooled = population.pooled
-        factor = quantity.factor
-        unit = quantity.shown_unit
-        is_noise = quantity.unit.startswith('m/s')
-        mean, std = (factor * value if is_noise else value
-                     for value in (pooled.mean, pooled.mean_std))
+        pooled, factor, unit = population.pooled, quantity.factor, quantity.shown_unit
+        shown = (factor, unit) if quantity.unit.startswith('m/s') else (1.0, quantity.unit)
+        mean, std = shown[0] * pooled.mean, shown[0] * pooled.mean_std
+        digits = int(np.clip(1 - np.floor(np.log10(std)), 0, 8)) if std > 0 else 4
+        # A scatter by calibrations that is nothing beside that of recordings is shown as nothing.
+        step = scatter.calibration if scatter.calibration > _NOTHING * scatter.recording else 0.0
         rows.append([
-            quantity.label,
-            f'{_value(mean, std)} ± {number(std, digits=2)} {unit if is_noise else quantity.unit}',
+            quantity.label, f'{mean:.{digits}f} ± {number(std, digits=2)} {shown[1]}',
             f'{number(factor * pooled.spread)} ({number(factor * pooled.spread_low)} to '
             f'{number(factor * pooled.spread_high)}) {unit}',
-            f'{_scatter(factor * result.trends.scatter.recording)} {unit}',
-            f'{_scatter(factor * _material(result.trends.scatter))} {unit}', str(pooled.units),
-            str(int(population.is_far_out.sum()))])
+            f'{_scatter(factor * scatter.recording)} {unit}', f'{_scatter(factor * step)} {unit}',
+            str(pooled.units), str(int(population.is_far_out.sum()))])
     return rows
 
 
 def _scatter(value: float) -> str:
     """Return a scatter; one that is too small to matter as its limit."""
     return f'< {_SMALLEST_SCATTER:g}' if 0 < value < _SMALLEST_SCATTER else number(value)
-
-
-def _material(scatter: Scatter) -> float:
-    """Return the scatter by calibrations; 0 where it is nothing beside that of recordings."""
-    return scatter.calibration if scatter.calibration > _NOTHING * scatter.recording else 0.0
-
-
-def _value(value: float, std: float) -> str:
-    """Return a value with the digits that its uncertainty leaves."""
-    digits = int(np.clip(2 - np.floor(np.log10(std)) - 1, 0, 8)) if std > 0 else 4
-    return f'{value:.{digits}f}'
 
 
 def _far_out_rows(distant: Sequence[dict[str, str | float]], results: Sequence[QuantityResult]
@@ -440,27 +399,21 @@ def _outlier_rows(table: FleetTable, results: Sequence[QuantityResult], folder: 
     outliers = [(float(result.distance[i]), result, i) for result in results
                 for i in np.flatnonzero(result.is_outlier)]
     outliers.sort(key=lambda item: -item[0])
-    rows = []
-    for distance, result, i in outliers[:_MOST_ROWS]:
-        row = result.rows[i]
-        rows.append({'serial': table.serials[table.unit[row]],
-                     'date': date_text(table.years[row]), 'quantity': result.quantity.label,
-                     'value': f'{number(result.quantity.factor * result.recordings.value[i])} '
-                     f'{result.quantity.shown_unit}', 'distance': number(distance),
-                     'url': str(table['url'][row]),
-                     'report': _link(str(table['report'][row]), folder)})
-    return rows
+    return [{'serial': table.serials[table.unit[row]], 'date': date_text(table.years[row]),
+             'quantity': quantity.label, 'distance': number(distance),
+             'value': f'{number(quantity.factor * result.recordings.value[i])} '
+             f'{quantity.shown_unit}',
+             'url': table['url'][row], 'report': _link(table['report'][row], folder)}
+            for distance, result, i in outliers[:_MOST_ROWS]
+            for row, quantity in [(result.rows[i], result.quantity)]]
 
 
 def _refusal_rows(table: FleetTable) -> list[list[str]]:
     """Return the reasons of refusals: how often, in how many units, and an example."""
-    rows = np.flatnonzero(table['outcome'] != 'done')
-    by_reason: dict[str, list[int]] = {}
-    for row in rows:
-        kind = reason_kind({name: str(table[name][row]) for name in ('refusal', 'outcome', 'url')})
-        by_reason.setdefault(kind, []).append(int(row))
-    ordered = sorted(by_reason.items(), key=lambda item: (-len(item[1]), item[0]))
+    failed = table.frame.assign(unit=table.unit)[table['outcome'] != 'done']
+    kinds = [reason_kind(row) for row in failed.to_dict('records')]
+    groups = sorted(failed.groupby(np.array(kinds, object)), key=lambda item: (-len(item[1]), item[0]))
     # A recording without a serial number is of no unit.
-    return [[str(len(numbers)), str(len({*table.unit[numbers].tolist()} - {-1})), reason,
-             str(table['refused_by'][numbers[0]]) or '-', str(table['url'][numbers[0]])]
-            for reason, numbers in ordered[:_MOST_ROWS]]
+    return [[str(len(group)), str(len({*group['unit']} - {-1})), kind,
+             group['refused_by'].iloc[0] or '-', group['url'].iloc[0]]
+            for kind, group in groups[:_MOST_ROWS]]

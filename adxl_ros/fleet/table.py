@@ -114,6 +114,7 @@ def read(path: str | os.PathLike) -> FleetTable:
         reason = str(error).splitlines()[0]
         raise UserError(f'{path}: not a table of `fleet`: {reason}') from None
     frame[_TEXTS] = frame[_TEXTS].astype(object).fillna('')
+    frame['effects'] = [[] if names is None else list(names) for names in frame['effects']]
     frame = frame.sort_values(['serial', 'date'], kind='stable', ignore_index=True)
     serials, unit = np.unique(frame['serial'].to_numpy(str), return_inverse=True)
     if len(serials) and not serials[0]:

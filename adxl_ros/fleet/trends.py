@@ -108,7 +108,9 @@ class Trends:
     period_time: np.ndarray
     period_value: np.ndarray
     period_std: np.ndarray
-    noise_ratio: np.ndarray  # Variance of each unit's scatter relative to that of all, (m,)
+    squares: np.ndarray  # Weighted squares of the residuals of each unit, (m,)
+    residual: np.ndarray  # Residuals over the expected scatter, (n,)
+    log_likelihood: float  # Restricted log-likelihood of the scatter
 
     @property
     def p_values(self) -> np.ndarray:
@@ -122,8 +124,7 @@ def fit_trends(recordings: Recordings) -> Trends:
     sums = _Sums.of(recordings)
     scatter = _shared_scatter(sums)
     fit = sums.fit(scatter)
-    widening = _widening(sums, fit, scatter)
-    scatter = replace(scatter, widening=widening)
+    widening = _widening(sums, fit)
     # A line takes two independent recordings, which are so many of the correlated ones.
     remaining = sums.counts - 2 * widening
     own_freedom = np.maximum(remaining, 0.0) * sums.has_slope / widening
@@ -131,28 +132,10 @@ def fit_trends(recordings: Recordings) -> Trends:
         ratio = np.where(own_freedom > 0, fit.squares / remaining, np.nan)
     variance, freedom = moderated(ratio, own_freedom)
     factor = np.sqrt(variance * widening)
-    return Trends(
-        scatter=scatter, level=fit.level, level_std=factor * fit.level_std, slope=fit.slope,
-        slope_std=factor * fit.slope_std,
-        freedom=np.where(sums.has_slope, freedom, np.nan),
-        period_time=fit.period_time, period_value=fit.period_value,
-        period_std=factor[sums.unit_of_period] * fit.period_std, noise_ratio=ratio)
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """Lines of the units for given variances."""
-
-    slope: np.ndarray
-    slope_std: np.ndarray
-    level: np.ndarray
-    level_std: np.ndarray
-    period_time: np.ndarray
-    period_value: np.ndarray
-    period_std: np.ndarray
-    squares: np.ndarray
-    log_likelihood: float
-    residual: np.ndarray
+    return replace(
+        fit, scatter=replace(scatter, widening=widening), level_std=factor * fit.level_std,
+        slope_std=factor * fit.slope_std, freedom=np.where(sums.has_slope, freedom, np.nan),
+        period_std=factor[sums.unit_of_period] * fit.period_std)
 
 
 @dataclass(frozen=True)
@@ -185,7 +168,7 @@ class _Sums:
                    centre_value, counts, starts, of_period,
                    np.flatnonzero(np.diff(of_period, prepend=-1)), has_slope)
 
-    def fit(self, scatter: Scatter) -> _Fit:
+    def fit(self, scatter: Scatter) -> Trends:
         """Fit the lines of all units for given variances, by generalised least squares."""
         step2, unit = scatter.calibration ** 2, self.recordings.unit
         weight = 1 / (self.recordings.std ** 2 + scatter.recording ** 2)
@@ -214,11 +197,13 @@ class _Sums:
             slope_std = nan * np.sqrt(a / det)
         # A period has a step as far as its recordings show one, else the line of its unit.
         unit, share = self.unit_of_period, shared * w
-        return _Fit(nan * slope, slope_std, self.centre_value + p / a, a ** -0.5,
-                    self.centre_time[unit] + (1 - share) * (b / a)[unit] + share * wt / w,
-                    self.centre_value[unit] + (1 - share) * (p / a)[unit] + share * wy / w,
-                    np.sqrt(shared + (1 - share) ** 2 / a[unit]),
-                    squares, float(log_likelihood), residual)
+        return Trends(
+            scatter, self.centre_value + p / a, a ** -0.5, nan * slope, slope_std,
+            np.full(len(a), np.inf),
+            self.centre_time[unit] + (1 - share) * (b / a)[unit] + share * wt / w,
+            self.centre_value[unit] + (1 - share) * (p / a)[unit] + share * wy / w,
+            np.sqrt(shared + (1 - share) ** 2 / a[unit]), squares, residual,
+            float(log_likelihood))
 
 
 def _shared_scatter(sums: _Sums) -> Scatter:
@@ -242,14 +227,14 @@ def _shared_scatter(sums: _Sums) -> Scatter:
     return scatter(best.x)
 
 
-def _widening(sums: _Sums, fit: _Fit, scatter: Scatter) -> float:
+def _widening(sums: _Sums, fit: Trends) -> float:
     """Estimate the factor of the variances of levels and slopes by correlation in time."""
     unit, residual = sums.recordings.unit, fit.residual
     used = sums.has_slope & (sums.counts > 2 * _MIN_RECORDINGS)
     same = (unit[1:] == unit[:-1]) & used[unit[1:]]
-    if not same.any() or scatter.recording == 0:
+    if not same.any() or fit.scatter.recording == 0:
         return 1.0
-    variance = scatter.recording ** 2
+    variance = fit.scatter.recording ** 2
     share = float(np.mean((variance / (variance + sums.recordings.std ** 2))[used[unit]]))
     products = float((residual[1:] * residual[:-1])[same].sum())
     squares, count = float((residual ** 2)[used[unit]].sum()), int(sums.counts[used].sum())
