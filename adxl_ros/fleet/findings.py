@@ -28,8 +28,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
 
-from adxl_ros.fleet.table import FleetTable, MG, QuantityResult, TOLERANCE_MG
 from adxl_ros.fleet.populations import by_prefix, CHANCE, MIN_GROUP
+from adxl_ros.fleet.table import FleetTable, MG, QuantityResult, TOLERANCE_MG
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Place
 import numpy as np

@@ -123,52 +123,77 @@ def find_sources(inputs: Iterable[str]) -> list[Source]:
 
     The files of a fleet's results, which lie beside its table, are no recordings.
     """
-    try:
-        sources = {source.url: source for text in inputs for source in _of_input(text)}
-    except UserError as error:
-        raise UserError(without_secrets(str(error))) from None
+    sources: dict[str, Source] = {}
+    for text in inputs:
+        try:
+            sources |= {source.url: source for source in _of_input(text)}
+        except UserError as error:
+            raise UserError(without_secrets(str(error))) from None
+        except Exception as error:
+            raise UserError(without_secrets(
+                f'{text}: cannot be listed: {one_line(error)}')) from None
     return [sources[url] for url in sorted(sources)]
 
 
-def _of_input(text: str) -> Iterator[Source]:
-    """Yield the recordings of one input."""
+def _of_input(text: str) -> Iterable[Source]:
+    """Return the recordings of one input."""
     try:
         fs, path = file_system(text)
     except Unreachable as error:
         if _wild_characters(text) or not _is_recording_name(text):
             raise
-        yield _unreachable(text, error)
-        return
+        return [_unreachable(text, error)]
     is_here = os.path.exists(path)
     if _wild_characters(path) and not is_here:
-        yield from _of_glob(text, fs, path)
-    elif is_here and not (os.path.isfile(path) or os.path.isdir(path)):
+        return _of_listing(text, fs, path, fs.glob(path, detail=True))
+    if is_here and not (os.path.isfile(path) or os.path.isdir(path)):
         # A pipe or a device may never end.
-        yield look_up(fs, path)
-    elif _is_recording_name(path) and not os.path.isdir(path):
+        return [look_up(fs, path)]
+    if _is_recording_name(path) and not os.path.isdir(path):
         rows = _manifest_rows(text, fs, path)
-        yield from [look_up(fs, path)] if rows is None else _of_manifest(text, rows)
-    elif _listed(text, lambda: fs.isdir(path)):
-        yield from _of_folder(fs, path)
-    else:
-        yield look_up(fs, path)
+        return [look_up(fs, path)] if rows is None else _of_manifest(text, rows)
+    if fs.isdir(path):
+        return _of_listing(text, fs, path, {path: {'type': 'directory'}})
+    return [look_up(fs, path)]
 
 
-def _of_glob(text: str, fs: Any, path: str) -> Iterator[Source]:
-    """Yield the recordings that match a glob; it names hidden ones, or does not match them."""
-    listed = _listed(text, lambda: fs.glob(path, detail=True))
-    wild = min(path.index(letter) for letter in _wild_characters(path))
-    fixed = path[:path.rfind('/', 0, wild) + 1]
-    names_hidden = '/.' in f'/{path.removeprefix(fixed)}'
-    names = [name for name in sorted(listed) if file_name(name) != _BAG
-             and (names_hidden or not _is_hidden(name, fixed)) and not _is_of_fleet(fs, name)]
-    if not names:
-        raise UserError(f'{text}: matches nothing')
-    for name in names:
-        if listed[name]['type'] == 'directory':
-            yield from _of_folder(fs, name, may_be_empty=True)
-        else:
-            yield _of_info(fs, name, listed[name])
+def _of_listing(text: str, fs: Any, path: str, named: Mapping[str, Mapping[str, Any]]
+                ) -> Iterator[Source]:
+    """
+    Yield the recordings of a folder or a glob, those in folders too; a bag is one recording.
+
+    named: what the folder or the glob names, by path. Hidden files do not count, unless the glob
+    asks for them.
+    """
+    wild = [path.index(letter) for letter in _wild_characters(path) if path not in named]
+    base = path[:path.rfind('/', 0, min(wild)) + 1] if wild else path
+    asks_for_hidden = '/.' in f'/{path.removeprefix(base)}'
+    files = {}
+    for name, info in named.items():
+        files |= fs.find(name, detail=True) if info['type'] == 'directory' else {name: info}
+
+    def is_visible(name: str) -> bool:
+        return asks_for_hidden or '/.' not in f'/{name.removeprefix(base).lstrip("/")}'
+
+    bags: dict[str, dict[str, Any]] = {
+        name.rpartition('/')[0]: {} for name in sorted(files)
+        if file_name(name) == _BAG and is_visible(name)}
+    count = len(bags)
+    for name, info in sorted(files.items()):
+        bag = name.rpartition('/')[0]
+        while bag and bag not in bags:
+            bag = bag.rpartition('/')[0]
+        if bag:
+            bags[bag][name] = info
+        elif is_visible(name) and not _is_of_fleet(fs, name) and (
+                name in named or _is_recording_name(name)):
+            count += 1
+            yield _of_info(fs, name, info)
+    for bag, content in bags.items():
+        yield _of_bag(fs, bag, content)
+    if not count:
+        raise UserError(f'{text}: matches nothing' if wild else f'{text}: has no recording '
+                        f'(*{", *".join(_ENDINGS)}, a bag or a table)')
 
 
 def _unreachable(url: str, error: UserError) -> Source:
@@ -187,16 +212,6 @@ def file_name(path: str) -> str:
     return PurePosixPath(urlsplit(path).path if '://' in path else path).name
 
 
-def _listed(text: str, look: Any) -> Any:
-    """Look at a folder; report what goes wrong in one line."""
-    try:
-        return look()
-    except FileNotFoundError:
-        return {}
-    except Exception as error:
-        raise UserError(f'{text}: cannot be listed: {one_line(error)}') from None
-
-
 def _is_recording_name(path: str) -> bool:
     """Return whether the name of a file is that of a recording, for folders and manifests."""
     return PurePosixPath(file_name(path)).suffix.lower() in (*_ENDINGS, *TABLE_ENDINGS)
@@ -205,40 +220,7 @@ def _is_recording_name(path: str) -> bool:
 def _is_of_fleet(fs: Any, name: str) -> bool:
     """Return whether a file is part of the results of a fleet."""
     folder, _, file = name.rpartition('/')
-    return file in (PAGE, POPULATION, TABLE, UNITS) and bool(
-        _listed(folder, lambda: fs.exists(f'{folder}/{TABLE}')))
-
-
-def _of_folder(fs: Any, folder: str, may_be_empty: bool = False) -> Iterator[Source]:
-    """Yield the recordings in a folder, those of its folders too; a bag is one recording."""
-    files = _listed(folder, lambda: fs.find(folder, detail=True))
-    bags: dict[str, dict[str, Any]] = {name.rpartition('/')[0]: {} for name in sorted(files)
-        if file_name(name) == _BAG and not _is_hidden(name, folder)}
-    count = len(bags)
-    for name in sorted(files):
-        bag = next((above for above in _folders(name) if above in bags), None)
-        if bag is not None:
-            bags[bag][name] = files[name]
-        elif _is_recording_name(name) and not _is_hidden(name, folder) \
-                and not _is_of_fleet(fs, name):
-            count += 1
-            yield _of_info(fs, name, files[name])
-    for bag, content in bags.items():
-        yield _of_bag(fs, bag, content)
-    if not count and not may_be_empty:
-        raise UserError(f'{folder}: has no recording (*{", *".join(_ENDINGS)}, a bag or a table)')
-
-
-def _is_hidden(name: str, folder: str) -> bool:
-    """Return whether a file lies in a hidden folder below a folder, or is hidden itself."""
-    return '/.' in f'/{name.removeprefix(folder).lstrip("/")}'
-
-
-def _folders(name: str) -> Iterator[str]:
-    """Yield the folders of a file, the nearest first; `//` of an address stays."""
-    while name:
-        name = name.rpartition('/')[0]
-        yield name
+    return file in (PAGE, POPULATION, TABLE, UNITS) and fs.exists(f'{folder}/{TABLE}')
 
 
 def look_up(fs: Any, path: str) -> Source:

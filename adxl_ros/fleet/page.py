@@ -21,6 +21,7 @@ from adxl_ros.fleet.findings import (
     State,
     UnitState,
 )
+from adxl_ros.fleet.row import PAGE, POPULATION, reason_kind, TABLE, UNITS
 from adxl_ros.fleet.table import (
     analyse,
     far_out,
@@ -33,7 +34,6 @@ from adxl_ros.fleet.table import (
     TOLERANCE_MG,
 )
 from adxl_ros.fleet.trends import FALSE_DISCOVERY_RATE
-from adxl_ros.fleet.row import PAGE, POPULATION, reason_kind, TABLE, UNITS
 from adxl_ros.model.constants import AXES, Z_90
 from adxl_ros.report import figures as plotly, page as html_page
 import numpy as np
@@ -412,7 +412,8 @@ def _refusal_rows(table: FleetTable) -> list[list[str]]:
     """Return the reasons of refusals: how often, in how many units, and an example."""
     failed = table.frame.assign(unit=table.unit)[table['outcome'] != 'done']
     kinds = [reason_kind(row) for row in failed.to_dict('records')]
-    groups = sorted(failed.groupby(np.array(kinds, object)), key=lambda item: (-len(item[1]), item[0]))
+    groups = sorted(failed.groupby(np.array(kinds, object)),
+                    key=lambda item: (-len(item[1]), item[0]))
     # A recording without a serial number is of no unit.
     return [[str(len(group)), str(len({*group['unit']} - {-1})), kind,
              group['refused_by'].iloc[0] or '-', group['url'].iloc[0]]

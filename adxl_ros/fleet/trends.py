@@ -121,7 +121,7 @@ class Trends:
 
 def fit_trends(recordings: Recordings) -> Trends:
     """Fit levels and slopes of all units."""
-    sums = _Sums.of(recordings)
+    sums = _Sums(recordings)
     scatter = _shared_scatter(sums)
     fit = sums.fit(scatter)
     widening = _widening(sums, fit)
@@ -138,35 +138,22 @@ def fit_trends(recordings: Recordings) -> Trends:
         period_std=factor[sums.unit_of_period] * fit.period_std)
 
 
-@dataclass(frozen=True)
 class _Sums:
     """Recordings about the centre of their unit, with where units and periods begin."""
 
-    recordings: Recordings
-    time: np.ndarray
-    value: np.ndarray
-    centre_time: np.ndarray
-    centre_value: np.ndarray
-    counts: np.ndarray
-    period_starts: np.ndarray
-    unit_of_period: np.ndarray
-    unit_starts: np.ndarray
-    has_slope: np.ndarray
-
-    @classmethod
-    def of(cls, recordings: Recordings) -> _Sums:
-        """Prepare recordings."""
-        unit, period = recordings.unit, recordings.period
-        counts = np.bincount(unit)
-        starts = np.flatnonzero(np.diff(period, prepend=-1))
-        of_period = unit[starts]
-        centre_time = np.bincount(unit, recordings.time) / counts
-        centre_value = np.bincount(unit, recordings.value) / counts
-        time = recordings.time - centre_time[unit]
-        has_slope = (counts >= _MIN_RECORDINGS) & (np.bincount(unit, time ** 2) > 0)
-        return cls(recordings, time, recordings.value - centre_value[unit], centre_time,
-                   centre_value, counts, starts, of_period,
-                   np.flatnonzero(np.diff(of_period, prepend=-1)), has_slope)
+    def __init__(self, recordings: Recordings) -> None:
+        self.recordings = recordings
+        unit = recordings.unit
+        self.counts = np.bincount(unit)
+        self.period_starts = np.flatnonzero(np.diff(recordings.period, prepend=-1))
+        self.unit_of_period = unit[self.period_starts]
+        self.unit_starts = np.flatnonzero(np.diff(self.unit_of_period, prepend=-1))
+        self.centre_time = np.bincount(unit, recordings.time) / self.counts
+        self.centre_value = np.bincount(unit, recordings.value) / self.counts
+        self.time = recordings.time - self.centre_time[unit]
+        self.value = recordings.value - self.centre_value[unit]
+        self.has_slope = (self.counts >= _MIN_RECORDINGS) & (
+            np.bincount(unit, self.time ** 2) > 0)
 
     def fit(self, scatter: Scatter) -> Trends:
         """Fit the lines of all units for given variances, by generalised least squares."""

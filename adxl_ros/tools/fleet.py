@@ -120,7 +120,7 @@ def _worked(options: argparse.Namespace, sources: Sequence[Source], recipe: Reci
     reason = ''
     try:
         if to_do.todo:
-            shared = (recipe, results.keys_of(to_do.todo))
+            shared = (recipe, frozenset(results.known))
             with open_pool(options.scheduler, options.jobs, shared) as pool, \
                     progress(PROG) as show:
                 for row in work(pool, to_do.todo, recipe, results, options.retries, show):
