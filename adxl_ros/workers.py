@@ -342,17 +342,11 @@ def for_each(pool: Executor, work: Callable[..., Any], jobs: Iterable[Callable[[
              keep: Callable[..., None], show: Callable[[float], None], done: int = 0) -> None:
     """Run jobs in parallel and keep each result as soon as it is there."""
     todo = list(jobs)
-    total = done + len(todo)
-    results = finished_tasks(pool, work, (job() for job in todo))
-    try:
-        for end in results:
-            if end.error is not None:
-                raise end.error
-            keep(*end.value)
-            done += 1
-            show(done / total)
-    finally:
-        results.close()
+    for number, end in enumerate(finished_tasks(pool, work, (job() for job in todo)), done + 1):
+        if end.error is not None:
+            raise end.error
+        keep(*end.value)
+        show(number / (done + len(todo)))
 
 
 def write(path: Path, data: bytes) -> None:

@@ -29,7 +29,7 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from adxl_ros.fleet.populations import by_prefix, CHANCE, MIN_GROUP
-from adxl_ros.fleet.table import FleetTable, MG, QuantityResult, TOLERANCE_MG
+from adxl_ros.fleet.table import FleetTable, MG, Quantity, QuantityResult, TOLERANCE_MG
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Place
 import numpy as np
@@ -156,6 +156,11 @@ class State(IntEnum):
         """Return the state for people."""
         return self.name.replace('_', ' ').lower()
 
+    @property
+    def colour(self) -> str:
+        """Return the colour of the badge of a unit."""
+        return ('red', 'amber', 'amber', 'amber', 'grey', 'green')[self - 1]
+
 
 class Drift(NamedTuple):
     """A claimed slope of a unit."""
@@ -170,20 +175,16 @@ class Drift(NamedTuple):
 
 @dataclass(frozen=True)
 class UnitState:
-    """One unit."""
+    """One unit; its texts are for people."""
 
     unit: int  # Its number
     serial: str  # Its serial number
     state: State  # Its state
-    reason: str  # Why it has this state, in one sentence
-    # gap_mg, floor_mg: Median of its last gaps and of their noise floors; NaN without any
-    gap_mg: float
-    floor_mg: float
+    reason: str  # Why it has this state, in one sentence; empty for none
     drifts: tuple[Drift, ...]  # Its claimed slopes, the most urgent first
-    # recordings, refused: Number of its recordings, and of those that are refused or crashed
-    recordings: int
-    refused: int
-    calibration_age_days: float  # Age of its calibration at the last recording; NaN without one
+    gap: str  # Median of its last gaps and of their noise floors, mg
+    recordings: str  # Number of its recordings, and of those that are refused or crashed
+    age: str  # Age of its calibration at the last recording, days
     last_year: float  # Date of its last recording, years since 1970; NaN without a date
     report: str  # Folder of the single reports of its last recording; empty for none
 
@@ -202,6 +203,12 @@ def number(value: float, signed: bool = False, digits: int = 3) -> str:
         np.format_float_positional(abs(rounded), trim='-')
     sign = '\N{MINUS SIGN}' if rounded < 0 else '+' if signed and rounded > 0 else ''
     return sign + text
+
+
+def interval_text(quantity: Quantity, value: float, low: float, high: float) -> str:
+    """Return a difference with its interval, in the unit of the page."""
+    middle, below, above = (number(quantity.factor * x, True) for x in (value, low, high))
+    return f'{middle} ({below} to {above}) {quantity.shown_unit}'
 
 
 def rank(table: FleetTable, results: Sequence[QuantityResult],
@@ -255,9 +262,11 @@ def _state_of(unit: int, table: FleetTable, results: Sequence[QuantityResult],
         reason = f'Its calibration is {age_days:.0f} days old.' if age_days > 0 else \
             'It has no calibration with a date.'
     return urgency, UnitState(
-        unit, table.serials[unit], state, reason[:1].upper() + reason[1:], gap_mg, floor_mg,
-        drifts, len(rows), int(refused.sum()), age_days, float(table.years[rows[-1]]),
-        next((str(text) for text in table['report'][rows[::-1]] if text), ''))
+        unit, table.serials[unit], state, reason[:1].upper() + reason[1:], drifts,
+        f'{number(gap_mg)} / {number(floor_mg)}' if np.isfinite(gap_mg) else '-',
+        f'{len(rows)} ({refused.sum()})', f'{age_days:.0f}' if np.isfinite(age_days) else '-',
+        float(table.years[rows[-1]]),
+        next((text for text in table['report'][rows[::-1]] if text), ''))
 
 
 def _gap_now(table: FleetTable, rows: np.ndarray) -> tuple[float, float, float]:
@@ -280,15 +289,14 @@ def _drifts(unit: int, results: Sequence[QuantityResult], over_mg: float, age_da
         place, quantity = result.place_of(unit), result.quantity
         if place is None or not result.is_claimed[place]:
             continue
-        slope, half = (quantity.factor * float(values[place])
-                       for values in (result.trends.slope, result.half_width))
-        text = (f'{quantity.label} {number(slope, True)} ({number(slope - half, True)} to '
-                f'{number(slope + half, True)}) {quantity.shown_unit} per year')
+        slope, half = float(result.trends.slope[place]), float(result.half_width[place])
+        text = f'{quantity.label} ' \
+            f'{interval_text(quantity, slope, slope - half, slope + half)} per year'
         days, reached_mg = np.inf, np.nan
         if quantity.is_force and (quantity.is_coefficient or slope > 0):
             # A coefficient is right at its calibration, and the gap shows what it is now.
-            since_mg = abs(slope) * np.nan_to_num(age_days) / _DAYS_PER_YEAR
-            reached_mg = over_mg if np.isfinite(over_mg) else since_mg
-            days = max(TOLERANCE_MG - reached_mg, 0.0) / abs(slope) * _DAYS_PER_YEAR
+            mg_per_day = abs(quantity.factor * slope) / _DAYS_PER_YEAR
+            reached_mg = over_mg if np.isfinite(over_mg) else mg_per_day * np.nan_to_num(age_days)
+            days = max(TOLERANCE_MG - reached_mg, 0.0) / mg_per_day
         drifts.append(Drift(result, text, days, reached_mg))
     return tuple(sorted(drifts, key=lambda drift: drift.days))

@@ -91,7 +91,7 @@ def file_system(url: str, secret: str = '') -> tuple[Any, str]:
         raise UserError(f'fleet needs fsspec; {install_hint("adxl_ros[fleet]")}') from None
     address = secret if _is_web(secret) else url
     # A path of this machine may have two colons, which join addresses.
-    if '://' not in address:
+    if '://' not in address or address.startswith('file://'):
         path = LocalFileSystem._strip_protocol(address)
         # One file has one address.
         is_long = '..' in PurePosixPath(path).parts
@@ -168,7 +168,7 @@ def _of_listing(text: str, fs: Any, path: str, named: Mapping[str, Mapping[str, 
     wild = [path.index(letter) for letter in _wild_characters(path) if path not in named]
     base = path[:path.rfind('/', 0, min(wild)) + 1] if wild else path
     asks_for_hidden = '/.' in f'/{path.removeprefix(base)}'
-    files = {}
+    files: dict[str, Mapping[str, Any]] = {}
     for name, info in named.items():
         files |= fs.find(name, detail=True) if info['type'] == 'directory' else {name: info}
 
@@ -279,53 +279,41 @@ def _of_info(fs: Any, path: str, info: Mapping[str, Any]) -> Source:
         return Source(_url(fs, path), fault='is no file')
     if as_utf_8(path) != path:
         return Source(_url(fs, path), fault='its name is not UTF-8; rename it')
-    return Source(_url(fs, path), info.get('size'), stamp_of(info), _modified(info),
+    return Source(_url(fs, path), info.get('size'), _stamp_of(info), _modified(info),
                   secret=_secret(fs, path))
 
 
 def _of_bag(fs: Any, folder: str, files: Mapping[str, Mapping[str, Any]]) -> Source:
     """Return the recording of a bag's folder."""
     sizes = [info.get('size') for info in files.values()]
-    stamps = [f'{name} {stamp_of(info)}' for name, info in sorted(files.items())]
-    stamp = hashlib.sha256('\n'.join(stamps).encode()).hexdigest() \
-        if all(stamp_of(info) for info in files.values()) else ''
-    return Source(_url(fs, folder), None if None in sizes else sum(filter(None, sizes)), stamp,
+    stamps = {name: _stamp_of(info) for name, info in sorted(files.items())}
+    text = '\n'.join(f'{name} {stamp}' for name, stamp in stamps.items())
+    return Source(_url(fs, folder), None if None in sizes else sum(filter(None, sizes)),
+                  hashlib.sha256(text.encode()).hexdigest() if all(stamps.values()) else '',
                   max(map(_modified, files.values()), default=''), secret=_secret(fs, folder))
 
 
-def stamp_of(info: Mapping[str, Any]) -> str:
+def _stamp_of(info: Mapping[str, Any]) -> str:
     """Return what changes with the content of a file; empty if the server states nothing."""
-    stated = {name: info[name] for name in _STAMPS if info.get(name)}
-    if not stated:
-        return ''
-    return ' '.join([f'size={info.get("size")}', *(
-        f'{name}={value}' for name, value in sorted(stated.items()))])
+    stated = [f'{name}={info[name]}' for name in sorted(_STAMPS) if info.get(name)]
+    return ' '.join([f'size={info.get("size")}', *stated]) if stated else ''
 
 
 def _modified(info: Mapping[str, Any]) -> str:
     """Return the time of the last change, ISO 8601, UTC; empty if unknown."""
-    for name in _TIMES:
-        value = info.get(name)
-        if isinstance(value, (int, float)):
-            return datetime.fromtimestamp(value, timezone.utc).isoformat()
-        if isinstance(value, datetime):
-            return as_utc(value).isoformat()
-        if isinstance(value, str) and value:
-            return as_date(value) or ''
-    return ''
-
-
-def as_utc(date: datetime) -> datetime:
-    """Return a time in UTC; one without a zone counts as UTC."""
-    return date.astimezone(timezone.utc) if date.tzinfo else date.replace(tzinfo=timezone.utc)
+    value = next((info[name] for name in _TIMES if info.get(name)), '')
+    if isinstance(value, (int, float)):
+        value = datetime.fromtimestamp(value, timezone.utc)
+    return as_date(str(value)) or ''
 
 
 def as_date(text: str) -> str | None:
-    """Return a date of ISO 8601 in UTC, or None if the text is none."""
+    """Return a date of ISO 8601 in UTC, or None if the text is none; UTC is the usual zone."""
     try:
-        return as_utc(datetime.fromisoformat(text.strip().replace('Z', '+00:00'))).isoformat()
+        date = datetime.fromisoformat(text.strip().replace('Z', '+00:00'))
     except ValueError:
         return None
+    return date.replace(tzinfo=date.tzinfo or timezone.utc).astimezone(timezone.utc).isoformat()
 
 
 def _manifest_rows(text: str, fs: Any, path: str) -> dict[int, dict[str, str]] | None:

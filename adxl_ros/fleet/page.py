@@ -7,15 +7,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from datetime import datetime, timedelta, timezone
+from functools import partial
 from itertools import repeat
 from pathlib import Path
-from typing import Any
 
 from adxl_ros.files import population_file
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.fleet.findings import (
     effect_matrix,
     EffectMatrix,
+    interval_text,
     number,
     rank,
     State,
@@ -28,7 +29,6 @@ from adxl_ros.fleet.table import (
     FleetTable,
     MG,
     population_of,
-    Quantity,
     QuantityResult,
     read,
     TOLERANCE_MG,
@@ -64,9 +64,6 @@ _SMALLEST_SCATTER = 1e-3
 """Smallest scatter on the page, mg, mg/g or µg. Chosen: far below the noise of any recording."""
 _NOTHING = 0.05
 """Smaller standard deviations are nothing beside another one. Chosen: 0.1 % of the variance."""
-_COLOURS = {State.OUT_OF_TOLERANCE: 'red', State.DRIFTS: 'amber', State.NOT_JUDGED: 'amber',
-            State.FAR_OUT: 'amber', State.OLD_CALIBRATION: 'grey', State.IN_ORDER: 'green'}
-"""Colour of the badge by the state of the most urgent unit."""
 _MEASURES = ('gap_before_mps2', *(f'zero_g_{axis}_v' for axis in AXES))
 """Columns that tell whether a unit is within the tolerance."""
 _SENTENCES = {
@@ -95,20 +92,24 @@ def _stamps(years: Iterable[float]) -> list[str]:
 
 
 def _trend_figure(table: FleetTable, result: QuantityResult, unit: int) -> plotly.Figure:
-    """Plot a quantity of a unit over time."""
+    """Plot a quantity of a unit over time, about its mean where units differ by far more."""
+    quantity, place = result.quantity, result.place_of(unit)
+    is_relative = quantity.is_coefficient and quantity.is_force
+    origin = float(result.trends.level[place]) if is_relative and place is not None else 0.0
     part = table.unit[result.rows] == unit
-    factor, years = result.quantity.factor, result.recordings.time[part]
-    value = factor * (result.recordings.value[part] - _origin(result, unit))
-    std = factor * result.recordings.std[part]
-    is_outlier, dates = result.is_outlier[part], np.array(_stamps(years), object)
+    years, is_outlier = result.recordings.time[part], result.is_outlier[part]
+    value = quantity.factor * (result.recordings.value[part] - origin)
+    std = quantity.factor * result.recordings.std[part]
+    dates = np.array(_stamps(years), object)
     recorded = plotly.points([], value[~is_outlier], Z_90 * std[~is_outlier], 'recording',
                              plotly.AXIS_COLOURS['x'])
     recorded |= {'x': list(dates[~is_outlier]), 'marker': {
         'color': plotly.AXIS_COLOURS['x'], 'size': 4}}
     recorded['error_y'] |= {'width': 0, 'thickness': 0.8}
-    kept = result.recordings[~result.is_outlier]
-    traces = [*_lines(result, unit, years[~is_outlier], kept.period[part[~result.is_outlier]]),
-              recorded]
+    traces = [recorded]
+    if place is not None and (~is_outlier).sum() > 1:
+        periods = result.recordings[~result.is_outlier].period[part[~result.is_outlier]]
+        traces = [*_lines(result, place, years[~is_outlier], periods, origin), recorded]
     if is_outlier.any():
         traces.append({'type': 'scatter', 'mode': 'markers', 'name': 'outlier',
                        'x': list(dates[is_outlier]), 'y': plotly.rounded(value[is_outlier]),
@@ -118,22 +119,11 @@ def _trend_figure(table: FleetTable, result: QuantityResult, unit: int) -> plotl
     marks = [{'type': 'line', 'x0': stamp, 'x1': stamp, 'yref': 'paper', 'y0': 0, 'y1': 1,
               'line': {'color': plotly.QUIET_COLOUR, 'width': 1.2, 'dash': 'dash'}}
              for stamp in _stamps(calibration_years(table, unit))]
-    title = result.quantity.shown_unit + ' from the mean' * _is_relative(result.quantity)
-    return plotly.figure(traces, _TREND_HEIGHT, showlegend=False, shapes=marks,
-                         xaxis={'type': 'date', 'nticks': 3, 'tickangle': 0,
-                                'tickformat': '%b %Y'},
-                         yaxis={'title': {'text': title}, 'nticks': 5})
-
-
-def _origin(result: QuantityResult, unit: int) -> float:
-    """Return the value that a plot has at 0: the mean of a unit where units differ by far more."""
-    place = result.place_of(unit)
-    return float(result.trends.level[place]) \
-        if _is_relative(result.quantity) and place is not None else 0.0
-
-
-def _is_relative(quantity: Quantity) -> bool:
-    return quantity.is_coefficient and quantity.is_force
+    title = quantity.shown_unit + ' from the mean' * is_relative
+    return plotly.figure(
+        traces, _TREND_HEIGHT, showlegend=False, shapes=marks,
+        xaxis={'type': 'date', 'nticks': 3, 'tickangle': 0, 'tickformat': '%b %Y'},
+        yaxis={'title': {'text': title}, 'nticks': 5})
 
 
 def calibration_years(table: FleetTable, unit: int) -> np.ndarray:
@@ -149,12 +139,9 @@ def calibration_years(table: FleetTable, unit: int) -> np.ndarray:
     return made[made > first - 0.1 * max(last - first, 0.01)]
 
 
-def _lines(result: QuantityResult, unit: int, times: np.ndarray, periods: np.ndarray
-           ) -> list[plotly.Figure]:
+def _lines(result: QuantityResult, place: int, times: np.ndarray, periods: np.ndarray,
+           origin: float) -> list[plotly.Figure]:
     """Return the lines of a unit between calibrations with their bands."""
-    place = result.place_of(unit)
-    if place is None or len(times) < 2:
-        return []
     trends, factor = result.trends, result.quantity.factor
     is_claimed = bool(result.is_claimed[place])
     slope, slope_std = (trends.slope[place], trends.slope_std[place]) if is_claimed else (0, 0)
@@ -165,7 +152,7 @@ def _lines(result: QuantityResult, unit: int, times: np.ndarray, periods: np.nda
         part = times[periods == period]
         x = np.linspace(part.min(), part.max(), _LINE_POINTS)
         distance = x - trends.period_time[period]
-        middle = factor * (trends.period_value[period] + slope * distance - _origin(result, unit))
+        middle = factor * (trends.period_value[period] + slope * distance - origin)
         half = factor * width * np.hypot(trends.period_std[period], slope_std * distance)
         dates = _stamps(x)
         traces += [
@@ -242,8 +229,8 @@ def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> 
     return html_page.render('adxl_ros.fleet', 'fleet.html', {
         'title': 'Fleet', 'about': _about(table), 'badge': _badge(table, units, counts),
         'tiles': _tiles(table, units, counts), 'shown': _SHOWN, 'figures': figures,
-        'units': [_unit_row(unit, folder) for unit in units],
-        'without_unit': _rows_without_unit(table, folder),
+        'units': units, 'date': date_text, 'link': partial(_link, folder),
+        'without_unit': _rows_without_unit(table),
         'without_unit_count': int((table.unit < 0).sum()),
         'trends': [{'figure': f'trend-{i}', 'title': f'{unit.serial}: {result.quantity.label}',
                     'text': f'{unit.drifts[0].text}.' if unit.drifts else 'No slope is claimed.'}
@@ -251,7 +238,7 @@ def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> 
         'findings': [*_batches(results), *effects.findings], 'has_effects': bool(effects.effects),
         'judged': len(effects.units), 'populations': _population_rows(results),
         'far_out': _far_out_rows(distant, results),
-        'outliers': _outlier_rows(table, results, folder),
+        'outliers': _outlier_rows(table, results),
         'outlier_count': sum(int(result.is_outlier.sum()) for result in results),
         'refusals': _refusal_rows(table), 'most_rows': _MOST_ROWS,
         'tolerance': number(TOLERANCE_MG), 'false_discovery': f'{FALSE_DISCOVERY_RATE:.0%}',
@@ -261,12 +248,10 @@ def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> 
 def _batches(results: Sequence[QuantityResult]) -> list[str]:
     """Name the batches whose coefficient is not that of the other units."""
     return [f'{batch.members.sum()} units with a serial number {batch.prefix}… have a '
-            f'{result.quantity.label} that differs by {number(factor * batch.difference, True)} '
-            f'({number(factor * batch.low, True)} to {number(factor * batch.high, True)}) '
-            f'{result.quantity.shown_unit} from that of the {(~batch.members).sum()} others: a '
-            'bad batch.'
-            for result in results if (batch := result.batch) is not None
-            for factor in [result.quantity.factor]]
+            f'{result.quantity.label} that differs by '
+            + interval_text(result.quantity, batch.difference, batch.low, batch.high) +
+            f' from that of the {(~batch.members).sum()} others: a bad batch.'
+            for result in results if (batch := result.batch) is not None]
 
 
 def _about(table: FleetTable) -> list[str]:
@@ -290,7 +275,7 @@ def _badge(table: FleetTable, units: Sequence[UnitState], counts: Counter[State]
                 'sentence': 'No gap and no zero-g were measured; they need diagnose and fit.'}
     word = 'IN ORDER' if worst is State.IN_ORDER else \
         f'{counts[worst]} of {len(units)} {worst.words}'.upper()
-    return {'colour': _COLOURS[worst], 'word': word,
+    return {'colour': worst.colour, 'word': word,
             'sentence': _SENTENCES[worst][counts[worst] > 1]}
 
 
@@ -314,18 +299,7 @@ def _tiles(table: FleetTable, units: Sequence[UnitState], counts: Counter[State]
                     'note': f'{number(3600 * hours / max(len(table), 1))} s a recording'}]
 
 
-def _unit_row(unit: UnitState, folder: Path) -> dict[str, Any]:
-    return {'serial': unit.serial, 'state': unit.state.words,
-            'colour': _COLOURS[unit.state], 'reason': unit.reason or 'Nothing to do.',
-            'gap': '-' if not np.isfinite(unit.gap_mg) else
-            f'{number(unit.gap_mg)} / {number(unit.floor_mg)}',
-            'age': '-' if not np.isfinite(unit.calibration_age_days) else
-            f'{unit.calibration_age_days:.0f}',
-            'recordings': f'{unit.recordings} ({unit.refused})',
-            'last': date_text(unit.last_year), 'report': _link(unit.report, folder)}
-
-
-def _rows_without_unit(table: FleetTable, folder: Path) -> list[dict[str, str]]:
+def _rows_without_unit(table: FleetTable) -> list[dict[str, str]]:
     """Return the recordings that state no serial number, the largest gap first."""
     gap_mg, floor_mg = (MG * table[f'gap_{name}_mps2'] for name in ('before', 'floor'))
     rows = np.flatnonzero(table.unit < 0)
@@ -336,10 +310,10 @@ def _rows_without_unit(table: FleetTable, folder: Path) -> list[dict[str, str]]:
                  ', '.join(table['effects'][row])])),
              'gap': f'{number(gap_mg[row])} / {number(floor_mg[row])}'
              if np.isfinite(gap_mg[row]) else '-',
-             'report': _link(str(table['report'][row]), folder)} for row in rows[:_MOST_ROWS]]
+             'report': table['report'][row]} for row in rows[:_MOST_ROWS]]
 
 
-def _link(report: str, folder: Path) -> str:
+def _link(folder: Path, report: str) -> str:
     """Return the address of a single report: its page where there is one; empty for none."""
     return next((name for name in (f'{report}/report.html', report)
                  if report and (folder / name).exists()), '')
@@ -393,7 +367,7 @@ def _far_out_rows(distant: Sequence[dict[str, str | float]], results: Sequence[Q
     return rows
 
 
-def _outlier_rows(table: FleetTable, results: Sequence[QuantityResult], folder: Path
+def _outlier_rows(table: FleetTable, results: Sequence[QuantityResult]
                   ) -> list[dict[str, str]]:
     """Return the recordings that are far from others of their unit, the farthest first."""
     outliers = [(float(result.distance[i]), result, i) for result in results
@@ -403,7 +377,7 @@ def _outlier_rows(table: FleetTable, results: Sequence[QuantityResult], folder: 
              'quantity': quantity.label, 'distance': number(distance),
              'value': f'{number(quantity.factor * result.recordings.value[i])} '
              f'{quantity.shown_unit}',
-             'url': table['url'][row], 'report': _link(table['report'][row], folder)}
+             'url': table['url'][row], 'report': table['report'][row]}
             for distance, result, i in outliers[:_MOST_ROWS]
             for row, quantity in [(result.rows[i], result.quantity)]]
 

@@ -231,14 +231,10 @@ def work(pool: Executor, sources: Sequence[Source], recipe: Recipe, results: Res
          retries: int, show: Callable[[float], None]) -> Iterator[Row]:
     """Work on recordings, and write each row as soon as it is there."""
     failed = {url for url, entry in results.newest.items() if entry.outcome != 'done'}
-    tasks = finished_tasks(pool, make_row, ((source, source.url in failed) for source in sources),
-                           retries)
-    try:
-        for count, end in enumerate(tasks, 1):
-            show(count / len(sources))
-            yield _written(end, recipe, results)
-    finally:
-        tasks.close()
+    tasks = ((source, source.url in failed) for source in sources)
+    for count, end in enumerate(finished_tasks(pool, make_row, tasks, retries), 1):
+        show(count / len(sources))
+        yield _written(end, recipe, results)
 
 
 def _written(end: Finished, recipe: Recipe, results: Results) -> Row:

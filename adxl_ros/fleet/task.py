@@ -15,9 +15,7 @@ from dataclasses import dataclass, field, replace
 import json
 import os
 from pathlib import Path
-import resource
 import shlex
-import sys
 from time import monotonic
 import traceback
 from typing import Any, NamedTuple, TYPE_CHECKING
@@ -81,7 +79,7 @@ def make_row(recipe: Recipe, earlier: frozenset[str], source: Source, is_again: 
         result = refused(recipe, source, one_line(error).removeprefix(f'{source.url}: '))
     row = result.row
     row |= {name: finite(value) for name, value in row.items() if isinstance(value, float)}
-    row |= {'seconds': round(monotonic() - begin_s, 6), 'memory_mb': round(_peak_mb(), 3),
+    row |= {'seconds': round(monotonic() - begin_s, 6), 'memory_mb': _peak_mb(),
             'worker': worker}
     if row['outcome'] == 'crashed':
         raise TaskCrashed(result)
@@ -346,11 +344,10 @@ class _Job:
             for (name, std), value in zip(stds.items(), get(sensor, tuple(stds)))]
 
 
-def _peak_mb() -> float:
-    """Return the largest memory of this process, MB."""
-    try:
+def _peak_mb() -> float | None:
+    """Return the largest memory of this process, MB; None where the system does not state it."""
+    with suppress(OSError, StopIteration):
         lines = Path('/proc/self/status').read_text(encoding='ascii').splitlines()
-        return int(next(line for line in lines if line.startswith('VmHWM')).split()[1]) / 1024
-    except (OSError, StopIteration):
-        unit = 2 ** 20 if sys.platform == 'darwin' else 1024
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+        kilobytes = next(line for line in lines if line.startswith('VmHWM')).split()[1]
+        return round(int(kilobytes) / 1024, 3)
+    return None
