@@ -34,6 +34,11 @@ from adxl_ros.errors import install_hint, one_line, UserError
 
 RETRIES = 2
 """Further attempts of a task that fails, by default; chosen."""
+_BY_CHANCE = 0.01
+"""Expected number of tasks that are blamed for workers that others end; chosen."""
+_MOST_DEATHS = 8
+"""Deaths of workers that chance may explain. Chosen: a task that kills its workers comes to an end
+where many others do so, too."""
 _TASKS_PER_WORKER = 3
 """Tasks that are submitted for each worker: one runs, two wait. Chosen: a worker is not idle where
 the client is slow, and no more arguments are in memory."""
@@ -301,14 +306,15 @@ def finished_tasks(pool: Executor, work: Callable[..., Any], tasks: Iterable[tup
     """
     Run tasks in parallel; each gives one result, in the order in which they end.
 
-    A task that raises, or whose worker ends, is repeated after all others. A `UserError` is not:
-    it would come again. After the loss of a pool its tasks are submitted again, which does not
-    count.
+    A task that raises, or whose worker ends, is repeated after all others, and more often where
+    workers end at random. A `UserError` is not repeated: it would come again. After the loss of a
+    pool its tasks are submitted again, which does not count.
     """
     workers, todo = cast(Pool, pool), ((arguments, 1) for arguments in tasks)
     again: deque[tuple[tuple, int]] = deque()
     running: dict[Any, tuple[tuple, int]] = {}
     ended: SimpleQueue[Any] = SimpleQueue()
+    attempts = deaths = 0
     try:
         while True:
             slots = workers.slots
@@ -325,17 +331,31 @@ def finished_tasks(pool: Executor, work: Callable[..., Any], tasks: Iterable[tup
             except (Empty, KeyError):  # KeyError: a task of a pool that was lost
                 continue
             value, error = workers.end(future)
+            is_death = isinstance(error, WorkerDied)
+            attempts, deaths = attempts + 1, deaths + is_death
             if isinstance(error, PoolLost):
                 again.extend([(arguments, attempt), *running.values()])
                 running.clear()
                 workers.renew()
-            elif error is None or isinstance(error, UserError) or attempt > retries:
+            elif error is None or isinstance(error, UserError) or (attempt > retries and not (
+                    is_death and _is_chance(attempt, deaths, attempts))):
                 yield Finished(arguments, value, error, attempt)
             else:
                 again.append((arguments, attempt + 1))
     finally:
         for future in running:
             future.cancel()
+
+
+def _is_chance(own: int, deaths: int, attempts: int) -> bool:
+    """
+    Return whether chance explains the deaths of the workers of one task.
+
+    Workers end at random if they also end under other tasks. The share of such attempts gives the
+    number of tasks that meet so many deaths by chance.
+    """
+    share = (deaths - own) / max(attempts - own, 1)
+    return own <= _MOST_DEATHS and attempts * share ** own > _BY_CHANCE
 
 
 def for_each(pool: Executor, work: Callable[..., Any], jobs: Iterable[Callable[[], tuple]],

@@ -11,16 +11,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-import errno
 import fcntl
-import hashlib
 import os
 from pathlib import Path
 import shutil
 import tempfile
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from adxl_ros.errors import one_line, UserError
+from adxl_ros.files.calibration_store import sha256
 from adxl_ros.fleet.inputs import (
     fault_of,
     file_name,
@@ -31,12 +30,8 @@ from adxl_ros.fleet.inputs import (
     Unreachable,
 )
 
-_LARGEST_BYTES = 16 << 30
-"""Largest recording, byte. Chosen: a day of three axes at 2 kHz as CSV."""
 _SPARE_BYTES = 64 << 20
 """Space that stays free, byte. Chosen: a task writes some MB."""
-_READ_BYTES = 1 << 20
-"""Bytes that are copied at a time (chosen: bounds the memory)."""
 
 
 class StagingError(Exception):
@@ -47,7 +42,7 @@ class Staged(NamedTuple):
     """The copy of a recording."""
 
     path: Path  # The file or folder
-    content: str  # SHA-256 of the content, as `files.checksum.sha256` gives it
+    content: str  # SHA-256 of the content
     size_bytes: int  # Its size
 
 
@@ -98,48 +93,35 @@ def stage(source: Source, folder: Path) -> Staged:
     before = look_up(fs, path)
     if before.fault:
         raise (UserError if before.fault == NO_FILE else StagingError)(f'{url}: {before.fault}')
-    _check_size(url, before.size_bytes, folder)
+    free = shutil.disk_usage(folder).free
+    if (before.size_bytes or 0) + _SPARE_BYTES > free:
+        raise StagingError(f'{url}: needs {(before.size_bytes or 0) / 1e6:.3g} MB beside '
+                           f'{_SPARE_BYTES / 1e6:.3g} MB that stay free, but '
+                           f'{tempfile.gettempdir()} has {free / 1e6:.3g} MB free; set TMPDIR to '
+                           'a larger disk')
     target = _inside(folder, file_name(path), url)
     try:
         # A web server answers `isdir` with the whole file.
         is_folder = fs.info(path)['type'] == 'directory'
-        files = {name: _inside(target, name.removeprefix(path).lstrip('/'), url)
-                 for name in fs.find(path)} if is_folder else {path: target}
-        copies = {copy: _copy(fs, name, copy, url) for name, copy in files.items()}
+        for name in fs.find(path) if is_folder else [path]:
+            copy = _inside(target, name.removeprefix(path).lstrip('/'), url) if is_folder \
+                else target
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            fs.get_file(name, str(copy))
     except UserError:
         raise
     except Exception as error:
         # A connection that broke is not used again.
         fs.clear_instance_cache()
-        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
-            raise StagingError(f'{url}: no space left in {tempfile.gettempdir()}; set TMPDIR to '
-                               'a larger disk') from None
         raise StagingError(f'{url}: {fault_of(error)}') from None
     fs.invalidate_cache()
     after = look_up(fs, path)
-    size_bytes = sum(copy.stat().st_size for copy in copies)
+    size_bytes = sum(copy.stat().st_size for copy in [target, *target.rglob('*')]
+                     if copy.is_file())
     if (after.stamp, after.size_bytes) != (before.stamp, before.size_bytes) or \
             before.size_bytes not in (None, size_bytes):
         raise StagingError(f'{url}: changed while it was read; is it still being written?')
-    checksums = [copies[copy] for copy in sorted(copies)]
-    content = checksums[0] if len(checksums) == 1 else \
-        hashlib.sha256(''.join(f'{line}\n' for line in checksums).encode()).hexdigest()
-    return Staged(target, content, size_bytes)
-
-
-def _check_size(url: str, size_bytes: int | None, folder: Path) -> None:
-    """Refuse what is too large, before anything is copied."""
-    if size_bytes is None:
-        return
-    if size_bytes > _LARGEST_BYTES:
-        raise UserError(f'{url}: has {size_bytes / 1e9:.3g} GB, expected '
-                        f'{_LARGEST_BYTES / 1e9:.3g} GB at most; split it')
-    free = shutil.disk_usage(folder).free
-    if size_bytes + _SPARE_BYTES > free:
-        raise StagingError(f'{url}: needs {size_bytes / 1e6:.3g} MB beside '
-                           f'{_SPARE_BYTES / 1e6:.3g} MB that stay free, but '
-                           f'{tempfile.gettempdir()} has {free / 1e6:.3g} MB free; set TMPDIR to '
-                           'a larger disk')
+    return Staged(target, sha256([target]), size_bytes)
 
 
 def _inside(folder: Path, name: str, url: str) -> Path:
@@ -148,19 +130,3 @@ def _inside(folder: Path, name: str, url: str) -> Path:
     if path == folder or folder not in path.parents or '..' in path.parts:
         raise UserError(f'{url}: {name!r} leads outside of its folder')
     return path
-
-
-def _copy(fs: Any, name: str, copy: Path, url: str) -> str:
-    """Copy a file, and return its SHA-256."""
-    copy.parent.mkdir(parents=True, exist_ok=True)
-    checksum, count = hashlib.sha256(), 0
-    # A web server need not offer parts of a file.
-    options = {'block_size': 0} if '://' in name else {}
-    with fs.open(name, 'rb', **options) as file, open(copy, 'wb') as target:
-        while block := file.read(_READ_BYTES):
-            count += len(block)
-            if count > _LARGEST_BYTES:
-                raise UserError(f'{url}: is larger than {_LARGEST_BYTES / 1e9:.3g} GB; split it')
-            checksum.update(block)
-            target.write(block)
-    return checksum.hexdigest()

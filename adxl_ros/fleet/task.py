@@ -27,7 +27,7 @@ from adxl_ros.files.recording_columns import recorded_unit, Recording, unit_of
 from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.files.tables import NoNumbers
 from adxl_ros.fleet.inputs import begin_of, is_manifest, Source
-from adxl_ros.fleet.recipe import age_days, code_version, key_of, ParameterText, Recipe
+from adxl_ros.fleet.recipe import age_days, code_version, ParameterText, Recipe, sha256_of
 from adxl_ros.fleet.row import empty_row, finite, Row
 from adxl_ros.fleet.staging import stage, Staged, temporary_folder
 from adxl_ros.model.coefficients import get, parameter_of
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 
 _PAGES = ('explained', 'partly', 'inseparable', 'unknown')
 """Statuses of a diagnosis that get a page. Chosen: it has 2 MB, and without a gap shows little."""
+
 
 class Result(NamedTuple):
     """What a task leaves."""
@@ -91,7 +92,7 @@ def refused(recipe: Recipe, source: Source, reason: str, outcome: str = 'refused
     parameters = recipe.parameters_of(source.serial, source.date, source.params)
     digest = recipe.digest(parameters, source.serial)
     row = _identity(recipe, source, None, source.serial, (source.date, 'manifest'), parameters)
-    row |= {'key': key_of(f'{source.url} {source.stamp}', digest), 'outcome': outcome,
+    row |= {'key': sha256_of(f'{source.url} {source.stamp}', digest), 'outcome': outcome,
             'refusal': reason, 'refused_by': 'stage'}
     return Result(row, {}, source.stamp, digest)
 
@@ -118,7 +119,7 @@ def _in_folder(recipe: Recipe, source: Source, earlier: frozenset[str], folder: 
     digest = recipe.digest(parameters, source.serial)
     # Which of both units it is of is not known.
     row = _identity(recipe, source, staged, '' if is_other else serial, date, parameters)
-    row['key'] = key_of(staged.content, digest)
+    row['key'] = sha256_of(staged.content, digest)
     if row['key'] in earlier:
         return Result(row, {}, source.stamp, digest, is_known=True)
     params = folder / parameters.name if parameters.text else None
