@@ -116,19 +116,19 @@ def _frequent(groups: dict[str, np.ndarray], effects: Sequence[str], has: np.nda
     """
     groups = {name: members for name, members in groups.items()
               if MIN_GROUP <= members.sum() <= len(members) - 1}
-    result = []
+    if not groups:
+        return []
+    names, members, total, result = list(groups), np.array(list(groups.values())), len(has), []
+    size = members.sum(axis=1)
     for number, effect in enumerate(effects):
-        tested = []
-        for name, members in groups.items():
-            inside, size = int(has[members, number].sum()), int(members.sum())
-            outside, rest = int(has[~members, number].sum()), len(members) - size
-            log_chance = float(scipy.stats.hypergeom.logsf(
-                inside - 1, len(members), inside + outside, size))
-            tested.append((log_chance, -size, (name, effect, inside, size, outside, rest)))
-        if tested and min(tested)[0] < np.log(CHANCE / (len(groups) * len(effects))):
-            best = min(tested)[2]
-            if best[2] > _MOST * best[3]:
-                result.append(best)
+        named = int(has[:, number].sum())
+        inside = (members & has[:, number]).sum(axis=1)
+        log_chance = scipy.stats.hypergeom.logsf(inside - 1, total, named, size)
+        i = min(range(len(names)), key=lambda g: (log_chance[g], -size[g], names[g]))
+        if log_chance[i] < np.log(CHANCE / (len(names) * len(effects))) \
+                and inside[i] > _MOST * size[i]:
+            result.append((names[i], effect, int(inside[i]), int(size[i]),
+                           named - int(inside[i]), total - int(size[i])))
     return result
 
 

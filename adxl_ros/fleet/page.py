@@ -66,19 +66,9 @@ _NOTHING = 0.05
 """Smaller standard deviations are nothing beside another one. Chosen: 0.1 % of the variance."""
 _MEASURES = ('gap_before_mps2', *(f'zero_g_{axis}_v' for axis in AXES))
 """Columns that tell whether a unit is within the tolerance."""
-_SENTENCES = {
-    State.OUT_OF_TOLERANCE: ('Recalibrate the unit at the head of the list.',
-                             'Recalibrate the units at the head of the list.'),
-    State.DRIFTS: ('No unit is out of tolerance, but one is on its way.',
-                   'No unit is out of tolerance, but some are on their way.'),
-    State.NOT_JUDGED: ('No unit is out of tolerance, but one gives no usable recordings.',
-                       'No unit is out of tolerance, but some give no usable recordings.'),
-    State.FAR_OUT: ('No unit is out of tolerance, but one differs from all others.',
-                    'No unit is out of tolerance, but some differ from all others.'),
-    State.OLD_CALIBRATION: ('No unit is out of tolerance, but one calibration is old.',
-                            'No unit is out of tolerance, but some calibrations are old.'),
-    State.IN_ORDER: ('The unit is within the tolerance.', 'All units are within the tolerance.')}
-"""What the most urgent state means for the user: of one unit, and of several."""
+_SENTENCES = {State.OUT_OF_TOLERANCE: 'Recalibrate what is at the head of the list.',
+              State.IN_ORDER: 'All units are within the tolerance.'}
+"""What the most urgent state means for the user; the others mean the same."""
 
 
 def date_text(year: float) -> str:
@@ -276,7 +266,8 @@ def _badge(table: FleetTable, units: Sequence[UnitState], counts: Counter[State]
     word = 'IN ORDER' if worst is State.IN_ORDER else \
         f'{counts[worst]} of {len(units)} {worst.words}'.upper()
     return {'colour': worst.colour, 'word': word,
-            'sentence': _SENTENCES[worst][counts[worst] > 1]}
+            'sentence': _SENTENCES.get(
+                worst, 'No unit is out of tolerance. Look at the head of the list.')}
 
 
 def _tiles(table: FleetTable, units: Sequence[UnitState], counts: Counter[State]
