@@ -29,9 +29,10 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from adxl_ros.fleet.populations import by_prefix, CHANCE, MIN_GROUP
-from adxl_ros.fleet.table import FleetTable, MG, Quantity, QuantityResult, TOLERANCE_MG
+from adxl_ros.fleet.table import FleetTable, MG, QuantityResult, TOLERANCE_MG
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Place
+from adxl_ros.report.quantities import number
 import numpy as np
 import pandas as pd
 import scipy
@@ -194,23 +195,6 @@ class UnitState:
         return bool(self.drifts) and self.drifts[0].days < _FARTHEST_DAYS
 
 
-def number(value: float, signed: bool = False, digits: int = 3) -> str:
-    """Return a number with a few digits and no exponent."""
-    if not np.isfinite(value):
-        return '-'
-    rounded = float(f'{value:.{digits}g}')
-    text = f'{abs(rounded):.0f}' if abs(rounded) >= 100 else \
-        np.format_float_positional(abs(rounded), trim='-')
-    sign = '\N{MINUS SIGN}' if rounded < 0 else '+' if signed and rounded > 0 else ''
-    return sign + text
-
-
-def interval_text(quantity: Quantity, value: float, low: float, high: float) -> str:
-    """Return a difference with its interval, in the unit of the page."""
-    middle, below, above = (number(quantity.factor * x, True) for x in (value, low, high))
-    return f'{middle} ({below} to {above}) {quantity.shown_unit}'
-
-
 def rank(table: FleetTable, results: Sequence[QuantityResult],
          far_out: Sequence[dict[str, str | float]]) -> list[UnitState]:
     """Return all units, the most urgent first."""
@@ -291,7 +275,7 @@ def _drifts(unit: int, results: Sequence[QuantityResult], over_mg: float, age_da
             continue
         slope, half = float(result.trends.slope[place]), float(result.half_width[place])
         text = f'{quantity.label} ' \
-            f'{interval_text(quantity, slope, slope - half, slope + half)} per year'
+            f'{quantity.text(slope, slope - half, slope + half)} per year'
         days, reached_mg = np.inf, np.nan
         if quantity.is_force and (quantity.is_coefficient or slope > 0):
             # A coefficient is right at its calibration, and the gap shows what it is now.

@@ -13,29 +13,14 @@ from pathlib import Path
 
 from adxl_ros.files import population_file
 from adxl_ros.files.atomic_write import write_text
-from adxl_ros.fleet.findings import (
-    effect_matrix,
-    EffectMatrix,
-    interval_text,
-    number,
-    rank,
-    State,
-    UnitState,
-)
+from adxl_ros.fleet.findings import effect_matrix, EffectMatrix, rank, State, UnitState
 from adxl_ros.fleet.row import PAGE, POPULATION, reason_kind, TABLE, UNITS
-from adxl_ros.fleet.table import (
-    analyse,
-    far_out,
-    FleetTable,
-    MG,
-    population_of,
-    QuantityResult,
-    read,
-    TOLERANCE_MG,
-)
+from adxl_ros.fleet.table import analyse, FleetTable, MG, QuantityResult, read, TOLERANCE_MG
 from adxl_ros.fleet.trends import FALSE_DISCOVERY_RATE
 from adxl_ros.model.constants import AXES, Z_90
+from adxl_ros.model.population import Population
 from adxl_ros.report import figures as plotly, page as html_page
+from adxl_ros.report.quantities import number
 import numpy as np
 import pandas as pd
 import scipy
@@ -188,6 +173,25 @@ def write(folder: Path) -> list[Path]:
     return [folder / name for name in (PAGE, POPULATION, UNITS)]
 
 
+def population_of(results: Sequence[QuantityResult], name: str) -> Population:
+    """Return what the units of a fleet are like."""
+    return Population(name, {
+        result.quantity.column: result.population.pooled for result in results
+        if result.population is not None and result.population.pooled.prediction_std > 0})
+
+
+def far_out(results: Sequence[QuantityResult], serials: Sequence[str]
+            ) -> list[dict[str, str | float]]:
+    """Return the units that are not of the population, the farthest first."""
+    units: list[dict[str, str | float]] = [
+        {'serial': serials[result.units[i]], 'coefficient': result.quantity.column,
+         'value': float(result.population.estimates[i]),
+         'distance': float(result.population.distances()[i])}
+        for result in results if result.population is not None
+        for i in np.flatnonzero(result.population.is_far_out)]
+    return sorted(units, key=lambda unit: -abs(float(unit['distance'])))
+
+
 def _units_csv(results: Sequence[QuantityResult], serials: Sequence[str]) -> str:
     """Return the estimates of all units, with and without the population."""
     columns = ('serial', 'coefficient', 'unit', 'estimate', 'std', 'shrunken', 'shrunken_std',
@@ -239,7 +243,7 @@ def _batches(results: Sequence[QuantityResult]) -> list[str]:
     """Name the batches whose coefficient is not that of the other units."""
     return [f'{batch.members.sum()} units with a serial number {batch.prefix}… have a '
             f'{result.quantity.label} that differs by '
-            + interval_text(result.quantity, batch.difference, batch.low, batch.high) +
+            + result.quantity.text(batch.difference, batch.low, batch.high) +
             f' from that of the {(~batch.members).sum()} others: a bad batch.'
             for result in results if (batch := result.batch) is not None]
 

@@ -20,15 +20,8 @@ from typing import NamedTuple
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files.calibration_store import sha256
-from adxl_ros.fleet.inputs import (
-    fault_of,
-    file_name,
-    file_system,
-    look_up,
-    NO_FILE,
-    Source,
-    Unreachable,
-)
+from adxl_ros.fleet import inputs
+from adxl_ros.fleet.inputs import Source
 
 _SPARE_BYTES = 64 << 20
 """Space that stays free, byte. Chosen: a task writes some MB."""
@@ -87,19 +80,19 @@ def stage(source: Source, folder: Path) -> Staged:
     """Copy a recording into a folder."""
     url = source.url
     try:
-        fs, path = file_system(url, source.secret)
-    except Unreachable as reason:
+        fs, path = inputs.file_system(url, source.secret)
+    except inputs.Unreachable as reason:
         raise StagingError(one_line(reason)) from None
-    before = look_up(fs, path)
+    before = inputs.look_up(fs, path)
     if before.fault:
-        raise (UserError if before.fault == NO_FILE else StagingError)(f'{url}: {before.fault}')
+        raise (UserError if before.fault == inputs.NO_FILE else StagingError)(f'{url}: {before.fault}')
     free = shutil.disk_usage(folder).free
     if (before.size_bytes or 0) + _SPARE_BYTES > free:
         raise StagingError(f'{url}: needs {(before.size_bytes or 0) / 1e6:.3g} MB beside '
                            f'{_SPARE_BYTES / 1e6:.3g} MB that stay free, but '
                            f'{tempfile.gettempdir()} has {free / 1e6:.3g} MB free; set TMPDIR to '
                            'a larger disk')
-    target = _inside(folder, file_name(path), url)
+    target = _inside(folder, inputs.file_name(path), url)
     try:
         # A web server answers `isdir` with the whole file.
         is_folder = fs.info(path)['type'] == 'directory'
@@ -113,9 +106,9 @@ def stage(source: Source, folder: Path) -> Staged:
     except Exception as error:
         # A connection that broke is not used again.
         fs.clear_instance_cache()
-        raise StagingError(f'{url}: {fault_of(error)}') from None
+        raise StagingError(f'{url}: {inputs.fault_of(error)}') from None
     fs.invalidate_cache()
-    after = look_up(fs, path)
+    after = inputs.look_up(fs, path)
     size_bytes = sum(copy.stat().st_size for copy in [target, *target.rglob('*')]
                      if copy.is_file())
     if (after.stamp, after.size_bytes) != (before.stamp, before.size_bytes) or \

@@ -8,7 +8,6 @@ Each quantity has trends, a population and outliers.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import os
 
@@ -20,17 +19,9 @@ from adxl_ros.fleet.populations import (
     random_effects,
     RandomEffects,
 )
-from adxl_ros.fleet.trends import (
-    are_outliers,
-    claimed,
-    fit_trends,
-    interval_factor,
-    outlier_distances,
-    Recordings,
-    Trends,
-)
+from adxl_ros.fleet.trends import claims, fit_trends, interval_factor, outliers, Recordings, Trends
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
-from adxl_ros.model.population import Population
+from adxl_ros.report.quantities import number
 import numpy as np
 import pandas as pd
 
@@ -64,6 +55,11 @@ class Quantity:
     def is_force(self) -> bool:
         """Whether the quantity is an error of specific force, which has a tolerance."""
         return self.shown_unit.startswith('mg')
+
+    def text(self, value: float, low: float, high: float) -> str:
+        """Return a difference with its interval, in the unit of the page."""
+        middle, below, above = (number(self.factor * x, True) for x in (value, low, high))
+        return f'{middle} ({below} to {above}) {self.shown_unit}'
 
 
 @dataclass(frozen=True)
@@ -191,8 +187,7 @@ def analyse(table: FleetTable) -> list[QuantityResult]:
     coefficients = sum(item[0].is_coefficient for item in measured) * len(table.serials)
     results = []
     for quantity, rows, recordings in measured:
-        distance, freedom = outlier_distances(recordings)
-        is_outlier = are_outliers(distance, freedom, values)
+        distance, is_outlier = outliers(recordings, values)
         trends = fit_trends(recordings[~is_outlier])
         units = np.unique(table.unit[rows[~is_outlier]])
         population, batch = None, None
@@ -207,11 +202,11 @@ def analyse(table: FleetTable) -> list[QuantityResult]:
     if not results:
         return []
     # The false discovery rate is controlled over all slopes together.
-    is_claimed = claimed(np.concatenate([result.trends.p_values for result in results]))
+    is_claimed = claims(np.concatenate([result.trends.p_values for result in results]))
     factor = interval_factor(np.concatenate([r.trends.freedom for r in results]), is_claimed)
     splits = np.cumsum([len(result.units) for result in results])[:-1]
-    return [replace(result, is_claimed=claims, half_width=factors * result.trends.slope_std)
-            for result, claims, factors in zip(results, np.split(is_claimed, splits),
+    return [replace(result, is_claimed=claimed, half_width=factors * result.trends.slope_std)
+            for result, claimed, factors in zip(results, np.split(is_claimed, splits),
                                                np.split(factor, splits))]
 
 
@@ -224,22 +219,3 @@ def _population(trends: Trends, batch: BadBatch | None, tests: int) -> RandomEff
     is_far_out = batch.members.copy()
     is_far_out[others] = of_others.is_far_out
     return RandomEffects(of_others.pooled, trends.level, trends.level_std, is_far_out)
-
-
-def population_of(results: Sequence[QuantityResult], name: str) -> Population:
-    """Return what the units of a fleet are like."""
-    return Population(name, {
-        result.quantity.column: result.population.pooled for result in results
-        if result.population is not None and result.population.pooled.prediction_std > 0})
-
-
-def far_out(results: Sequence[QuantityResult], serials: Sequence[str]
-            ) -> list[dict[str, str | float]]:
-    """Return the units that are not of the population, the farthest first."""
-    units: list[dict[str, str | float]] = [
-        {'serial': serials[result.units[i]], 'coefficient': result.quantity.column,
-         'value': float(result.population.estimates[i]),
-         'distance': float(result.population.distances()[i])}
-        for result in results if result.population is not None
-        for i in np.flatnonzero(result.population.is_far_out)]
-    return sorted(units, key=lambda unit: -abs(float(unit['distance'])))

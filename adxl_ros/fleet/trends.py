@@ -235,7 +235,7 @@ def _widening(sums: _Sums, fit: Trends) -> float:
     return widening
 
 
-def claimed(p_values: np.ndarray) -> np.ndarray:
+def claims(p_values: np.ndarray) -> np.ndarray:
     """Mark the slopes that survive the control of the false discovery rate."""
     tested = np.isfinite(p_values)
     result = np.zeros(p_values.shape, bool)
@@ -252,12 +252,13 @@ def interval_factor(freedom: np.ndarray, is_claimed: np.ndarray) -> np.ndarray:
     return -scipy.special.stdtrit(freedom, outside / 2)
 
 
-def outlier_distances(recordings: Recordings) -> tuple[np.ndarray, np.ndarray]:
+def outliers(recordings: Recordings, tests: int) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return how far recordings are from the median of their unit and period.
+    Mark the recordings that are too far from the median of their unit and period to be chance.
 
-    returns: the distance in robust standard deviations, (n,), and the degrees of freedom of its t
-    distribution, (n,). The distance is 0 where a period has too few recordings.
+    tests: number of recordings that share the chance of a false outlier; returns: the distance of
+    each recording in robust standard deviations, (n,), which is 0 where a period has too few
+    recordings, and whether it is an outlier, (n,) bool.
     """
     period, value = recordings.period, recordings.value
     counts = np.bincount(period)
@@ -270,19 +271,11 @@ def outlier_distances(recordings: Recordings) -> tuple[np.ndarray, np.ndarray]:
     stated2 = recordings.std ** 2
     worse2 = np.maximum(stated2 - _medians(period, stated2)[period], 0.0)
     scale = np.sqrt((variance * (1 + np.pi / 2 / counts))[period] + worse2)
-    distance = np.divide(deviation, scale, out=np.zeros(len(value)), where=scale > 0)
-    return np.where(enough[period], distance, 0.0), freedom[period]
-
-
-def are_outliers(distance: np.ndarray, freedom: np.ndarray, tests: int) -> np.ndarray:
-    """
-    Mark the recordings that are too far to be chance.
-
-    distance, freedom: as `outlier_distances` returns them, (n,); returns: whether each recording
-    is an outlier, (n,) bool.
-    """
-    limits = -scipy.special.stdtrit(np.minimum(freedom, 1e6), FALSE_OUTLIERS / (2 * max(tests, 1)))
-    return distance > limits
+    distance = np.divide(deviation, scale, out=np.zeros(len(value)),
+                         where=(scale > 0) & enough[period])
+    limits = -scipy.special.stdtrit(np.minimum(freedom[period], 1e6),
+                                    FALSE_OUTLIERS / (2 * max(tests, 1)))
+    return distance, distance > limits
 
 
 def _medians(label: np.ndarray, value: np.ndarray) -> np.ndarray:
