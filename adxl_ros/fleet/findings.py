@@ -73,7 +73,7 @@ def effect_matrix(table: FleetTable) -> EffectMatrix:
     share = has.groupby(unit).mean()
     by_unit = share.to_numpy() > _MOST
     by_place = has.groupby([unit, [url.rpartition('/')[0] for url in frame['url']]]).mean()
-    serials = [table.serials[number] for number in share.index]
+    serials = [table.serials[i] for i in share.index]
     is_common = (by_unit.sum(axis=0) > _MOST * len(serials)) & (len(serials) >= MIN_GROUP)
     findings = [
         *(f'{by_unit[:, i].sum()} of {len(by_unit)} units have {effects[i]}. ' + (
@@ -121,9 +121,9 @@ def _frequent(groups: dict[str, np.ndarray], effects: Sequence[str], has: np.nda
         return []
     names, members, total, result = list(groups), np.array(list(groups.values())), len(has), []
     size = members.sum(axis=1)
-    for number, effect in enumerate(effects):
-        named = int(has[:, number].sum())
-        inside = (members & has[:, number]).sum(axis=1)
+    for column, effect in enumerate(effects):
+        named = int(has[:, column].sum())
+        inside = (members & has[:, column]).sum(axis=1)
         log_chance = scipy.stats.hypergeom.logsf(inside - 1, total, named, size)
         i = min(range(len(names)), key=lambda g: (log_chance[g], -size[g], names[g]))
         if log_chance[i] < np.log(CHANCE / (len(names) * len(effects))) \

@@ -85,7 +85,8 @@ def stage(source: Source, folder: Path) -> Staged:
         raise StagingError(one_line(reason)) from None
     before = inputs.look_up(fs, path)
     if before.fault:
-        raise (UserError if before.fault == inputs.NO_FILE else StagingError)(f'{url}: {before.fault}')
+        error = UserError if before.fault == inputs.NO_FILE else StagingError
+        raise error(f'{url}: {before.fault}')
     free = shutil.disk_usage(folder).free
     if (before.size_bytes or 0) + _SPARE_BYTES > free:
         raise StagingError(f'{url}: needs {(before.size_bytes or 0) / 1e6:.3g} MB beside '
@@ -103,10 +104,10 @@ def stage(source: Source, folder: Path) -> Staged:
             fs.get_file(name, str(copy))
     except UserError:
         raise
-    except Exception as error:
+    except Exception as problem:
         # A connection that broke is not used again.
         fs.clear_instance_cache()
-        raise StagingError(f'{url}: {inputs.fault_of(error)}') from None
+        raise StagingError(f'{url}: {inputs.fault_of(problem)}') from None
     fs.invalidate_cache()
     after = inputs.look_up(fs, path)
     size_bytes = sum(copy.stat().st_size for copy in [target, *target.rglob('*')]
