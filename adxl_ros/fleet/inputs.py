@@ -227,17 +227,16 @@ def look_up(fs: Any, path: str) -> Source:
     """Look up one recording."""
     try:
         info = fs.info(path)
-        if info['type'] == 'directory':
-            files = fs.find(path, detail=True)
-            if _BAG not in map(file_name, files):
-                return Source(_url(fs, path), fault=f'is a folder without {_BAG}, not a recording')
-            return _of_bag(fs, path, files)
-        return _of_info(fs, path, info)
+        if info['type'] != 'directory':
+            return _of_info(fs, path, info)
+        files = fs.find(path, detail=True)
+        return _of_bag(fs, path, files) if _BAG in map(file_name, files) else \
+            _source(fs, path, fault=f'is a folder without {_BAG}, not a recording')
     except Exception as error:
         if not isinstance(error, FileNotFoundError):
             # A connection that broke is not used again.
             fs.clear_instance_cache()
-        return Source(_url(fs, path), fault=fault_of(error), secret=_secret(fs, path))
+        return _source(fs, path, fault=fault_of(error))
 
 
 def fault_of(error: BaseException) -> str:
@@ -251,36 +250,32 @@ def fault_of(error: BaseException) -> str:
     return f'cannot be read: {without_secrets(reason)}'
 
 
-def _url(fs: Any, path: str) -> str:
-    """Return the address of a path: the path itself on this machine."""
-    name = str(fs.unstrip_protocol(path))
+def _source(fs: Any, path: str, size_bytes: int | None = None, stamp: str = '',
+            modified: str = '', fault: str = '') -> Source:
+    """Return a recording by its address, which is the path itself on this machine."""
+    name, options = str(fs.unstrip_protocol(path)), fs.storage_options
     scheme, _, rest = name.partition(':///')
-    options = fs.storage_options
     if rest and options.get('host'):
         # The path in a server does not name the server.
         user = f'{options["username"]}@' if options.get('username') else ''
         port = f':{options["port"]}' if options.get('port') else ''
         name = f'{scheme}://{user}{options["host"]}{port}/{rest}'
     # A name that is not UTF-8 has no place in a table.
-    name = without_secrets(as_utf_8(name))
-    return name.removeprefix('file://') if name.startswith('file:///') else name
-
-
-def _secret(fs: Any, path: str) -> str:
-    """Return what an address leaves out; see `Source`."""
+    url = without_secrets(as_utf_8(name))
+    url = url.removeprefix('file://') if url.startswith('file:///') else url
+    secret = str(options.get('password') or '')
     if _is_web(path):
-        return path if without_secrets(path) != path else ''
-    return str(fs.storage_options.get('password') or '')
+        secret = path if path != url else ''
+    return Source(url, size_bytes, stamp, modified, fault=fault, secret=secret)
 
 
 def _of_info(fs: Any, path: str, info: Mapping[str, Any]) -> Source:
     """Return the recording that a file system describes."""
     if info['type'] not in ('file', 'link'):
-        return Source(_url(fs, path), fault='is no file')
+        return _source(fs, path, fault='is no file')
     if as_utf_8(path) != path:
-        return Source(_url(fs, path), fault='its name is not UTF-8; rename it')
-    return Source(_url(fs, path), info.get('size'), _stamp_of(info), _modified(info),
-                  secret=_secret(fs, path))
+        return _source(fs, path, fault='its name is not UTF-8; rename it')
+    return _source(fs, path, info.get('size'), _stamp_of(info), _modified(info))
 
 
 def _of_bag(fs: Any, folder: str, files: Mapping[str, Mapping[str, Any]]) -> Source:
@@ -288,9 +283,9 @@ def _of_bag(fs: Any, folder: str, files: Mapping[str, Mapping[str, Any]]) -> Sou
     sizes = [info.get('size') for info in files.values()]
     stamps = {name: _stamp_of(info) for name, info in sorted(files.items())}
     text = '\n'.join(f'{name} {stamp}' for name, stamp in stamps.items())
-    return Source(_url(fs, folder), None if None in sizes else sum(filter(None, sizes)),
-                  hashlib.sha256(text.encode()).hexdigest() if all(stamps.values()) else '',
-                  max(map(_modified, files.values()), default=''), secret=_secret(fs, folder))
+    return _source(fs, folder, None if None in sizes else sum(filter(None, sizes)),
+                   hashlib.sha256(text.encode()).hexdigest() if all(stamps.values()) else '',
+                   max(map(_modified, files.values()), default=''))
 
 
 def _stamp_of(info: Mapping[str, Any]) -> str:
