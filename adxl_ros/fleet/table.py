@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 import os
+from typing import TYPE_CHECKING
 
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.fleet.populations import (
@@ -23,7 +24,9 @@ from adxl_ros.fleet.trends import claims, fit_trends, interval_factor, outliers,
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.report.quantities import number
 import numpy as np
-import pandas as pd
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _TEXTS = ['url', 'hash', 'serial', 'outcome', 'refusal', 'refused_by', 'calibration_id', 'status',
           'report', 'version']
@@ -206,8 +209,8 @@ def analyse(table: FleetTable) -> list[QuantityResult]:
     factor = interval_factor(np.concatenate([r.trends.freedom for r in results]), is_claimed)
     splits = np.cumsum([len(result.units) for result in results])[:-1]
     return [replace(result, is_claimed=claimed, half_width=factors * result.trends.slope_std)
-            for result, claimed, factors in zip(results, np.split(is_claimed, splits),
-                                               np.split(factor, splits))]
+            for result, claimed, factors in zip(
+                results, np.split(is_claimed, splits), np.split(factor, splits))]
 
 
 def _population(trends: Trends, batch: BadBatch | None, tests: int) -> RandomEffects:
