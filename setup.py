@@ -30,7 +30,7 @@ setup(
               f'{PACKAGE}.params'],
     package_dir={f'{PACKAGE}.params': 'params'},
     package_data={PACKAGE: ['calibrate/report/*.html', 'calibrate/report/*.js', 'diagnose/*.html',
-                            'report/page_templates/*', 'fleet/report/*.html', 'tools/*.html'],
+                            'report/page_templates/*', 'fleet/*.html', 'tools/*.html'],
                   f'{PACKAGE}.params': ['*.yaml']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),

@@ -11,14 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
 import csv
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 import hashlib
-import math
 import os
 from pathlib import Path, PurePosixPath
+import re
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
@@ -34,13 +33,11 @@ _ENDINGS = ('.csv', '.mcap', '.db3')
 """Ends of the names of recordings in a folder, beside those of other tables."""
 _BAG = 'metadata.yaml'
 """File that makes a folder a bag."""
-_GLOB = frozenset('*?[')
-"""Characters of a glob."""
-_STAMPS = ('ETag', 'etag', 'e_tag', 'md5Hash', 'Content-MD5', 'Digest', 'mtime', 'created', 'ino',
-           'LastModified', 'last_modified', 'Last-Modified', 'updated', 'modified')
-"""Properties of an object that change with its content, by the names of file systems."""
 _TIMES = ('mtime', 'LastModified', 'last_modified', 'updated', 'modified')
-"""Properties that are the time of the last change."""
+"""Properties of an object that are the time of the last change, by the names of file systems."""
+_STAMPS = ('ETag', 'etag', 'e_tag', 'md5Hash', 'Content-MD5', 'Digest', 'created', 'ino',
+           'Last-Modified', *_TIMES)
+"""Properties of an object that change with its content."""
 _THREADS = 32
 """Objects of a manifest that are looked up at once. Chosen: a server answers in 0.1 s."""
 _SILENCE_S = 60.0
@@ -50,16 +47,16 @@ _CONNECT_S = 30.0
 """Time in which a web server must accept a connection, s: that of aiohttp."""
 _HEAD_BYTES = 4096
 """Begin of a CSV file that is read for serial number and date, byte. Chosen: its comments fit."""
+_COMMENT = re.compile(r'^#\s*(\w+)\s*:\s*(.*?)\s*$', re.MULTILINE)
+"""A comment of a CSV file that states something."""
 _DATES_S = (946684800.0, 4102444800.0)
 """Stamps between these count from 1970, s: the years 2000 to 2100. Others count from a start."""
 NO_FILE = 'no such file'
 """Fault of a recording that is not there."""
-_WEB_BAG = 'is a bag on a web server, which cannot be read as a whole; name a copy or its file'
-"""Fault of a bag whose address begins with http."""
 _DELIMITERS = ',;\t'
 """Characters between the columns of a manifest; the header has the one that it uses."""
-_MANIFEST_COLUMNS = ('serial', 'params', 'date')
-"""Columns of a manifest beside `url`."""
+_MANIFEST_COLUMNS = ('url', 'serial', 'params', 'date')
+"""Columns of a manifest."""
 
 
 class Unreachable(UserError):
@@ -92,31 +89,27 @@ def file_system(url: str, secret: str = '') -> tuple[Any, str]:
         from fsspec.implementations.local import LocalFileSystem
     except ImportError:
         raise UserError(f'fleet needs fsspec; {install_hint("adxl_ros[fleet]")}') from None
+    address = secret if _is_web(secret) else url
+    # A path of this machine may have two colons, which join addresses.
+    if '://' not in address or address.startswith('file://'):
+        path = LocalFileSystem._strip_protocol(address)
+        # One file has one address.
+        is_long = '..' in PurePosixPath(path).parts
+        return LocalFileSystem(), os.path.realpath(path) if is_long else str(PurePosixPath(path))
     try:
-        address = secret if _is_web(secret) else url
-        options = {'password': secret} if secret and address == url else _web_options(address)
-        # A path of this machine may have two colons, which join addresses.
-        fs, path = url_to_fs(address, **options) if '://' in address else \
-            (LocalFileSystem(), LocalFileSystem._strip_protocol(address))
+        options: dict[str, Any] = {}
+        if _is_web(address):
+            from aiohttp import ClientTimeout
+            options = {'client_kwargs': {'timeout': ClientTimeout(
+                total=None, sock_connect=_CONNECT_S, sock_read=_SILENCE_S)}}
+        elif secret:
+            options = {'password': secret}
+        return url_to_fs(address, **options)
     except (ImportError, ValueError) as error:
         raise UserError(without_secrets(f'{url}: {one_line(error)}')) from None
     except Exception as error:
         raise Unreachable(
             without_secrets(f'{url}: cannot be opened: {one_line(error)}')) from None
-    if not isinstance(fs, LocalFileSystem):
-        return fs, path
-    # One file has one address.
-    pure = PurePosixPath(path)
-    return fs, os.path.realpath(path) if '..' in pure.parts else str(pure)
-
-
-def _web_options(url: str) -> dict[str, Any]:
-    """Return how a web server is read: as long as it sends; empty for another address."""
-    if not _is_web(url):
-        return {}
-    from aiohttp import ClientTimeout
-    return {'client_kwargs': {'timeout': ClientTimeout(
-        total=None, sock_connect=_CONNECT_S, sock_read=_SILENCE_S)}}
 
 
 def _is_web(url: str) -> bool:
@@ -130,49 +123,77 @@ def find_sources(inputs: Iterable[str]) -> list[Source]:
 
     The files of a fleet's results, which lie beside its table, are no recordings.
     """
-    try:
-        sources = {source.url: source for text in inputs for source in _of_input(text)}
-    except UserError as error:
-        raise UserError(without_secrets(str(error))) from None
+    sources: dict[str, Source] = {}
+    for text in inputs:
+        try:
+            sources |= {source.url: source for source in _of_input(text)}
+        except UserError as error:
+            raise UserError(without_secrets(str(error))) from None
+        except Exception as error:
+            raise UserError(without_secrets(
+                f'{text}: cannot be listed: {one_line(error)}')) from None
     return [sources[url] for url in sorted(sources)]
 
 
-def _of_input(text: str) -> Iterator[Source]:
-    """Yield the recordings of one input."""
+def _of_input(text: str) -> Iterable[Source]:
+    """Return the recordings of one input."""
     try:
         fs, path = file_system(text)
     except Unreachable as error:
-        if _is_glob(text) or not _is_recording_name(text):
+        if _wild_characters(text) or not _is_recording_name(text):
             raise
-        yield _unreachable(text, error)
-        return
-    if _is_glob(path) and not os.path.exists(path):
-        listed = _listed(text, lambda: fs.glob(path, detail=True))
-        names = [name for name in listed
-                 if PurePosixPath(name).name != _BAG and not _is_hidden_to(path, name)
-                 and not _is_of_fleet(fs, name)]
-        if not names:
-            raise UserError(f'{text}: matches nothing')
-        for name in sorted(names):
-            info = listed[name]
-            if info['type'] == 'directory':
-                yield from _of_folder(fs, name, may_be_empty=True)
-            else:
-                yield _of_info(fs, name, info)
-    elif _is_special(path):
-        yield look_up(fs, path, text)
-    elif _is_recording_name(path) and not os.path.isdir(path):
+        return [_unreachable(text, error)]
+    is_here = os.path.exists(path)
+    if _wild_characters(path) and not is_here:
+        return _of_listing(text, fs, path, fs.glob(path, detail=True))
+    if is_here and not (os.path.isfile(path) or os.path.isdir(path)):
+        # A pipe or a device may never end.
+        return [look_up(fs, path)]
+    if _is_recording_name(path) and not os.path.isdir(path):
         rows = _manifest_rows(text, fs, path)
-        yield from [look_up(fs, path, text)] if rows is None else _of_manifest(text, rows)
-    elif _listed(text, lambda: fs.isdir(path)):
-        yield from _of_folder(fs, path)
-    else:
-        yield look_up(fs, path, text)
+        return [look_up(fs, path)] if rows is None else _of_manifest(text, rows)
+    if fs.isdir(path):
+        return _of_listing(text, fs, path, {path: {'type': 'directory'}})
+    return [look_up(fs, path)]
 
 
-def _is_special(path: str) -> bool:
-    """Return whether a path of this machine is a pipe or a device, which may never end."""
-    return os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path))
+def _of_listing(text: str, fs: Any, path: str, named: Mapping[str, Mapping[str, Any]]
+                ) -> Iterator[Source]:
+    """
+    Yield the recordings of a folder or a glob, those in folders too; a bag is one recording.
+
+    named: what the folder or the glob names, by path. Hidden files do not count, unless the glob
+    asks for them.
+    """
+    wild = [path.index(letter) for letter in _wild_characters(path) if path not in named]
+    base = path[:path.rfind('/', 0, min(wild)) + 1] if wild else path
+    asks_for_hidden = '/.' in f'/{path.removeprefix(base)}'
+    files: dict[str, Mapping[str, Any]] = {}
+    for name, info in named.items():
+        files |= fs.find(name, detail=True) if info['type'] == 'directory' else {name: info}
+
+    def is_visible(name: str) -> bool:
+        return asks_for_hidden or '/.' not in f'/{name.removeprefix(base).lstrip("/")}'
+
+    bags: dict[str, dict[str, Any]] = {
+        name.rpartition('/')[0]: {} for name in sorted(files)
+        if file_name(name) == _BAG and is_visible(name)}
+    count = len(bags)
+    for name, info in sorted(files.items()):
+        bag = name.rpartition('/')[0]
+        while bag and bag not in bags:
+            bag = bag.rpartition('/')[0]
+        if bag:
+            bags[bag][name] = info
+        elif is_visible(name) and not _is_of_fleet(fs, name) and (
+                name in named or _is_recording_name(name)):
+            count += 1
+            yield _of_info(fs, name, info)
+    for bag, content in bags.items():
+        yield _of_bag(fs, bag, content)
+    if not count:
+        raise UserError(f'{text}: matches nothing' if wild else f'{text}: has no recording '
+                        f'(*{", *".join(_ENDINGS)}, a bag or a table)')
 
 
 def _unreachable(url: str, error: UserError) -> Source:
@@ -181,24 +202,14 @@ def _unreachable(url: str, error: UserError) -> Source:
     return Source(plain, fault=one_line(error).removeprefix(f'{plain}: '))
 
 
-def _is_glob(path: str) -> bool:
-    """Return whether a path has characters of a glob; in a web address only * is one."""
-    return bool(set(path) & (set('*') if '://' in path else _GLOB))
+def _wild_characters(path: str) -> set[str]:
+    """Return the characters of a glob in a path; in a web address only * is one."""
+    return set(path) & set('*' if '://' in path else '*?[')
 
 
 def file_name(path: str) -> str:
     """Return the name of the file of a path; that of a web address ends before its query."""
     return PurePosixPath(urlsplit(path).path if '://' in path else path).name
-
-
-def _listed(text: str, look: Any) -> Any:
-    """Look at a folder; report what goes wrong in one line."""
-    try:
-        return look()
-    except FileNotFoundError:
-        return {}
-    except Exception as error:
-        raise UserError(f'{text}: cannot be listed: {one_line(error)}') from None
 
 
 def _is_recording_name(path: str) -> bool:
@@ -209,69 +220,23 @@ def _is_recording_name(path: str) -> bool:
 def _is_of_fleet(fs: Any, name: str) -> bool:
     """Return whether a file is part of the results of a fleet."""
     folder, _, file = name.rpartition('/')
-    return file in (PAGE, POPULATION, TABLE, UNITS) and bool(
-        _listed(folder, lambda: fs.exists(f'{folder}/{TABLE}')))
+    return file in (PAGE, POPULATION, TABLE, UNITS) and fs.exists(f'{folder}/{TABLE}')
 
 
-def _of_folder(fs: Any, folder: str, may_be_empty: bool = False) -> Iterator[Source]:
-    """Yield the recordings in a folder, those of its folders too; a bag is one recording."""
-    files = _listed(folder, lambda: fs.find(folder, detail=True))
-    bags = {name.rpartition('/')[0] for name in files
-            if PurePosixPath(name).name == _BAG and not _is_hidden(name, folder)}
-    by_bag: dict[str, dict[str, Any]] = {bag: {} for bag in sorted(bags)}
-    count = 0
-    for name in sorted(files):
-        parent = next((above for above in _folders(name) if above in bags), None)
-        if parent is not None:
-            by_bag[parent][name] = files[name]
-        elif _is_recording_name(name) and not _is_hidden(name, folder) \
-                and not _is_of_fleet(fs, name):
-            count += 1
-            yield _of_info(fs, name, files[name])
-    for bag, content in by_bag.items():
-        count += 1
-        # A web server does not say that this is a folder.
-        yield Source(_url(fs, bag), fault=_WEB_BAG) if _is_web(bag) else _of_bag(fs, bag, content)
-    if not count and not may_be_empty:
-        raise UserError(f'{folder}: has no recording (*{", *".join(_ENDINGS)}, a bag or a table)')
-
-
-def _is_hidden(name: str, folder: str) -> bool:
-    """Return whether a file lies in a hidden folder below a folder, or is hidden itself."""
-    below = name.removeprefix(folder.rstrip('/'))
-    return any(part.startswith('.') for part in below.split('/'))
-
-
-def _is_hidden_to(glob: str, name: str) -> bool:
-    """Return whether a file is hidden to a glob, which may ask for hidden ones."""
-    parts = glob.split('/')
-    wild = next(i for i, part in enumerate(parts) if _is_glob(part))
-    return not any(part.startswith('.') for part in parts[wild:]) and \
-        _is_hidden(name, '/'.join(parts[:wild]))
-
-
-def _folders(name: str) -> Iterator[str]:
-    """Yield the folders of a file, the nearest first; `//` of an address stays."""
-    while name:
-        name = name.rpartition('/')[0]
-        yield name
-
-
-def look_up(fs: Any, path: str, url: str) -> Source:
+def look_up(fs: Any, path: str) -> Source:
     """Look up one recording."""
     try:
         info = fs.info(path)
-        if info['type'] == 'directory':
-            files = fs.find(path, detail=True)
-            if not any(PurePosixPath(name).name == _BAG for name in files):
-                return Source(_url(fs, path), fault=f'is a folder without {_BAG}, not a recording')
-            return _of_bag(fs, path, files)
-        return _of_info(fs, path, info)
+        if info['type'] != 'directory':
+            return _of_info(fs, path, info)
+        files = fs.find(path, detail=True)
+        return _of_bag(fs, path, files) if _BAG in map(file_name, files) else \
+            _source(fs, path, fault=f'is a folder without {_BAG}, not a recording')
     except Exception as error:
         if not isinstance(error, FileNotFoundError):
             # A connection that broke is not used again.
             fs.clear_instance_cache()
-        return Source(_url(fs, path), fault=fault_of(error), secret=_secret(fs, path))
+        return _source(fs, path, fault=fault_of(error))
 
 
 def fault_of(error: BaseException) -> str:
@@ -285,81 +250,65 @@ def fault_of(error: BaseException) -> str:
     return f'cannot be read: {without_secrets(reason)}'
 
 
-def _url(fs: Any, path: str) -> str:
-    """Return the address of a path: the path itself on this machine."""
-    name = str(fs.unstrip_protocol(path))
+def _source(fs: Any, path: str, size_bytes: int | None = None, stamp: str = '',
+            modified: str = '', fault: str = '') -> Source:
+    """Return a recording by its address, which is the path itself on this machine."""
+    name, options = str(fs.unstrip_protocol(path)), fs.storage_options
     scheme, _, rest = name.partition(':///')
-    options = fs.storage_options
     if rest and options.get('host'):
         # The path in a server does not name the server.
         user = f'{options["username"]}@' if options.get('username') else ''
         port = f':{options["port"]}' if options.get('port') else ''
         name = f'{scheme}://{user}{options["host"]}{port}/{rest}'
     # A name that is not UTF-8 has no place in a table.
-    name = without_secrets(as_utf_8(name))
-    return name.removeprefix('file://') if name.startswith('file:///') else name
-
-
-def _secret(fs: Any, path: str) -> str:
-    """Return what an address leaves out; see `Source`."""
+    url = without_secrets(as_utf_8(name))
+    url = url.removeprefix('file://') if url.startswith('file:///') else url
+    secret = str(options.get('password') or '')
     if _is_web(path):
-        return path if without_secrets(path) != path else ''
-    return str(fs.storage_options.get('password') or '')
+        secret = path if path != url else ''
+    return Source(url, size_bytes, stamp, modified, fault=fault, secret=secret)
 
 
 def _of_info(fs: Any, path: str, info: Mapping[str, Any]) -> Source:
     """Return the recording that a file system describes."""
     if info['type'] not in ('file', 'link'):
-        return Source(_url(fs, path), fault='is no file')
+        return _source(fs, path, fault='is no file')
     if as_utf_8(path) != path:
-        return Source(_url(fs, path), fault='its name is not UTF-8; rename it')
-    return Source(_url(fs, path), info.get('size'), stamp_of(info), _modified(info),
-                  secret=_secret(fs, path))
+        return _source(fs, path, fault='its name is not UTF-8; rename it')
+    return _source(fs, path, info.get('size'), _stamp_of(info), _modified(info))
 
 
 def _of_bag(fs: Any, folder: str, files: Mapping[str, Mapping[str, Any]]) -> Source:
     """Return the recording of a bag's folder."""
     sizes = [info.get('size') for info in files.values()]
-    stamps = [f'{name} {stamp_of(info)}' for name, info in sorted(files.items())]
-    stamp = hashlib.sha256('\n'.join(stamps).encode()).hexdigest() \
-        if all(stamp_of(info) for info in files.values()) else ''
-    return Source(_url(fs, folder), None if None in sizes else sum(filter(None, sizes)), stamp,
-                  max(map(_modified, files.values()), default=''), secret=_secret(fs, folder))
+    stamps = {name: _stamp_of(info) for name, info in sorted(files.items())}
+    text = '\n'.join(f'{name} {stamp}' for name, stamp in stamps.items())
+    return _source(fs, folder, None if None in sizes else sum(filter(None, sizes)),
+                   hashlib.sha256(text.encode()).hexdigest() if all(stamps.values()) else '',
+                   max(map(_modified, files.values()), default=''))
 
 
-def stamp_of(info: Mapping[str, Any]) -> str:
+def _stamp_of(info: Mapping[str, Any]) -> str:
     """Return what changes with the content of a file; empty if the server states nothing."""
-    stated = {name: info[name] for name in _STAMPS if info.get(name)}
-    if not stated:
-        return ''
-    return ' '.join([f'size={info.get("size")}', *(
-        f'{name}={value}' for name, value in sorted(stated.items()))])
+    stated = [f'{name}={info[name]}' for name in sorted(_STAMPS) if info.get(name)]
+    return ' '.join([f'size={info.get("size")}', *stated]) if stated else ''
 
 
 def _modified(info: Mapping[str, Any]) -> str:
     """Return the time of the last change, ISO 8601, UTC; empty if unknown."""
-    for name in _TIMES:
-        value = info.get(name)
-        if isinstance(value, (int, float)):
-            return datetime.fromtimestamp(value, timezone.utc).isoformat()
-        if isinstance(value, datetime):
-            return as_utc(value).isoformat()
-        if isinstance(value, str) and value:
-            return as_date(value) or ''
-    return ''
-
-
-def as_utc(date: datetime) -> datetime:
-    """Return a time in UTC; one without a zone counts as UTC."""
-    return date.astimezone(timezone.utc) if date.tzinfo else date.replace(tzinfo=timezone.utc)
+    value = next((info[name] for name in _TIMES if info.get(name)), '')
+    if isinstance(value, (int, float)):
+        value = datetime.fromtimestamp(value, timezone.utc)
+    return as_date(str(value)) or ''
 
 
 def as_date(text: str) -> str | None:
-    """Return a date of ISO 8601 in UTC, or None if the text is none."""
+    """Return a date of ISO 8601 in UTC, or None if the text is none; UTC is the usual zone."""
     try:
-        return as_utc(datetime.fromisoformat(text.strip().replace('Z', '+00:00'))).isoformat()
+        date = datetime.fromisoformat(text.strip().replace('Z', '+00:00'))
     except ValueError:
         return None
+    return date.replace(tzinfo=date.tzinfo or timezone.utc).astimezone(timezone.utc).isoformat()
 
 
 def _manifest_rows(text: str, fs: Any, path: str) -> dict[int, dict[str, str]] | None:
@@ -372,15 +321,10 @@ def _manifest_rows(text: str, fs: Any, path: str) -> dict[int, dict[str, str]] |
     try:
         if suffix == '.csv':
             with fs.open(path, 'r', encoding='utf-8-sig', newline='') as file:
-                begin, head = next(((number, line) for number, line in enumerate(file, 1)
-                                    if line.strip() and not _is_comment(line)), (0, ''))
-                delimiter = max(_DELIMITERS, key=head.count)
-                names = [name.strip().lower()
-                         for name in next(csv.reader([head], delimiter=delimiter), [])]
-                return _csv_rows(text, names, begin, csv.reader(file, delimiter=delimiter)) \
-                    if 'url' in names else None
+                return _csv_rows(text, file)
         if suffix in ('.parquet', '.pq'):
-            return _parquet_rows(fs, path)
+            with fs.open(path, 'rb') as file:
+                return _parquet_rows(file)
     except UserError:
         raise
     except Exception:
@@ -389,47 +333,46 @@ def _manifest_rows(text: str, fs: Any, path: str) -> dict[int, dict[str, str]] |
     return None
 
 
-def _is_comment(line: str) -> bool:
-    """Return whether a line of a manifest is a comment."""
-    return line.lstrip().startswith('#')
-
-
-def _csv_rows(text: str, names: list[str], begin: int, rows: Any) -> dict[int, dict[str, str]]:
-    """Return the rows of a manifest below its header in line `begin`, by number and column."""
-    result = {}
-    for cells in rows:
-        if not any(map(str.strip, cells)) or _is_comment(cells[0]):
-            continue
-        number = begin + rows.line_num
-        if len(cells) != len(names):
-            raise UserError(f'{text}: row {number}: {len(cells)} columns, expected {len(names)}')
-        result[number] = {name: cell.strip() for name, cell in zip(names, cells)}
+def _csv_rows(text: str, file: Iterable[str]) -> dict[int, dict[str, str]] | None:
+    """Return the rows of a manifest, by line and column; None for a recording."""
+    lines = iter(file)
+    begin, head = next(((number, line) for number, line in enumerate(lines, 1)
+                        if line.strip() and not line.lstrip().startswith('#')), (0, ''))
+    delimiter = max(_DELIMITERS, key=head.count)
+    names = [name.strip().lower() for name in next(csv.reader([head], delimiter=delimiter), [])]
+    if 'url' not in names:
+        return None
+    result, reader = {}, csv.reader(lines, delimiter=delimiter)
+    for cells in reader:
+        if any(map(str.strip, cells)) and not cells[0].lstrip().startswith('#'):
+            number = begin + reader.line_num
+            if len(cells) != len(names):
+                raise UserError(
+                    f'{text}: row {number}: {len(cells)} columns, expected {len(names)}')
+            result[number] = dict(zip(names, map(str.strip, cells)))
     return result
 
 
-def _parquet_rows(fs: Any, path: str) -> dict[int, dict[str, str]] | None:
-    """Return the rows of a manifest by number; None for a recording."""
+def _parquet_rows(file: Any) -> dict[int, dict[str, str]] | None:
+    """Return the rows of a manifest by number and column; None for a recording."""
     from pyarrow import parquet
-    with fs.open(path, 'rb') as file:
-        content = parquet.ParquetFile(file)
-        if 'url' not in content.schema_arrow.names:
-            return None
-        names = [name for name in ('url', *_MANIFEST_COLUMNS)
-                 if name in content.schema_arrow.names]
-        rows = content.read(names).to_pylist()
-    return {number: {name: '' if value is None else _text(value) for name, value in row.items()}
-            for number, row in enumerate(rows, 1)}
+    content = parquet.ParquetFile(file)
+    names = [name for name in _MANIFEST_COLUMNS if name in content.schema_arrow.names]
+    if 'url' not in names:
+        return None
+    return {number: {name: _text(value) for name, value in row.items()}
+            for number, row in enumerate(content.read(names).to_pylist(), 1)}
 
 
 def _text(value: Any) -> str:
     """Return a value of a manifest as text; a column with empty cells has floats."""
-    if isinstance(value, float):
-        return '' if math.isnan(value) else str(int(value)) if value.is_integer() else str(value)
-    return value.isoformat() if isinstance(value, datetime) else str(value)
+    if value is None or value != value:
+        return ''
+    return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
 
 
-def _of_manifest(text: str, rows: dict[int, dict[str, str]]) -> list[Source]:
-    """Return the recordings that a manifest lists."""
+def _of_manifest(text: str, rows: dict[int, dict[str, str]]) -> Iterable[Source]:
+    """Return the recordings that a manifest lists, each once."""
     folder = text.rpartition('/')[0]
     if not rows:
         raise UserError(f'{text}: the manifest has no row below its header')
@@ -441,34 +384,24 @@ def _of_manifest(text: str, rows: dict[int, dict[str, str]]) -> list[Source]:
                             'for example 2026-11-01T10:00:00Z')
 
     def source(row: dict[str, str]) -> Source:
-        params = row.get('params', '')
-        if set(params) & set('/.'):
-            params = _beside(folder, params)
-        url = _beside(folder, row['url'])
+        url, params = _beside(folder, row['url']), row.get('params', '')
         try:
-            recorded = look_up(*file_system(url), row['url'])
+            recorded = look_up(*file_system(url))
         except UserError as error:
             recorded = _unreachable(url, error)
         serial = row.get('serial', '')
-        return replace(recorded, serial='' if serial == NO_UNIT else serial, params=params,
+        return replace(recorded, serial='' if serial == NO_UNIT else serial,
+                       params=_beside(folder, params) if set(params) & set('/.') else params,
                        date=as_date(row.get('date', '')) or '')
 
+    result: dict[str, Source] = {}
     with ThreadPoolExecutor(_THREADS) as pool:
-        return _once(text, zip(rows, pool.map(source, rows.values())))
-
-
-def _once(text: str, sources: Iterable[tuple[int, Source]]) -> list[Source]:
-    """Return the recordings of a manifest's rows, each once, with what any row states of it."""
-    first: dict[str, tuple[int, Source]] = {}
-    for number, source in sources:
-        before, earlier = first.get(source.url, (number, source))
-        if earlier.serial and source.serial not in ('', earlier.serial):
-            raise UserError(f'{text}: rows {before} and {number}: the serial of {source.url} is '
-                            f'{earlier.serial} and {source.serial}, expected one')
-        first[source.url] = (before if earlier.serial else number, replace(
-            source, serial=source.serial or earlier.serial, params=source.params or earlier.params,
-            date=source.date or earlier.date))
-    return [source for _, source in first.values()]
+        for number, found in zip(rows, pool.map(source, rows.values())):
+            first = result.setdefault(found.url, found)
+            if found.serial and found.serial != first.serial:
+                raise UserError(f'{text}: row {number}: the serial of {found.url} is '
+                                f'{found.serial}, but an earlier row says {first.serial!r}')
+    return result.values()
 
 
 def is_manifest(path: Path) -> bool:
@@ -502,13 +435,10 @@ def _stated(source: Source) -> Stated:
         stated = Stated()
         if path.lower().endswith('.csv'):
             head = fs.cat_file(path, 0, _HEAD_BYTES).decode('utf-8', 'replace')
-            comments = dict(line[1:].partition(':')[::2] for line in head.splitlines()
-                            if line.startswith('#'))
-            texts = {name.strip(): text.strip() for name, text in comments.items()}
+            texts = dict(_COMMENT.findall(head))
             stated = Stated(texts.get('serial', ''), as_date(texts.get('date', '')) or '')
         if not all(stated) and '://' not in source.url:
-            with closing(recording.blocks(path, 1)) as blocks:
-                first = next(blocks)
+            first = next(recording.blocks(path, 1))
             stated = Stated(first.stream_info.texts.get('serial', ''), begin_of(first)[0])
         return stated
     except Exception:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 from functools import lru_cache
 import hashlib
 import json
@@ -34,8 +34,6 @@ _CODE_OF_TASKS = ('recipe', 'row', 'staging', 'task')
 """Files of this folder whose code changes a row."""
 _CACHED_CALIBRATIONS = 8192
 """Stored calibrations that are kept after they were read. Chosen: 200 units for years."""
-_SECONDS_PER_DAY = 86400.0
-"""Seconds of a day."""
 
 
 class ParameterText(NamedTuple):
@@ -86,26 +84,20 @@ class Recipe:
 
     def digest(self, chosen: ParameterText, serial: str) -> str:
         """Return the SHA-256 of all that a row follows from, beside the content."""
-        return _sha256([chosen.text, serial, self.tasks, repr(self.reading), self.code])
+        return sha256_of(chosen.text, serial, self.tasks, repr(self.reading), self.code)
 
 
-def key_of(content: str, digest: str) -> str:
-    """Return the key of a row."""
-    return _sha256([content, digest])
-
-
-def _sha256(values: Iterable[object]) -> str:
+def sha256_of(*values: object) -> str:
     """Return the SHA-256 of values as JSON."""
-    return hashlib.sha256(json.dumps(list(values)).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(values).encode()).hexdigest()
 
 
 def age_days(chosen: ParameterText, date: str) -> float | None:
     """Return the age of a calibration at a date, days."""
     if not (chosen.date and date):
         return None
-    seconds = (datetime.fromisoformat(date) - datetime.fromisoformat(chosen.date)
-               ).total_seconds()
-    return seconds / _SECONDS_PER_DAY
+    begun, calibrated = map(datetime.fromisoformat, (date, chosen.date))
+    return (begun - calibrated) / timedelta(days=1)
 
 
 def task_names(text: str) -> tuple[str, ...]:

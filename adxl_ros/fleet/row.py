@@ -13,7 +13,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime
 from functools import lru_cache
-from itertools import chain
 import math
 import re
 from typing import Any
@@ -56,20 +55,13 @@ class Column:
     is_timing: bool = False
 
 
-def _by_axis(name: str, unit_name: str, meaning: str, unit: str) -> list[Column]:
-    """Return a column of numbers for each axis: `name` + axis + `unit_name`."""
-    return [Column(f'{name}_{axis}_{unit_name}', 'float', f'{meaning}, axis {axis}', unit)
-            for axis in AXES]
-
-
-def _noise_term(letter: str, meaning: str, unit_name: str, unit: str) -> list[Column]:
-    """Return the columns of a noise term: estimate and 90 % interval by axis."""
-    return list(chain(
-        _by_axis(f'noise_{letter}', unit_name, meaning, unit),
-        _by_axis(f'noise_{letter}_low', unit_name, f'{meaning}: lower end of the 90 % interval',
-                 unit),
-        _by_axis(f'noise_{letter}_high', unit_name, f'{meaning}: upper end of the 90 % interval',
-                 unit)))
+def _with_interval(name: str, unit_name: str, meaning: str, unit: str, note: str = ''
+                   ) -> list[Column]:
+    """Return the columns of a quantity of the gap and of its interval."""
+    return [Column(f'{name}{unit_name}', 'float', meaning, unit),
+            *(Column(f'{name}_{end}{unit_name}', 'float',
+                     f'{word} end of its 90 % interval{note}', unit)
+              for end, word in (('low', 'lower'), ('high', 'upper')))]
 
 
 COLUMNS: tuple[Column, ...] = (
@@ -100,30 +92,30 @@ COLUMNS: tuple[Column, ...] = (
     Column('calibration_id', 'text', 'calibration that was valid at the date'),
     Column('calibration_age_days', 'float', 'its age at the date', 'day'),
     Column('validity', 'text', 'valid, or why the calibration is not known to be valid'),
-    *_noise_term('n', 'white noise N', 'mps2_per_rthz', 'm/s²/√Hz'),
-    *_noise_term('b', 'bias instability B', 'mps2', 'm/s²'),
-    *_noise_term('k', 'random walk K', 'mps2_per_rts', 'm/s²/√s'),
-    *_by_axis('zero_g', 'v', 'fitted zero-g', 'V'),
-    *_by_axis('zero_g_std', 'v', 'standard deviation of the zero-g', 'V'),
-    *_by_axis('scale', 'v_per_g', 'fitted scale factor', 'V/g'),
-    *_by_axis('scale_std', 'v_per_g', 'standard deviation of the scale factor', 'V/g'),
+    *(Column(f'noise_{letter}{end}_{axis}_{unit_name}', 'float', f'{meaning}{note}, axis {axis}',
+             unit)
+      for letter, meaning, unit_name, unit in (
+          ('n', 'white noise N', 'mps2_per_rthz', 'm/s²/√Hz'),
+          ('b', 'bias instability B', 'mps2', 'm/s²'),
+          ('k', 'random walk K', 'mps2_per_rts', 'm/s²/√s'))
+      for end, note in (('', ''), ('_low', ': lower end of the 90 % interval'),
+                        ('_high', ': upper end of the 90 % interval'))
+      for axis in AXES),
+    *(Column(f'{name}_{axis}_{unit_name}', 'float', f'{meaning}, axis {axis}', unit)
+      for name, unit_name, meaning, unit in (
+          ('zero_g', 'v', 'fitted zero-g', 'V'),
+          ('zero_g_std', 'v', 'standard deviation of the zero-g', 'V'),
+          ('scale', 'v_per_g', 'fitted scale factor', 'V/g'),
+          ('scale_std', 'v_per_g', 'standard deviation of the scale factor', 'V/g'))
+      for axis in AXES),
     Column('fit_model', 'text', 'model that was fitted'),
     Column('fit_poses', 'integer', 'poses that were fitted'),
-    Column('gap_before_mps2', 'float', 'rms of recording minus simulation', 'm/s²'),
-    Column('gap_before_low_mps2', 'float', 'lower end of its 90 % interval', 'm/s²'),
-    Column('gap_before_high_mps2', 'float', 'upper end of its 90 % interval', 'm/s²'),
-    Column('gap_after_mps2', 'float', 'rms with the named effects, on held-out blocks', 'm/s²'),
-    Column('gap_after_low_mps2', 'float', 'lower end of its 90 % interval', 'm/s²'),
-    Column('gap_after_high_mps2', 'float', 'upper end of its 90 % interval', 'm/s²'),
-    Column('gap_floor_mps2', 'float', 'noise floor', 'm/s²'),
-    Column('gap_floor_low_mps2', 'float', 'lower end of its 90 % interval; none if assumed',
-           'm/s²'),
-    Column('gap_floor_high_mps2', 'float', 'upper end of its 90 % interval; none if assumed',
-           'm/s²'),
+    *_with_interval('gap_before', '_mps2', 'rms of recording minus simulation', 'm/s²'),
+    *_with_interval('gap_after', '_mps2', 'rms with the named effects, on held-out blocks',
+                    'm/s²'),
+    *_with_interval('gap_floor', '_mps2', 'noise floor', 'm/s²', '; none if assumed'),
     Column('gap_floor_source', 'text', 'where the floor is from: still, repeats or assumed'),
-    Column('gap_closed', 'float', 'closed share of the squared gap above the floor'),
-    Column('gap_closed_low', 'float', 'lower end of its 90 % interval'),
-    Column('gap_closed_high', 'float', 'upper end of its 90 % interval'),
+    *_with_interval('gap_closed', '', 'closed share of the squared gap above the floor', ''),
     Column('status', 'text',
            'no_gap, explained, partly, inseparable, unknown, insufficient or bad_data'),
     Column('effects', 'texts', 'effects that are named for certain'),
@@ -145,10 +137,6 @@ COLUMNS: tuple[Column, ...] = (
 
 TIMING = tuple(column.name for column in COLUMNS if column.is_timing)
 """Columns that differ from run to run."""
-
-
-_TIMES = tuple(column.name for column in COLUMNS if column.kind == 'time')
-"""Columns of times."""
 
 
 def empty_row() -> Row:
@@ -189,9 +177,7 @@ def arrow_schema() -> Any:
 def as_table(rows: Iterable[Row]) -> Any:
     """Return rows, whose times are texts of ISO 8601 with an offset, as a table of pyarrow."""
     import pyarrow as pa
-    return pa.Table.from_pylist([_with_times(row) for row in rows], arrow_schema())
-
-
-def _with_times(row: Row) -> Row:
-    """Return a row with `datetime` in place of texts."""
-    return {**row, **{name: datetime.fromisoformat(row[name]) for name in _TIMES if row[name]}}
+    times = [column.name for column in COLUMNS if column.kind == 'time']
+    return pa.Table.from_pylist([
+        {**row, **{name: datetime.fromisoformat(row[name]) for name in times if row[name]}}
+        for row in rows], arrow_schema())

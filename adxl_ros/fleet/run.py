@@ -10,13 +10,13 @@ written. One client at a time works on a folder.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
-from dataclasses import dataclass
 from datetime import datetime, timezone
 import fcntl
 import hashlib
+from itertools import islice
 import json
 import os
 from pathlib import Path
@@ -69,7 +69,7 @@ def only_client(folder: Path) -> Iterator[None]:
 
 
 class Entry(NamedTuple):
-    """What the client keeps in memory of a row."""
+    """What the client keeps in memory of a row; a text is empty where nothing is known."""
 
     name: str  # Name of the row's file
     written: str  # When it was written, ISO 8601, UTC
@@ -77,10 +77,10 @@ class Entry(NamedTuple):
     digest: str  # See `Recipe.digest`
     key: str  # Key of the row
     outcome: str  # One of `row.OUTCOMES`
-    # serial, date: Unit and begin of the recording; empty if unknown
+    # serial, date, date_source: Unit and begin of the recording, and where the date is from
     serial: str
     date: str
-    date_source: str  # Where the date is from; empty if unknown
+    date_source: str
     size_bytes: int  # Size of the recording, byte
     seconds: float  # Run time of its tasks, s
     tasks: tuple[str, ...]  # Its tasks
@@ -92,13 +92,12 @@ class Results:
     def __init__(self, folder: Path) -> None:
         self.folder = folder  # The folder
         self.newest: dict[str, Entry] = {}  # The newest row of each recording, by URL
-        self._by_size: dict[int, set[str]] = {}
-        rows = folder / _ROWS
-        for path in rows.iterdir() if rows.is_dir() else ():
-            if path.suffix == '.json' and not path.name.startswith('.'):
-                content = _read(path)
-                if content is not None:
-                    self._add(path.name, content)
+        # Keys of rows whose content need not be worked on again, with the name of a row's file
+        self.known: dict[str, str] = {}
+        for path in sorted((folder / _ROWS).glob('[!.]*.json')):
+            content = _read(path)
+            if content is not None:
+                self._add(path.name, content)
 
     def _add(self, name: str, content: dict[str, Any]) -> None:
         """Keep what is needed of a row."""
@@ -108,78 +107,43 @@ class Results:
                       row['date_source'] or '', row['size_bytes'] or 0,
                       row['seconds'] or 0.0, tuple(row['tasks']))
         present = self.newest.get(row['url'])
-        if present is None or (present.written, present.name) <= (entry.written, name):
+        if present is None or present.written <= entry.written:
             self.newest[row['url']] = entry
         if row['hash'] and entry.outcome != 'crashed':
-            self._by_size.setdefault(entry.size_bytes, set()).add(row['key'])
-
-    def keys_of(self, sources: Iterable[Source]) -> frozenset[str]:
-        """Return the keys of rows that may have the content of recordings, by their sizes."""
-        sizes = {source.size_bytes or 0 for source in sources}
-        return frozenset(key for size in sizes for key in self._by_size.get(size, ()))
-
-    def row_with_key(self, key: str, url: str) -> Row | None:
-        """Return a row with a key."""
-        of_url = _row_name(key, url)
-        for path in sorted((self.folder / _ROWS).glob(f'{key}-*.json'),
-                           key=lambda path: (path.name != of_url, path.name)):
-            content = _read(path)
-            if content is not None:
-                return content['row']
-        return None
+            self.known.setdefault(row['key'], name)
 
     def put(self, result: Result, attempts: int) -> Row:
         """Write what a task left: its files, then its row."""
         row = {**result.row, 'attempts': attempts,
                'written': datetime.now(timezone.utc).isoformat()}
         if result.files:
-            name = f'{_REPORTS}/{row["key"][:_NAME_DIGITS]}'
-            folder = make_folder(self.folder / name)
+            row['report'] = f'{_REPORTS}/{row["key"][:_NAME_DIGITS]}'
+            folder = make_folder(self.folder / row['report'])
             for file, data in result.files.items():
                 write(folder / file, data)
-            row['report'] = name
-        name = _row_name(row['key'], row['url'])
+        of_url = hashlib.sha256(row['url'].encode()).hexdigest()[:_NAME_DIGITS]
+        name = f'{row["key"]}-{of_url}.json'
         content = {'stamp': result.stamp, 'digest': result.digest, 'row': row}
         write(make_folder(self.folder / _ROWS) / name,
               json.dumps(content, allow_nan=False, ensure_ascii=False).encode())
         self._add(name, content)
         return row
 
-    def rows(self) -> Iterator[Row]:
-        """Yield the newest row of each recording, by URL."""
-        for url in sorted(self.newest):
-            content = _read(self.folder / _ROWS / self.newest[url].name)
-            if content is not None:
-                yield content['row']
-
     def write_table(self) -> Path:
-        """Write the table."""
+        """Write the table: the newest row of each recording, by URL."""
         from pyarrow import ArrowException, parquet
         path = self.folder / TABLE
+        contents = (_read(self.folder / _ROWS / self.newest[url].name)
+                    for url in sorted(self.newest))
+        rows = (content['row'] for content in contents if content is not None)
         try:
             with atomic_path(path) as fresh, \
                     parquet.ParquetWriter(fresh, arrow_schema(), compression='zstd') as writer:
-                for batch in _batches(self.rows()):
+                while batch := list(islice(rows, _BATCH_ROWS)):
                     writer.write_table(as_table(batch))
         except ArrowException as error:
             raise UserError(f'{path}: cannot be written: {one_line(error)}') from None
         return path
-
-
-def _row_name(key: str, url: str) -> str:
-    """Return the name of the file of a row."""
-    return f'{key}-{hashlib.sha256(url.encode()).hexdigest()[:_NAME_DIGITS]}.json'
-
-
-def _batches(rows: Iterable[Row]) -> Iterator[list[Row]]:
-    """Yield rows in lists of some length."""
-    batch: list[Row] = []
-    for row in rows:
-        batch.append(row)
-        if len(batch) == _BATCH_ROWS:
-            yield batch
-            batch = []
-    yield batch
 
 
 def _read(path: Path) -> dict[str, Any] | None:
@@ -191,15 +155,14 @@ def _read(path: Path) -> dict[str, Any] | None:
         return None
 
 
-@dataclass(frozen=True)
-class Plan:
+class Plan(NamedTuple):
     """What a run has to do."""
 
-    todo: tuple[Source, ...]  # Recordings to work on
+    todo: list[Source]  # Recordings to work on
     done: int  # Number of recordings that have their row
     outside: int  # Number of recordings that --since, --limit or --only-failed leave out
     # Serial numbers of the recordings to work on as far as they are known before; else empty
-    serials: tuple[str, ...]
+    serials: list[str]
     size_bytes: int  # Size of the recordings to work on
     core_hours: float  # Expected run time on one core, h
 
@@ -215,26 +178,19 @@ class Selection(NamedTuple):
 def plan(sources: Sequence[Source], recipe: Recipe, results: Results,
          selection: Selection) -> Plan:
     """Decide which recordings are to be worked on."""
-    todo, done = [], 0
     chosen = _since(sources, selection.since, results) if selection.since else sources
-    outside = len(sources) - len(chosen)
-    for source in chosen:
-        entry = results.newest.get(source.url)
-        if selection.only_failed:
-            if entry is not None and entry.outcome != 'done':
-                todo.append(source)
-            else:
-                outside += 1
-        elif entry is not None and is_done(source, entry, recipe):
-            done += 1
-        else:
-            todo.append(source)
-    if selection.limit is not None:
-        outside += max(len(todo) - selection.limit, 0)
-        todo = todo[:selection.limit]
-    serials = [source.serial or _serial(source, results) for source in todo]
+    entries = {source.url: results.newest.get(source.url) for source in chosen}
+    if selection.only_failed:
+        failed = {url for url, entry in entries.items() if entry and entry.outcome != 'done'}
+        todo, done = [source for source in chosen if source.url in failed], 0
+    else:
+        todo = [source for source in chosen if not is_done(source, entries[source.url], recipe)]
+        done = len(chosen) - len(todo)
+    todo = todo[:selection.limit]
+    serials = [source.serial or (entry.serial if (entry := entries[source.url]) else '')
+               for source in todo]
     size_bytes = sum(source.size_bytes or 0 for source in todo)
-    return Plan(tuple(todo), done, outside, tuple(serials), size_bytes,
+    return Plan(todo, done, len(sources) - done - len(todo), serials, size_bytes,
                 _expected_s(len(todo), size_bytes, recipe, results) / 3600)
 
 
@@ -249,15 +205,9 @@ def _since(sources: Sequence[Source], since: str, results: Results) -> list[Sour
             if (source.date or dates.get(source.url) or source.modified or since) >= since]
 
 
-def _serial(source: Source, results: Results) -> str:
-    """Return the serial number that an earlier row of a recording has; empty for none."""
-    entry = results.newest.get(source.url)
-    return entry.serial if entry else ''
-
-
-def is_done(source: Source, entry: Entry, recipe: Recipe) -> bool:
+def is_done(source: Source, entry: Entry | None, recipe: Recipe) -> bool:
     """Return whether a row is that of a recording as it is now, by the present recipe."""
-    if source.stamp != entry.stamp or not (source.stamp or source.fault):
+    if entry is None or source.stamp != entry.stamp or not (source.stamp or source.fault):
         return False
     if source.date != (entry.date if entry.date_source == 'manifest' else ''):
         return False
@@ -281,14 +231,10 @@ def work(pool: Executor, sources: Sequence[Source], recipe: Recipe, results: Res
          retries: int, show: Callable[[float], None]) -> Iterator[Row]:
     """Work on recordings, and write each row as soon as it is there."""
     failed = {url for url, entry in results.newest.items() if entry.outcome != 'done'}
-    tasks = finished_tasks(pool, make_row, ((source, source.url in failed) for source in sources),
-                           retries)
-    try:
-        for count, end in enumerate(tasks, 1):
-            show(count / len(sources))
-            yield _written(end, recipe, results)
-    finally:
-        tasks.close()
+    tasks = ((source, source.url in failed) for source in sources)
+    for count, end in enumerate(finished_tasks(pool, make_row, tasks, retries), 1):
+        show(count / len(sources))
+        yield _written(end, recipe, results)
 
 
 def _written(end: Finished, recipe: Recipe, results: Results) -> Row:
@@ -298,7 +244,7 @@ def _written(end: Finished, recipe: Recipe, results: Results) -> Row:
     if isinstance(error, UserError):
         raise error
     if isinstance(error, TaskCrashed):
-        result = error.result
+        result = error.args[0]
     elif isinstance(error, StagingError):
         result = refused(recipe, source, one_line(error).removeprefix(f'{source.url}: '))
     elif error is not None:
@@ -308,18 +254,14 @@ def _written(end: Finished, recipe: Recipe, results: Results) -> Row:
         result = end.value
     # What a row costs in this run need not be what its tasks took.
     spent = {name: result.row[name] for name in _COST}
-    return {**results.put(_with_known(result, results), end.attempts), **spent}
-
-
-def _with_known(result: Result, results: Results) -> Result:
-    """Return a result; one whose content has a row already gets the values of that row."""
-    if not result.is_known:
-        return result
-    row = results.row_with_key(result.row['key'], result.row['url'])
-    assert row is not None, 'rows are never removed'
-    is_copy = row['url'] != result.row['url']
-    names = (*_IDENTITY, *_COST) if is_copy else _IDENTITY
-    return result._replace(row={**row, **{name: result.row[name] for name in names}})
+    if result.is_known:
+        # The content has a row already, and this recording gets the values of that row.
+        content = _read(results.folder / _ROWS / results.known[result.row['key']])
+        assert content is not None, 'rows are never removed'
+        row = content['row']
+        names = _IDENTITY if row['url'] == source.url else (*_IDENTITY, *_COST)
+        result = result._replace(row={**row, **{name: result.row[name] for name in names}})
+    return {**results.put(result, end.attempts), **spent}
 
 
 def since_text(text: str) -> str:

@@ -3,6 +3,8 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 _MOST_DECIMALS = 7
 """Largest number of decimals (chosen: a table of 79 columns has room for ten digits)."""
 _UNKNOWN_DECIMALS = 4
@@ -45,3 +47,14 @@ def duration(seconds: float) -> str:
             count, rest = divmod(round(seconds / smaller_s), round(unit_s / smaller_s))
             return f'{count} {unit} {rest} {smaller}' if rest else f'{count} {unit}'
     return f'{seconds / 60:.3g} min' if seconds >= 120 else f'{seconds:.3g} s'
+
+
+def number(value: float, signed: bool = False, digits: int = 3) -> str:
+    """Return a number with a few digits and no exponent."""
+    if not np.isfinite(value):
+        return '-'
+    rounded = float(f'{value:.{digits}g}')
+    text = f'{abs(rounded):.0f}' if abs(rounded) >= 100 else \
+        np.format_float_positional(abs(rounded), trim='-')
+    sign = '\N{MINUS SIGN}' if rounded < 0 else '+' if signed and rounded > 0 else ''
+    return sign + text

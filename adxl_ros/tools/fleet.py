@@ -120,7 +120,7 @@ def _worked(options: argparse.Namespace, sources: Sequence[Source], recipe: Reci
     reason = ''
     try:
         if to_do.todo:
-            shared = (recipe, results.keys_of(to_do.todo))
+            shared = (recipe, frozenset(results.known))
             with open_pool(options.scheduler, options.jobs, shared) as pool, \
                     progress(PROG) as show:
                 for row in work(pool, to_do.todo, recipe, results, options.retries, show):
@@ -164,10 +164,10 @@ def _warn_of_replaced(to_do: Plan, results: Results, tasks: Sequence[str]) -> No
 
 def _written(folder: Path, results: Results) -> list[Path]:
     """Write table and page, and return their files; a page that is not possible is reported."""
-    from adxl_ros.fleet.report import report_html  # only the end of a run needs it
+    from adxl_ros.fleet import page  # only the end of a run needs it
     files = [results.write_table()]
     try:
-        files = [*report_html.write(folder), *files]
+        files = [*page.write(folder), *files]
     except UserError as error:
         note(f'{PROG}: no page: {error}')
     return [*files, folder / 'reports']

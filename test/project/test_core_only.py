@@ -64,11 +64,10 @@ def test_what_needs_an_extra_names_it() -> None:
     code = """
 from adxl_ros.errors import UserError
 from adxl_ros.files import bag_messages, tables
-from adxl_ros.fleet import inputs
-from adxl_ros.fleet.report import fleet_table
+from adxl_ros.fleet import inputs, table
 from adxl_ros.report import figures, page
 for use in (lambda: tables.open_table('log.ulg'), lambda: tables.open_table('log.parquet'),
-            lambda: fleet_table.read('fleet.parquet'), lambda: inputs.file_system('log.csv'),
+            lambda: table.read('fleet.parquet'), lambda: inputs.file_system('log.csv'),
             bag_messages.import_rosbags, figures.pyplot, page.check_libraries):
     try:
         use()

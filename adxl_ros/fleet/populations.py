@@ -20,8 +20,9 @@ difference that no one would notice is no bad batch, however certain it is.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 from adxl_ros.model.constants import MAD_TO_STD
@@ -210,33 +211,28 @@ def reml_spread2(y: np.ndarray, variance: np.ndarray) -> float:
         squares = float(np.sum((weight * (y - mean)) ** 2))
         return squares - float(weight.sum() - weight @ weight * mean_variance)
 
+    return _root(score, y, variance)
+
+
+def _q_profile(y: np.ndarray, variance: np.ndarray) -> list[float]:
+    """Return the 90 % interval of the variance between units."""
+    def excess(spread2: float, target: float) -> float:
+        mean, _ = weighted_mean(y, variance, spread2)
+        return float(np.sum((y - mean) ** 2 / (variance + spread2))) - target
+
+    return [_root(partial(excess, target=float(scipy.special.chdtri(len(y) - 1, chance))), y,
+                  variance) for chance in (0.05, 0.95)]
+
+
+def _root(falling: Callable[[float], float], y: np.ndarray, variance: np.ndarray) -> float:
+    """Return the variance between units at which a function is 0; 0 if it is below everywhere."""
     floor = 1e-12 * float(np.var(y) + variance.mean())
-    if floor == 0 or score(floor) <= 0:
+    if floor == 0 or falling(floor) <= 0:
         return 0.0
     high = float(np.var(y, ddof=1)) + floor
-    while score(high) > 0:
+    while falling(high) > 0:
         high *= 2
-    return float(scipy.optimize.brentq(score, floor, high, rtol=1e-12, xtol=1e-300))
-
-
-def _q_profile(y: np.ndarray, variance: np.ndarray) -> tuple[float, float]:
-    """Return the 90 % interval of the variance between units."""
-    freedom = len(y) - 1
-
-    def squares(spread2: float) -> float:
-        mean, _ = weighted_mean(y, variance, spread2)
-        return float(np.sum((y - mean) ** 2 / (variance + spread2)))
-
-    def solve(target: float) -> float:
-        floor = 1e-12 * float(np.var(y) + variance.mean())
-        if floor == 0 or squares(floor) <= target:
-            return 0.0
-        high = float(np.sum((y - y.mean()) ** 2)) / target + floor
-        return float(scipy.optimize.brentq(lambda spread2: squares(spread2) - target, floor, high,
-                                           rtol=1e-9, xtol=1e-300))
-
-    return (solve(float(scipy.special.chdtri(freedom, 0.05))),
-            solve(float(scipy.special.chdtri(freedom, 0.95))))
+    return float(scipy.optimize.brentq(falling, floor, high, rtol=1e-12, xtol=1e-300))
 
 
 class BadBatch(NamedTuple):
@@ -266,11 +262,12 @@ def bad_batch(serials: Sequence[str], level: np.ndarray, tolerance: float, tests
     # The larger part of a fleet is what the others are compared with.
     groups = {prefix: members for prefix, members in by_prefix(serials).items()
               if MIN_GROUP <= members.sum() <= len(serials) / 2}
-    differing: list[tuple[float, BadBatch]] = []
+    best, lowest = None, CHANCE / (max(len(groups), 1) * tests)
     for prefix, members in groups.items():
         test = scipy.stats.ttest_ind(level[members], level[~members], equal_var=False)
         difference = float(level[members].mean() - level[~members].mean())
-        if test.pvalue < CHANCE / (len(groups) * tests) and abs(difference) > tolerance:
-            differing.append((float(test.pvalue), BadBatch(
-                prefix, members, difference, *map(float, test.confidence_interval(0.9)))))
-    return min(differing, key=lambda item: item[0])[1] if differing else None
+        if test.pvalue < lowest and abs(difference) > tolerance:
+            lowest = float(test.pvalue)
+            best = BadBatch(prefix, members, difference,
+                            *map(float, test.confidence_interval(0.9)))
+    return best

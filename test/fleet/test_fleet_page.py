@@ -5,7 +5,7 @@ import csv
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import population_file
-from adxl_ros.fleet.report import report_html
+from adxl_ros.fleet import page as fleet_page
 from made_up_fleet import MadeUpFleet
 from pages import layout_faults, NEEDS_CHROMIUM, wait_until_drawn, WIDTHS
 import pytest
@@ -32,7 +32,7 @@ def folders(tmp_path_factory):
         made[name] = tmp_path_factory.mktemp(name)
         # A fleet without faults has a claim or an outlier in 15 % of draws; this one has none.
         fleet.write(made[name], seed=1)
-        report_html.write(made[name])
+        fleet_page.write(made[name])
     return made
 
 
@@ -42,7 +42,7 @@ def page_without(column, fleet, folder):
     table = pq.read_table(path)
     pq.write_table(pa.Table.from_pylist(
         [row | {column: None} for row in table.to_pylist()], table.schema), path)
-    report_html.write(folder)
+    fleet_page.write(folder)
     return (folder / 'fleet.html').read_text()
 
 
@@ -136,5 +136,5 @@ def test_a_file_that_is_no_table(tmp_path):
     for contents in (b'', b'not parquet'):
         (tmp_path / 'fleet.parquet').write_bytes(contents)
         with pytest.raises(UserError, match='fleet.parquet: not a table of `fleet`'):
-            report_html.write(tmp_path)
+            fleet_page.write(tmp_path)
     assert list(tmp_path.iterdir()) == [tmp_path / 'fleet.parquet']

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from adxl_ros.fleet.report.populations import moderated
+from adxl_ros.fleet.populations import moderated
 from adxl_ros.model.constants import MAD_TO_STD
 import numpy as np
 import scipy
@@ -108,7 +108,9 @@ class Trends:
     period_time: np.ndarray
     period_value: np.ndarray
     period_std: np.ndarray
-    noise_ratio: np.ndarray  # Variance of each unit's scatter relative to that of all, (m,)
+    squares: np.ndarray  # Weighted squares of the residuals of each unit, (m,)
+    residual: np.ndarray  # Residuals over the expected scatter, (n,)
+    log_likelihood: float  # Restricted log-likelihood of the scatter
 
     @property
     def p_values(self) -> np.ndarray:
@@ -119,11 +121,10 @@ class Trends:
 
 def fit_trends(recordings: Recordings) -> Trends:
     """Fit levels and slopes of all units."""
-    sums = _Sums.of(recordings)
+    sums = _Sums(recordings)
     scatter = _shared_scatter(sums)
     fit = sums.fit(scatter)
-    widening = _widening(sums, fit, scatter)
-    scatter = replace(scatter, widening=widening)
+    widening = _widening(sums, fit)
     # A line takes two independent recordings, which are so many of the correlated ones.
     remaining = sums.counts - 2 * widening
     own_freedom = np.maximum(remaining, 0.0) * sums.has_slope / widening
@@ -131,61 +132,30 @@ def fit_trends(recordings: Recordings) -> Trends:
         ratio = np.where(own_freedom > 0, fit.squares / remaining, np.nan)
     variance, freedom = moderated(ratio, own_freedom)
     factor = np.sqrt(variance * widening)
-    return Trends(
-        scatter=scatter, level=fit.level, level_std=factor * fit.level_std, slope=fit.slope,
-        slope_std=factor * fit.slope_std,
-        freedom=np.where(sums.has_slope, freedom, np.nan),
-        period_time=fit.period_time, period_value=fit.period_value,
-        period_std=factor[sums.unit_of_period] * fit.period_std, noise_ratio=ratio)
+    return replace(
+        fit, scatter=replace(scatter, widening=widening), level_std=factor * fit.level_std,
+        slope_std=factor * fit.slope_std, freedom=np.where(sums.has_slope, freedom, np.nan),
+        period_std=factor[sums.unit_of_period] * fit.period_std)
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """Lines of the units for given variances."""
-
-    slope: np.ndarray
-    slope_std: np.ndarray
-    level: np.ndarray
-    level_std: np.ndarray
-    period_time: np.ndarray
-    period_value: np.ndarray
-    period_std: np.ndarray
-    squares: np.ndarray
-    log_likelihood: float
-    residual: np.ndarray
-
-
-@dataclass(frozen=True)
 class _Sums:
     """Recordings about the centre of their unit, with where units and periods begin."""
 
-    recordings: Recordings
-    time: np.ndarray
-    value: np.ndarray
-    centre_time: np.ndarray
-    centre_value: np.ndarray
-    counts: np.ndarray
-    period_starts: np.ndarray
-    unit_of_period: np.ndarray
-    unit_starts: np.ndarray
-    has_slope: np.ndarray
+    def __init__(self, recordings: Recordings) -> None:
+        self.recordings = recordings
+        unit = recordings.unit
+        self.counts = np.bincount(unit)
+        self.period_starts = np.flatnonzero(np.diff(recordings.period, prepend=-1))
+        self.unit_of_period = unit[self.period_starts]
+        self.unit_starts = np.flatnonzero(np.diff(self.unit_of_period, prepend=-1))
+        self.centre_time = np.bincount(unit, recordings.time) / self.counts
+        self.centre_value = np.bincount(unit, recordings.value) / self.counts
+        self.time = recordings.time - self.centre_time[unit]
+        self.value = recordings.value - self.centre_value[unit]
+        self.has_slope = (self.counts >= _MIN_RECORDINGS) & (
+            np.bincount(unit, self.time ** 2) > 0)
 
-    @classmethod
-    def of(cls, recordings: Recordings) -> _Sums:
-        """Prepare recordings."""
-        unit, period = recordings.unit, recordings.period
-        counts = np.bincount(unit)
-        starts = np.flatnonzero(np.diff(period, prepend=-1))
-        of_period = unit[starts]
-        centre_time = np.bincount(unit, recordings.time) / counts
-        centre_value = np.bincount(unit, recordings.value) / counts
-        time = recordings.time - centre_time[unit]
-        has_slope = (counts >= _MIN_RECORDINGS) & (np.bincount(unit, time ** 2) > 0)
-        return cls(recordings, time, recordings.value - centre_value[unit], centre_time,
-                   centre_value, counts, starts, of_period,
-                   np.flatnonzero(np.diff(of_period, prepend=-1)), has_slope)
-
-    def fit(self, scatter: Scatter) -> _Fit:
+    def fit(self, scatter: Scatter) -> Trends:
         """Fit the lines of all units for given variances, by generalised least squares."""
         step2, unit = scatter.calibration ** 2, self.recordings.unit
         weight = 1 / (self.recordings.std ** 2 + scatter.recording ** 2)
@@ -214,11 +184,13 @@ class _Sums:
             slope_std = nan * np.sqrt(a / det)
         # A period has a step as far as its recordings show one, else the line of its unit.
         unit, share = self.unit_of_period, shared * w
-        return _Fit(nan * slope, slope_std, self.centre_value + p / a, a ** -0.5,
-                    self.centre_time[unit] + (1 - share) * (b / a)[unit] + share * wt / w,
-                    self.centre_value[unit] + (1 - share) * (p / a)[unit] + share * wy / w,
-                    np.sqrt(shared + (1 - share) ** 2 / a[unit]),
-                    squares, float(log_likelihood), residual)
+        return Trends(
+            scatter, self.centre_value + p / a, a ** -0.5, nan * slope, slope_std,
+            np.full(len(a), np.inf),
+            self.centre_time[unit] + (1 - share) * (b / a)[unit] + share * wt / w,
+            self.centre_value[unit] + (1 - share) * (p / a)[unit] + share * wy / w,
+            np.sqrt(shared + (1 - share) ** 2 / a[unit]), squares, residual,
+            float(log_likelihood))
 
 
 def _shared_scatter(sums: _Sums) -> Scatter:
@@ -242,14 +214,14 @@ def _shared_scatter(sums: _Sums) -> Scatter:
     return scatter(best.x)
 
 
-def _widening(sums: _Sums, fit: _Fit, scatter: Scatter) -> float:
+def _widening(sums: _Sums, fit: Trends) -> float:
     """Estimate the factor of the variances of levels and slopes by correlation in time."""
     unit, residual = sums.recordings.unit, fit.residual
     used = sums.has_slope & (sums.counts > 2 * _MIN_RECORDINGS)
     same = (unit[1:] == unit[:-1]) & used[unit[1:]]
-    if not same.any() or scatter.recording == 0:
+    if not same.any() or fit.scatter.recording == 0:
         return 1.0
-    variance = scatter.recording ** 2
+    variance = fit.scatter.recording ** 2
     share = float(np.mean((variance / (variance + sums.recordings.std ** 2))[used[unit]]))
     products = float((residual[1:] * residual[:-1])[same].sum())
     squares, count = float((residual ** 2)[used[unit]].sum()), int(sums.counts[used].sum())
@@ -263,7 +235,7 @@ def _widening(sums: _Sums, fit: _Fit, scatter: Scatter) -> float:
     return widening
 
 
-def claimed(p_values: np.ndarray) -> np.ndarray:
+def claims(p_values: np.ndarray) -> np.ndarray:
     """Mark the slopes that survive the control of the false discovery rate."""
     tested = np.isfinite(p_values)
     result = np.zeros(p_values.shape, bool)
@@ -280,12 +252,13 @@ def interval_factor(freedom: np.ndarray, is_claimed: np.ndarray) -> np.ndarray:
     return -scipy.special.stdtrit(freedom, outside / 2)
 
 
-def outlier_distances(recordings: Recordings) -> tuple[np.ndarray, np.ndarray]:
+def outliers(recordings: Recordings, tests: int) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return how far recordings are from the median of their unit and period.
+    Mark the recordings that are too far from the median of their unit and period to be chance.
 
-    returns: the distance in robust standard deviations, (n,), and the degrees of freedom of its t
-    distribution, (n,). The distance is 0 where a period has too few recordings.
+    tests: number of recordings that share the chance of a false outlier; returns: the distance of
+    each recording in robust standard deviations, (n,), which is 0 where a period has too few
+    recordings, and whether it is an outlier, (n,) bool.
     """
     period, value = recordings.period, recordings.value
     counts = np.bincount(period)
@@ -298,19 +271,11 @@ def outlier_distances(recordings: Recordings) -> tuple[np.ndarray, np.ndarray]:
     stated2 = recordings.std ** 2
     worse2 = np.maximum(stated2 - _medians(period, stated2)[period], 0.0)
     scale = np.sqrt((variance * (1 + np.pi / 2 / counts))[period] + worse2)
-    distance = np.divide(deviation, scale, out=np.zeros(len(value)), where=scale > 0)
-    return np.where(enough[period], distance, 0.0), freedom[period]
-
-
-def are_outliers(distance: np.ndarray, freedom: np.ndarray, tests: int) -> np.ndarray:
-    """
-    Mark the recordings that are too far to be chance.
-
-    distance, freedom: as `outlier_distances` returns them, (n,); returns: whether each recording
-    is an outlier, (n,) bool.
-    """
-    limits = -scipy.special.stdtrit(np.minimum(freedom, 1e6), FALSE_OUTLIERS / (2 * max(tests, 1)))
-    return distance > limits
+    distance = np.divide(deviation, scale, out=np.zeros(len(value)),
+                         where=(scale > 0) & enough[period])
+    limits = -scipy.special.stdtrit(np.minimum(freedom[period], 1e6),
+                                    FALSE_OUTLIERS / (2 * max(tests, 1)))
+    return distance, distance > limits
 
 
 def _medians(label: np.ndarray, value: np.ndarray) -> np.ndarray:

@@ -1,14 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Slopes of units: least squares, the share of false claims, weak drifts, and recalibrations."""
 
-from adxl_ros.fleet.report.trends import (
-    are_outliers,
-    claimed,
-    fit_trends,
-    interval_factor,
-    outlier_distances,
-    Recordings,
-)
+from adxl_ros.fleet.trends import claims, fit_trends, interval_factor, outliers, Recordings
 import numpy as np
 import pytest
 from scipy.stats import false_discovery_control, linregress
@@ -65,9 +58,9 @@ def test_the_share_of_false_claims(changes):
         units = changes.get('units', 200)
         drift = np.where(np.arange(units) < max(units // 10, 1), 6.0, 0.0)
         trends = fit_trends(fleet(rng, drift=drift, **changes))
-        claims = claimed(trends.p_values)
-        shares.append((claims & (drift == 0)).sum() / max(claims.sum(), 1))
-        hits.append(claims[drift > 0].mean())
+        named = claims(trends.p_values)
+        shares.append((named & (drift == 0)).sum() / max(named.sum(), 1))
+        hits.append(named[drift > 0].mean())
         half = trends.slope_std * interval_factor(trends.freedom, np.zeros(units, bool))
         inside.append(np.nanmean(np.abs(trends.slope - drift) < half))
     error = np.std(shares) / np.sqrt(FLEETS)
@@ -82,7 +75,7 @@ def test_a_recalibration_is_no_drift():
     drift = np.where(np.arange(60) == 7, 8.0, 0.0)
     recordings = fleet(rng, counts=(40, 60), units=60, step=5.0, drift=drift)
     trends = fit_trends(recordings)
-    assert np.flatnonzero(claimed(trends.p_values)).tolist() == [7]
+    assert np.flatnonzero(claims(trends.p_values)).tolist() == [7]
     assert trends.scatter.calibration == pytest.approx(5.0, rel=0.3)
     # A line through all recordings of a unit would call most steps a drift.
     lines = [linregress(recordings.time[part], recordings.value[part]).pvalue
@@ -95,6 +88,6 @@ def test_the_rate_of_false_outliers(changes):
     rng = np.random.default_rng(6)
     false = []
     for _ in range(100):
-        distance, freedom = outlier_distances(fleet(rng, **changes))
-        false.append(are_outliers(distance, freedom, len(distance)).any())
+        recordings = fleet(rng, **changes)
+        false.append(outliers(recordings, len(recordings.value))[1].any())
     assert np.mean(false) < 0.05 + 3 * np.sqrt(0.05 * 0.95 / 100)

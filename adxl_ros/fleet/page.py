@@ -5,37 +5,22 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-import csv
+from collections.abc import Iterable, Sequence
 from datetime import datetime, timedelta, timezone
-import io
+from functools import partial
+from itertools import repeat
 from pathlib import Path
-from typing import Any
 
 from adxl_ros.files import population_file
 from adxl_ros.files.atomic_write import write_text
-from adxl_ros.fleet.report.findings import (
-    effect_matrix,
-    EffectMatrix,
-    number,
-    rank,
-    State,
-    UnitState,
-)
-from adxl_ros.fleet.report.fleet_table import (
-    analyse,
-    far_out,
-    FleetTable,
-    MG,
-    population_of,
-    QuantityResult,
-    read,
-    TOLERANCE_MG,
-)
-from adxl_ros.fleet.report.trends import FALSE_DISCOVERY_RATE, Scatter
+from adxl_ros.fleet.findings import effect_matrix, EffectMatrix, rank, State, UnitState
 from adxl_ros.fleet.row import PAGE, POPULATION, reason_kind, TABLE, UNITS
+from adxl_ros.fleet.table import analyse, FleetTable, MG, QuantityResult, read, TOLERANCE_MG
+from adxl_ros.fleet.trends import FALSE_DISCOVERY_RATE
 from adxl_ros.model.constants import AXES, Z_90
+from adxl_ros.model.population import Population
 from adxl_ros.report import figures as plotly, page as html_page
+from adxl_ros.report.quantities import number
 import numpy as np
 import scipy
 
@@ -63,54 +48,42 @@ _SMALLEST_SCATTER = 1e-3
 """Smallest scatter on the page, mg, mg/g or µg. Chosen: far below the noise of any recording."""
 _NOTHING = 0.05
 """Smaller standard deviations are nothing beside another one. Chosen: 0.1 % of the variance."""
-_COLOURS = {State.OUT_OF_TOLERANCE: 'red', State.DRIFTS: 'amber', State.NOT_JUDGED: 'amber',
-            State.FAR_OUT: 'amber', State.OLD_CALIBRATION: 'grey', State.IN_ORDER: 'green'}
-"""Colour of the badge by the state of the most urgent unit."""
 _MEASURES = ('gap_before_mps2', *(f'zero_g_{axis}_v' for axis in AXES))
 """Columns that tell whether a unit is within the tolerance."""
-_SENTENCES = {
-    State.OUT_OF_TOLERANCE: ('Recalibrate the unit at the head of the list.',
-                             'Recalibrate the units at the head of the list.'),
-    State.DRIFTS: ('No unit is out of tolerance, but one is on its way.',
-                   'No unit is out of tolerance, but some are on their way.'),
-    State.NOT_JUDGED: ('No unit is out of tolerance, but one gives no usable recordings.',
-                       'No unit is out of tolerance, but some give no usable recordings.'),
-    State.FAR_OUT: ('No unit is out of tolerance, but one differs from all others.',
-                    'No unit is out of tolerance, but some differ from all others.'),
-    State.OLD_CALIBRATION: ('No unit is out of tolerance, but one calibration is old.',
-                            'No unit is out of tolerance, but some calibrations are old.'),
-    State.IN_ORDER: ('The unit is within the tolerance.', 'All units are within the tolerance.')}
-"""What the most urgent state means for the user: of one unit, and of several."""
+_SENTENCES = {State.OUT_OF_TOLERANCE: 'Recalibrate what is at the head of the list.',
+              State.IN_ORDER: 'All units are within the tolerance.'}
+"""What the most urgent state means for the user; the others mean the same."""
 
 
 def date_text(year: float) -> str:
     """Return the day of a date in years since 1970; '-' for NaN."""
-    return f'{_date(year):%Y-%m-%d}' if np.isfinite(year) else '-'
+    return _stamps([year])[0][:10] if np.isfinite(year) else '-'
 
 
-def _date(year: float) -> datetime:
-    return _EPOCH + timedelta(days=float(year) * _DAYS_PER_YEAR)
-
-
-def _stamps(years: np.ndarray) -> list[str]:
-    return [f'{_date(year):%Y-%m-%d %H:%M}' for year in years]
+def _stamps(years: Iterable[float]) -> list[str]:
+    return [f'{_EPOCH + timedelta(days=float(year) * _DAYS_PER_YEAR):%Y-%m-%d %H:%M}'
+            for year in years]
 
 
 def _trend_figure(table: FleetTable, result: QuantityResult, unit: int) -> plotly.Figure:
-    """Plot a quantity of a unit over time."""
+    """Plot a quantity of a unit over time, about its mean where units differ by far more."""
+    quantity, place = result.quantity, result.place_of(unit)
+    is_relative = quantity.is_coefficient and quantity.is_force
+    origin = float(result.trends.level[place]) if is_relative and place is not None else 0.0
     part = table.unit[result.rows] == unit
-    factor, years = result.quantity.factor, result.recordings.time[part]
-    value = factor * (result.recordings.value[part] - _origin(result, unit))
-    std = factor * result.recordings.std[part]
-    is_outlier, dates = result.is_outlier[part], np.array(_stamps(years), object)
+    years, is_outlier = result.recordings.time[part], result.is_outlier[part]
+    value = quantity.factor * (result.recordings.value[part] - origin)
+    std = quantity.factor * result.recordings.std[part]
+    dates = np.array(_stamps(years), object)
     recorded = plotly.points([], value[~is_outlier], Z_90 * std[~is_outlier], 'recording',
                              plotly.AXIS_COLOURS['x'])
     recorded |= {'x': list(dates[~is_outlier]), 'marker': {
         'color': plotly.AXIS_COLOURS['x'], 'size': 4}}
     recorded['error_y'] |= {'width': 0, 'thickness': 0.8}
-    kept = result.recordings[~result.is_outlier]
-    traces = [*_lines(result, unit, years[~is_outlier], kept.period[part[~result.is_outlier]]),
-              recorded]
+    traces = [recorded]
+    if place is not None and (~is_outlier).sum() > 1:
+        periods = result.recordings[~result.is_outlier].period[part[~result.is_outlier]]
+        traces = [*_lines(result, place, years[~is_outlier], periods, origin), recorded]
     if is_outlier.any():
         traces.append({'type': 'scatter', 'mode': 'markers', 'name': 'outlier',
                        'x': list(dates[is_outlier]), 'y': plotly.rounded(value[is_outlier]),
@@ -120,56 +93,29 @@ def _trend_figure(table: FleetTable, result: QuantityResult, unit: int) -> plotl
     marks = [{'type': 'line', 'x0': stamp, 'x1': stamp, 'yref': 'paper', 'y0': 0, 'y1': 1,
               'line': {'color': plotly.QUIET_COLOUR, 'width': 1.2, 'dash': 'dash'}}
              for stamp in _stamps(calibration_years(table, unit))]
-    return plotly.figure(traces, _TREND_HEIGHT, showlegend=False, shapes=marks,
-                         xaxis={'type': 'date', 'nticks': 3, 'tickangle': 0,
-                                'tickformat': '%b %Y'},
-                         yaxis={'title': {'text': _axis_title(result)}, 'nticks': 5})
-
-
-def _origin(result: QuantityResult, unit: int) -> float:
-    """Return the value that a plot has at 0: the mean of a unit where units differ by far more."""
-    place = result.place_of(unit)
-    return float(result.trends.level[place]) \
-        if _is_relative(result) and place is not None else 0.0
-
-
-def _is_relative(result: QuantityResult) -> bool:
-    return result.quantity.is_coefficient and result.quantity.is_force
-
-
-def _axis_title(result: QuantityResult) -> str:
-    unit = result.quantity.shown_unit
-    return f'{unit} from the mean' if _is_relative(result) else unit
+    title = quantity.shown_unit + ' from the mean' * is_relative
+    return plotly.figure(
+        traces, _TREND_HEIGHT, showlegend=False, shapes=marks,
+        xaxis={'type': 'date', 'nticks': 3, 'tickangle': 0, 'tickformat': '%b %Y'},
+        yaxis={'title': {'text': title}, 'nticks': 5})
 
 
 def calibration_years(table: FleetTable, unit: int) -> np.ndarray:
-    """Return when the calibrations of a unit changed."""
+    """Return when the calibrations of a unit were made."""
     rows = table.rows_of(unit)
-    rows = rows[np.isfinite(table.years[rows])]
-    if not len(rows):
-        return np.zeros(0)
-    begins = np.flatnonzero(np.diff(table.period[rows], prepend=-1))
-    age = table['calibration_age_days'][rows]
-    years = []
-    for i, begin in enumerate(begins):
-        end = begins[i + 1] if i + 1 < len(begins) else len(rows)
-        dated = begin + np.flatnonzero(np.isfinite(age[begin:end]))
-        if len(dated):
-            years.append(table.years[rows[dated[0]]] - age[dated[0]] / _DAYS_PER_YEAR)
-        elif i:
-            years.append(table.years[rows[begin]])
-    first = table.years[rows[0]]
+    made = table.years[rows] - table['calibration_age_days'][rows] / _DAYS_PER_YEAR
+    dated = np.flatnonzero(np.isfinite(made))
+    if not len(dated):
+        return made[dated]
+    made = made[dated[np.unique(table.period[rows[dated]], return_index=True)[1]]]
+    first, last = np.nanmin(table.years[rows]), np.nanmax(table.years[rows])
     # A calibration long before the first recording would compress the plot.
-    return np.array([year for year in years
-                     if year > first - 0.1 * max(table.years[rows[-1]] - first, 0.01)])
+    return made[made > first - 0.1 * max(last - first, 0.01)]
 
 
-def _lines(result: QuantityResult, unit: int, times: np.ndarray, periods: np.ndarray
-           ) -> list[plotly.Figure]:
+def _lines(result: QuantityResult, place: int, times: np.ndarray, periods: np.ndarray,
+           origin: float) -> list[plotly.Figure]:
     """Return the lines of a unit between calibrations with their bands."""
-    place = result.place_of(unit)
-    if place is None or len(times) < 2:
-        return []
     trends, factor = result.trends, result.quantity.factor
     is_claimed = bool(result.is_claimed[place])
     slope, slope_std = (trends.slope[place], trends.slope_std[place]) if is_claimed else (0, 0)
@@ -180,7 +126,7 @@ def _lines(result: QuantityResult, unit: int, times: np.ndarray, periods: np.nda
         part = times[periods == period]
         x = np.linspace(part.min(), part.max(), _LINE_POINTS)
         distance = x - trends.period_time[period]
-        middle = factor * (trends.period_value[period] + slope * distance - _origin(result, unit))
+        middle = factor * (trends.period_value[period] + slope * distance - origin)
         half = factor * width * np.hypot(trends.period_std[period], slope_std * distance)
         dates = _stamps(x)
         traces += [
@@ -226,24 +172,39 @@ def write(folder: Path) -> list[Path]:
     return [folder / name for name in (PAGE, POPULATION, UNITS)]
 
 
+def population_of(results: Sequence[QuantityResult], name: str) -> Population:
+    """Return what the units of a fleet are like."""
+    return Population(name, {
+        result.quantity.column: result.population.pooled for result in results
+        if result.population is not None and result.population.pooled.prediction_std > 0})
+
+
+def far_out(results: Sequence[QuantityResult], serials: Sequence[str]
+            ) -> list[dict[str, str | float]]:
+    """Return the units that are not of the population, the farthest first."""
+    units: list[dict[str, str | float]] = [
+        {'serial': serials[result.units[i]], 'coefficient': result.quantity.column,
+         'value': float(result.population.estimates[i]),
+         'distance': float(result.population.distances()[i])}
+        for result in results if result.population is not None
+        for i in np.flatnonzero(result.population.is_far_out)]
+    return sorted(units, key=lambda unit: -abs(float(unit['distance'])))
+
+
 def _units_csv(results: Sequence[QuantityResult], serials: Sequence[str]) -> str:
     """Return the estimates of all units, with and without the population."""
-    text = io.StringIO()
-    rows = csv.writer(text, lineterminator='\n')
-    rows.writerow(['serial', 'coefficient', 'unit', 'estimate', 'std', 'shrunken',
-                   'shrunken_std', 'distance', 'is_far_out'])
+    import pandas as pd
+    columns = ('serial', 'coefficient', 'unit', 'estimate', 'std', 'shrunken', 'shrunken_std',
+               'distance', 'is_far_out')
+    rows: list[tuple] = []
     for result in results:
-        population = result.population
-        if population is None:
-            continue
-        shrunken, shrunken_std = population.shrunken()
-        columns = (population.estimates, population.std, shrunken, shrunken_std,
-                   population.distances())
-        for i, unit in enumerate(result.units):
-            rows.writerow([serials[unit], result.quantity.column, result.quantity.unit,
-                           *(f'{values[i]:.9g}' for values in columns),
-                           str(bool(population.is_far_out[i])).lower()])
-    return text.getvalue()
+        if (population := result.population) is not None:
+            rows += zip([serials[unit] for unit in result.units], repeat(result.quantity.column),
+                        repeat(result.quantity.unit), population.estimates, population.std,
+                        *population.shrunken(), population.distances(),
+                        ['true' if far else 'false' for far in population.is_far_out])
+    return pd.DataFrame(rows, columns=columns).to_csv(
+        index=False, float_format='%.9g', lineterminator='\n')
 
 
 def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> str:
@@ -259,17 +220,19 @@ def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> 
     if effects.effects:
         figures['matrix'] = _matrix_figure(table, effects)
     counts = Counter(unit.state for unit in units)
-    return html_page.render('adxl_ros.fleet.report', 'fleet.html', {
+    return html_page.render('adxl_ros.fleet', 'fleet.html', {
         'title': 'Fleet', 'about': _about(table), 'badge': _badge(table, units, counts),
         'tiles': _tiles(table, units, counts), 'shown': _SHOWN, 'figures': figures,
-        'units': [_unit_row(unit, folder) for unit in units],
-        'without_unit': _rows_without_unit(table, folder),
+        'units': units, 'date': date_text, 'link': partial(_link, folder),
+        'without_unit': _rows_without_unit(table),
         'without_unit_count': int((table.unit < 0).sum()),
-        'trends': [_trend_caption(i, unit, result) for i, (unit, result) in enumerate(plotted)],
+        'trends': [{'figure': f'trend-{i}', 'title': f'{unit.serial}: {result.quantity.label}',
+                    'text': f'{unit.drifts[0].text}.' if unit.drifts else 'No slope is claimed.'}
+                   for i, (unit, result) in enumerate(plotted)],
         'findings': [*_batches(results), *effects.findings], 'has_effects': bool(effects.effects),
         'judged': len(effects.units), 'populations': _population_rows(results),
         'far_out': _far_out_rows(distant, results),
-        'outliers': _outlier_rows(table, results, folder),
+        'outliers': _outlier_rows(table, results),
         'outlier_count': sum(int(result.is_outlier.sum()) for result in results),
         'refusals': _refusal_rows(table), 'most_rows': _MOST_ROWS,
         'tolerance': number(TOLERANCE_MG), 'false_discovery': f'{FALSE_DISCOVERY_RATE:.0%}',
@@ -279,12 +242,10 @@ def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> 
 def _batches(results: Sequence[QuantityResult]) -> list[str]:
     """Name the batches whose coefficient is not that of the other units."""
     return [f'{batch.members.sum()} units with a serial number {batch.prefix}… have a '
-            f'{result.quantity.label} that differs by {number(factor * batch.difference, True)} '
-            f'({number(factor * batch.low, True)} to {number(factor * batch.high, True)}) '
-            f'{result.quantity.shown_unit} from that of the {(~batch.members).sum()} others: a '
-            'bad batch.'
-            for result in results if (batch := result.batch) is not None
-            for factor in [result.quantity.factor]]
+            f'{result.quantity.label} that differs by '
+            + result.quantity.text(batch.difference, batch.low, batch.high) +
+            f' from that of the {(~batch.members).sum()} others: a bad batch.'
+            for result in results if (batch := result.batch) is not None]
 
 
 def _about(table: FleetTable) -> list[str]:
@@ -308,8 +269,9 @@ def _badge(table: FleetTable, units: Sequence[UnitState], counts: Counter[State]
                 'sentence': 'No gap and no zero-g were measured; they need diagnose and fit.'}
     word = 'IN ORDER' if worst is State.IN_ORDER else \
         f'{counts[worst]} of {len(units)} {worst.words}'.upper()
-    return {'colour': _COLOURS[worst], 'word': word,
-            'sentence': _SENTENCES[worst][counts[worst] > 1]}
+    return {'colour': worst.colour, 'word': word,
+            'sentence': _SENTENCES.get(
+                worst, 'No unit is out of tolerance. Look at the head of the list.')}
 
 
 def _tiles(table: FleetTable, units: Sequence[UnitState], counts: Counter[State]
@@ -332,18 +294,7 @@ def _tiles(table: FleetTable, units: Sequence[UnitState], counts: Counter[State]
                     'note': f'{number(3600 * hours / max(len(table), 1))} s a recording'}]
 
 
-def _unit_row(unit: UnitState, folder: Path) -> dict[str, Any]:
-    return {'serial': unit.serial, 'state': unit.state.words,
-            'colour': _COLOURS[unit.state], 'reason': unit.reason or 'Nothing to do.',
-            'gap': '-' if not np.isfinite(unit.gap_mg) else
-            f'{number(unit.gap_mg)} / {number(unit.floor_mg)}',
-            'age': '-' if not np.isfinite(unit.calibration_age_days) else
-            f'{unit.calibration_age_days:.0f}',
-            'recordings': f'{unit.recordings} ({unit.refused})',
-            'last': date_text(unit.last_year), 'report': _link(unit.report, folder)}
-
-
-def _rows_without_unit(table: FleetTable, folder: Path) -> list[dict[str, str]]:
+def _rows_without_unit(table: FleetTable) -> list[dict[str, str]]:
     """Return the recordings that state no serial number, the largest gap first."""
     gap_mg, floor_mg = (MG * table[f'gap_{name}_mps2'] for name in ('before', 'floor'))
     rows = np.flatnonzero(table.unit < 0)
@@ -354,17 +305,13 @@ def _rows_without_unit(table: FleetTable, folder: Path) -> list[dict[str, str]]:
                  ', '.join(table['effects'][row])])),
              'gap': f'{number(gap_mg[row])} / {number(floor_mg[row])}'
              if np.isfinite(gap_mg[row]) else '-',
-             'report': _link(str(table['report'][row]), folder)} for row in rows[:_MOST_ROWS]]
+             'report': table['report'][row]} for row in rows[:_MOST_ROWS]]
 
 
-def _link(report: str, folder: Path) -> str:
+def _link(folder: Path, report: str) -> str:
     """Return the address of a single report: its page where there is one; empty for none."""
-    if not report:
-        return ''
-    for name in ('diagnose/report.html', 'report.html', 'fit/report.html', 'noise/report.html'):
-        if (folder / report / name).is_file():
-            return f'{report}/{name}'
-    return report if (folder / report).is_dir() else ''
+    return next((name for name in (f'{report}/report.html', report)
+                 if report and (folder / name).exists()), '')
 
 
 def _plotted_quantity(unit: UnitState, results: Sequence[QuantityResult]
@@ -375,49 +322,30 @@ def _plotted_quantity(unit: UnitState, results: Sequence[QuantityResult]
     return next((result for result in results if result.place_of(unit.unit) is not None), None)
 
 
-def _trend_caption(i: int, unit: UnitState, result: QuantityResult) -> dict[str, str]:
-    text = next((drift.text for drift in unit.drifts if drift.result is result), '')
-    return {'figure': f'trend-{i}', 'title': f'{unit.serial}: {result.quantity.label}',
-            'text': f'{text}.' if text else 'No slope is claimed.'}
-
-
 def _population_rows(results: Sequence[QuantityResult]) -> list[list[str]]:
     rows = []
     for result in results:
-        population, quantity = result.population, result.quantity
+        population, quantity, scatter = result.population, result.quantity, result.trends.scatter
         if population is None:
             continue
-        pooled = population.pooled
-        factor = quantity.factor
-        unit = quantity.shown_unit
-        is_noise = quantity.unit.startswith('m/s')
-        mean, std = (factor * value if is_noise else value
-                     for value in (pooled.mean, pooled.mean_std))
+        pooled, factor, unit = population.pooled, quantity.factor, quantity.shown_unit
+        shown = (factor, unit) if quantity.unit.startswith('m/s') else (1.0, quantity.unit)
+        mean, std = shown[0] * pooled.mean, shown[0] * pooled.mean_std
+        digits = int(np.clip(1 - np.floor(np.log10(std)), 0, 8)) if std > 0 else 4
+        # A scatter by calibrations that is nothing beside that of recordings is shown as nothing.
+        step = scatter.calibration if scatter.calibration > _NOTHING * scatter.recording else 0.0
         rows.append([
-            quantity.label,
-            f'{_value(mean, std)} ± {number(std, digits=2)} {unit if is_noise else quantity.unit}',
+            quantity.label, f'{mean:.{digits}f} ± {number(std, digits=2)} {shown[1]}',
             f'{number(factor * pooled.spread)} ({number(factor * pooled.spread_low)} to '
             f'{number(factor * pooled.spread_high)}) {unit}',
-            f'{_scatter(factor * result.trends.scatter.recording)} {unit}',
-            f'{_scatter(factor * _material(result.trends.scatter))} {unit}', str(pooled.units),
-            str(int(population.is_far_out.sum()))])
+            f'{_scatter(factor * scatter.recording)} {unit}', f'{_scatter(factor * step)} {unit}',
+            str(pooled.units), str(int(population.is_far_out.sum()))])
     return rows
 
 
 def _scatter(value: float) -> str:
     """Return a scatter; one that is too small to matter as its limit."""
     return f'< {_SMALLEST_SCATTER:g}' if 0 < value < _SMALLEST_SCATTER else number(value)
-
-
-def _material(scatter: Scatter) -> float:
-    """Return the scatter by calibrations; 0 where it is nothing beside that of recordings."""
-    return scatter.calibration if scatter.calibration > _NOTHING * scatter.recording else 0.0
-
-
-def _value(value: float, std: float) -> str:
-    """Return a value with the digits that its uncertainty leaves."""
-    digits = int(np.clip(2 - np.floor(np.log10(std)) - 1, 0, 8)) if std > 0 else 4
-    return f'{value:.{digits}f}'
 
 
 def _far_out_rows(distant: Sequence[dict[str, str | float]], results: Sequence[QuantityResult]
@@ -434,33 +362,28 @@ def _far_out_rows(distant: Sequence[dict[str, str | float]], results: Sequence[Q
     return rows
 
 
-def _outlier_rows(table: FleetTable, results: Sequence[QuantityResult], folder: Path
+def _outlier_rows(table: FleetTable, results: Sequence[QuantityResult]
                   ) -> list[dict[str, str]]:
     """Return the recordings that are far from others of their unit, the farthest first."""
     outliers = [(float(result.distance[i]), result, i) for result in results
                 for i in np.flatnonzero(result.is_outlier)]
     outliers.sort(key=lambda item: -item[0])
-    rows = []
-    for distance, result, i in outliers[:_MOST_ROWS]:
-        row = result.rows[i]
-        rows.append({'serial': table.serials[table.unit[row]],
-                     'date': date_text(table.years[row]), 'quantity': result.quantity.label,
-                     'value': f'{number(result.quantity.factor * result.recordings.value[i])} '
-                     f'{result.quantity.shown_unit}', 'distance': number(distance),
-                     'url': str(table['url'][row]),
-                     'report': _link(str(table['report'][row]), folder)})
-    return rows
+    return [{'serial': table.serials[table.unit[row]], 'date': date_text(table.years[row]),
+             'quantity': quantity.label, 'distance': number(distance),
+             'value': f'{number(quantity.factor * result.recordings.value[i])} '
+             f'{quantity.shown_unit}',
+             'url': table['url'][row], 'report': table['report'][row]}
+            for distance, result, i in outliers[:_MOST_ROWS]
+            for row, quantity in [(result.rows[i], result.quantity)]]
 
 
 def _refusal_rows(table: FleetTable) -> list[list[str]]:
     """Return the reasons of refusals: how often, in how many units, and an example."""
-    rows = np.flatnonzero(table['outcome'] != 'done')
-    by_reason: dict[str, list[int]] = {}
-    for row in rows:
-        kind = reason_kind({name: str(table[name][row]) for name in ('refusal', 'outcome', 'url')})
-        by_reason.setdefault(kind, []).append(int(row))
-    ordered = sorted(by_reason.items(), key=lambda item: (-len(item[1]), item[0]))
+    failed = table.frame.assign(unit=table.unit)[table['outcome'] != 'done']
+    kinds = [reason_kind(row) for row in failed.to_dict('records')]
+    groups = sorted(failed.groupby(np.array(kinds, object)),
+                    key=lambda item: (-len(item[1]), item[0]))
     # A recording without a serial number is of no unit.
-    return [[str(len(numbers)), str(len({*table.unit[numbers].tolist()} - {-1})), reason,
-             str(table['refused_by'][numbers[0]]) or '-', str(table['url'][numbers[0]])]
-            for reason, numbers in ordered[:_MOST_ROWS]]
+    return [[str(len(group)), str(len({*group['unit']} - {-1})), kind,
+             group['refused_by'].iloc[0] or '-', group['url'].iloc[0]]
+            for kind, group in groups[:_MOST_ROWS]]
