@@ -284,14 +284,14 @@ def white_noise_v(noise_v: np.ndarray, sensor: Sensor, rows: np.ndarray | None =
     Estimate the standard deviation of the white noise behind the RC filter, V, (m,).
 
     The median over the upper half of the frequencies ignores lines, drift and motion. That over
-    the samples, (n,) bool, ignores spikes. The smaller one counts.
+    first differences of samples, (n,) bool, ignores spikes. The smaller one counts.
     """
     innovations, decay = _innovations(noise_v, sensor)
     frequency_hz, power = scipy.signal.periodogram(innovations, sensor.rate_hz, 'hann', axis=0)
     level = np.median(power[frequency_hz > sensor.rate_hz / 4], axis=0) / np.log(2)
-    chosen = innovations if rows is None else innovations[rows[1:]]
-    std = np.minimum(np.sqrt(level * sensor.rate_hz / 2),
-                     MAD_TO_STD * np.median(np.abs(chosen), axis=0))
+    changes = np.abs(np.diff(innovations, axis=0)) / np.sqrt(2)
+    std = np.minimum(np.sqrt(level * sensor.rate_hz / 2), MAD_TO_STD * np.median(
+        changes if rows is None else changes[rows[2:]], axis=0))
     return std / np.sqrt(1 - decay ** 2)
 
 
