@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
+from adxl_ros.diagnose import noise_effects, reference
 from adxl_ros.diagnose.comparison import (
     at_search_rate,
     BaselineComparison,
@@ -20,26 +21,7 @@ from adxl_ros.diagnose.comparison import (
     Reference,
     SMALLEST_MOTION_G,
 )
-from adxl_ros.diagnose.noise_effects import (
-    coarse_codes,
-    Detection,
-    isolated_samples,
-    repeated_samples,
-)
-from adxl_ros.diagnose.reference import (
-    align_force,
-    code_step_v,
-    CORRELATED,
-    correlations,
-    DataFault,
-    fading_frequency_hz,
-    LeftOut,
-    seen_step_rad,
-    SHORTEST_S,
-    stated_poses,
-    too_coarse,
-    without_reading,
-)
+from adxl_ros.diagnose.reference import DataFault, SHORTEST_S
 from adxl_ros.files.recording_columns import JOINTS, Recording
 from adxl_ros.model import noise
 from adxl_ros.model.kinematics import specific_force
@@ -123,37 +105,39 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
         fault = find_encoder_fault(recording, sensor)
     if fault is not None:
         return fault
-    left_out: list[LeftOut] = []
+    left_out: list[reference.LeftOut] = []
     if sim is not None:
-        aligned = align_force(recording, sensor, sim, may_shift)
+        aligned = reference.align_force(recording, sensor, sim, may_shift)
         if isinstance(aligned, DataFault):
             return aligned
         recording, sim, more = aligned
         notes = notes + more
     else:
-        step_rad = seen_step_rad(recording, sensor.stage_resolution_rad)
+        step_rad = reference.seen_step_rad(recording, sensor.stage_resolution_rad)
         if step_rad > sensor.stage_resolution_rad:
             notes = [*notes, f'the stage reads in steps of {np.degrees(step_rad):.3g}°, not of '
                      f'{np.degrees(sensor.stage_resolution_rad):.3g}° as stated: this is used']
             sensor = replace(sensor, stage_resolution_rad=step_rad)
-        recording, left_out = stated_poses(recording, sensor)
+        recording, left_out = reference.stated_poses(recording, sensor)
     comparison = compare(recording, sensor, sim)
     if even is not None and not even.certain and len(even.time_s) == len(recording):
         evenly = compare(replace(recording, time_s=even.time_s), sensor, sim)
         if _roughness(evenly) < _SAME_ROUGHNESS * _roughness(comparison):
             comparison, notes = evenly, notes + even.notes
     stated = left_out if comparison.joints else []
-    comparison = _without(comparison, [*stated, *without_reading(comparison, recording.columns)])
+    comparison = _without(comparison, [
+        *stated, *reference.without_reading(comparison, recording.columns)])
     # What moves too fast is looked for where the reference is stated.
-    comparison = _without(comparison, too_coarse(comparison, recording.columns))
-    fading_hz = fading_frequency_hz(comparison)
+    comparison = _without(comparison, reference.too_coarse(comparison, recording.columns))
+    fading_hz = reference.fading_frequency_hz(comparison)
     if fading_hz is not None:
         notes = [*notes, f'--sim is smoother than the sensor: above {fading_hz:.3g} Hz it lacks '
                  'motion that the recording has; effects that show in fast motion are not named']
     return replace(comparison, notes=(*notes, *comparison.notes), fading_hz=fading_hz)
 
 
-def _without(comparison: BaselineComparison, left_out: Sequence[LeftOut]) -> BaselineComparison:
+def _without(comparison: BaselineComparison, left_out: Sequence[reference.LeftOut]
+             ) -> BaselineComparison:
     """Return a comparison that does not use some samples, and notes why."""
     rows = np.logical_or.reduce([~comparison.used, *(part.rows for part in left_out)])
     notes = [part.text(comparison.time_s) for part in left_out]
@@ -282,9 +266,10 @@ class CheckedRecording:
 
     comparison: BaselineComparison  # The recording beside the baseline at its full rate
     search_comparison: BaselineComparison  # The same at the rate of the search
-    detections: tuple[Detection, ...]  # Noise-like effects that the samples themselves show
+    # Noise-like effects that the samples themselves show
+    detections: tuple[noise_effects.Detection, ...]
     # Isolated samples; the residual of the best hypothesis must show them, too
-    possible_spikes: Detection | None
+    possible_spikes: noise_effects.Detection | None
     stated_bits: int  # Bits of the ADC by the parameter file
 
 
@@ -300,9 +285,9 @@ def check_recording(comparison: BaselineComparison) -> CheckedRecording | DataFa
         return fault
     volts, time_s, sensor = comparison.volts, comparison.time_s, comparison.sensor
     used = comparison.used & np.isfinite(volts).all(axis=1)
-    coarse = coarse_codes(volts, sensor)
+    coarse = noise_effects.coarse_codes(volts, sensor)
     if coarse is None:
-        used, detections = repeated_samples(volts, time_s, used, sensor)
+        used, detections = noise_effects.repeated_samples(volts, time_s, used, sensor)
     else:
         # Coarse codes repeat by themselves.
         detections = [coarse]
@@ -310,7 +295,7 @@ def check_recording(comparison: BaselineComparison) -> CheckedRecording | DataFa
         comparison, search_comparison = (
             replace(c, sensor=replace(c.sensor, adc_bits=bits))
             for c in (comparison, search_comparison))
-    used, spikes = isolated_samples(volts, time_s, used, comparison.sensor)
+    used, spikes = noise_effects.isolated_samples(volts, time_s, used, comparison.sensor)
     every = round(sensor.rate_hz / search_comparison.sensor.rate_hz)
     return CheckedRecording(replace(comparison, used=used),
                             replace(search_comparison, used=used[::every]),
@@ -349,8 +334,8 @@ def find_clock_fault(time_s: np.ndarray) -> DataFault | None:
     steps_s = np.diff(time_s)
     backward = np.flatnonzero(steps_s <= 0)
     if len(backward):
-        return bad('clock_jump', f'the stamps run backwards at {time_s[backward[0]]:.6g} s; record '
-                   'again with a steady clock')
+        return bad('clock_jump', f'the stamps run backwards at {time_s[backward[0]]:.6g} s; '
+                   'record again with a steady clock')
     wide = np.flatnonzero(steps_s > _JUMP_STEPS * float(np.median(steps_s)))
     if len(wide) and float(steps_s[wide].sum()) > _LARGEST_JUMP_SHARE * float(steps_s.sum()):
         return bad('clock_jump', f'the stamps jump by {steps_s[wide].max():.3g} s at '
@@ -365,7 +350,7 @@ def _range_fault(comparison: BaselineComparison, finite: np.ndarray) -> DataFaul
     volts, simulated_v = (v[finite] for v in (comparison.volts, comparison.simulated_v(sensor)))
     lsb_v, range_v = max(sensor.lsb_v, _SMALLEST_STEP_V), np.ptp(volts, axis=0)
     railed = 0.0
-    for axis_v, expected_v, step_v in zip(volts.T, simulated_v.T, code_step_v(volts)):
+    for axis_v, expected_v, step_v in zip(volts.T, simulated_v.T, reference.code_step_v(volts)):
         for rail_v in (axis_v.max(), axis_v.min()) if np.ptp(axis_v) > _SMALLEST_RANGE_V else ():
             at_rail = np.abs(axis_v - rail_v) < lsb_v / 2
             # Coarse codes repeat in an extreme pose, so that the simulation must differ, too.
@@ -373,8 +358,8 @@ def _range_fault(comparison: BaselineComparison, finite: np.ndarray) -> DataFaul
                 at_rail &= np.abs(expected_v - rail_v) > step_v
             railed = max(railed, at_rail.mean() * (at_rail.mean() > _RAIL_SHARE))
     if railed > _LARGEST_MISSING_SHARE:
-        return bad('saturated', f'{100 * railed:.0f} % of the samples are at the end of the range; '
-                   'check supply, range and wiring')
+        return bad('saturated', f'{100 * railed:.0f} % of the samples are at the end of the '
+                   'range; check supply, range and wiring')
     expected_v = np.ptp(simulated_v, axis=0)
     # At rest, codes may all be the same where their step exceeds the noise.
     noisy = noise.analog_std_v(sensor) > sensor.lsb_v
@@ -419,12 +404,12 @@ def _axis_fault(comparison: BaselineComparison) -> DataFault | None:
     moving = np.flatnonzero(simulated_g.std(axis=0) > SMALLEST_MOTION_G)
     if not len(moving):
         return None
-    lags, _, by_lag = correlations(simulated_g, np.nan_to_num(measured_g),
+    lags, _, by_lag = reference.correlations(simulated_g, np.nan_to_num(measured_g),
                                    2 * len(simulated_g) // 3)
     by_lag = np.where(np.abs(lags) <= _LARGEST_DELAY_S * sensor.rate_hz, by_lag, -1.0)
     best = int(np.argmax(by_lag))
     delay_s = lags[best] / sensor.rate_hz
-    if by_lag[best] > max(CORRELATED, by_lag[lags == 0][0] + _CORRELATION_GAIN) \
+    if by_lag[best] > max(reference.CORRELATED, by_lag[lags == 0][0] + _CORRELATION_GAIN) \
             and abs(delay_s) > _SEARCHED_DELAY_S:
         return bad('time_misaligned', f'the sensor is {abs(delay_s):.2f} s '
                    f'{"later" if delay_s > 0 else "earlier"} than the reference, but the search '
@@ -438,7 +423,7 @@ def _axis_fault(comparison: BaselineComparison) -> DataFault | None:
         return bad('axis_inverted' if polarity.axis == polarity.follows else 'axis_swapped',
                    polarity.describe(axes[polarity.axis], axes[polarity.follows]))
     gains = [np.polyfit(simulated_g[:, d], measured_g[:, d], 1)[0]
-             for d in np.flatnonzero(np.diag(correlation) > CORRELATED)]
+             for d in np.flatnonzero(np.diag(correlation) > reference.CORRELATED)]
     for ratio, units in _UNIT_RATIOS.items() if gains else ():
         if abs(np.log(np.median(gains) / ratio)) < _UNIT_TOLERANCE:
             return bad('unit', f'the output is {np.median(gains):.4g} times the simulated output, '

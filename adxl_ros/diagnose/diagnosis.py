@@ -13,48 +13,32 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import NamedTuple
 
-from adxl_ros.diagnose import data_checks, noise_effects, noise_model
+from adxl_ros.diagnose import (
+    data_checks,
+    next_experiment,
+    noise_effects,
+    noise_model,
+    verdict as rule,
+)
 from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
 from adxl_ros.diagnose.data_checks import CheckedRecording, compare_checked
-from adxl_ros.diagnose.evidence import bridged, used_by_block
+from adxl_ros.diagnose.evidence import used_by_block
 from adxl_ros.diagnose.held_out import block_weights, HeldOutFits, reproducible_rest
 from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
-from adxl_ros.diagnose.next_experiment import (
-    could_show,
-    CouldShow,
-    NextExperiment,
-    propose_next_experiment,
-    RecordedEvidence,
-)
-from adxl_ros.diagnose.noise_effects import (
-    compare_noise,
-    Detection,
-    floor_without,
-    noise_remainders,
-    NoiseComparison,
-    NoiseRemainder,
-    NoiseSamples,
-    UNKNOWN,
-)
+from adxl_ros.diagnose.next_experiment import CouldShow, NextExperiment, RecordedEvidence
+from adxl_ros.diagnose.noise_effects import Detection, NoiseComparison, NoiseRemainder, UNKNOWN
 from adxl_ros.diagnose.noise_model import drift_effects, NoiseFloor
 from adxl_ros.diagnose.reference import DataFault
 from adxl_ros.diagnose.residual_map import not_covered, residual_map, ResidualCell
 from adxl_ros.diagnose.search import Hypothesis, linearise, Search
-from adxl_ros.diagnose.verdict import (
-    Candidate,
-    decide,
-    Evidence,
-    HEALTHY,
-    MATERIAL_MG,
-    MATERIAL_SHARE_OF_NOISE,
-    Verdict,
-)
+from adxl_ros.diagnose.verdict import HEALTHY, MATERIAL_MG, Verdict
 from adxl_ros.files.recording_columns import check_unit, Recording
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor, with_axes
+from adxl_ros.report.quantities import Interval
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.simulator import simulate_at_stamps
 import numpy as np
@@ -75,16 +59,10 @@ _SMALLEST_RANGES = {'temperature_c': 0.5, 'supply_v': 0.02}
 class GapClosure(NamedTuple):
     """The gap before and after the effects of the verdict, held out, and the noise floor."""
 
-    # before_mps2, after_mps2: Rms of recording minus simulation over samples and axes, m/s²
-    before_mps2: float
-    # before_ci, after_ci: Their 90 % intervals
-    before_ci: tuple[float, float]
-    after_mps2: float
-    after_ci: tuple[float, float]
-    floor_mps2: float  # Noise floor, m/s²
-    floor_ci: tuple[float, float] | None  # Its 90 % interval; None where it is not measured
-    closed: float  # (before² − after²)/(before² − floor²); NaN without a gap
-    closed_ci: tuple[float, float]  # Its 90 % interval
+    before: Interval  # Rms of recording minus simulation over samples and axes, m/s²
+    after: Interval  # The same with the effects, m/s²
+    floor: Interval  # Noise floor, m/s²; its interval is NaN where it is not measured
+    closed: Interval  # (before² − after²)/(before² − floor²); NaN without a gap
 
 
 @dataclass(frozen=True)
@@ -178,15 +156,15 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     floor = noise_model.estimate([c.comparison for c in checked])
     counts = np.sum([used_by_block(c.used) for c in model.comparisons], axis=0)
     fits = _held_out(model, search, floor, max(counts.sum(), 1.0))
-    evidence = Evidence(
-        {e: Candidate({d: f.figures for d, (f, _) in drifts.items()},
+    evidence = rule.Evidence(
+        {e: rule.Candidate({d: f.figures for d, (f, _) in drifts.items()},
                       {d: size for d, (_, size) in drifts.items()}) for e, drifts in fits.items()},
         counts, block_weights(seed), material_mps2(model, floor, material_mg),
         model.smallest_angle_rad() * G0_MPS2,
         any(c.fading_hz is not None for c in model.comparisons),
         np.inf if floor.source == 'assumed' else floor.rms_mps2)
     detections = _detections(checked, search.best, model.baseline)
-    verdict = decide(
+    verdict = rule.decide(
         evidence, cache(lambda effects, drift: reproducible_rest(fits[effects][drift][0], model)),
         [d.effect for d in detections if d.effect != UNKNOWN])
     show('report', 0.0)
@@ -226,7 +204,7 @@ def material_mps2(model: LinearModel, floor: NoiseFloor, material_mg: float = MA
                   ) -> float:
     """Return the material amplitude: the stated one, or a share of the noise."""
     noise_mps2 = floor.noise_v / model.comparisons[0].scale_v_per_mps2
-    return max(1e-3 * material_mg * G0_MPS2, MATERIAL_SHARE_OF_NOISE * float(
+    return max(1e-3 * material_mg * G0_MPS2, rule.MATERIAL_SHARE_OF_NOISE * float(
         np.sqrt(np.mean(noise_mps2 ** 2) + model.lost_motion_mps2 ** 2)))
 
 
@@ -262,16 +240,14 @@ def _detections(checked: Sequence[CheckedRecording], best: Hypothesis, baseline:
     detections = [d for c in checked for d in c.detections]
     for c in checked:
         comparison, used = c.comparison, c.comparison.used
-        sensors = [replace(s, rate_hz=comparison.sensor.rate_hz) for s in (best.sensor, baseline)]
         residual_v = comparison.residual_v(best.sensor)
         # In motion, a smooth reference lacks knocks that look like spikes.
         regular = used if comparison.fading_hz is None else used | ~comparison.at_rest
         if c.possible_spikes is not None and noise_effects.residual_shows_spikes(
-                c.possible_spikes, residual_v, regular, sensors[0]):
+                c.possible_spikes, residual_v, regular, comparison.sensor):
             detections.append(c.possible_spikes)
-        found, of_baseline = ([*noise_effects.residual_detections(NoiseSamples(
-            comparison.time_s, bridged(residual_v, used), comparison.simulated_noise_v(s, 0),
-            comparison.at_rest & used, used), s)] for s in sensors)
+        found, of_baseline = (noise_effects.residual_detections(comparison, residual_v, s)
+                              for s in (best.sensor, baseline))
         detections += [d for d in found if d.effect in {o.effect for o in of_baseline}]
     ranked = sorted(detections, key=lambda d: d.log_bayes_factor)
     return list({d.effect: d for d in ranked}.values())
@@ -321,54 +297,59 @@ def _named_sensor(verdict: Verdict, best: Hypothesis, detections: Sequence[Detec
                    covariance_names=tuple(baseline.covariance_names[i] for i in kept))
 
 
-def _closure(verdict: Verdict, evidence: Evidence, floor: NoiseFloor,
+def _closure(verdict: Verdict, evidence: rule.Evidence, floor: NoiseFloor,
              remainders: Sequence[NoiseRemainder], sensor: Sensor, seed: int) -> GapClosure:
     """Return the gap before and after the best set, above the floor without noise-like effects."""
     best = verdict.best if verdict.closes else frozenset[str]()
     before, after = (evidence.mean(evidence.candidates[e].figures[HEALTHY].squares)
                      for e in (frozenset[str](), best))
     stated = noise.sample_std_v(sensor) / (sensor.scale_v_per_g / G0_MPS2)
+    stated_mps2 = float(np.sqrt(np.mean(stated ** 2)))
     draws = floor.draws_mps2(seed, len(before) - 1)
     floors = np.full(len(before), floor.rms_mps2)
     if draws is not None:
         floors[1:] = draws
-    lowest = np.array([floor_without(min(f, np.sqrt(a)), remainders, float(np.sqrt(np.mean(
-        stated ** 2)))) for f, a in zip(floors, after)])
+    lowest = np.array([noise_effects.floor_without(min(f, np.sqrt(a)), remainders, stated_mps2)
+                       for f, a in zip(floors, after)])
     with np.errstate(all='ignore'):
         closed = (before - after) / np.where(before > lowest ** 2, before - lowest ** 2, np.nan)
-    before, after, closed = np.sqrt(before), np.sqrt(after), np.clip(closed, -1.0, 1.0)
-    return GapClosure(float(before[0]), _interval(before), float(after[0]), _interval(after),
-                      float(lowest[0]), None if draws is None else _interval(lowest),
-                      float(closed[0]), _interval(closed))
+    if draws is None:
+        lowest[1:] = np.nan
+    return GapClosure(*map(_interval, (np.sqrt(before), np.sqrt(after), lowest,
+                                       np.clip(closed, -1.0, 1.0))))
 
 
-def _interval(draws: np.ndarray) -> tuple[float, float]:
-    """Return the 90 % interval of draws after the first, which is the value."""
+def _interval(draws: np.ndarray) -> Interval:
+    """Return the first value with the 90 % interval of the others."""
     finite = draws[1:][np.isfinite(draws[1:])]
     low, high = np.quantile(finite, [0.05, 0.95]) if len(finite) else (np.nan, np.nan)
-    return float(low), float(high)
+    return Interval(float(draws[0]), float(low), float(high))
 
 
 def _report(checked: Sequence[CheckedRecording], model: LinearModel, search: Search,
             verdict: Verdict, detections: Sequence[Detection], floor: NoiseFloor,
-            evidence: Evidence, fits: dict[str, HeldOutFits], seed: int) -> Report:
+            evidence: rule.Evidence, fits: dict[str, HeldOutFits], seed: int) -> Report:
     """Add to a verdict the other parts of the report."""
     comparisons, best = [c.comparison for c in checked], search.found[verdict.best]
     # Coarse codes are an effect of the verdict, and not of its baseline.
     baseline = replace(comparisons[0].sensor, adc_bits=checked[0].stated_bits)
     sensor = _named_sensor(verdict, best, detections, baseline, fits)
     lacking = tuple(not_covered(model.comparisons))
-    remainders = tuple(noise_remainders(comparisons, best.sensor, sensor, detections, seed))
+    remainders = tuple(noise_effects.noise_remainders(comparisons, best.sensor, sensor,
+                                                      detections, seed))
     ranked = sorted(search.found.values(), key=lambda h: -h.log_evidence)
-    noise_before, noise_after = (tuple(compare_noise(c, mean, noisy, seed) for c in comparisons)
-                                 for mean, noisy in ((baseline, baseline), (best.sensor, sensor)))
+    noise_before, noise_after = (
+        tuple(noise_effects.compare_noise(c, mean, noisy, seed) for c in comparisons)
+        for mean, noisy in ((baseline, baseline), (best.sensor, sensor)))
     return Report(
         verdict, _closure(verdict, evidence, floor, remainders, baseline, seed), floor,
         (best, *(h for h in ranked if h is not best)), tuple(detections), remainders,
         noise_before, noise_after,
-        tuple(residual_map(model.comparisons[0], comparisons[0], seed)), lacking,
-        tuple(could_show(model, comparisons[0], floor.noise_v, verdict.material_mps2)),
-        propose_next_experiment(verdict, lacking, RecordedEvidence(baseline, model, seed)),
+        tuple(residual_map(model.comparisons[0], seed)), lacking,
+        tuple(next_experiment.could_show(model, comparisons[0], floor.noise_v,
+                                         verdict.material_mps2)),
+        next_experiment.propose_next_experiment(verdict, lacking, RecordedEvidence(
+            baseline, model, seed)),
         baseline, sensor, model)
 
 
@@ -381,7 +362,8 @@ def what_shows(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | No
         return checked.fault
     model = build_linear_model([c.search_comparison for c in checked])
     floor = noise_model.estimate([c.comparison for c in checked])
-    return could_show(model, checked[0].comparison, floor.noise_v, material_mps2(model, floor))
+    return next_experiment.could_show(model, checked[0].comparison, floor.noise_v,
+                                      material_mps2(model, floor))
 
 
 def self_check(diagnosis: Diagnosis, recordings: list[Recording], sim: Motion | None, count: int,

@@ -210,7 +210,8 @@ class LinearFit:
         return mean
 
     def loss(self, values: np.ndarray) -> float:
-        """Return how far the log posterior at values of the first coefficients is below its top.
+        """
+        Return how far the log posterior at values of the first coefficients is below its top.
 
         The other coefficients are at their conditional maximum.
         """

@@ -22,13 +22,7 @@ from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence
 from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
-from adxl_ros.diagnose.evidence import (
-    drifts_among,
-    FlexibleColumns,
-    LinearFit,
-    WhitenedChannel,
-    Whitener,
-)
+from adxl_ros.diagnose.evidence import LinearFit, Whitener
 from adxl_ros.diagnose.noise_model import LostMotionFilter, whiteners
 from adxl_ros.diagnose.residual_map import Basis, flexible_bases
 from adxl_ros.errors import UserError
@@ -126,6 +120,8 @@ def variants(comparison: BaselineComparison, effect: Effect, baseline_v: np.ndar
     baseline_v: simulated output of the baseline, V, (n, m).
     """
     modelled = effect.name in comparison.sensor.effects
+    if effect.concern is Concern.REFERENCE and comparison.reference is not Reference.SIMULATOR:
+        return
     if limits(effect):
         if not modelled:
             yield from _limit_variants(comparison, effect, limits(effect)[0], baseline_v)
@@ -264,7 +260,7 @@ class LinearModel:
     prior_std: np.ndarray  # Prior standard deviation of each coefficient, (columns,)
     # Whitened residuals and columns at the baseline, by the filters for healthy units and for the
     # drifts of the baseline
-    channels: list[WhitenedChannel]
+    channels: list[evidence.WhitenedChannel]
     filters: list[list[Whitener]]  # Whitening filters of each channel
     columns: list[list[Column]]  # By channel: sensitivities to the library
     # By channel: nuisance parameters and their sensitivities, V per unit, (n,)
@@ -360,7 +356,7 @@ class LinearModel:
         ids = {k for k in self.nuisance_ids if self.names[k].effect not in effects}.union(
             *(self.column_ids[i] for i in chosen))
         return evidence.fit_columns(self.channels, ids, self.prior(chosen), None, start,
-                                    drifts_among(self.baseline.effects))
+                                    evidence.drifts_among(self.baseline.effects))
 
 
 def calibration_takes_up(effect: str) -> bool:
@@ -378,7 +374,7 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
                        show_progress: Callable[[float], None] = lambda fraction: None,
                        filters: Sequence[list[Whitener]] | None = None,
                        only: Sequence[str] | None = None,
-                       flexible: Sequence[FlexibleColumns] | None = None) -> LinearModel:
+                       flexible: Sequence[evidence.FlexibleColumns] | None = None) -> LinearModel:
     """Differentiate the baseline by the whole library in all recordings."""
     baseline_v = [c.simulated_v(c.sensor) for c in comparisons]
     # The same variant of several recordings, by the number of the recording.
@@ -388,10 +384,8 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
         any(c.fading_hz is not None for c in comparisons) and _shows_in_lost_motion(e))]
     for i, (comparison, output_v) in enumerate(zip(comparisons, baseline_v)):
         for k, effect in enumerate(effects):
-            if effect.concern is not Concern.REFERENCE \
-                    or comparison.reference is Reference.SIMULATOR:
-                for variant in variants(comparison, effect, output_v):
-                    every.setdefault(variant.key, {})[i] = variant
+            for variant in variants(comparison, effect, output_v):
+                every.setdefault(variant.key, {})[i] = variant
             show_progress(_SIMULATED_SHARE * (i + (k + 1) / len(effects)) / len(comparisons))
     names: list[Coefficient] = []
     prior_std: list[float] = []
@@ -415,7 +409,7 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
     by_channel = list(chain(*columns))
     if filters is None:
         filters = [whiteners(c, d) for c in comparisons for d in range(len(c.sensor.axes))]
-    channels: list[WhitenedChannel] = []
+    channels: list[evidence.WhitenedChannel] = []
     chosen = filters_for(filters, comparisons[0].sensor.effects)
     for comparison in comparisons:
         for residual_v in comparison.residual_v(comparison.sensor).T:
@@ -443,7 +437,7 @@ def _shows_in_lost_motion(effect: Effect) -> bool:
 def filters_for(filters: Sequence[list[Whitener]], effects: Sequence[str]
                 ) -> list[list[Whitener]]:
     """Return for each channel the filters of healthy units and of the drifts among effects."""
-    drifts = drifts_among(effects)
+    drifts = evidence.drifts_among(effects)
     return [[f for f in every if f.healthy or f.effect in drifts] or every for every in filters]
 
 

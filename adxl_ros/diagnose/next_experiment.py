@@ -22,7 +22,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
-from adxl_ros.diagnose import evidence
+from adxl_ros.diagnose import evidence, noise_effects
 from adxl_ros.diagnose.comparison import (
     at_search_rate,
     BaselineComparison,
@@ -30,21 +30,13 @@ from adxl_ros.diagnose.comparison import (
     Reference,
     with_values,
 )
-from adxl_ros.diagnose.evidence import drifts_among
 from adxl_ros.diagnose.linear_model import (
     build_linear_model,
     candidates,
     filters_for,
     LinearModel,
 )
-from adxl_ros.diagnose.noise_effects import (
-    COARSE_STEPS,
-    LINE_LOG_EXCESS,
-    NOISE_EXCESS,
-    shortest_repeat,
-    SPIKE_STDS,
-    UNKNOWN,
-)
+from adxl_ros.diagnose.noise_effects import UNKNOWN
 from adxl_ros.diagnose.noise_model import expected_drift_g
 from adxl_ros.diagnose.verdict import Verdict, WeightedHypothesis
 from adxl_ros.errors import UserError
@@ -155,13 +147,14 @@ def _noise_could_show(comparison: BaselineComparison, noise_v: np.ndarray, mater
     """Return the smallest sizes of effects that show in the noise of one recording."""
     sensor, count = comparison.sensor, len(comparison)
     level_v, rate_hz = float(noise_v.max()), sensor.rate_hz
-    line_v = level_v * np.sqrt(8 * (LINE_LOG_EXCESS + np.log(count)) / count)
-    sizes = {Detector.NOISE_LEVEL: ('ratio', NOISE_EXCESS - 1),
+    line_v = level_v * np.sqrt(8 * (noise_effects.LINE_LOG_EXCESS + np.log(count)) / count)
+    sizes = {Detector.NOISE_LEVEL: ('ratio', noise_effects.NOISE_EXCESS - 1),
              Detector.MAINS_LINE: ('amplitude_v', line_v),
-             Detector.ISOLATED_SAMPLES: ('amplitude_v', SPIKE_STDS * max(level_v, sensor.lsb_v)),
-             Detector.REPEATED_SAMPLES: ('duration_s', shortest_repeat(
+             Detector.ISOLATED_SAMPLES: ('amplitude_v', noise_effects.SPIKE_STDS * max(
+                 level_v, sensor.lsb_v)),
+             Detector.REPEATED_SAMPLES: ('duration_s', noise_effects.shortest_repeat(
                  comparison.volts, len(sensor.axes)) / rate_hz),
-             Detector.COARSE_CODES: ('lost_bits', float(np.log2(COARSE_STEPS)))}
+             Detector.COARSE_CODES: ('lost_bits', float(np.log2(noise_effects.COARSE_STEPS)))}
     rows = []
     for effect in library().values():
         hints = effect.diagnosis
@@ -354,7 +347,7 @@ def rank_responses(responses: Sequence[PredictedResponse],
         unknown = UNKNOWN in hypothesis.effects
         effects = named if unknown else hypothesis.effects
         functions = {*(dimensions if unknown else ()),
-                     *((FormDimension.TIME,) if drifts_among(effects) else ())}
+                     *((FormDimension.TIME,) if evidence.drifts_among(effects) else ())}
         posteriors.append(_posterior(model, effects, tuple(functions), best))
     total = sum(h.probability for h in leaders)
     probabilities = [h.probability / total for h in leaders]

@@ -77,7 +77,7 @@ _LOG_BAYES_FACTORS = {Detector.ISOLATED_SAMPLES: 10.0, Detector.REPEATED_SAMPLES
                       Detector.COARSE_CODES: 1e3}
 """Log Bayes factor of one event, rough: it only ranks detections."""
 _BANDS, _LOWEST_EDGE_HZ, _TIMES_S, _SEGMENT_S = 5, 0.05, (0.1, 1.0, 10.0), 16.0
-"""Bands of frequency, smallest edge, Hz, averaging times of the Allan deviation, s, and segments of
+"""Bands of frequency, smallest edge, Hz, averaging times of the Allan deviation, and segments of
 the simulated spectrum, s. Chosen: half a decade each; a period of 20 s; ten segments."""
 _LOWEST_POWER = 1e-6
 """Smallest power of the simulated spectrum, divided by its largest. Chosen: rounding errors."""
@@ -225,28 +225,24 @@ def _lost_bits(volts: np.ndarray, sensor: Sensor) -> float:
     return 0.0 if between > _BETWEEN_CODES_SHARE else float(np.log2(step_v / sensor.lsb_v))
 
 
-@dataclass(frozen=True)
-class NoiseSamples:
-    """The residual of the best hypothesis beside drawn noise, n samples of m axes."""
-
-    time_s: np.ndarray  # Stamps, s, (n,)
-    residual_v: np.ndarray  # Residual, bridged over samples that are not used, V, (n, m)
-    simulated_v: np.ndarray  # Noise that the simulator draws, V, (n, m)
-    at_rest: np.ndarray  # Samples that rest and are used, (n,) bool
-    used: np.ndarray  # Samples that are used, (n,) bool
-
-
-def residual_detections(samples: NoiseSamples, sensor: Sensor) -> list[Detection]:
-    """Find lines and excess noise in the residual of the best hypothesis."""
-    white = np.diff(_innovations(samples.residual_v, sensor)[0], axis=0)
-    line = _line(white, samples, sensor)
+def residual_detections(comparison: BaselineComparison, residual_v: np.ndarray, sensor: Sensor
+                        ) -> list[Detection]:
+    """Find lines and excess noise in a residual, V, (n, m), beside the noise of a sensor."""
+    sensor = replace(sensor, rate_hz=comparison.sensor.rate_hz)
+    residual_v = bridged(residual_v, comparison.used)
+    at_rest = comparison.at_rest & comparison.used
+    white = np.diff(_innovations(residual_v, sensor)[0], axis=0)
+    line = _line(white, residual_v, comparison.time_s, sensor)
     if line is not None and line.effect == UNKNOWN:
         # A line of another frequency than the mains must also show at rest.
-        at_rest = samples.at_rest[2:]
-        resting = _line(white * at_rest[:, None], samples, sensor) \
+        resting = _line(white * at_rest[2:, None], residual_v, comparison.time_s, sensor) \
             if at_rest.sum() >= _LINE_REST_S * sensor.rate_hz else None
         line = line if resting is not None and resting.effect == UNKNOWN else None
-    return [d for d in (line, _excess(samples, sensor)) if d is not None]
+    # In motion, effects that are not modelled would look like noise, so that rests are preferred.
+    resting = at_rest.sum() > _RESTING_FEWEST
+    excess = _excess(residual_v, comparison.simulated_noise_v(sensor, 0), sensor,
+                     at_rest if resting else comparison.used, resting)
+    return [d for d in (line, excess) if d is not None]
 
 
 def _innovations(volts: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
@@ -256,21 +252,17 @@ def _innovations(volts: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.ndar
     return volts[1:] - decay * volts[:-1], decay
 
 
-def _excess(samples: NoiseSamples, sensor: Sensor) -> Detection | None:
-    """Find noise above the level of drawn noise."""
-    resting = samples.at_rest.sum() > _RESTING_FEWEST
-    # In motion, effects that are not modelled would look like noise, so that rests are preferred.
-    rows = samples.at_rest if resting else samples.used
-    recorded, drawn = (white_noise_v(v, sensor, rows)
-                       for v in (samples.residual_v, samples.simulated_v))
+def _excess(residual_v: np.ndarray, simulated_v: np.ndarray, sensor: Sensor, rows: np.ndarray,
+            resting: bool) -> Detection | None:
+    """Find noise above the level of drawn noise in samples, (n,) bool, that may rest."""
+    recorded, drawn = (white_noise_v(v, sensor, rows) for v in (residual_v, simulated_v))
     # The level of noise far below a step of the ADC does not show.
     roundings = [noise.rounding(sensor, d) for d in range(len(drawn))]
     shows = np.array([r.held_v2 <= r.white_v2 for r in roundings]) & (drawn > 0)
     ratio = recorded / np.where(shows, drawn, np.inf)
     if resting:
         # Noise past the RC filter looks excessive in the innovations, but not in the samples.
-        recorded_v, drawn_v = (np.std(v[rows], axis=0)
-                               for v in (samples.residual_v, samples.simulated_v))
+        recorded_v, drawn_v = (np.std(v[rows], axis=0) for v in (residual_v, simulated_v))
         ratio = np.minimum(ratio, recorded_v / np.where(drawn_v > 0, drawn_v, np.inf))
     largest = np.max(ratio)
     return None if largest <= NOISE_EXCESS else _detection(
@@ -295,8 +287,9 @@ def white_noise_v(noise_v: np.ndarray, sensor: Sensor, rows: np.ndarray | None =
     return std / np.sqrt(1 - decay ** 2)
 
 
-def _line(white: np.ndarray, samples: NoiseSamples, sensor: Sensor) -> Detection | None:
-    """Return the strongest line of a spectrum, None where chance explains it."""
+def _line(white: np.ndarray, residual_v: np.ndarray, time_s: np.ndarray, sensor: Sensor
+          ) -> Detection | None:
+    """Return the strongest line of a whitened residual, None where chance explains it."""
     frequency_hz, power = scipy.signal.periodogram(white, sensor.rate_hz, 'hann', axis=0)
     kept = frequency_hz > _LINE_LOWEST_HZ
     frequency_hz, power = frequency_hz[kept], power[kept]
@@ -317,7 +310,7 @@ def _line(white: np.ndarray, samples: NoiseSamples, sensor: Sensor) -> Detection
     text = f'the spectrum has a line at {line_hz:.2f} Hz'
     if mains_hz is None:
         return Detection(UNKNOWN, {}, log_excess, f'{text}, which is no mains frequency')
-    amplitude_v = line_amplitude_v(samples.residual_v, samples.time_s, mains_hz)
+    amplitude_v = line_amplitude_v(residual_v, time_s, mains_hz)
     return _detection(Detector.MAINS_LINE, {
         'amplitude_v': amplitude_v, 'frequency_hz': np.array(mains_hz),
         'phase_rad': np.array(0.0)}, log_excess, f'{text}, {amplitude_v.max() * 1e3:.3g} mV')

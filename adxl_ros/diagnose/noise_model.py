@@ -141,7 +141,7 @@ def estimate(comparisons: Sequence[BaselineComparison]) -> NoiseFloor:
 
 
 def squares_at_rest(volts: np.ndarray, at_rest: np.ndarray, sensor: Sensor) -> Squares:
-    """Sum the squares about the mean of each second at rest, (n,) bool, of an output, V, (n, m)."""
+    """Sum the squares of an output, V, (n, m), about the mean of each second at rest."""
     length = max(round(_REST_S * sensor.rate_hz), 4)
     # The mean of correlated samples takes more out of their variance than one sample.
     independent = length / float(noise.effective_samples(length, 1 / sensor.rate_hz,

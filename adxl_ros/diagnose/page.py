@@ -13,28 +13,11 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, NamedTuple
 
+from adxl_ros.diagnose import report as words
 from adxl_ros.diagnose.comparison import BaselineComparison
 from adxl_ros.diagnose.diagnosis import Diagnosis, Report
 from adxl_ros.diagnose.evidence import bridged
 from adxl_ros.diagnose.next_experiment import by_effect
-from adxl_ros.diagnose.report import (
-    as_json,
-    axis_scale,
-    badge,
-    figure_rows,
-    headline,
-    mg,
-    mg_text,
-    named_effects,
-    notes,
-    parameter_label,
-    parameter_text,
-    percent,
-    PROBABLE,
-    remainder_rows,
-    shares_of_gap,
-    shown_row,
-)
 from adxl_ros.diagnose.residual_map import BLOCK_S, RANGES, ResidualCell, SIGNIFICANT_P
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import with_neutral
@@ -44,8 +27,9 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import ActsOn
 from adxl_ros.model.filters import low_pass
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.report import figures as plots, page as html_page
+from adxl_ros.report import figures as plots, page as html_page, units
 from adxl_ros.report.figures import Figure, figure, line, rounded
+from adxl_ros.report.units import mg, mg_text, percent
 import numpy as np
 import scipy
 
@@ -106,12 +90,12 @@ class Run:
 def page(diagnosis: Diagnosis, run: Run) -> str:
     """Lay out the page; raise UserError where Plotly or jinja2 is not installed."""
     html_page.check_libraries()
-    objects = as_json(diagnosis)
+    objects = words.as_json(diagnosis)
     values: dict[str, Any] = {
         'title': run.subject, 'about': [f'parameter file {run.parameter_file}'],
         'badge': {'colour': _COLOURS[objects['verdict']['status']],
-                  'word': badge(diagnosis), 'sentence': headline(diagnosis)},
-        'notes': notes(diagnosis), 'figures': {}, 'has_verdict': False,
+                  'word': words.badge(diagnosis), 'sentence': words.headline(diagnosis)},
+        'notes': words.notes(diagnosis), 'figures': {}, 'has_verdict': False,
         'download': run.parameters_text and html_page.download_url(run.parameters_text)}
     if run.command:
         values['command'] = run.command
@@ -122,9 +106,9 @@ def page(diagnosis: Diagnosis, run: Run) -> str:
 
 def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> dict[str, Any]:
     """Return what the template shows of a diagnosis with a verdict."""
-    named, proposal = named_effects(report, objects), objects['next_experiment']
+    named, proposal = words.named_effects(report, objects), objects['next_experiment']
     shown = [c for c in objects['candidates']
-             if c['effect'] in named or c['probability'] >= PROBABLE]
+             if c['effect'] in named or c['probability'] >= words.PROBABLE]
     shown.sort(key=lambda c: named.index(c['effect']) if c['effect'] in named else len(named))
     best, compared, full_rate = report.hypotheses[0], diagnosis.comparisons[0], \
         diagnosis.full_rate[0]
@@ -134,7 +118,7 @@ def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> 
             h.sensor for h in report.hypotheses if name in h.effects]
         if sensors:
             proofs[name] = _proof(name, compared, full_rate, sensors[0])
-    rows, scale = figure_rows(diagnosis), float(report.baseline.scale_v_per_g.mean())
+    rows, scale = words.figure_rows(diagnosis), float(report.baseline.scale_v_per_g.mean())
     return {
         'has_verdict': True,
         'figures': {'waterfall': waterfall(report), 'map': map_figure(report.residual_cells),
@@ -145,14 +129,14 @@ def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> 
             'upper limit', 'explained', 'repeats, not explained')][:4 - len(rows[:3])],
         'effects': [_effect(c, report) for c in shown],
         'proofs': [{'effect': name, 'text': text} for name, (_, text) in proofs.items()],
-        'figure_rows': rows, 'remainders': [row[:2] for row in remainder_rows(report)],
+        'figure_rows': rows, 'remainders': [row[:2] for row in words.remainder_rows(report)],
         'converged': best.converged,
         'hypotheses': [[', '.join(h['effects']) or 'no gap', percent(h['probability'])]
                        for h in objects['hypotheses']],
         'not_covered': objects['not_covered'], 'noise': _noise_rows(objects),
         'menu': [[m['manoeuvre'], f'{m["minutes"]:.1f}', f'{m["nats_per_minute"]:.2g}']
                  for m in proposal['menu']] if proposal else [],
-        'could_show': [(row.shows, *shown_row(row, scale))
+        'could_show': [(row.shows, *words.shown_row(row, scale))
                        for row in by_effect(report.could_show).values()]}
 
 
@@ -162,7 +146,7 @@ def _effect(candidate: dict[str, Any], report: Report) -> dict[str, Any]:
     docs, sizes = {p.name: p.doc for p in effect.parameters}, []
     is_single = len({key.partition('.')[0] for key in parameters}) == 1
     for key, parameter in parameters.items():
-        text, mark = parameter_text(parameter, axis_scale(report, key)), None
+        text, mark = units.parameter_text(parameter, words.axis_scale(report, key)), None
         if parameter.get('ci'):
             ends = [v for p in parameters.values() if p.get('ci')
                     and p['unit'] == parameter['unit'] for v in p['ci']]
@@ -170,7 +154,7 @@ def _effect(candidate: dict[str, Any], report: Report) -> dict[str, Any]:
             margin = _MARGIN * (high - low)
             mark = plots.whisker(parameter['value'], *parameter['ci'],
                                  (low - margin, high + margin), text)
-        sizes.append({'label': parameter_label(key, is_single) or 'size', 'text': text,
+        sizes.append({'label': units.parameter_label(key, is_single) or 'size', 'text': text,
                       'doc': docs[key.partition('.')[0]], 'mark': mark})
     return {'name': effect.name, 'sure': percent(candidate['probability']),
             'share': '' if candidate['share'] is None else
@@ -328,17 +312,17 @@ def waterfall(report: Report) -> Figure:
     """Draw the gap, what each effect takes off it, what stays, and the noise floor."""
     closure = report.closure
     level, after, floor = (float(mg(v)) for v in (
-        closure.before_mps2, closure.after_mps2, closure.floor_mps2))
+        closure.before.value, closure.after.value, closure.floor.value))
     highest, above = max(level, after, floor), level ** 2 - floor ** 2
-    bars = [('gap', 0.0, level, mg_text(closure.before_mps2), plots.BEFORE_COLOUR)]
-    for name, share in sorted(shares_of_gap(report).items(), key=lambda item: -item[1]):
+    bars = [('gap', 0.0, level, mg_text(closure.before.value), plots.BEFORE_COLOUR)]
+    for name, share in sorted(words.shares_of_gap(report).items(), key=lambda item: -item[1]):
         if share > 0:
             lower = max(level ** 2 - share * above, 0.0) ** 0.5
             bars.append((name, lower, level - lower, percent(share), _EFFECT_COLOUR))
             level = lower
     if len(bars) > 1:
-        bars.append(('what is left', 0.0, after, mg_text(closure.after_mps2), plots.AFTER_COLOUR))
-    bars.append(('noise floor', 0.0, floor, mg_text(closure.floor_mps2), plots.QUIET_COLOUR))
+        bars.append(('what is left', 0.0, after, mg_text(closure.after.value), plots.AFTER_COLOUR))
+    bars.append(('noise floor', 0.0, floor, mg_text(closure.floor.value), plots.QUIET_COLOUR))
     labels, base, width, text, colours = zip(*bars)
     trace = {'type': 'bar', 'width': 0.62, 'orientation': 'h', 'y': labels, 'x': rounded(width),
              'base': rounded(base), 'text': text, 'textposition': 'outside', 'cliponaxis': False,
@@ -415,8 +399,7 @@ def gap_spectrum(comparison: BaselineComparison, after: Sensor) -> Figure:
 
 def map_figure(cells: Sequence[ResidualCell]) -> Figure:
     """Draw the mean residual over ranges of all dimensions; significant cells have a dot."""
-    means = sorted((c for c in cells if c.dimension != 'frequency_hz'),
-                   key=lambda c: (c.dimension, c.axis, c.low))
+    means = sorted(cells, key=lambda c: (c.dimension, c.axis, c.low))
     labels, values, texts, marks = [], [], [], []
     for name, axis in dict.fromkeys((c.dimension, c.axis) for c in means):
         row = [c for c in means if (c.dimension, c.axis) == (name, axis)]

@@ -16,10 +16,19 @@ from adxl_ros.diagnose.residual_map import SIGNIFICANT_P
 from adxl_ros.diagnose.search import Hypothesis
 from adxl_ros.diagnose.verdict import Verdict
 from adxl_ros.model.coefficients import fitted_of, get, parameter_of
-from adxl_ros.model.constants import G0_MPS2, Z_90
+from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import ActsOn, Coefficient, Concern
 from adxl_ros.report.quantities import Interval
+from adxl_ros.report.units import (
+    amplitude_text,
+    listed,
+    mg_text,
+    parameter_label,
+    parameter_text,
+    percent,
+    power_text,
+)
 import numpy as np
 
 _DIGITS = 6
@@ -28,10 +37,6 @@ _MOST_CELLS = 40
 """Largest number of cells in the report. Chosen: cells of small share say little."""
 PROBABLE = 0.05
 """Smallest probability of what terminal and page show first. Chosen: that of a rival."""
-_NEARLY_ALL = 0.995
-"""Share from which a percentage would be rounded to 100."""
-_SMALLEST_MG = 0.005
-"""Acceleration, mg, that rounds to 0.00 below this."""
 _WITHOUT_GAP = ('no_gap', 'insufficient')
 """Verdicts in which there is no gap to close."""
 _MATTERS = 0.3
@@ -48,8 +53,6 @@ _DIMENSIONS = {
 """Dimensions of the reproducible rest, for people."""
 _MOST_DIMENSIONS = 2
 """Dimensions that a sentence names. Chosen: the strongest ones."""
-_UNIT_SUFFIXES = ('m', 's', 'rad', 'v', 'hz', 'f', 'g')
-"""Ends of parameter names that repeat the unit of the value."""
 NOISE_STAYS = 'The effects are noise, which no simulation repeats sample by sample.'
 """Why effects on the noise close nothing."""
 
@@ -142,15 +145,15 @@ def _gap(diagnosis: Diagnosis, report: Report) -> dict[str, Any]:
               'allan_ratio_after': _rounded(after.allan_ratio)}
              for comparison, before, after in zip(diagnosis.comparisons, report.noise_before,
                                                   report.noise_after)]
-    return {'unit': 'm/s^2', 'before': _rounded(closure.before_mps2),
-            'before_ci': _rounded(closure.before_ci), 'after': _rounded(closure.after_mps2),
-            'after_ci': _rounded(closure.after_ci), 'floor': _rounded(closure.floor_mps2),
-            'floor_ci': closure.floor_ci and _rounded(closure.floor_ci),
+    figures: dict[str, Any] = {'unit': 'm/s^2'}
+    for name, figure in closure._asdict().items():
+        figures[name] = _rounded(figure.value)
+        figures[f'{name}_ci'] = _rounded((figure.low, figure.high))
+    return {**figures, 'floor_ci': figures['floor_ci'] if np.isfinite(closure.floor.low) else None,
+            'closed': figures['closed'] if has_gap else None,
             'floor_source': report.noise_floor.source,
             'upper_limit': _rounded(report.verdict.upper_limit_mps2),
             'reference': _rounded(report.verdict.reference_mps2),
-            'closed': _rounded(closure.closed) if has_gap else None,
-            'closed_ci': _rounded(closure.closed_ci),
             'not_in_reference': _rounded(report.linear_model.lost_motion_mps2), 'noise': noise}
 
 
@@ -161,7 +164,7 @@ def shares_of_gap(report: Report) -> dict[str, float]:
         return {}
     lost = {effect: max(power.value, 0.0) for effect, power in verdict.lost_without.items()}
     total = sum(lost.values())
-    closed = float(np.clip(closure.closed, 0.0, 1.0)) if np.isfinite(closure.closed) else 0.0
+    closed = float(np.clip(np.nan_to_num(closure.closed.value), 0.0, 1.0))
     return {effect: closed * power / total if total else 0.0 for effect, power in lost.items()}
 
 
@@ -185,7 +188,7 @@ def _candidates(report: Report) -> list[dict[str, Any]]:
         out.append({
             'effect': name, 'of': effect.concern.value,
             'probability': _rounded(min(sum(h.probability for h in sets), 1.0)),
-            'closed': _rounded(report.closure.closed) if name in verdict.best else None,
+            'closed': _rounded(report.closure.closed.value) if name in verdict.best else None,
             'p': float(np.exp(-detected[name].log_bayes_factor)) if name in detected else None,
             'parameters': parameters,
             'share': _rounded(shares[name]) if name in shares else None,
@@ -250,7 +253,7 @@ def headline(diagnosis: Diagnosis) -> str:
     verdict = diagnosis.report.verdict
     sure, share = f'({percent(verdict.probability)} sure)', verdict.explained_share
     named = listed([*verdict.effects, *(listed(group, 'or') for group in verdict.groups)], 'and')
-    rest = mg_text(_amplitude(verdict.remaining))
+    rest = amplitude_text(verdict.remaining)
     where = [_DIMENSIONS[d] for d in verdict.rest_follows[:_MOST_DIMENSIONS]]
     follows = f' It follows {listed(where, "and")}.' if where and verdict.rest.low > 0 else ''
     several = 'these recordings do' if len(diagnosis.comparisons) > 1 else 'this recording does'
@@ -291,11 +294,6 @@ def _of_reference(verdict: Verdict) -> str:
         for c in undecided])
 
 
-def listed(names: Sequence[str], word: str) -> str:
-    """Return names separated by commas, with a word before the last one."""
-    return f' {word} '.join(filter(None, [', '.join(names[:-1]), *names[-1:]]))
-
-
 def summary(diagnosis: Diagnosis) -> str:
     """Return verdict and figures in a few sentences."""
     report = diagnosis.report
@@ -310,22 +308,22 @@ def figure_rows(diagnosis: Diagnosis) -> list[Row]:
     assert report is not None
     closure, verdict = report.closure, report.verdict
     compared = any(c.reference is not Reference.NONE for c in diagnosis.comparisons)
-    rows = [Row('gap', f'{mg_text(closure.before_mps2)} rms', 'recording minus simulation'
+    rows = [Row('gap', f'{mg_text(closure.before.value)} rms', 'recording minus simulation'
                 if compared else 'without its mean, because the pose is unknown')]
     if closes(report):
-        low, high = (percent(share) for share in closure.closed_ci)
+        low, high = (percent(share) for share in (closure.closed.low, closure.closed.high))
         ci = '' if low == high else f', 90 % interval {low} to {high}'
-        rows.append(Row('with the effects', f'{mg_text(closure.after_mps2)} rms',
-                        f'{percent(closure.closed)} closed, held out{ci}'))
-    rows.append(Row('noise floor', f'{mg_text(closure.floor_mps2)} rms',
+        rows.append(Row('with the effects', f'{mg_text(closure.after.value)} rms',
+                        f'{percent(closure.closed.value)} closed, held out{ci}'))
+    rows.append(Row('noise floor', f'{mg_text(closure.floor.value)} rms',
                     _FLOOR_SOURCES[report.noise_floor.source]))
     if verdict.status in _WITHOUT_GAP:
         rows.append(Row('upper limit', mg_text(verdict.upper_limit_mps2),
                         'a larger gap would have shown'))
     else:
-        rows.append(Row('explained', _power_text(verdict.explained), 'by ' + listed(
+        rows.append(Row('explained', power_text(verdict.explained), 'by ' + listed(
             sorted(verdict.best), 'and') if verdict.best else 'no effect on the mean'))
-    rows.append(Row('repeats, not explained', _power_text(verdict.rest),
+    rows.append(Row('repeats, not explained', power_text(verdict.rest),
                     'by flexible functions, held out'))
     text, note = f'from {mg_text(verdict.material_mps2)}', 'smaller is no gap'
     if verdict.reference_mps2 > _MATTERS * verdict.material_mps2:
@@ -338,8 +336,8 @@ def figure_rows(diagnosis: Diagnosis) -> list[Row]:
         rows.append(Row('not in the reference', f'{mg_text(report.linear_model.lost_motion_mps2)} '
                         'rms', f'motion above {min(fading_hz) / 2:.2g} Hz'))
     if len(verdict.lost_without) > 1 and closes(report):
-        rows += [Row(f'lost without {effect}', mg_text(_amplitude(power.value)), ' to '.join(
-            mg_text(_amplitude(p)) for p in (power.low, power.high)))
+        rows += [Row(f'lost without {effect}', amplitude_text(power.value), ' to '.join(
+            amplitude_text(p) for p in (power.low, power.high)))
             for effect, power in verdict.lost_without.items()]
     return rows
 
@@ -366,7 +364,7 @@ def is_only_noise(report: Report) -> bool:
 
 def closes(report: Report) -> bool:
     """Determine whether there is a gap, and effects that change the mean."""
-    return report.verdict.closes and bool(np.isfinite(report.closure.closed)) \
+    return report.verdict.closes and bool(np.isfinite(report.closure.closed.value)) \
         and not is_only_noise(report)
 
 
@@ -385,83 +383,6 @@ def shows_row(row: CouldShow, scale_v_per_g: float) -> tuple[str, str, str, str]
     of_reference = effect_named(effect).concern is Concern.REFERENCE
     return effect, smallest, typical, '' if row.shows else \
         'needs --sim' if of_reference else f'needs: {manoeuvre}'
-
-
-def mg(value_mps2: Any) -> Any:
-    """Convert m/s² to mg."""
-    return 1e3 * value_mps2 / G0_MPS2
-
-
-def mg_text(value_mps2: float) -> str:
-    """Return an acceleration, m/s², in mg with three digits at most."""
-    value = float(mg(value_mps2))
-    if abs(value) < _SMALLEST_MG:
-        return '< 0.01 mg'
-    return f'{value:.{2 if abs(value) < 10 else 1 if abs(value) < 100 else 0}f} mg'
-
-
-def _amplitude(power: float) -> float:
-    """Return the root of a power; a negative power counts as 0."""
-    return float(np.sqrt(max(power, 0.0)))
-
-
-def _power_text(power: Interval) -> str:
-    """Return the root of a power with its 90 % interval in mg."""
-    value, low, high = (mg_text(_amplitude(p)) for p in (power.value, power.low, power.high))
-    return value if value == high else f'{value[:-3]} ({low[:-3]} to {high[:-3]}) mg'
-
-
-def percent(share: float) -> str:
-    """Return a share in per cent; only certainty by definition would be 0 or 100 %."""
-    if share >= _NEARLY_ALL:
-        return '> 99 %'
-    return '< 1 %' if 0 < share < 1 - _NEARLY_ALL else f'{100 * share:.0f} %'
-
-
-def parameter_label(key: str, is_single: bool) -> str:
-    """Return the name of a parameter without its unit, or its axis where that is enough."""
-    name, _, axis = key.partition('.')
-    stem, _, suffix = name.rpartition('_')
-    short = stem if stem and suffix in _UNIT_SUFFIXES else name
-    return axis if axis and is_single else f'{short} {axis}'.rstrip()
-
-
-def parameter_text(parameter: dict[str, Any], scale_v_per_g: float = 1.0, digits: int = 3
-                   ) -> str:
-    """Return a parameter of the report with its interval, in a unit that people use."""
-    if not parameter.get('determined', True):
-        return 'not determined'
-    ci = parameter.get('ci')
-    plain = np.array([*np.atleast_1d(parameter['value']), *(ci or ())], float)
-    values, unit = _for_people(plain, parameter['unit'], scale_v_per_g)
-    if ci:
-        width = max((values[2] - values[1]) / 4, 1e-12)
-        places = int(np.clip(np.ceil(-np.log10(width)), 0, 6))
-        value, low, high = (f'{round(v, places) + 0.0:.{places}f}' for v in values)
-        return f'{value} ({low} to {high}) {unit}'.rstrip()
-    texts = dict.fromkeys(np.format_float_positional(v, digits, fractional=False, trim='-')
-                          if abs(v) < 100 else f'{v:.0f}' for v in values)
-    return f'{", ".join(texts)} {unit}'.rstrip()
-
-
-def _for_people(values: np.ndarray, unit: str, scale_v_per_g: float) -> tuple[np.ndarray, str]:
-    """Return values in a unit with prefix; volts of the output as the acceleration they feign."""
-    if unit == 'rad':
-        return np.degrees(values), 'deg'
-    largest = float(np.abs(values).max())
-    if unit in ('V', 'V/g') and largest < scale_v_per_g:
-        values, unit = values / scale_v_per_g, 'g' if unit == 'V' else '1'
-    if unit == 'm/s^2':
-        values, unit = values / G0_MPS2, 'g'
-    base, slash, per = unit.replace('s/s', '1').partition('/')
-    per = per.replace('^2', '²').replace('sqrt(', '√').replace(')', '')
-    largest = float(np.abs(values).max())
-    if base in ('g', 'm', 's', 'V', '1') and 0 < largest < 0.1:
-        factor = 1e6 if largest < 1e-4 else 1e2 if base == '1' else 1e3
-        values = factor * values
-        base = {1e6: 'ppm', 1e2: '%'}[factor] if base == '1' else {1e6: 'µ', 1e3: 'm'}[
-            factor] + base
-    return values, (base + slash + per).removeprefix('1' if not per else '')
 
 
 COLUMNS = 79
@@ -483,10 +404,10 @@ def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
     objects, rows = as_json(diagnosis), figure_rows(diagnosis)
     closure, first = report.closure, {row.label: row.note for row in rows}
     # The gap, with the effects, and the floor stand in the first line.
-    after = f' -> {mg_text(closure.after_mps2)}' if closes(report) else ''
-    gap = f'{mg_text(closure.before_mps2)}{after} rms'
+    after = f' -> {mg_text(closure.after.value)}' if closes(report) else ''
+    gap = f'{mg_text(closure.before.value)}{after} rms'
     lines.append(f'{word:{_BADGE_COLUMNS - 1}} {gap:{_GAP_COLUMNS - 1}} noise floor '
-                 f'{mg_text(closure.floor_mps2)}')
+                 f'{mg_text(closure.floor.value)}')
     remarks = [first['with the effects']] if closes(report) else \
         [] if 'sim' in first['gap'] else [f'gap {first["gap"]}']
     lines += [f'{"":{_BADGE_COLUMNS}}{line}'

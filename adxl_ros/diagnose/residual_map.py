@@ -4,8 +4,7 @@ What a residual follows: a map over dimensions, and flexible functions of them.
 
 The map has the mean residual over axis and dimension. Each mean is compared with the largest of
 all under random signs of whole blocks (max-T; Westfall and Young 1993), because separate tests at
-5 % would report ten of 200 cells by chance. The power in bands of frequency is compared with that
-of the stated noise.
+5 % would report ten of 200 cells by chance.
 
 The functions stand for what no effect of the library describes, and for the difference between
 the form of an effect and that of a real sensor (Kennedy and O'Hagan 2001, J. R. Stat. Soc. B 63).
@@ -14,7 +13,7 @@ Each axis has functions of its own, by dimension.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from math import prod
 from typing import NamedTuple
@@ -26,13 +25,10 @@ from adxl_ros.diagnose.comparison import (
     Reference,
     time_since_move_s,
 )
-from adxl_ros.model import noise
-from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.constants import AXES
 from adxl_ros.model.diagnosis_hints import FormDimension as Form
 from adxl_ros.model.filters import loop, low_pass
-from adxl_ros.model.sensor import Sensor
 import numpy as np
-import scipy
 
 RANGES = 8
 """Number of ranges of a dimension, with equally many samples. Chosen: a row of the page."""
@@ -42,8 +38,6 @@ BLOCK_S = 2.0
 """Length of the blocks that change sign together, s. Chosen: beyond the correlation of noise."""
 SIGNIFICANT_P = 0.05
 """Family-wise probability below which a cell is reported. Chosen: the usual level."""
-_BANDS_HZ = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 500.0)
-"""Edges of the bands of frequency, Hz. Chosen: half a decade each."""
 _SMALLEST_RANGE, _SMALLEST_WARMING_C, _LONGEST_SINCE_MOVE_S = 1e-3, 1.0, 60.0
 """Range of a dimension, in its unit, below which it is constant; that of a temperature that is
 covered, °C; and longest time since a move, s. Chosen: an encoder, 0.1 mg, and the end of creep."""
@@ -219,7 +213,7 @@ def _modes(values: np.ndarray, dimension: Form, decay: float = 1.5) -> np.ndarra
 
 class ResidualCell(NamedTuple):
     """
-    Mean residual of one axis in one range of one dimension, m/s²; of a band, root of the excess.
+    Mean residual of one axis in one range of one dimension, m/s².
 
     `share` is of the squares of the residual, `p` the family-wise probability without a gap.
     """
@@ -262,26 +256,13 @@ def not_covered(comparisons: Sequence[BaselineComparison]) -> list[str]:
     return [text for name, text in _COVERAGE.items() if name not in covered]
 
 
-def residual_map(comparison: BaselineComparison, at_full_rate: BaselineComparison, seed: int
-                 ) -> list[ResidualCell]:
-    """Map the residual; frequencies need all samples. The cell of the largest share is first."""
-    cells = [*_cells_over_dimensions(comparison, _levelled(comparison), seed),
-             *_cells_over_frequency(at_full_rate.sensor, _levelled(at_full_rate))]
-    return sorted(cells, key=lambda cell: -cell.share)
-
-
-def _levelled(comparison: BaselineComparison) -> np.ndarray:
-    """Return the residual about its mean, m/s², (n, m); 0 where samples are not used."""
+def residual_map(comparison: BaselineComparison, seed: int) -> list[ResidualCell]:
+    """Test the means of the residual over all dimensions together; the largest share is first."""
     used = comparison.used
     residual = comparison.residual_v(comparison.sensor) / comparison.scale_v_per_mps2
-    return np.where(used[:, None], residual - residual[used].mean(axis=0), 0.0)
-
-
-def _cells_over_dimensions(comparison: BaselineComparison, residual: np.ndarray, seed: int
-                           ) -> Iterator[ResidualCell]:
-    """Test the means over all dimensions together."""
+    residual = np.where(used[:, None], residual - residual[used].mean(axis=0), 0.0)
     number = np.arange(len(residual)) // max(round(BLOCK_S * comparison.sensor.rate_hz), 2)
-    blocks, used, total = int(number[-1]) + 1, comparison.used, float(np.sum(residual ** 2))
+    blocks, total = int(number[-1]) + 1, float(np.sum(residual ** 2))
     places, sums, counts = [], [], []
     for name, values in dimensions(comparison).items():
         edges = np.unique(np.quantile(values[used], np.linspace(0, 1, RANGES + 1)))
@@ -295,7 +276,7 @@ def _cells_over_dimensions(comparison: BaselineComparison, residual: np.ndarray,
                     sums.append(np.bincount(number[chosen], residual[chosen, d], blocks))
                     counts.append(float(count.sum()))
     if not places:
-        return
+        return []
     by_block, count = np.array(sums), np.array(counts)
     spread = np.maximum(np.sqrt((by_block ** 2).sum(axis=1)), 1e-300)
     signs = np.random.default_rng(seed).choice([-1.0, 1.0], (blocks, _DRAWS))
@@ -303,26 +284,6 @@ def _cells_over_dimensions(comparison: BaselineComparison, residual: np.ndarray,
     statistic, mean = np.abs(by_block.sum(axis=1)) / spread, by_block.sum(axis=1) / count
     p = (1 + (largest[None] >= statistic[:, None]).sum(axis=1)) / (_DRAWS + 1)
     share = np.minimum(mean ** 2 * count / max(total, 1e-300), 1.0)
-    for place, *figures in zip(places, mean, share, p):
-        yield ResidualCell(*place, *map(float, figures))
-
-
-def _cells_over_frequency(sensor: Sensor, residual: np.ndarray) -> Iterator[ResidualCell]:
-    """Compare the power in bands with that of the stated noise (gamma, Bonferroni)."""
-    rate_hz = sensor.rate_hz
-    frequency_hz, power = scipy.signal.periodogram(residual, rate_hz, axis=0)
-    stated = noise.density_v2_per_hz(sensor, frequency_hz) / (sensor.scale_v_per_g / G0_MPS2) ** 2
-    total = float(np.sum(np.mean(residual ** 2, axis=0)))
-    bands = [(low, min(high, rate_hz / 2)) for low, high in pairwise(_BANDS_HZ)
-             if low < rate_hz / 2]
-    for low, high in bands:
-        inside = (frequency_hz > low) & (frequency_hz <= high)
-        count = int(inside.sum())
-        for d, axis in enumerate(sensor.axes if count else ''):
-            measured, expected = power[inside, d].sum(), stated[inside, d].sum()
-            p = float(scipy.stats.gamma.sf(measured / expected * count, count)) * len(bands) \
-                * residual.shape[1]
-            excess = float(max(measured - expected, 0.0) * frequency_hz[1])
-            yield ResidualCell(axis, 'frequency_hz', low, high, excess ** 0.5,
-                               min(excess / max(total, 1e-300), 1.0),
-                               float(np.clip(p, 1e-12, 1.0)))
+    cells = [ResidualCell(*place, *map(float, figures))
+             for place, *figures in zip(places, mean, share, p)]
+    return sorted(cells, key=lambda cell: -cell.share)

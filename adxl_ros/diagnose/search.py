@@ -15,26 +15,9 @@ from dataclasses import dataclass, replace
 from itertools import chain, combinations
 from typing import NamedTuple
 
-from adxl_ros.diagnose import evidence
-from adxl_ros.diagnose.evidence import (
-    drifts_among,
-    FlexibleColumns,
-    LinearFit,
-    WhitenedChannel,
-    Whitener,
-)
-from adxl_ros.diagnose.linear_model import (
-    build_linear_model,
-    calibration_takes_up,
-    Column,
-    filters_for,
-    limits,
-    LinearModel,
-    parts_at_rest,
-    PRIOR_WIDTH,
-    sensitivities_at,
-    Variant,
-)
+from adxl_ros.diagnose import evidence, linear_model as linear
+from adxl_ros.diagnose.evidence import LinearFit, Whitener
+from adxl_ros.diagnose.linear_model import LinearModel, Variant
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import fitted_of, get, parameter_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
@@ -140,14 +123,14 @@ class LinearisedHypothesis:
     reach: np.ndarray  # Largest departure of the nuisance parameters of a healthy unit, (k − j,)
     values: np.ndarray  # Values of the coefficients of the effects, (j,)
     # Whitened columns, and whitened residuals at the prior mean by the linear model
-    channels: list[WhitenedChannel]
+    channels: list[evidence.WhitenedChannel]
     columns: list[ChannelColumns]  # The same before whitening
     filters: Sequence[Sequence[Whitener]]  # Whitening filters of each channel
 
     def fit(self, blocks: np.ndarray | None = None, drifts: Sequence[str] = ()) -> LinearFit:
         """Fit all coefficients to some blocks, (blocks,) bool, or to all."""
         return evidence.fit_columns(self.channels, range(len(self.names)), self.prior_std, blocks,
-                                    drifts=(*drifts, *drifts_among(self.sensor.effects)))
+                                    drifts=(*drifts, *evidence.drifts_among(self.sensor.effects)))
 
     def departures(self, fit: LinearFit, full_fit: LinearFit | None = None) -> np.ndarray:
         """
@@ -164,7 +147,7 @@ class LinearisedHypothesis:
         undetermined = std > _UNDETERMINED_SHARE * self.prior_std[:j]
         if full_fit is not None:
             undetermined |= std > _UNDETERMINED_RATIO * np.sqrt(np.diag(full_fit.covariance)[:j])
-        kept = np.array([not p.is_size or bool(limits(effect_named(name.effect)))
+        kept = np.array([not p.is_size or bool(linear.limits(effect_named(name.effect)))
                          for p, name in zip(parameters, self.names)], bool)
         is_shape = np.array([p.role is Role.SHAPE for p in parameters], bool)
         fitted = self.prior_mean[:j] + fit.values[:j]
@@ -184,7 +167,7 @@ class LinearisedHypothesis:
 def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
               filters: Sequence[Sequence[Whitener]] | None = None) -> LinearisedHypothesis:
     """Linearise a hypothesis at the coefficients of a sensor."""
-    filters = filters_for(linear_model.filters, linear_model.baseline.effects) \
+    filters = linear.filters_for(linear_model.filters, linear_model.baseline.effects) \
         if filters is None else filters
     names = _fitted_names(linear_model, effects)
     nuisances = [n for n in dict.fromkeys(chain(*linear_model.nuisance_columns))
@@ -193,19 +176,20 @@ def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
         n.effect for n in nuisances)])
     parameters, values = [parameter_of(name) for name in names], get(sensor, names)
     prior_mean = _prior_mean(start, names)
-    prior_std = [p.scale * (PRIOR_WIDTH if p.is_size else 1) for p in parameters]
+    prior_std = [p.scale * (linear.PRIOR_WIDTH if p.is_size else 1) for p in parameters]
     sensor = put(start, names, values)
     all_names, j = [*names, *nuisances], len(names)
     # Without the effects that a calibration can take up.
     without = replace(sensor, values={**sensor.values, **{
-        e: start.values[e] for e in effects if calibration_takes_up(e)}})
-    channels: list[WhitenedChannel] = []
+        e: start.values[e] for e in effects if linear.calibration_takes_up(e)}})
+    channels: list[evidence.WhitenedChannel] = []
     columns: list[ChannelColumns] = []
-    changes: list[list[Column]] = []
+    changes: list[list[linear.Column]] = []
     for comparison in linear_model.comparisons:
         at_rate = replace(sensor, rate_hz=comparison.sensor.rate_hz)
         output_v = comparison.simulated_v(at_rate)
-        derivatives = sensitivities_at(comparison.simulated_v, at_rate, names, values, output_v)
+        derivatives = linear.sensitivities_at(comparison.simulated_v, at_rate, names, values,
+                                              output_v)
         change_v = output_v - comparison.simulated_v(replace(without, rate_hz=at_rate.rate_hz))
         for d, axis in enumerate(start.axes):
             places = [i for i, n in enumerate(names) if n.axis in ('', axis)]
@@ -221,10 +205,11 @@ def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
                 stacked / scale, comparison.used)))
             channels.append(evidence.whiten_channel(stacked[:, 0], stacked[:, 1:], ids,
                                                     comparison.used, filters[len(channels)]))
-            changes.append([Column(0, change_v[:, d])])
+            changes.append([linear.Column(0, change_v[:, d])])
     # The square of each deviation is that of a healthy unit's tolerance plus that of what a
     # calibration can take up of the effects.
-    parts = parts_at_rest(linear_model.comparisons, linear_model.nuisance_columns, changes, 1)
+    parts = linear.parts_at_rest(linear_model.comparisons, linear_model.nuisance_columns,
+                                 changes, 1)
     nuisance_std, reach = (np.array([np.hypot(factor * linear_model.tolerance(n), parts.get(
         n, np.zeros(1))[0]) for n in nuisances]) for factor in (1.0, _HEALTHY_STDS))
     return LinearisedHypothesis(
@@ -238,7 +223,7 @@ def _fitted_names(linear_model: LinearModel, effects: Sequence[str]) -> list[Coe
     return [name for effect in effects
             for name in fitted_of(effect_named(effect), linear_model.baseline.axes)
             if not parameter_of(name).is_size or name in linear_model.names
-            or limits(effect_named(effect))]
+            or linear.limits(effect_named(effect))]
 
 
 def _prior_mean(sensor: Sensor, names: Sequence[Coefficient]) -> np.ndarray:
@@ -267,7 +252,7 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
     """
     neutral_sensor = with_neutral(linear_model.baseline, effects)
     names = _fitted_names(linear_model, effects)
-    filters = filters_for(linear_model.filters, linear_model.baseline.effects)
+    filters = linear.filters_for(linear_model.filters, linear_model.baseline.effects)
     # The iteration has the noise of no gap; only its end is compared for every noise.
     fixed = [[f[i]] for f, i in zip(filters, linear_model.null_fit.filter_indices)]
 
@@ -491,9 +476,9 @@ def _model_about(model: LinearModel, best: Hypothesis) -> LinearModel:
             size_v = _PRESENT_FORM_ERROR * float(np.std(own @ best.values[places]))
             functions += [size_v * basis[d] for d in effect_named(effect).diagnosis.form
                           if d in basis]
-        flexible.append(FlexibleColumns(np.concatenate(functions, axis=1),
+        flexible.append(evidence.FlexibleColumns(np.concatenate(functions, axis=1),
                                         float(best.fit.innovation_variance_v2[number])))
-    return build_linear_model(comparisons, filters=[[w] for w in best.whiteners],
+    return linear.build_linear_model(comparisons, filters=[[w] for w in best.whiteners],
                               flexible=flexible)
 
 
