@@ -109,8 +109,10 @@ class BaselineComparison:
         """Return the specific force of the reference, g, (3, n); None without a reference."""
         if self.reference is Reference.SIMULATOR and self.motion.force is not None:
             return np.array(self.motion.force(self.time_s)) / G0_MPS2
-        return None if self.joints is None else np.array(
-            specific_force(*(joint(self.time_s) for joint in self.joints), 1.0))
+        if self.joints is None:
+            return None
+        alpha_rad, beta_rad = (joint(self.time_s) for joint in self.joints)
+        return np.array(specific_force(alpha_rad, beta_rad, 1.0))
 
     def simulated_v(self, sensor: Sensor) -> np.ndarray:
         """Return the mean output of a sensor in this recording, V, (n, m)."""
@@ -162,8 +164,9 @@ class CachedPath:
 def _cached(motion: Motion, reference: Reference) -> Motion:
     """Return the motion with paths that are evaluated once."""
     names = ('temperature_c', 'supply_v') + tuple(JOINTS) * (reference is Reference.STAGE)
-    paths = {name: getattr(motion, name) for name in names}
-    return replace(motion, **{name: path and CachedPath(path) for name, path in paths.items()})
+    paths: dict[str, Any] = {name: (path := getattr(motion, name)) and CachedPath(path)
+                             for name in names}
+    return replace(motion, **paths)
 
 
 def noiseless(sensor: Sensor) -> Sensor:

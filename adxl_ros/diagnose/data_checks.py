@@ -214,7 +214,8 @@ def find_encoder_fault(recording: Recording, sensor: Sensor) -> DataFault | None
         return None
 
     def force_g(factors: tuple[float, ...]) -> np.ndarray:
-        return np.column_stack(specific_force(*(angles_rad * factors).T, 1.0)[:axes])
+        alpha_rad, beta_rad = (angles_rad * factors).T
+        return np.column_stack(specific_force(alpha_rad, beta_rad, 1.0)[:axes])
 
     def unexplained(factors: tuple[float, ...]) -> float:
         """Return the share of the variance that angles times factors do not explain."""

@@ -143,12 +143,12 @@ def reproducible_rest(fits: HeldOutFits, model: LinearModel) -> Rest:
                 gram, residual = _products(white[fitted], departures[columns.places], active)
                 values = np.linalg.solve(gram / variance + np.diag(1 / level[active]),
                                          residual / variance)
-                flat, nats = (
+                flat, gained = (np.array(
                     [_gain(_products(block[None], departures[columns.places], active), values)
-                     for block in grams[held_out]] for grams in (plain, white))
+                     for block in grams[held_out]]) for grams in (plain, white))
                 by_choice.setdefault(name, np.zeros(BLOCKS))[held_out] += flat
                 if name == 'steady':
-                    by_choice['nats'][held_out] += 0.5 * np.array(nats) / variance
+                    by_choice['nats'][held_out] += 0.5 * gained / variance
     together, steady, nats = (by_choice.pop(name) for name in ('all', 'steady', 'nats'))
     p = [increments_p(c.values @ np.concatenate([[1.0], -whole[c.places]]), comparison.used,
                       comparison.sensor.rate_hz)

@@ -133,7 +133,7 @@ def variants(comparison: BaselineComparison, effect: Effect, baseline_v: np.ndar
         or list((_SMOOTH_STEP,) if effect.smooth or shaped else _ROUGH_STEPS)
     sizes = [p for p in effect.parameters if p.role is not Role.SHAPE]
     unshaped = [] if modelled else [p for p in sizes if not p.shaped]
-    tried = [({}, unshaped)] if unshaped else []
+    tried: list[tuple[dict[str, float], list[Parameter]]] = [({}, unshaped)] if unshaped else []
     tried += [(shape, [p for p in sizes if p not in unshaped])
               for shape in ([{}] if modelled else _shapes(effect))]
     for (shape, parameters), step in product(tried, steps):

@@ -304,7 +304,8 @@ def predict(manoeuvre: Experiment, sensor: Sensor, effects: Sequence[str],
     comparison = at_search_rate(compare(recording, at_rate))
     model = build_linear_model([comparison], only=effects)
     filters = filters_for(model.filters, sensor.effects)
-    keys, places, blocks = _keys(model), {}, []
+    places: dict[Key, int] = {}
+    keys, blocks = _keys(model), []
     for number, channel in enumerate(model.columns):
         functions = model.flexible_bases[0][number]
         size_v = _UNKNOWN_G * float(comparison.sensor.scale_v_per_g[number])

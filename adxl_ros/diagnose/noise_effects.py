@@ -473,7 +473,8 @@ def _statistics(comparison: BaselineComparison, detection: Detection, volts: np.
         yield 'white noise', 'm/s^2', white_noise_v(noise_v, sensor) / scale
     elif detector is Detector.ISOLATED_SAMPLES:
         spikes = isolated_samples(volts, time_s, finite, sensor)[1]
-        values = spikes.values if spikes else {'rate_hz': 0.0, 'amplitude_v': np.zeros(len(scale))}
+        values = spikes.values if spikes else {'rate_hz': np.zeros(1),
+                                               'amplitude_v': np.zeros(len(scale))}
         yield 'spikes per second and axis', '1/s', np.atleast_1d(values['rate_hz'])
         yield 'size of a spike', 'm/s^2', values['amplitude_v'] / scale
     elif detector is Detector.REPEATED_SAMPLES:
@@ -505,6 +506,8 @@ def floor_without(floor_mps2: float, remainders: Sequence[NoiseRemainder], state
     square = floor_mps2 ** 2
     for r in remainders:
         detector, recorded = effect_named(r.effect).diagnosis.detector, np.mean(r.recorded ** 2)
-        square -= {Detector.MAINS_LINE: recorded / 2,
-                   Detector.NOISE_LEVEL: recorded - stated_mps2 ** 2}.get(detector, 0.0)
+        if detector is Detector.MAINS_LINE:
+            square -= recorded / 2
+        elif detector is Detector.NOISE_LEVEL:
+            square -= recorded - stated_mps2 ** 2
     return float(np.sqrt(max(square, min(stated_mps2, floor_mps2) ** 2)))

@@ -152,7 +152,7 @@ def _effect(candidate: dict[str, Any], report: Report) -> dict[str, Any]:
                     and p['unit'] == parameter['unit'] for v in p['ci']]
             low, high = min(0.0, *ends), max(0.0, *ends)
             margin = _MARGIN * (high - low)
-            mark = plots.whisker(parameter['value'], *parameter['ci'],
+            mark = plots.whisker(parameter['value'], parameter['ci'][0], parameter['ci'][1],
                                  (low - margin, high + margin), text)
         sizes.append({'label': units.parameter_label(key, is_single) or 'size', 'text': text,
                       'doc': docs[key.partition('.')[0]], 'mark': mark})
@@ -336,7 +336,8 @@ def waterfall(report: Report) -> Figure:
 def _stacked(panels: Sequence[tuple[dict[str, Any], Sequence[Figure]]], height: int,
              margin: dict[str, int], xaxis: dict[str, Any]) -> Figure:
     """Put panels, an axis with its lines each, below each other; all zoom together."""
-    traces, layout, count = [], {}, len(panels)
+    traces: list[Figure] = []
+    layout, count = {}, len(panels)
     part = (1 + 0.08) / count - 0.08
     for i, (axis, lines) in enumerate(panels, 1):
         top = 1 - (i - 1) * (part + 0.08)

@@ -285,8 +285,9 @@ def without_reading(comparison: BaselineComparison, columns: dict[str, np.ndarra
                     ) -> list[LeftOut]:
     """Find samples in gaps of another simulator, of temperature and of supply."""
     time_s, force, left_out = comparison.time_s, comparison.motion.force, []
-    readings = {name: (time_s[np.isfinite(columns[name])], _LONGEST_SLOW_BRIDGE_S)
-                for name in ('temperature_c', 'supply_v') if name in columns}
+    readings: dict[str, tuple[np.ndarray, float]] = {
+        name: (time_s[np.isfinite(columns[name])], _LONGEST_SLOW_BRIDGE_S)
+        for name in ('temperature_c', 'supply_v') if name in columns}
     if isinstance(force, ForcePath):
         readings['--sim'] = force.time_s, _LONGEST_BRIDGE_S
     for name, (read_s, longest_s) in readings.items():

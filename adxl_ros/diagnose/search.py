@@ -289,10 +289,10 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
     form = np.where([effect_named(n.effect).exact for n in names], 0.0, _FORM_ERROR * size)
     # The nuisance parameters are at their mean given the values of the effects.
     fitted = linearised.prior_mean + fit.given(np.arange(j), at_values)
-    bounds = [[getattr(parameter_of(n), end) for n in linearised.names]
-              for end in ('lower', 'upper')]
+    low, high = ([getattr(parameter_of(n), end) for n in linearised.names]
+                 for end in ('lower', 'upper'))
     return Hypothesis(
-        tuple(effects), put(linearised.sensor, linearised.names, np.clip(fitted, *bounds)),
+        tuple(effects), put(linearised.sensor, linearised.names, np.clip(fitted, low, high)),
         linearised.names[:j], at_values, np.sqrt(std ** 2 + form ** 2 + np.where(
             in_rad, linear_model.smallest_angle_rad(), 0.0) ** 2),
         std > _UNDETERMINED_SHARE * np.maximum(linearised.prior_std[:j], np.abs(at_values)),
@@ -414,7 +414,8 @@ class Search:
             return
         for ranked in (first, *first.others):
             start = dict(zip(beside.names, beside.values)) if beside else {}
-            own, shapes = {k for i in ranked.chosen for k in model.column_ids[i]}, {}
+            shapes: dict[Coefficient, float] = {}
+            own = {k for i in ranked.chosen for k in model.column_ids[i]}
             start |= {model.names[k]: float(v) for k, v in zip(
                 ranked.fit.column_ids, ranked.fit.values) if k in own}
             for variant in (model.variants[i] for i in ranked.chosen):
