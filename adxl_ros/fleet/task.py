@@ -405,7 +405,7 @@ def _put_verdict(row: Row, diagnosis: Diagnosis, report: dict[str, Any]) -> None
                 'gap_floor_high_mps2': gap['floor_ci'][1]}
     if gap['closed'] is not None:
         row |= {'gap_closed_low': gap['closed_ci'][0], 'gap_closed_high': gap['closed_ci'][1]}
-    best = diagnosis.report.verdict.best
+    best = diagnosis.report.hypotheses[0]
     values = get(best.sensor, best.names)
     row['coefficients'] += [
         _coefficient(name, value, std, 'diagnose')
