@@ -9,7 +9,7 @@ from enum import Enum
 from typing import Any
 
 from adxl_ros.files.recording_columns import JOINTS, Recording
-from adxl_ros.model import signal_chain
+from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import ActsOn
@@ -21,6 +21,7 @@ from adxl_ros.simulate.response import ChainMemo, Response
 from adxl_ros.simulate.simulator import environment_paths, motion_from_references
 from adxl_ros.simulate.smoothed_paths import PathErrors, SmoothedPath
 import numpy as np
+import scipy
 
 SMALLEST_MOTION_G = 0.05
 """Standard deviation of the simulated force, g, from which an axis is compared. Chosen: ten times
@@ -135,6 +136,17 @@ class BaselineComparison:
         at_rate = replace(sensor, rate_hz=self.sensor.rate_hz)
         noisy = Response(at_rate, self.motion, seed, float(self.time_s[0]))(self.time_s)
         return noisy - self.simulated_v(at_rate)
+
+
+    def lost_motion_mps2(self) -> float:
+        """Return the rms of the fast motion that a smooth reference lacks, m/s²."""
+        if self.fading_hz is None:
+            return 0.0
+        residual_v = np.where(self.used[:, None], self.residual_v(self.sensor), 0.0)
+        frequency_hz, power = scipy.signal.periodogram(residual_v, self.sensor.rate_hz, axis=0)
+        lost = (power - noise.density_v2_per_hz(self.sensor, frequency_hz))[
+            frequency_hz > self.fading_hz / 2] / self.scale_v_per_mps2 ** 2
+        return float(np.sqrt(max(lost.mean(axis=1).sum() * frequency_hz[1], 0.0)))
 
 
 class CachedPath:

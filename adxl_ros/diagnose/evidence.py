@@ -33,8 +33,8 @@ _RIDGE = 1e-12
 """Ridge on the scaled precision. Chosen: columns that differ by a millionth are separable."""
 
 
-class ReferenceErrors(Protocol):
-    """A filter for errors of the reference, which comes before those for noise."""
+class HeldErrors(Protocol):
+    """A filter for errors of angles and rounding, which comes before those for noise."""
 
     @property
     def scale(self) -> np.ndarray:
@@ -52,9 +52,9 @@ class Whitener:
     log_prior: float  # Log prior probability of such noise, up to a constant
     effect: str  # Name of the drift effect that the filter is for
     density: float  # Density of the drift, in the unit of the effect's parameter
-    # Filter for the errors of the reference; None where it is exact, or where the drift exceeds
-    # these errors: they would take up a part of it
-    errors: ReferenceErrors | None = None
+    # Filter for the errors of angles and rounding; None where there are none, or where the drift
+    # exceeds them: they would take up a part of it
+    errors: HeldErrors | None = None
 
     @property
     def spectrum(self) -> DriftSpectrum:

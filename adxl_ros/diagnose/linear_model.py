@@ -23,7 +23,7 @@ from typing import NamedTuple
 from adxl_ros.diagnose import evidence
 from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
 from adxl_ros.diagnose.evidence import LinearFit, Whitener
-from adxl_ros.diagnose.noise_model import LostMotionFilter, whiteners
+from adxl_ros.diagnose.noise_model import whiteners
 from adxl_ros.diagnose.residual_map import Basis, flexible_bases
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import names_of, parameter_of, put, with_neutral
@@ -279,13 +279,10 @@ class LinearModel:
         """Whether all recordings have a reference."""
         return all(c.reference is not Reference.NONE for c in self.comparisons)
 
-    @property
+    @cached_property
     def lost_motion_mps2(self) -> float:
         """Rms of the motion that smooth references lack, m/s²."""
-        scales = [scale for c in self.comparisons for scale in c.scale_v_per_mps2]
-        errors = [filters[0].errors for filters in self.filters]
-        return float(np.sqrt(np.mean([(e.lost_rms_v / scale) ** 2 if isinstance(
-            e, LostMotionFilter) else 0.0 for e, scale in zip(errors, scales)])))
+        return float(np.sqrt(np.mean([c.lost_motion_mps2() ** 2 for c in self.comparisons])))
 
     def place_of_channel(self, number: int) -> tuple[int, int]:
         """Return the number of the recording and of the axis of a channel."""

@@ -19,18 +19,12 @@ new after each move (errors in variables; Fuller 1987). The model is y = n + g·
 behind the RC filter, AR(1) with pole a, u has variance 1, u_t = φ_t·u_(t−1) + √(1 − φ_t²)·ξ_t, and
 g is its standard deviation in V. A Kalman filter predicts g·u; its innovations, scaled and
 filtered by 1/(1 − aL), have the spectrum of n. Where g is 0, samples stay as they are.
-
-Motion that a smooth reference lacks adds to the noise in motion. Its spectrum is that of the part
-of the recording that no linear filter of the reference predicts (multiple coherence; Bendat and
-Piersol 2010, section 7.3). A filter of the smallest phase gives such noise the spectrum of noise
-alone.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from math import sqrt
 
 from adxl_ros.diagnose.comparison import BaselineComparison, CachedPath, gravity_slopes
@@ -74,13 +68,6 @@ _SMALLEST_HELD_SHARE = 0.01
 a third of a step, as in any unit whose ADC suits it."""
 _SERIES = 16
 """Series that are filtered together. Chosen: little memory beside all series."""
-_LOST_S, _FEWEST_MOVING, _OVERLAP_SHARE = 2.0, 12, 0.6
-"""Length of the windows of the spectra, s, fewest windows in motion, and independent ones divided
-by those that overlap by half. Chosen: a filter of an optical tracker is shorter; three axes of a
-reference then predict a quarter by chance."""
-_RESTORING_ERROR, _RIDGE = 0.1, 1e-9
-"""Error of restored motion, divided by what the reference lacks of it, and ridge on the spectra of
-the reference, divided by their mean. Chosen: the forms of filters differ by some per cent."""
 
 
 @dataclass(frozen=True)
@@ -298,76 +285,6 @@ def _held_errors(comparison: BaselineComparison, axis: int, held_v2: float
         yield np.full(len(comparison), held_v2), np.exp(-6 * steps)
 
 
-@dataclass(frozen=True)
-class LostMotionFilter:
-    """A filter that gives noise with lost motion the spectrum of noise without it."""
-
-    moves: np.ndarray  # Samples in motion, (n,) bool; at rest nothing is lost
-    taps: np.ndarray  # Impulse response of the filter, (k,)
-    lost_rms_v: float  # Rms of the lost motion over all samples, V
-    # Filter for errors of angles and rounding, which comes first; None without any
-    before: AngleErrorFilter | None = None
-
-    @property
-    def rms_v(self) -> float:
-        """Return the rms of the errors, V."""
-        return float(np.hypot(self.lost_rms_v, self.before.rms_v if self.before else 0.0))
-
-    @cached_property
-    def scale(self) -> np.ndarray:
-        """Return the standard deviation of the noise over that of the innovation, (n,)."""
-        scale = np.where(self.moves, self.taps[0], 1.0)
-        return scale if self.before is None else scale * self.before.scale
-
-    def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Filter k series, (k, n)."""
-        before = values if self.before is None else self.before(values)
-        return np.where(self.moves, scipy.signal.lfilter(self.taps, [1.0], before), before)
-
-
-def reference_errors(comparison: BaselineComparison, axis: int
-                     ) -> AngleErrorFilter | LostMotionFilter | None:
-    """Return the filter for the errors of the reference on one axis; None where it is exact."""
-    before, sensor = angle_error_filter(comparison, axis), comparison.sensor
-    moves = ~comparison.at_rest
-    size = round(_LOST_S * sensor.rate_hz) // 2 * 2
-    usable = comparison.used & moves
-    starts = [i for i in range(0, len(usable) - size + 1, size // 2) if usable[i:i + size].all()]
-    if comparison.fading_hz is None or len(starts) < _FEWEST_MOVING:
-        return before
-    rows, taper = np.array(starts)[:, None] + np.arange(size), np.hanning(size)
-    # Spectra of windows by frequency, (frequencies, windows, m), of unit power.
-    recorded, stated = (np.moveaxis(np.fft.rfft(scipy.signal.detrend(
-        v[rows], axis=1) * taper[:, None], axis=1), 1, 0) / np.sqrt(np.sum(taper ** 2))
-        for v in (comparison.volts[:, axis:axis + 1], comparison.simulated_v(sensor)))
-    recorded = recorded[:, :, 0]
-    # Power that no linear filter of the reference predicts; what it predicts by chance is made
-    # up for.
-    gram = np.einsum('fwi,fwj->fij', stated.conj(), stated)
-    cross = np.einsum('fwi,fw->fi', stated.conj(), recorded)
-    ridge = _RIDGE * np.trace(gram, axis1=1, axis2=2).real.mean() * np.eye(stated.shape[2])
-    gain = np.linalg.solve(gram + ridge, cross[:, :, None])
-    rest = recorded - np.einsum('fwi,fi->fw', stated, gain[:, :, 0])
-    independent = _OVERLAP_SHARE * len(starts)
-    unpredicted = np.mean(np.abs(rest) ** 2, axis=1) * independent / max(
-        independent - stated.shape[2], 1.0)
-    lacking = np.mean(np.abs(recorded) ** 2 - np.abs(stated[:, :, axis]) ** 2, axis=1)
-    density_v2 = 2 * comparison.dt_s * (unpredicted + _RESTORING_ERROR ** 2 * np.maximum(
-        lacking, 0.0))
-    noise_v2 = noise.density_v2_per_hz(sensor, np.fft.rfftfreq(size, 1 / sensor.rate_hz))[:, axis]
-    noise_v2 = np.maximum(noise_v2, 2 * comparison.dt_s * _LOWEST_NOISE_V ** 2)
-    lost_v2 = np.maximum(density_v2 - noise_v2, 0.0)
-    lost_rms_v = float(np.sqrt(lost_v2.sum() / (size * comparison.dt_s)
-                               * usable.sum() / comparison.used.sum()))
-    # The impulse response of the smallest phase with this gain, by its cepstrum.
-    cepstrum = np.fft.irfft(0.5 * np.log(noise_v2 / (noise_v2 + lost_v2)))
-    half = len(cepstrum) // 2
-    cepstrum[1:half] *= 2
-    cepstrum[half + 1:] = 0.0
-    taps = np.fft.irfft(np.exp(np.fft.rfft(cepstrum)))[:half]
-    return LostMotionFilter(moves, taps, lost_rms_v, before)
-
-
 def drift_effects() -> tuple[str, ...]:
     """Return the names of the effects that let the zero-g drift."""
     return tuple(e.name for e in library().values() if e.diagnosis.drift)
@@ -376,7 +293,7 @@ def drift_effects() -> tuple[str, ...]:
 def whiteners(comparison: BaselineComparison, axis: int) -> list[Whitener]:
     """Return the filters that are tried for the noise of one axis of a recording."""
     sensor, dt_s, span_s = comparison.sensor, comparison.dt_s, comparison.span_s
-    errors, scale = reference_errors(comparison, axis), float(sensor.scale_v_per_g[axis])
+    errors, scale = angle_error_filter(comparison, axis), float(sensor.scale_v_per_g[axis])
     a, std_v = _analog(comparison, axis)
     step_v2 = noise.rounding(sensor, axis).white_v2
     by_spectrum = {effect_named(e).diagnosis.drift: e for e in drift_effects()}
