@@ -137,7 +137,6 @@ class BaselineComparison:
         noisy = Response(at_rate, self.motion, seed, float(self.time_s[0]))(self.time_s)
         return noisy - self.simulated_v(at_rate)
 
-
     def lost_motion_mps2(self) -> float:
         """Return the rms of the fast motion that a smooth reference lacks, m/s²."""
         if self.fading_hz is None:

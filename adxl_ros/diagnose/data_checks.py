@@ -406,7 +406,7 @@ def _axis_fault(comparison: BaselineComparison) -> DataFault | None:
     if not len(moving):
         return None
     lags, _, by_lag = reference.correlations(simulated_g, np.nan_to_num(measured_g),
-                                   2 * len(simulated_g) // 3)
+                                             2 * len(simulated_g) // 3)
     by_lag = np.where(np.abs(lags) <= _LARGEST_DELAY_S * sensor.rate_hz, by_lag, -1.0)
     best = int(np.argmax(by_lag))
     delay_s = lags[best] / sensor.rate_hz

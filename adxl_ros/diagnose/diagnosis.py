@@ -158,7 +158,8 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     fits = _held_out(model, search, floor, max(counts.sum(), 1.0))
     evidence = rule.Evidence(
         {e: rule.Candidate({d: f.figures for d, (f, _) in drifts.items()},
-                      {d: size for d, (_, size) in drifts.items()}) for e, drifts in fits.items()},
+                           {d: size for d, (_, size) in drifts.items()})
+         for e, drifts in fits.items()},
         counts, block_weights(seed), material_mps2(model, floor, material_mg),
         model.smallest_angle_rad() * G0_MPS2,
         any(c.fading_hz is not None for c in model.comparisons),

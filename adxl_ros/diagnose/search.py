@@ -52,8 +52,9 @@ sets that are fitted without each effect, and other shapes that are tried. Chose
 _IMMATERIAL = 0.01
 """Share of the gain of a set that a further effect must gain, so that a third one is looked for.
 Chosen: a third of what each effect of a set must explain."""
-_WORTH_FITTING = 10.0
-"""Gain of log evidence from which a set is fitted: below it no held-out figure shows it."""
+_WORTH_FITTING = -30.0
+"""Gain of log evidence from which a set is fitted. Chosen: the wide priors of a small effect on
+three axes cost as much, and the held-out figures decide."""
 _HOPELESS_SHARE, _SMALLEST_DEFICIT = 0.2, 100.0
 """A set that gains less than the best one by this share of it, and by this log evidence, is not
 refined or extended. Its form would have to be wrong by as much of the gap."""
@@ -477,10 +478,10 @@ def _model_about(model: LinearModel, best: Hypothesis) -> LinearModel:
             size_v = _PRESENT_FORM_ERROR * float(np.std(own @ best.values[places]))
             functions += [size_v * basis[d] for d in effect_named(effect).diagnosis.form
                           if d in basis]
-        flexible.append(evidence.FlexibleColumns(np.concatenate(functions, axis=1),
-                                        float(best.fit.innovation_variance_v2[number])))
+        flexible.append(evidence.FlexibleColumns(
+            np.concatenate(functions, axis=1), float(best.fit.innovation_variance_v2[number])))
     return linear.build_linear_model(comparisons, filters=[[w] for w in best.whiteners],
-                              flexible=flexible)
+                                     flexible=flexible)
 
 
 def _stepped(variant: Variant) -> dict[Coefficient, float]:
