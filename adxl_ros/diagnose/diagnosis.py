@@ -13,56 +13,34 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import NamedTuple
 
-from adxl_ros.diagnose import data_checks, noise_effects, noise_model
-from adxl_ros.diagnose.comparison import BaselineComparison, Reference
-from adxl_ros.diagnose.data_checks import CheckedRecording, compare_checked, DataFault
-from adxl_ros.diagnose.evidence import bridged
-from adxl_ros.diagnose.held_out import (
-    block_weights,
-    drift_densities,
-    drift_mps2,
-    HeldOutFits,
-    pose_shares,
-    reproducible_rest,
-    used_counts,
+from adxl_ros.diagnose import (
+    data_checks,
+    next_experiment,
+    noise_effects,
+    noise_model,
+    verdict as rule,
 )
-from adxl_ros.diagnose.hypothesis_fit import Hypothesis, linearise
+from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
+from adxl_ros.diagnose.data_checks import CheckedRecording, compare_checked
+from adxl_ros.diagnose.evidence import used_by_block
+from adxl_ros.diagnose.held_out import block_weights, HeldOutFits, reproducible_rest
 from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
-from adxl_ros.diagnose.next_experiment import (
-    NextExperiment,
-    propose_next_experiment,
-    RecordedEvidence,
-)
-from adxl_ros.diagnose.noise_effects import (
-    compare_noise,
-    Detection,
-    floor_without,
-    noise_remainders,
-    NoiseComparison,
-    NoiseRemainder,
-    NoiseSamples,
-    UNKNOWN,
-)
+from adxl_ros.diagnose.next_experiment import CouldShow, NextExperiment, RecordedEvidence
+from adxl_ros.diagnose.noise_effects import Detection, NoiseComparison, NoiseRemainder, UNKNOWN
 from adxl_ros.diagnose.noise_model import drift_effects, NoiseFloor
+from adxl_ros.diagnose.reference import DataFault
 from adxl_ros.diagnose.residual_map import not_covered, residual_map, ResidualCell
-from adxl_ros.diagnose.search import Search
-from adxl_ros.diagnose.verdict import (
-    Candidate,
-    decide,
-    Evidence,
-    HEALTHY,
-    MATERIAL_MG,
-    MATERIAL_SHARE_OF_NOISE,
-    Verdict,
-)
-from adxl_ros.diagnose.visibility import could_show, CouldShow, noise_could_show
+from adxl_ros.diagnose.search import Hypothesis, linearise, Search
+from adxl_ros.diagnose.verdict import HEALTHY, MATERIAL_MG, Verdict
 from adxl_ros.files.recording_columns import check_unit, Recording
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
-from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor, with_axes
+from adxl_ros.report.quantities import Interval
 from adxl_ros.simulate.motion import Motion
+from adxl_ros.simulate.simulator import simulate_at_stamps
 import numpy as np
 
 ShowProgress = Callable[[str, float], None]
@@ -74,9 +52,6 @@ _STAGES = {'checks': 0.1, 'library of effects': 0.3, 'effects': 0.8, 'held-out f
 _DRIFT_LIMIT = 5.0
 """Expected mean square of a random walk about its mean, divided by the one in a recording, that
 one walk in 20 exceeds. Derived from the random walk."""
-_REPEATED, _RIGHT = (0.0, 0.5, 0.8, 0.95, 1.0), (0.2, 0.4, 0.6, 0.75, 0.9)
-"""Shares of the draws that repeat a verdict, and how often such verdicts were right. Rounded from
-40 working cases (seed 901): of those that all draws repeat, 21 of 25."""
 _SMALLEST_RANGES = {'temperature_c': 0.5, 'supply_v': 0.02}
 """Range of temperature, °C, and supply, V, below which they do not change. Chosen: noise."""
 
@@ -84,16 +59,10 @@ _SMALLEST_RANGES = {'temperature_c': 0.5, 'supply_v': 0.02}
 class GapClosure(NamedTuple):
     """The gap before and after the effects of the verdict, held out, and the noise floor."""
 
-    # before_mps2, after_mps2: Rms of recording minus simulation over samples and axes, m/s²
-    before_mps2: float
-    # before_ci, after_ci: Their 90 % intervals
-    before_ci: tuple[float, float]
-    after_mps2: float
-    after_ci: tuple[float, float]
-    floor_mps2: float  # Noise floor, m/s²
-    floor_ci: tuple[float, float] | None  # Its 90 % interval; None where it is not measured
-    closed: float  # (before² − after²)/(before² − floor²); NaN without a gap
-    closed_ci: tuple[float, float]  # Its 90 % interval
+    before: Interval  # Rms of recording minus simulation over samples and axes, m/s²
+    after: Interval  # The same with the effects, m/s²
+    floor: Interval  # Noise floor, m/s²; its interval is NaN where it is not measured
+    closed: Interval  # (before² − after²)/(before² − floor²); NaN without a gap
 
 
 @dataclass(frozen=True)
@@ -103,7 +72,8 @@ class Report:
     verdict: Verdict  # The verdict with its figures
     closure: GapClosure  # The gap before and after the effects of the verdict
     noise_floor: NoiseFloor  # The noise floor with its source
-    hypotheses: tuple[Hypothesis, ...]  # Fitted sets of effects, those that explain most first
+    # Fitted sets of effects: that of the verdict, then those that explain most
+    hypotheses: tuple[Hypothesis, ...]
     # detections, noise_remainders: Effects that show in the noise, and what remains after they are
     # added
     detections: tuple[Detection, ...]
@@ -117,7 +87,6 @@ class Report:
     # Smallest size of each effect that these recordings would have shown
     could_show: tuple[CouldShow, ...]
     next_experiment: NextExperiment | None  # What to record next
-    lost_motion_mps2: float  # Rms of motion that a smooth reference lacks, m/s²
     baseline: Sensor  # The baseline
     sensor: Sensor  # The baseline with the effects whose closing is stated, ready for `simulate`
     linear_model: LinearModel  # The linear model of the recordings
@@ -169,7 +138,12 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
         A recording is of another unit, or its reference cannot be followed.
 
     """
-    show = _stages(show_progress)
+    names, ends = list(_STAGES), [0.0, *_STAGES.values()]
+
+    def show(stage: str, share: float) -> None:
+        i = names.index(stage)
+        show_progress(f'{i + 1}/{len(names)} {stage}', ends[i] + share * (ends[i + 1] - ends[i]))
+
     show('checks', 0.0)
     checked = check(recordings, sensor, sim, align)
     if isinstance(checked, Diagnosis):
@@ -180,39 +154,27 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     search.run(lambda share: show('effects', share))
     show('held-out figures', 0.0)
     floor = noise_model.estimate([c.comparison for c in checked])
-    fits = _held_out(model, search, floor)
-    evidence = Evidence(
-        {effects: candidate for effects, (candidate, _) in fits.items()}, used_counts(model),
-        block_weights(seed), material_mps2(model, floor, material_mg),
+    counts = np.sum([used_by_block(c.used) for c in model.comparisons], axis=0)
+    fits = _held_out(model, search, floor, max(counts.sum(), 1.0))
+    evidence = rule.Evidence(
+        {e: rule.Candidate({d: f.figures for d, (f, _) in drifts.items()},
+                           {d: size for d, (_, size) in drifts.items()})
+         for e, drifts in fits.items()},
+        counts, block_weights(seed), material_mps2(model, floor, material_mg),
         model.smallest_angle_rad() * G0_MPS2,
-        model.lost_motion_mps2, np.inf if floor.source == 'assumed' else floor.rms_mps2)
+        any(c.fading_hz is not None for c in model.comparisons),
+        np.inf if floor.source == 'assumed' else floor.rms_mps2)
     detections = _detections(checked, search.best, model.baseline)
-    verdict = decide(
-        evidence, cache(lambda effects, drift: reproducible_rest(fits[effects][1][drift], model)),
-        [d.effect for d in detections if d.effect != UNKNOWN],
-        lambda share: float(np.interp(share, _REPEATED, _RIGHT)))
+    verdict = rule.decide(
+        evidence, cache(lambda effects, drift: reproducible_rest(fits[effects][drift][0], model)),
+        [d.effect for d in detections if d.effect != UNKNOWN])
     show('report', 0.0)
     if verdict.status == 'no_gap' and not any(map(_could_show, model.comparisons)):
         verdict = replace(verdict, status='insufficient')
-    best = frozenset(verdict.best.effects)
-    named = _named_sensor(verdict, detections, model.baseline, checked[0].comparison.sensor,
-                          fits[best][1])
-    report = _report(checked, model, search, verdict, detections, floor, evidence, named, seed)
+    report = _report(checked, model, search, verdict, detections, floor, evidence,
+                     {d: f for d, (f, _) in fits[verdict.best].items()}, seed)
     show('report', 1.0)
     return Diagnosis(tuple(model.comparisons), tuple(c.comparison for c in checked), None, report)
-
-
-def _stages(show_progress: ShowProgress) -> ShowProgress:
-    """Return a function that shows a stage with its number and the fraction of all work."""
-    names = list(_STAGES)
-
-    def show(stage: str, share: float) -> None:
-        number = names.index(stage)
-        before = _STAGES[names[number - 1]] if number else 0.0
-        show_progress(f'{number + 1}/{len(names)} {stage}',
-                      before + share * (_STAGES[stage] - before))
-
-    return show
 
 
 def check(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = None,
@@ -242,34 +204,29 @@ def check(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = 
 def material_mps2(model: LinearModel, floor: NoiseFloor, material_mg: float = MATERIAL_MG
                   ) -> float:
     """Return the material amplitude: the stated one, or a share of the noise."""
-    scale = model.comparisons[0].scale_v_per_mps2
-    noise_mps2 = np.sqrt(np.mean((floor.noise_v / scale) ** 2) + model.lost_motion_mps2 ** 2)
-    return max(1e-3 * material_mg * G0_MPS2, MATERIAL_SHARE_OF_NOISE * float(noise_mps2))
+    noise_mps2 = floor.noise_v / model.comparisons[0].scale_v_per_mps2
+    return max(1e-3 * material_mg * G0_MPS2, rule.MATERIAL_SHARE_OF_NOISE * float(
+        np.sqrt(np.mean(noise_mps2 ** 2) + model.lost_motion_mps2 ** 2)))
 
 
-def _held_out(model: LinearModel, search: Search, floor: NoiseFloor
-              ) -> dict[frozenset[str], tuple[Candidate, dict[str, HeldOutFits]]]:
-    """Return the held-out figures of all sets, with the drifts that their noise may have."""
+def _held_out(model: LinearModel, search: Search, floor: NoiseFloor, count: float
+              ) -> dict[frozenset[str], dict[str, tuple[HeldOutFits, float]]]:
+    """Return held-out fits of all sets by the drift of their noise, with its size, m/s²."""
     best = search.best
     beside = linearise(model, best.effects, best.sensor, model.filters)
     drifts = drift_effects() if beside.fit(drifts=drift_effects()).log_evidence \
         > beside.fit().log_evidence else ()
-    count = max(used_counts(model).sum(), 1.0)
     out = {}
     for effects, hypothesis in search.found.items():
-        fits = {HEALTHY: HeldOutFits(hypothesis.linearised)}
-        sizes = {HEALTHY: 0.0}
-        left = fits[HEALTHY].figures.squares.sum() / count - floor.rms_mps2 ** 2
+        healthy = HeldOutFits(hypothesis.linearised)
+        left = healthy.figures.squares.sum() / count - floor.rms_mps2 ** 2
         linearised = linearise(model, hypothesis.effects, hypothesis.sensor, model.filters) \
             if drifts else hypothesis.linearised
-        for drift in drifts:
-            beside_drift = HeldOutFits(linearised, (drift,))
-            size = drift_mps2(beside_drift, model)
-            # A drift that should be far larger than what is left is none.
-            if size ** 2 <= _DRIFT_LIMIT * max(left, 0.0):
-                fits[drift], sizes[drift] = beside_drift, size
-        out[effects] = (Candidate(hypothesis, {d: f.figures for d, f in fits.items()}, sizes,
-                                  pose_shares(hypothesis, model)), fits)
+        fits = {d: HeldOutFits(linearised, (d,)) for d in drifts}
+        # A drift that should be far larger than what is left is none.
+        sized = {d: (f, size) for d, f in fits.items()
+                 if (size := f.drift_mps2(model)) ** 2 <= _DRIFT_LIMIT * max(left, 0.0)}
+        out[effects] = {HEALTHY: (healthy, 0.0), **sized}
     return out
 
 
@@ -284,36 +241,28 @@ def _detections(checked: Sequence[CheckedRecording], best: Hypothesis, baseline:
     detections = [d for c in checked for d in c.detections]
     for c in checked:
         comparison, used = c.comparison, c.comparison.used
-        sensor = replace(best.sensor, rate_hz=comparison.sensor.rate_hz)
         residual_v = comparison.residual_v(best.sensor)
-        spikes = c.possible_spikes
         # In motion, a smooth reference lacks knocks that look like spikes.
-        regular = used | ~comparison.at_rest if comparison.reference_fades else used
-        if spikes is not None and noise_effects.residual_shows_spikes(spikes, residual_v,
-                                                                      regular, sensor):
-            detections.append(spikes)
-        by_sensor = [noise_effects.residual_detections(NoiseSamples(
-            time_s=comparison.time_s, residual_v=bridged(residual_v, used),
-            simulated_v=comparison.simulated_noise_v(s, 0),
-            at_rest=comparison.at_rest & used, used=used), s)
-            for s in (sensor, replace(baseline, rate_hz=comparison.sensor.rate_hz))]
-        of_baseline = {d.effect for d in by_sensor[1]}
-        detections += [d for d in by_sensor[0] if d.effect in of_baseline]
+        regular = used if comparison.fading_hz is None else used | ~comparison.at_rest
+        if c.possible_spikes is not None and noise_effects.residual_shows_spikes(
+                c.possible_spikes, residual_v, regular, comparison.sensor):
+            detections.append(c.possible_spikes)
+        found, of_baseline = (noise_effects.residual_detections(comparison, residual_v, s)
+                              for s in (best.sensor, baseline))
+        detections += [d for d in found if d.effect in {o.effect for o in of_baseline}]
     ranked = sorted(detections, key=lambda d: d.log_bayes_factor)
     return list({d.effect: d for d in ranked}.values())
 
 
 def _could_show(comparison: BaselineComparison) -> bool:
     """Determine whether the sensor moves, or its temperature or supply changes."""
-    if comparison.reference is Reference.SIMULATOR or (
-            comparison.reference is Reference.STAGE and not comparison.at_rest.all()):
-        return True
-    paths = {name: getattr(comparison.motion, name) for name in _SMALLEST_RANGES}
-    return any(path is not None and np.ptp(path(comparison.time_s)) > _SMALLEST_RANGES[name]
-               for name, path in paths.items())
+    moves = comparison.reference is Reference.SIMULATOR or (
+        comparison.joints is not None and not comparison.at_rest.all())
+    return moves or any(np.ptp(values) > _SMALLEST_RANGES[name]
+                        for name, values in comparison.surroundings.items())
 
 
-def _named_sensor(verdict: Verdict, detections: Sequence[Detection], searched: Sensor,
+def _named_sensor(verdict: Verdict, best: Hypothesis, detections: Sequence[Detection],
                   baseline: Sensor, fits: dict[str, HeldOutFits]) -> Sensor:
     """
     Return the baseline with exactly the effects whose closing the verdict states.
@@ -321,100 +270,88 @@ def _named_sensor(verdict: Verdict, detections: Sequence[Detection], searched: S
     Zero-g and scale factor that the file holds, or that changed beside the effects by a material
     amount, have their fitted values. Filter and latency stay those of the file.
     """
-    if verdict.status in ('no_gap', 'insufficient', 'unknown'):
+    if not verdict.closes:
         return baseline
-    best, drifts = verdict.best, [e for e in drift_effects()
-                                  if e in (*verdict.effects, *sum(verdict.groups, ()))]
-    sensor = with_neutral(baseline, best.effects)
+    fitted, sensor = best.sensor, with_neutral(baseline, best.effects)
     if best.effects:
-        straight = [e for e in best.sensor.effects if effect_named(e).diagnosis.straight_line
-                    and e not in best.effects
-                    and (e in baseline.effects or _changed(best.sensor, searched, e, verdict))]
+        from_file = with_neutral(baseline, fitted.effects)
+        smallest_v = verdict.material_mps2 / G0_MPS2 * baseline.scale_v_per_g.min()
+        straight = [e for e in fitted.effects if effect_named(e).diagnosis.straight_line
+                    and e not in best.effects and (e in baseline.effects or any(
+                        np.abs(value - from_file.values[e][p]).max() > smallest_v
+                        for p, value in fitted.values[e].items()))]
         sensor = with_neutral(sensor, straight)
-        from_file = sensor
-        sensor = replace(sensor, values={**sensor.values, **{
-            e: best.sensor.values[e] for e in (*best.effects, *straight)}})
         # A size that these recordings do not determine would be a guess in others.
         hidden = [name for name, is_open in zip(best.names, best.undetermined)
                   if is_open and parameter_of(name).is_size]
-        sensor = put(sensor, hidden, get(from_file, hidden))
+        before = get(sensor, hidden)
+        sensor = put(replace(sensor, values={**sensor.values, **{
+            e: fitted.values[e] for e in (*best.effects, *straight)}}), hidden, before)
     in_noise = {d.effect: d.values for d in detections if d.effect != UNKNOWN}
-    in_noise |= {drift: {effect_named(drift).parameters[0].name: drift_densities(
-        fits[drift], sensor)} for drift in drifts[:1]}
+    for drift in [e for e in drift_effects() if e in verdict.named][:1]:
+        densities = fits[drift].drift_densities()[:len(sensor.axes)]
+        in_noise[drift] = {effect_named(drift).parameters[0].name: densities}
     for effect, values in in_noise.items():
-        sensor = with_neutral(sensor, [effect])
-        sensor = replace(sensor, values={
-            **sensor.values, effect: {**sensor.values[effect], **values}})
+        sensor = with_values(with_neutral(sensor, [effect]), effect, values)
     kept = [i for i, name in enumerate(baseline.covariance_names) if name.effect in sensor.effects]
     return replace(sensor, covariance=baseline.covariance[np.ix_(kept, kept)],
                    covariance_names=tuple(baseline.covariance_names[i] for i in kept))
 
 
-def _changed(fitted: Sensor, baseline: Sensor, effect: str, verdict: Verdict) -> bool:
-    """Determine whether a zero-g or scale factor changed by a material amount."""
-    from_file = with_neutral(baseline, [effect])
-    change = max(np.abs(np.asarray(fitted.values[effect][p.name])
-                        - np.asarray(from_file.values[effect][p.name])).max()
-                 for p in effect_named(effect).parameters)
-    return bool(change / baseline.scale_v_per_g.min() * G0_MPS2 > verdict.material_mps2)
-
-
-def _closure(verdict: Verdict, evidence: Evidence, floor: NoiseFloor,
+def _closure(verdict: Verdict, evidence: rule.Evidence, floor: NoiseFloor,
              remainders: Sequence[NoiseRemainder], sensor: Sensor, seed: int) -> GapClosure:
     """Return the gap before and after the best set, above the floor without noise-like effects."""
-    best = frozenset(verdict.best.effects) if verdict.status not in (
-        'no_gap', 'insufficient', 'unknown') else frozenset()
+    best = verdict.best if verdict.closes else frozenset[str]()
     before, after = (evidence.mean(evidence.candidates[e].figures[HEALTHY].squares)
                      for e in (frozenset[str](), best))
     stated = noise.sample_std_v(sensor) / (sensor.scale_v_per_g / G0_MPS2)
     stated_mps2 = float(np.sqrt(np.mean(stated ** 2)))
     draws = floor.draws_mps2(seed, len(before) - 1)
-    floors = np.concatenate([[floor.rms_mps2], np.full(len(before) - 1, floor.rms_mps2)
-                             if draws is None else draws])
-    lowest = np.array([floor_without(min(f, np.sqrt(a)), remainders, stated_mps2)
+    floors = np.full(len(before), floor.rms_mps2)
+    if draws is not None:
+        floors[1:] = draws
+    lowest = np.array([noise_effects.floor_without(min(f, np.sqrt(a)), remainders, stated_mps2)
                        for f, a in zip(floors, after)])
     with np.errstate(all='ignore'):
         closed = (before - after) / np.where(before > lowest ** 2, before - lowest ** 2, np.nan)
-    closed = np.clip(closed, -1.0, 1.0)
-    return GapClosure(
-        float(np.sqrt(before[0])), _interval(np.sqrt(before)), float(np.sqrt(after[0])),
-        _interval(np.sqrt(after)), float(lowest[0]), None if draws is None else _interval(lowest),
-        float(closed[0]), _interval(closed))
+    if draws is None:
+        lowest[1:] = np.nan
+    return GapClosure(*map(_interval, (np.sqrt(before), np.sqrt(after), lowest,
+                                       np.clip(closed, -1.0, 1.0))))
 
 
-def _interval(draws: np.ndarray) -> tuple[float, float]:
-    """Return the 90 % interval of draws after the first, which is the value."""
+def _interval(draws: np.ndarray) -> Interval:
+    """Return the first value with the 90 % interval of the others."""
     finite = draws[1:][np.isfinite(draws[1:])]
     low, high = np.quantile(finite, [0.05, 0.95]) if len(finite) else (np.nan, np.nan)
-    return float(low), float(high)
+    return Interval(float(draws[0]), float(low), float(high))
 
 
 def _report(checked: Sequence[CheckedRecording], model: LinearModel, search: Search,
             verdict: Verdict, detections: Sequence[Detection], floor: NoiseFloor,
-            evidence: Evidence, sensor: Sensor, seed: int) -> Report:
+            evidence: rule.Evidence, fits: dict[str, HeldOutFits], seed: int) -> Report:
     """Add to a verdict the other parts of the report."""
-    comparisons = [c.comparison for c in checked]
-    baseline, lacking = comparisons[0].sensor, tuple(not_covered(model.comparisons))
-    remainders = tuple(noise_remainders(comparisons, verdict.best.sensor, sensor, detections,
-                                        seed))
+    comparisons, best = [c.comparison for c in checked], search.found[verdict.best]
+    # Coarse codes are an effect of the verdict, and not of its baseline.
+    baseline = replace(comparisons[0].sensor, adc_bits=checked[0].stated_bits)
+    sensor = _named_sensor(verdict, best, detections, baseline, fits)
+    lacking = tuple(not_covered(model.comparisons))
+    remainders = tuple(noise_effects.noise_remainders(comparisons, best.sensor, sensor,
+                                                      detections, seed))
     ranked = sorted(search.found.values(), key=lambda h: -h.log_evidence)
+    noise_before, noise_after = (
+        tuple(noise_effects.compare_noise(c, mean, noisy, seed) for c in comparisons)
+        for mean, noisy in ((baseline, baseline), (best.sensor, sensor)))
     return Report(
         verdict, _closure(verdict, evidence, floor, remainders, baseline, seed), floor,
-        (verdict.best, *(h for h in ranked if h is not verdict.best)), tuple(detections),
-        remainders, _noise_comparisons(comparisons, baseline, baseline, seed),
-        _noise_comparisons(comparisons, verdict.best.sensor, sensor, seed),
-        tuple(residual_map(model.comparisons[0], comparisons[0], floor.rms_mps2, seed)), lacking,
-        tuple(shown(model, comparisons, floor, verdict.material_mps2)),
-        propose_next_experiment(verdict, lacking, RecordedEvidence(baseline, model, seed)),
-        model.lost_motion_mps2, baseline, sensor, model)
-
-
-def shown(model: LinearModel, comparisons: Sequence[BaselineComparison], floor: NoiseFloor,
-          material: float) -> list[CouldShow]:
-    """Return the smallest size of each effect that recordings show, by the mean or the noise."""
-    return sorted([*could_show(model, material),
-                   *noise_could_show(comparisons[0], floor.noise_v, material)],
-                  key=lambda row: (row.effect, row.parameter, row.axis))
+        (best, *(h for h in ranked if h is not best)), tuple(detections), remainders,
+        noise_before, noise_after,
+        tuple(residual_map(model.comparisons[0], seed)), lacking,
+        tuple(next_experiment.could_show(model, comparisons[0], floor.noise_v,
+                                         verdict.material_mps2)),
+        next_experiment.propose_next_experiment(verdict, lacking, RecordedEvidence(
+            baseline, model, seed)),
+        baseline, sensor, model)
 
 
 def what_shows(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = None
@@ -425,14 +362,41 @@ def what_shows(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | No
         assert checked.fault is not None
         return checked.fault
     model = build_linear_model([c.search_comparison for c in checked])
-    comparisons = [c.comparison for c in checked]
-    floor = noise_model.estimate(comparisons)
-    return shown(model, comparisons, floor, material_mps2(model, floor))
+    floor = noise_model.estimate([c.comparison for c in checked])
+    return next_experiment.could_show(model, checked[0].comparison, floor.noise_v,
+                                      material_mps2(model, floor))
 
 
-def _noise_comparisons(comparisons: Sequence[BaselineComparison], mean_sensor: Sensor,
-                       noise_sensor: Sensor, seed: int) -> tuple[NoiseComparison, ...]:
-    """Compare the residual after one sensor's mean output with the noise of another sensor."""
-    return tuple(compare_noise(bridged(c.residual_v(mean_sensor), c.used),
-                               bridged(c.simulated_noise_v(noise_sensor, seed), c.used),
-                               c.sensor.rate_hz, c.scale_v_per_mps2) for c in comparisons)
+def self_check(diagnosis: Diagnosis, recordings: list[Recording], sim: Motion | None, count: int,
+               seed: int, show: Callable[[float], None] = lambda done: None) -> str:
+    """
+    Diagnose recordings that are simulated from a verdict; say how often the verdict comes back.
+
+    This is posterior simulation-based calibration (Säilynoja, Schmitt, Bürkner and Vehtari 2025,
+    arXiv 2502.03279): the sensor of the verdict records the same motion, with noise and with the
+    steps of the encoder, and the same baseline is compared with it.
+    """
+    report = diagnosis.report
+    assert report is not None
+    named, same, inside = (report.verdict.effects, report.verdict.groups), 0, []
+    for i in range(count):
+        drawn = []
+        for k, (c, recording) in enumerate(zip(diagnosis.full_rate, recordings)):
+            sensor = replace(report.sensor, rate_hz=recording.rate_hz)
+            parts = list(simulate_at_stamps(sensor, c.motion, recording,
+                                            seed + 1 + i * len(recordings) + k))
+            columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+            drawn.append(replace(recording, time_s=columns.pop('time_s'), columns=columns))
+        again = diagnose(drawn, report.baseline, sim, seed).report
+        if again is not None:
+            same += (again.verdict.effects, again.verdict.groups) == named
+            fitted = again.hypotheses[0]
+            places = [j for j, name in enumerate(fitted.names) if report.verdict.closes
+                      and name.effect in report.verdict.best and not fitted.undetermined[j]]
+            names = [fitted.names[j] for j in places]
+            inside += list(np.abs(get(fitted.sensor, names) - get(report.sensor, names))
+                           <= Z_90 * fitted.std[places])
+        show((i + 1) / count)
+    sizes = f', {sum(inside)} of {len(inside)} intervals held the size (90 % expected)' \
+        if inside else ''
+    return f'self-check: {same} of {count} simulated recordings had the same verdict{sizes}'

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The next experiment: what each manoeuvre is expected to tell, given the samples so far.
+What recordings could show, and what to record next.
 
-Each hypothesis has a posterior of its coefficients by the samples so far. The manoeuvre is
-simulated with the baseline and goes through the same comparison as a recording, with the steps of
-the encoder. Its sensitivities to the library then predict the response of each hypothesis. The
+Each hypothesis has a posterior of its coefficients by the samples so far. A manoeuvre is simulated
+with the baseline and goes through the same comparison as a recording, with the steps of the
+encoder. Its sensitivities to the library then predict the response of each hypothesis. The
 manoeuvre with the largest expected information per minute is proposed.
 
 All hypotheses predict y = J·θ + e with white noise e of variance 1. They differ in what they know
@@ -19,20 +19,31 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
-from adxl_ros.diagnose import evidence
-from adxl_ros.diagnose.comparison import at_search_rate, compare, Reference
-from adxl_ros.diagnose.evidence import LinearFit
-from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
+from adxl_ros.diagnose import evidence, noise_effects
+from adxl_ros.diagnose.comparison import (
+    at_search_rate,
+    BaselineComparison,
+    compare,
+    Reference,
+    with_values,
+)
+from adxl_ros.diagnose.linear_model import (
+    build_linear_model,
+    candidates,
+    filters_for,
+    LinearModel,
+)
 from adxl_ros.diagnose.noise_effects import UNKNOWN
-from adxl_ros.diagnose.noise_model import drifts_among
+from adxl_ros.diagnose.noise_model import expected_drift_g
 from adxl_ros.diagnose.verdict import Verdict, WeightedHypothesis
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
-from adxl_ros.model.coefficients import with_neutral
-from adxl_ros.model.diagnosis_hints import FormDimension, Manoeuvre
+from adxl_ros.model.coefficients import parameter_of, with_neutral
+from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.diagnosis_hints import Detector, FormDimension, Manoeuvre
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Coefficient, Effect
 from adxl_ros.model.sensor import Sensor
@@ -40,6 +51,131 @@ from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.simulator import simulate_blocks
 import numpy as np
+
+_SHOWN_STDS = 4.0
+"""Size of a coefficient, in standard deviations, that shows: it gains 8 nats."""
+_RATE_HZ = 62.5
+"""Sample rate of the simulated manoeuvres, Hz. Chosen: run time; a stage moves far slower."""
+_SMALLEST_PROBABILITY, _MOST_HYPOTHESES = 1e-3, 40
+"""Probability of a hypothesis that leads the choice, and their largest number. Chosen: the others
+together are far below the 5 % that remain at the end; run time."""
+_UNKNOWN_G = 1e-3
+"""Rms of an unknown function, g. Chosen: the middle of those of the diagnosis."""
+_EVIDENCE_FACTOR = 0.3
+"""Factor of the information, because no model of a sensor is exact (Miller and Dunson 2019)."""
+_OTHER_REFERENCE = 'ros2 run adxl_ros diagnose next.csv --sim next_simulated.csv -o next'
+"""Command for another recording beside another reference."""
+
+
+@dataclass(frozen=True)
+class CouldShow:
+    """Smallest size of one parameter of an effect that recordings would have shown."""
+
+    # effect, parameter, axis: The coefficient; `axis` is '' where it has none
+    effect: str
+    parameter: str
+    axis: str
+    unit: str  # Unit of the size
+    smallest: float  # The size; infinite where nothing of the effect reaches the output
+    typical: float  # Typical size
+    shows: bool  # Whether the smallest size is one that the parameter can have
+    # Share of the effect's signal that zero-g, scale factor and latency cannot imitate
+    share: float
+    revealed_by: Manoeuvre | None  # Manoeuvre that shows the effect best
+
+
+def _could_show(name: Coefficient, size: float, share: float) -> CouldShow:
+    """Describe the smallest size of a coefficient."""
+    p = parameter_of(name)
+    return CouldShow(name.effect, name.parameter, name.axis, p.unit, float(size), p.scale,
+                     bool(size <= p.upper - p.neutral), share,
+                     effect_named(name.effect).diagnosis.revealed_by)
+
+
+def could_show(model: LinearModel, comparison: BaselineComparison, noise_v: np.ndarray,
+               material_mps2: float) -> list[CouldShow]:
+    """
+    Return the smallest sizes by coefficient: material ones, that exceed their uncertainty.
+
+    Nuisance parameters are free, within their tolerance. An effect with several shapes has the
+    size of the shape that shows best. The sizes of effects on the noise are those of one
+    recording at its full rate; `noise_v` is its noise, V, (m,).
+    """
+    prior_std, free = model.prior(()), np.array(model.nuisance_ids, int)
+    fit, count = model.null_fit, len(model.names)
+    # Products of the whitened columns in units of the noise, and their squares, (m/s²)²/unit².
+    gram, plain, samples = np.zeros((count, count)), np.zeros(count), 0.0
+    for number, (c, f, variance) in enumerate(zip(
+            model.channels, fit.filter_indices, fit.innovation_variance_v2)):
+        gram[np.ix_(c.column_ids, c.column_ids)] += c.total_grams[f][1:, 1:] / variance
+        recording, axis = model.place_of_channel(number)
+        of_channel = model.comparisons[recording]
+        for column in model.columns[number]:
+            plain[column.number] += float(np.sum(column.values[of_channel.used] ** 2)) \
+                / float(of_channel.scale_v_per_mps2[axis]) ** 2
+        samples += of_channel.used.sum()
+    precision = gram[np.ix_(free, free)] + np.diag(prior_std[free] ** -2.0)
+    marginal = np.diag(gram) - np.einsum('ij,ij->j', gram[free], np.linalg.solve(
+        precision, gram[free]))
+    best: dict[Coefficient, CouldShow] = {}
+    for variant, ids in zip(model.variants, model.column_ids):
+        hints = effect_named(variant.effect).diagnosis
+        if variant.limit_start or (hints.straight_line and not model.pose_known):
+            continue
+        for k in ids:
+            name = model.names[k]
+            information = gram[k, k] if hints.nuisance else marginal[k]
+            share = float(np.clip(information / max(gram[k, k], 1e-300), 0.0, 1.0))
+            power = plain[k] * share / max(samples, 1.0)
+            size = max(_SHOWN_STDS * information ** -0.5, material_mps2 * power ** -0.5) \
+                if information > 0 and power > 0 else np.inf
+            if hints.nuisance:
+                size = np.hypot(size, 3 * model.tolerance(name))
+            if name not in best or size < best[name].smallest:
+                best[name] = _could_show(name, size, share)
+    seen = {row.effect for row in best.values()} | {
+        v.effect for v in model.variants if v.limit_start}
+    hidden = [_could_show(Coefficient(e.name, e.parameters[0].name), np.inf, 0.0)
+              for e in candidates() if e.name not in seen]
+    return sorted([*best.values(), *hidden, *_noise_could_show(comparison, noise_v,
+                                                               material_mps2)],
+                  key=lambda r: (r.effect, r.parameter, r.axis))
+
+
+def _noise_could_show(comparison: BaselineComparison, noise_v: np.ndarray, material_mps2: float
+                      ) -> list[CouldShow]:
+    """Return the smallest sizes of effects that show in the noise of one recording."""
+    sensor, count = comparison.sensor, len(comparison)
+    level_v, rate_hz = float(noise_v.max()), sensor.rate_hz
+    line_v = level_v * np.sqrt(8 * (noise_effects.LINE_LOG_EXCESS + np.log(count)) / count)
+    sizes = {Detector.NOISE_LEVEL: ('ratio', noise_effects.NOISE_EXCESS - 1),
+             Detector.MAINS_LINE: ('amplitude_v', line_v),
+             Detector.ISOLATED_SAMPLES: ('amplitude_v', noise_effects.SPIKE_STDS * max(
+                 level_v, sensor.lsb_v)),
+             Detector.REPEATED_SAMPLES: ('duration_s', noise_effects.shortest_repeat(
+                 comparison.volts, len(sensor.axes)) / rate_hz),
+             Detector.COARSE_CODES: ('lost_bits', float(np.log2(noise_effects.COARSE_STEPS)))}
+    rows = []
+    for effect in library().values():
+        hints = effect.diagnosis
+        if hints.drift is not None:
+            unit_g = expected_drift_g(hints.drift, 1.0, comparison.span_s, rate_hz)
+            parameter, size = effect.parameters[0].name, max(
+                material_mps2 / G0_MPS2 / unit_g, hints.healthy_density)
+        elif hints.detector in sizes:
+            parameter, size = sizes[hints.detector]
+        else:
+            continue
+        rows.append(_could_show(Coefficient(effect.name, parameter), size, 1.0))
+    return rows
+
+
+def by_effect(rows: Sequence[CouldShow]) -> dict[str, CouldShow]:
+    """Return for each effect its coefficient that shows best, by smallest over typical size."""
+    best: dict[str, CouldShow] = {}
+    for row in sorted(rows, key=lambda r: r.smallest / r.typical):
+        best.setdefault(row.effect, row)
+    return best
 
 
 @dataclass(frozen=True)
@@ -50,25 +186,9 @@ class Belief:
     root: np.ndarray  # Square root of the covariance, S = root·rootᵀ, (k, r)
 
 
-def _distance(gram: np.ndarray, first: Belief, second: Belief) -> float:
-    """Return the part of the Bhattacharyya distance that is not of one belief alone."""
-    both = np.hstack([first.root, second.root]) / np.sqrt(2)
-    difference = first.mean - second.mean
-    projected = gram @ difference
-    values, vectors = _eigen(both.T @ gram @ both)
-    across = vectors.T @ (both.T @ projected)
-    # Woodbury: (1 + J·S·Jᵀ)⁻¹ within the span of J.
-    square = float(difference @ projected - np.sum(across ** 2 / (1 + values)))
-    return max(square, 0.0) / 8 + 0.5 * float(np.log1p(values).sum())
-
-
-def _log_det_of(gram: np.ndarray, belief: Belief) -> float:
-    """Return the log determinant of the covariance of a prediction, in units of the noise."""
-    return float(np.log1p(_eigen(belief.root.T @ gram @ belief.root)[0]).sum())
-
-
-def _eigen(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return eigenvalues and vectors; 1 + products is singular in floats where one is huge."""
+def _eigen(gram: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return eigenvalues and vectors of a covariance in units of the noise."""
+    products = root.T @ gram @ root
     values, vectors = np.linalg.eigh((products + products.T) / 2)
     return np.maximum(values, 0.0), vectors
 
@@ -76,44 +196,26 @@ def _eigen(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def expected_information(gram: np.ndarray, probabilities: Sequence[float],
                          beliefs: Sequence[Belief], factor: float = 1.0) -> float:
     """
-    Return a lower bound of the information that an experiment gives on the hypothesis.
+    Return a lower bound of the information that an experiment gives on the hypothesis, nat.
 
     gram: products of the sensitivities, in units of the noise, (k, k).
     """
     weights = np.asarray(probabilities, float)
-    count = len(weights)
-    overlap = np.eye(count)
-    # One each, not one for each pair.
-    log_dets = [_log_det_of(gram, belief) for belief in beliefs]
-    for i in range(count):
-        for j in range(i):
-            distance = factor * (_distance(gram, beliefs[i], beliefs[j])
-                                 - 0.25 * (log_dets[i] + log_dets[j]))
-            overlap[i, j] = overlap[j, i] = np.exp(-max(distance, 0.0))
+    overlap = np.eye(len(weights))
+    log_dets = [float(np.log1p(_eigen(gram, b.root)[0]).sum()) for b in beliefs]
+    for i, first in enumerate(beliefs):
+        for j, second in enumerate(beliefs[:i]):
+            both = np.hstack([first.root, second.root]) / np.sqrt(2)
+            values, vectors = _eigen(gram, both)
+            difference = first.mean - second.mean
+            across = vectors.T @ (both.T @ gram @ difference)
+            # Woodbury: (1 + J·S·Jᵀ)⁻¹ within the span of J.
+            square = float(difference @ gram @ difference - np.sum(across ** 2 / (1 + values)))
+            distance = max(square, 0.0) / 8 + 0.5 * float(np.log1p(values).sum()) \
+                - 0.25 * (log_dets[i] + log_dets[j])
+            overlap[i, j] = overlap[j, i] = np.exp(-max(factor * distance, 0.0))
     positive = weights > 0
     return max(float(-weights[positive] @ np.log((overlap @ weights)[positive])), 0.0)
-
-
-def entropy(probabilities: Sequence[float]) -> float:
-    """Return the entropy of probabilities, nat."""
-    weights = np.asarray(probabilities, float)
-    weights = weights[weights > 0]
-    return float(-weights @ np.log(weights))
-
-
-_RATE_HZ = 62.5
-"""Sample rate of the simulated manoeuvres, Hz. Chosen: run time; a stage moves far slower."""
-_SMALLEST_PROBABILITY = 1e-3
-"""Probability below which a hypothesis does not lead the choice. Chosen: together they are far
-below the 5 % that remain at the end."""
-_MOST_HYPOTHESES = 40
-"""Largest number of hypotheses that lead the choice. Chosen: run time."""
-_UNKNOWN_G = 1e-3
-"""Rms of an unknown function, g. Chosen: the middle of those of the diagnosis."""
-
-
-_EVIDENCE_FACTOR = 0.3
-"""Factor of the information, because no model of a sensor is exact (Miller and Dunson 2019)."""
 
 
 class Experiment(Protocol):
@@ -136,11 +238,8 @@ class Experiment(Protocol):
         """Return its duration, min."""
 
 
-class ColumnKey(NamedTuple):
-    """A coefficient of one variant of an effect, or of a flexible function."""
-
-    variant: tuple  # Effect, shape and step; dimension, channel and number of a flexible function
-    name: Coefficient | None  # The coefficient; None of a flexible function
+Key = tuple
+"""Variant and coefficient of a column; dimension, channel and number of a flexible function."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +261,7 @@ class PredictedResponse:
 
     manoeuvre: Experiment  # The manoeuvre
     linear_model: LinearModel  # Its linear model
-    places: dict[ColumnKey, int]  # Place of each column
+    places: dict[Key, int]  # Place of each column
     gram: np.ndarray  # Products, in units of the noise, (k, k)
 
     @property
@@ -175,32 +274,11 @@ class PredictedResponse:
 class _Posterior:
     """What a hypothesis knows after the samples so far."""
 
-    keys: tuple[ColumnKey, ...]  # Columns of its k coefficients
+    keys: tuple[Key, ...]  # Columns of its k coefficients
     mean: np.ndarray  # Their means, (k,)
     covariance: np.ndarray  # Their covariance, (k, k)
-    unseen: tuple[str, ...] = ()  # Effects of the hypothesis about which only the prior is known
-    dimensions: tuple[FormDimension, ...] = ()  # Dimensions in which it has an unknown function
-
-
-@dataclass
-class _Samples:
-    """The linear model of the samples so far, and fits that hypotheses share."""
-
-    linear_model: LinearModel
-    null_fit: LinearFit
-    best_variants: dict[str, int] = field(default_factory=dict)
-
-    def best_variant(self, effect: str) -> int | None:
-        """Return the variant of an effect that fits best; None where the samples show none."""
-        if effect not in self.best_variants:
-            model = self.linear_model
-            numbers = [i for i, v in enumerate(model.variants)
-                       if v.effect == effect and not v.limit_start]
-            if not numbers:
-                return None
-            self.best_variants[effect] = max(
-                numbers, key=lambda i: model.fit_variants([i], self.null_fit).log_evidence)
-        return self.best_variants[effect]
+    unseen: tuple[str, ...]  # Effects of the hypothesis about which only the prior is known
+    dimensions: tuple[FormDimension, ...]  # Dimensions in which it has an unknown function
 
 
 def leading(hypotheses: Sequence[WeightedHypothesis]) -> tuple[WeightedHypothesis, ...]:
@@ -211,26 +289,9 @@ def leading(hypotheses: Sequence[WeightedHypothesis]) -> tuple[WeightedHypothesi
 
 def unknown_dimensions(verdict: Verdict | None) -> tuple[FormDimension, ...]:
     """Return the dimensions in which something unknown may act, or the usual ones."""
-    present = {d.value: d for d in FormDimension}
-    where = tuple(present[d] for d in (verdict.rest_follows if verdict else ()) if d in present)
+    where = tuple(map(FormDimension, verdict.rest_follows if verdict else ()))
     return where or (FormDimension.FORCE, FormDimension.DIRECTION, FormDimension.RATE,
                      FormDimension.TIME)
-
-
-def rank_responses(responses: Sequence[PredictedResponse],
-                   hypotheses: Sequence[WeightedHypothesis], model: LinearModel | None,
-                   dimensions: Sequence[FormDimension]
-                   ) -> tuple[ManoeuvreWorth, ...]:
-    """Rank manoeuvres by their expected information per minute."""
-    samples = _Samples(model, model.fit_variants([])) if model else None
-    leaders = leading(hypotheses)
-    posteriors = [_posterior_of(h, samples, leaders, dimensions) for h in leaders]
-    total = sum(h.probability for h in leaders)
-    probabilities = [h.probability / total for h in leaders]
-    worth = [ManoeuvreWorth(r.manoeuvre, expected_information(
-        r.gram, probabilities, [_belief(p, r) for p in posteriors], _EVIDENCE_FACTOR))
-        for r in responses]
-    return tuple(sorted(worth, key=lambda w: -w.per_minute))
 
 
 def predict(manoeuvre: Experiment, sensor: Sensor, effects: Sequence[str],
@@ -239,114 +300,106 @@ def predict(manoeuvre: Experiment, sensor: Sensor, effects: Sequence[str],
     at_rate = replace(sensor, rate_hz=min(sensor.rate_hz, _RATE_HZ))
     parts = list(simulate_blocks(at_rate, manoeuvre.motion, 0, manoeuvre.begin_s))
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    time_s = columns.pop('time_s')
-    comparison = at_search_rate(compare(Recording(manoeuvre.name, time_s, columns), at_rate))
+    recording = Recording(manoeuvre.name, columns.pop('time_s'), columns)
+    comparison = at_search_rate(compare(recording, at_rate))
     model = build_linear_model([comparison], only=effects)
-    fit = model.fit_variants([])
-    keys = _keys(model)
-    places: dict[ColumnKey, int] = {}
-    blocks = []
+    filters = filters_for(model.filters, sensor.effects)
+    places: dict[Key, int] = {}
+    keys, blocks = _keys(model), []
     for number, channel in enumerate(model.columns):
         functions = model.flexible_bases[0][number]
-        scale = float(comparison.sensor.scale_v_per_g[number])
-        of_channel = [(keys[c.number], c.values) for c in channel if c.number in keys]
-        for dimension in (d for d in dimensions if d in functions):
-            of_channel += [(ColumnKey((dimension, number, i), None), scale * _UNKNOWN_G * values)
-                           for i, values in enumerate(functions[dimension].T)]
-        whitener = model.filters_of(())[number][fit.filter_indices[number]]
-        shown = np.array([v for _, v in of_channel]).T
-        grams = evidence.whiten_channel(np.zeros(len(shown)), shown, np.arange(shown.shape[1]),
+        size_v = _UNKNOWN_G * float(comparison.sensor.scale_v_per_g[number])
+        shown: dict[Key, np.ndarray] = {keys[c.number]: c.values for c in channel
+                                        if c.number in keys}
+        shown |= {(d, number, i): size_v * values for d in dimensions if d in functions
+                  for i, values in enumerate(functions[d].T)}
+        whitener = filters[number][model.null_fit.filter_indices[number]]
+        values = np.array(list(shown.values())).T
+        grams = evidence.whiten_channel(np.zeros(len(values)), values, np.arange(len(shown)),
                                         comparison.used, [whitener], by_block=False).total_grams
-        for key, _ in of_channel:
+        for key in shown:
             places.setdefault(key, len(places))
-        blocks.append((np.array([places[key] for key, _ in of_channel]),
-                       grams[0, 1:, 1:] / fit.innovation_variance_v2[number]))
+        blocks.append(([places[key] for key in shown],
+                       grams[0, 1:, 1:] / model.null_fit.innovation_variance_v2[number]))
     gram = np.zeros((len(places), len(places)))
     for ids, block in blocks:
         gram[np.ix_(ids, ids)] += block
     return PredictedResponse(manoeuvre, model, places, gram)
 
 
-def _keys(model: LinearModel) -> dict[int, ColumnKey]:
+def _keys(model: LinearModel) -> dict[int, Key]:
     """Return the key of each column of a linear model by its number."""
-    return {number: ColumnKey((v.effect, tuple(v.shape.items()), v.step), model.names[number])
+    return {number: (v.key, model.names[number])
             for v, ids in zip(model.variants, model.column_ids) if not v.limit_start
             for number in ids}
 
 
-def _posterior_of(hypothesis: WeightedHypothesis, samples: _Samples | None,
-                  others: Sequence[WeightedHypothesis], dimensions: Sequence[FormDimension]
-                  ) -> _Posterior:
-    """Return what a hypothesis knows; something unknown acts beside the best other one."""
-    if UNKNOWN in hypothesis.effects:
-        named = next((h for h in others if UNKNOWN not in h.effects), WeightedHypothesis((), 1.0))
-        effects, functions = named.effects, tuple(dimensions)
-    else:
-        effects, functions = hypothesis.effects, ()
-    if drifts_among(effects):
-        functions = tuple(dict.fromkeys((*functions, FormDimension.TIME)))
-    if samples is None:
-        return _Posterior((), np.zeros(0), np.zeros((0, 0)), effects, functions)
-    numbers = {e: samples.best_variant(e) for e in effects}
-    unseen = tuple(e for e, number in numbers.items() if number is None)
-    chosen = [number for number in numbers.values() if number is not None]
-    model = samples.linear_model
-    fit = model.fit_variants(chosen, samples.null_fit) if chosen else samples.null_fit
-    keys = _keys(model)
+def rank_responses(responses: Sequence[PredictedResponse],
+                   hypotheses: Sequence[WeightedHypothesis], model: LinearModel | None,
+                   dimensions: Sequence[FormDimension]
+                   ) -> tuple[ManoeuvreWorth, ...]:
+    """Rank manoeuvres by their expected information per minute."""
+    leaders = leading(hypotheses)
+    named = next((h.effects for h in leaders if UNKNOWN not in h.effects), ())
+    best: dict[str, int | None] = {}
+    posteriors = []
+    for hypothesis in leaders:
+        # Something unknown acts beside the best other hypothesis.
+        unknown = UNKNOWN in hypothesis.effects
+        effects = named if unknown else hypothesis.effects
+        functions = {*(dimensions if unknown else ()),
+                     *((FormDimension.TIME,) if evidence.drifts_among(effects) else ())}
+        posteriors.append(_posterior(model, effects, tuple(functions), best))
+    total = sum(h.probability for h in leaders)
+    probabilities = [h.probability / total for h in leaders]
+    worth = [ManoeuvreWorth(r.manoeuvre, expected_information(
+        r.gram, probabilities, [_belief(p, r) for p in posteriors], _EVIDENCE_FACTOR))
+        for r in responses]
+    return tuple(sorted(worth, key=lambda w: -w.per_minute))
+
+
+def _variants_of(model: LinearModel, effect: str) -> list[int]:
+    """Return the numbers of the variants of an effect."""
+    return [i for i, v in enumerate(model.variants) if v.effect == effect and not v.limit_start]
+
+
+def _posterior(model: LinearModel | None, effects: Sequence[str],
+               functions: tuple[FormDimension, ...], best: dict[str, int | None]) -> _Posterior:
+    """Return what a hypothesis knows; `best` keeps the variants of effects that fit best."""
+    if model is None:
+        return _Posterior((), np.zeros(0), np.zeros((0, 0)), tuple(effects), functions)
+    for effect in effects:
+        if effect not in best:
+            best[effect] = max(_variants_of(model, effect), default=None,
+                               key=lambda i: model.fit_variants([i], model.null_fit).log_evidence)
+    chosen = [i for e in effects if (i := best[e]) is not None]
+    fit, keys = model.fit_variants(chosen, model.null_fit), _keys(model)
     return _Posterior(tuple(keys[int(i)] for i in fit.column_ids), fit.values, fit.covariance,
-                      unseen, functions)
+                      tuple(e for e in effects if best[e] is None), functions)
 
 
 def _belief(posterior: _Posterior, response: PredictedResponse) -> Belief:
     """Return what a hypothesis knows of the columns of a manoeuvre."""
-    places = response.places
-    count = len(places)
+    places, model, keys = response.places, response.linear_model, _keys(response.linear_model)
     kept = [i for i, key in enumerate(posterior.keys) if key in places]
-    mean = np.zeros(count)
-    mean[[places[posterior.keys[i]] for i in kept]] = posterior.mean[kept]
-    roots = []
-    if kept:
-        root = np.zeros((count, len(kept)))
-        root[[places[posterior.keys[i]] for i in kept]] = _square_root(
-            posterior.covariance[np.ix_(kept, kept)])
-        roots.append(root)
-    prior_std = _prior_std(posterior, response)
-    ids = [place for place in prior_std if prior_std[place] > 0]
-    if ids:
-        root = np.zeros((count, len(ids)))
-        root[ids, range(len(ids))] = [prior_std[i] for i in ids]
-        roots.append(root)
-    return Belief(mean, np.hstack(roots) if roots else np.zeros((count, 0)))
-
-
-def _prior_std(posterior: _Posterior, response: PredictedResponse) -> dict[int, float]:
-    """Return prior standard deviations by place of what the samples so far do not determine."""
-    places, model = response.places, response.linear_model
-    keys = _keys(model)
-    chosen = []
-    for effect in posterior.unseen:
-        numbers = [i for i, v in enumerate(model.variants)
-                   if v.effect == effect and not v.limit_start]
-        # The middle one of the shapes stands for all.
-        chosen += [numbers[len(numbers) // 2]] if numbers else []
-    prior_std = model.prior(chosen)
-    determined = {places[key] for key in posterior.keys if key in places}
-    ids = {k for i in chosen for k in model.column_ids[i]} | set(model.nuisance_ids())
-    stds = {places[keys[k]]: float(prior_std[k]) for k in ids if keys[k] in places}
-    stds |= {place: 1.0 for key, place in places.items()
-             if key.name is None and key.variant[0] in posterior.dimensions}
-    return {place: std for place, std in stds.items() if place not in determined}
-
-
-def _square_root(covariance: np.ndarray) -> np.ndarray:
-    """Return a square root of a covariance, (k, k), whose units may differ by orders."""
+    at = [places[posterior.keys[i]] for i in kept]
+    mean, root = np.zeros(len(places)), np.zeros((len(places), len(kept)))
+    mean[at] = posterior.mean[kept]
+    # A square root of a covariance whose units may differ by orders.
+    covariance = posterior.covariance[np.ix_(kept, kept)]
     std = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
-    return std[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-
-
-_OTHER_REFERENCE = 'ros2 run adxl_ros diagnose next.csv --sim next_simulated.csv -o next'
-"""Command for another recording beside another reference."""
+    root[at] = std[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    # Prior standard deviations of what the samples do not determine; the middle one of the shapes
+    # of an effect stands for all.
+    chosen = [numbers[len(numbers) // 2] for effect in posterior.unseen
+              if (numbers := _variants_of(model, effect))]
+    prior_std = model.prior(chosen)
+    ids = {k for i in chosen for k in model.column_ids[i]} | set(model.nuisance_ids)
+    stds = {places[keys[k]]: float(prior_std[k]) for k in ids if keys[k] in places}
+    stds |= {place: 1.0 for key, place in places.items() if key[0] in posterior.dimensions}
+    more = np.diag([stds.get(place, 0.0) * (place not in at) for place in range(len(places))])
+    return Belief(mean, np.hstack([root, more[:, more.any(axis=0)]]))
 
 
 class ManoeuvreDescription(NamedTuple):
@@ -426,8 +479,6 @@ class NextExperiment:
     manoeuvre: str  # What to do, for people
     why: str  # The reason, for people
     command: str  # Command that simulates the manoeuvre, or that diagnoses its recording
-    # What it is expected to tell; None where nothing has to be separated
-    nats_per_minute: float | None = None
     # All manoeuvres that can be simulated, the best first; empty where nothing has to be separated
     menu: tuple[MenuWorth, ...] = ()
     # Whether the reference has to change, so that nothing can be simulated
@@ -438,14 +489,16 @@ class NextExperiment:
 def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str],
                             evidence: RecordedEvidence) -> NextExperiment | None:
     """Propose the manoeuvre that separates most of what is not separated."""
-    same = next((group for group in verdict.groups if _give_same_samples(group)), None)
+    # An error of the reference that another effect imitates.
+    same = next((g for g in verdict.groups if any(
+        effect_named(effect).diagnosis.imitated_by in g for effect in g)), None)
     if same is not None:
         return NextExperiment(
             'another sensor beside the same reference',
             f'because {" and ".join(same)} give the same samples, and what stays is of the '
             'reference', _OTHER_REFERENCE, concerns_reference=True)
-    named = [effect_named(effect) for effect in verdict.effects]
-    if verdict.status == 'explained' and any(e.diagnosis.smooths_reference for e in named):
+    hints = [effect_named(effect).diagnosis for effect in verdict.effects]
+    if verdict.status == 'explained' and any(h.smooths_reference for h in hints):
         return NextExperiment(
             'the motion with less smoothing of the reference',
             'because it lacks motion that the sensor has', _OTHER_REFERENCE,
@@ -454,82 +507,56 @@ def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str],
         return _separating_experiment(verdict, evidence)
     if verdict.status == 'no_gap' and not not_covered:
         return None
+    why = 'to confirm the verdict on another recording'
     if verdict.status == 'unknown':
         why = 'to show what the unknown part of the gap depends on'
     elif not_covered:
         why = f'because the recordings have no {", no ".join(not_covered)}'
-    else:
-        why = 'to confirm the verdict on another recording'
-    return _experiment(_revealing_manoeuvre(verdict, bool(not_covered)), why,
-                       evidence.beside_simulator)
-
-
-def _give_same_samples(group: Sequence[str]) -> bool:
-    """Determine whether a group has an error of the reference that another effect imitates."""
-    return any(effect_named(effect).diagnosis.imitated_by in group for effect in group)
+    revealed_by = [h.revealed_by for h in hints]
+    best = max(MENU, key=revealed_by.count)
+    if best not in revealed_by:
+        best = Manoeuvre.SPEEDS if verdict.status == 'unknown' or not not_covered \
+            else Manoeuvre.PLANES
+    return _experiment(best, why, evidence.beside_simulator)
 
 
 def _separating_experiment(verdict: Verdict, evidence: RecordedEvidence) -> NextExperiment:
     """Rank the whole menu by its expected information; propose the best manoeuvre."""
-    hypotheses = leading(verdict.hypotheses)
-    effects = sorted({effect for h in hypotheses for effect in h.effects})
-    dimensions = unknown_dimensions(verdict)
+    effects = sorted({effect for h in leading(verdict.hypotheses) for effect in h.effects})
+    dimensions, no_stage = unknown_dimensions(verdict), evidence.beside_simulator
+    planned = {described.text: MenuManoeuvre(manoeuvre, trajectories.TRAJECTORIES[
+        described.trajectory](np.random.default_rng(evidence.seed)))
+        for manoeuvre, described in MENU.items()}
     responses = []
-    for planned in _menu(evidence.seed):
+    for manoeuvre in planned.values():
         # At rest the pose is unknown, so that a baseline with effects of the stage has no place.
         with suppress(UserError):
-            responses.append(predict(
-                planned, _as_mounted(evidence.sensor, planned.manoeuvre), effects, dimensions))
-    of_text = {described.text: manoeuvre for manoeuvre, described in MENU.items()}
-    ranked = [(worth, of_text[worth.manoeuvre.name]) for worth in rank_responses(
-        responses, hypotheses, evidence.linear_model, dimensions)]
-    group, has_no_stage = verdict.groups[0], evidence.beside_simulator
-    why = f'to separate {", ".join(group[:-1])} and {group[-1]}'
-    menu = tuple(MenuWorth(_text(manoeuvre, has_no_stage), float(worth.manoeuvre.minutes),
-                           float(worth.per_minute)) for worth, manoeuvre in ranked)
-    return replace(_experiment(ranked[0][1], why, has_no_stage), menu=menu,
-                   nats_per_minute=menu[0].nats_per_minute)
+            responses.append(predict(manoeuvre, _remounted(evidence.sensor) if MENU[
+                manoeuvre.manoeuvre].remounted else evidence.sensor, effects, dimensions))
+    ranked = rank_responses(responses, verdict.hypotheses, evidence.linear_model, dimensions)
+    group = verdict.groups[0]
+    best = planned[ranked[0].manoeuvre.name].manoeuvre
+    return replace(_experiment(
+        best, f'to separate {", ".join(group[:-1])} and {group[-1]}', no_stage), menu=tuple(
+        MenuWorth(_text(planned[w.manoeuvre.name].manoeuvre, no_stage),
+                  float(w.manoeuvre.minutes), float(w.per_minute)) for w in ranked))
 
 
-def _menu(seed: int) -> list[MenuManoeuvre]:
-    """Return the manoeuvres of the menu with their motions."""
-    return [MenuManoeuvre(manoeuvre, trajectories.TRAJECTORIES[described.trajectory](
-        np.random.default_rng(seed))) for manoeuvre, described in MENU.items()]
-
-
-def _as_mounted(sensor: Sensor, manoeuvre: Manoeuvre) -> Sensor:
-    """Return the sensor as it is mounted in a manoeuvre."""
-    return _remounted(sensor) if MENU[manoeuvre].remounted else sensor
-
-
-def _revealing_manoeuvre(verdict: Verdict, lacks_coverage: bool) -> Manoeuvre:
-    """Return the manoeuvre that reveals most of the effects of a verdict."""
-    revealed_by = [effect_named(e).diagnosis.revealed_by for e in verdict.effects]
-    best = max(MENU, key=revealed_by.count)
-    if best in revealed_by:
-        return best
-    return Manoeuvre.SPEEDS if verdict.status == 'unknown' or not lacks_coverage \
-        else Manoeuvre.PLANES
-
-
-def _text(manoeuvre: Manoeuvre, beside_simulator: bool) -> str:
+def _text(manoeuvre: Manoeuvre, no_stage: bool) -> str:
     """Return what to do in a manoeuvre, for people."""
-    described = MENU[manoeuvre]
-    return described.robot_text if beside_simulator else described.text
+    return MENU[manoeuvre].robot_text if no_stage else MENU[manoeuvre].text
 
 
-def _experiment(manoeuvre: Manoeuvre, why: str, beside_simulator: bool) -> NextExperiment:
+def _experiment(manoeuvre: Manoeuvre, why: str, no_stage: bool) -> NextExperiment:
     """Describe a manoeuvre with its command."""
-    described = MENU[manoeuvre]
-    if beside_simulator:
-        return NextExperiment(described.robot_text, why, _OTHER_REFERENCE, beside_simulator=True)
-    option = ''
+    described, option, text = MENU[manoeuvre], '', _text(manoeuvre, no_stage)
+    if no_stage:
+        return NextExperiment(text, why, _OTHER_REFERENCE, beside_simulator=True)
     if described.remounted:
         effect = _remounting_effect()
         option = f' --effect {effect.name}:{effect.diagnosis.half_turn}={np.pi:.6f}'
     return NextExperiment(
-        described.text, why,
-        f'ros2 run adxl_ros simulate {described.trajectory}{option} -o next.csv')
+        text, why, f'ros2 run adxl_ros simulate {described.trajectory}{option} -o next.csv')
 
 
 def _remounting_effect() -> Effect:
@@ -539,9 +566,7 @@ def _remounting_effect() -> Effect:
 
 def _remounted(sensor: Sensor) -> Sensor:
     """Turn the sensor on its stage by half a turn: the encoder's zero changes by π."""
-    effect = _remounting_effect()
-    turned = with_neutral(sensor, [effect.name])
-    values = dict(turned.values[effect.name])
-    parameter = effect.diagnosis.half_turn
-    values[parameter] = np.asarray(values[parameter]) + np.pi
-    return replace(turned, values={**turned.values, effect.name: values})
+    name, parameter = (effect := _remounting_effect()).name, effect.diagnosis.half_turn
+    turned = with_neutral(sensor, [name])
+    return with_values(turned, name, {parameter: np.asarray(
+        turned.values[name][parameter]) + np.pi})

@@ -1,114 +1,105 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is known of the reference: empty cells, too coarse sampling, and fading."""
+"""
+What is known of the reference: its time, empty cells, too coarse sampling, and fading.
+
+The force of another simulator may have another clock. A large shift is a fault of the files. A
+small one may be the latency of the sensor, which is an effect of the library: it is left alone.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from os.path import basename
 
 from adxl_ros.diagnose.comparison import (
     BaselineComparison,
+    compare,
     Reference,
     SMALLEST_MOTION_G,
 )
-from adxl_ros.diagnose.noise_effects import code_step_v
 from adxl_ros.files.recording_columns import JOINTS, Recording
 from adxl_ros.files.reference_alignment import LONGEST_MOVE_NS, USUAL_GAPS
 from adxl_ros.model import noise
-from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import true_runs
+from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.smoothed_paths import BAND_LIMITED_DEGREE, ForcePath, KNOT_S
 import numpy as np
 import scipy
 
-LONGEST_BRIDGE_S = LONGEST_MOVE_NS / 1e9
-"""Longest time without a reading of a joint, s, that is bridged: as between messages of a bag."""
-_SLOWEST_S = 1.0
-"""Longest distance of readings, s, that may be the rate of a slow encoder. Chosen: a move."""
-LONGEST_SLOW_BRIDGE_S = 10.0
-"""The same for temperature and supply. Chosen: a board warms by less than 0.1 K."""
+SHORTEST_S = 30.0
+"""Shortest time, s, that the recordings of a moving sensor last together. Chosen: a few turns of
+the stage."""
+LARGEST_LATENCY_S = 0.1
+"""Largest shift, s, that may be a latency of the sensor. Chosen: twenty times the typical delay of
+`time_offset`; a buffer of ten samples at 100 Hz has it."""
+_SEARCH_STEP_S, _LONGEST_SEARCH = 0.02, 1 << 20
+"""Step of the first search of a shift, s, and its largest number of steps. Chosen: well below the
+largest latency, and six hours."""
+CORRELATED = 0.9
+"""Correlation from which two motions are the same one. Chosen: noise of half the motion."""
+_SAME_CORRELATION = 0.01
+"""Correlations that differ by less are equal, and the one of the longest overlap counts. Chosen: a
+motion that repeats fits at several shifts."""
+_LARGEST_ERROR_RATIO = 0.5
+"""A shift shows if it reduces 1 − correlation below this share. Chosen: noise that is not shifted
+keeps it."""
+_ROUNDS, _BLOCKS, _FINE_SAMPLES = 6, 10, 20_000
+"""Gauss-Newton steps, blocks and samples of the fine search. Chosen: the shift then changes by
+less than 1 µs, and the scatter of the blocks shows its error to 24 %."""
+_LONGEST_BRIDGE_S, _LONGEST_SLOW_BRIDGE_S, _SLOWEST_S = LONGEST_MOVE_NS / 1e9, 10.0, 1.0
+"""Longest time without a reading that is bridged, s: of a joint as between messages of a bag; of
+temperature and supply; and of a slow encoder, whose readings are a move apart at most."""
 _BEFORE_S, _AFTER_S = 0.1, 0.3
-"""Times that are left out beside a gap in which a joint moves, s. Chosen: the spline is uncertain
-before it, and an RC filter of 15 Hz has settled after it."""
-_FEWEST_CHANGES = 100
-"""Fewest changes of a reading that show the step of its encoder. Chosen: two turns by hand."""
-_LARGEST_STEP_RAD = 0.02
-"""Largest step of an encoder, rad. Chosen: 1°; poses of a table differ by more."""
-_COARSER = 1.05
-"""Seen step, divided by the stated one, from which it counts. Chosen: 1/12° may be 0.083°."""
-_ROUNDING_ERROR = 1e-9
-"""Change of a reading, rad or m, that is a rounding error. Chosen: text files have larger ones."""
-_SAME_POSE = 1e-4
-"""Change of a joint, rad or m, that is the same pose. Chosen: 0.1 mg."""
-_LAG_S, _SLOW = 0.02, 3.0
-"""Lag of differences, s, and standard deviation of the output, divided by theirs, up to which it
-rests. Chosen: an RC filter has forgotten its noise, and motion below 2 Hz exceeds it."""
+"""Times that are left out beside a gap, s. Chosen: the spline is uncertain before it, and an RC
+filter of 15 Hz has settled after it."""
+_FEWEST_CHANGES, _LARGEST_STEP_RAD, _COARSER = 100, 0.02, 1.05
+"""Fewest changes of a reading that show the step of its encoder, its largest step, rad, and the
+ratio to the stated one from which it counts. Chosen: two turns by hand; 1°; 1/12° may be 0.083°.
+"""
 _WHOLE, _WHOLE_SHARE = 0.2, 0.9
 """Deviation from whole steps, and share of the changes within it, by encoders. Chosen: 40 % of the
 changes of exact readings are within it."""
-_SAME_STEPS = 2.0
-"""Steps of the encoder by which a reading may change over a gap without a move. Chosen: both
-readings scatter by one."""
-_WINDOW_S = 1.0
-"""Length of a window whose spectrum is taken, s. Chosen: shorter than a move."""
-_WINDOW_READINGS = 64
-"""Fewest readings of a window. Chosen: a shaker then has some periods in it."""
+_SAME_POSE, _SAME_STEPS = 1e-4, 2.0
+"""Change of a joint over a gap without a move, rad or m, and in steps of its encoder. Chosen:
+0.1 mg, and two readings that scatter by one step."""
+_LAG_S, _SLOW = 0.02, 3.0
+"""Lag of differences, s, and standard deviation of the output, divided by theirs, up to which it
+rests. Chosen: an RC filter has forgotten its noise, and motion below 2 Hz exceeds it."""
+_WINDOW_S, _SHORTEST_WINDOW = 1.0, 64
+"""Length of a window whose spectrum is taken, s and readings. Chosen: shorter than a move, and
+some periods of a shaker."""
 _LARGEST_ERROR = 0.3
 """Error of the force by the spline, divided by the noise, up to which a window is used. Chosen: it
 adds 4 % to the noise."""
 _ENCODER_SQUARES = 3.0
 """Mean square of what looks like motion by the steps of an encoder, divided by step²/12, that is
 accepted. Chosen: the steps are not white in slow motion."""
-_SAME_MOTION = 2.0
-"""Ratio of the recorded to the simulated motion beside a part that is too coarse, from which it is
-an alias. Chosen: an alias below 0.2 of the rate has a ratio of 4."""
-_USUAL_QUANTILE = 0.9
-"""Quantile of the gaps that stands for the distance of uneven readings. Chosen: single lost ones
-do not count."""
-_EVEN_READINGS = 0.02
-"""Range of the gaps, divided by the usual one, up to which readings are even. Chosen: far above
-rounding errors."""
-_MOVES = 3.0
-"""Motion, divided by the noise, from which an alias is looked for. Chosen: noise alone has 1."""
-_ABRUPT = 10.0
-"""Fourth difference of a force, divided by its median around, of a jump. Chosen: vibrations and
-noise stay below 8."""
-_LARGEST_JUMP = 0.03
-"""Error of a jump, divided by the noise, up to which it is used. Chosen: a tenth of that of a
-window, because the errors of jumps have one sign."""
-_AROUND_S = 0.5
-"""Time whose fourth differences are usual, s. Chosen: a move is longer."""
-_JUMP_DIFFERENCE = 6.0
-"""Fourth difference of a jump, divided by the largest error of its time. Chosen: a jump of 1 has a
-difference of 3, and half of it may be on the other side of a reading."""
-_SETTLED_TAU = 5.0
-"""Time constants of the sensor that are left out after a jump. Chosen: 1 % of the error stays."""
+_SAME_MOTION, _MOVES = 2.0, 3.0
+"""Ratio of recorded and simulated motion from which one is an alias, and motion, divided by the
+noise, from which that counts. Chosen: an alias below 0.2 of the rate has a ratio of 4."""
 _IMAGES = np.arange(-8, 9)
 """Orders of the images of a spline that are summed. Chosen: the rest is below 1e-6."""
 _NAMED_PARTS = 4
 """Parts that a note names. Chosen: it stays one or two lines."""
-_SPECTRUM_S = 1.0
-"""Length of the windows of the spectra, s. Chosen: it separates frequencies of 1 Hz."""
-_SHORTEST_WINDOW = 64
-"""Fewest samples of a window. Chosen: 33 frequencies."""
-_USED = 0.9
-"""Share of the samples of a window that are compared. Chosen: jumps of the force take a few."""
-_FEWEST_WINDOWS = 20
-"""Fewest windows. Chosen: noise then has a coherence of 0.05."""
-_QUIET = 0.1
-"""Share of the windows, those of the smallest power, that show the noise. Chosen: a recording
-begins with a rest of some seconds."""
-_BAND = 2
-"""Frequencies that are averaged. Chosen: 2 Hz, so that a line of the mains is one value."""
-_MOTION = 10.0
-"""Power, divided by that of the noise, from which motion shows. Chosen: far above its scatter."""
-_COHERENCE = 0.5
-"""Coherence from which the recording follows the reference. Chosen: half of the power."""
-_GAIN = 1.5
-"""Gain of the recording over the reference, beyond that of a missing RC filter, that no sensor
-has. Chosen: a third of the motion is then missing."""
-_FADED = 0.5
-"""Power of the reference, divided by the recorded one, below which it has faded."""
+_FEWEST_WINDOWS, _BAND_HZ = 20, 2.0
+"""Fewest windows, and width of the bands, Hz, by which fading is judged. Chosen: noise then has a
+coherence of 0.05, and a line of the mains is one value."""
+_MOTION, _COHERENCE, _GAIN, _FADED = 10.0, 0.5, 1.5, 0.5
+"""Power over noise from which motion shows; coherence from which a recording follows its
+reference; gain over it that no sensor has; and power of the reference, divided by the recorded
+one, below which it has faded. Chosen."""
+
+
+@dataclass(frozen=True)
+class DataFault:
+    """A fault of the recording."""
+
+    name: str  # Name in the report: `verdict.data_fault`
+    status: str  # Status of the verdict: 'bad_data' or 'insufficient'
+    message: str  # What is wrong and what to do, one line
 
 
 @dataclass(frozen=True)
@@ -129,308 +120,222 @@ class LeftOut:
         return f'left out: {total_s:.3g} s ({parts}{others}): {self.reason}'
 
 
-def without_reading(recording: Recording, comparison: BaselineComparison) -> list[LeftOut]:
+@dataclass(frozen=True)
+class _Shift:
+    """How much later the motion of a simulator is stamped than that of a recording."""
+
+    late_s: float  # The shift, s; negative where the simulator is early
+    std_s: float  # Its standard deviation, s
+    correlation: float  # Correlation of the two motions without the shift
+
+    @property
+    def text(self) -> str:
+        """Return the shift with its 90 % error and correlation, for people."""
+        return (f'{abs(self.late_s):.4f} s {"late" if self.late_s > 0 else "early"} '
+                f'(± {Z_90 * self.std_s:.4f} s, correlation {self.correlation:.3f})')
+
+
+def align_force(recording: Recording, sensor: Sensor, sim: Motion, may_shift: bool
+                ) -> tuple[Recording, Motion, list[str]] | DataFault:
+    """
+    Find the part of a recording that another simulator covers, and check their time.
+
+    Return that part, the simulator, shifted where it was asked for, and notes.
+    """
+    force, notes = sim.force, []
+    assert isinstance(force, ForcePath)
+    shift = _find_shift(recording, replace(sensor, rate_hz=recording.rate_hz), force)
+    if shift is not None and may_shift:
+        force = force.shifted(-shift.late_s)
+        notes = [f'--align: --sim was {shift.text}, and is shifted by {-shift.late_s:+.6g} s; a '
+                 'latency of the sensor is a part of that and cannot show']
+    elif may_shift:
+        notes = [f'--align: no shift beyond {LARGEST_LATENCY_S:g} s was found; less may be an '
+                 'effect of the sensor (time_offset), and nothing is shifted']
+    begin_s, end_s = force.time_s[0], force.time_s[-1]
+    covered = (recording.time_s >= begin_s) & (recording.time_s <= end_s)
+    if not covered.any():
+        advice = f'its motion fits, but is {shift.text}; use --align' if shift is not None else \
+            'no shift makes its motion fit; give the simulation of this recording'
+        return DataFault('no_overlap', 'bad_data', '--sim does not overlap the recording in '
+                         f'time: {basename(recording.path)} is from {recording.time_s[0]:.6g} '
+                         f'to {recording.time_s[-1]:.6g} s, --sim from {begin_s:.6g} to '
+                         f'{end_s:.6g} s; {advice}')
+    if shift is not None and not may_shift:
+        return DataFault('time_misaligned', 'bad_data', f'--sim is {shift.text}; use --align, or '
+                         f'shift its stamps by {-shift.late_s:+.6g} s')
+    if not covered.all():
+        outside_s = (1 - covered.mean()) * float(np.ptp(recording.time_s))
+        notes.append(f'left out: {outside_s:.3g} s of the recording that --sim does not cover '
+                     f'(it is from {begin_s:.6g} to {end_s:.6g} s)')
+    return _between(recording, begin_s, end_s), replace(sim, force=force), notes
+
+
+def _between(recording: Recording, begin_s: float, end_s: float) -> Recording:
+    """Return the samples of a recording between two times."""
+    return recording.rows(int(np.searchsorted(recording.time_s, begin_s)),
+                          int(np.searchsorted(recording.time_s, end_s, 'right')))
+
+
+def _find_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> _Shift | None:
+    """
+    Return the shift of a simulator from the cross-correlation of both motions over all overlaps.
+
+    None where it may be a latency, or does not show.
+    """
+    measured_g = recording.volts(sensor) / sensor.nominal_scale_v_per_g
+    finite = np.isfinite(measured_g).all(axis=1)
+    if finite.sum() < 2:
+        return None
+    time_s, sim_s = recording.time_s[finite], force.time_s
+    step_s = max(_SEARCH_STEP_S, (np.ptp(time_s) + np.ptp(sim_s)) / _LONGEST_SEARCH)
+    first_s, second_s = (np.arange(t[0], t[-1], step_s) for t in (time_s, sim_s))
+    first = np.column_stack([np.interp(first_s, time_s, g) for g in measured_g[finite].T])
+    second = np.column_stack(force(second_s))[:, :first.shape[1]] / G0_MPS2
+    shortest_s = min(SHORTEST_S, np.ptp(time_s) / 2, np.ptp(sim_s) / 2)
+    lags, overlap, correlation = correlations(first, second, max(round(shortest_s / step_s), 2))
+    lags_s = second_s[0] - first_s[0] + lags * step_s
+    equal = np.flatnonzero(correlation > correlation.max() - _SAME_CORRELATION)
+    longest_s = lags_s[equal[np.argmax(overlap[equal])]]
+    best = int(np.argmax(np.where(np.abs(lags_s - longest_s) < 1.0, correlation, -1.0)))
+    unshifted = int(np.argmin(np.abs(lags_s)))
+    if correlation[best] < CORRELATED or (
+            abs(lags_s[unshifted]) < step_s and 1 - correlation[best]
+            > _LARGEST_ERROR_RATIO * (1 - correlation[unshifted])):
+        return None
+    fine = _fine_shift(recording, sensor, force, float(lags_s[best]), float(correlation[best]))
+    return fine if fine is not None and abs(fine.late_s) > LARGEST_LATENCY_S else None
+
+
+def correlations(first: np.ndarray, second: np.ndarray, smallest: int
+                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """
+    Correlate two motions, g, (n, m) and (n', m), at all lags, each over the samples that overlap.
+
+    Sample i of the first meets sample i + lag of the second. Return lags, counts of samples that
+    overlap, and correlations, −1 where fewer than `smallest` overlap or one does not move.
+    """
+    def products(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return scipy.signal.correlate(b, a, method='fft')
+
+    one, two = np.ones(len(first)), np.ones(len(second))
+    overlap = np.maximum(np.rint(products(one, two)), 1)
+    covariance, squares = np.zeros(len(overlap)), np.zeros((2, len(overlap)))
+    for a, b in zip((first - first.mean(axis=0)).T, (second - second.mean(axis=0)).T):
+        sum_a, sum_b = products(a, two), products(one, b)
+        covariance += np.abs(products(a, b) - sum_a * sum_b / overlap)
+        squares[0] += products(a * a, two) - sum_a ** 2 / overlap
+        squares[1] += products(one, b * b) - sum_b ** 2 / overlap
+    smallest_square = SMALLEST_MOTION_G ** 2 * overlap
+    compared = (overlap >= smallest) & (squares > smallest_square).all(axis=0)
+    correlation = covariance / np.sqrt(np.maximum(squares, smallest_square).prod(axis=0))
+    return (scipy.signal.correlation_lags(len(second), len(first)), overlap,
+            np.where(compared, correlation, -1.0))
+
+
+def _fine_shift(recording: Recording, sensor: Sensor, force: ForcePath, late_s: float,
+                correlation: float) -> _Shift | None:
+    """Fit shift, zero-g and scale factor to blocks of the recording, from a rough shift."""
+    begin_s, end_s = force.time_s[0] - late_s, force.time_s[-1] - late_s
+    comparison = compare(_between(recording, begin_s, end_s), sensor,
+                         Motion(float(end_s - begin_s), force=force.shifted(-late_s)))
+    time_s, volts = comparison.time_s, comparison.volts
+    simulated_v = comparison.simulated_v(comparison.sensor)
+    slope_v = np.gradient(simulated_v, time_s, axis=0)
+    # The ends may need values from outside.
+    inside = np.isfinite(volts).all(axis=1) & (time_s > time_s[0] + LARGEST_LATENCY_S) \
+        & (time_s < time_s[-1] - LARGEST_LATENCY_S)
+    rows = np.flatnonzero(inside)[::max(1, len(recording) // _FINE_SAMPLES)]
+    more_s, scatter = 0.0, np.zeros(1)
+    for _ in range(_ROUNDS):
+        at_s = time_s[rows] + more_s
+        products, weights = np.zeros((2, _BLOCKS))
+        for measured, simulated, slope in zip(volts[rows].T, simulated_v.T, slope_v.T):
+            series = np.column_stack([measured, np.interp(at_s, time_s, simulated),
+                                      np.interp(at_s, time_s, slope)])
+            for i, part in enumerate(np.array_split(series, _BLOCKS)):
+                line = np.column_stack([np.ones(len(part)), part[:, 1]])
+                residual, rest = (part[:, [0, 2]] - line @ np.linalg.lstsq(
+                    line, part[:, [0, 2]])[0]).T
+                products[i] += residual @ rest
+                weights[i] += rest @ rest
+        if not weights.sum():
+            return None
+        step_s = float(products.sum() / weights.sum())
+        more_s += float(np.clip(step_s, -LARGEST_LATENCY_S, LARGEST_LATENCY_S))
+        scatter = (products - step_s * weights) / weights.sum()
+    return _Shift(late_s + more_s, float(np.sqrt(np.sum(scatter ** 2))), correlation)
+
+
+def _in_gaps(time_s: np.ndarray, read_s: np.ndarray, longest_s: float
+             ) -> Iterable[tuple[int, int]]:
+    """
+    Yield the samples, begin and end, in gaps between readings that are not bridged.
+
+    Before the first reading and after the last, the ends of the recording count.
+    """
+    ends_s = np.concatenate([[min(time_s[0], read_s[0])], read_s, [max(time_s[-1], read_s[-1])]])
+    for i in np.flatnonzero(np.diff(ends_s) > longest_s):
+        yield (int(np.searchsorted(time_s, ends_s[i], 'right' if i else 'left')),
+               int(np.searchsorted(time_s, ends_s[i + 1], 'right' if i > len(read_s) - 1
+                                   else 'left')))
+
+
+def without_reading(comparison: BaselineComparison, columns: dict[str, np.ndarray]
+                    ) -> list[LeftOut]:
     """Find samples in gaps of another simulator, of temperature and of supply."""
-    readings = {name: (recording.time_s[np.isfinite(values)], LONGEST_SLOW_BRIDGE_S)
-                for name, values in recording.columns.items()
-                if name in ('temperature_c', 'supply_v')}
-    force = comparison.motion.force
-    if comparison.reference is Reference.SIMULATOR and isinstance(force, ForcePath):
-        readings['--sim'] = force.time_s, LONGEST_BRIDGE_S
-    left_out = []
+    time_s, force, left_out = comparison.time_s, comparison.motion.force, []
+    readings: dict[str, tuple[np.ndarray, float]] = {
+        name: (time_s[np.isfinite(columns[name])], _LONGEST_SLOW_BRIDGE_S)
+        for name in ('temperature_c', 'supply_v') if name in columns}
+    if isinstance(force, ForcePath):
+        readings['--sim'] = force.time_s, _LONGEST_BRIDGE_S
     for name, (read_s, longest_s) in readings.items():
         if len(read_s) < 2:
             continue
         limit_s = max(longest_s, USUAL_GAPS * float(np.median(np.diff(read_s))))
-        after = np.searchsorted(read_s, recording.time_s)
-        begins_s, ends_s = (np.concatenate(edges)[after] for edges in (
-            ([-np.inf], read_s), (read_s, [np.inf])))
-        # Before the first reading and after the last, the ends of the recording count.
-        begins_s = np.maximum(begins_s, min(recording.time_s[0], read_s[0]))
-        ends_s = np.minimum(ends_s, max(recording.time_s[-1], read_s[-1]))
-        unknown = (ends_s - begins_s > limit_s) & (recording.time_s < ends_s)
-        margin = (_BEFORE_S, _AFTER_S) if name == '--sim' else (0.0, 0.0)
+        beside = name == '--sim'
+        unknown = np.zeros(len(time_s), bool)
+        for begin, end in _in_gaps(time_s, read_s, limit_s):
+            if end > begin:
+                unknown |= (time_s >= time_s[begin] - beside * _BEFORE_S) & (
+                    time_s <= time_s[end - 1] + beside * _AFTER_S)
         if unknown.any():
-            for begin, end in true_runs(unknown):
-                unknown |= ((recording.time_s > recording.time_s[begin] - margin[0])
-                            & (recording.time_s < recording.time_s[end - 1] + margin[1]))
             left_out.append(LeftOut(unknown, f'no reading of {name} for more than '
                                     f'{limit_s:.3g} s'))
     return left_out
-
-
-def too_coarse(recording: Recording, comparison: BaselineComparison) -> list[LeftOut]:
-    """Find samples at which the reference moves faster than its readings show."""
-    sensor, time_s, force = comparison.sensor, recording.time_s, comparison.motion.force
-    noise_g = float(np.min(noise.analog_std_v(sensor) / sensor.scale_v_per_g))
-    limit_g = _LARGEST_ERROR * max(noise_g, float(np.min(sensor.lsb_v / sensor.scale_v_per_g)))
-    left_out: list[LeftOut] = []
-
-    def leave_out(name: str, read_s: np.ndarray, error_g: np.ndarray, largest_g: float,
-                  advice: str = '') -> None:
-        """Add the windows whose error exceeds a limit."""
-        coarse = np.interp(time_s, read_s, error_g) > largest_g
-        if coarse.any():
-            rate_hz = 1 / float(np.median(np.diff(read_s)))
-            coarse = _with_aliases(comparison, coarse, noise_g)
-            # The motion begins and ends within a window.
-            margin = round(_WINDOW_S / 2 * sensor.rate_hz)
-            coarse = np.convolve(coarse, np.ones(2 * margin + 1), 'same') > 0.5
-            left_out.append(LeftOut(
-                coarse, f'{name} moves too fast for its {rate_hz:.4g} readings a second (error '
-                f'up to {1e3 * error_g.max():.2g} mg){advice}'))
-
-    if comparison.reference is Reference.SIMULATOR and isinstance(force, ForcePath):
-        jumps, jump_g = _jumps(sensor, force, _LARGEST_JUMP * noise_g)
-        if jumps.any():
-            left_out.append(LeftOut(
-                _after_jumps(time_s, sensor, force.time_s, jumps), '--sim jumps between its '
-                f'readings (error up to {1e3 * jump_g:.2g} mg); write it at a higher rate'))
-        squares = [_spline_error(force.time_s, f / G0_MPS2, 3, 0, 0.0, jumps) ** 2
-                   for f in force(force.time_s)[:len(sensor.axes)]]
-        leave_out('--sim', force.time_s, np.sqrt(np.max(squares, axis=0)), limit_g,
-                  '; write it at a higher rate, and switch off noise that the simulator adds')
-    if comparison.reference is Reference.STAGE:
-        step_rad = sensor.stage_resolution_rad
-        for joint, name in JOINTS.items():
-            values = recording.columns.get(name, np.zeros(0))
-            sampled = np.isfinite(values)
-            if sampled.sum() < 2 or np.ptp(values[sampled]) == 0:
-                continue
-            sampled, unknown = np.flatnonzero(sampled), ~comparison.used[sampled]
-            if joint == 'shift':
-                error_g = _spline_error(time_s[sampled], values[sampled] / G0_MPS2,
-                                        BAND_LIMITED_DEGREE, 2, 0.0, unknown)
-                leave_out(name, time_s[sampled], error_g, limit_g)
-            else:
-                error_g = _spline_error(time_s[sampled], values[sampled], 5, 0,
-                                        KNOT_S if step_rad else 0.0, unknown)
-                leave_out(name, time_s[sampled], error_g,
-                          np.sqrt(limit_g ** 2 + _ENCODER_SQUARES * step_rad ** 2 / 12))
-    return left_out
-
-
-def _jumps(sensor: Sensor, force: ForcePath, largest_g: float) -> tuple[np.ndarray, float]:
-    """Find jumps of a simulator's force, whose exact time is unknown."""
-    step_s = float(np.median(np.diff(force.time_s)))
-    around = max(round(_AROUND_S / step_s), 2) // 2 * 2 + 1
-    # The filter of the sensor averages what is uncertain for a part of a step.
-    tau_s = float(np.max(noise.electronics(sensor)[0]))
-    error_per_difference = step_s / (step_s + 2 * tau_s) / _JUMP_DIFFERENCE
-    jumps, largest = np.zeros(len(force.time_s), bool), 0.0
-    for values in force(force.time_s)[:len(sensor.axes)]:
-        fourth = np.abs(_fourth_differences(values / G0_MPS2))
-        error_g = error_per_difference * fourth
-        abrupt = (error_g > largest_g) & (
-            fourth > _ABRUPT * scipy.ndimage.median_filter(fourth, around))
-        largest = max(largest, float(np.max(error_g[abrupt], initial=0.0)))
-        jumps |= scipy.ndimage.binary_dilation(abrupt, iterations=2)
-    return jumps, largest
-
-
-def _after_jumps(time_s: np.ndarray, sensor: Sensor, read_s: np.ndarray, jumps: np.ndarray
-                 ) -> np.ndarray:
-    """Return which samples, s, (n,), follow jumps among readings, s, (k,), before they settle."""
-    settling_s = _SETTLED_TAU * float(np.max(noise.electronics(sensor)[0]))
-    rows = np.zeros(len(time_s), bool)
-    for begin, end in true_runs(jumps):
-        rows |= (time_s >= read_s[begin]) & (time_s <= read_s[end - 1] + settling_s)
-    return rows
-
-
-def _fourth_differences(values: np.ndarray) -> np.ndarray:
-    """Return fourth differences around readings, (k,)."""
-    return np.diff(values, 4, prepend=values[:2], append=values[-2:])[:len(values)]
-
-
-def _spline_error(read_s: np.ndarray, values: np.ndarray, degree: int, order: int, knots_s: float,
-                  jumps: np.ndarray | None = None) -> np.ndarray:
-    """
-    Return how much a spline through readings may differ from what was read, by its spectrum.
-
-    A cardinal spline reproduces the frequency ν, in units of the rate, with the gain
-    sinc(ν)ⁿ/Σ sinc(ν + k)ⁿ, n = degree + 1. The other terms of the sum are its images.
-    """
-    gaps_s = np.diff(read_s)
-    step_s = float(np.median(gaps_s))
-    wide = np.flatnonzero(gaps_s > max(LONGEST_BRIDGE_S, USUAL_GAPS * step_s)) + 1
-    spacing = max(knots_s, float(np.quantile(gaps_s, _USUAL_QUANTILE))) / step_s
-    left_out = np.zeros(len(values), bool) if jumps is None else jumps
-    errors = []
-    for times_s, part, ignored in zip(*(np.split(array, wide)
-                                        for array in (read_s, values, left_out))):
-        if len(part) > 1 and np.ptp(np.diff(times_s)) > _EVEN_READINGS * step_s:
-            even_s = np.arange(times_s[0], times_s[-1], step_s)
-            even = _windowed_error(scipy.interpolate.CubicSpline(times_s, part)(even_s), step_s,
-                                   np.interp(even_s, times_s, ignored) > 0, spacing, degree, order)
-            errors.append(np.interp(times_s, even_s, even))
-        else:
-            errors.append(_windowed_error(part, step_s, ignored, spacing, degree, order))
-    return np.concatenate(errors)
-
-
-def _windowed_error(values: np.ndarray, step_s: float, ignored: np.ndarray, spacing: float,
-                    degree: int, order: int) -> np.ndarray:
-    """Return the error of a spline in windows of even readings."""
-    size = max(round(_WINDOW_S / step_s), _WINDOW_READINGS) // 2 * 2
-    if len(values) < size:
-        return np.zeros(len(values))
-    # Differences keep slow motion from leaking into high frequencies.
-    differences = np.where(ignored, 0.0, _fourth_differences(values))
-    cycles = np.fft.rfftfreq(size)[1:]
-    gain = _error_gain(cycles * spacing, degree, order) \
-        * (2 * np.pi * cycles / step_s) ** order / (2 * np.sin(np.pi * cycles)) ** 4
-    window = np.hanning(size)
-    starts = np.arange(0, len(values) - size + 1, size // 2)
-    errors = np.empty(len(starts))
-    for i, start in enumerate(starts):
-        spectrum = np.abs(np.fft.rfft(differences[start:start + size] * window))[1:]
-        errors[i] = np.sqrt(2 * np.sum((gain * spectrum) ** 2) / size / np.sum(window ** 2))
-    # A reading counts in all windows that hold it.
-    halves = np.concatenate([errors[:1], np.maximum(errors[1:], errors[:-1]), errors[-1:]])
-    return halves[np.minimum(np.arange(len(values)) // (size // 2), len(halves) - 1)]
-
-
-def _error_gain(cycles: np.ndarray, degree: int, order: int) -> np.ndarray:
-    """Return the error of a derivative of a cardinal spline, divided by it, (k,)."""
-    followed = np.minimum(cycles, 0.5)
-    weights = np.sinc(followed + _IMAGES[:, None]) ** (degree + 1)
-    weights /= weights.sum(axis=0)
-    middle = np.flatnonzero(_IMAGES == 0)[0]
-    images = weights * ((followed + _IMAGES[:, None]) / followed) ** order
-    lost = 1 - weights[middle]
-    images[middle] = 0.0
-    error = np.sqrt(lost ** 2 + np.sum(images ** 2, axis=0))
-    # Beyond half the rate of the knots nothing is followed.
-    return np.where(cycles > 0.5, np.maximum(error, 1.0), error)
-
-
-def _with_aliases(comparison: BaselineComparison, coarse: np.ndarray, noise_g: float
-                  ) -> np.ndarray:
-    """Extend samples to the neighbours that move otherwise than the simulator, (n,) bool."""
-    sensor = comparison.sensor
-    size = max(round(_WINDOW_S * sensor.rate_hz), _WINDOW_READINGS)
-    simulated_v = comparison.simulated_v(sensor)
-    # Coarse codes jump by themselves.
-    scatter_g = np.maximum(noise_g, code_step_v(comparison.volts) / sensor.scale_v_per_g)
-    parts = np.array_split(np.arange(len(coarse)), max(len(coarse) // size, 1))
-    differs, touched = np.zeros(len(parts), bool), np.zeros(len(parts), bool)
-    for i, part in enumerate(parts):
-        recorded_g, simulated_g = (np.nanstd(np.diff(v[part], axis=0) / sensor.scale_v_per_g,
-                                             axis=0) for v in (comparison.volts, simulated_v))
-        touched[i] = coarse[part].any()
-        ratio = np.hypot(recorded_g, scatter_g) / np.hypot(simulated_g, scatter_g)
-        moves = np.maximum(recorded_g, simulated_g) > _MOVES * scatter_g
-        differs[i] = np.any(moves & ((ratio < 1 / _SAME_MOTION) | (ratio > _SAME_MOTION)))
-    extended = coarse.copy()
-    for begin, end in true_runs(differs | touched):
-        if touched[begin:end].any():
-            for i in range(begin, end):
-                if differs[i]:
-                    extended[parts[i]] = True
-    return extended
-
-
-def fading_frequency_hz(comparison: BaselineComparison) -> float | None:
-    """Find the frequency above which the reference has less motion than the sensor."""
-    if comparison.reference is not Reference.SIMULATOR:
-        return None
-    sensor = comparison.sensor
-    size = max(round(_SPECTRUM_S * sensor.rate_hz), _SHORTEST_WINDOW) // 2 * 2
-    recorded_g, simulated_g = (v / sensor.scale_v_per_g for v in (
-        comparison.volts, comparison.simulated_v(sensor)))
-    is_finite = np.isfinite(recorded_g + simulated_g).all(axis=1)
-    starts = [i for i in range(0, len(is_finite) - size + 1, size // 2)
-              if is_finite[i:i + size].all() and comparison.used[i:i + size].mean() > _USED]
-    if len(starts) < _FEWEST_WINDOWS:
-        return None
-    rows = np.array(starts)[:, None] + np.arange(size)
-    recorded, simulated = (
-        np.fft.rfft(scipy.signal.detrend(accel_g[rows], axis=1) * np.hanning(size)[None, :, None],
-                    axis=1)
-        for accel_g in (recorded_g, simulated_g))
-    power = np.sum(np.abs(recorded) ** 2, axis=2)
-    quiet = np.argsort(power.sum(axis=1))[:max(round(_QUIET * len(starts)), 2)]
-    quiet_power = _bands(power[quiet].mean(axis=0))
-    recorded_power = _bands(power.mean(axis=0))
-    simulated_power = _bands(np.mean(np.sum(np.abs(simulated) ** 2, axis=2), axis=0))
-    shared = np.abs(_bands(np.mean(np.sum(np.conj(simulated) * recorded, axis=2), axis=0)))
-    frequency_hz = _bands(np.fft.rfftfreq(size, 1 / sensor.rate_hz))
-    # Without its RC filter the sensor has this gain over its simulation.
-    rc_s = float(np.max(noise.electronics(sensor)[0]))
-    unfiltered = np.sqrt(1 + (2 * np.pi * frequency_hz * rc_s) ** 2)
-    moves = recorded_power > _MOTION * quiet_power
-    follows = shared ** 2 > _COHERENCE * simulated_power * recorded_power
-    exceeds = moves & follows & (shared > _GAIN * unfiltered * simulated_power)
-    faded = simulated_power < _FADED * recorded_power
-    if not exceeds.any() or not faded[moves & (frequency_hz >= frequency_hz[exceeds][0])].all():
-        return None
-    followed = np.flatnonzero(moves & ~faded)
-    first = followed[-1] + 1 if len(followed) else 0
-    return float(frequency_hz[first])
-
-
-def _bands(values: np.ndarray) -> np.ndarray:
-    """Return means of neighbouring frequencies without the lowest one."""
-    count = (len(values) - 1) // _BAND
-    return values[1:1 + count * _BAND].reshape(count, _BAND).mean(axis=1)
-
-
-def seen_step_rad(recording: Recording, stated_rad: float) -> float:
-    """Return the step that the encoders show, where it exceeds the stated one, rad."""
-    largest_rad = stated_rad
-    for name in ('alpha_rad', 'beta_rad'):
-        changes = np.abs(np.diff(recording.columns.get(name, np.zeros(0))))
-        changes = changes[changes > _ROUNDING_ERROR]
-        if len(changes) < _FEWEST_CHANGES:
-            continue
-        # Readings with decimals differ by one step more or less exactly.
-        step_rad = float(np.median(changes[changes < 1.5 * changes.min()]))
-        few = changes[changes < 4.5 * step_rad]
-        steps = np.rint(few / step_rad)
-        step_rad = float(few.sum() / steps.sum())
-        whole = np.abs(few / step_rad - steps) < _WHOLE
-        if len(few) >= _FEWEST_CHANGES and whole.mean() > _WHOLE_SHARE \
-                and _COARSER * largest_rad < step_rad < _LARGEST_STEP_RAD:
-            largest_rad = step_rad
-    return largest_rad
 
 
 def stated_poses(recording: Recording, sensor: Sensor) -> tuple[Recording, list[LeftOut]]:
     """
     Fill the gaps of the stage's joints, and return what is not known there.
 
-    A pose that is stated before and after a gap, while the output rests, holds in between. In
-    other gaps the joint moves smoothly from pose to pose, and the samples are left out.
+    A pose that is stated before and after a gap, while the output rests, holds in between. Other
+    gaps are left out.
     """
-    time_s, volts = recording.time_s, recording.volts(sensor)
+    time_s, output_g = recording.time_s, recording.volts(sensor) / sensor.scale_v_per_g
     columns, left_out = dict(recording.columns), []
     lag = max(1, round(_LAG_S * recording.rate_hz))
     for joint, name in JOINTS.items():
-        read = np.flatnonzero(np.isfinite(columns.get(name, np.zeros(0))))
+        values = columns.get(name, np.zeros(0))
+        read = np.flatnonzero(np.isfinite(values))
         if len(read) < 2:
             continue
         step = 0.0 if joint == 'shift' else sensor.stage_resolution_rad
-        values, read_s = columns[name].copy(), time_s[read]
-        limit_s = max(LONGEST_BRIDGE_S,
-                      min(USUAL_GAPS * float(np.median(np.diff(read_s))), _SLOWEST_S))
-        unknown = (time_s < read_s[0]) & (time_s[0] < read_s[0] - limit_s)
-        unknown |= (time_s > read_s[-1]) & (time_s[-1] > read_s[-1] + limit_s)
-        wide = np.flatnonzero(np.diff(read_s) > LONGEST_BRIDGE_S)
-        if len(wide):
-            path = scipy.interpolate.PchipInterpolator(read_s, values[read])
-        for begin, end in zip(read[wide], read[wide + 1]):
-            gap_s, inside = time_s[end] - time_s[begin], slice(begin + 1, end)
-            holds = end > begin + 1 and _rests(volts[inside] / sensor.scale_v_per_g, lag) \
-                and abs(values[end] - values[begin]) <= _SAME_STEPS * step + _SAME_POSE
-            if gap_s <= (LONGEST_BRIDGE_S if holds else limit_s):
-                continue
-            moved = path(time_s[inside]) - values[begin]
-            values[inside] = values[begin] + (np.rint(moved / step) * step if step else moved)
-            if not holds:
-                unknown |= ((time_s > time_s[begin] - _BEFORE_S)
-                            & (time_s < time_s[end] + _AFTER_S))
-        columns[name] = values
+        filled = np.interp(time_s, time_s[read], values[read])
+        limit_s = max(_LONGEST_BRIDGE_S, min(USUAL_GAPS * float(np.median(np.diff(
+            time_s[read]))), _SLOWEST_S))
+        unknown, columns[name] = np.zeros(len(time_s), bool), values.copy()
+        for begin, end in _in_gaps(time_s, time_s[read], _LONGEST_BRIDGE_S):
+            inner = 0 < begin < end < len(time_s)
+            gap_s = time_s[min(end, len(time_s) - 1)] - time_s[max(begin - 1, 0)]
+            holds = inner and _rests(output_g[begin:end], lag) and abs(
+                filled[end] - filled[begin - 1]) <= _SAME_STEPS * step + _SAME_POSE
+            if inner and (holds or gap_s > limit_s):
+                columns[name][begin:end] = filled[begin:end]
+            if not holds and gap_s > limit_s:
+                unknown |= (time_s > time_s[begin] - _BEFORE_S) \
+                    & (time_s < time_s[end - 1] + _AFTER_S)
         if unknown.any():
             left_out.append(LeftOut(unknown, f'no reading of {name} for more than '
                                     f'{limit_s:.3g} s'))
@@ -445,3 +350,164 @@ def _rests(output_g: np.ndarray, lag: int) -> bool:
     noise_g = np.sqrt(np.mean((output_g[lag:] - output_g[:-lag]) ** 2, axis=0) / 2)
     return bool(np.all(output_g.std(axis=0) < np.minimum(SMALLEST_MOTION_G, _SLOW * noise_g)
                        + _SAME_POSE))
+
+
+def seen_step_rad(recording: Recording, stated_rad: float) -> float:
+    """Return the step that the encoders show, where it exceeds the stated one, rad."""
+    largest_rad = stated_rad
+    for name in ('alpha_rad', 'beta_rad'):
+        changes = np.abs(np.diff(recording.columns.get(name, np.zeros(0))))
+        changes = changes[changes > 1e-9]
+        if len(changes) < _FEWEST_CHANGES:
+            continue
+        step_rad = float(np.median(changes[changes < 1.5 * changes.min()]))
+        few = changes[changes < 4.5 * step_rad]
+        # Readings with decimals differ by one step more or less exactly.
+        step_rad = float(few.sum() / np.rint(few / step_rad).sum())
+        whole = np.abs(few / step_rad - np.rint(few / step_rad)) < _WHOLE
+        if whole.sum() >= _FEWEST_CHANGES and whole.mean() > _WHOLE_SHARE \
+                and _COARSER * largest_rad < step_rad < _LARGEST_STEP_RAD:
+            largest_rad = step_rad
+    return largest_rad
+
+
+def too_coarse(comparison: BaselineComparison, columns: dict[str, np.ndarray]) -> list[LeftOut]:
+    """Find samples at which the reference moves faster than its readings show."""
+    sensor, time_s, force = comparison.sensor, comparison.time_s, comparison.motion.force
+    noise_g = float(np.min(noise.analog_std_v(sensor) / sensor.scale_v_per_g))
+    limit_g = _LARGEST_ERROR * max(noise_g, float(np.min(sensor.lsb_v / sensor.scale_v_per_g)))
+    # Name, times and readings of each reference, degree, derivative and knots of its spline, the
+    # largest error, and what to do
+    references: list[tuple] = []
+    if isinstance(force, ForcePath):
+        references = [('--sim', force.time_s, np.array(force(force.time_s)) / G0_MPS2, 3, 0, 0.0,
+                       limit_g, '; write it at a higher rate, and switch off noise that the '
+                       'simulator adds')]
+    for joint, name in JOINTS.items() if comparison.joints else ():
+        values = columns.get(name, np.zeros(0))
+        read = np.isfinite(values)
+        if read.sum() < 2 or np.ptp(values[read]) == 0:
+            continue
+        step = sensor.stage_resolution_rad
+        spline = (BAND_LIMITED_DEGREE, 2, 0.0, limit_g) if joint == 'shift' else (
+            5, 0, KNOT_S if step else 0.0,
+            np.sqrt(limit_g ** 2 + _ENCODER_SQUARES * step ** 2 / 12))
+        unit = 1 / G0_MPS2 if joint == 'shift' else 1.0
+        references.append((name, time_s[read], values[None, read] * unit, *spline, ''))
+    left_out = []
+    for name, read_s, readings, degree, order, knots_s, largest_g, advice in references:
+        ignored = np.interp(read_s, time_s, ~comparison.used) > 0
+        error_g = np.max([_spline_error(read_s, values, degree, order, knots_s, ignored)
+                          for values in readings[:len(sensor.axes)]], axis=0)
+        coarse = np.interp(time_s, read_s, error_g) > largest_g
+        if coarse.any():
+            coarse = _with_aliases(comparison, coarse, noise_g)
+            # The motion begins and ends within a window.
+            margin = round(_WINDOW_S / 2 * sensor.rate_hz)
+            coarse = np.convolve(coarse, np.ones(2 * margin + 1), 'same') > 0.5
+            rate_hz = 1 / float(np.median(np.diff(read_s)))
+            left_out.append(LeftOut(
+                coarse, f'{name} moves too fast for its {rate_hz:.4g} readings a second (error '
+                f'up to {1e3 * error_g.max():.2g} mg){advice}'))
+    return left_out
+
+
+def _spline_error(read_s: np.ndarray, values: np.ndarray, degree: int, order: int, knots_s: float,
+                  ignored: np.ndarray) -> np.ndarray:
+    """
+    Return how much a spline through readings may differ from what was read, by its spectrum.
+
+    A cardinal spline reproduces the frequency ν, in units of the rate, with the gain
+    sinc(ν)ⁿ/Σ sinc(ν + k)ⁿ, n = degree + 1. The other terms of the sum are its images. Beyond
+    half the rate of the knots nothing is followed.
+    """
+    step_s = float(np.median(np.diff(read_s)))
+    even_s = np.arange(read_s[0], read_s[-1] + step_s / 2, step_s)
+    size = max(round(_WINDOW_S / step_s), _SHORTEST_WINDOW) // 2 * 2
+    if len(even_s) < size:
+        return np.zeros(len(read_s))
+    even = scipy.interpolate.CubicSpline(read_s, values)(even_s)
+    # Differences keep slow motion from leaking into high frequencies.
+    differences = np.diff(even, 4, prepend=even[:2], append=even[-2:])[:len(even)]
+    differences[np.interp(even_s, read_s, ignored) > 0] = 0.0
+    frequency, at, power = scipy.signal.spectrogram(
+        differences, window='hann', nperseg=size, noverlap=size // 2, detrend=False)
+    cycles = frequency[1:] * max(knots_s / step_s, 1.0)
+    followed = np.minimum(cycles, 0.5)
+    weights = np.sinc(followed + _IMAGES[:, None]) ** (degree + 1)
+    weights /= weights.sum(axis=0)
+    images = weights * ((followed + _IMAGES[:, None]) / followed) ** order
+    images[_IMAGES == 0] = 1 - weights[_IMAGES == 0]
+    error = np.sqrt(np.sum(images ** 2, axis=0))
+    error = np.where(cycles > 0.5, np.maximum(error, 1.0), error)
+    gain = error * (2 * np.pi * frequency[1:] / step_s) ** order \
+        / (2 * np.sin(np.pi * frequency[1:])) ** 4
+    errors = np.sqrt(gain ** 2 @ power[1:] / size)
+    # A reading counts in all windows that hold it.
+    return np.interp(read_s, even_s[0] + step_s * at,
+                     scipy.ndimage.maximum_filter1d(errors, 3))
+
+
+def _with_aliases(comparison: BaselineComparison, coarse: np.ndarray, noise_g: float
+                  ) -> np.ndarray:
+    """Extend samples to the neighbours that move otherwise than the simulator, (n,) bool."""
+    sensor, signals_v = comparison.sensor, (comparison.volts,
+                                            comparison.simulated_v(comparison.sensor))
+    length = max(round(_WINDOW_S * sensor.rate_hz), _SHORTEST_WINDOW)
+    part = np.minimum(np.arange(len(coarse)) // length, max(len(coarse) // length - 1, 0))
+    changes_v = [np.nan_to_num(np.diff(v, axis=0, prepend=v[:1])) for v in signals_v]
+    # Coarse codes jump by themselves.
+    scatter_g = max(noise_g, float((code_step_v(comparison.volts) / sensor.scale_v_per_g).max()))
+    recorded, simulated = (np.sqrt([np.bincount(part, c ** 2) / np.bincount(part)
+                                    for c in (v / sensor.scale_v_per_g).T]) for v in changes_v)
+    ratio = np.hypot(recorded, scatter_g) / np.hypot(simulated, scatter_g)
+    moves = np.maximum(recorded, simulated) > _MOVES * scatter_g
+    differs = np.any(moves & (np.abs(np.log(ratio)) > np.log(_SAME_MOTION)), axis=0)
+    touched, extended = np.bincount(part, coarse) > 0, coarse.copy()
+    for begin, end in true_runs(differs | touched):
+        if touched[begin:end].any():
+            extended |= (part >= begin) & (part < end) & differs[part]
+    return extended
+
+
+def code_step_v(volts: np.ndarray) -> np.ndarray:
+    """Return the smallest change of an output on each axis, V; 0 where it never changes."""
+    changes_v = np.abs(np.diff(volts, axis=0))
+    smallest = np.min(changes_v, axis=0, initial=np.inf, where=changes_v > 0)
+    return np.where(np.isfinite(smallest), smallest, 0.0)
+
+
+def fading_frequency_hz(comparison: BaselineComparison) -> float | None:
+    """Find the frequency above which the reference has less motion than the sensor."""
+    if comparison.reference is not Reference.SIMULATOR:
+        return None
+    sensor = comparison.sensor
+    size = max(round(_WINDOW_S * sensor.rate_hz), _SHORTEST_WINDOW)
+    recorded_g, simulated_g = (np.nan_to_num(v / sensor.scale_v_per_g) for v in (
+        comparison.volts, comparison.simulated_v(sensor)))
+    if len(recorded_g) < _FEWEST_WINDOWS * size // 2:
+        return None
+
+    def power(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return frequencies and means of cross spectra over bands, summed over axes."""
+        frequency_hz, products = scipy.signal.csd(first, second, sensor.rate_hz, nperseg=size,
+                                                  detrend='linear', axis=0)
+        band = max(round(_BAND_HZ / frequency_hz[1]), 1)
+        count = (len(frequency_hz) - 1) // band * band
+        return tuple(v[1:1 + count].reshape(-1, band).mean(axis=1)  # type: ignore[return-value]
+                     for v in (frequency_hz, products.sum(axis=1)))
+
+    frequency_hz, recorded = power(recorded_g, recorded_g)
+    simulated, shared = power(simulated_g, simulated_g)[1].real, power(simulated_g, recorded_g)[1]
+    stated = np.sum(noise.density_v2_per_hz(sensor, frequency_hz) / sensor.scale_v_per_g ** 2, 1)
+    # Without its RC filter the sensor has this gain over its simulation.
+    rc_s = float(np.max(noise.electronics(sensor).rc_s))
+    unfiltered = np.sqrt(1 + (2 * np.pi * frequency_hz * rc_s) ** 2)
+    moves = recorded.real > _MOTION * stated
+    follows = np.abs(shared) ** 2 > _COHERENCE * simulated * recorded.real
+    exceeds = moves & follows & (np.abs(shared) > _GAIN * unfiltered * simulated)
+    faded = simulated < _FADED * recorded.real
+    if not exceeds.any() or not faded[moves & (frequency_hz >= frequency_hz[exceeds][0])].all():
+        return None
+    followed = np.flatnonzero(moves & ~faded)
+    return float(frequency_hz[followed[-1] + 1 if len(followed) else 0])

@@ -10,17 +10,25 @@ from typing import Any, NamedTuple
 
 from adxl_ros.diagnose.comparison import Reference
 from adxl_ros.diagnose.diagnosis import Diagnosis, Report
-from adxl_ros.diagnose.hypothesis_fit import Hypothesis
-from adxl_ros.diagnose.next_experiment import MENU, NextExperiment
+from adxl_ros.diagnose.next_experiment import by_effect, CouldShow, MENU
 from adxl_ros.diagnose.noise_effects import UNKNOWN
 from adxl_ros.diagnose.residual_map import SIGNIFICANT_P
-from adxl_ros.diagnose.verdict import Verdict, WeightedHypothesis
-from adxl_ros.diagnose.visibility import by_effect, CouldShow
+from adxl_ros.diagnose.search import Hypothesis
+from adxl_ros.diagnose.verdict import Verdict
 from adxl_ros.model.coefficients import fitted_of, get, parameter_of
-from adxl_ros.model.constants import G0_MPS2, Z_90
+from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import ActsOn, Coefficient, Concern
 from adxl_ros.report.quantities import Interval
+from adxl_ros.report.units import (
+    amplitude_text,
+    listed,
+    mg_text,
+    parameter_label,
+    parameter_text,
+    percent,
+    power_text,
+)
 import numpy as np
 
 _DIGITS = 6
@@ -29,14 +37,8 @@ _MOST_CELLS = 40
 """Largest number of cells in the report. Chosen: cells of small share say little."""
 PROBABLE = 0.05
 """Smallest probability of what terminal and page show first. Chosen: that of a rival."""
-_NEARLY_ALL = 0.995
-"""Share from which a percentage would be rounded to 100."""
-_SMALLEST_MG = 0.005
-"""Acceleration, mg, that rounds to 0.00 below this."""
 _WITHOUT_GAP = ('no_gap', 'insufficient')
 """Verdicts in which there is no gap to close."""
-_CLOSING = ('explained', 'partly', 'inseparable')
-"""Verdicts that name effects."""
 _MATTERS = 0.3
 """Error of the reference, in material amplitudes, that is shown: it adds 5 % to them."""
 _FLOOR_SOURCES = {'still': 'from rests', 'repeats': 'from repeats of a trajectory',
@@ -51,8 +53,6 @@ _DIMENSIONS = {
 """Dimensions of the reproducible rest, for people."""
 _MOST_DIMENSIONS = 2
 """Dimensions that a sentence names. Chosen: the strongest ones."""
-_UNIT_SUFFIXES = ('m', 's', 'rad', 'v', 'hz', 'f', 'g')
-"""Ends of parameter names that repeat the unit of the value."""
 NOISE_STAYS = 'The effects are noise, which no simulation repeats sample by sample.'
 """Why effects on the noise close nothing."""
 
@@ -75,21 +75,24 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
             'probability': 1.0}, 'hypotheses': [], 'gap': None, 'where': [], 'candidates': [],
             'notes': notes(diagnosis), 'next_experiment': None, 'summary': fault.message}
     assert report is not None
-    verdict = report.verdict
+    verdict, proposal = report.verdict, report.next_experiment
+    # Rounded probabilities still sum to 1.
+    probabilities = [round(h.probability, _DIGITS) for h in verdict.hypotheses]
+    probabilities[0] = round(1 - sum(probabilities[1:]), _DIGITS)
     return {
         'schema': 1,
         'verdict': {'status': verdict.status, 'effects': list(verdict.effects),
                     'groups': [list(group) for group in verdict.groups], 'of': concern(verdict),
                     'data_fault': None, 'probability': _rounded(verdict.probability)},
-        'hypotheses': _hypotheses(verdict.hypotheses),
+        'hypotheses': [{'effects': list(h.effects), 'probability': p}
+                       for h, p in zip(verdict.hypotheses, probabilities)],
         'gap': _gap(diagnosis, report),
         'explained': _power(verdict.explained), 'rest': _power(verdict.rest),
         'rest_follows': list(verdict.rest_follows),
         'material': _rounded(verdict.material_mps2),
         'lost_without': {e: _power(p) for e, p in verdict.lost_without.items()},
-        'where': [{'axis': c.axis, 'dimension': c.dimension,
-                   'range': [_rounded(c.low), _rounded(c.high)], 'mean': _rounded(c.mean_mps2),
-                   'share': _rounded(c.share), 'p': _rounded(c.p)}
+        'where': [{'axis': c.axis, 'dimension': c.dimension, 'range': _rounded((c.low, c.high)),
+                   'mean': _rounded(c.mean_mps2), 'share': _rounded(c.share), 'p': _rounded(c.p)}
                   for c in report.residual_cells if c.p < SIGNIFICANT_P][:_MOST_CELLS],
         'not_covered': list(report.not_covered), 'notes': notes(diagnosis),
         'could_show': [{'effect': r.effect, 'parameter': r.parameter, 'axis': r.axis or None,
@@ -102,7 +105,10 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
              'recorded': _rounded(r.recorded[r.largest]),
              'simulated': _rounded(r.simulated[r.largest]),
              'left': _rounded(r.remains[r.largest])} for r in report.noise_remainders],
-        'next_experiment': _next_experiment(report.next_experiment),
+        'next_experiment': proposal and {
+            'manoeuvre': proposal.manoeuvre, 'why': proposal.why, 'command': proposal.command,
+            'menu': [{'manoeuvre': w.text, 'minutes': _rounded(w.minutes),
+                      'nats_per_minute': _rounded(w.nats_per_minute)} for w in proposal.menu]},
         'summary': summary(diagnosis)}
 
 
@@ -113,22 +119,17 @@ def notes(diagnosis: Diagnosis) -> list[str]:
             for c in diagnosis.comparisons for note in c.notes]
 
 
-def _rounded(value: float) -> float | None:
-    """Round to the digits of the report; None for NaN and infinity."""
+def _rounded(value: Any) -> Any:
+    """Round one or several numbers to the digits of the report; None for NaN and infinity."""
+    if isinstance(value, Sequence):
+        return [_rounded(v) for v in value]
     return float(f'{value:.{_DIGITS}g}') if np.isfinite(value) else None
 
 
 def _power(power: Interval) -> dict[str, Any]:
     """Return a power, (m/s²)², with its interval."""
-    return {'value': _rounded(power.value), 'ci': [_rounded(power.low), _rounded(power.high)],
+    return {'value': _rounded(power.value), 'ci': _rounded((power.low, power.high)),
             'unit': '(m/s^2)^2'}
-
-
-def _hypotheses(hypotheses: Sequence[WeightedHypothesis]) -> list[dict[str, Any]]:
-    """Round probabilities so that they still sum to 1."""
-    rounded = [round(h.probability, _DIGITS) for h in hypotheses]
-    rounded[0] = round(1 - sum(rounded[1:]), _DIGITS)
-    return [{'effects': list(h.effects), 'probability': p} for h, p in zip(hypotheses, rounded)]
 
 
 def _gap(diagnosis: Diagnosis, report: Report) -> dict[str, Any]:
@@ -136,72 +137,58 @@ def _gap(diagnosis: Diagnosis, report: Report) -> dict[str, Any]:
     closure, has_gap = report.closure, report.verdict.status not in _WITHOUT_GAP
     noise = [{'recording': comparison.name,
               'log_likelihood_gain': _rounded(after.log_likelihood - before.log_likelihood),
-              'bands_hz': list(map(_rounded, after.band_edges_hz)),
-              'power_ratio_before': list(map(_rounded, before.power_ratio)),
-              'power_ratio_after': list(map(_rounded, after.power_ratio)),
+              'bands_hz': _rounded(after.band_edges_hz),
+              'power_ratio_before': _rounded(before.power_ratio),
+              'power_ratio_after': _rounded(after.power_ratio),
               'allan_s': list(after.averaging_times_s),
-              'allan_ratio_before': list(map(_rounded, before.allan_ratio)),
-              'allan_ratio_after': list(map(_rounded, after.allan_ratio))}
+              'allan_ratio_before': _rounded(before.allan_ratio),
+              'allan_ratio_after': _rounded(after.allan_ratio)}
              for comparison, before, after in zip(diagnosis.comparisons, report.noise_before,
                                                   report.noise_after)]
-    return {'unit': 'm/s^2', 'before': _rounded(closure.before_mps2),
-            'before_ci': list(map(_rounded, closure.before_ci)),
-            'after': _rounded(closure.after_mps2),
-            'after_ci': list(map(_rounded, closure.after_ci)),
-            'floor': _rounded(closure.floor_mps2),
-            'floor_ci': closure.floor_ci and list(map(_rounded, closure.floor_ci)),
+    figures: dict[str, Any] = {'unit': 'm/s^2'}
+    for name, figure in closure._asdict().items():
+        figures[name] = _rounded(figure.value)
+        figures[f'{name}_ci'] = _rounded((figure.low, figure.high))
+    return {**figures, 'floor_ci': figures['floor_ci'] if np.isfinite(closure.floor.low) else None,
+            'closed': figures['closed'] if has_gap else None,
             'floor_source': report.noise_floor.source,
             'upper_limit': _rounded(report.verdict.upper_limit_mps2),
             'reference': _rounded(report.verdict.reference_mps2),
-            'closed': _rounded(closure.closed) if has_gap else None,
-            'closed_ci': list(map(_rounded, closure.closed_ci)),
-            'not_in_reference': _rounded(report.lost_motion_mps2), 'noise': noise}
-
-
-def _next_experiment(proposal: NextExperiment | None) -> dict[str, Any] | None:
-    """Return what to record next."""
-    return None if proposal is None else {
-        'manoeuvre': proposal.manoeuvre, 'why': proposal.why, 'command': proposal.command,
-        'menu': [{'manoeuvre': w.text, 'minutes': _rounded(w.minutes),
-                  'nats_per_minute': _rounded(w.nats_per_minute)} for w in proposal.menu]}
+            'not_in_reference': _rounded(report.linear_model.lost_motion_mps2), 'noise': noise}
 
 
 def shares_of_gap(report: Report) -> dict[str, float]:
     """Split the closed share of the squared gap among the effects by what is lost without each."""
     verdict, closure = report.verdict, report.closure
-    if not set(verdict.best.effects) & {*verdict.effects, *sum(verdict.groups, ())}:
+    if not verdict.best & {*verdict.named}:
         return {}
     lost = {effect: max(power.value, 0.0) for effect, power in verdict.lost_without.items()}
     total = sum(lost.values())
-    closed = float(np.clip(closure.closed, 0.0, 1.0)) if np.isfinite(closure.closed) else 0.0
+    closed = float(np.clip(np.nan_to_num(closure.closed.value), 0.0, 1.0))
     return {effect: closed * power / total if total else 0.0 for effect, power in lost.items()}
 
 
 def _candidates(report: Report) -> list[dict[str, Any]]:
     """Return the effects of all hypotheses and detections, the most probable first."""
     verdict, shown = report.verdict, by_effect(report.could_show)
-    best_with: dict[str, Hypothesis] = {}
-    for h in report.hypotheses:
-        for name in h.effects:
-            best_with.setdefault(name, h)
     detected, shares = {d.effect: d for d in report.detections}, shares_of_gap(report)
     out = []
     for name, effect in library().items():
         sets = [h for h in verdict.hypotheses if name in h.effects]
-        if not sets and name not in best_with:
+        hypothesis = next((h for h in report.hypotheses if name in h.effects), None)
+        if not sets and hypothesis is None:
             continue
         if name in detected:
-            parameters = {p.name: {'value': np.asarray(detected[name].values[p.name]).tolist(),
-                                   'unit': p.unit}
-                          for p in effect.parameters if p.name in detected[name].values}
+            values = detected[name].values
+            parameters = {p.name: {'value': np.asarray(values[p.name]).tolist(), 'unit': p.unit}
+                          for p in effect.parameters if p.name in values}
         else:
-            parameters = _parameters(report, best_with.get(name), name)
-        closed = _rounded(report.closure.closed) if name in verdict.best.effects else None
+            parameters = _parameters(report, hypothesis, name)
         group = next((g for g in reversed(verdict.groups) if name in g), ())
         out.append({
             'effect': name, 'of': effect.concern.value,
             'probability': _rounded(min(sum(h.probability for h in sets), 1.0)),
-            'closed': closed,
+            'closed': _rounded(report.closure.closed.value) if name in verdict.best else None,
             'p': float(np.exp(-detected[name].log_bayes_factor)) if name in detected else None,
             'parameters': parameters,
             'share': _rounded(shares[name]) if name in shares else None,
@@ -217,25 +204,22 @@ def _parameters(report: Report, hypothesis: Hypothesis | None, effect: str) -> d
 
     A parameter that the recordings do not determine has no value.
     """
-    drift, sensor = effect_named(effect).diagnosis.drift, report.sensor
-    if drift and effect in sensor.effects:
+    names, sensor = fitted_of(effect_named(effect), report.sensor.axes), report.sensor
+    if effect_named(effect).diagnosis.drift and effect in sensor.effects:
         # The density of a drift is chosen with the noise, on a grid.
         return {_key(name): {'value': _rounded(float(get(sensor, [name])[0])),
-                             'unit': parameter_of(name).unit}
-                for name in fitted_of(effect_named(effect), sensor.axes)}
+                             'unit': parameter_of(name).unit} for name in names}
     parameters: dict[str, dict[str, Any]] = {}
-    if hypothesis is None:
-        return parameters
-    for name in fitted_of(effect_named(effect), hypothesis.sensor.axes):
-        if name not in hypothesis.names:
-            continue
-        place = hypothesis.names.index(name)
-        value, half = float(get(hypothesis.sensor, [name])[0]), Z_90 * hypothesis.std[place]
-        determined = not hypothesis.undetermined[place]
-        parameters[_key(name)] = {
-            'value': _rounded(value) if determined else None,
-            'ci': [_rounded(value - half), _rounded(value + half)] if determined else None,
-            'unit': parameter_of(name).unit, 'determined': determined}
+    for name in names if hypothesis else ():
+        if name in hypothesis.names:  # type: ignore[union-attr]
+            assert hypothesis is not None
+            place = hypothesis.names.index(name)
+            value, half = float(get(hypothesis.sensor, [name])[0]), Z_90 * hypothesis.std[place]
+            known = not hypothesis.undetermined[place]
+            parameters[_key(name)] = {
+                'value': _rounded(value) if known else None,
+                'ci': _rounded((value - half, value + half)) if known else None,
+                'unit': parameter_of(name).unit, 'determined': known}
     return parameters
 
 
@@ -246,9 +230,9 @@ def _key(name: Coefficient) -> str:
 
 def badge(diagnosis: Diagnosis) -> str:
     """Return the verdict in a few words."""
-    if diagnosis.fault is not None:
+    if diagnosis.report is None:
+        assert diagnosis.fault is not None
         return 'BAD DATA' if diagnosis.fault.status == 'bad_data' else 'TOO LITTLE DATA'
-    assert diagnosis.report is not None
     verdict = diagnosis.report.verdict
     count = len(verdict.effects)
     if verdict.status == 'explained' and concern(verdict) == Concern.REFERENCE.value:
@@ -263,43 +247,33 @@ def badge(diagnosis: Diagnosis) -> str:
 
 def headline(diagnosis: Diagnosis) -> str:
     """Return the verdict in a sentence or two."""
-    if diagnosis.fault is not None:
+    if diagnosis.report is None:
+        assert diagnosis.fault is not None
         return diagnosis.fault.message
-    assert diagnosis.report is not None
     verdict = diagnosis.report.verdict
-    sure = f'({percent(verdict.probability)} sure)'
+    sure, share = f'({percent(verdict.probability)} sure)', verdict.explained_share
     named = listed([*verdict.effects, *(listed(group, 'or') for group in verdict.groups)], 'and')
-    if verdict.status == 'no_gap':
-        return f'No gap {sure}: one above {mg_text(verdict.upper_limit_mps2)} would have shown.'
-    if verdict.status == 'insufficient':
-        return 'No verdict: neither motion nor temperature nor supply changes, so that no ' \
-               'effect can show.'
-    rest = mg_text(_amplitude(verdict.remaining))
-    if verdict.status == 'unknown':
-        return f'Unknown {sure}: no effect of the library explains {rest}.{_follows(verdict)}'
-    if verdict.status == 'partly':
-        share = verdict.explained_share
-        return f'Partly explained {sure}: {percent(share)} of the gap is {named}; ' \
-               f'{percent(1 - share)} ({rest}) is something else.{_follows(verdict)}' \
-               f'{_of_reference(verdict)}'
-    recordings = 'these recordings do' if len(diagnosis.comparisons) > 1 else 'this recording does'
-    separate = f': {recordings} not separate them' if verdict.groups else ''
+    rest = amplitude_text(verdict.remaining)
+    where = [_DIMENSIONS[d] for d in verdict.rest_follows[:_MOST_DIMENSIONS]]
+    follows = f' It follows {listed(where, "and")}.' if where and verdict.rest.low > 0 else ''
+    several = 'these recordings do' if len(diagnosis.comparisons) > 1 else 'this recording does'
+    separate = f': {several} not separate them' if verdict.groups else ''
     noise = f' {NOISE_STAYS}' if is_only_noise(diagnosis.report) else ''
-    return f'Explained {sure} by {named}{separate}.{noise}{_of_reference(verdict)}'
-
-
-def _follows(verdict: Verdict) -> str:
-    """Return a sentence on what the reproducible rest follows."""
-    repeats = verdict.rest.low > 0
-    where = [_DIMENSIONS.get(d, d) for d in verdict.rest_follows[:_MOST_DIMENSIONS] if repeats]
-    return f' It follows {listed(where, "and")}.' if where else ''
+    explained = f'Explained {sure} by {named}{separate}.{noise}{_of_reference(verdict)}'
+    return {'no_gap': f'No gap {sure}: one above {mg_text(verdict.upper_limit_mps2)} would have '
+                      'shown.',
+            'insufficient': 'No verdict: neither motion nor temperature nor supply changes, so '
+                            'that no effect can show.',
+            'unknown': f'Unknown {sure}: no effect of the library explains {rest}.{follows}',
+            'partly': f'Partly explained {sure}: {percent(share)} of the gap is {named}; '
+                      f'{percent(1 - share)} ({rest}) is something else.{follows}'
+                      f'{_of_reference(verdict)}'}.get(verdict.status, explained)
 
 
 def concern(verdict: Verdict) -> str | None:
     """Return what a verdict is about, joined by 'and', within a group by 'or'; None for none."""
-    parts = [_concerns(group) for group in ([e] for e in verdict.effects)]
-    parts += [_concerns(group) for group in verdict.groups]
-    return ' and '.join(sorted(set(parts))) or None
+    parts = {_concerns(group) for group in (*((e,) for e in verdict.effects), *verdict.groups)}
+    return ' and '.join(sorted(parts)) or None
 
 
 def _concerns(effects: Sequence[str]) -> str:
@@ -320,18 +294,12 @@ def _of_reference(verdict: Verdict) -> str:
         for c in undecided])
 
 
-def listed(names: Sequence[str], word: str) -> str:
-    """Return names separated by commas, with a word before the last one."""
-    return f' {word} '.join(filter(None, [', '.join(names[:-1]), *names[-1:]]))
-
-
 def summary(diagnosis: Diagnosis) -> str:
     """Return verdict and figures in a few sentences."""
-    if diagnosis.report is None:
-        return headline(diagnosis)
-    rows = [f'{row.label}: {row.text}.' for row in (*figure_rows(diagnosis),
-                                                    *remainder_rows(diagnosis.report))]
-    return ' '.join([headline(diagnosis), *(row[0].upper() + row[1:] for row in rows)])
+    report = diagnosis.report
+    rows = [] if report is None else [*figure_rows(diagnosis), *remainder_rows(report)]
+    return ' '.join([headline(diagnosis), *(f'{row.label[0].upper()}{row.label[1:]}: {row.text}.'
+                                            for row in rows)])
 
 
 def figure_rows(diagnosis: Diagnosis) -> list[Row]:
@@ -340,22 +308,22 @@ def figure_rows(diagnosis: Diagnosis) -> list[Row]:
     assert report is not None
     closure, verdict = report.closure, report.verdict
     compared = any(c.reference is not Reference.NONE for c in diagnosis.comparisons)
-    rows = [Row('gap', f'{mg_text(closure.before_mps2)} rms', 'recording minus simulation'
+    rows = [Row('gap', f'{mg_text(closure.before.value)} rms', 'recording minus simulation'
                 if compared else 'without its mean, because the pose is unknown')]
     if closes(report):
-        low, high = (percent(share) for share in closure.closed_ci)
+        low, high = (percent(share) for share in (closure.closed.low, closure.closed.high))
         ci = '' if low == high else f', 90 % interval {low} to {high}'
-        rows.append(Row('with the effects', f'{mg_text(closure.after_mps2)} rms',
-                        f'{percent(closure.closed)} closed, held out{ci}'))
-    rows.append(Row('noise floor', f'{mg_text(closure.floor_mps2)} rms',
+        rows.append(Row('with the effects', f'{mg_text(closure.after.value)} rms',
+                        f'{percent(closure.closed.value)} closed, held out{ci}'))
+    rows.append(Row('noise floor', f'{mg_text(closure.floor.value)} rms',
                     _FLOOR_SOURCES[report.noise_floor.source]))
     if verdict.status in _WITHOUT_GAP:
         rows.append(Row('upper limit', mg_text(verdict.upper_limit_mps2),
                         'a larger gap would have shown'))
     else:
-        rows.append(Row('explained', _power_text(verdict.explained), 'by ' + listed(
-            verdict.best.effects, 'and') if verdict.best.effects else 'no effect on the mean'))
-    rows.append(Row('repeats, not explained', _power_text(verdict.rest),
+        rows.append(Row('explained', power_text(verdict.explained), 'by ' + listed(
+            sorted(verdict.best), 'and') if verdict.best else 'no effect on the mean'))
+    rows.append(Row('repeats, not explained', power_text(verdict.rest),
                     'by flexible functions, held out'))
     text, note = f'from {mg_text(verdict.material_mps2)}', 'smaller is no gap'
     if verdict.reference_mps2 > _MATTERS * verdict.material_mps2:
@@ -363,46 +331,40 @@ def figure_rows(diagnosis: Diagnosis) -> list[Row]:
         text += f', {mg_text(highest)} if it follows the pose'
         note += f'; the reference has errors of {mg_text(verdict.reference_mps2)}'
     rows.append(Row('material', text, note))
-    if report.lost_motion_mps2:
-        lacking_hz = min(c.lacking_hz for c in diagnosis.comparisons)
-        rows.append(Row('not in the reference', f'{mg_text(report.lost_motion_mps2)} rms',
-                        f'motion above {lacking_hz:.2g} Hz'))
+    fading_hz = [c.fading_hz for c in diagnosis.comparisons if c.fading_hz is not None]
+    if report.linear_model.lost_motion_mps2:
+        rows.append(Row('not in the reference', f'{mg_text(report.linear_model.lost_motion_mps2)} '
+                        'rms', f'motion above {min(fading_hz) / 2:.2g} Hz'))
     if len(verdict.lost_without) > 1 and closes(report):
-        rows += [Row(f'lost without {effect}', mg_text(_amplitude(power.value)), ' to '.join(
-            mg_text(_amplitude(p)) for p in (power.low, power.high)))
+        rows += [Row(f'lost without {effect}', amplitude_text(power.value), ' to '.join(
+            amplitude_text(p) for p in (power.low, power.high)))
             for effect, power in verdict.lost_without.items()]
     return rows
 
 
 def remainder_rows(report: Report) -> list[Row]:
     """Return what remains of each noise-like effect."""
-    rows = []
-    for r in report.noise_remainders:
-        values = (_statistic_text(float(v[r.largest]), r.unit)
-                  for v in (r.recorded, r.simulated, r.remains))
-        axis = f' on {r.axes[r.largest]}' if r.axes else ''
-        rows.append(Row(f'{r.effect}, {r.quantity}{axis}',
-                        '{} recorded, {} simulated, {} left'.format(*values)))
-    return rows
+    def text(value: float, unit: str) -> str:
+        if unit == 'm/s^2':
+            return mg_text(value)
+        return f'{100 * value:.2g} %' if unit == '1' else f'{value:.2g} a second'
 
-
-def _statistic_text(value: float, unit: str) -> str:
-    """Return a statistic of the noise with its unit."""
-    if unit == 'm/s^2':
-        return mg_text(value)
-    return f'{100 * value:.2g} %' if unit == '1' else f'{value:.2g} {unit}'.replace(
-        ' 1/s', ' a second')
+    return [Row(f'{r.effect}, {r.quantity}{f" on {r.axes[r.largest]}" if r.axes else ""}',
+                '{} recorded, {} simulated, {} left'.format(*(
+                    text(float(v[r.largest]), r.unit)
+                    for v in (r.recorded, r.simulated, r.remains))))
+            for r in report.noise_remainders]
 
 
 def is_only_noise(report: Report) -> bool:
     """Determine whether a verdict has effects, but none that acts on the mean."""
-    return report.verdict.status in _CLOSING and not any(
-        effect_named(e).acts_on is ActsOn.MEAN for e in report.verdict.best.effects)
+    return report.verdict.closes and not any(
+        effect_named(e).acts_on is ActsOn.MEAN for e in report.verdict.best)
 
 
 def closes(report: Report) -> bool:
     """Determine whether there is a gap, and effects that change the mean."""
-    return report.verdict.status in _CLOSING and bool(np.isfinite(report.closure.closed)) \
+    return report.verdict.closes and bool(np.isfinite(report.closure.closed.value)) \
         and not is_only_noise(report)
 
 
@@ -418,90 +380,9 @@ def shown_row(row: CouldShow, scale_v_per_g: float) -> list[str]:
 def shows_row(row: CouldShow, scale_v_per_g: float) -> tuple[str, str, str, str]:
     """Return effect, smallest and typical size, and what is missing to show it; '' for nothing."""
     effect, _, smallest, typical, manoeuvre = shown_row(row, scale_v_per_g)
-    if row.shows:
-        return effect, smallest, typical, ''
     of_reference = effect_named(effect).concern is Concern.REFERENCE
-    return effect, smallest, typical, 'needs --sim' if of_reference else f'needs: {manoeuvre}'
-
-
-def mg(value_mps2: Any) -> Any:
-    """Convert m/s² to mg."""
-    return 1e3 * value_mps2 / G0_MPS2
-
-
-def mg_text(value_mps2: float) -> str:
-    """Return an acceleration, m/s², in mg with three digits at most."""
-    value = float(mg(value_mps2))
-    if abs(value) < _SMALLEST_MG:
-        return '< 0.01 mg'
-    return f'{value:.{2 if abs(value) < 10 else 1 if abs(value) < 100 else 0}f} mg'
-
-
-def _amplitude(power: float) -> float:
-    """Return the root of a power; a negative power counts as 0."""
-    return float(np.sqrt(max(power, 0.0)))
-
-
-def _power_text(power: Interval) -> str:
-    """Return the root of a power with its 90 % interval in mg."""
-    value, low, high = (mg_text(_amplitude(p)) for p in (power.value, power.low, power.high))
-    if value == high:
-        return value
-    return f'{value.removesuffix(" mg")} ({low.removesuffix(" mg")} to {high[:-3]}) mg'
-
-
-def percent(share: float) -> str:
-    """Return a share in per cent; only certainty by definition would be 0 or 100 %."""
-    if share >= _NEARLY_ALL:
-        return '> 99 %'
-    return '< 1 %' if 0 < share < 1 - _NEARLY_ALL else f'{100 * share:.0f} %'
-
-
-def parameter_label(key: str, is_single: bool) -> str:
-    """Return the name of a parameter without its unit, or its axis where that is enough."""
-    name, _, axis = key.partition('.')
-    stem, _, suffix = name.rpartition('_')
-    short = stem if stem and suffix in _UNIT_SUFFIXES else name
-    return axis if axis and is_single else f'{short} {axis}'.rstrip()
-
-
-def parameter_text(parameter: dict[str, Any], scale_v_per_g: float = 1.0, digits: int = 3
-                   ) -> str:
-    """Return a parameter of the report with its interval, in a unit that people use."""
-    if not parameter.get('determined', True):
-        return 'not determined'
-    ci = parameter.get('ci')
-    plain = np.array([*np.atleast_1d(parameter['value']), *(ci or ())], float)
-    values, unit = _for_people(plain, parameter['unit'], scale_v_per_g)
-    if ci:
-        width = max((values[2] - values[1]) / 4, 1e-12)
-        places = int(np.clip(np.ceil(-np.log10(width)), 0, 6))
-        value, low, high = (f'{round(v, places) + 0.0:.{places}f}' for v in values)
-        return f'{value} ({low} to {high}) {unit}'.rstrip()
-    texts = dict.fromkeys(np.format_float_positional(v, digits, fractional=False, trim='-')
-                          if abs(v) < 100 else f'{v:.0f}' for v in values)
-    return f'{", ".join(texts)} {unit}'.rstrip()
-
-
-def _for_people(values: np.ndarray, unit: str, scale_v_per_g: float) -> tuple[np.ndarray, str]:
-    """Return values in a unit with prefix; volts of the output as the acceleration they feign."""
-    if unit in ('V', 'V/g') and np.abs(values).max() < scale_v_per_g:
-        values, unit = values / scale_v_per_g, 'g' if unit == 'V' else '1'
-    if unit == 'm/s^2':
-        values, unit = values / G0_MPS2, 'g'
-    if unit == 'rad':
-        return np.degrees(values), 'deg'
-    base, slash, per = unit.replace('s/s', '1').partition('/')
-    per = per.replace('^2', '²').replace('sqrt(', '√').replace(')', '')
-    largest = float(np.abs(values).max())
-    prefixes = {'g': (1e3, 'mg', 1e6, 'µg'), 'm': (1e3, 'mm', 1e6, 'µm'),
-                's': (1e3, 'ms', 1e6, 'µs'), 'V': (1e3, 'mV', 1e6, 'µV'),
-                '1': (1e2, '%', 1e6, 'ppm')}
-    if base in prefixes and 0 < largest < 0.1:
-        milli, milli_name, micro, micro_name = prefixes[base]
-        factor, base = (milli, milli_name) if largest >= 1e-4 else (micro, micro_name)
-        values = factor * values
-    return values, (base + slash + per).removeprefix('1' if not per else '')
+    return effect, smallest, typical, '' if row.shows else \
+        'needs --sim' if of_reference else f'needs: {manoeuvre}'
 
 
 COLUMNS = 79
@@ -519,56 +400,42 @@ def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
     lines, word, report = [*_wrapped(subject), ''], badge(diagnosis), diagnosis.report
     note_lines = [line for note in notes(diagnosis) for line in _row_lines('note', note)]
     if report is None:
-        lines += _wrapped(f'{word}  {headline(diagnosis)}', len(word) + 2)
-        return lines + note_lines
-    objects = as_json(diagnosis)
-    rows = figure_rows(diagnosis)
-    lines += _verdict_lines(diagnosis, report)
-    lines += _effect_table(report, objects)
+        return lines + _wrapped(f'{word}  {headline(diagnosis)}', len(word) + 2) + note_lines
+    objects, rows = as_json(diagnosis), figure_rows(diagnosis)
+    closure, first = report.closure, {row.label: row.note for row in rows}
     # The gap, with the effects, and the floor stand in the first line.
-    first = 3 if closes(report) else 2
-    figures = [f'{row.label} {row.text}' for row in rows[first:]]
-    lines += ['', *_row_lines('figures', '; '.join(figures))]
+    after = f' -> {mg_text(closure.after.value)}' if closes(report) else ''
+    gap = f'{mg_text(closure.before.value)}{after} rms'
+    lines.append(f'{word:{_BADGE_COLUMNS - 1}} {gap:{_GAP_COLUMNS - 1}} noise floor '
+                 f'{mg_text(closure.floor.value)}')
+    remarks = [first['with the effects']] if closes(report) else \
+        [] if 'sim' in first['gap'] else [f'gap {first["gap"]}']
+    lines += [f'{"":{_BADGE_COLUMNS}}{line}'
+              for remark in (*remarks, f'noise floor {first["noise floor"]}')
+              for line in wrap(remark, COLUMNS - _BADGE_COLUMNS)]
+    if report.verdict.status != 'explained' or 'REFERENCE' in word:
+        lines += _wrapped(headline(diagnosis))
+    elif is_only_noise(report):
+        lines += _wrapped(NOISE_STAYS)
+    lines += [*_effect_table(report, objects), '', *_row_lines('figures', '; '.join(
+        f'{row.label} {row.text}' for row in rows[3 if closes(report) else 2:]))]
     lines += [line for i, row in enumerate(remainder_rows(report))
               for line in _row_lines('' if i else 'noise', f'{row.label}: {row.text}')]
     lines += _row_lines('shows', shown_text(report))
     named, causes = named_effects(report, objects), {
         c['effect']: c['cause'] for c in objects['candidates']}
     width = max(map(len, named), default=0) + 2
-    lines += [line for i, name in enumerate(named)
-              for line in _row_lines('' if i else 'cause', f'{name:{width}}{causes[name]}',
-                                     _LABEL_COLUMNS + width)]
-    return lines + note_lines
-
-
-def _verdict_lines(diagnosis: Diagnosis, report: Report) -> list[str]:
-    """Return verdict and gap, and what the verdict means where that is not plain."""
-    closure, verdict = report.closure, report.verdict
-    gap = f'{mg_text(closure.before_mps2)} rms'
-    if closes(report):
-        gap = f'{mg_text(closure.before_mps2)} -> {mg_text(closure.after_mps2)} rms'
-    rows = {row.label: row for row in figure_rows(diagnosis)}
-    lines = [f'{badge(diagnosis):{_BADGE_COLUMNS - 1}} {gap:{_GAP_COLUMNS - 1}} '
-             f'noise floor {mg_text(closure.floor_mps2)}']
-    remarks = [rows['with the effects'].note] if closes(report) else \
-        [] if 'sim' in rows['gap'].note else [f'gap {rows["gap"].note}']
-    remarks.append(f'noise floor {rows["noise floor"].note}')
-    lines += [f'{"":{_BADGE_COLUMNS}}{line}' for remark in remarks
-              for line in wrap(remark, COLUMNS - _BADGE_COLUMNS)]
-    if verdict.status != 'explained' or 'REFERENCE' in badge(diagnosis):
-        lines += _wrapped(headline(diagnosis))
-    elif is_only_noise(report):
-        lines += _wrapped(NOISE_STAYS)
-    return lines
+    return lines + [line for i, name in enumerate(named)
+                    for line in _row_lines('' if i else 'cause', f'{name:{width}}{causes[name]}',
+                                           _LABEL_COLUMNS + width)] + note_lines
 
 
 def shown_text(report: Report) -> str:
     """Return how many effects would have shown, some of them, and some that could not."""
     rows = by_effect(report.could_show)
     scale = float(report.baseline.scale_v_per_g.mean())
-    named = {*report.verdict.effects, *sum(report.verdict.groups, ())}
     shown = [f'{name} from {shown_row(row, scale)[2]}' for name, row in rows.items()
-             if row.shows and name not in named]
+             if row.shows and name not in report.verdict.named]
     hidden = [name for name, row in rows.items() if not row.shows]
     text = f'{sum(r.shows for r in rows.values())} of {len(rows)} effects could show'
     if shown:
@@ -581,9 +448,8 @@ def shown_text(report: Report) -> str:
 
 def named_effects(report: Report, objects: dict[str, Any]) -> list[str]:
     """Return the effects of the verdict by their share of the gap."""
-    named = [*report.verdict.effects, *sum(report.verdict.groups, ())]
     shares = {c['effect']: c['share'] or 0.0 for c in objects['candidates']}
-    return sorted((name for name in dict.fromkeys(named) if name in shares),
+    return sorted((name for name in report.verdict.named if name in shares),
                   key=lambda name: -shares[name])
 
 
@@ -596,19 +462,17 @@ def _effect_table(report: Report, objects: dict[str, Any]) -> list[str]:
     unknown = sum(h['probability'] for h in objects['hypotheses'] if UNKNOWN in h['effects'])
     if unknown >= PROBABLE and report.verdict.status != 'unknown':
         others.append((unknown, 'something unknown'))
-    lines = []
-    if named:
-        width = max(map(len, ('effect', *named))) + 2
-        size_columns = COLUMNS - 1 - width - _SURE_COLUMNS - _SHARE_COLUMNS
-        lines = ['', f' {"effect":{width}}{"sure":{_SURE_COLUMNS}}'
-                 f'{"size (90 % interval)":{size_columns - 6}} share of gap']
+    width = max(map(len, ('effect', *named))) + 2
+    size_columns = COLUMNS - 1 - width - _SURE_COLUMNS - _SHARE_COLUMNS
+    lines = ['', f' {"effect":{width}}{"sure":{_SURE_COLUMNS}}'
+             f'{"size (90 % interval)":{size_columns - 6}} share of gap'] if named else []
     for name in named:
         share, sure = candidates[name]['share'], percent(candidates[name]['probability'])
-        sizes = [line for size in size_lines(report, candidates[name])
-                 for line in wrap(size, size_columns - 1, subsequent_indent='  ')] or ['']
-        lines.append(f' {name:{width}}{sure:{_SURE_COLUMNS}}{sizes[0]:{size_columns}}'
+        first, *more = [line for size in size_lines(report, candidates[name])
+                        for line in wrap(size, size_columns - 1, subsequent_indent='  ')] or ['']
+        lines.append(f' {name:{width}}{sure:{_SURE_COLUMNS}}{first:{size_columns}}'
                      f'{"" if share is None else percent(share):>{_SHARE_COLUMNS}}'.rstrip())
-        lines += [f'{"":{1 + width + _SURE_COLUMNS}}{size}' for size in sizes[1:]]
+        lines += [f'{"":{1 + width + _SURE_COLUMNS}}{size}' for size in more]
     if others:
         texts = [f'{name} ({percent(p)})' for p, name in sorted(others, reverse=True)]
         lines += [] if named else ['']
@@ -626,28 +490,23 @@ def size_lines(report: Report, candidate: dict[str, Any]) -> list[str]:
         if ci and ci[0] <= 0 <= ci[1]:
             zeros.append(label)
         else:
-            text = parameter_text(parameter, axis_scale(report, key))
-            lines.append(f'{label} {text}'.strip())
+            lines.append(f'{label} {parameter_text(parameter, axis_scale(report, key))}'.strip())
     return lines + ([f'{", ".join(zeros)}: not different from 0'.removeprefix(': ')]
                     if zeros else [])
 
 
 def axis_scale(report: Report, key: str) -> float:
     """Return the scale factor, V/g, of the axis of a parameter; the mean one without an axis."""
-    axis = key.partition('.')[2]
     scales = dict(zip(report.baseline.axes, report.baseline.scale_v_per_g))
-    return float(scales.get(axis, report.baseline.scale_v_per_g.mean()))
+    return float(scales.get(key.partition('.')[2], report.baseline.scale_v_per_g.mean()))
 
 
 def _row_lines(label: str, text: str, indent: int = _LABEL_COLUMNS) -> list[str]:
     """Return a text behind its label, wrapped between words."""
-    start = f' {label:{min(indent, _LABEL_COLUMNS) - 1}}'
-    return wrap(text, COLUMNS, initial_indent=start, subsequent_indent=indent * ' ',
-                break_long_words=False, break_on_hyphens=False)
+    return _wrapped(text, indent, f' {label:{min(indent, _LABEL_COLUMNS) - 1}}')
 
 
-def _wrapped(text: str, indent: int = 0) -> list[str]:
+def _wrapped(text: str, indent: int = 0, start: str = '') -> list[str]:
     """Wrap a text between words; further lines have an indent."""
-    texts: Sequence[str] = wrap(text, COLUMNS, subsequent_indent=indent * ' ',
-                                break_long_words=False, break_on_hyphens=False)
-    return list(texts)
+    return list(wrap(text, COLUMNS, initial_indent=start, subsequent_indent=indent * ' ',
+                     break_long_words=False, break_on_hyphens=False))

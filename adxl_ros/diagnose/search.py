@@ -11,53 +11,294 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
-from itertools import combinations
+from dataclasses import dataclass, replace
+from itertools import chain, combinations
 from typing import NamedTuple
 
-from adxl_ros.diagnose.evidence import FlexibleColumns, LinearFit
-from adxl_ros.diagnose.hypothesis_fit import fit_hypothesis, Hypothesis
-from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel, Variant
+from adxl_ros.diagnose import evidence, linear_model as linear
+from adxl_ros.diagnose.evidence import LinearFit, Whitener
+from adxl_ros.diagnose.linear_model import LinearModel, Variant
 from adxl_ros.errors import UserError
-from adxl_ros.model.coefficients import parameter_of, with_neutral
+from adxl_ros.model.coefficients import fitted_of, get, parameter_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.effects.base import Coefficient, Role
+from adxl_ros.model.gauss_newton import gauss_newton, Iterate
+from adxl_ros.model.sensor import Sensor
 import numpy as np
 
+_EVALUATIONS, _HALVINGS = 8, 2
+"""Largest number of simulations of a hypothesis, and of halvings of a step. Chosen: most need
+five, and a quarter of a step is enough for the library."""
+_EVIDENCE_TOLERANCE = 1e-3
+"""A step may lower the log evidence by this. Chosen: far below one unit."""
+_SMALLEST_STEP, _SMALLEST_GAIN, _SMALLEST_GAIN_SHARE = 1e-3, 0.5, 1e-4
+"""Step, in prior standard deviations, and gain of log evidence, also divided by that of all steps,
+below which a fit has converged. Chosen: far below any interval; a large effect needs no more
+digits."""
+_FORM_ERROR = 0.03
+"""Relative standard deviation of a coefficient because the form of its effect is not exact. Only
+geometry and clocks have exact forms. Tuned by hand on simulated recordings of the working seeds of
+the blind check."""
+_UNDETERMINED_SHARE, _UNDETERMINED_RATIO = 0.5, 3.0
+"""A coefficient is not determined if its posterior standard deviation exceeds this share of the
+prior's, nor by some blocks if it exceeds that of all blocks by this factor. Chosen."""
+_HEALTHY_STDS = 3.0
+"""Largest departure of a healthy unit, in standard deviations: one unit in 400 exceeds it."""
 LARGEST_SET = 3
 """Largest number of effects in a set. Chosen: one recording hardly separates more."""
-_SINGLES = 8
-"""Single effects whose pairs are tried on the linear model. Chosen: run time."""
-_FITTED_SINGLES = 5
-"""Single effects that are fitted. Chosen: run time."""
-_FURTHER = 3
-"""Further effects that are fitted beside the best set. Chosen: run time."""
+_SINGLES, _FITTED_SINGLES, _FURTHER, _COMPLETED, _OTHER_STARTS = 8, 5, 3, 4, 2
+"""Singles whose pairs are ranked, singles that are fitted, further effects beside the best set,
+sets that are fitted without each effect, and other shapes that are tried. Chosen: run time."""
 _IMMATERIAL = 0.01
 """Share of the gain of a set that a further effect must gain, so that a third one is looked for.
 Chosen: a third of what each effect of a set must explain."""
-_COMPLETED = 4
-"""Best sets that are fitted without each of their effects. Chosen: run time."""
-_WORTH_FITTING = 10.0
-"""Gain of log evidence from which a set is fitted: below it no held-out figure shows it."""
-_HOPELESS_SHARE = 0.2
-"""A set that gains less than the best one by this share of it is neither refined nor extended. Its
-form would have to be wrong by as much of the gap."""
-_SMALLEST_DEFICIT = 100.0
-"""Deficit of log evidence below which no set is hopeless. Chosen: small effects."""
+_WORTH_FITTING = -30.0
+"""Gain of log evidence from which a set is fitted. Chosen: the wide priors of a small effect on
+three axes cost as much, and the held-out figures decide."""
+_HOPELESS_SHARE, _SMALLEST_DEFICIT = 0.2, 100.0
+"""A set that gains less than the best one by this share of it, and by this log evidence, is not
+refined or extended. Its form would have to be wrong by as much of the gap."""
 _LARGEST_GAIN_RATIO = 5.0
 """What a fit in full may gain, divided by what the linear model promises."""
-_FORM_ERROR = 0.3
+_PRESENT_FORM_ERROR = 0.3
 """Share of the present effects by which their form may differ where further ones are ranked."""
-_OTHER_STARTS = 2
-"""Other shapes from which a fit that did not converge starts again. Chosen: run time."""
 _NEAR_START = 1.4
 """Largest ratio of the start of a size to the one at which the effect was simulated: the starts
 differ by factors of two."""
 _TIME_CONSTANTS = 4.0
 """Length of a recording that shows a time constant: its response is then complete to 2 %."""
 
-Found = dict[frozenset[str], Hypothesis]
-"""Fitted sets by the names of their effects."""
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A set of effects after its fit."""
+
+    effects: tuple[str, ...]  # Names of the effects; none for no gap
+    sensor: Sensor  # The baseline with the effects and the nuisance parameters, as fitted
+    names: tuple[Coefficient, ...]  # Names of the k fitted coefficients of the effects, (k,)
+    values: np.ndarray  # Their values, as departures from the baseline, (k,)
+    std: np.ndarray  # Their standard deviations, (k,)
+    undetermined: np.ndarray  # Those that the recordings hardly narrow, (k,) bool
+    log_evidence: float  # Log evidence
+    fit: LinearFit  # The last linear fit
+    linearised: LinearisedHypothesis  # The hypothesis linearised at its values
+    converged: bool = True  # Whether the Gauss-Newton iteration has converged
+
+    @property
+    def whiteners(self) -> list[Whitener]:
+        """Whitening filter of each channel."""
+        return [filters[i] for filters, i in zip(self.linearised.filters,
+                                                 self.fit.filter_indices)]
+
+
+class ChannelColumns(NamedTuple):
+    """The linear model of a hypothesis in one channel."""
+
+    places: np.ndarray  # Places of the k coefficients among all, (k,)
+    values: np.ndarray  # Residual at the prior mean, V, and sensitivities, V per unit, (n, k + 1)
+    # Products of the same divided by the scale factor and the root of the number of axes, by
+    # block, (m/s²)², (blocks, k + 1, k + 1)
+    plain: np.ndarray
+
+    def of_effect(self, names: Sequence[Coefficient], effect: str) -> tuple[np.ndarray, list[int]]:
+        """Return the sensitivities to the coefficients of an effect, and their places."""
+        own = [i for i, k in enumerate(self.places)
+               if k < len(names) and names[k].effect == effect]
+        return self.values[:, 1:][:, own], [int(self.places[i]) for i in own]
+
+
+@dataclass(frozen=True)
+class LinearisedHypothesis:
+    """
+    A hypothesis linearised at values of its k coefficients.
+
+    The first j coefficients are those of the effects. The others are nuisance parameters, which
+    stay near the baseline and are linearised there.
+    """
+
+    effects: tuple[str, ...]  # Names of the effects
+    sensor: Sensor  # The sensor at the values
+    names: tuple[Coefficient, ...]  # Coefficients, those of the effects first, (k,)
+    prior_mean: np.ndarray  # Prior mean of the coefficients, (k,)
+    prior_std: np.ndarray  # Prior standard deviation of the coefficients, (k,)
+    reach: np.ndarray  # Largest departure of the nuisance parameters of a healthy unit, (k − j,)
+    values: np.ndarray  # Values of the coefficients of the effects, (j,)
+    # Whitened columns, and whitened residuals at the prior mean by the linear model
+    channels: list[evidence.WhitenedChannel]
+    columns: list[ChannelColumns]  # The same before whitening
+    filters: Sequence[Sequence[Whitener]]  # Whitening filters of each channel
+
+    def fit(self, blocks: np.ndarray | None = None, drifts: Sequence[str] = ()) -> LinearFit:
+        """Fit all coefficients to some blocks, (blocks,) bool, or to all."""
+        return evidence.fit_columns(self.channels, range(len(self.names)), self.prior_std, blocks,
+                                    drifts=(*drifts, *evidence.drifts_among(self.sensor.effects)))
+
+    def departures(self, fit: LinearFit, full_fit: LinearFit | None = None) -> np.ndarray:
+        """
+        Return the departures from the prior mean after a fit, (k,).
+
+        A limit or a shape keeps its value if the samples do not determine it, because its prior
+        mean is no better guess. It also keeps its value if only the blocks that are not fitted
+        determine it. A shape changes by a factor of two at most. In a fit to some blocks, zero-g,
+        scale factor, filter and latency stay within the tolerance of a healthy unit.
+        """
+        j = len(self.values)
+        parameters = [parameter_of(name) for name in self.names[:j]]
+        std = np.sqrt(np.diag(fit.covariance)[:j])
+        undetermined = std > _UNDETERMINED_SHARE * self.prior_std[:j]
+        if full_fit is not None:
+            undetermined |= std > _UNDETERMINED_RATIO * np.sqrt(np.diag(full_fit.covariance)[:j])
+        kept = np.array([not p.is_size or bool(linear.limits(effect_named(name.effect)))
+                         for p, name in zip(parameters, self.names)], bool)
+        is_shape = np.array([p.role is Role.SHAPE for p in parameters], bool)
+        fitted = self.prior_mean[:j] + fit.values[:j]
+        values = np.where(undetermined & kept, self.values, fitted)
+        values = np.where(is_shape, np.clip(values, *np.sort([self.values / 2, self.values * 2],
+                                                             axis=0)), values)
+        given = np.concatenate([values != fitted, np.zeros(len(self.reach), bool)])
+        target = np.concatenate([values - self.prior_mean[:j], np.zeros(len(self.reach))])
+        departures = fit.given(np.flatnonzero(given), target[given])
+        outside = np.abs(departures[j:]) > self.reach
+        if full_fit is None or not outside.any():
+            return departures
+        given[j:], target[j:] = outside, np.clip(departures[j:], -self.reach, self.reach)
+        return fit.given(np.flatnonzero(given), target[given])
+
+
+def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
+              filters: Sequence[Sequence[Whitener]] | None = None) -> LinearisedHypothesis:
+    """Linearise a hypothesis at the coefficients of a sensor."""
+    filters = linear.filters_for(linear_model.filters, linear_model.baseline.effects) \
+        if filters is None else filters
+    names = _fitted_names(linear_model, effects)
+    nuisances = [n for n in dict.fromkeys(chain(*linear_model.nuisance_columns))
+                 if n.effect not in effects]
+    start = with_neutral(linear_model.baseline, [*effects, *dict.fromkeys(
+        n.effect for n in nuisances)])
+    parameters, values = [parameter_of(name) for name in names], get(sensor, names)
+    prior_mean = _prior_mean(start, names)
+    prior_std = [p.scale * (linear.PRIOR_WIDTH if p.is_size else 1) for p in parameters]
+    sensor = put(start, names, values)
+    all_names, j = [*names, *nuisances], len(names)
+    # Without the effects that a calibration can take up.
+    without = replace(sensor, values={**sensor.values, **{
+        e: start.values[e] for e in effects if linear.calibration_takes_up(e)}})
+    channels: list[evidence.WhitenedChannel] = []
+    columns: list[ChannelColumns] = []
+    changes: list[list[linear.Column]] = []
+    for comparison in linear_model.comparisons:
+        at_rate = replace(sensor, rate_hz=comparison.sensor.rate_hz)
+        output_v = comparison.simulated_v(at_rate)
+        derivatives = linear.sensitivities_at(comparison.simulated_v, at_rate, names, values,
+                                              output_v)
+        change_v = output_v - comparison.simulated_v(replace(without, rate_hz=at_rate.rate_hz))
+        for d, axis in enumerate(start.axes):
+            places = [i for i, n in enumerate(names) if n.axis in ('', axis)]
+            design = derivatives[:, d, places]
+            residual_v = comparison.volts[:, d] - output_v[:, d] \
+                + design @ (values - prior_mean)[places]
+            on_channel = linear_model.nuisance_columns[len(channels)]
+            own = [n for n in nuisances if n in on_channel]
+            ids = np.array([*places, *map(all_names.index, own)], int)
+            stacked = np.column_stack([residual_v, design, *(on_channel[n] for n in own)])
+            scale = float(comparison.scale_v_per_mps2[d]) * len(start.axes) ** 0.5
+            columns.append(ChannelColumns(ids, stacked.astype(np.float32), evidence.plain_grams(
+                stacked / scale, comparison.used)))
+            channels.append(evidence.whiten_channel(stacked[:, 0], stacked[:, 1:], ids,
+                                                    comparison.used, filters[len(channels)]))
+            changes.append([linear.Column(0, change_v[:, d])])
+    # The square of each deviation is that of a healthy unit's tolerance plus that of what a
+    # calibration can take up of the effects.
+    parts = linear.parts_at_rest(linear_model.comparisons, linear_model.nuisance_columns,
+                                 changes, 1)
+    nuisance_std, reach = (np.array([np.hypot(factor * linear_model.tolerance(n), parts.get(
+        n, np.zeros(1))[0]) for n in nuisances]) for factor in (1.0, _HEALTHY_STDS))
+    return LinearisedHypothesis(
+        tuple(effects), sensor, tuple(all_names),
+        np.concatenate([prior_mean, get(start, nuisances)]),
+        np.array([*prior_std, *nuisance_std]), reach, values[:j], channels, columns, filters)
+
+
+def _fitted_names(linear_model: LinearModel, effects: Sequence[str]) -> list[Coefficient]:
+    """Return the coefficients of effects that the recordings show, and limits and shapes."""
+    return [name for effect in effects
+            for name in fitted_of(effect_named(effect), linear_model.baseline.axes)
+            if not parameter_of(name).is_size or name in linear_model.names
+            or linear.limits(effect_named(effect))]
+
+
+def _prior_mean(sensor: Sensor, names: Sequence[Coefficient]) -> np.ndarray:
+    """Return prior means of coefficients: as in a sensor, typical of shapes and limits, (k,)."""
+    return np.array([float(get(sensor, [name])[0]) if p.is_size else p.scale
+                     for name in names for p in (parameter_of(name),)])
+
+
+@dataclass(frozen=True)
+class _HypothesisIterate(Iterate):
+    """An iterate of the fit: the linearised hypothesis and its linear fit."""
+
+    linearised: LinearisedHypothesis
+    fit: LinearFit
+
+
+def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
+                   start: Mapping[Coefficient, float], shapes: Mapping[Coefficient, float],
+                   lowest_log_evidence: float = -np.inf) -> Hypothesis:
+    """
+    Fit a set of effects by re-simulation, shape parameters included.
+
+    Each Gauss-Newton step simulates, differentiates, whitens and fits at the present values. The
+    iteration ends where the log evidence no longer gains, or where even the maximum of the linear
+    model is hopelessly low. `start` has departures of sizes from the prior mean.
+    """
+    neutral_sensor = with_neutral(linear_model.baseline, effects)
+    names = _fitted_names(linear_model, effects)
+    filters = linear.filters_for(linear_model.filters, linear_model.baseline.effects)
+    # The iteration has the noise of no gap; only its end is compared for every noise.
+    fixed = [[f[i]] for f, i in zip(filters, linear_model.null_fit.filter_indices)]
+
+    def linearised_at(values: np.ndarray) -> _HypothesisIterate:
+        within = np.clip(values, [parameter_of(n).lower for n in names],
+                         [parameter_of(n).upper for n in names]) if names else values
+        linearised = linearise(linear_model, effects, put(neutral_sensor, names, within), fixed)
+        fit, j = linearised.fit(), len(linearised.values)
+        step = linearised.departures(fit)[:j] + linearised.prior_mean[:j] - linearised.values
+        loss = fit.loss(linearised.values - linearised.prior_mean[:j])
+        return _HypothesisIterate(linearised.values, step, loss - fit.log_evidence, linearised,
+                                  fit)
+
+    def has_ended(first: _HypothesisIterate, previous: _HypothesisIterate | None,
+                  present: _HypothesisIterate) -> bool:
+        if previous is not None and (present.fit.log_evidence < lowest_log_evidence
+                                     or previous.cost - present.cost < _SMALLEST_GAIN):
+            return True
+        smallest = max(_SMALLEST_GAIN, _SMALLEST_GAIN_SHARE * (first.cost - present.cost))
+        return present.fit.log_evidence + present.cost < smallest or bool(np.all(
+            np.abs(present.step) < _SMALLEST_STEP * present.linearised.prior_std[:len(names)]))
+
+    first = _prior_mean(neutral_sensor, names) + [start.get(name, 0.0) for name in names]
+    first = np.array([shapes.get(name.without_axis, value) for name, value in zip(names, first)])
+    solution = gauss_newton(linearised_at, first, has_ended, _EVALUATIONS, _HALVINGS,
+                            _EVIDENCE_TOLERANCE)
+    linearised = linearise(linear_model, effects, solution.last.linearised.sensor, filters)
+    fit, j = linearised.fit(), len(names)
+    at_values = linearised.values - linearised.prior_mean[:j]
+    std = np.sqrt(np.diag(fit.covariance)[:j])
+    # Neither the encoder nor the form of an effect is exact.
+    in_rad = [parameter_of(n).unit == 'rad' for n in names]
+    size = np.where([parameter_of(n).is_size for n in names], fit.values[:j], linearised.values)
+    form = np.where([effect_named(n.effect).exact for n in names], 0.0, _FORM_ERROR * size)
+    # The nuisance parameters are at their mean given the values of the effects.
+    fitted = linearised.prior_mean + fit.given(np.arange(j), at_values)
+    low, high = ([getattr(parameter_of(n), end) for n in linearised.names]
+                 for end in ('lower', 'upper'))
+    return Hypothesis(
+        tuple(effects), put(linearised.sensor, linearised.names, np.clip(fitted, low, high)),
+        linearised.names[:j], at_values, np.sqrt(std ** 2 + form ** 2 + np.where(
+            in_rad, linear_model.smallest_angle_rad(), 0.0) ** 2),
+        std > _UNDETERMINED_SHARE * np.maximum(linearised.prior_std[:j], np.abs(at_values)),
+        fit.log_evidence - fit.loss(at_values), fit, linearised,
+        solution.converged and solution.last.fit.log_evidence >= lowest_log_evidence)
 
 
 class _Ranked(NamedTuple):
@@ -74,7 +315,7 @@ class Search:
 
     def __init__(self, model: LinearModel) -> None:
         self.model = model
-        self.found: Found = {frozenset(): fit_hypothesis(model, (), {}, {})}
+        self.found = {frozenset[str](): fit_hypothesis(model, (), {}, {})}
         self._null = model.null_fit
 
     @property
@@ -89,120 +330,127 @@ class Search:
         gain = best - self.found[frozenset()].log_evidence
         return best - max(_SMALLEST_DEFICIT, _HOPELESS_SHARE * gain)
 
-    def identifiable(self, model: LinearModel) -> list[int]:
-        """Return the variants that can show: no zero-g or scale factor without a known pose."""
-        return [i for i, v in enumerate(model.variants) if model.pose_known
-                or not effect_named(v.effect).diagnosis.straight_line]
-
     def run(self, show_share: Callable[[float], None]) -> None:
         """Fit singles, then further effects beside the best set, then pairs."""
-        singles = self._rank([(i,) for i in self.identifiable(self.model)])
-        worth = [s for s in singles[:_FITTED_SINGLES] if s.gain > _WORTH_FITTING]
-        for number, single in enumerate(worth):
-            show_share(0.5 * number / len(worth))
-            self._fit(single)
-        straight = [i for i in self.identifiable(self.model)
+        singles = self._rank(self.model, (), [(i,) for i in _identifiable(self.model)])
+        straight = [i for i in _identifiable(self.model)
                     if effect_named(self.model.variants[i].effect).diagnosis.straight_line]
-        for ranked in (*self._rank([(i,) for i in straight]),
-                       *self._rank(list(combinations(straight, 2)))):
-            self._fit(ranked)
+        first = [*singles[:_FITTED_SINGLES], *self._rank(self.model, (), [
+            *((i,) for i in straight), *combinations(straight, 2)])]
+        for number, single in enumerate(first):
+            show_share(0.5 * number / len(first))
+            self._fit(self.model, single)
         for _ in range(LARGEST_SET - 1):
             show_share(0.6)
             best = self.best
             if not 0 < len(best.effects) < LARGEST_SET:
                 break
             self._extend(best)
-            gained = self.best.log_evidence - best.log_evidence
-            if gained < _IMMATERIAL * (best.log_evidence - self._null.log_evidence):
+            if self.best.log_evidence - best.log_evidence < _IMMATERIAL * (
+                    best.log_evidence - self._null.log_evidence):
                 break
         best = self.best
-        for i in straight:
-            effect = self.model.variants[i].effect
-            if 0 < len(best.effects) < LARGEST_SET and effect not in best.effects:
+        for effect in {self.model.variants[i].effect for i in straight} - {*best.effects}:
+            if 0 < len(best.effects) < LARGEST_SET:
                 self._add((*best.effects, effect), dict(zip(best.names, best.values)), {})
         show_share(0.8)
-        first = sorted(ranked.chosen[0] for ranked in singles[:_SINGLES])
-        pairs = self._rank(list(combinations(first, 2)))[:_FURTHER]
+        pairs = self._rank(self.model, (), list(combinations(sorted(
+            ranked.chosen[0] for ranked in singles[:_SINGLES]), 2)))[:_FURTHER]
         for pair in pairs:
-            if pair.gain > singles[0].gain + _IMMATERIAL * pairs[0].gain \
-                    and pair.gain > (1 - _HOPELESS_SHARE) * pairs[0].gain:
-                self._fit(pair)
+            if pair.gain > max(singles[0].gain + _IMMATERIAL * pairs[0].gain,
+                               (1 - _HOPELESS_SHARE) * pairs[0].gain):
+                self._fit(self.model, pair)
         for hypothesis in sorted(self.found.values(), key=lambda h: -h.log_evidence)[:_COMPLETED]:
-            self.complete(hypothesis.effects)
+            self._complete(hypothesis.effects)
         show_share(1.0)
 
-    def complete(self, effects: Sequence[str] | frozenset[str]) -> None:
+    def _complete(self, effects: Iterable[str]) -> None:
         """Fit a set without each of its effects, and these without each, and so on."""
         for effect in effects:
             rest = frozenset(effects) - {effect}
             if rest not in self.found:
                 start = self.found.get(frozenset(effects), self.best)
-                self._add(rest, dict(zip(start.names, start.values)), {}, hopeful=True)
+                self._add(rest, dict(zip(start.names, start.values)), {}, -np.inf)
             if rest in self.found:
-                self.complete(rest)
-
-    def _rank(self, sets: Sequence[tuple[int, ...]]) -> list[_Ranked]:
-        """Fit sets of variants on the linear model; the best of each set of effects, ranked."""
-        fits = []
-        for chosen in sets:
-            if len({self.model.variants[i].effect for i in chosen}) == len(chosen):
-                fit = self.model.fit_variants(chosen, self._null)
-                fits.append(_Ranked(fit.log_evidence - self._null.log_evidence, chosen, fit))
-        return _best_of_each(self.model, fits)
-
-    def _fit(self, first: _Ranked) -> None:
-        """Fit a ranked set in full, from other shapes, too, where it does not converge."""
-        effects = tuple(self.model.variants[i].effect for i in first.chosen)
-        if first.gain < _WORTH_FITTING or frozenset(effects) in self.found:
-            return
-        for ranked in (first, *first.others):
-            start, shapes = _start(self.model, ranked)
-            fitted = self._add(effects, start, shapes)
-            if fitted is not None and (fitted.converged or fitted.log_evidence < self._lowest):
-                break
+                self._complete(rest)
 
     def _extend(self, best: Hypothesis) -> None:
         """Fit the further effects that gain most beside a set, ranked at its values."""
         about = _model_about(self.model, best)
-        present = [i for i, v in enumerate(about.variants) if v.effect in best.effects]
-        without = about.fit_variants(present)
-        fits = []
-        for i in self.identifiable(about):
-            if about.variants[i].effect not in best.effects:
-                fit = about.fit_variants([*present, i], without)
-                fits.append(_Ranked(fit.log_evidence - without.log_evidence, (i,), fit))
-        for first in _best_of_each(about, fits)[:_FURTHER]:
-            promised = best.log_evidence + _LARGEST_GAIN_RATIO * first.gain
-            if first.gain < _WORTH_FITTING or promised < self._lowest:
+        present = tuple(i for i, v in enumerate(about.variants) if v.effect in best.effects)
+        further = [(i,) for i in _identifiable(about)
+                   if about.variants[i].effect not in best.effects]
+        for ranked in self._rank(about, present, further)[:_FURTHER]:
+            if best.log_evidence + _LARGEST_GAIN_RATIO * ranked.gain >= self._lowest:
+                self._fit(about, ranked, best)
+
+    def _rank(self, model: LinearModel, present: tuple[int, ...],
+              sets: Sequence[tuple[int, ...]]) -> list[_Ranked]:
+        """
+        Fit sets of variants beside present ones on a linear model, by falling gain.
+
+        Of each set of effects the best variants are ranked, with the next best shapes.
+        """
+        without = model.fit_variants(present) if present else model.null_fit
+        by_effects: dict[frozenset[str], list[_Ranked]] = {}
+        for chosen in sets:
+            effects = frozenset(model.variants[i].effect for i in chosen)
+            if len(effects) == len(chosen):
+                fit = model.fit_variants([*present, *chosen], without)
+                by_effects.setdefault(effects, []).append(
+                    _Ranked(fit.log_evidence - without.log_evidence, chosen, fit))
+        ranked = []
+        for same in by_effects.values():
+            best, *others = sorted(same, key=lambda f: _start_loss(model, f) - f.gain)
+            ranked.append(best._replace(others=tuple(
+                f for f in others if 2 * f.gain > best.gain
+                and all(model.variants[i].shape for i in f.chosen))[:_OTHER_STARTS]))
+        return sorted(ranked, key=lambda f: -f.gain)
+
+    def _fit(self, model: LinearModel, first: _Ranked, beside: Hypothesis | None = None) -> None:
+        """Fit a ranked set beside another one, from other shapes where it does not converge."""
+        present = beside.effects if beside else ()
+        effects = (*present, *(model.variants[i].effect for i in first.chosen))
+        if first.gain < _WORTH_FITTING or frozenset(effects) in self.found:
+            return
+        for ranked in (first, *first.others):
+            start = dict(zip(beside.names, beside.values)) if beside else {}
+            shapes: dict[Coefficient, float] = {}
+            own = {k for i in ranked.chosen for k in model.column_ids[i]}
+            start |= {model.names[k]: float(v) for k, v in zip(
+                ranked.fit.column_ids, ranked.fit.values) if k in own}
+            for variant in (model.variants[i] for i in ranked.chosen):
+                # Limits and sizes start where the effect was simulated.
+                start |= {name: value - (0.0 if parameter_of(name).is_size
+                                         else parameter_of(name).scale)
+                          for name, value in variant.first_limits(start).items()}
+                start |= {name: float(np.clip(start.get(name, size), size / _NEAR_START,
+                                              size * _NEAR_START))
+                          for name, size in _stepped(variant).items()}
+                shapes |= {Coefficient(variant.effect, p): v for p, v in variant.shape.items()}
+            fitted = self._add(effects, start, shapes, self._lowest)
+            if fitted is not None and (fitted.converged or fitted.log_evidence < self._lowest):
                 break
-            effects = (*best.effects, about.variants[first.chosen[0]].effect)
-            if frozenset(effects) in self.found:
-                continue
-            for ranked in (first, *first.others[:1]):
-                added = about.variants[ranked.chosen[0]]
-                start = dict(zip(best.names, best.values))
-                start |= {about.names[k]: v for k, v in zip(ranked.fit.column_ids,
-                                                            ranked.fit.values)
-                          if k in about.column_ids[ranked.chosen[0]]}
-                start |= _limit_start(added, start) | _size_start(added, start)
-                fitted = self._add(effects, start, _shape(added))
-                if fitted is not None and fitted.converged:
-                    break
 
     def _add(self, effects: Iterable[str], start: Mapping[Coefficient, float],
-             shapes: Mapping[Coefficient, float], hopeful: bool = False) -> Hypothesis | None:
+             shapes: Mapping[Coefficient, float], lowest: float | None = None
+             ) -> Hypothesis | None:
         """Fit a set; None where it cannot be simulated, is singular or does not show."""
-        effects = tuple(dict.fromkeys(effects))
-        fitted = None
+        key, fitted = frozenset(effects), None
         with suppress(UserError, np.linalg.LinAlgError):
-            fitted = fit_hypothesis(self.model, effects, start, shapes,
-                                    -np.inf if hopeful else self._lowest)
+            fitted = fit_hypothesis(self.model, tuple(effects), start, shapes,
+                                    self._lowest if lowest is None else lowest)
         if fitted is None or not _shows_time_constants(self.model, fitted):
             return None
-        key = frozenset(effects)
         if key not in self.found or fitted.log_evidence > self.found[key].log_evidence:
             self.found[key] = fitted
         return fitted
+
+
+def _identifiable(model: LinearModel) -> list[int]:
+    """Return the variants that can show: no zero-g or scale factor without a known pose."""
+    return [i for i, v in enumerate(model.variants) if model.pose_known
+            or not effect_named(v.effect).diagnosis.straight_line]
 
 
 def _model_about(model: LinearModel, best: Hypothesis) -> LinearModel:
@@ -210,55 +458,30 @@ def _model_about(model: LinearModel, best: Hypothesis) -> LinearModel:
     Return the linear model about a set: residuals and sensitivities at its fit.
 
     Filter and latency stay those of the parameter file, unless they are effects of the set, so
-    that their tolerance is the same as before.
+    that their tolerance is the same as before. What the form of the effects may lack is free.
     """
-    file_values = with_neutral(model.baseline, best.sensor.effects).values
-
-    def stays(effect: str) -> bool:
+    file_values, values = with_neutral(model.baseline, best.sensor.effects).values, {}
+    for effect, fitted in best.sensor.values.items():
         hints = effect_named(effect).diagnosis
-        return hints.nuisance and not hints.straight_line and effect not in best.effects
-
-    values = {effect: file_values[effect] if stays(effect) else fitted
-              for effect, fitted in best.sensor.values.items()}
+        stays = hints.nuisance and not hints.straight_line and effect not in best.effects
+        values[effect] = file_values[effect] if stays else fitted
     comparisons = [replace(c, sensor=replace(best.sensor, values=values,
                                              rate_hz=c.sensor.rate_hz))
                    for c in model.comparisons]
-    filters = [[w] for w in best.whiteners]
-    return build_linear_model(comparisons, filters=filters,
-                              flexible=_form_functions(model, best))
-
-
-def _form_functions(model: LinearModel, best: Hypothesis) -> list[FlexibleColumns]:
-    """Return for each channel what the form of the present effects may lack."""
-    out = []
+    flexible = []
     for number, columns in enumerate(best.linearised.columns):
         recording, axis = model.place_of_channel(number)
         basis = model.flexible_bases[recording][axis]
-        functions = [np.zeros((len(model.comparisons[recording]), 0))]
+        functions = [np.zeros((len(comparisons[recording]), 0))]
         for effect in best.effects:
-            own = [i for i, place in enumerate(columns.places)
-                   if place < len(best.names) and best.names[place].effect == effect]
-            size_v = float(np.std(columns.values[:, 1:][:, own]
-                                  @ best.values[columns.places[own]]))
-            functions += [_FORM_ERROR * size_v * basis[d]
-                          for d in effect_named(effect).diagnosis.form if d in basis]
-        out.append(FlexibleColumns(np.concatenate(functions, axis=1),
-                                   float(best.fit.innovation_variance_v2[number])))
-    return out
-
-
-def _best_of_each(model: LinearModel, fits: Iterable[_Ranked]) -> list[_Ranked]:
-    """Return the best fit of each set of effects, by falling gain, with the next best shapes."""
-    by_effects: dict[frozenset[str], list[_Ranked]] = {}
-    for fit in sorted(fits, key=lambda f: -f.gain):
-        by_effects.setdefault(
-            frozenset(model.variants[i].effect for i in fit.chosen), []).append(fit)
-    for same in by_effects.values():
-        same.sort(key=lambda f: _start_loss(model, f) - f.gain)
-    return [best._replace(others=tuple(
-        f for f in others if 2 * f.gain > best.gain
-        and all(model.variants[i].shape for i in f.chosen))[:_OTHER_STARTS])
-        for best, *others in by_effects.values()]
+            own, places = columns.of_effect(best.names, effect)
+            size_v = _PRESENT_FORM_ERROR * float(np.std(own @ best.values[places]))
+            functions += [size_v * basis[d] for d in effect_named(effect).diagnosis.form
+                          if d in basis]
+        flexible.append(evidence.FlexibleColumns(
+            np.concatenate(functions, axis=1), float(best.fit.innovation_variance_v2[number])))
+    return linear.build_linear_model(comparisons, filters=[[w] for w in best.whiteners],
+                                     flexible=flexible)
 
 
 def _stepped(variant: Variant) -> dict[Coefficient, float]:
@@ -269,45 +492,13 @@ def _stepped(variant: Variant) -> dict[Coefficient, float]:
 
 def _start_loss(model: LinearModel, ranked: _Ranked) -> float:
     """Return what log likelihood a fit loses at the sizes at which its effects were simulated."""
-    loss = 0.0
+    stepped: dict[Coefficient, float] = {}
     for i in ranked.chosen:
-        stepped = _stepped(model.variants[i])
-        for k in range(len(ranked.fit.values) if stepped else 0):
-            name = model.names[ranked.fit.column_ids[k]]
-            if name in stepped:
-                loss += 0.5 * float((ranked.fit.values[k] - stepped[name]) ** 2
-                                    / ranked.fit.covariance[k, k])
-    return loss
-
-
-def _start(model: LinearModel, ranked: _Ranked
-           ) -> tuple[dict[Coefficient, float], dict[Coefficient, float]]:
-    """Return first departures of all coefficients, and first values of shapes."""
-    start = dict(zip([model.names[i] for i in ranked.fit.column_ids], ranked.fit.values))
-    shapes: dict[Coefficient, float] = {}
-    for variant in (model.variants[i] for i in ranked.chosen):
-        start |= _limit_start(variant, start) | _size_start(variant, start)
-        shapes |= _shape(variant)
-    return start, shapes
-
-
-def _size_start(variant: Variant, start: Mapping[Coefficient, float]) -> dict[Coefficient, float]:
-    """Return where the fit of a size starts in which the effect is far from linear."""
-    return {name: float(np.clip(start.get(name, size), size / _NEAR_START, size * _NEAR_START))
-            for name, size in _stepped(variant).items()}
-
-
-def _limit_start(variant: Variant, amounts: Mapping[Coefficient, float]
-                 ) -> dict[Coefficient, float]:
-    """Return where the fit of a limit starts, as departures from the prior mean."""
-    return {name: value - (0.0 if parameter_of(name).is_size else parameter_of(name).scale)
-            for name, value in variant.first_limits(amounts).items()}
-
-
-def _shape(variant: Variant) -> dict[Coefficient, float]:
-    """Return the shape parameters of a variant by coefficient without axis."""
-    return {Coefficient(variant.effect, parameter): value
-            for parameter, value in variant.shape.items()}
+        stepped |= _stepped(model.variants[i])
+    fit = ranked.fit
+    return sum(0.5 * float((fit.values[k] - stepped[name]) ** 2 / fit.covariance[k, k])
+               for k, i in enumerate(fit.column_ids if stepped else ())
+               if (name := model.names[i]) in stepped)
 
 
 def _shows_time_constants(model: LinearModel, hypothesis: Hypothesis) -> bool:

@@ -331,7 +331,7 @@ class _Job:
             low, high = (gap[name] is not None and gap[f'{name}_ci']) or (None, None)
             self.row |= {f'gap_{name}{unit}': gap[name], f'gap_{name}_low{unit}': low,
                          f'gap_{name}_high{unit}': high}
-        best = diagnosis.report.verdict.best
+        best = diagnosis.report.hypotheses[0]
         self._put_coefficients('diagnose', best.sensor, {
             name: std for name, std, is_open in zip(best.names, best.std, best.undetermined)
             if not is_open})

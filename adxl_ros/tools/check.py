@@ -12,10 +12,10 @@ import textwrap
 from typing import Any
 
 from adxl_ros.check.findings import check_recording, Findings
-from adxl_ros.diagnose.data_checks import DataFault
 from adxl_ros.diagnose.diagnosis import what_shows
+from adxl_ros.diagnose.next_experiment import by_effect
+from adxl_ros.diagnose.reference import DataFault
 from adxl_ros.diagnose.report import shows_row
-from adxl_ros.diagnose.visibility import by_effect
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import recording
 from adxl_ros.files.atomic_write import write_text

@@ -11,9 +11,8 @@ from time import monotonic
 from typing import Any
 
 from adxl_ros.diagnose import page
-from adxl_ros.diagnose.diagnosis import diagnose as diagnose_recordings, Diagnosis
+from adxl_ros.diagnose.diagnosis import diagnose as diagnose_recordings, Diagnosis, self_check
 from adxl_ros.diagnose.report import as_json, screen_lines
-from adxl_ros.diagnose.self_check import self_check
 from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, population_file, recording
@@ -126,8 +125,8 @@ def diagnose(options: argparse.Namespace) -> int:
         lines = [*screen_lines(diagnosis, subject), *prior_lines]
         if options.self_check and diagnosis.report is not None:
             lines += ['', ' ' + self_check(diagnosis, recordings, sim, options.self_check,
-                                           options.seed, lambda done: show(
-                                               done, 'self-check')).text]
+                                           options.seed,
+                                           lambda done: show(done, 'self-check'))]
         report = _write(options, diagnosis, subject, lines)
     if options.json:
         print(json.dumps(report, indent=1, allow_nan=False))

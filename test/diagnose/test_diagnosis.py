@@ -224,11 +224,10 @@ def test_next_experiment_separates_most():
     verdict = diagnosed()[0].report.verdict
     verdict = replace(
         verdict, status='inseparable', groups=(rivals,),
-        hypotheses=tuple(WeightedHypothesis((effect,), 0.5) for effect in rivals),
-        best=replace(verdict.best, effects=rivals[:1], sensor=sensor))
+        hypotheses=tuple(WeightedHypothesis((effect,), 0.5) for effect in rivals))
     proposal = propose_next_experiment(verdict, [], RecordedEvidence(sensor, None, 0))
     worth = {m.text: m.nats_per_minute for m in proposal.menu}
-    assert proposal.nats_per_minute == max(worth.values()) == worth[proposal.manoeuvre] > 0
+    assert max(worth.values()) == worth[proposal.manoeuvre] > 0
     assert worth['shake along x from 2 to 40 Hz'] < 0.1 * worth['dwell, heat and cool']
 
 

@@ -26,7 +26,7 @@ def test_the_interval_contains_the_noise(seconds):
         white = np.random.default_rng(seed).normal(size=(count + 100, 1))
         volts = lfilter([np.sqrt(1 - pole ** 2)], [1, -pole], white, axis=0)[100:]
         sums = squares_at_rest(volts, np.ones(count, bool), sensor)
-        parts = np.array([(part.squares_v2[0], part.count) for part in sums]).T
+        parts = np.array([(squares_v2[0], count) for squares_v2, count in sums]).T
         rms = np.sqrt(parts[0].sum() / parts[1].sum())
         floor = NoiseFloor(np.array([rms]), rms, 'still', parts)
         low, high = np.quantile(floor.draws_mps2(seed, 200), [0.05, 0.95])
