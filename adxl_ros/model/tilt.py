@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from math import atan2, cos, hypot, sin
 
-from adxl_ros.model.effects.base import Components, Value
-from adxl_ros.model.scalar_or_array import ARRAYS, Maths
+from adxl_ros.model.effects.base import ARRAYS, Components, Maths, Value
 import numpy as np
 
 UNOBSERVABLE_RAD2 = 1.0
