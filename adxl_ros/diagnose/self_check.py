@@ -17,7 +17,7 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.coefficients import get
 from adxl_ros.model.constants import Z_90
 from adxl_ros.simulate.motion import Motion
-from adxl_ros.simulate.simulator import simulate_at_stamps
+from adxl_ros.simulate.response import simulate_at_stamps
 import numpy as np
 
 

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from math import isfinite
 from typing import Any
 
-from adxl_ros.compensate import filter_inversion
+from adxl_ros.compensate import inversions
 from adxl_ros.compensate.compensation_policy import CompensationPolicy, Interval, State, Topics
 from adxl_ros.compensate.live_stream import COUNTS, LiveStream
 from adxl_ros.errors import UserError
@@ -21,8 +21,8 @@ from adxl_ros.files import imu_message
 from adxl_ros.files.stream_info import StreamInfo
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.kinematics import Mounting
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.tilt import Mounting
 from adxl_ros.nodes.node_help import NodeHelp
 from adxl_ros.nodes.parameters import declare_all, parameter_error
 from adxl_ros.nodes.run_node import run
@@ -328,7 +328,7 @@ class Compensation(Node):
         newer = self._policy.newer()
         state, text = self._policy.status(interval, newer, self._calibration())
         counts, duration_s = interval.counts, interval.duration_s
-        late = filter_inversion.HALF if self._settings.undo_filter else 0
+        late = inversions.HALF if self._settings.undo_filter else 0
         values: dict[str, Any] = {
             'rate_in_hz': round(counts['received'] / duration_s, 1),
             'rate_out_hz': round(counts['published'] / duration_s, 1),

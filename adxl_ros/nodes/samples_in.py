@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from adxl_ros.compensate.live_stream import UNKNOWN_ANGLE_RAD2
 from adxl_ros.files import cdr
+from adxl_ros.model.kinematics import UNKNOWN_ANGLE_RAD2
 from adxl_ros.model.sensor import Sensor, to_volts
 from adxl_ros.nodes.topics import Inbox, STEADY
 import numpy as np

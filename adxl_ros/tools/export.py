@@ -13,7 +13,7 @@ from adxl_ros.files import exports, parameter_file
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.simulate.simulator import PartSizes
+from adxl_ros.simulate.response import PartSizes
 from adxl_ros.tools.command_line import argument_parser, command, entry_list
 from adxl_ros.tools.output import print_end, progress, quoted, run
 import numpy as np

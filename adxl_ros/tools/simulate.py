@@ -20,10 +20,13 @@ from adxl_ros.links.support import emulated_board
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Concern
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.simulate import simulator
 from adxl_ros.simulate.motion import INTERNAL_RATE_HZ
-from adxl_ros.simulate.simulator import motion_from_force, motion_from_references
-from adxl_ros.simulate.trajectories import TRAJECTORIES
+from adxl_ros.simulate.response import Columns, simulate_at_stamps, simulate_blocks
+from adxl_ros.simulate.trajectories import (
+    motion_from_force,
+    motion_from_references,
+    TRAJECTORIES,
+)
 from adxl_ros.tools.command_line import (
     argument_parser,
     command,
@@ -47,7 +50,7 @@ _EXAMPLES = {
 }
 """Examples of arguments, by their purpose."""
 
-Output = Callable[[simulator.Columns], None]
+Output = Callable[[Columns], None]
 """Takes a block of simulated samples."""
 
 
@@ -58,7 +61,7 @@ class _Run:
     sensor: Sensor  # The sensor, at its sample rate
     begin_s: float  # Time of the first sample, s
     duration_s: float  # Time from the first to the last sample, s
-    blocks: Iterator[simulator.Columns]  # The samples
+    blocks: Iterator[Columns]  # The samples
 
 
 def parser() -> argparse.ArgumentParser:
@@ -175,7 +178,7 @@ class _FileOutput:
         self._write = stack.enter_context(recording.writer(path, sensor))
         self._path, self._info = path, sensor_info(sensor)
 
-    def __call__(self, columns: simulator.Columns) -> None:
+    def __call__(self, columns: Columns) -> None:
         others = {name: values for name, values in columns.items() if name != 'time_s'}
         self._write(Recording(self._path, columns['time_s'], others, self._info))
 
@@ -189,7 +192,7 @@ class _BoardOutput:
         self._descriptor = stack.enter_context(emulated_board.open_terminal(port))
         self._board: emulated_board.Board | None = None
 
-    def __call__(self, columns: simulator.Columns) -> None:
+    def __call__(self, columns: Columns) -> None:
         if self._board is None:
             roles = emulated_board.roles_of(self._sensor, columns)
             self._board = emulated_board.Board(self._sensor, roles, self._descriptor)
@@ -205,7 +208,7 @@ def _run(sensor: Sensor, options: argparse.Namespace) -> _Run:
     if options.trajectory in TRAJECTORIES:
         motion = TRAJECTORIES[options.trajectory](np.random.default_rng(options.seed))
         return _Run(sensor, 0.0, motion.duration_s,
-                    simulator.simulate_blocks(sensor, motion, options.seed))
+                    simulate_blocks(sensor, motion, options.seed))
     return _simulate_recording(sensor, options)
 
 
@@ -216,7 +219,7 @@ def _simulate_force(sensor: Sensor, options: argparse.Namespace) -> _Run:
         sensor = replace(sensor, rate_hz=motion.internal_rate_hz)
         motion = replace(motion, internal_rate_hz=max(sensor.rate_hz, INTERNAL_RATE_HZ))
     return _Run(sensor, begin_s, motion.duration_s,
-                simulator.simulate_blocks(sensor, motion, options.seed, begin_s))
+                simulate_blocks(sensor, motion, options.seed, begin_s))
 
 
 def _simulate_recording(sensor: Sensor, options: argparse.Namespace) -> _Run:
@@ -229,10 +232,10 @@ def _simulate_recording(sensor: Sensor, options: argparse.Namespace) -> _Run:
     if options.rate is not None:
         motion = replace(motion, duration_s=duration_s)
         return _Run(sensor, begin_s, duration_s,
-                    simulator.simulate_blocks(sensor, motion, options.seed, begin_s))
+                    simulate_blocks(sensor, motion, options.seed, begin_s))
     sensor = replace(sensor, rate_hz=read.rate_hz)
     return _Run(sensor, begin_s, duration_s,
-                simulator.simulate_at_stamps(sensor, motion, read, options.seed))
+                simulate_at_stamps(sensor, motion, read, options.seed))
 
 
 def main() -> int:

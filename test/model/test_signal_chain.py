@@ -4,19 +4,13 @@
 
 from dataclasses import replace
 
-from adxl_ros.model import analog_stages, noise, signal_chain
+from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
 from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects import library
-from adxl_ros.model.effects.base import (
-    Coefficient,
-    Need,
-    Role,
-)
-from adxl_ros.model.kinematics import specific_force
-from adxl_ros.model.scalar_or_array import ARRAYS, FLOATS
+from adxl_ros.model.effects.base import ARRAYS, Coefficient, FLOATS, Need, Role
+from adxl_ros.model.kinematics import angles, roll_pitch_covariance, specific_force, tilt
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.tilt import angles, roll_pitch_covariance, tilt
 from hypothesis import given, strategies as st
 import numpy as np
 import pytest
@@ -69,7 +63,7 @@ def bit_error_v(sensor: Sensor) -> float:
 
 def near_a_step(sensor: Sensor, force: np.ndarray) -> bool:
     """Return whether the input of the ADC is so near a step that another input has its code."""
-    input_v = np.array(analog_stages.analog_response(sensor)([float(f) for f in force]))
+    input_v = np.array(signal_chain.analog_response(sensor)([float(f) for f in force]))
     step_v = sensor.adc_vref_v / 64
     off_v = np.abs(input_v - np.rint(input_v / step_v) * step_v)
     return bool((off_v <= 2 * bit_error_v(sensor)).any())

@@ -82,7 +82,7 @@ def scale_factor_cross(signals: Signals, p: Parameters) -> None:
                                  form=(FormDimension.FORCE, FormDimension.CROSS_FORCE),
                                  proof=(ProofVariable.FORCE_Z, ProofVariable.OWN_FORCE)))
 def scale_factor_z(signals: Signals, p: Parameters) -> None:
-    """Scale factor that depends on the out-of-plane axis: equations 15 and 17, centred and in g."""
+    """Scale factor by the out-of-plane axis, y for z: equations 15 and 17, centred and in g."""
     for d, (r1, r2) in enumerate(zip(p['linear_per_g'], p['quadratic_per_g2'])):
         other = signals.sensed[_OUT_OF_PLANE[d]]
         signals.output[d] = signals.output[d] + signals.sensed[d] * (r1 + r2 * other) * other
@@ -136,7 +136,8 @@ def quadratic(signals: Signals, p: Parameters) -> None:
         cause='The reading depends on the direction of the last change; approach poses from both '
               'sides and average, or relieve the package of mounting stress.',
         diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS,
-                                 form=(FormDimension.FORCE, FormDimension.DIRECTION, FormDimension.LAG),
+                                 form=(FormDimension.FORCE, FormDimension.DIRECTION,
+                                       FormDimension.LAG),
                                  proof=(ProofVariable.FORCE_RATE, ProofVariable.OWN_FORCE)))
 def hysteresis(signals: Signals, p: Parameters) -> None:
     """

@@ -6,7 +6,15 @@ from functools import lru_cache
 from math import cos, sin
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
-from adxl_ros.model.effects.base import Components, effect, Parameter, Parameters, Place, Role, Signals
+from adxl_ros.model.effects.base import (
+    Components,
+    effect,
+    Parameter,
+    Parameters,
+    Place,
+    Role,
+    Signals,
+)
 from adxl_ros.model.filters import resonator
 
 

@@ -69,7 +69,7 @@ def temperature_scale(signals: Signals, p: Parameters) -> None:
                                  proof=(ProofVariable.TEMPERATURE_RATE,)))
 def thermal_lag(signals: Signals, p: Parameters) -> None:
     """
-    A thermometer that differs from the sensor in time, so that the zero-g is late or early.
+    Lag of the sensor behind its thermometer, or lead, so that the zero-g is late or early.
 
     Add k·(θ − T) to the output, g; θ follows the measured temperature T by 1/(1 + τ·s).
 
