@@ -190,7 +190,7 @@ def motion_errors(fitted: Sensor, time_s: np.ndarray, volts: np.ndarray, referen
     The RC filter is inverted. Estimate and reference then pass the same Butterworth filter.
     """
     unfiltered = inversions.undo_filter(volts, time_s, noise.electronics(fitted).rc_s,
-                                       fitted.rate_hz)
+                                        fitted.rate_hz)
     estimate = signal_chain.inverse(fitted)(list(unfiltered.T))[0]
     b, a = scipy.signal.butter(_BUTTERWORTH_ORDER, _BUTTERWORTH_HZ, fs=fitted.rate_hz)
     smooth, expected = (scipy.signal.lfilter(b, a, v) for v in (estimate, reference_mps2))

@@ -77,8 +77,8 @@ def undo_filter(volts: np.ndarray, time_s: np.ndarray, rc_s: np.ndarray, rate_hz
     return volts + rc_s * rate_hz * slope
 
 
-def undo_filter_blocks(blocks: Iterable[tuple[Token, np.ndarray, np.ndarray]], rc_s: np.ndarray,
-                rate_hz: float) -> Iterator[tuple[Token, np.ndarray]]:
+def undo_filter_blocks(blocks: Iterable[tuple[Token, np.ndarray, np.ndarray]],
+                       rc_s: np.ndarray, rate_hz: float) -> Iterator[tuple[Token, np.ndarray]]:
     """
     Undo the filter block by block, with the result of `undo_filter` for the whole.
 
@@ -94,8 +94,9 @@ def undo_filter_blocks(blocks: Iterable[tuple[Token, np.ndarray, np.ndarray]], r
             following_s, following_v = np.empty(0), np.empty((0, len(rc_s)))
             if following is not None:
                 following_s, following_v = following[1][:HALF], following[2][:HALF]
-            undone_v = undo_filter(np.concatenate([previous_v, volts, following_v]),
-                            np.concatenate([previous_s, time_s, following_s]), rc_s, rate_hz)
+            undone_v = undo_filter(
+                np.concatenate([previous_v, volts, following_v]),
+                np.concatenate([previous_s, time_s, following_s]), rc_s, rate_hz)
             yield token, undone_v[len(previous_s):len(previous_s) + len(time_s)]
             previous_s = np.concatenate([previous_s, time_s])[-HALF:]
             previous_v = np.concatenate([previous_v, volts])[-HALF:]

@@ -37,11 +37,29 @@ def counted(number: int, noun: str) -> str:
     return f'{number} {noun}{"" if number == 1 else "s"}'
 
 
-def duration(seconds: float) -> str:
-    """Return a time with two units at most, for people."""
+def duration(seconds: float, digits: int = 0) -> str:
+    """Return a time with two units at most, for people, with so many digits of its unit if any."""
     seconds = round(seconds, 3)
+    if digits:
+        unit_s = next((unit_s for unit_s in (86400.0, 3600.0, 60.0) if seconds >= 2 * unit_s), 1.0)
+        seconds = float(f'{seconds / unit_s:.{digits}g}') * unit_s
     for unit_s, unit, smaller_s, smaller in ((86400, 'd', 3600, 'h'), (3600, 'h', 60, 'min')):
         if round(seconds) >= unit_s:
             count, rest = divmod(round(seconds / smaller_s), round(unit_s / smaller_s))
             return f'{count} {unit} {rest} {smaller}' if rest else f'{count} {unit}'
     return f'{seconds / 60:.3g} min' if seconds >= 120 else f'{seconds:.3g} s'
+
+
+def short_time(seconds: float) -> str:
+    """Return a time that is mostly short."""
+    if abs(seconds) >= 1:
+        return f'{seconds:.4g} s'
+    return f'{1e3 * seconds:.3g} ms' if abs(seconds) >= 1e-6 else '< 0.001 ms'
+
+
+def file_size(count: int) -> str:
+    """Return a number of bytes with its prefix."""
+    for factor, unit in ((1e9, 'GB'), (1e6, 'MB'), (1e3, 'kB')):
+        if count >= factor:
+            return f'{count / factor:.3g} {unit}'
+    return f'{count} B'

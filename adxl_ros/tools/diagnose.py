@@ -25,26 +25,10 @@ from adxl_ros.model.effects import library
 from adxl_ros.model.population import posterior
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report import page as html_page
+from adxl_ros.report.screen import NextStep
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
 from adxl_ros.simulate.trajectories import motion_from_force
-from adxl_ros.tools.command_line import (
-    add_recording_options,
-    argument_parser,
-    command,
-    effect_list,
-    reading_options,
-    RECORDING_HELP,
-)
-from adxl_ros.tools.output import (
-    make_folder,
-    NextStep,
-    note,
-    print_end,
-    progress,
-    quoted,
-    report_reading,
-    run,
-)
+from adxl_ros.tools import command_line as cli
 
 _NO_VERDICT = ('bad_data', 'insufficient')
 """Statuses of the report that hold no verdict: the exit status is then 1."""
@@ -62,9 +46,9 @@ _FILES = ('report.html', 'params.yaml', 'report.json')
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = argument_parser('diagnose', __doc__, _EXAMPLES, _details)
+    parse = cli.argument_parser('diagnose', __doc__, _EXAMPLES, _details)
     parse.add_argument('recording', nargs='+',
-                       help=f'{RECORDING_HELP}; all of one unit')
+                       help=f'{cli.RECORDING_HELP}; all of one unit')
     parse.add_argument('--params', metavar='FILE', default=None,
                        help='what the simulator models (default: the nominal sensor)')
     parse.add_argument('--prior', metavar='FILE',
@@ -82,7 +66,7 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--json', action='store_true', help='print the report as JSON')
     parse.add_argument('-o', dest='output', metavar='DIR', required=True,
                        help='report.json, report.html and params.yaml')
-    add_recording_options(parse)
+    cli.add_recording_options(parse)
     return parse
 
 
@@ -90,7 +74,7 @@ def _details() -> str:
     """Return exit status and effects for the help text."""
     return ('Exit status: 0 with a verdict, 1 where none was possible (the report then\n'
             'names the fault of the recording, or what it lacks), 2 after wrong usage.\n\n'
-            + effect_list(library().values()))
+            + cli.effect_list(library().values()))
 
 
 def diagnose(options: argparse.Namespace) -> int:
@@ -107,10 +91,10 @@ def diagnose(options: argparse.Namespace) -> int:
                         f'{len(options.recording)} are given')
     if options.align and not options.sim:
         raise UserError('--align: shifts --sim, which is not given')
-    reading = reading_options(options)
+    reading = cli.reading_options(options)
     population = population_file.read(options.prior) if options.prior else None
     html_page.check_libraries()
-    with progress('reading') as show:
+    with cli.progress('reading') as show:
         recordings = [_read(path, reading) for path in options.recording]
         sim = motion_from_force(options.sim, False, recordings[0].epoch_ns)[0] if options.sim \
             else None
@@ -132,12 +116,12 @@ def diagnose(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(report, indent=1, allow_nan=False))
     else:
-        print_end([*lines, ''], [Path(options.output, name) for name in _FILES],
+        cli.print_end([*lines, ''], [Path(options.output, name) for name in _FILES],
                   _next_steps(options, diagnosis), monotonic() - begin_s)
     if report['verdict']['status'] not in _NO_VERDICT:
         return 0
     reason = report['verdict']['data_fault'] or report['verdict']['status']
-    note(f'diagnose: {", ".join(options.recording)}: no verdict ({reason}); the reason is in '
+    cli.note(f'diagnose: {", ".join(options.recording)}: no verdict ({reason}); the reason is in '
          f'{Path(options.output, "report.json")}')
     return 1
 
@@ -145,7 +129,7 @@ def diagnose(options: argparse.Namespace) -> int:
 def _read(path: str, reading: ReadingOptions) -> Recording:
     """Read a recording, and report how."""
     read = recording.read(path, reading)
-    report_reading('diagnose', read)
+    cli.report_reading('diagnose', read)
     return read
 
 
@@ -153,7 +137,7 @@ def _write(options: argparse.Namespace, diagnosis: Diagnosis, subject: str, line
            ) -> dict[str, Any]:
     """Write the files of a diagnosis; return its report."""
     folder = Path(options.output)
-    make_folder(folder)
+    cli.make_folder(folder)
     report = as_json(diagnosis)
     write_text(folder / 'report.json', json.dumps(report, indent=1, allow_nan=False) + '\n')
     parameters = '' if diagnosis.report is None else \
@@ -185,8 +169,8 @@ def _next_steps(options: argparse.Namespace, diagnosis: Diagnosis) -> str | list
     if diagnosis.report is None:
         return ''
     verdict = diagnosis.report.verdict
-    params = quoted(Path(options.output) / 'params.yaml')
-    simulate = command('simulate', f'rich --params {params} -o sim.csv')
+    params = cli.quoted(Path(options.output) / 'params.yaml')
+    simulate = cli.command('simulate', f'rich --params {params} -o sim.csv')
     if diagnosis.report.next_experiment is None:
         return simulate
     proposal = diagnosis.report.next_experiment
@@ -204,7 +188,7 @@ def _next_steps(options: argparse.Namespace, diagnosis: Diagnosis) -> str | list
                            _diagnose_command(options, params, [])),
                   NextStep('simulate with the effects', simulate)]
     else:
-        given = options.params and quoted(options.params)
+        given = options.params and cli.quoted(options.params)
         together = '' if options.sim else ' together with this one'
         steps.append(NextStep(f'{then}diagnose it{together}',
                               _diagnose_command(options, given, options.recording)))
@@ -214,13 +198,13 @@ def _next_steps(options: argparse.Namespace, diagnosis: Diagnosis) -> str | list
 def _diagnose_command(options: argparse.Namespace, params: str | None, recordings: list[str]
                       ) -> str:
     """Return the command that diagnoses the next recording, alone or with others."""
-    words = [quoted(*([] if options.sim else recordings), 'next.csv')]
+    words = [cli.quoted(*([] if options.sim else recordings), 'next.csv')]
     words += [f'--params {params}'] if params else []
     words += ['--sim next_simulated.csv'] if options.sim else []
     output = f'{options.output}{"_2" if options.output[-1].isdigit() else "2"}'
-    return command('diagnose', ' '.join([*words, f'-o {quoted(output)}']))
+    return cli.command('diagnose', ' '.join([*words, f'-o {cli.quoted(output)}']))
 
 
 def main() -> int:
     """Run the tool on the command line."""
-    return run(parser(), diagnose)
+    return cli.run(parser(), diagnose)

@@ -28,24 +28,7 @@ from adxl_ros.model.effects.base import Place
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.report import page as html_page
 from adxl_ros.signals.recorded_sensor import BeyondRange, listed, load_sensor, measure_unstated
-from adxl_ros.tools.command_line import (
-    add_recording_options,
-    argument_parser,
-    command,
-    effect_list,
-    reading_options,
-    reading_text,
-    RECORDING_HELP,
-)
-from adxl_ros.tools.output import (
-    make_folder,
-    note,
-    print_end,
-    quoted,
-    report_reading,
-    run,
-    staged_progress,
-)
+from adxl_ros.tools import command_line as cli
 
 _EXAMPLES = {
     'the richest model that a sweep determines, with a page':
@@ -68,9 +51,9 @@ _REPORT_FILES = ('report.html', 'calibration.png')
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = argument_parser('fit', __doc__, _EXAMPLES, _details)
+    parse = cli.argument_parser('fit', __doc__, _EXAMPLES, _details)
     parse.add_argument('recording', nargs='+',
-                       help=f'{RECORDING_HELP}; all of one unit')
+                       help=f'{cli.RECORDING_HELP}; all of one unit')
     parse.add_argument('--params', metavar='FILE', default=None,
                        help='values that are not fitted (default: the nominal sensor; what '
                             'a file leaves out is measured)')
@@ -96,13 +79,13 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--store', metavar='DIR', default=str(calibration_store.default_folder()),
                        help='the calibration store, which gets a copy (default: %(default)s); '
                             'empty for none')
-    add_recording_options(parse)
+    cli.add_recording_options(parse)
     return parse
 
 
 def _details() -> str:
     """Return the effects that a fit can have for the help text."""
-    return effect_list(effect for effect in library().values()
+    return cli.effect_list(effect for effect in library().values()
                        if effect.invertible or effect.place is Place.STAGE)
 
 
@@ -122,12 +105,12 @@ def fit(options: argparse.Namespace) -> int:
     measured: list[str] = []
     recordings = []
     thermal: Poses | None = None
-    reading = reading_options(options)
+    reading = cli.reading_options(options)
     work = {name: seconds for name, seconds in _WORK.items() if options.report or name != 'report'}
-    with staged_progress(work) as show:
+    with cli.staged_progress(work) as show:
         for number, path in enumerate(options.recording):
             read = recording.read(path, reading)
-            report_reading('fit', read)
+            cli.report_reading('fit', read)
             if unit is None:
                 unit, lines = measure_unstated(load_sensor(options.params, read), read)
                 base, measured = unit, listed(lines)
@@ -155,17 +138,17 @@ def fit(options: argparse.Namespace) -> int:
         result = replace(result, report_lines=[*result.report_lines, *measured])
         if options.report:
             show('report', 0.0)
-            make_folder(Path(options.report))
+            cli.make_folder(Path(options.report))
             report_html.write(options.report, result, options.store)
     result.save(options.output)
-    note(f'fit: {result.keep(options.store)}')
+    cli.note(f'fit: {result.keep(options.store)}')
     report = [Path(options.report) / name for name in _REPORT_FILES] if options.report else []
     lines = [errors_in_words(result.fitted), '', *_result_lines(result)] if thermal is None else \
         [*result.summary_lines, '']
-    print_end([*lines, *measured, ''],
-              [options.output, *report], command(
-        'apply', f'{quoted(options.recording[0])}{reading_text(options)} --params '
-        f'{quoted(options.output)} -o tilt.csv'))
+    cli.print_end([*lines, *measured, ''],
+              [options.output, *report], cli.command(
+        'apply', f'{cli.quoted(options.recording[0])}{cli.reading_text(options)} --params '
+        f'{cli.quoted(options.output)} -o tilt.csv'))
     return 0
 
 
@@ -187,7 +170,7 @@ def _report_range(read: Recording, unit: Sensor) -> None:
     beyond.add(read.volts(unit), unit)
     text = beyond.describe(unit)
     if text and 'range_g' not in unit.measured:
-        note(f'fit: {read.path}: {text}')
+        cli.note(f'fit: {read.path}: {text}')
 
 
 def _result_lines(result: calibration.CalibrationResult) -> list[str]:
@@ -217,4 +200,4 @@ def _records(path: str | None) -> list[sweep_journal.PoseRecord] | None:
 
 def main() -> int:
     """Run the tool on the command line."""
-    return run(parser(), fit)
+    return cli.run(parser(), fit)

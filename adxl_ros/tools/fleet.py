@@ -20,14 +20,8 @@ from adxl_ros.fleet.row import reason_kind, Row
 from adxl_ros.fleet.run import only_client, Plan, plan, Results, Selection, since_text, work
 from adxl_ros.report.addresses import as_utf_8, without_secrets
 from adxl_ros.report.quantities import counted, duration
-from adxl_ros.tools.command_line import (
-    add_recording_options,
-    argument_parser,
-    command,
-    reading_options,
-    reading_text,
-)
-from adxl_ros.tools.output import note, print_end, progress, run, wrapped
+from adxl_ros.report.screen import wrapped
+from adxl_ros.tools import command_line as cli
 from adxl_ros.workers import open_pool, RETRIES
 
 PROG = 'fleet'
@@ -51,7 +45,7 @@ _MOST_REASONS = 3
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = argument_parser(PROG, __doc__, _EXAMPLES)
+    parse = cli.argument_parser(PROG, __doc__, _EXAMPLES)
     parse.add_argument('input', nargs='+', metavar='INPUT',
                        help='file, folder, glob, URL of fsspec (s3://, gs://, https://, sftp://), '
                             'or a manifest: CSV or Parquet with url, serial, params, date')
@@ -79,7 +73,7 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--limit', metavar='N', type=int,
                        help='work on N recordings at most')
     parse.add_argument('--dry-run', action='store_true', help='only show what there is to do')
-    add_recording_options(parse)
+    cli.add_recording_options(parse)
     return parse
 
 
@@ -92,11 +86,11 @@ def fleet(options: argparse.Namespace) -> int:
     tasks = task_names(options.do)
     sources = find_sources(options.input)
     recipe = make_recipe(tasks, options.params, (source.params for source in sources),
-                         options.store, reading_options(options))
+                         options.store, cli.reading_options(options))
     folder = Path(options.output)
     if options.dry_run:
         to_do = _planned(sources, recipe, Results(folder), selection)
-        print_end(_plan_lines(to_do, len(sources)), [], _command(options, options.only_failed))
+        cli.print_end(_plan_lines(to_do, len(sources)), [], _command(options, options.only_failed))
         return 0
     with only_client(folder):
         return _worked(options, sources, recipe, selection, begin_s)
@@ -122,17 +116,17 @@ def _worked(options: argparse.Namespace, sources: Sequence[Source], recipe: Reci
         if to_do.todo:
             shared = (recipe, results.keys_of(to_do.todo))
             with open_pool(options.scheduler, options.jobs, shared) as pool, \
-                    progress(PROG) as show:
+                    cli.progress(PROG) as show:
                 for row in work(pool, to_do.todo, recipe, results, options.retries, show):
                     rows.append(_short(row))
     except KeyboardInterrupt:
         reason = 'interrupted; the same command continues'
     files = _written(folder, results)
     if reason:
-        note(f'{PROG}: {reason}')
+        cli.note(f'{PROG}: {reason}')
         return 130
     took_s = monotonic() - begin_s
-    print_end([*_result_lines(rows, to_do, took_s), ''], files, _next(options, rows), took_s)
+    cli.print_end([*_result_lines(rows, to_do, took_s), ''], files, _next(options, rows), took_s)
     return 1 if rows and not any(row['outcome'] == 'done' for row in rows) else 0
 
 
@@ -158,8 +152,8 @@ def _warn_of_replaced(to_do: Plan, results: Results, tasks: Sequence[str]) -> No
     if missing:
         together = ','.join(name for name in TASKS if name in {*tasks, *missing})
         count = sum(not set(missing).isdisjoint(earlier) for earlier in before)
-        note(f'{PROG}: {counted(count, "recording")} will lose {" and ".join(missing)} in table '
-             f'and page; --do {together} keeps them, or name another folder')
+        cli.note(f'{PROG}: {counted(count, "recording")} will lose {" and ".join(missing)} in '
+                 f'table and page; --do {together} keeps them, or name another folder')
 
 
 def _written(folder: Path, results: Results) -> list[Path]:
@@ -169,7 +163,7 @@ def _written(folder: Path, results: Results) -> list[Path]:
     try:
         files = [*report_html.write(folder), *files]
     except UserError as error:
-        note(f'{PROG}: no page: {error}')
+        cli.note(f'{PROG}: no page: {error}')
     return [*files, folder / 'reports']
 
 
@@ -263,7 +257,7 @@ def _command(options: argparse.Namespace, only_failed: bool) -> str:
         value = getattr(options, name)
         words += [f'--{name}', str(value)] if value != parser().get_default(name) else []
     words += ['--only-failed'] if only_failed else []
-    return command(PROG, shlex.join(words) + reading_text(options))
+    return cli.command(PROG, shlex.join(words) + cli.reading_text(options))
 
 
 def _next(options: argparse.Namespace, rows: Sequence[Row]) -> str:
@@ -275,4 +269,4 @@ def _next(options: argparse.Namespace, rows: Sequence[Row]) -> str:
 
 def main() -> int:
     """Run the tool on the command line."""
-    return run(parser(), fleet)
+    return cli.run(parser(), fleet)
