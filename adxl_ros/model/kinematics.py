@@ -57,18 +57,10 @@ def specific_force(alpha_rad: Value, beta_rad: Value, gravity_mps2: float,
 
 def stage_angles(roll_rad: np.ndarray, pitch_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return the stage angles that hold the sensor at a tilt.
+    Return the stage angles that hold the sensor at a tilt, rad, (n,).
 
-    Parameters
-    ----------
-    roll_rad, pitch_rad
-        Tilt by REP-103, rad, (n,): roll = atan2(fy, fz), pitch = atan2(−fx, hypot(fy, fz)).
-
-    Returns
-    -------
-    alpha_rad, beta_rad : ndarray
-        Stage angles, rad, (n,): alpha from 0 to π, beta from −π to π, 0 where alpha is 0.
-
+    roll_rad, pitch_rad: tilt by REP-103: roll = atan2(fy, fz), pitch = atan2(−fx, hypot(fy, fz));
+    returns: alpha from 0 to π, beta from −π to π, 0 where alpha is 0.
     """
     x = -np.sin(pitch_rad)
     y = np.sin(roll_rad) * np.cos(pitch_rad)
@@ -83,22 +75,7 @@ def specific_force_in_motion(alpha: Joint, beta: Joint, shift: Joint, gravity_mp
     Specific force in the case frame of a sensor while all joints move, m/s².
 
     A shifted sensor is carried by the turning stage, and the Coriolis acceleration adds to its
-    force.
-
-    Parameters
-    ----------
-    alpha, beta, shift
-        Joints with their derivatives, rad and m, arrays or floats of one shape.
-    gravity_mps2
-        Local gravity, m/s².
-    up
-        The vertical in the frame of the stage's base; its y is the axis of alpha.
-
-    Returns
-    -------
-    list
-        The three components, each in the shape of the joints.
-
+    force. See `specific_force` for the other parameters.
     """
     force = specific_force(alpha.position, beta.position, gravity_mps2, shift.acceleration, up)
     if np.any(shift.position) and (np.any(alpha.velocity) or np.any(beta.velocity)):
@@ -138,42 +115,17 @@ def angular_motion(alpha: Joint, beta: Joint) -> tuple[Components, Components]:
 
 def carried_acceleration(omega: Components, omega_dot: Components, r: Components) -> Components:
     """
-    Acceleration of a point that a turning body carries: ω × (ω × r) + ω̇ × r.
+    Acceleration, m/s², of a point that a turning body carries: ω × (ω × r) + ω̇ × r.
 
-    Parameters
-    ----------
-    omega
-        Angular velocity of the body in its frame, rad/s, three components.
-    omega_dot
-        Angular acceleration of the body in its frame, rad/s², three components.
-    r
-        Vector from the axis to the point in the frame of the body, m, three components.
-
-    Returns
-    -------
-    list
-        Acceleration in the frame of the body, m/s², three components.
-
+    omega, omega_dot: angular velocity, rad/s, and acceleration, rad/s², in the frame of the body;
+    r: vector from the axis to the point, m.
     """
     centripetal = cross_product(omega, cross_product(omega, r))
     return [c + t for c, t in zip(centripetal, cross_product(omega_dot, r))]
 
 
 def cross_product(a: Components, b: Components) -> Components:
-    """
-    Return the vector product a × b.
-
-    Parameters
-    ----------
-    a, b
-        Vectors of three components, arrays or floats of one shape.
-
-    Returns
-    -------
-    list
-        Three components.
-
-    """
+    """Return the vector product a × b."""
     return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
@@ -302,24 +254,7 @@ def angles(force: Components, covariance: tuple[Value, ...],
 
 def roll_pitch_covariance(force: Components, covariance: tuple[Value, ...],
                           maths: Maths) -> Value:
-    """
-    Return the first-order covariance of roll and pitch.
-
-    Parameters
-    ----------
-    force
-        Specific force at rest in the case frame, m/s², three components.
-    covariance
-        Covariance of the force, (m/s²)²: xx, xy, xz, yy, yz, zz.
-    maths
-        Functions for arrays or for floats.
-
-    Returns
-    -------
-    Value
-        Covariance, rad².
-
-    """
+    """Return the first-order covariance of roll and pitch, rad²; see `angles`."""
     x, y, z = force
     _, xy, xz, yy, yz, zz = covariance
     side2 = y * y + z * z + _FORCE2_FLOOR
@@ -328,22 +263,7 @@ def roll_pitch_covariance(force: Components, covariance: tuple[Value, ...],
 
 
 def quaternion(roll_rad: Value, pitch_rad: Value, maths: Maths) -> tuple[Value, ...]:
-    """
-    Return the orientation of a roll and pitch at a yaw of 0.
-
-    Parameters
-    ----------
-    roll_rad, pitch_rad
-        Angles, rad, (n,) each or floats.
-    maths
-        Functions for them.
-
-    Returns
-    -------
-    tuple
-        x, y, z and w.
-
-    """
+    """Return the orientation x, y, z, w of a roll and pitch, rad, at a yaw of 0."""
     sr, cr = maths.sin(roll_rad / 2), maths.cos(roll_rad / 2)
     sp, cp = maths.sin(pitch_rad / 2), maths.cos(pitch_rad / 2)
     return sr * cp, cr * sp, -sr * sp, cr * cp

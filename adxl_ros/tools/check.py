@@ -158,9 +158,10 @@ def check(options: argparse.Namespace) -> int:
     results, count = [], len(options.recording)
     with cli.progress('check') as show:
         for i, path in enumerate(options.recording):
-            results.append(check_recording(
-                path, options.params, reading,
-                lambda done, i=i, path=path: show((i + done) / count, Path(path).name)))
+            def step(done: float, i: int = i, name: str = Path(path).name) -> None:
+                show((i + done) / count, name)
+
+            results.append(check_recording(path, options.params, reading, step))
         if len(results) == 1:
             results = [_with_what_shows(results[0], options.params, reading)]
     page = []

@@ -60,7 +60,7 @@ def _head(result: RecordingNoise) -> list[str]:
 def _tables(result: RecordingNoise) -> list[str]:
     """Return the terms with intervals, then in SI units and by sample, 79 columns at most."""
     wide, narrow = (6, 25, 25, 25), (6, 12, 12, 12, 13, 13, 9)
-    rows = [row((' axis', *map(NAMES.get, TERMS)), wide),
+    rows = [row((' axis', *(NAMES[term] for term in TERMS)), wide),
             row(('', 'µg/√Hz (90 %)', 'µg (90 %)', 'µg/√s (90 %)'), wide)]
     rows += [row((f' {noise.axis}', *_micro_g_intervals(noise)), wide) for noise in result.axes]
     rows += _walk_lines(result)
