@@ -94,14 +94,11 @@ class RecordingEstimator:
 
     def _environment(self, block: Recording) -> Environment:
         """Return the surroundings of the samples; nominal where they are not measured."""
-        environment = NOMINAL_ENVIRONMENT._replace(time_s=block.time_s - self._begin_s)
-        for name in ('temperature_c', 'supply_v'):
-            values = block.columns.get(name)
-            if values is not None:
-                nominal = getattr(NOMINAL_ENVIRONMENT, name)
-                environment = environment._replace(
-                    **{name: np.where(np.isfinite(values), values, nominal)})
-        return environment
+        measured = {name: block.columns[name] for name in ('temperature_c', 'supply_v')
+                    if name in block.columns}
+        return NOMINAL_ENVIRONMENT._replace(time_s=block.time_s - self._begin_s, **{
+            name: np.where(np.isfinite(values), values, getattr(NOMINAL_ENVIRONMENT, name))
+            for name, values in measured.items()})
 
     def _estimate(self, volts: np.ndarray, input_v: np.ndarray, environment: Environment
                   ) -> Estimates:

@@ -22,7 +22,13 @@ from typing import Any, Protocol
 
 from adxl_ros.closed_output import ended_by_closed_output
 from adxl_ros.errors import UserError
-from adxl_ros.files.column_mapping import parse_mapping, parse_mounting, ReadingOptions
+from adxl_ros.files import recording
+from adxl_ros.files.column_mapping import (
+    AS_IT_IS,
+    parse_mapping,
+    parse_mounting,
+    ReadingOptions,
+)
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model import coefficients
 from adxl_ros.model.effects import effect_named
@@ -305,6 +311,13 @@ def report_reading(tool: str, recording: Recording) -> None:
             note(f'{tool}: {recording.path}: {name} aligned by its stamps: residual '
                  f'{alignment.residual:.3g} {unit} rms, nearest message at most '
                  f'{alignment.gap_s:.3g} s away')
+
+
+def read(tool: str, path: str, reading: ReadingOptions = AS_IT_IS) -> Recording:
+    """Read a recording, and report on stderr how."""
+    read = recording.read(path, reading)
+    report_reading(tool, read)
+    return read
 
 
 class ShowDone(Protocol):

@@ -16,9 +16,8 @@ from adxl_ros.diagnose.report import as_json, screen_lines
 from adxl_ros.diagnose.self_check import self_check
 from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.errors import UserError
-from adxl_ros.files import parameter_file, population_file, recording
+from adxl_ros.files import parameter_file, population_file
 from adxl_ros.files.atomic_write import write_text
-from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.model.effects import library
@@ -80,22 +79,22 @@ def _details() -> str:
 def diagnose(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     begin_s = monotonic()
-    if options.seed < 0:
-        raise UserError(f'--seed {options.seed}: must not be negative')
-    if not 0 < options.material < float('inf'):
-        raise UserError(f'--material {options.material:g}: must be positive')
-    if options.self_check < 0:
-        raise UserError(f'--self-check {options.self_check}: must not be negative')
-    if options.sim and len(options.recording) > 1:
-        raise UserError(f'--sim {options.sim}: goes with one recording, but '
-                        f'{len(options.recording)} are given')
-    if options.align and not options.sim:
-        raise UserError('--align: shifts --sim, which is not given')
+    count = len(options.recording)
+    for is_wrong, message in (
+            (options.seed < 0, f'--seed {options.seed}: must not be negative'),
+            (not 0 < options.material < float('inf'),
+             f'--material {options.material:g}: must be positive'),
+            (options.self_check < 0, f'--self-check {options.self_check}: must not be negative'),
+            (options.sim and count > 1,
+             f'--sim {options.sim}: goes with one recording, but {count} are given'),
+            (options.align and not options.sim, '--align: shifts --sim, which is not given')):
+        if is_wrong:
+            raise UserError(message)
     reading = cli.reading_options(options)
     population = population_file.read(options.prior) if options.prior else None
     html_page.check_libraries()
     with cli.progress('reading') as show:
-        recordings = [_read(path, reading) for path in options.recording]
+        recordings = [cli.read('diagnose', path, reading) for path in options.recording]
         sim = motion_from_force(options.sim, False, recordings[0].epoch_ns)[0] if options.sim \
             else None
         sensor, _ = measure_unstated(load_sensor(options.params, recordings[0]), recordings[0])
@@ -117,20 +116,13 @@ def diagnose(options: argparse.Namespace) -> int:
         print(json.dumps(report, indent=1, allow_nan=False))
     else:
         cli.print_end([*lines, ''], [Path(options.output, name) for name in _FILES],
-                  _next_steps(options, diagnosis), monotonic() - begin_s)
+                      _next_steps(options, diagnosis), monotonic() - begin_s)
     if report['verdict']['status'] not in _NO_VERDICT:
         return 0
     reason = report['verdict']['data_fault'] or report['verdict']['status']
     cli.note(f'diagnose: {", ".join(options.recording)}: no verdict ({reason}); the reason is in '
-         f'{Path(options.output, "report.json")}')
+             f'{Path(options.output, "report.json")}')
     return 1
-
-
-def _read(path: str, reading: ReadingOptions) -> Recording:
-    """Read a recording, and report how."""
-    read = recording.read(path, reading)
-    cli.report_reading('diagnose', read)
-    return read
 
 
 def _write(options: argparse.Namespace, diagnosis: Diagnosis, subject: str, lines: list[str]

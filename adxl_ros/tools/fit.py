@@ -14,12 +14,7 @@ from adxl_ros.calibrate.poses import Poses, with_table_angles
 from adxl_ros.calibrate.report import acceptance, report_html, text_tables
 from adxl_ros.calibrate.report.text_tables import errors_in_words
 from adxl_ros.errors import UserError
-from adxl_ros.files import (
-    calibration_store,
-    population_file,
-    recording,
-    sweep_journal,
-)
+from adxl_ros.files import calibration_store, population_file, sweep_journal
 from adxl_ros.files.calibration_store import sha256
 from adxl_ros.files.recording_columns import recorded_unit, Recording
 from adxl_ros.files.tables import read_pose_table
@@ -86,7 +81,7 @@ def parser() -> argparse.ArgumentParser:
 def _details() -> str:
     """Return the effects that a fit can have for the help text."""
     return cli.effect_list(effect for effect in library().values()
-                       if effect.invertible or effect.place is Place.STAGE)
+                           if effect.invertible or effect.place is Place.STAGE)
 
 
 def fit(options: argparse.Namespace) -> int:
@@ -99,18 +94,16 @@ def fit(options: argparse.Namespace) -> int:
     if options.poses and (options.journal or len(options.recording) != 1):
         raise UserError(f'--poses {options.poses}: goes with one recording, and without --journal')
     population = population_file.read(options.prior) if options.prior else None
-    records = _records(options.journal)
+    records = sweep_journal.poses_to_fit(sweep_journal.read(options.journal).entries) \
+        if options.journal else None
     unit: Sensor | None = None
-    base: Sensor | None = None
-    measured: list[str] = []
-    recordings = []
+    recordings: list[calibration.RecordedPoses] = []
     thermal: Poses | None = None
     reading = cli.reading_options(options)
     work = {name: seconds for name, seconds in _WORK.items() if options.report or name != 'report'}
     with cli.staged_progress(work) as show:
         for number, path in enumerate(options.recording):
-            read = recording.read(path, reading)
-            cli.report_reading('fit', read)
+            read = cli.read('fit', path, reading)
             if unit is None:
                 unit, lines = measure_unstated(load_sensor(options.params, read), read)
                 base, measured = unit, listed(lines)
@@ -128,7 +121,7 @@ def fit(options: argparse.Namespace) -> int:
                 poses = with_table_angles(poses, read_pose_table(options.poses), read.epoch_ns)
             recordings.append(calibration.RecordedPoses(
                 Path(path).name, poses, pose_extraction.estimate_filters(read, unit, poses)))
-        assert unit is not None and base is not None, 'argparse asks for a recording'
+        assert unit is not None, 'argparse asks for a recording'
         show('fit', 0.0)
         sha = sha256(options.recording)
         result = calibration.calibrate(unit, recordings, options.model, options.effect, sha,
@@ -145,8 +138,7 @@ def fit(options: argparse.Namespace) -> int:
     report = [Path(options.report) / name for name in _REPORT_FILES] if options.report else []
     lines = [errors_in_words(result.fitted), '', *_result_lines(result)] if thermal is None else \
         [*result.summary_lines, '']
-    cli.print_end([*lines, *measured, ''],
-              [options.output, *report], cli.command(
+    cli.print_end([*lines, *measured, ''], [options.output, *report], cli.command(
         'apply', f'{cli.quoted(options.recording[0])}{cli.reading_text(options)} --params '
         f'{cli.quoted(options.output)} -o tilt.csv'))
     return 0
@@ -191,11 +183,6 @@ def _result_lines(result: calibration.CalibrationResult) -> list[str]:
         lines += ['', *acceptance.limit_table(assessment, fitted),
                   f' {"limited by":24} {_LIMITS[assessment.limited_by]}']
     return lines + [f' {line}' for line in (*acceptance.unit_line(fitted), *result.warnings)]
-
-
-def _records(path: str | None) -> list[sweep_journal.PoseRecord] | None:
-    """Return the poses that a journal names; None without a journal."""
-    return None if path is None else sweep_journal.poses_to_fit(sweep_journal.read(path).entries)
 
 
 def main() -> int:

@@ -155,8 +155,7 @@ def _samples(sensor: Sensor, options: argparse.Namespace
             motion = replace(motion, internal_rate_hz=max(sensor.rate_hz, INTERNAL_RATE_HZ))
     else:
         # The references of a recording, at its stamps or at another rate.
-        read = recording.read(options.trajectory)
-        cli.report_reading('simulate', read)
+        read = cli.read('simulate', options.trajectory)
         motion, begin_s = motion_from_references(read, sensor), float(read.time_s[0])
         if options.rate is None:
             sensor = replace(sensor, rate_hz=read.rate_hz)

@@ -223,7 +223,8 @@ class Parameter:
     source: str  # Source of the typical magnitude: datasheet, paper or physics
     doc: str  # Meaning, in words that continue "it is the ..."
     # Axes that it applies to, with one value for each measured axis; values of other axes are
-    # neutral. Empty for one value without axes.
+    # neutral. Empty for one value without axes. At ELEMENT and ELECTRONICS, the value of an axis
+    # changes the output of that axis only.
     axes: str = AXES
     # Value at which the effect does nothing. A parameter of shape has its typical value there.
     neutral: float = 0.0
