@@ -10,7 +10,7 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.model.constants import G0_MPS2, MEASURED_AXES
-from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.effects.base import Coefficient, Parameters
 import numpy as np
 
 MODELS = ('nominal', 'linear', 'physical', 'full', 'gravity')
@@ -247,6 +247,12 @@ class Sensor:
     def lsb_v(self) -> float:
         """Step of the ADC, V; 0 where it does not quantise."""
         return self.adc_vref_v / 2 ** self.adc_bits if self.adc_bits else 0.0
+
+    def parameters(self, effect: str) -> Parameters:
+        """Return the values of one of its effects in the form that its `apply` takes."""
+        arrays = {name: np.asarray(value, float) for name, value in self.values[effect].items()}
+        return {name: tuple(value.tolist()) if value.ndim else float(value)
+                for name, value in arrays.items()}
 
     def saturated(self, volts: np.ndarray) -> np.ndarray:
         """Return where volts, (n, m), are at a rail of the ADC or beyond the range, (n, m)."""

@@ -66,10 +66,7 @@ class RunningEffect:
     def __init__(self, sensor: Sensor, name: str, seed: int) -> None:
         """Prepare the effect before its first sample."""
         effect = effect_named(name)
-        # By name: a tuple of floats, one for each measured axis, or a float.
-        self.parameters: dict[str, Any] = {
-            key: tuple(value.tolist()) if value.ndim else float(value)
-            for key, value in ((k, np.asarray(v, float)) for k, v in sensor.values[name].items())}
+        self.parameters = sensor.parameters(name)
         sizes = [p for p in effect.parameters if p.role is not Role.SHAPE]
         # At the neutral values of its sizes and limits an effect does nothing.
         self.is_neutral = bool(sizes) and all(
