@@ -175,52 +175,43 @@ def with_effects(sensor: Sensor, texts: Sequence[str]) -> Sensor:
     stated: dict[Coefficient, str] = {}
     for text in texts:
         name, _, rest = text.partition(':')
-        effect = _effect(name, text)
-        if not rest:
-            values = coefficients.typical(effect, sensor.axes)
-            sensor = _with_values(sensor, effect, values)
+        try:
+            effect = effect_named(name)
+        except UserError as error:
+            raise UserError(f'--effect {text}: {error}') from None
+        values = dict(sensor.values.get(name) or coefficients.neutral(effect, sensor.axes)) \
+            if rest else coefficients.typical(effect, sensor.axes)
         for part in filter(None, rest.split(',')):
-            key, _, number = part.partition('=')
-            coefficient = Coefficient(name, *key.strip().split('.', 1))
+            key, _, number = (word.strip() for word in part.partition('='))
+            coefficient = Coefficient(name, *key.split('.', 1))
             if coefficient in stated:
                 raise UserError(f'--effect {text}: {key} of {name} is stated twice, also in '
                                 f'{stated[coefficient]}; keep one')
             stated[coefficient] = text
-            sensor = _with_value(sensor, effect, key.strip(), number.strip(), text)
+            values[coefficient.parameter] = _value(effect, values, sensor.axes, key, number, text)
+        effects = sensor.effects if name in sensor.effects else (*sensor.effects, name)
+        sensor = replace(sensor, effects=effects, values={**sensor.values, name: values})
     return sensor
 
 
-def _effect(name: str, text: str) -> Effect:
-    try:
-        return effect_named(name)
-    except UserError as error:
-        raise UserError(f'--effect {text}: {error}') from None
-
-
-def _with_values(sensor: Sensor, effect: Effect, values: dict[str, np.ndarray]) -> Sensor:
-    """Return the sensor with an effect that has these values by parameter."""
-    effects = sensor.effects if effect.name in sensor.effects else (*sensor.effects, effect.name)
-    return replace(sensor, effects=effects, values={**sensor.values, effect.name: values})
-
-
-def _with_value(sensor: Sensor, effect: Effect, key: str, number: str, text: str) -> Sensor:
-    """Set one parameter, for all its axes or one; `text` is the option, for messages."""
+def _value(effect: Effect, values: Mapping[str, np.ndarray], axes: str, key: str, number: str,
+           text: str) -> np.ndarray:
+    """Return one parameter with a new value for all its axes or one; `text` is the option."""
     name, _, axis = key.partition('.')
     parameter = _parameter(effect, name, text)
     value = _number(parameter, number, text)
-    values = dict(sensor.values.get(effect.name) or coefficients.neutral(effect, sensor.axes))
     if not parameter.axes:
         if axis:
             raise UserError(f'--effect {text}: {name} is one number without axes; write '
                             f'{name}={number}')
-        return _with_values(sensor, effect, {**values, name: np.array(value)})
-    chosen = [i for i, a in enumerate(sensor.axes) if a in parameter.axes and axis in ('', a)]
+        return np.array(value)
+    chosen = [i for i, a in enumerate(axes) if a in parameter.axes and axis in ('', a)]
     if not chosen:
-        raise UserError(f'--effect {text}: no axis {axis!r} to act on; the sensor has '
-                        f'{sensor.axes}, {name} acts on {parameter.axes}')
+        raise UserError(f'--effect {text}: no axis {axis!r} to act on; the sensor has {axes}, '
+                        f'{name} acts on {parameter.axes}')
     changed = np.array(values[name], float)
     changed[chosen] = value
-    return _with_values(sensor, effect, {**values, name: changed})
+    return changed
 
 
 def _parameter(effect: Effect, name: str, text: str) -> Parameter:
