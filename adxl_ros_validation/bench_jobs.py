@@ -34,8 +34,8 @@ from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2, with_axes
 from adxl_ros.nodes.jobs import executable
 from adxl_ros.signals.allan_deviation import AllanStream, CellMeans
+from adxl_ros.simulate.response import simulate
 from adxl_ros.simulate.sensor_model import SensorModel
-from adxl_ros.simulate.simulator import simulate
 from adxl_ros.simulate.trajectories import rich, sweep
 import numpy as np
 import scipy

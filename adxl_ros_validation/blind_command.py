@@ -9,8 +9,16 @@ from pathlib import Path
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import write_text
-from adxl_ros.tools.command_line import argument_parser, command
-from adxl_ros.tools.output import make_folder, note, print_end, progress, quoted, run
+from adxl_ros.tools.command_line import (
+    argument_parser,
+    command,
+    make_folder,
+    note,
+    print_end,
+    progress,
+    quoted,
+    run,
+)
 from adxl_ros.workers import open_pool
 from adxl_ros_validation.blind import check, real_sensors, report_html, sealing, trials
 

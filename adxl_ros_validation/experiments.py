@@ -15,7 +15,7 @@ from adxl_ros.calibrate.fits import full_model, linear, term_selection
 from adxl_ros.calibrate.guided.pose_plan import sweep
 from adxl_ros.calibrate.pose_response import StageError
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.compensate import filter_inversion
+from adxl_ros.compensate import inversions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.files.sweep_journal import PoseRecord
@@ -25,12 +25,12 @@ from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Components
+from adxl_ros.model.kinematics import tilt
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.tilt import tilt
 from adxl_ros.signals import recorded_sensor
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Held, Motion
-from adxl_ros.simulate.simulator import simulate
+from adxl_ros.simulate.response import simulate
 import numpy as np
 import scipy
 
@@ -180,8 +180,8 @@ def motion_errors(fitted: Sensor, time_s: np.ndarray, volts: np.ndarray, referen
     The RC filter is inverted. Estimate and reference then pass the same Butterworth filter. Return
     the rms of the residual about its mean and this mean, mm/s², the estimate and the reference.
     """
-    unfiltered = filter_inversion.undo(volts, time_s, noise.electronics(fitted).rc_s,
-                                       fitted.rate_hz)
+    unfiltered = inversions.undo_filter(volts, time_s, noise.electronics(fitted).rc_s,
+                                        fitted.rate_hz)
     estimate = signal_chain.inverse(fitted)(list(unfiltered.T))[0]
     b, a = scipy.signal.butter(_BUTTERWORTH_ORDER, _BUTTERWORTH_HZ, fs=fitted.rate_hz)
     smooth, expected = (scipy.signal.lfilter(b, a, v) for v in (estimate, reference_mps2))

@@ -18,8 +18,16 @@ from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.recording_columns import recorded_unit
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.package_version import package_version
-from adxl_ros.tools.command_line import argument_parser, command
-from adxl_ros.tools.output import make_folder, print_end, progress, quoted, report_reading, run
+from adxl_ros.tools.command_line import (
+    argument_parser,
+    command,
+    make_folder,
+    print_end,
+    progress,
+    quoted,
+    report_reading,
+    run,
+)
 from adxl_ros_validation import coverage, experiments, reproduction_report as report
 from adxl_ros_validation.reproduction_report import FIGURES
 import numpy as np

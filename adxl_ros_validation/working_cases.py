@@ -21,8 +21,7 @@ import sys
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
-from adxl_ros.tools.command_line import argument_parser
-from adxl_ros.tools.output import run
+from adxl_ros.tools.command_line import argument_parser, run
 from adxl_ros.workers import for_each, make_folder, open_pool, write
 from adxl_ros_validation import working_world as world
 from adxl_ros_validation.blind import diagnosis_runs, grading, scores, trials

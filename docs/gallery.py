@@ -13,7 +13,7 @@ from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Coefficient, Effect, Need
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.simulate.motion import Held, Knots, Motion
-from adxl_ros.simulate.simulator import Columns, simulate
+from adxl_ros.simulate.response import Columns, simulate
 from adxl_ros.simulate.smoothed_paths import ForcePath
 from adxl_ros.simulate.trajectories import Steps, SweptSine
 import matplotlib

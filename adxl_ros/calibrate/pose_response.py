@@ -14,7 +14,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.model import analog_stages, signal_chain
+from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get, parameter_of, put
 from adxl_ros.model.effects.base import (
     Coefficient,
@@ -242,8 +242,7 @@ def stage_force(unit: Sensor, alpha_rad: np.ndarray, beta_rad: np.ndarray) -> Co
     """
     signals = Signals(NOMINAL_ENVIRONMENT, alpha=Joint(alpha_rad), beta=Joint(beta_rad),
                       up=list(UPRIGHT), gravity_mps2=unit.local_gravity_mps2)
-    for apply, values in analog_stages.effects_at(unit, Place.STAGE):
-        apply(signals, values)
+    signal_chain.Chain(unit)(Place.STAGE, signals)
     return specific_force(signals.alpha.position, signals.beta.position, signals.gravity_mps2,
                           0.0, signals.up)
 

@@ -19,13 +19,12 @@ from adxl_ros.calibrate.fits.linear import planes
 from adxl_ros.calibrate.poses import Poses, reference_force
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store
-from adxl_ros.model import analog_stages, signal_chain
+from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.covariance import leverage
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.validity import Envelope, STRETCH
+from adxl_ros.model.sensor import Envelope, Sensor, STRETCH
 from adxl_ros.package_version import package_version
 import numpy as np
 
@@ -153,7 +152,7 @@ def _turn_and_shifts(full: FullFit, poses: Poses) -> tuple[np.ndarray, np.ndarra
     unit = full.unit
     force = reference_force(poses, unit.local_gravity_mps2)
     by_force = np.moveaxis(signal_chain.jacobian(
-        analog_stages.analog_response(unit), force, poses.environment), 2, 0)
+        signal_chain.analog_response(unit), force, poses.environment), 2, 0)
     turned = np.stack([np.cross(axis, np.column_stack(force)) for axis in np.eye(3)], axis=2)
     shifted = np.broadcast_to(np.diag(unit.scale_v_per_g),
                               (len(poses), len(unit.axes), len(unit.axes)))

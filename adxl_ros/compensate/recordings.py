@@ -7,8 +7,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from adxl_ros.compensate import filter_inversion, paper_inverse
-from adxl_ros.compensate.live_stream import UNKNOWN_ANGLE_RAD2
+from adxl_ros.compensate.inversions import (
+    noise_variance_v2,
+    paper_inverse,
+    undo_filter_blocks,
+)
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model import noise, signal_chain
@@ -16,15 +19,21 @@ from adxl_ros.model.covariance import prepared_covariance, UNMEASURED_VARIANCE
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import (
     ActsOn,
+    ARRAYS,
     Effect,
     Environment,
     Need,
     NOMINAL_ENVIRONMENT,
     Place,
 )
-from adxl_ros.model.scalar_or_array import ARRAYS
+from adxl_ros.model.kinematics import (
+    quaternion,
+    roll_pitch_covariance,
+    Tilt,
+    tilt,
+    UNKNOWN_ANGLE_RAD2,
+)
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.tilt import quaternion, roll_pitch_covariance, Tilt, tilt
 import numpy as np
 
 
@@ -64,9 +73,9 @@ class RecordingEstimator:
             sensor = sensor.without_temperature_range()
         self._sensor, self._undo_filter = sensor, undo_filter
         self._begin_s = float(first.time_s[0])
-        self._inverse = (paper_inverse if paper else signal_chain).inverse(sensor)
+        self._inverse = (paper_inverse if paper else signal_chain.inverse)(sensor)
         self._covariance = prepared_covariance(
-            sensor, filter_inversion.noise_variance_v2(sensor) if undo_filter else None)
+            sensor, noise_variance_v2(sensor) if undo_filter else None)
 
     def blocks(self, recording: Iterable[Recording]) -> Iterator[tuple[Recording, Estimates]]:
         """Yield each block of the recording with its estimates."""
@@ -79,20 +88,17 @@ class RecordingEstimator:
         """Return blocks and volts, (n, m), with the volts before the RC filter if it is undone."""
         if not self._undo_filter:
             return ((pair, pair[1]) for pair in measured)
-        return filter_inversion.undo_blocks(
+        return undo_filter_blocks(
             ((pair, pair[0].time_s, pair[1]) for pair in measured),
             noise.electronics(self._sensor).rc_s, self._sensor.rate_hz)
 
     def _environment(self, block: Recording) -> Environment:
         """Return the surroundings of the samples; nominal where they are not measured."""
-        environment = NOMINAL_ENVIRONMENT._replace(time_s=block.time_s - self._begin_s)
-        for name in ('temperature_c', 'supply_v'):
-            values = block.columns.get(name)
-            if values is not None:
-                nominal = getattr(NOMINAL_ENVIRONMENT, name)
-                environment = environment._replace(
-                    **{name: np.where(np.isfinite(values), values, nominal)})
-        return environment
+        measured = {name: block.columns[name] for name in ('temperature_c', 'supply_v')
+                    if name in block.columns}
+        return NOMINAL_ENVIRONMENT._replace(time_s=block.time_s - self._begin_s, **{
+            name: np.where(np.isfinite(values), values, getattr(NOMINAL_ENVIRONMENT, name))
+            for name, values in measured.items()})
 
     def _estimate(self, volts: np.ndarray, input_v: np.ndarray, environment: Environment
                   ) -> Estimates:

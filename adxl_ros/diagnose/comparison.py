@@ -18,8 +18,8 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.rest_detection import find_rests
 from adxl_ros.simulate.motion import INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.response import ChainMemo, Response
-from adxl_ros.simulate.simulator import environment_paths, motion_from_references
 from adxl_ros.simulate.smoothed_paths import PathErrors, SmoothedPath
+from adxl_ros.simulate.trajectories import environment_paths, motion_from_references
 import numpy as np
 import scipy
 

@@ -49,7 +49,7 @@ from adxl_ros.model.effects.base import Coefficient, Effect
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Motion
-from adxl_ros.simulate.simulator import simulate_blocks
+from adxl_ros.simulate.response import simulate_blocks
 import numpy as np
 
 _SHOWN_STDS = 4.0

@@ -20,7 +20,7 @@ from xml.sax.saxutils import quoteattr
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.files.parameter_file import float_text
-from adxl_ros.model import analog_stages, noise, signal_chain
+from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Place
@@ -89,7 +89,7 @@ class Axis:
 def axes(sensor: Sensor) -> list[Axis]:
     """Return the values of the measured axes at 25 °C and the nominal supply."""
     mps2_per_v = G0_MPS2 / sensor.nominal_scale_v_per_g
-    at_zero_v = np.array([analog_stages.analog_response(sensor)([0.0, 0.0, 0.0])])
+    at_zero_v = np.array([signal_chain.analog_response(sensor)([0.0, 0.0, 0.0])])
     zero_g = to_nominal_mps2(at_zero_v, sensor)[0]
     lost = sensor.values.get('quantisation', {})
     lost_bits = np.asarray(lost.get('lost_bits', 0.0)) + lost.get('axis_lost_bits', 0.0)
@@ -235,7 +235,7 @@ def _json(export: Export) -> str:
     steps. The parameters of all effects are in it, but not their functions.
     """
     sensor = export.sensor
-    by_force = signal_chain.jacobian(analog_stages.analog_response(sensor), [0.0, 0.0, 0.0])
+    by_force = signal_chain.jacobian(signal_chain.analog_response(sensor), [0.0, 0.0, 0.0])
     gain = by_force * G0_MPS2 / sensor.nominal_scale_v_per_g[:, None]
     holds = FORMATS['json'].holds
     effects: dict[str, dict[str, Any]] = {}

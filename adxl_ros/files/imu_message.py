@@ -15,7 +15,7 @@ import struct
 from typing import NamedTuple
 
 from adxl_ros.files import cdr
-from adxl_ros.model.tilt import Mounting
+from adxl_ros.model.kinematics import Mounting
 
 _STAMP_OFFSET = 4
 """Offset of the header's stamp, bytes."""

@@ -20,8 +20,7 @@ from adxl_ros.files.atomic_write import write_text
 from adxl_ros.model.coefficients import names_of, neutral
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Effect, Parameter, Role
-from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.validity import Envelope
+from adxl_ros.model.sensor import Envelope, Sensor
 import numpy as np
 import yaml
 
@@ -44,7 +43,7 @@ ENVELOPE = {
     'force_low_mps2': 'lowest specific force of the poses by component, m/s^2',
     'force_high_mps2': 'highest specific force of the poses by component, m/s^2',
 }
-"""Meaning of the keys `envelope.*`, those of `model.validity.Envelope`; each may be missing."""
+"""Meaning of the keys `envelope.*`, those of `model.sensor.Envelope`; each may be missing."""
 
 ENVELOPE_LISTS = {'temperature_c': 2, 'force_low_mps2': 3, 'force_high_mps2': 3}
 """Number of values of the keys `envelope.*` that have more than one."""

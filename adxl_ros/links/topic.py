@@ -15,8 +15,8 @@ from adxl_ros.files.recording_columns import is_even, stamped_rate_hz
 from adxl_ros.links.support import base
 from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.simulate.motion import Motion
-from adxl_ros.simulate.response import lagrange_weights, POINTS, Response
+from adxl_ros.simulate.motion import lagrange_weights, Motion, POINTS
+from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.sensor_model import SensorModel
 import numpy as np
 import scipy

@@ -14,22 +14,7 @@ import numpy as np
 
 
 def names_of(effect: Effect, axes: str) -> tuple[Coefficient, ...]:
-    """
-    Name the coefficients of an effect on a sensor.
-
-    Parameters
-    ----------
-    effect
-        An effect of the library.
-    axes
-        Measured axes of the sensor. A parameter has coefficients for its own axes only.
-
-    Returns
-    -------
-    tuple
-        Names in the order of the parameters, axis by axis.
-
-    """
+    """Name the coefficients of an effect: by parameter, for those measured axes that it has."""
     return tuple(name for p in effect.parameters for name in _names_of_parameter(effect, p, axes))
 
 
@@ -40,22 +25,7 @@ def _names_of_parameter(effect: Effect, parameter: Parameter, axes: str) -> list
 
 
 def fitted_of(effect: Effect, axes: str) -> tuple[Coefficient, ...]:
-    """
-    Name the coefficients of an effect that a fit of its own estimates.
-
-    Parameters
-    ----------
-    effect
-        An effect of the library.
-    axes
-        Measured axes of the sensor.
-
-    Returns
-    -------
-    tuple
-        Names as of `names_of`, without those of parameters that fits hold.
-
-    """
+    """Name the coefficients as `names_of`, without those of parameters that fits hold."""
     return tuple(name for p in effect.parameters if not p.held
                  for name in _names_of_parameter(effect, p, axes))
 
@@ -66,43 +36,16 @@ def parameter_of(name: Coefficient) -> Parameter:
 
 
 def neutral(effect: Effect, axes: str) -> dict[str, np.ndarray]:
-    """
-    Return the neutral values of an effect.
-
-    Parameters
-    ----------
-    effect
-        An effect of the library.
-    axes
-        Measured axes of the sensor.
-
-    Returns
-    -------
-    dict
-        Values by parameter, (m,) or (), each in the unit of its parameter.
-
-    """
+    """Return the neutral values of an effect by parameter, (m,) or (), each in its unit."""
     return {p.name: np.full(len(axes), p.neutral) if p.axes else np.array(p.neutral)
             for p in effect.parameters}
 
 
 def typical(effect: Effect, axes: str) -> dict[str, np.ndarray]:
     """
-    Return the typical values of an effect.
+    Return the typical values of an effect by parameter, (m,) or (), each in its unit.
 
-    Parameters
-    ----------
-    effect
-        An effect of the library.
-    axes
-        Measured axes of the sensor.
-
-    Returns
-    -------
-    dict
-        Values by parameter, (m,) or (), each in the unit of its parameter. Axes that a parameter
-        does not have keep the neutral value.
-
+    Axes that a parameter does not have keep the neutral value.
     """
     values = neutral(effect, axes)
     for p in effect.parameters:
@@ -112,44 +55,14 @@ def typical(effect: Effect, axes: str) -> dict[str, np.ndarray]:
 
 
 def with_neutral(sensor: Sensor, effects: Iterable[str]) -> Sensor:
-    """
-    Add effects to a sensor at their neutral values.
-
-    Parameters
-    ----------
-    sensor
-        The unit; effects that it has stay as they are.
-    effects
-        Names of the effects.
-
-    Returns
-    -------
-    Sensor
-        The unit with all of the effects, which responds as before.
-
-    """
+    """Add effects to a sensor at their neutral values; those that it has stay as they are."""
     added = [name for name in dict.fromkeys(effects) if name not in sensor.effects]
     values = {name: neutral(effect_named(name), sensor.axes) for name in added}
     return replace(sensor, effects=(*sensor.effects, *added), values={**sensor.values, **values})
 
 
 def get(sensor: Sensor, names: Sequence[Coefficient]) -> np.ndarray:
-    """
-    Return the values of coefficients.
-
-    Parameters
-    ----------
-    sensor
-        A sensor with the effects of the coefficients.
-    names
-        Names of the coefficients, (k,).
-
-    Returns
-    -------
-    ndarray
-        Values, (k,), each in the unit of its parameter.
-
-    """
+    """Return the values of coefficients, (k,), each in the unit of its parameter."""
     return np.array([sensor.values[name.effect][name.parameter][_index(sensor, name)]
                      for name in names], float)
 
@@ -157,22 +70,9 @@ def get(sensor: Sensor, names: Sequence[Coefficient]) -> np.ndarray:
 def put(sensor: Sensor, names: Sequence[Coefficient],
         coefficients: Sequence[float] | np.ndarray) -> Sensor:
     """
-    Return the sensor with other values of some coefficients.
+    Return the sensor with other values of some coefficients, (k,), each in its unit.
 
-    Parameters
-    ----------
-    sensor
-        A sensor with the effects of the coefficients.
-    names
-        Names of the coefficients, (k,).
-    coefficients
-        Their new values, (k,), each in the unit of its parameter.
-
-    Returns
-    -------
-    Sensor
-        A copy with arrays of its own for the parameters that change.
-
+    It is a copy with arrays of its own for the parameters that change.
     """
     values = {effect: dict(by_parameter) for effect, by_parameter in sensor.values.items()}
     copied = set()

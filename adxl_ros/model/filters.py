@@ -132,26 +132,7 @@ def pole(x: np.ndarray, rate: complex, dt_s: float, memory: dict[str, Any]) -> n
 
 def first_order_recursion(gain: float, decay: complex, inputs: np.ndarray,
                           previous: complex | np.ndarray) -> np.ndarray:
-    """
-    Filter by y[i] = decay · y[i − 1] + gain · inputs[i].
-
-    Parameters
-    ----------
-    gain
-        Weight of the input.
-    decay
-        Weight of the output before.
-    inputs
-        Inputs, (n,), or (n, k) for k independent filters.
-    previous
-        Output before the first one, a scalar or (k,).
-
-    Returns
-    -------
-    ndarray
-        Outputs, in the shape of the inputs.
-
-    """
+    """Filter inputs, (n,) or (n, k), by y[i] = decay · y[i − 1] + gain · inputs[i]."""
     if len(inputs) <= _FEW_INPUTS:
         # scipy.signal takes 0.5 s to import, and a live sensor has short blocks only.
         outputs = []
@@ -192,22 +173,8 @@ def stop(x: np.ndarray, reach: float, memory: dict[Any, Any]) -> np.ndarray:
     Return the mean of stop operators, x − play(x), each divided by its threshold.
 
     It is at most 1. It reaches that when the input has changed by 2·`reach` after a reversal
-    (Prandtl-Ishlinskii; Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996).
-
-    Parameters
-    ----------
-    x
-        Input, (n,), or (n, k) for k independent operators.
-    reach
-        Largest threshold, in the unit of the input.
-    memory
-        Keeps the state from one block to the next. It is empty before the first block.
-
-    Returns
-    -------
-    ndarray
-        Lag behind the input, −1 to 1, (n,).
-
+    (Prandtl-Ishlinskii; Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996). The
+    input is (n,), or (n, k) for k independent operators, as in `play`.
     """
     lag = np.zeros(x.shape)
     for i, fraction in enumerate(_THRESHOLDS):
@@ -220,22 +187,7 @@ def loop(x: np.ndarray, reach: float, memory: dict[Any, Any]) -> np.ndarray:
     """
     Return the stop operator minus its first branch, which is 0 until the input turns back.
 
-    The first branch is a function of the input alone, and no hysteresis.
-
-    Parameters
-    ----------
-    x
-        Input, (n,), or (n, k) for k independent operators.
-    reach
-        Largest threshold, in the unit of the input.
-    memory
-        Keeps the state from one block to the next. It is empty before the first block.
-
-    Returns
-    -------
-    ndarray
-        Difference of the branches, −2 to 2, in the shape of the input.
-
+    The first branch is a function of the input alone, and no hysteresis. See `stop`.
     """
     if not len(x):
         return x

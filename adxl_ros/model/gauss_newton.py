@@ -99,20 +99,8 @@ def halve_until(attempt: Callable[[float], Trial], accept: Callable[[Trial], boo
     """
     Attempt a step, its half, its quarter and so on, until an attempt is accepted.
 
-    Parameters
-    ----------
-    attempt
-        Maps the share of the step, at most 1, to a result.
-    accept
-        Accepts or rejects that result.
-    max_halvings
-        How often the step is halved.
-
-    Returns
-    -------
-    tuple
-        The last result, whether it was accepted, and the count of attempts.
-
+    attempt: maps the share of the step, at most 1, to a result; returns: the last result, whether
+    it was accepted, and the count of attempts.
     """
     share = 1.0
     result = attempt(share)

@@ -1,10 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Kinematics of the two-axis rotary stage with a linear third joint."""
+"""
+Specific force by the angles of the stage, and tilt by specific force.
+
+The stage has two rotary axes and a linear third joint.
+"""
 
 from __future__ import annotations
 
-from adxl_ros.model.effects.base import Components, Joint, Value
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from math import atan2, cos, hypot, sin
+
+from adxl_ros.model.effects.base import ARRAYS, Components, Joint, Maths, Value
 import numpy as np
 
 UPRIGHT = (0.0, 0.0, 1.0)
@@ -48,18 +57,10 @@ def specific_force(alpha_rad: Value, beta_rad: Value, gravity_mps2: float,
 
 def stage_angles(roll_rad: np.ndarray, pitch_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return the stage angles that hold the sensor at a tilt.
+    Return the stage angles that hold the sensor at a tilt, rad, (n,).
 
-    Parameters
-    ----------
-    roll_rad, pitch_rad
-        Tilt by REP-103, rad, (n,): roll = atan2(fy, fz), pitch = atan2(−fx, hypot(fy, fz)).
-
-    Returns
-    -------
-    alpha_rad, beta_rad : ndarray
-        Stage angles, rad, (n,): alpha from 0 to π, beta from −π to π, 0 where alpha is 0.
-
+    roll_rad, pitch_rad: tilt by REP-103: roll = atan2(fy, fz), pitch = atan2(−fx, hypot(fy, fz));
+    returns: alpha from 0 to π, beta from −π to π, 0 where alpha is 0.
     """
     x = -np.sin(pitch_rad)
     y = np.sin(roll_rad) * np.cos(pitch_rad)
@@ -74,22 +75,7 @@ def specific_force_in_motion(alpha: Joint, beta: Joint, shift: Joint, gravity_mp
     Specific force in the case frame of a sensor while all joints move, m/s².
 
     A shifted sensor is carried by the turning stage, and the Coriolis acceleration adds to its
-    force.
-
-    Parameters
-    ----------
-    alpha, beta, shift
-        Joints with their derivatives, rad and m, arrays or floats of one shape.
-    gravity_mps2
-        Local gravity, m/s².
-    up
-        The vertical in the frame of the stage's base; its y is the axis of alpha.
-
-    Returns
-    -------
-    list
-        The three components, each in the shape of the joints.
-
+    force. See `specific_force` for the other parameters.
     """
     force = specific_force(alpha.position, beta.position, gravity_mps2, shift.acceleration, up)
     if np.any(shift.position) and (np.any(alpha.velocity) or np.any(beta.velocity)):
@@ -129,40 +115,230 @@ def angular_motion(alpha: Joint, beta: Joint) -> tuple[Components, Components]:
 
 def carried_acceleration(omega: Components, omega_dot: Components, r: Components) -> Components:
     """
-    Acceleration of a point that a turning body carries: ω × (ω × r) + ω̇ × r.
+    Acceleration, m/s², of a point that a turning body carries: ω × (ω × r) + ω̇ × r.
 
-    Parameters
-    ----------
-    omega
-        Angular velocity of the body in its frame, rad/s, three components.
-    omega_dot
-        Angular acceleration of the body in its frame, rad/s², three components.
-    r
-        Vector from the axis to the point in the frame of the body, m, three components.
-
-    Returns
-    -------
-    list
-        Acceleration in the frame of the body, m/s², three components.
-
+    omega, omega_dot: angular velocity, rad/s, and acceleration, rad/s², in the frame of the body;
+    r: vector from the axis to the point, m.
     """
     centripetal = cross_product(omega, cross_product(omega, r))
     return [c + t for c, t in zip(centripetal, cross_product(omega_dot, r))]
 
 
 def cross_product(a: Components, b: Components) -> Components:
+    """Return the vector product a × b."""
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+UNOBSERVABLE_RAD2 = 1.0
+"""Variance from which an angle counts as not shown, rad²; chosen: a guess has 1.8 rad rms."""
+
+UNKNOWN_ANGLE_RAD2 = 1e6
+"""Variance of an angle that is not known, rad²; yaw is never known.
+
+π²/3, that of a uniform angle, would let a filter that fuses 1000 samples a second believe in
+yaw = 0 before long. 1e6, as for an axis that is not there, never counts."""
+
+INFINITE = float('inf')
+"""Variance of an angle that the force does not determine, rad²."""
+
+_FORCE2_FLOOR = 1e-30
+"""Square of a negligible force, (m/s²)²; chosen: far below any noise, it keeps divisors from 0."""
+
+
+@dataclass(frozen=True)
+class Tilt:
     """
-    Return the vector product a × b.
+    Angles of samples at rest, by the specific force a in the case frame.
+
+    An angle that is not shown is NaN and has an infinite standard deviation. The force of a
+    sensor without z axis does not determine whether it is upright, so that alpha is at most π/2.
+    """
+
+    roll: np.ndarray  # atan2(a_y, a_z), rad, (n,)
+    pitch: np.ndarray  # atan2(−a_x, hypot(a_y, a_z)), rad, (n,)
+    inclination: np.ndarray  # atan2(hypot(a_x, a_y), a_z), rad, (n,)
+    alpha: np.ndarray  # Angle of the stage: the inclination, rad, (n,)
+    beta: np.ndarray  # Angle of the stage: atan2(−a_y, a_x), rad, (n,)
+    # roll_std, pitch_std, inclination_std, alpha_std, beta_std: Standard deviations of the angles,
+    # rad, (n,)
+    roll_std: np.ndarray
+    pitch_std: np.ndarray
+    inclination_std: np.ndarray
+    alpha_std: np.ndarray
+    beta_std: np.ndarray
+
+
+def tilt(force: Components, covariance: np.ndarray, measures_z: bool = True) -> Tilt:
+    """
+    Return the angles of samples with first-order standard deviations.
 
     Parameters
     ----------
-    a, b
-        Vectors of three components, arrays or floats of one shape.
+    force
+        Specific force at rest in the case frame, m/s², three components (n,).
+    covariance
+        Covariance of the force, (m/s²)², (3, 3, n).
+    measures_z
+        Whether the sensor has a z axis.
 
     Returns
     -------
-    list
-        Three components.
+    Tilt
+        Angles of the n samples.
 
     """
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    force = [np.asarray(f, float) for f in force]
+    components = tuple(covariance[i, j] for i in range(3) for j in range(i, 3))
+    with np.errstate(over='ignore', invalid='ignore'):
+        roll, pitch, inclination, beta = (
+            _shown(angle, variance) for angle, variance in angles(force, components, ARRAYS))
+    alpha = inclination[0] if measures_z else np.minimum(inclination[0], np.pi - inclination[0])
+    return Tilt(roll[0], pitch[0], inclination[0], alpha, beta[0],
+                roll[1], pitch[1], inclination[1], inclination[1], beta[1])
+
+
+def _shown(angle: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the angle and its standard deviation; NaN and inf where it is not shown."""
+    shows = variance < UNOBSERVABLE_RAD2
+    return (np.where(shows, angle, np.nan),
+            np.where(shows, np.sqrt(np.maximum(variance, 0)), np.inf))
+
+
+def angles(force: Components, covariance: tuple[Value, ...],
+           maths: Maths) -> tuple[tuple[Value, Value], ...]:
+    """
+    Return roll, pitch, inclination and beta with first-order variances.
+
+    Where noise exceeds the part of the force that shows roll or beta, the angle can be anything:
+    its variance is infinite. Pitch and inclination are then the length of a small vector of any
+    direction.
+
+    Parameters
+    ----------
+    force
+        Specific force at rest in the case frame, m/s², three components.
+    covariance
+        Covariance of the force, (m/s²)²: xx, xy, xz, yy, yz, zz.
+    maths
+        Functions for arrays or for floats.
+
+    Returns
+    -------
+    tuple
+        Angle, rad, and variance, rad², of roll, pitch, inclination and beta.
+
+    """
+    x, y, z = force
+    xx, xy, xz, yy, yz, zz = covariance
+    plane2, side2 = x * x + y * y + _FORCE2_FLOOR, y * y + z * z + _FORCE2_FLOOR
+    total2 = plane2 + z * z
+    total4 = total2 * total2
+    in_plane, in_side = xx + yy, yy + zz
+    along = y * y * yy + 2 * y * z * yz + z * z * zz
+    roll = maths.where(side2 > in_side + _FORCE2_FLOOR,
+                       (z * z * yy - 2 * y * z * yz + y * y * zz) / (side2 * side2), INFINITE)
+    pitch = maths.where(
+        side2 > in_side,
+        (side2 * xx - 2 * x * (y * xy + z * xz) + x * x * along / side2) / total4,
+        in_side / total2)
+    along = x * x * xx + 2 * x * y * xy + y * y * yy
+    inclination = maths.where(
+        plane2 > in_plane,
+        (z * z * along / plane2 - 2 * z * (x * xz + y * yz) + plane2 * zz) / total4,
+        in_plane / total2)
+    beta = maths.where(plane2 > in_plane + _FORCE2_FLOOR,
+                       (y * y * xx - 2 * x * y * xy + x * x * yy) / (plane2 * plane2), INFINITE)
+    return ((maths.atan2(y, z), roll), (maths.atan2(-x, maths.sqrt(side2)), pitch),
+            (maths.atan2(maths.sqrt(plane2), z), inclination), (maths.atan2(0.0 - y, x), beta))
+
+
+def roll_pitch_covariance(force: Components, covariance: tuple[Value, ...],
+                          maths: Maths) -> Value:
+    """Return the first-order covariance of roll and pitch, rad²; see `angles`."""
+    x, y, z = force
+    _, xy, xz, yy, yz, zz = covariance
+    side2 = y * y + z * z + _FORCE2_FLOOR
+    by_pitch = x * (y * (z * yy - y * yz) + z * (z * yz - y * zz)) / side2 - (z * xy - y * xz)
+    return by_pitch / (maths.sqrt(side2) * (x * x + side2))
+
+
+def quaternion(roll_rad: Value, pitch_rad: Value, maths: Maths) -> tuple[Value, ...]:
+    """Return the orientation x, y, z, w of a roll and pitch, rad, at a yaw of 0."""
+    sr, cr = maths.sin(roll_rad / 2), maths.cos(roll_rad / 2)
+    sp, cp = maths.sin(pitch_rad / 2), maths.cos(pitch_rad / 2)
+    return sr * cp, cr * sp, -sr * sp, cr * cp
+
+
+Vector = tuple[float, float, float]
+"""Three components."""
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """
+    Rotation of the case in the frame of the robot, as in a URDF joint.
+
+    A vector v of the case is R·v in the frame of the robot, with R = Rz(yaw)·Ry(pitch)·Rx(roll)
+    (fixed axes, REP-103).
+    """
+
+    rpy_rad: Vector = (0.0, 0.0, 0.0)  # Roll, pitch and yaw, rad
+
+    @property
+    def turns(self) -> bool:
+        """Return whether the case is turned at all."""
+        return any(self.rpy_rad)
+
+    @cached_property
+    def rows(self) -> tuple[Vector, Vector, Vector]:
+        """Return the rows of R."""
+        roll, pitch, yaw = self.rpy_rad
+        sr, cr, sp, cp = sin(roll), cos(roll), sin(pitch), cos(pitch)
+        sy, cy = sin(yaw), cos(yaw)
+        return ((cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+                (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+                (-sp, cp * sr, cp * cr))
+
+    @cached_property
+    def inverse_quaternion(self) -> tuple[float, float, float, float]:
+        """Return the quaternion x, y, z, w of Rᵀ, from the robot to the case."""
+        roll, pitch, yaw = (angle / 2 for angle in self.rpy_rad)
+        sr, cr, sp, cp = sin(roll), cos(roll), sin(pitch), cos(pitch)
+        sy, cy = sin(yaw), cos(yaw)
+        return (-(sr * cp * cy - cr * sp * sy), -(cr * sp * cy + sr * cp * sy),
+                -(cr * cp * sy - sr * sp * cy), cr * cp * cy + sr * sp * sy)
+
+    def rotate(self, vector: Sequence[float]) -> list[float]:
+        """Return a vector of the case in the frame of the robot."""
+        x, y, z = vector
+        return [a * x + b * y + c * z for a, b, c in self.rows]
+
+    def rotate_covariance(self, covariance: Sequence[float]) -> tuple[float, ...]:
+        """Return the covariance R·C·Rᵀ; both are xx, xy, xz, yy, yz, zz."""
+        xx, xy, xz, yy, yz, zz = covariance
+        half = [(a * xx + b * xy + c * xz, a * xy + b * yy + c * yz, a * xz + b * yz + c * zz)
+                for a, b, c in self.rows]
+        return tuple(sum(h * r for h, r in zip(half[i], self.rows[j]))
+                     for i in range(3) for j in range(i, 3))
+
+    def rotate_matrix(self, covariance: Sequence[float]) -> tuple[float, ...]:
+        """Return the covariance R·C·Rᵀ; both have 9 numbers, row by row."""
+        matrix = np.reshape(covariance, (3, 3))
+        rotation = np.array(self.rows)
+        return tuple((rotation @ matrix @ rotation.T).ravel().tolist())
+
+    def rotate_orientation(self, quaternion: Sequence[float]) -> tuple[float, ...]:
+        """Return the orientation of the robot from that of the case."""
+        ax, ay, az, aw = quaternion
+        bx, by, bz, bw = self.inverse_quaternion
+        return (aw * bx + ax * bw + ay * bz - az * by, aw * by - ax * bz + ay * bw + az * bx,
+                aw * bz + ax * by - ay * bx + az * bw, aw * bw - ax * bx - ay * by - az * bz)
+
+    def levelled(self, force_mps2: Sequence[float]) -> Mounting:
+        """
+        Return the mounting that makes a force at rest vertical, with the yaw of this one.
+
+        force_mps2: mean specific force in the frame of the case, on level ground, m/s², (3,).
+        """
+        x, y, z = force_mps2
+        return Mounting((atan2(y, z), atan2(-x, hypot(y, z)), self.rpy_rad[2]))

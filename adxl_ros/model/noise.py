@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from adxl_ros.model import analog_stages
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Need, NOMINAL_ENVIRONMENT, Place, Signals
 from adxl_ros.model.sensor import Sensor
@@ -38,13 +37,13 @@ class Electronics(NamedTuple):
 def electronics(sensor: Sensor) -> Electronics:
     """Return filter and white noise of a unit by its effects."""
     count = len(sensor.axes)
-    signals = Signals(NOMINAL_ENVIRONMENT, zero_g_v=sensor.nominal_zero_g_v.tolist(),
-                      scale_v_per_g=sensor.nominal_scale_v_per_g.tolist(),
-                      output=[0.0] * count, rc_s=[sensor.rc_s] * count,
-                      noise_ratio=[1.0] * count)
+    signals = Signals(NOMINAL_ENVIRONMENT, rc_s=[sensor.rc_s] * count, noise_ratio=[1.0] * count,
+                      zero_g_v=sensor.nominal_zero_g_v.tolist(), output=[0.0] * count,
+                      scale_v_per_g=sensor.nominal_scale_v_per_g.tolist())
     for effect in map(effect_named, sensor.effects):
+        # They change nothing else, so that the rest of the chain need not run.
         if effect.needs in ((Need.FILTER,), (Need.NOISE,)) and effect.place is Place.ELECTRONICS:
-            effect.apply(signals, analog_stages.parameters(sensor, effect.name))
+            effect.apply(signals, sensor.parameters(effect.name))
     return Electronics(np.array(signals.rc_s), np.array(signals.noise_ratio))
 
 

@@ -86,18 +86,7 @@ def posterior(sensor: Sensor, population: Population) -> Posterior:
     """
     Combine the coefficients of a unit with its population.
 
-    Parameters
-    ----------
-    sensor
-        The unit. Without zero-g and scale factor of its own it takes those of the population.
-    population
-        The population.
-
-    Returns
-    -------
-    Posterior
-        The unit, and how the population is used.
-
+    A unit without zero-g and scale factor of its own takes those of the population.
     """
     prior = population.prior(sensor)
     if not prior.names:

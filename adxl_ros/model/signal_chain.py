@@ -1,27 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The signal chain at rest, from specific force to volts, and its exact inverse."""
+"""
+The signal chain: the effects of a sensor, place by place, and the exact inverse at rest.
+
+`Chain` is the one runner of effects. It serves one live sample (floats), a block (arrays, (n,)),
+and a batch of sensors (arrays, (1, n)).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
+import zlib
 
-from adxl_ros.model.analog_stages import analog_response, effects_at
-from adxl_ros.model.constants import AXES
+from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import (
+    ARRAYS,
     Components,
     Environment,
+    Maths,
     NOMINAL_ENVIRONMENT,
     Place,
+    Role,
     Signals,
     Value,
 )
-from adxl_ros.model.scalar_or_array import ARRAYS, Maths
 from adxl_ros.model.sensor import Sensor
 import numpy as np
+
+ANALOG = (Place.MOUNTING, Place.ELEMENT, Place.ELECTRONICS)
+"""Places between the specific force and the filter."""
 
 _TOLERANCE_MPS2 = 1e-10
 """Newton step below which the inverse has converged, m/s²; chosen: near rounding."""
@@ -31,8 +41,8 @@ _UNSOLVED_MPS2 = 1e-6
 equation 5 is a root of 0, and rounding moves it by up to this."""
 
 _MAX_ITERATIONS = 60
-"""Largest number of iterations of either inverse; chosen: samples with a
-solution need far fewer."""
+"""Largest number of iterations of either inverse; chosen: samples with a solution need far
+fewer."""
 
 _CHORD_STEPS = 8
 """Steps with the tangent at rest without gravity before Newton's method; chosen: each leaves a few
@@ -50,6 +60,104 @@ _DIFFERENCE_MPS2 = 1e-3
 linear, so that a wide step loses nothing."""
 
 
+class RunningEffect:
+    """An effect of a sensor with its parameters, its memory and its random generator."""
+
+    def __init__(self, sensor: Sensor, name: str, seed: int) -> None:
+        """Prepare the effect before its first sample."""
+        effect = effect_named(name)
+        self.parameters = sensor.parameters(name)
+        sizes = [p for p in effect.parameters if p.role is not Role.SHAPE]
+        # At the neutral values of its sizes and limits an effect does nothing.
+        self.is_neutral = bool(sizes) and all(
+            np.all(np.equal(self.parameters.get(p.name, p.neutral), p.neutral)) for p in sizes)
+        self.place, self.apply = effect.place, effect.apply
+        self.key = (name, *sorted(self.parameters.items()))
+        self.memory: dict[str, Any] = {}
+        # An invertible effect is a function of one sample, and draws nothing.
+        self.rng = None if effect.invertible else np.random.default_rng(
+            [seed, zlib.crc32(name.encode())])
+
+
+class Chain:
+    """The effects of a sensor, applied place by place to samples of any shape."""
+
+    def __init__(self, sensor: Sensor, names: Iterable[str] | None = None, seed: int = 0) -> None:
+        """Prepare effects of the sensor, all unless some are named, before the first sample."""
+        self.sensor = sensor
+        running = [RunningEffect(sensor, name, seed)
+                   for name in (sensor.effects if names is None else names)]
+        self.effects = {place: [effect for effect in running
+                                if effect.place is place and not effect.is_neutral]
+                        for place in Place}
+        self._zero_g_v = sensor.nominal_zero_g_v.tolist()
+        self._scale_v_per_g = sensor.nominal_scale_v_per_g.tolist()
+
+    def signals(self, environment: Environment, **given: Any) -> Signals:
+        """Return signals before the chain: those that are given, and what the sensor states."""
+        return Signals(environment, gravity_mps2=self.sensor.local_gravity_mps2,
+                       nominal_scale_v_per_g=self._scale_v_per_g, vref_v=self.sensor.adc_vref_v,
+                       **given)
+
+    def __call__(self, place: Place, signals: Signals) -> None:
+        """Set the signals that begin at a place, and apply its effects."""
+        count = len(self._zero_g_v)
+        if place is Place.MOUNTING:
+            signals.sensed = [f / G0_MPS2 for f in signals.force]
+        elif place is Place.ELEMENT:
+            signals.output = list(signals.sensed)
+        elif place is Place.ELECTRONICS:
+            sensor = self.sensor
+            signals.output = list(signals.output)
+            signals.zero_g_v, signals.scale_v_per_g = self._zero_g_v[:], self._scale_v_per_g[:]
+            signals.rc_s, signals.noise_ratio = [sensor.rc_s] * count, [1.0] * count
+            signals.lsb_v, signals.lsb_ratio = sensor.lsb_v, [1.0] * count
+        elif place is Place.ADC:
+            signals.volts = list(signals.input_v)
+        for effect in self.effects[place]:
+            signals.memory, signals.rng = effect.memory, effect.rng
+            effect.apply(signals, effect.parameters)
+
+    def volts(self, signals: Signals, first: Place = Place.MOUNTING) -> Components:
+        """Run the chain from a place to the filter; return volts by measured axis."""
+        for place in ANALOG:
+            if place >= first:
+                self(place, signals)
+        return [zero + scale * out for zero, scale, out in
+                zip(signals.zero_g_v, signals.scale_v_per_g, signals.output)]
+
+    def through_adc(self, input_v: Components) -> Components:
+        """Return volts behind the ADC's effects, by measured axis, without its steps."""
+        if not self.effects[Place.ADC]:
+            return input_v
+        signals = self.signals(NOMINAL_ENVIRONMENT, input_v=input_v)
+        self(Place.ADC, signals)
+        return signals.volts
+
+    def convert(self, signals: Signals) -> np.ndarray:
+        """Run the ADC on `input_v`; return volts, (..., m)."""
+        self(Place.ADC, signals)
+        coded = quantise(np.stack(signals.volts, axis=-1), self.sensor,
+                         signals.lsb_v * np.array(signals.lsb_ratio))
+        if not self.effects[Place.CODE]:
+            return coded
+        signals.volts = [coded[..., d] for d in range(coded.shape[-1])]
+        self(Place.CODE, signals)
+        return np.stack(signals.volts, axis=-1)
+
+
+def static_chain(sensor: Sensor) -> Chain:
+    """Return the chain of the effects that the inverse undoes."""
+    return Chain(sensor, [name for name in sensor.effects if effect_named(name).invertible])
+
+
+def analog_response(sensor: Sensor) -> Callable[..., Components]:
+    """Prepare `static_response` up to the input of the ADC."""
+    chain = static_chain(sensor)
+    return lambda force, environment=NOMINAL_ENVIRONMENT: chain.volts(
+        chain.signals(environment, force=force))
+
+
 def static_response(sensor: Sensor) -> Callable[..., Components]:
     """
     Prepare the chain from specific force to volts at rest, by its invertible effects.
@@ -64,31 +172,9 @@ def static_response(sensor: Sensor) -> Callable[..., Components]:
         volts of each measured axis.
 
     """
-    respond, convert = analog_response(sensor), _adc(sensor)
-    if convert is None:
-        return respond
-
-    def respond_with_adc(force: Components, environment: Environment = NOMINAL_ENVIRONMENT
-                         ) -> Components:
-        return convert(respond(force, environment))
-
-    return respond_with_adc
-
-
-def _adc(sensor: Sensor) -> Callable[[Components], Components] | None:
-    """Prepare the ADC's effects at rest, from volts at its input to volts; None without any."""
-    effects = effects_at(sensor, Place.ADC, True)
-    if not effects:
-        return None
-
-    def convert(volts: Components) -> Components:
-        signals = Signals(NOMINAL_ENVIRONMENT, input_v=volts, volts=list(volts),
-                          vref_v=sensor.adc_vref_v)
-        for apply, values in effects:
-            apply(signals, values)
-        return signals.volts
-
-    return convert
+    chain = static_chain(sensor)
+    return lambda force, environment=NOMINAL_ENVIRONMENT: chain.through_adc(chain.volts(
+        chain.signals(environment, force=force)))
 
 
 def adc_inverse(sensor: Sensor) -> Callable[[Components], Components]:
@@ -99,15 +185,15 @@ def adc_inverse(sensor: Sensor) -> Callable[[Components], Components]:
     therefore inverted apart from the rest of the chain. Where two inputs near a step give the
     same volts, one of them is returned; where none does, the middle of the gap.
     """
-    convert = _adc(sensor)
-    if convert is None:
+    chain = static_chain(sensor)
+    if not chain.effects[Place.ADC]:
         return list
 
     def undo(volts: Components) -> Components:
         previous, current = list(volts), list(volts)
         with np.errstate(all='ignore'):
             for _ in range(_MAX_ITERATIONS):
-                changes = [v - c for v, c in zip(volts, convert(current))]
+                changes = [v - c for v, c in zip(volts, chain.through_adc(current))]
                 # A converged sample stays, so that it does not depend on its neighbours.
                 changes = [change * (abs(change) >= _SETTLED_V) for change in changes]
                 previous, current = current, [v + change for v, change in zip(current, changes)]
@@ -120,9 +206,9 @@ def adc_inverse(sensor: Sensor) -> Callable[[Components], Components]:
 
 def gravity_mps2(sensor: Sensor) -> float:
     """Return local gravity with the effects on it, m/s²."""
-    signals = Signals(NOMINAL_ENVIRONMENT, gravity_mps2=sensor.local_gravity_mps2)
-    for apply, values in effects_at(sensor, Place.STAGE, True):
-        apply(signals, values)
+    chain = static_chain(sensor)
+    signals = chain.signals(NOMINAL_ENVIRONMENT)
+    chain(Place.STAGE, signals)
     return signals.gravity_mps2
 
 
@@ -168,39 +254,15 @@ class Tangent:
 
 def tangent(respond: Callable[..., Components], axes: str, force: Components,
             environment: Environment = NOMINAL_ENVIRONMENT) -> Tangent:
-    """
-    Linearise the inverse of `static_response` around a force.
-
-    Parameters
-    ----------
-    respond
-        From `analog_response`.
-    axes
-        Measured axes.
-    force
-        Specific force in the case frame, m/s², three components (n,) or floats.
-    environment
-        Surroundings in the shape of the force.
-
-    Returns
-    -------
-    Tangent
-        Derivatives at the force, in its shape.
-
-    """
+    """Linearise the inverse of `respond` around forces; see `jacobian` for the parameters."""
     by_force: Any = jacobian(respond, force, environment)
     if isinstance(force[0], float):
         by_force = by_force.tolist()
-    return _inverted(by_force, axes)
-
-
-def _inverted(by_force: Any, axes: str) -> Tangent:
-    """Invert derivatives by force, m rows of three components, along the measured axes."""
     measured = [AXES.index(a) for a in axes]
     back = _inverse_matrix([[row[c] for c in measured] for row in by_force])
-    if axes != 'xy':
-        return Tangent(back, [])
-    return Tangent(back, [-sum(b * row[2] for b, row in zip(line, by_force)) for line in back])
+    slope = [] if axes != 'xy' else [-sum(b * row[2] for b, row in zip(line, by_force))
+                                     for line in back]
+    return Tangent(back, slope)
 
 
 def _inverse_matrix(a: list[Components]) -> list[Components]:
@@ -217,52 +279,37 @@ def _inverse_matrix(a: list[Components]) -> list[Components]:
     return [[minors[d][c] / determinant for d in range(3)] for c in range(3)]
 
 
-def newton_step(axes: str, gravity_mps2: float, up: Value, maths: Maths
-                ) -> Callable[..., Components]:
+def newton_step(axes: str, gravity_mps2: float, maths: Maths) -> Callable[..., Components]:
     """
-    Prepare one Newton step of the inverse.
-
-    Parameters
-    ----------
-    axes
-        Measured axes.
-    gravity_mps2
-        |f| at rest, m/s², for the z of equation 5.
-    up
-        Sign of that z, 1 or −1.
-    maths
-        Functions for arrays or for floats.
+    Prepare one Newton step of the inverse for measured axes, with |f| at rest for equation 5.
 
     Returns
     -------
     callable
-        Maps volts minus the response to a force, V, that force, m/s², and a `Tangent` near it to
-        the next force, m/s².
+        Maps volts minus the response to a force, V, that force, m/s², a `Tangent` near it, and
+        the sign of a derived z to the next force, m/s².
 
     """
     measured = [AXES.index(a) for a in axes]
 
-    def next_force(residual_v: Components, force: Components, tangent: Tangent) -> Components:
+    def next_force(residual_v: Components, force: Components, tangent: Tangent, up: Value
+                   ) -> Components:
         force = list(force)
         for d, row in zip(measured, tangent.back):
             for by_volt, r in zip(row, residual_v):
                 force[d] = force[d] + by_volt * r
-        if tangent.slope:
-            _derive_z(force, tangent.slope, gravity_mps2, up, maths)
-        return force
+        if not tangent.slope:
+            return force
+        # z by |f| = g, its contribution removed from x and y (equation 5).
+        slope = tangent.slope
+        x, y = force[0] - slope[0] * force[2], force[1] - slope[1] * force[2]
+        a = 1 + slope[0] * slope[0] + slope[1] * slope[1]
+        half_b = x * slope[0] + y * slope[1]
+        discriminant = half_b * half_b - a * (x * x + y * y - gravity_mps2 * gravity_mps2)
+        z = (up * maths.sqrt(maths.maximum(discriminant, 0.0)) - half_b) / a
+        return [x + slope[0] * z, y + slope[1] * z, z]
 
     return next_force
-
-
-def _derive_z(force: Components, slope: Components, gravity: float, up: Value,
-              maths: Maths) -> None:
-    """Set z by |f| = g, and remove its contribution from x and y (equation 5)."""
-    x, y = force[0] - slope[0] * force[2], force[1] - slope[1] * force[2]
-    a = 1 + slope[0] * slope[0] + slope[1] * slope[1]
-    half_b = x * slope[0] + y * slope[1]
-    discriminant = half_b * half_b - a * (x * x + y * y - gravity * gravity)
-    z = (up * maths.sqrt(maths.maximum(discriminant, 0.0)) - half_b) / a
-    force[:] = [x + slope[0] * z, y + slope[1] * z, z]
 
 
 def inverse(sensor: Sensor, z_sign: np.ndarray | None = None) -> Callable[..., Components]:
@@ -288,7 +335,7 @@ def inverse(sensor: Sensor, z_sign: np.ndarray | None = None) -> Callable[..., C
         unless given) to three components, m/s². Samples without a solution are NaN.
 
     """
-    respond, gravity = analog_response(sensor), gravity_mps2(sensor)
+    search = _Search(sensor)
     undo_adc = adc_inverse(sensor)
     up = np.asarray(sensor.z_sign if z_sign is None else z_sign)
 
@@ -297,90 +344,75 @@ def inverse(sensor: Sensor, z_sign: np.ndarray | None = None) -> Callable[..., C
         count = input_v.shape[1]
         finite = np.flatnonzero(np.isfinite(input_v).all(axis=0))
         force = np.full((3, count), np.nan)
+        around = Environment(*(np.broadcast_to(np.asarray(e, float), count) for e in environment))
         with np.errstate(all='ignore'):
-            force[:, finite] = search(
-                input_v[:, finite],
-                Environment(*(np.broadcast_to(np.asarray(e, float), count)[finite]
-                              for e in environment)), np.broadcast_to(up, count)[finite])
+            force[:, finite] = search(input_v[:, finite], _select(around, finite),
+                                      np.broadcast_to(up, count)[finite])
         return list(force) if np.ndim(volts[0]) else force[:, 0].tolist()
-
-    def search(input_v: np.ndarray, environment: Environment, signs: np.ndarray) -> np.ndarray:
-        step = partial(newton_step, sensor.axes, gravity, maths=ARRAYS)
-        force, is_solved = _chord_steps(respond, sensor.axes, step(signs), input_v, environment)
-        if sensor.axes == 'xy':
-            is_solved &= _is_clear_of_the_fold(force, gravity)
-        further = np.flatnonzero(~is_solved)
-        if len(further):
-            force[:, further] = _newton_steps(
-                respond, sensor.axes, step, input_v[:, further], signs[further],
-                _select(environment, further))
-        return force
 
     return invert
 
 
-def _is_clear_of_the_fold(force: np.ndarray, gravity: float) -> np.ndarray:
-    """
-    Return where |f| = g clearly has a z, so that every tangent leads to the same one.
+class _Search:
+    """Newton's method on many samples, each until it has converged."""
 
-    force: forces, m/s², (3, n); gravity: |f| at rest, m/s²; returns: whether z is clear, (n,).
-    """
-    x, y, z = force
-    excess = x * x + y * y + z * z - gravity * gravity
-    return (np.abs(z) > _CLEAR_Z_MPS2) & (np.abs(excess) < _TOLERANCE_MPS2 * gravity)
+    def __init__(self, sensor: Sensor) -> None:
+        self._axes, self._gravity = sensor.axes, gravity_mps2(sensor)
+        self._respond = analog_response(sensor)
+        self._step = newton_step(sensor.axes, self._gravity, ARRAYS)
 
+    def __call__(self, input_v: np.ndarray, environment: Environment, signs: np.ndarray
+                 ) -> np.ndarray:
+        """
+        Return forces, m/s², (3, n), with NaN where there is none.
 
-def _chord_steps(respond: Callable[..., Components], axes: str, advance: Callable[..., Components],
-                 input_v: np.ndarray, environment: Environment
-                 ) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Take steps from no force with the tangent at rest, which cost one response each.
+        input_v: volts to reach, (m, n); signs: sign of a derived z, (n,).
+        """
+        # Steps with the tangent at rest cost one response each, and mostly suffice.
+        at_rest = tangent(self._respond, self._axes, [np.zeros(1)] * 3)
+        force, change = self._steps(input_v, environment, signs, _CHORD_STEPS, at_rest)
+        is_solved = change < _TOLERANCE_MPS2
+        if self._axes == 'xy':
+            # Where |f| = g clearly has a z, every tangent leads to the same one.
+            x, y, z = force
+            excess = x * x + y * y + z * z - self._gravity * self._gravity
+            is_solved &= (np.abs(z) > _CLEAR_Z_MPS2) & (
+                np.abs(excess) < _TOLERANCE_MPS2 * self._gravity)
+        further = np.flatnonzero(~is_solved)
+        if len(further):
+            force[:, further], change = self._steps(
+                input_v[:, further], _select(environment, further), signs[further],
+                _MAX_ITERATIONS)
+            force[:, further[~(change < _UNSOLVED_MPS2)]] = np.nan
+        return force
 
-    returns: last forces, m/s², (3, n), and which of them have converged, (n,).
-    """
-    begin = tangent(respond, axes, [np.zeros(1)] * 3, NOMINAL_ENVIRONMENT)
-    force, moves = np.zeros((3, input_v.shape[1])), np.ones(input_v.shape[1], bool)
-    for _ in range(_CHORD_STEPS):
-        current = list(force)
-        residual_v = [v - r for v, r in zip(input_v, respond(current, environment))]
-        new = np.array(advance(residual_v, current, begin))
-        change = np.abs(new - force).max(axis=0)
-        # A converged sample stays, so that it does not depend on its neighbours.
-        force = np.where(moves, new, force)
-        moves &= ~(change < _TOLERANCE_MPS2)
-        if not moves.any():
-            break
-    return force, ~moves
+    def _steps(self, input_v: np.ndarray, environment: Environment, signs: np.ndarray, limit: int,
+               common: Tangent | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Take steps from no force, with a tangent of each sample or a common one.
 
-
-def _newton_steps(respond: Callable[..., Components], axes: str,
-                  step: Callable[[np.ndarray], Callable[..., Components]], input_v: np.ndarray,
-                  signs: np.ndarray, environment: Environment) -> np.ndarray:
-    """
-    Take Newton's steps from no force, with a tangent of each sample, until it has converged.
-
-    input_v: volts to reach, (m, n); signs: sign of a derived z, (n,); returns: forces, m/s²,
-    (3, n); NaN where there is no solution.
-    """
-    count = input_v.shape[1]
-    force, unsolved = np.zeros((3, count)), np.ones(count, bool)
-    active = np.arange(count)
-    for _ in range(_MAX_ITERATIONS):
-        # Most samples need equally many steps, and a slice costs less than their numbers.
-        samples = slice(None) if len(active) == count else active
-        current = list(force[:, samples])
-        surroundings = _select(environment, samples)
-        residual_v = [v - r for v, r in zip(input_v[:, samples], respond(current, surroundings))]
-        following = np.array(step(signs[samples])(
-            residual_v, current, tangent(respond, axes, current, surroundings)))
-        change = np.abs(following - current).max(axis=0)
-        force[:, samples], unsolved[samples] = following, ~(change < _UNSOLVED_MPS2)
-        # NaN and infinity fail the comparison, too.
-        active = active[(change >= _TOLERANCE_MPS2) & (change < np.inf)]
-        if not len(active):
-            break
-    force[:, unsolved] = np.nan
-    return force
+        returns: last forces, m/s², (3, n), and the size of their last steps, (n,).
+        """
+        count = input_v.shape[1]
+        force, last_change = np.zeros((3, count)), np.full(count, np.inf)
+        active = np.arange(count)
+        for _ in range(limit):
+            # Most samples need equally many steps, and a slice costs less than their numbers.
+            samples = slice(None) if len(active) == count else active
+            current, around = list(force[:, samples]), _select(environment, samples)
+            residual_v = [v - r for v, r in zip(input_v[:, samples],
+                                                self._respond(current, around))]
+            following = np.array(self._step(
+                residual_v, current, common or tangent(self._respond, self._axes, current, around),
+                signs[samples]))
+            change = np.abs(following - current).max(axis=0)
+            force[:, samples], last_change[samples] = following, change
+            # A converged sample stays, so that it does not depend on its neighbours; NaN and
+            # infinity fail the comparison, too.
+            active = active[(change >= _TOLERANCE_MPS2) & (change < np.inf)]
+            if not len(active):
+                break
+        return force, last_change
 
 
 def _select(environment: Environment, samples: np.ndarray | slice) -> Environment:
@@ -389,24 +421,7 @@ def _select(environment: Environment, samples: np.ndarray | slice) -> Environmen
 
 
 def quantise(volts: np.ndarray, sensor: Sensor, lsb_v: np.ndarray) -> np.ndarray:
-    """
-    Round volts to the steps of the ADC, within its rails.
-
-    Parameters
-    ----------
-    volts
-        Volts at the ADC, V, (n, m).
-    sensor
-        The unit with the rails of its ADC.
-    lsb_v
-        Step by axis, V, (m,), which may be coarser than that of the ADC; 0 does not quantise.
-
-    Returns
-    -------
-    ndarray
-        Rounded volts, V, (n, m).
-
-    """
+    """Round volts, (..., m), to steps by axis, V, (m,), within the rails; 0 does not quantise."""
     if not np.any(lsb_v):
         return volts
     highest = sensor.adc_vref_v - sensor.lsb_v
@@ -417,22 +432,10 @@ def quantise(volts: np.ndarray, sensor: Sensor, lsb_v: np.ndarray) -> np.ndarray
 
 def at_a_rail(volts: np.ndarray, sensor: Sensor) -> np.ndarray:
     """
-    Return the samples of which an axis reads the lowest or highest code of the ADC.
+    Return the samples, (n,), of which an axis reads the lowest or highest code of the ADC.
 
-    Volts beyond the rails come from another ADC, or from none, and do not indicate saturation.
-
-    Parameters
-    ----------
-    volts
-        Volts of the ADC, V, (n, m).
-    sensor
-        The unit with the rails of its ADC.
-
-    Returns
-    -------
-    ndarray
-        Whether each sample is at a rail, (n,).
-
+    Volts, (n, m), beyond the rails come from another ADC, or from none, and do not indicate
+    saturation.
     """
     rails_v = 0.0, sensor.adc_vref_v - sensor.lsb_v
     return np.logical_or.reduce([np.abs(axis_v - rail_v) < sensor.lsb_v / 2

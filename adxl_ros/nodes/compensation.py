@@ -12,15 +12,15 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from math import isfinite
 
-from adxl_ros.compensate import filter_inversion
+from adxl_ros.compensate import inversions
 from adxl_ros.compensate.compensation_policy import CompensationPolicy, Interval, State, Topics
 from adxl_ros.compensate.live_stream import COUNTS, LiveStream
 from adxl_ros.errors import UserError
 from adxl_ros.files import imu_message, parameter_file
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.kinematics import Mounting
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.tilt import Mounting
 from adxl_ros.nodes import parameters, topics
 from adxl_ros.nodes.run_node import NodeHelp, run
 from adxl_ros.nodes.sample_output import SampleAges
@@ -307,7 +307,7 @@ class Compensation(Node):
             self._obstacle if self._stream.unknown is not None else '')
         newer = self._policy.newer()
         state, text = self._policy.status(interval, newer, self._calibration())
-        late = filter_inversion.HALF if self._settings.undo_filter else 0
+        late = inversions.HALF if self._settings.undo_filter else 0
         values = {'rate_in_hz': round(counts['received'] / duration_s, 1),
                   'rate_out_hz': round(counts['published'] / duration_s, 1), **totals,
                   'delay_s': late / self._policy.rate_hz, **self._ages.report(),

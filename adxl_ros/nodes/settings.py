@@ -8,7 +8,7 @@ from dataclasses import astuple, dataclass
 from itertools import chain
 from typing import Any
 
-from adxl_ros.compensate.filter_inversion import HALF
+from adxl_ros.compensate.inversions import HALF
 from adxl_ros.files import calibration_store
 from adxl_ros.files.parameter_file import SENSOR_FIELDS
 from adxl_ros.files.stream_info import NO_UNIT

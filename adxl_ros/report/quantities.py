@@ -39,9 +39,12 @@ def counted(number: int, noun: str) -> str:
     return f'{number} {noun}{"" if number == 1 else "s"}'
 
 
-def duration(seconds: float) -> str:
-    """Return a time with two units at most, for people."""
+def duration(seconds: float, digits: int = 0) -> str:
+    """Return a time with two units at most, for people, with so many digits of its unit if any."""
     seconds = round(seconds, 3)
+    if digits:
+        unit_s = next((unit_s for unit_s in (86400.0, 3600.0, 60.0) if seconds >= 2 * unit_s), 1.0)
+        seconds = float(f'{seconds / unit_s:.{digits}g}') * unit_s
     for unit_s, unit, smaller_s, smaller in ((86400, 'd', 3600, 'h'), (3600, 'h', 60, 'min')):
         if round(seconds) >= unit_s:
             count, rest = divmod(round(seconds / smaller_s), round(unit_s / smaller_s))
@@ -58,3 +61,18 @@ def number(value: float, signed: bool = False, digits: int = 3) -> str:
         np.format_float_positional(abs(rounded), trim='-')
     sign = '\N{MINUS SIGN}' if rounded < 0 else '+' if signed and rounded > 0 else ''
     return sign + text
+
+
+def short_time(seconds: float) -> str:
+    """Return a time that is mostly short."""
+    if abs(seconds) >= 1:
+        return f'{seconds:.4g} s'
+    return f'{1e3 * seconds:.3g} ms' if abs(seconds) >= 1e-6 else '< 0.001 ms'
+
+
+def file_size(count: int) -> str:
+    """Return a number of bytes with its prefix."""
+    for factor, unit in ((1e9, 'GB'), (1e6, 'MB'), (1e3, 'kB')):
+        if count >= factor:
+            return f'{count / factor:.3g} {unit}'
+    return f'{count} B'

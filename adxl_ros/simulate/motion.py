@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Manoeuvres: motion of the joints of the stage, and surroundings, over time."""
+"""A manoeuvre: motion of the joints of the stage, and surroundings, over time."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from adxl_ros.model.effects.base import Components
+from adxl_ros.errors import UserError
+from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Components, Need
+from adxl_ros.model.sensor import Sensor
 import numpy as np
 import scipy
 
@@ -88,3 +91,43 @@ class Motion:
     # stage moves the sensor. The joints then have no meaning.
     force: Callable[[np.ndarray], Components] | None = None
     internal_rate_hz: float = INTERNAL_RATE_HZ  # Lowest rate at which the chain runs, Hz
+
+    @property
+    def environment(self) -> dict[str, Path]:
+        """Return temperature, °C, and supply, V, by name, as far as they change."""
+        paths = {'temperature_c': self.temperature_c, 'supply_v': self.supply_v}
+        return {name: path for name, path in paths.items() if path}
+
+
+def encoder_reading(angle_rad: np.ndarray, resolution_rad: float) -> np.ndarray:
+    """Round angles, rad, to the steps of an encoder."""
+    if not resolution_rad:
+        return angle_rad
+    return np.rint(angle_rad / resolution_rad) * resolution_rad
+
+
+POINTS = 6
+"""Points of the polynomial between the steps of a grid; chosen: as exact as the filters."""
+
+
+def lagrange_weights(position: np.ndarray) -> np.ndarray:
+    """Return the weights of `POINTS` steps for interpolation at positions, (n, points)."""
+    nodes = np.arange(POINTS)
+    return np.column_stack([
+        np.prod([(position - k) / (j - k) for k in nodes if k != j], axis=0) for j in nodes])
+
+
+def check_needs(sensor: Sensor, motion: Motion) -> None:
+    """Refuse an effect that has nothing to act on."""
+    missing = {}
+    if motion.force is not None:
+        missing[Need.STAGE] = 'this manoeuvre has none, only specific force'
+    if not sensor.adc_bits > 0:
+        missing[Need.ADC] = 'the sensor has none: sensor.adc_bits is 0'
+    if not np.any(sensor.noise_density_g_per_rthz):
+        missing[Need.NOISE] = 'the sensor has none: sensor.noise_density_g_per_rthz is 0'
+    for name in sensor.effects:
+        for need in effect_named(name).needs:
+            if need in missing:
+                raise UserError(f'{name} acts on the {need.value}, but {missing[need]}; leave the '
+                                'effect out')

@@ -1,19 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The signal chain over time: volts of a sensor during a manoeuvre, block by block."""
+"""The signal chain over time: samples of a sensor during a manoeuvre, block by block."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Collection, Hashable, Iterator
 from dataclasses import replace
 from functools import partial
 from math import ceil
 from typing import Any, TypeVar
-import zlib
 
-from adxl_ros.errors import UserError
-from adxl_ros.model import analog_stages, noise, signal_chain
-from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.files.recording_columns import Recording, REFERENCES
+from adxl_ros.model import noise
+from adxl_ros.model.coefficients import neutral
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import (
     Components,
@@ -21,17 +20,29 @@ from adxl_ros.model.effects.base import (
     Joint,
     Need,
     NOMINAL_ENVIRONMENT,
-    Parameters,
     Place,
-    Role,
     Signals,
 )
 from adxl_ros.model.filters import first_order_recursion, low_pass
-from adxl_ros.model.kinematics import specific_force_in_motion, UPRIGHT
+from adxl_ros.model.kinematics import specific_force_in_motion
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.simulate.motion import Motion
+from adxl_ros.model.signal_chain import Chain
+from adxl_ros.simulate.motion import (
+    check_needs,
+    encoder_reading,
+    Held,
+    lagrange_weights,
+    Motion,
+    POINTS,
+)
 from adxl_ros.simulate.smoothed_paths import ForcePath
 import numpy as np
+
+Columns = dict[str, np.ndarray]
+"""Columns of a recording by canonical name, (n,) each."""
+
+_BLOCK_ROWS = 32768
+"""Samples of a block; chosen: its arrays stay smaller than the internal grid."""
 
 _BLOCK_STEPS = 65536
 """Steps of the internal grid in memory at once; chosen: some 10 MB of signals."""
@@ -39,9 +50,6 @@ _BLOCK_STEPS = 65536
 _WHOLE_STEPS = 300_000
 """Largest number of steps that are simulated at once and kept; chosen: 20 minutes at 250 Hz, some
 200 MB."""
-
-POINTS = 6
-"""Points of the polynomial between the steps of the grid; chosen: as exact as the filters."""
 
 _ALIGNED_STEPS = 1e-4
 """Largest distance of a sample on a step from it, in steps; chosen: far above rounding."""
@@ -70,8 +78,7 @@ class Response:
         self.sensor, self._motion, self._begin_s = sensor, motion, begin_s
         self._seed = seed
         self._force_path: Callable[[np.ndarray], Components] | None = None
-        self._run = EffectRunner(sensor, sensor.effects, seed)
-        self._effects = self._run.effects
+        self._chain = Chain(sensor, seed=seed)
         self._memo: ChainMemo | None = None
         self._block_steps = _BLOCK_STEPS
         steps_per_sample = ceil(motion.internal_rate_hz / sensor.rate_hz - _ROUNDING)
@@ -103,10 +110,10 @@ class Response:
         instants_s = self._instants(stamps_s)
         analog_v, signals = self._sampled(steps)
         signals.dt_s = 1 / self.sensor.rate_hz
-        if self._effects[Place.ADC] or self._effects[Place.CODE]:
+        if self._chain.effects[Place.ADC] or self._chain.effects[Place.CODE]:
             signals.environment = self._environment(instants_s)
         signals.input_v = list((analog_v + self._draw_noise(stamps_s, signals)).T)
-        return self._run.convert(signals)
+        return self._chain.convert(signals)
 
     def whole(self, stamps_s: np.ndarray, memo: ChainMemo) -> np.ndarray:
         """
@@ -120,26 +127,31 @@ class Response:
             return self(stamps_s)
         self._memo, self._block_steps = memo, steps
         sensor = self.sensor
-        key = (*self._chain_key(), self._seed, sensor.rate_hz, sensor.rc_s, sensor.lsb_v,
+        key = (*self._key(*Place), self._seed, sensor.rate_hz, sensor.rc_s, sensor.lsb_v,
                *sensor.nominal_zero_g_v.tolist(), *sensor.noise_density_g_per_rthz.tolist(),
-               stamps_s.tobytes(), *(state.key for states in self._effects.values()
-                                     for state in states))
+               stamps_s.tobytes())
         return self._kept('volts', key, lambda: self(stamps_s)).copy()
+
+    def _key(self, *places: Place) -> tuple:
+        """Return what the chain up to the element depends on, with effects of some places."""
+        sensor = self.sensor
+        return (self._motion, self._begin_s, self._step_s, sensor.local_gravity_mps2,
+                sensor.adc_vref_v, *sensor.nominal_scale_v_per_g.tolist(),
+                *(effect.key for place in places for effect in self._chain.effects[place]))
+
+    def _kept(self, part: str, key: Hashable, compute: Callable[[], Any]) -> Any:
+        """Return a result from the memo, or compute it."""
+        return compute() if self._memo is None else self._memo(part, key, compute)
 
     def _instants(self, stamps_s: np.ndarray) -> np.ndarray:
         """Return the instants of samples by their stamps, s, (n,)."""
         signals = Signals(NOMINAL_ENVIRONMENT, time_s=stamps_s)
-        self._run(Place.CLOCK, signals)
+        self._chain(Place.CLOCK, signals)
         return signals.time_s
 
     def _environment(self, instants_s: np.ndarray) -> Environment:
-        environment = NOMINAL_ENVIRONMENT._replace(time_s=instants_s)
-        if self._motion.temperature_c:
-            environment = environment._replace(
-                temperature_c=self._motion.temperature_c(instants_s))
-        if self._motion.supply_v:
-            environment = environment._replace(supply_v=self._motion.supply_v(instants_s))
-        return environment
+        return NOMINAL_ENVIRONMENT._replace(time_s=instants_s, **{
+            name: path(instants_s) for name, path in self._motion.environment.items()})
 
     def _sampled(self, steps: np.ndarray) -> tuple[np.ndarray, Signals]:
         """Return filtered volts, (n, m), at samples in steps of the grid, and its signals."""
@@ -169,93 +181,62 @@ class Response:
 
     def _advance(self, count: int) -> tuple[np.ndarray, Signals]:
         """Run the chain up to the filter over the next steps of the grid: volts, (n, m)."""
-        signals = self._output_of_element(max(count, 0))
-        self._done_steps += max(count, 0)
-        volts = np.empty((max(count, 0), len(self.sensor.axes)))
-        for d, v in enumerate(self._run.amplify(signals)):
-            volts[:, d] = low_pass(np.broadcast_to(v, len(volts)), signals.rc_s[d],
+        count = max(count, 0)
+        signals = self._output_of_element(count)
+        self._done_steps += count
+        volts = np.empty((count, len(self.sensor.axes)))
+        for d, v in enumerate(self._chain.volts(signals, Place.ELECTRONICS)):
+            volts[:, d] = low_pass(np.broadcast_to(v, count), signals.rc_s[d],
                                    self._dt_s, self._filters[d])
         return volts, signals
 
     def _output_of_element(self, count: int) -> Signals:
         """Run the chain up to the sensing element over the next steps of the grid."""
-        key = (*self._chain_key(), self._done_steps, count)
         stamps_s = self._begin_s + (self._done_steps + np.arange(count)) * self._step_s
-        signals = Signals(
-            NOMINAL_ENVIRONMENT, time_s=stamps_s, dt_s=self._dt_s, up=list(UPRIGHT),
-            gravity_mps2=self.sensor.local_gravity_mps2, vref_v=self.sensor.adc_vref_v,
-            nominal_scale_v_per_g=self.sensor.nominal_scale_v_per_g.tolist())
-        for place, run in _UP_TO_ELEMENT.items():
-            key = (*key, *(state.key for state in self._effects[place]))
-            # The memo shares its signals; those that follow are a copy.
-            signals = _copied(self._kept(place.name, key, partial(run, self, signals)))
-        return signals
+        signals = self._chain.signals(NOMINAL_ENVIRONMENT, time_s=stamps_s, dt_s=self._dt_s)
+        places = [Place.REFERENCE]
+        for place in (Place.CLOCK, Place.STAGE, Place.FORCE, Place.MOUNTING, Place.ELEMENT):
+            places.append(place)
+            signals = self._kept(place.name, (*self._key(*places), self._done_steps, count),
+                                 partial(self._through, place, signals))
+        return replace(signals)
 
-    def _chain_key(self) -> tuple:
-        """Return what the chain depends on beside its effects, up to the element."""
-        sensor = self.sensor
-        return (self._motion, self._begin_s, self._step_s, sensor.local_gravity_mps2,
-                sensor.adc_vref_v, *sensor.nominal_scale_v_per_g.tolist(),
-                *(state.key for state in self._effects[Place.REFERENCE]))
-
-    def _put_in_time(self, signals: Signals) -> Signals:
-        """Set the instants of the samples and the surroundings."""
-        self._run(Place.CLOCK, signals)
-        signals.environment = self._environment(signals.time_s)
-        return signals
-
-    def _move(self, signals: Signals) -> Signals:
-        """Set the specific force by the stage, or by the motion where it states the force."""
-        motion, instants_s = self._motion, signals.time_s
-        if motion.force:
+    def _through(self, place: Place, before: Signals) -> Signals:
+        """Return signals behind a place of the chain; those before it stay, for the memo."""
+        signals = replace(before, up=list(before.up), force=list(before.force))
+        motion, instants_s = self._motion, before.time_s
+        if place is Place.STAGE and motion.force:
             if self._force_path is None:
-                keys = [state.key for state in self._effects[Place.REFERENCE]]
-                self._force_path = self._kept('reference', (motion, *keys),
-                                              partial(self._acting_force, motion.force))
+                self._force_path = self._kept('reference', self._key(Place.REFERENCE),
+                                              self._acting_force)
             signals.force = list(self._force_path(instants_s))
             return signals
-        signals.alpha, signals.beta, signals.shift = (
-            Joint(*(joint(instants_s, order) for order in range(3)))
-            for joint in (motion.alpha, motion.beta, motion.shift))
-        self._run(Place.STAGE, signals)
-        signals.force = specific_force_in_motion(
-            signals.alpha, signals.beta, signals.shift, signals.gravity_mps2, signals.up)
+        if place is Place.STAGE:
+            signals.alpha, signals.beta, signals.shift = (
+                Joint(*(joint(instants_s, order) for order in range(3)))
+                for joint in (motion.alpha, motion.beta, motion.shift))
+        self._chain(place, signals)
+        if place is Place.CLOCK:
+            signals.environment = self._environment(signals.time_s)
+        elif place is Place.STAGE:
+            signals.force = specific_force_in_motion(
+                signals.alpha, signals.beta, signals.shift, signals.gravity_mps2, signals.up)
         return signals
 
-    def _acting_force(self, force: Callable[[np.ndarray], Components]
-                      ) -> Callable[[np.ndarray], Components]:
+    def _acting_force(self) -> Callable[[np.ndarray], Components]:
         """
         Return the specific force that acts on the sensor, from that of the reference.
 
         Only a recorded force has the errors of a reference; others are exact.
         """
-        if not isinstance(force, ForcePath) or not self._effects[Place.REFERENCE]:
+        force = self._motion.force
+        assert force is not None
+        if not isinstance(force, ForcePath) or not self._chain.effects[Place.REFERENCE]:
             return force
         signals = Signals(NOMINAL_ENVIRONMENT, time_s=force.time_s, force=force(force.time_s),
                           dt_s=float(np.median(np.diff(force.time_s))))
-        self._run(Place.REFERENCE, signals)
+        self._chain(Place.REFERENCE, signals)
         return ForcePath(signals.time_s, np.column_stack(signals.force))
-
-    def _mount(self, signals: Signals) -> Signals:
-        """Turn the specific force into the force along the axes of the case, g."""
-        self._run(Place.FORCE, signals)
-        signals.sensed = [f / G0_MPS2 for f in signals.force]
-        return signals
-
-    def _sense(self, signals: Signals) -> Signals:
-        """Turn the force along the axes of the case into that along the sensing axes."""
-        self._run(Place.MOUNTING, signals)
-        signals.output = list(signals.sensed)
-        return signals
-
-    def _put_out(self, signals: Signals) -> Signals:
-        """Add the effects of the sensing element."""
-        self._run(Place.ELEMENT, signals)
-        return signals
-
-    def _kept(self, part: str, key: Hashable, compute: Callable[[], Any]) -> Any:
-        """Return a result from the memo, or compute it."""
-        return compute() if self._memo is None else self._memo(part, key, compute)
 
     def _draw_noise(self, stamps_s: np.ndarray, signals: Signals) -> np.ndarray:
         """
@@ -284,104 +265,11 @@ class Response:
         return drawn[np.cumsum(passed) - 1] * std_v
 
 
-_UP_TO_ELEMENT = {Place.CLOCK: Response._put_in_time, Place.STAGE: Response._move,
-                  Place.FORCE: Response._mount, Place.MOUNTING: Response._sense,
-                  Place.ELEMENT: Response._put_out}
-"""What the chain does at each place before the electronics, in its order."""
-
-
-class EffectState:
-    """An effect of the sensor: its parameters, its memory and its random generator."""
-
-    def __init__(self, name: str, values: Parameters, seed: int) -> None:
-        """Prepare the effect before its first sample."""
-        effect = effect_named(name)
-        sizes = [p for p in effect.parameters if p.role is not Role.SHAPE]
-        # At the neutral values of its sizes and limits an effect does nothing.
-        self.is_neutral = bool(sizes) and all(
-            np.all(np.equal(values.get(p.name, p.neutral), p.neutral)) for p in sizes)
-        self.place, self.apply = effect.place, effect.apply
-        self.key = (name, *sorted(values.items()))
-        self.parameters = values
-        self.memory: dict[str, Any] = {}
-        self.rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
-
-
-class EffectRunner:
-    """Runs the effects of a sensor over samples, in blocks or one by one."""
-
-    def __init__(self, sensor: Sensor, names: Iterable[str], seed: int) -> None:
-        """Prepare some effects of the sensor before the first sample."""
-        self._sensor = sensor
-        states = [EffectState(name, analog_stages.parameters(sensor, name), seed)
-                  for name in names]
-        self.effects = {place: [state for state in states
-                                if state.place is place and not state.is_neutral]
-                        for place in Place}
-
-    def __call__(self, place: Place, signals: Signals) -> None:
-        """Apply the effects of a place."""
-        for effect in self.effects[place]:
-            signals.memory, signals.rng = effect.memory, effect.rng
-            effect.apply(signals, effect.parameters)
-
-    def amplify(self, signals: Signals) -> Components:
-        """Run the electronics up to the filter; return volts by axis."""
-        sensor, count = self._sensor, len(self._sensor.axes)
-        signals.zero_g_v = sensor.nominal_zero_g_v.tolist()
-        signals.scale_v_per_g = sensor.nominal_scale_v_per_g.tolist()
-        signals.rc_s, signals.noise_ratio = [sensor.rc_s] * count, [1.0] * count
-        signals.lsb_v, signals.lsb_ratio = sensor.lsb_v, [1.0] * count
-        self(Place.ELECTRONICS, signals)
-        return analog_stages.output_volts(signals)
-
-    def convert(self, signals: Signals) -> np.ndarray:
-        """Run the ADC on `input_v`; return volts, (..., m)."""
-        signals.volts = list(signals.input_v)
-        self(Place.ADC, signals)
-        coded = signal_chain.quantise(np.stack(signals.volts, axis=-1), self._sensor,
-                                      signals.lsb_v * np.array(signals.lsb_ratio))
-        if not self.effects[Place.CODE]:
-            return coded
-        signals.volts = [coded[..., d] for d in range(coded.shape[-1])]
-        self(Place.CODE, signals)
-        return np.stack(signals.volts, axis=-1)
-
-
-def _copied(signals: Signals) -> Signals:
-    """Return signals that effects can change without changing these."""
-    return replace(signals, up=list(signals.up), force=list(signals.force),
-                   sensed=list(signals.sensed), output=list(signals.output))
-
-
 def _interpolation(steps: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the steps from `first` on that samples lie between, (n, points), and weights."""
     start = np.floor(steps).astype(np.intp) - (POINTS // 2 - 1)
     index = np.clip(start[:, None] + np.arange(POINTS) - first, 0, None)
     return index, lagrange_weights(steps - start)
-
-
-def lagrange_weights(position: np.ndarray) -> np.ndarray:
-    """Return the weights of `POINTS` steps for interpolation at positions, (n, points)."""
-    nodes = np.arange(POINTS)
-    return np.column_stack([
-        np.prod([(position - k) / (j - k) for k in nodes if k != j], axis=0) for j in nodes])
-
-
-def check_needs(sensor: Sensor, motion: Motion) -> None:
-    """Refuse an effect that has nothing to act on."""
-    missing = {}
-    if motion.force is not None:
-        missing[Need.STAGE] = 'this manoeuvre has none, only specific force'
-    if not sensor.adc_bits > 0:
-        missing[Need.ADC] = 'the sensor has none: sensor.adc_bits is 0'
-    if not np.any(sensor.noise_density_g_per_rthz):
-        missing[Need.NOISE] = 'the sensor has none: sensor.noise_density_g_per_rthz is 0'
-    for name in sensor.effects:
-        for need in effect_named(name).needs:
-            if need in missing:
-                raise UserError(f'{name} acts on the {need.value}, but {missing[need]}; leave the '
-                                'effect out')
 
 
 _KEPT = 3
@@ -405,3 +293,130 @@ class ChainMemo:
         while len(kept) > _KEPT:
             del kept[next(iter(kept))]
         return kept[key]  # type: ignore[return-value]
+
+
+def simulate(sensor: Sensor, motion: Motion, seed: int) -> Columns:
+    """
+    Simulate a whole recording.
+
+    returns: columns by canonical name, (n,) each: `time_s`, volts by axis, readings of the
+    encoders, and temperature and supply if the manoeuvre has them.
+    """
+    parts = list(simulate_blocks(sensor, motion, seed))
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def simulate_blocks(sensor: Sensor, motion: Motion, seed: int, begin_s: float = 0.0
+                    ) -> Iterator[Columns]:
+    """Simulate a recording block by block."""
+    respond = Response(sensor, motion, seed, begin_s)
+    count = max(int(round(motion.duration_s * sensor.rate_hz, 6)), 1)
+    for begin in range(0, count, _BLOCK_ROWS):
+        time_s = begin_s + np.arange(begin, min(begin + _BLOCK_ROWS, count)) / sensor.rate_hz
+        yield {**_samples(respond, time_s), **_references(sensor, motion, time_s)}
+
+
+def simulate_at_stamps(sensor: Sensor, motion: Motion, recording: Recording, seed: int
+                       ) -> Iterator[Columns]:
+    """Simulate samples at the stamps of a recording, beside its references, block by block."""
+    respond = Response(sensor, motion, seed, float(recording.time_s[0]))
+    references = [name for name in REFERENCES if name in recording.columns]
+    for begin in range(0, len(recording), _BLOCK_ROWS):
+        part = slice(begin, begin + _BLOCK_ROWS)
+        yield {**_samples(respond, recording.time_s[part]),
+               **{name: recording.columns[name][part] for name in references}}
+
+
+def _samples(respond: Response, time_s: np.ndarray) -> Columns:
+    """Return the next stamps, s, with the volts of each axis."""
+    volts = respond(time_s)
+    return {'time_s': time_s,
+            **{f'{axis}_v': volts[:, d] for d, axis in enumerate(respond.sensor.axes)}}
+
+
+def _references(sensor: Sensor, motion: Motion, time_s: np.ndarray) -> Columns:
+    """Return the readings of the encoders, temperature and supply at stamps, s."""
+    columns = {}
+    if motion.force is None:
+        resolution_rad = sensor.stage_resolution_rad
+        columns['alpha_rad'] = encoder_reading(motion.alpha(time_s), resolution_rad)
+        columns['beta_rad'] = encoder_reading(motion.beta(time_s), resolution_rad)
+        if not isinstance(motion.shift, Held):
+            columns['shift_m'] = motion.shift(time_s)
+    return columns | {name: path(time_s) for name, path in motion.environment.items()}
+
+
+_SEED = 0
+"""Seed of noise-like effects in a comparison."""
+
+_QUIET = 1e-9
+"""Factor of the white noise in a comparison; chosen: invisible, but not 0, which effects on the
+noise refuse."""
+
+_FINE_BITS = 32
+"""Resolution of the ADC in a comparison, bit; chosen: its steps are invisible."""
+
+_RATE_HZ = 250.0
+"""Largest sample rate of the comparison, Hz; chosen: above twice the bandwidth of the motion."""
+
+_SHORT_RC_S = 1e-9
+"""Time constant of a filter that does nothing, s; chosen: not 0, which `bandwidth` refuses."""
+
+
+class PartSizes:
+    """Simulates a sensor in a manoeuvre with and without parts of it."""
+
+    def __init__(self, sensor: Sensor, motion: Motion) -> None:
+        """Prepare the comparison."""
+        self._sensor = replace(sensor, rate_hz=min(sensor.rate_hz, _RATE_HZ))
+        self._motion = replace(motion, internal_rate_hz=self._sensor.rate_hz)
+        count = int(motion.duration_s * self._sensor.rate_hz)
+        self._stamps_s = np.arange(count) / self._sensor.rate_hz
+        self._memo = ChainMemo()
+
+    def effects_mg(self, effects: Collection[str], show: Callable[[float], None]
+                   ) -> dict[str, float]:
+        """Return the size of each effect."""
+        sizes = {}
+        for number, name in enumerate(effects):
+            show(number / len(effects))
+            needs = effect_named(name).needs
+            sensor = self._sensor if {Need.ADC, Need.NOISE} & set(needs) else self._quiet()
+            sizes[name] = self._change_mg(sensor, _without(sensor, [name]))
+        return sizes
+
+    def filter_mg(self) -> float:
+        """Return the rms of what the RC filter changes, mg."""
+        return self._change_mg(self._quiet(), _unfiltered(self._quiet()))
+
+    def remaining_mg(self, held: Collection[str], is_filtered: bool) -> float:
+        """Return the size of all that some effects leave out."""
+        sensor = self._quiet()
+        other = _without(sensor, [name for name in sensor.effects if name not in held])
+        return self._change_mg(sensor, other if is_filtered else _unfiltered(other))
+
+    def _quiet(self) -> Sensor:
+        """Return the sensor with invisible white noise and steps."""
+        sensor = self._sensor
+        return replace(sensor, adc_bits=_FINE_BITS if sensor.adc_bits else 0,
+                       noise_density_g_per_rthz=_QUIET * sensor.noise_density_g_per_rthz)
+
+    def _change_mg(self, sensor: Sensor, other: Sensor) -> float:
+        """Return the rms of the difference of two sensors, mg."""
+        volts = [Response(unit, self._motion, _SEED).whole(self._stamps_s, self._memo)
+                 for unit in (sensor, other)]
+        change_g = (volts[0] - volts[1]) / sensor.nominal_scale_v_per_g
+        return float(1e3 * np.sqrt(np.mean(change_g ** 2)))
+
+
+def _without(sensor: Sensor, effects: Collection[str]) -> Sensor:
+    """Return the sensor with some effects at their neutral values."""
+    return replace(sensor, values={**sensor.values, **{
+        name: neutral(effect_named(name), sensor.axes) for name in effects}})
+
+
+def _unfiltered(sensor: Sensor) -> Sensor:
+    """Return the sensor without its filter."""
+    if not sensor.rc_s:
+        return sensor
+    return replace(sensor, rc_resistance_ohm=_SHORT_RC_S / sensor.rc_capacitance_f)

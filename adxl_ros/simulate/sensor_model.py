@@ -12,18 +12,13 @@ from typing import Any
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.model import noise
-from adxl_ros.model.constants import (
-    AXES,
-    G0_MPS2,
-    NOMINAL_SUPPLY_V,
-    NOMINAL_TEMPERATURE_C,
-)
+from adxl_ros.model.constants import AXES, NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Effect, Environment, Need, Place, Signals
 from adxl_ros.model.filters import low_pass
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.simulate.motion import Motion
-from adxl_ros.simulate.response import check_needs, EffectRunner, lagrange_weights, POINTS
+from adxl_ros.model.signal_chain import Chain
+from adxl_ros.simulate.motion import check_needs, lagrange_weights, Motion, POINTS
 import numpy as np
 
 _SAME_STEP = 1e-6
@@ -49,7 +44,7 @@ class SensorModel:
                    for name in self.sensor.effects}
         # Reason by name of an effect of the unit that is not simulated
         self.left_out = {name: reason for name, reason in reasons.items() if reason}
-        self._run = EffectRunner(
+        self._chain = Chain(
             self.sensor, [name for name in self.sensor.effects if name not in self.left_out], seed)
         self._filters: list[dict[str, Any]] = [{} for _ in self.sensor.axes]
         self._white = np.random.default_rng([seed, 0])
@@ -139,19 +134,11 @@ class SensorModel:
 
     def _analog(self, now: Environment, force: list[np.ndarray]) -> Signals:
         """Run the chain up to the filter; its volts are in `input_v`, (1, n) each."""
-        sensor = self.sensor
-        signals = Signals(
-            now, time_s=now.time_s, dt_s=self._dt_s, force=force, vref_v=sensor.adc_vref_v,
-            nominal_scale_v_per_g=sensor.nominal_scale_v_per_g.tolist())
-        self._run(Place.FORCE, signals)
-        signals.sensed = [f / G0_MPS2 for f in signals.force]
-        self._run(Place.MOUNTING, signals)
-        signals.output = list(signals.sensed)
-        self._run(Place.ELEMENT, signals)
-        amplified_v = self._run.amplify(signals)
+        signals = self._chain.signals(now, time_s=now.time_s, dt_s=self._dt_s, force=force)
+        self._chain(Place.FORCE, signals)
+        analog_v = self._chain.volts(signals)
         signals.input_v = [low_pass(np.asarray(volts), rc_s, self._dt_s, memory)
-                           for volts, rc_s, memory in zip(amplified_v, signals.rc_s,
-                                                          self._filters)]
+                           for volts, rc_s, memory in zip(analog_v, signals.rc_s, self._filters)]
         return signals
 
     def _digital_v(self, signals: Signals) -> np.ndarray:
@@ -159,7 +146,7 @@ class SensorModel:
         drawn_v = self._draw_noise(signals)
         if drawn_v is not None:
             signals.input_v = [volts + drawn_v[:, d] for d, volts in enumerate(signals.input_v)]
-        return self._run.convert(signals)[0]
+        return self._chain.convert(signals)[0]
 
     def _draw_noise(self, signals: Signals) -> np.ndarray | None:
         """Draw the noise behind the filter, V, (n, m), as `Response` does; None without any."""

@@ -9,7 +9,7 @@ from math import exp
 from types import MappingProxyType
 
 from adxl_ros.errors import UserError
-from adxl_ros.simulate.simulator import encoder_reading
+from adxl_ros.simulate.motion import encoder_reading
 import numpy as np
 
 JOINTS = ('alpha', 'beta', 'shift')

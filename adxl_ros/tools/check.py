@@ -21,42 +21,34 @@ from adxl_ros.files import recording
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.report import page as html_page
-from adxl_ros.report.quantities import duration
+from adxl_ros.report.quantities import duration, short_time
+from adxl_ros.report.screen import COLUMNS, row
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
 from adxl_ros.signals.recording_contents import RecordingContents
-from adxl_ros.tools.command_line import (
-    add_recording_options,
-    argument_parser,
-    COLUMNS,
-    command,
-    reading_options,
-    reading_text,
-    RECORDING_HELP,
-)
-from adxl_ros.tools.output import make_folder, print_end, progress, quoted, run, ShowDone
+from adxl_ros.tools import command_line as cli
 
-_NAME_COLUMNS = 21
+_NAME_COLUMNS = 20
 """Columns of the name of a recording."""
-_WIDTHS = (13, 10, 9, 8, 6)
-"""Columns of length, rate, missing samples, share at rest and axes."""
-_HEAD = ('length', 'rate', 'missing', 'rest', 'axes')
+_HEAD = ('recording', 'length', 'rate', 'missing', 'rest', 'axes', 'verdict')
+_COLUMNS = (_NAME_COLUMNS, '>13', '>10', '>9', '>8', '>6', 11)
 _SHOWS_HEAD = ('effect', 'from', 'typical', '')
+_SHOWS_COLUMNS = (24, 16, 14, 0)
 _MOST_SHOWN = 1_000_000
 """Samples up to which it is listed what `diagnose` could show. Chosen: a minute, and 1 GB."""
 _MOST_DETAILED = 3
 """Recordings up to which the details of sound ones are printed, too. Chosen: a screen."""
 _LABEL_COLUMNS = 12
 """Columns of the label of a line below a recording."""
+_UNITS = {'rad': 'rad', 'm': 'm', 'c': '°C', 'v': 'V'}
+"""Units of references by the end of their names."""
 
 
 def _lines(results: list[Findings]) -> list[str]:
     """Return a line for each recording, then why some are not sound, 79 columns at most."""
-    head = ''.join(f'{name:>{width}}' for name, width in zip(_HEAD, _WIDTHS))
-    rows = [f' {"recording":{_NAME_COLUMNS - 1}}{head}  verdict']
-    for result in results:
-        cells = _cells(result.contents)
-        text = ''.join(f'{cell:>{width}}' for cell, width in zip(cells, _WIDTHS))
-        rows.append(f' {_short(result.path):{_NAME_COLUMNS - 1}}{text}  {_verdict(result)}')
+    rows = []
+    for name, *cells, verdict in (_HEAD, *map(_cells, results)):
+        short = name if len(name) < _NAME_COLUMNS else f'{name[:_NAME_COLUMNS - 2]}…'
+        rows.append(' ' + row((short, *cells, f'  {verdict}'), _COLUMNS))
     detailed = results if len(results) <= _MOST_DETAILED else \
         [result for result in results if not result.is_sound]
     for result in detailed:
@@ -64,8 +56,8 @@ def _lines(results: list[Findings]) -> list[str]:
         if result.shows:
             count = sum(not missing for *_, missing in result.shows)
             rows += ['', f'  {count} of {len(result.shows)} effects could show to diagnose',
-                     *(f'  {a:24}{b:16}{c:14}{d}'.rstrip()
-                       for a, b, c, d in (_SHOWS_HEAD, *result.shows))]
+                     *('  ' + row(cells, _SHOWS_COLUMNS)
+                       for cells in (_SHOWS_HEAD, *result.shows))]
     if len(detailed) < len(results):
         rows += ['', '--report DIR and --json have the details of all recordings.']
     return [*rows, '']
@@ -79,23 +71,14 @@ def _sentence(results: list[Findings]) -> str:
     return f'{count} of {len(results)} recordings ' + ('is sound.' if count == 1 else 'are sound.')
 
 
-def _cells(contents: RecordingContents | None) -> list[str]:
-    """Return length, rate, missing samples, share at rest and axes."""
+def _cells(result: Findings) -> list[str]:
+    """Return name, length, rate, missing samples, share at rest, axes and verdict."""
+    name, contents = Path(result.path).name, result.contents
     if contents is None:
-        return ['–'] * len(_WIDTHS)
-    return [duration(contents.span_s), f'{contents.rate_hz:.4g} Hz', str(contents.missing),
-            f'{100 * contents.rest_share:.0f} %', 'xyz'[:len(contents.axes)]]
-
-
-def _verdict(result: Findings) -> str:
-    """Return the verdict in one or two words."""
-    return 'sound' if result.is_sound else 'NOT SOUND' if result.contents else 'unreadable'
-
-
-def _short(path: str) -> str:
-    """Return the name of a recording, with its end cut where it is long."""
-    name = Path(path).name
-    return name if len(name) < _NAME_COLUMNS - 1 else f'{name[:_NAME_COLUMNS - 3]}…'
+        return [name, *['–'] * 5, 'unreadable']
+    return [name, duration(contents.span_s), f'{contents.rate_hz:.4g} Hz', str(contents.missing),
+            f'{100 * contents.rest_share:.0f} %', 'xyz'[:len(contents.axes)],
+            'sound' if result.is_sound else 'NOT SOUND']
 
 
 def _entries(result: Findings) -> list[tuple[str, str]]:
@@ -123,23 +106,15 @@ def _details(result: Findings) -> list[str]:
 
 def _value_lines(contents: RecordingContents) -> list[str]:
     """Return stamps, ranges and references of a recording, for people."""
-    texts = [f'{contents.samples} samples, jitter {_milliseconds(contents.jitter_s)} rms']
-    texts.append(', '.join(f'{axis.name} {axis.lowest_mps2:.3g} to {axis.highest_mps2:.3g} m/s²'
-                           for axis in contents.axes))
-    units = {'rad': 'rad', 'm': 'm', 'c': '°C', 'v': 'V'}
-    texts += [f'{name} {low:.4g} to {high:.4g} {units[name.rsplit("_", 1)[1]]}'
-              for name, (low, high) in contents.reference_ranges.items()]
+    texts = [f'{contents.samples} samples, jitter {short_time(contents.jitter_s)} rms',
+             ', '.join(f'{axis.name} {axis.lowest_mps2:.3g} to {axis.highest_mps2:.3g} m/s²'
+                       for axis in contents.axes),
+             *(f'{name} {low:.4g} to {high:.4g} {_UNITS[name.rsplit("_", 1)[1]]}'
+               for name, (low, high) in contents.reference_ranges.items())]
     if contents.delay is not None:
-        texts.append(f'log time minus header time {_milliseconds(contents.delay.median_s)}, '
-                     f'spread {_milliseconds(contents.delay.spread_s)}')
+        texts.append(f'log time minus header time {short_time(contents.delay.median_s)}, '
+                     f'spread {short_time(contents.delay.spread_s)}')
     return texts
-
-
-def _milliseconds(seconds: float) -> str:
-    """Return a time that is mostly short."""
-    if abs(seconds) >= 1:
-        return f'{seconds:.4g} s'
-    return f'{1e3 * seconds:.3g} ms' if abs(seconds) >= 1e-6 else '< 0.001 ms'
 
 
 def _page(results: list[Findings]) -> str:
@@ -147,13 +122,11 @@ def _page(results: list[Findings]) -> str:
     is_sound = all(result.is_sound for result in results)
     badge = {'colour': 'green' if is_sound else 'red', 'sentence': _sentence(results),
              'word': 'Sound.' if is_sound else 'Not sound.'}
-    rows = [[Path(result.path).name, *_cells(result.contents), _verdict(result)]
-            for result in results]
     recordings = [{'path': result.path, 'entries': _entries(result), 'shows': result.shows}
                   for result in results]
     return html_page.render('adxl_ros.tools', 'check.html', {
         'title': 'Check of recordings', 'about': [], 'badge': badge,
-        'figures': {}, 'columns': ('recording', *_HEAD, 'verdict'), 'rows': rows,
+        'figures': {}, 'columns': _HEAD, 'rows': list(map(_cells, results)),
         'recordings': recordings, 'shows_head': _SHOWS_HEAD})
 
 
@@ -167,38 +140,40 @@ _EXAMPLES = {
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = argument_parser('check', __doc__, _EXAMPLES)
-    parse.add_argument('recording', nargs='+', metavar='RECORDING', help=RECORDING_HELP)
+    parse = cli.argument_parser('check', __doc__, _EXAMPLES)
+    parse.add_argument('recording', nargs='+', metavar='RECORDING', help=cli.RECORDING_HELP)
     parse.add_argument('--params', metavar='FILE', default=None,
                        help='the sensor, for recordings in volts (default: the nominal sensor)')
     parse.add_argument('--report', metavar='DIR', help='write the page check.html there')
     parse.add_argument('--json', action='store_true', help='print the result as JSON')
-    add_recording_options(parse)
+    cli.add_recording_options(parse)
     return parse
 
 
 def check(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
-    reading = replace(reading_options(options), drop_bad_stamps=True)
+    reading = replace(cli.reading_options(options), drop_bad_stamps=True)
     if options.report:
         html_page.check_libraries()
-    results = []
-    with progress('check') as show:
+    results, count = [], len(options.recording)
+    with cli.progress('check') as show:
         for i, path in enumerate(options.recording):
-            step = _Step(show, i, len(options.recording), Path(path).name)
+            def step(done: float, i: int = i, name: str = Path(path).name) -> None:
+                show((i + done) / count, name)
+
             results.append(check_recording(path, options.params, reading, step))
         if len(results) == 1:
             results = [_with_what_shows(results[0], options.params, reading)]
     page = []
     if options.report:
-        make_folder(Path(options.report))
+        cli.make_folder(Path(options.report))
         page = [Path(options.report) / 'check.html']
         write_text(page[0], _page(results))
     if options.json:
         print(json.dumps([_as_json(result) for result in results], indent=1))
     else:
         print('\n'.join(_lines(results)))
-        print_end([_sentence(results)], page, _next_command(results, options))
+        cli.print_end([_sentence(results)], page, _next_command(results, options))
     return 0 if all(result.is_sound for result in results) else 1
 
 
@@ -207,44 +182,32 @@ def _with_what_shows(result: Findings, params: str | None, reading: ReadingOptio
     if not result.is_sound or not any(a.tool == 'diagnose' and a.is_able
                                       for a in result.abilities):
         return result
-    if result.contents is None or result.contents.samples > _MOST_SHOWN:
-        return replace(result, remarks=(
-            *result.remarks, 'what diagnose could show is listed for recordings of '
-            f'{_MOST_SHOWN} samples at most; check a part'))
     try:
+        if result.contents is None or result.contents.samples > _MOST_SHOWN:
+            raise UserError('what diagnose could show is listed for recordings of '
+                            f'{_MOST_SHOWN} samples at most; check a part')
         read = recording.read(result.path, reading)
         sensor, _ = measure_unstated(load_sensor(params, read), read)
         shown = what_shows([read], sensor)
+        if isinstance(shown, DataFault):
+            raise UserError(f'diagnose: {shown.message}')
     except UserError as error:
         return replace(result, remarks=(*result.remarks, one_line(error)))
-    if isinstance(shown, DataFault):
-        return replace(result, remarks=(*result.remarks, f'diagnose: {shown.message}'))
     scale_v_per_g = float(sensor.scale_v_per_g.mean())
     return replace(result, shows=tuple(
-        shows_row(row, scale_v_per_g) for row in sorted(
-            by_effect(shown).values(), key=lambda row: (not row.shows, row.effect))))
-
-
-class _Step:
-    """Shows how much of one recording among several is done."""
-
-    def __init__(self, show: ShowDone, number: int, count: int, name: str) -> None:
-        self._show, self._number, self._count, self._name = show, number, count, name
-
-    def __call__(self, done: float) -> None:
-        """Show the fraction of this recording that is done."""
-        self._show((self._number + done) / self._count, self._name)
+        shows_row(effect, scale_v_per_g) for effect in sorted(
+            by_effect(shown).values(), key=lambda effect: (not effect.shows, effect.effect))))
 
 
 def _next_command(results: list[Findings], options: argparse.Namespace) -> str:
     """Return the command that a sound recording allows; empty for none."""
     for result in results:
         able = {ability.tool for ability in result.abilities if ability.is_able}
-        words = f'{quoted(result.path)}{reading_text(options)}'
-        if result.is_sound and 'fit' in able:
-            return command('fit', f'{words} -o unit.yaml --report report')
-        if result.is_sound and 'noise' in able:
-            return command('noise', f'{words} -o noise.yaml --report noise')
+        for tool, output in (('fit', 'unit.yaml --report report'),
+                             ('noise', 'noise.yaml --report noise')):
+            if result.is_sound and tool in able:
+                return cli.command(tool, f'{cli.quoted(result.path)}{cli.reading_text(options)} '
+                                   f'-o {output}')
     return ''
 
 
@@ -266,4 +229,4 @@ def _as_json(result: Findings) -> dict[str, Any]:
 
 def main() -> int:
     """Run the tool on the command line."""
-    return run(parser(), check)
+    return cli.run(parser(), check)

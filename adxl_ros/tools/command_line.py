@@ -1,29 +1,46 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The command lines of the tools: parsers, how recordings are read, effects."""
+"""The command lines of the tools: parser, options, effects, messages, progress and end."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from difflib import get_close_matches
 import math
+import os
+from pathlib import Path
 import shlex
 import shutil
+import signal
+import sys
 import textwrap
-from typing import Any
+from types import FrameType
+from typing import Any, Protocol
 
+from adxl_ros.closed_output import ended_by_closed_output
 from adxl_ros.errors import UserError
-from adxl_ros.files.column_mapping import parse_mapping, parse_mounting, ReadingOptions
+from adxl_ros.files import recording
+from adxl_ros.files.column_mapping import (
+    AS_IT_IS,
+    parse_mapping,
+    parse_mounting,
+    ReadingOptions,
+)
+from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model import coefficients
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Effect, Parameter
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.report.screen import COLUMNS, end_lines, entry_list, NextStep
 import numpy as np
 
-COLUMNS = 79
-"""Columns of a terminal that a tool uses."""
+_UNITS = {'rad': 'rad', 'm': 'm', 'c': 'degC', 'v': 'V'}
+"""Units of references by the end of their columns' names."""
+_BAR_COLUMNS = 24
+"""Columns of a progress bar: names of stages and times stand beside it in 80 columns."""
 
 
 class _HelpFormatter(argparse.RawDescriptionHelpFormatter):
@@ -79,14 +96,6 @@ def effect_list(effects: Iterable[Effect]) -> str:
     """Return a list of effects with their causes for a help text, by name."""
     causes = {effect.name: effect.cause.partition(';')[0].rstrip('.') for effect in effects}
     return entry_list('effects', dict(sorted(causes.items())))
-
-
-def entry_list(title: str, entries: Mapping[str, str]) -> str:
-    """Return a list for a help text."""
-    width = max(map(len, entries)) + 2
-    return '\n'.join([f'{title}:', *(
-        textwrap.fill(f'  {name:{width}}{meaning}', COLUMNS, subsequent_indent=(width + 2) * ' ')
-        for name, meaning in entries.items())])
 
 
 RECORDING_HELP = 'rosbag2 directory, .mcap, CSV or another table'
@@ -166,52 +175,43 @@ def with_effects(sensor: Sensor, texts: Sequence[str]) -> Sensor:
     stated: dict[Coefficient, str] = {}
     for text in texts:
         name, _, rest = text.partition(':')
-        effect = _effect(name, text)
-        if not rest:
-            values = coefficients.typical(effect, sensor.axes)
-            sensor = _with_values(sensor, effect, values)
+        try:
+            effect = effect_named(name)
+        except UserError as error:
+            raise UserError(f'--effect {text}: {error}') from None
+        values = dict(sensor.values.get(name) or coefficients.neutral(effect, sensor.axes)) \
+            if rest else coefficients.typical(effect, sensor.axes)
         for part in filter(None, rest.split(',')):
-            key, _, number = part.partition('=')
-            coefficient = Coefficient(name, *key.strip().split('.', 1))
+            key, _, number = (word.strip() for word in part.partition('='))
+            coefficient = Coefficient(name, *key.split('.', 1))
             if coefficient in stated:
                 raise UserError(f'--effect {text}: {key} of {name} is stated twice, also in '
                                 f'{stated[coefficient]}; keep one')
             stated[coefficient] = text
-            sensor = _with_value(sensor, effect, key.strip(), number.strip(), text)
+            values[coefficient.parameter] = _value(effect, values, sensor.axes, key, number, text)
+        effects = sensor.effects if name in sensor.effects else (*sensor.effects, name)
+        sensor = replace(sensor, effects=effects, values={**sensor.values, name: values})
     return sensor
 
 
-def _effect(name: str, text: str) -> Effect:
-    try:
-        return effect_named(name)
-    except UserError as error:
-        raise UserError(f'--effect {text}: {error}') from None
-
-
-def _with_values(sensor: Sensor, effect: Effect, values: dict[str, np.ndarray]) -> Sensor:
-    """Return the sensor with an effect that has these values by parameter."""
-    effects = sensor.effects if effect.name in sensor.effects else (*sensor.effects, effect.name)
-    return replace(sensor, effects=effects, values={**sensor.values, effect.name: values})
-
-
-def _with_value(sensor: Sensor, effect: Effect, key: str, number: str, text: str) -> Sensor:
-    """Set one parameter, for all its axes or one; `text` is the option, for messages."""
+def _value(effect: Effect, values: Mapping[str, np.ndarray], axes: str, key: str, number: str,
+           text: str) -> np.ndarray:
+    """Return one parameter with a new value for all its axes or one; `text` is the option."""
     name, _, axis = key.partition('.')
     parameter = _parameter(effect, name, text)
     value = _number(parameter, number, text)
-    values = dict(sensor.values.get(effect.name) or coefficients.neutral(effect, sensor.axes))
     if not parameter.axes:
         if axis:
             raise UserError(f'--effect {text}: {name} is one number without axes; write '
                             f'{name}={number}')
-        return _with_values(sensor, effect, {**values, name: np.array(value)})
-    chosen = [i for i, a in enumerate(sensor.axes) if a in parameter.axes and axis in ('', a)]
+        return np.array(value)
+    chosen = [i for i, a in enumerate(axes) if a in parameter.axes and axis in ('', a)]
     if not chosen:
-        raise UserError(f'--effect {text}: no axis {axis!r} to act on; the sensor has '
-                        f'{sensor.axes}, {name} acts on {parameter.axes}')
+        raise UserError(f'--effect {text}: no axis {axis!r} to act on; the sensor has {axes}, '
+                        f'{name} acts on {parameter.axes}')
     changed = np.array(values[name], float)
     changed[chosen] = value
-    return _with_values(sensor, effect, {**values, name: changed})
+    return changed
 
 
 def _parameter(effect: Effect, name: str, text: str) -> Parameter:
@@ -235,3 +235,123 @@ def _number(parameter: Parameter, number: str, text: str) -> float:
                         f'{parameter.lower:g} to {parameter.upper:g} {parameter.unit}; a typical '
                         f'{parameter.name} is {parameter.scale:g}')
     return value
+
+
+def print_end(result: Sequence[str], files: Iterable[str | os.PathLike],
+              following: str | Sequence[NextStep] = '', took_s: float | None = None) -> None:
+    """Print the end of a tool within 79 columns; outcomes are coloured in a terminal."""
+    print('\n'.join(end_lines(result, [str(path) for path in files if Path(path).exists()],
+                              following, took_s)))
+
+
+def quoted(*words: str | os.PathLike) -> str:
+    """Return words of a command line as a shell reads them."""
+    return shlex.join(str(word) for word in words)
+
+
+@ended_by_closed_output()
+def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace], int]) -> int:
+    """Parse the command line and run a tool."""
+    signal.signal(signal.SIGTERM, _terminated)
+    try:
+        return command(parser.parse_args())
+    except UserError as error:
+        note(f'{parser.prog}: {" ".join(str(error).split())}', error.paste)
+        return 1
+    except KeyboardInterrupt:
+        note(f'{parser.prog}: interrupted; nothing was written')
+        return 130
+
+
+def note(text: str, paste: str = '') -> None:
+    """Print a message on stderr: one line, which a terminal gets wrapped between words."""
+    if sys.stderr.isatty():
+        text = textwrap.fill(text.removesuffix(paste), COLUMNS, subsequent_indent='  ',
+                             break_long_words=False, break_on_hyphens=False)
+        text += f'\n{paste}' * bool(paste)
+    print(text, file=sys.stderr)
+
+
+def _terminated(number: int, frame: FrameType | None) -> None:
+    """End by an exception, so that unfinished files are removed."""
+    sys.exit(128 + number)
+
+
+def make_folder(folder: Path) -> None:
+    """Create a folder for the output of a tool, if it does not exist."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f'{folder}: cannot be made: {error.strerror}') from None
+
+
+def refuse_same_file(output: str, source: str) -> None:
+    """Refuse an output that is the input, which a tool reads while it writes."""
+    if Path(output).resolve() == Path(source).resolve():
+        raise UserError(f'{output}: is the input itself; choose another output')
+
+
+def report_reading(tool: str, recording: Recording) -> None:
+    """Report on stderr what was assumed in reading, the cut, and the alignment of references."""
+    for line in (*recording.remarks, *[recording.cut] * bool(recording.cut)):
+        note(f'{tool}: {line}')
+    for name, alignment in recording.alignments.items():
+        # References with the stamps of the samples need no alignment.
+        if alignment.gap_s:
+            unit = _UNITS[name.rsplit('_', 1)[1]]
+            note(f'{tool}: {recording.path}: {name} aligned by its stamps: residual '
+                 f'{alignment.residual:.3g} {unit} rms, nearest message at most '
+                 f'{alignment.gap_s:.3g} s away')
+
+
+def read(tool: str, path: str, reading: ReadingOptions = AS_IT_IS) -> Recording:
+    """Read a recording, and report on stderr how."""
+    read = recording.read(path, reading)
+    report_reading(tool, read)
+    return read
+
+
+class ShowDone(Protocol):
+    """Shows how much is done."""
+
+    def __call__(self, done: float, stage: str = '') -> None:
+        """Show a fraction."""
+
+
+@contextmanager
+def progress(title: str) -> Iterator[ShowDone]:
+    """Show a progress bar on a terminal where rich is installed, else nothing."""
+    try:
+        from rich import console, progress as bars
+    except ImportError:
+        yield lambda done, stage='': None
+        return
+    screen = console.Console(stderr=True)
+    columns = (bars.TextColumn('{task.description}'), bars.BarColumn(_BAR_COLUMNS),
+               bars.TextColumn('{task.percentage:3.0f} %'), bars.TimeElapsedColumn(),
+               bars.TimeRemainingColumn())
+    with bars.Progress(*columns, console=screen, transient=True,
+                       disable=not screen.is_terminal) as bar:
+        task = bar.add_task(title, total=1.0)
+
+        def show(done: float, stage: str = '') -> None:
+            """Show a fraction; see `ShowDone`."""
+            # A plan that grows does not take the bar back.
+            bar.update(task, completed=max(done, bar.tasks[task].completed),
+                       description=stage or title)
+
+        yield show
+
+
+@contextmanager
+def staged_progress(work: Mapping[str, float]) -> Iterator[Callable[[str, float], None]]:
+    """Show a progress bar over stages of different length, as `progress` does."""
+    names, total = list(work), sum(work.values())
+    with progress(f'1/{len(names)} {names[0]}') as show:
+        def show_stage(stage: str, share: float = 0.0) -> None:
+            number = names.index(stage)
+            before = sum(work[name] for name in names[:number])
+            show((before + share * work[stage]) / total,
+                 f'{number + 1}/{len(names)} {stage}')
+
+        yield show_stage

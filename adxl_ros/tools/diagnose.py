@@ -15,35 +15,18 @@ from adxl_ros.diagnose.diagnosis import diagnose as diagnose_recordings, Diagnos
 from adxl_ros.diagnose.report import as_json, screen_lines
 from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.errors import UserError
-from adxl_ros.files import parameter_file, population_file, recording
+from adxl_ros.files import parameter_file, population_file
 from adxl_ros.files.atomic_write import write_text
-from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.model.effects import library
 from adxl_ros.model.population import posterior
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report import page as html_page
+from adxl_ros.report.screen import NextStep
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
-from adxl_ros.simulate.simulator import motion_from_force
-from adxl_ros.tools.command_line import (
-    add_recording_options,
-    argument_parser,
-    command,
-    effect_list,
-    reading_options,
-    RECORDING_HELP,
-)
-from adxl_ros.tools.output import (
-    make_folder,
-    NextStep,
-    note,
-    print_end,
-    progress,
-    quoted,
-    report_reading,
-    run,
-)
+from adxl_ros.simulate.trajectories import motion_from_force
+from adxl_ros.tools import command_line as cli
 
 _NO_VERDICT = ('bad_data', 'insufficient')
 """Statuses of the report that hold no verdict: the exit status is then 1."""
@@ -61,9 +44,9 @@ _FILES = ('report.html', 'params.yaml', 'report.json')
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = argument_parser('diagnose', __doc__, _EXAMPLES, _details)
+    parse = cli.argument_parser('diagnose', __doc__, _EXAMPLES, _details)
     parse.add_argument('recording', nargs='+',
-                       help=f'{RECORDING_HELP}; all of one unit')
+                       help=f'{cli.RECORDING_HELP}; all of one unit')
     parse.add_argument('--params', metavar='FILE', default=None,
                        help='what the simulator models (default: the nominal sensor)')
     parse.add_argument('--prior', metavar='FILE',
@@ -81,7 +64,7 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--json', action='store_true', help='print the report as JSON')
     parse.add_argument('-o', dest='output', metavar='DIR', required=True,
                        help='report.json, report.html and params.yaml')
-    add_recording_options(parse)
+    cli.add_recording_options(parse)
     return parse
 
 
@@ -89,28 +72,28 @@ def _details() -> str:
     """Return exit status and effects for the help text."""
     return ('Exit status: 0 with a verdict, 1 where none was possible (the report then\n'
             'names the fault of the recording, or what it lacks), 2 after wrong usage.\n\n'
-            + effect_list(library().values()))
+            + cli.effect_list(library().values()))
 
 
 def diagnose(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     begin_s = monotonic()
-    if options.seed < 0:
-        raise UserError(f'--seed {options.seed}: must not be negative')
-    if not 0 < options.material < float('inf'):
-        raise UserError(f'--material {options.material:g}: must be positive')
-    if options.self_check < 0:
-        raise UserError(f'--self-check {options.self_check}: must not be negative')
-    if options.sim and len(options.recording) > 1:
-        raise UserError(f'--sim {options.sim}: goes with one recording, but '
-                        f'{len(options.recording)} are given')
-    if options.align and not options.sim:
-        raise UserError('--align: shifts --sim, which is not given')
-    reading = reading_options(options)
+    count = len(options.recording)
+    for is_wrong, message in (
+            (options.seed < 0, f'--seed {options.seed}: must not be negative'),
+            (not 0 < options.material < float('inf'),
+             f'--material {options.material:g}: must be positive'),
+            (options.self_check < 0, f'--self-check {options.self_check}: must not be negative'),
+            (options.sim and count > 1,
+             f'--sim {options.sim}: goes with one recording, but {count} are given'),
+            (options.align and not options.sim, '--align: shifts --sim, which is not given')):
+        if is_wrong:
+            raise UserError(message)
+    reading = cli.reading_options(options)
     population = population_file.read(options.prior) if options.prior else None
     html_page.check_libraries()
-    with progress('reading') as show:
-        recordings = [_read(path, reading) for path in options.recording]
+    with cli.progress('reading') as show:
+        recordings = [cli.read('diagnose', path, reading) for path in options.recording]
         sim = motion_from_force(options.sim, False, recordings[0].epoch_ns)[0] if options.sim \
             else None
         sensor, _ = measure_unstated(load_sensor(options.params, recordings[0]), recordings[0])
@@ -131,28 +114,21 @@ def diagnose(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(report, indent=1, allow_nan=False))
     else:
-        print_end([*lines, ''], [Path(options.output, name) for name in _FILES],
-                  _next_steps(options, diagnosis), monotonic() - begin_s)
+        cli.print_end([*lines, ''], [Path(options.output, name) for name in _FILES],
+                      _next_steps(options, diagnosis), monotonic() - begin_s)
     if report['verdict']['status'] not in _NO_VERDICT:
         return 0
     reason = report['verdict']['data_fault'] or report['verdict']['status']
-    note(f'diagnose: {", ".join(options.recording)}: no verdict ({reason}); the reason is in '
-         f'{Path(options.output, "report.json")}')
+    cli.note(f'diagnose: {", ".join(options.recording)}: no verdict ({reason}); the reason is in '
+             f'{Path(options.output, "report.json")}')
     return 1
-
-
-def _read(path: str, reading: ReadingOptions) -> Recording:
-    """Read a recording, and report how."""
-    read = recording.read(path, reading)
-    report_reading('diagnose', read)
-    return read
 
 
 def _write(options: argparse.Namespace, diagnosis: Diagnosis, subject: str, lines: list[str]
            ) -> dict[str, Any]:
     """Write the files of a diagnosis; return its report."""
     folder = Path(options.output)
-    make_folder(folder)
+    cli.make_folder(folder)
     report = as_json(diagnosis)
     write_text(folder / 'report.json', json.dumps(report, indent=1, allow_nan=False) + '\n')
     parameters = '' if diagnosis.report is None else \
@@ -184,8 +160,8 @@ def _next_steps(options: argparse.Namespace, diagnosis: Diagnosis) -> str | list
     if diagnosis.report is None:
         return ''
     verdict = diagnosis.report.verdict
-    params = quoted(Path(options.output) / 'params.yaml')
-    simulate = command('simulate', f'rich --params {params} -o sim.csv')
+    params = cli.quoted(Path(options.output) / 'params.yaml')
+    simulate = cli.command('simulate', f'rich --params {params} -o sim.csv')
     if diagnosis.report.next_experiment is None:
         return simulate
     proposal = diagnosis.report.next_experiment
@@ -203,7 +179,7 @@ def _next_steps(options: argparse.Namespace, diagnosis: Diagnosis) -> str | list
                            _diagnose_command(options, params, [])),
                   NextStep('simulate with the effects', simulate)]
     else:
-        given = options.params and quoted(options.params)
+        given = options.params and cli.quoted(options.params)
         together = '' if options.sim else ' together with this one'
         steps.append(NextStep(f'{then}diagnose it{together}',
                               _diagnose_command(options, given, options.recording)))
@@ -213,13 +189,13 @@ def _next_steps(options: argparse.Namespace, diagnosis: Diagnosis) -> str | list
 def _diagnose_command(options: argparse.Namespace, params: str | None, recordings: list[str]
                       ) -> str:
     """Return the command that diagnoses the next recording, alone or with others."""
-    words = [quoted(*([] if options.sim else recordings), 'next.csv')]
+    words = [cli.quoted(*([] if options.sim else recordings), 'next.csv')]
     words += [f'--params {params}'] if params else []
     words += ['--sim next_simulated.csv'] if options.sim else []
     output = f'{options.output}{"_2" if options.output[-1].isdigit() else "2"}'
-    return command('diagnose', ' '.join([*words, f'-o {quoted(output)}']))
+    return cli.command('diagnose', ' '.join([*words, f'-o {cli.quoted(output)}']))
 
 
 def main() -> int:
     """Run the tool on the command line."""
-    return run(parser(), diagnose)
+    return cli.run(parser(), diagnose)

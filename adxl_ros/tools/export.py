@@ -8,14 +8,14 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
-from adxl_ros.errors import UserError
 from adxl_ros.files import exports, parameter_file
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.simulate.simulator import PartSizes
-from adxl_ros.tools.command_line import argument_parser, command, entry_list
-from adxl_ros.tools.output import print_end, progress, quoted, run
+from adxl_ros.report.screen import entry_list
+from adxl_ros.simulate.response import PartSizes
+from adxl_ros.simulate.trajectories import TRAJECTORIES
+from adxl_ros.tools import command_line as cli
 import numpy as np
 
 _EXAMPLES = {
@@ -31,7 +31,7 @@ _NAMED_PARTS = 3
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = argument_parser('export', __doc__, _EXAMPLES, lambda: entry_list(
+    parse = cli.argument_parser('export', __doc__, _EXAMPLES, lambda: entry_list(
         'formats', {name: each.meaning for name, each in exports.FORMATS.items()}))
     parse.add_argument('params', metavar='PARAMS', help='parameter file of the sensor')
     parse.add_argument('--to', dest='format', required=True, choices=list(exports.FORMATS),
@@ -42,23 +42,22 @@ def parser() -> argparse.ArgumentParser:
 
 def export(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
-    if Path(options.params).resolve() == Path(options.output).resolve():
-        raise UserError(f'{options.output}: is the input itself; choose another output')
+    cli.refuse_same_file(options.output, options.params)
     sensor = parameter_file.load(options.params)
     exporter = exports.FORMATS[options.format]
-    with progress('sizes of the effects') as show:
+    with cli.progress('sizes of the effects') as show:
         exported = _sized(sensor, options, set(exporter.holds), show)
     write_text(options.output, exporter.text(exported))
     held = [name for name in exported.sizes_mg if name in exporter.holds]
-    print_end(_result_lines(exported, options.format, held), [options.output], command(
-        'simulate', f'rich --params {quoted(options.params)} -o rich.csv'))
+    cli.print_end(_result_lines(exported, options.format, held), [options.output], cli.command(
+        'simulate', f'rich --params {cli.quoted(options.params)} -o rich.csv'))
     return 0
 
 
 def _sized(sensor: Sensor, options: argparse.Namespace, held: set[str],
            show: Callable[[float], None]) -> exports.Export:
     """Simulate the sizes of all parts of a sensor."""
-    parts = PartSizes(sensor)
+    parts = PartSizes(sensor, TRAJECTORIES['rich'](np.random.default_rng(0)))
     stage = exports.stage_effects(sensor)
     sizes_mg = parts.effects_mg([name for name in sensor.effects if name not in stage], show)
     axes = exports.axes(sensor)
@@ -94,4 +93,4 @@ def _result_lines(exported: exports.Export, format_name: str, held: list[str]) -
 
 def main() -> int:
     """Run the tool on the command line."""
-    return run(parser(), export)
+    return cli.run(parser(), export)

@@ -14,12 +14,7 @@ from adxl_ros.calibrate.poses import Poses, with_table_angles
 from adxl_ros.calibrate.report import acceptance, report_html, text_tables
 from adxl_ros.calibrate.report.text_tables import errors_in_words
 from adxl_ros.errors import UserError
-from adxl_ros.files import (
-    calibration_store,
-    population_file,
-    recording,
-    sweep_journal,
-)
+from adxl_ros.files import calibration_store, population_file, sweep_journal
 from adxl_ros.files.calibration_store import sha256
 from adxl_ros.files.recording_columns import recorded_unit, Recording
 from adxl_ros.files.tables import read_pose_table
@@ -28,24 +23,7 @@ from adxl_ros.model.effects.base import Place
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.report import page as html_page
 from adxl_ros.signals.recorded_sensor import BeyondRange, listed, load_sensor, measure_unstated
-from adxl_ros.tools.command_line import (
-    add_recording_options,
-    argument_parser,
-    command,
-    effect_list,
-    reading_options,
-    reading_text,
-    RECORDING_HELP,
-)
-from adxl_ros.tools.output import (
-    make_folder,
-    note,
-    print_end,
-    quoted,
-    report_reading,
-    run,
-    staged_progress,
-)
+from adxl_ros.tools import command_line as cli
 
 _EXAMPLES = {
     'the richest model that a sweep determines, with a page':
@@ -68,9 +46,9 @@ _REPORT_FILES = ('report.html', 'calibration.png')
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = argument_parser('fit', __doc__, _EXAMPLES, _details)
+    parse = cli.argument_parser('fit', __doc__, _EXAMPLES, _details)
     parse.add_argument('recording', nargs='+',
-                       help=f'{RECORDING_HELP}; all of one unit')
+                       help=f'{cli.RECORDING_HELP}; all of one unit')
     parse.add_argument('--params', metavar='FILE', default=None,
                        help='values that are not fitted (default: the nominal sensor; what '
                             'a file leaves out is measured)')
@@ -96,14 +74,14 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--store', metavar='DIR', default=str(calibration_store.default_folder()),
                        help='the calibration store, which gets a copy (default: %(default)s); '
                             'empty for none')
-    add_recording_options(parse)
+    cli.add_recording_options(parse)
     return parse
 
 
 def _details() -> str:
     """Return the effects that a fit can have for the help text."""
-    return effect_list(effect for effect in library().values()
-                       if effect.invertible or effect.place is Place.STAGE)
+    return cli.effect_list(effect for effect in library().values()
+                           if effect.invertible or effect.place is Place.STAGE)
 
 
 def fit(options: argparse.Namespace) -> int:
@@ -116,18 +94,16 @@ def fit(options: argparse.Namespace) -> int:
     if options.poses and (options.journal or len(options.recording) != 1):
         raise UserError(f'--poses {options.poses}: goes with one recording, and without --journal')
     population = population_file.read(options.prior) if options.prior else None
-    records = _records(options.journal)
+    records = sweep_journal.poses_to_fit(sweep_journal.read(options.journal).entries) \
+        if options.journal else None
     unit: Sensor | None = None
-    base: Sensor | None = None
-    measured: list[str] = []
-    recordings = []
+    recordings: list[calibration.RecordedPoses] = []
     thermal: Poses | None = None
-    reading = reading_options(options)
+    reading = cli.reading_options(options)
     work = {name: seconds for name, seconds in _WORK.items() if options.report or name != 'report'}
-    with staged_progress(work) as show:
+    with cli.staged_progress(work) as show:
         for number, path in enumerate(options.recording):
-            read = recording.read(path, reading)
-            report_reading('fit', read)
+            read = cli.read('fit', path, reading)
             if unit is None:
                 unit, lines = measure_unstated(load_sensor(options.params, read), read)
                 base, measured = unit, listed(lines)
@@ -145,7 +121,7 @@ def fit(options: argparse.Namespace) -> int:
                 poses = with_table_angles(poses, read_pose_table(options.poses), read.epoch_ns)
             recordings.append(calibration.RecordedPoses(
                 Path(path).name, poses, pose_extraction.estimate_filters(read, unit, poses)))
-        assert unit is not None and base is not None, 'argparse asks for a recording'
+        assert unit is not None, 'argparse asks for a recording'
         show('fit', 0.0)
         sha = sha256(options.recording)
         result = calibration.calibrate(unit, recordings, options.model, options.effect, sha,
@@ -155,17 +131,16 @@ def fit(options: argparse.Namespace) -> int:
         result = replace(result, report_lines=[*result.report_lines, *measured])
         if options.report:
             show('report', 0.0)
-            make_folder(Path(options.report))
+            cli.make_folder(Path(options.report))
             report_html.write(options.report, result, options.store)
     result.save(options.output)
-    note(f'fit: {result.keep(options.store)}')
+    cli.note(f'fit: {result.keep(options.store)}')
     report = [Path(options.report) / name for name in _REPORT_FILES] if options.report else []
     lines = [errors_in_words(result.fitted), '', *_result_lines(result)] if thermal is None else \
         [*result.summary_lines, '']
-    print_end([*lines, *measured, ''],
-              [options.output, *report], command(
-        'apply', f'{quoted(options.recording[0])}{reading_text(options)} --params '
-        f'{quoted(options.output)} -o tilt.csv'))
+    cli.print_end([*lines, *measured, ''], [options.output, *report], cli.command(
+        'apply', f'{cli.quoted(options.recording[0])}{cli.reading_text(options)} --params '
+        f'{cli.quoted(options.output)} -o tilt.csv'))
     return 0
 
 
@@ -187,7 +162,7 @@ def _report_range(read: Recording, unit: Sensor) -> None:
     beyond.add(read.volts(unit), unit)
     text = beyond.describe(unit)
     if text and 'range_g' not in unit.measured:
-        note(f'fit: {read.path}: {text}')
+        cli.note(f'fit: {read.path}: {text}')
 
 
 def _result_lines(result: calibration.CalibrationResult) -> list[str]:
@@ -210,11 +185,6 @@ def _result_lines(result: calibration.CalibrationResult) -> list[str]:
     return lines + [f' {line}' for line in (*acceptance.unit_line(fitted), *result.warnings)]
 
 
-def _records(path: str | None) -> list[sweep_journal.PoseRecord] | None:
-    """Return the poses that a journal names; None without a journal."""
-    return None if path is None else sweep_journal.poses_to_fit(sweep_journal.read(path).entries)
-
-
 def main() -> int:
     """Run the tool on the command line."""
-    return run(parser(), fit)
+    return cli.run(parser(), fit)

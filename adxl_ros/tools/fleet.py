@@ -7,6 +7,7 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 import shlex
 from time import monotonic
@@ -14,20 +15,14 @@ from time import monotonic
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.files import calibration_store
 from adxl_ros.files.stream_info import NO_UNIT
-from adxl_ros.fleet.inputs import find_sources, Source, stated_by
+from adxl_ros.fleet.inputs import find_sources, stated_by
 from adxl_ros.fleet.recipe import make_recipe, Recipe, task_names, TASKS
 from adxl_ros.fleet.row import reason_kind, Row
 from adxl_ros.fleet.run import only_client, Plan, plan, Results, Selection, since_text, work
 from adxl_ros.report.addresses import as_utf_8, without_secrets
-from adxl_ros.report.quantities import counted, duration
-from adxl_ros.tools.command_line import (
-    add_recording_options,
-    argument_parser,
-    command,
-    reading_options,
-    reading_text,
-)
-from adxl_ros.tools.output import note, print_end, progress, run, wrapped
+from adxl_ros.report.quantities import counted, duration, file_size
+from adxl_ros.report.screen import wrapped
+from adxl_ros.tools import command_line as cli
 from adxl_ros.workers import open_pool, RETRIES
 
 PROG = 'fleet'
@@ -47,11 +42,14 @@ _REASON_COLUMNS = 12
 """Columns before a reason."""
 _MOST_REASONS = 3
 """Reasons of refusals on the screen. Chosen: the page has all."""
+_SHOWN = ('url', 'outcome', 'refusal', 'refused_by', 'serial', 'status', 'seconds', 'is_sound',
+          'duration_s')
+"""What the screen needs of a row; the others are not kept."""
 
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = argument_parser(PROG, __doc__, _EXAMPLES)
+    parse = cli.argument_parser(PROG, __doc__, _EXAMPLES)
     parse.add_argument('input', nargs='+', metavar='INPUT',
                        help='file, folder, glob, URL of fsspec (s3://, gs://, https://, sftp://), '
                             'or a manifest: CSV or Parquet with url, serial, params, date')
@@ -79,7 +77,7 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--limit', metavar='N', type=int,
                        help='work on N recordings at most')
     parse.add_argument('--dry-run', action='store_true', help='only show what there is to do')
-    add_recording_options(parse)
+    cli.add_recording_options(parse)
     return parse
 
 
@@ -92,47 +90,40 @@ def fleet(options: argparse.Namespace) -> int:
     tasks = task_names(options.do)
     sources = find_sources(options.input)
     recipe = make_recipe(tasks, options.params, (source.params for source in sources),
-                         options.store, reading_options(options))
+                         options.store, cli.reading_options(options))
     folder = Path(options.output)
-    if options.dry_run:
-        to_do = _planned(sources, recipe, Results(folder), selection)
-        print_end(_plan_lines(to_do, len(sources)), [], _command(options, options.only_failed))
-        return 0
-    with only_client(folder):
-        return _worked(options, sources, recipe, selection, begin_s)
+    with nullcontext() if options.dry_run else only_client(folder):
+        results = Results(folder)
+        to_do = plan(sources, recipe, results, selection)
+        _warn_of_replaced(to_do, results, recipe.tasks)
+        if not options.dry_run:
+            return _worked(options, recipe, results, to_do, begin_s)
+    cli.print_end(_plan_lines(to_do, len(sources)), [], _command(options, options.only_failed))
+    return 0
 
 
-def _planned(sources: Sequence[Source], recipe: Recipe, results: Results, selection: Selection
-             ) -> Plan:
-    """Plan a run; warn of what is replaced."""
-    to_do = plan(sources, recipe, results, selection)
-    _warn_of_replaced(to_do, results, recipe.tasks)
-    return to_do
-
-
-def _worked(options: argparse.Namespace, sources: Sequence[Source], recipe: Recipe,
-            selection: Selection, begin_s: float) -> int:
+def _worked(options: argparse.Namespace, recipe: Recipe, results: Results, to_do: Plan,
+            begin_s: float) -> int:
     """Work on all that there is to do, and write table and page."""
-    folder = Path(options.output)
-    results = Results(folder)
-    to_do = _planned(sources, recipe, results, selection)
     rows: list[Row] = []
-    reason = ''
+    is_interrupted = False
     try:
         if to_do.todo:
             shared = (recipe, frozenset(results.known))
             with open_pool(options.scheduler, options.jobs, shared) as pool, \
-                    progress(PROG) as show:
+                    cli.progress(PROG) as show:
                 for row in work(pool, to_do.todo, recipe, results, options.retries, show):
-                    rows.append(_short(row))
+                    rows.append({name: row[name] for name in _SHOWN})
     except KeyboardInterrupt:
-        reason = 'interrupted; the same command continues'
-    files = _written(folder, results)
-    if reason:
-        note(f'{PROG}: {reason}')
+        is_interrupted = True
+    files = _written(Path(options.output), results)
+    if is_interrupted:
+        cli.note(f'{PROG}: interrupted; the same command continues')
         return 130
     took_s = monotonic() - begin_s
-    print_end([*_result_lines(rows, to_do, took_s), ''], files, _next(options, rows), took_s)
+    is_repeated = any(row['outcome'] == 'crashed' or row['refused_by'] == 'stage' for row in rows)
+    cli.print_end([*_result_lines(rows, to_do, took_s), ''], files,
+                  _command(options, True) if is_repeated else '', took_s)
     return 1 if rows and not any(row['outcome'] == 'done' for row in rows) else 0
 
 
@@ -158,8 +149,8 @@ def _warn_of_replaced(to_do: Plan, results: Results, tasks: Sequence[str]) -> No
     if missing:
         together = ','.join(name for name in TASKS if name in {*tasks, *missing})
         count = sum(not set(missing).isdisjoint(earlier) for earlier in before)
-        note(f'{PROG}: {counted(count, "recording")} will lose {" and ".join(missing)} in table '
-             f'and page; --do {together} keeps them, or name another folder')
+        cli.note(f'{PROG}: {counted(count, "recording")} will lose {" and ".join(missing)} in '
+                 f'table and page; --do {together} keeps them, or name another folder')
 
 
 def _written(folder: Path, results: Results) -> list[Path]:
@@ -169,22 +160,8 @@ def _written(folder: Path, results: Results) -> list[Path]:
     try:
         files = [*page.write(folder), *files]
     except UserError as error:
-        note(f'{PROG}: no page: {error}')
+        cli.note(f'{PROG}: no page: {error}')
     return [*files, folder / 'reports']
-
-
-def _short(row: Row) -> Row:
-    """Return what the screen needs of a row."""
-    return {name: row[name] for name in ('url', 'outcome', 'refusal', 'refused_by', 'serial',
-                                         'status', 'seconds', 'is_sound', 'duration_s')}
-
-
-def _size(count: int) -> str:
-    """Return a number of bytes with its prefix."""
-    for factor, unit in ((1e9, 'GB'), (1e6, 'MB'), (1e3, 'kB')):
-        if count >= factor:
-            return f'{count / factor:.3g} {unit}'
-    return f'{count} B'
 
 
 def _plan_lines(to_do: Plan, count: int) -> list[str]:
@@ -196,19 +173,14 @@ def _plan_lines(to_do: Plan, count: int) -> list[str]:
     largest = ', '.join(f'{serial} ({number})' for serial, number in by_unit.most_common(_UNITS))
     rows = {'found': f'{counted(count, "recording")}', 'done already': f'{to_do.done}',
             'left out': _left_out(to_do),
-            'core hours': _hours(to_do.core_hours),
+            'core hours': f'{to_do.core_hours:.3g}' if not 0 < to_do.core_hours < _FEWEST_HOURS
+            else f'below {_FEWEST_HOURS}: {duration(3600 * to_do.core_hours)}',
             'units': f'{len(by_unit)}{":" if by_unit else ""} {largest}'
             f'{", ..." if len(by_unit) > _UNITS else ""}',
             'unknown unit': f'{counted(unknown, "recording")}' if unknown else ''}
-    return [f'{counted(len(to_do.todo), "recording")} to do, {_size(to_do.size_bytes)}, about '
+    return [f'{counted(len(to_do.todo), "recording")} to do, {file_size(to_do.size_bytes)}, about '
             f'{duration(3600 * to_do.core_hours)} of one core', '',
             *(f' {name:13}{text}' for name, text in rows.items() if text), '']
-
-
-def _hours(hours: float) -> str:
-    """Return core hours, in shorter units where they are few."""
-    few = 0 < hours < _FEWEST_HOURS
-    return f'below {_FEWEST_HOURS}: {duration(3600 * hours)}' if few else f'{hours:.3g}'
 
 
 def _left_out(to_do: Plan) -> str:
@@ -263,16 +235,9 @@ def _command(options: argparse.Namespace, only_failed: bool) -> str:
         value = getattr(options, name)
         words += [f'--{name}', str(value)] if value != parser().get_default(name) else []
     words += ['--only-failed'] if only_failed else []
-    return command(PROG, shlex.join(words) + reading_text(options))
-
-
-def _next(options: argparse.Namespace, rows: Sequence[Row]) -> str:
-    """Return how to repeat what failed."""
-    if any(row['outcome'] == 'crashed' or row['refused_by'] == 'stage' for row in rows):
-        return _command(options, True)
-    return ''
+    return cli.command(PROG, shlex.join(words) + cli.reading_text(options))
 
 
 def main() -> int:
     """Run the tool on the command line."""
-    return run(parser(), fleet)
+    return cli.run(parser(), fleet)

@@ -22,35 +22,13 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.report import page as html_page
 from adxl_ros.report.figures import png, pyplot
 from adxl_ros.report.quantities import duration
+from adxl_ros.report.screen import row
+from adxl_ros.signals import axis_noise
 from adxl_ros.signals.allan_deviation import longest_rest, StillStretch
-from adxl_ros.signals.axis_noise import (
-    AxisNoise,
-    density_g_per_rthz,
-    recording_noise,
-    RecordingNoise,
-    settings,
-    TERMS,
-    with_noise,
-)
+from adxl_ros.signals.axis_noise import AxisNoise, RecordingNoise, settings, TERMS
 from adxl_ros.signals.noise_parameters import Drift, DriftKind, Estimate
 from adxl_ros.signals.recorded_sensor import load_sensor
-from adxl_ros.tools.command_line import (
-    add_recording_options,
-    argument_parser,
-    command,
-    reading_options,
-    reading_text,
-    RECORDING_HELP,
-)
-from adxl_ros.tools.output import (
-    make_folder,
-    print_end,
-    progress,
-    quoted,
-    report_reading,
-    run,
-    ShowDone,
-)
+from adxl_ros.tools import command_line as cli
 import numpy as np
 
 MICRO_G = 1e6 / G0_MPS2
@@ -81,26 +59,26 @@ def _head(result: RecordingNoise) -> list[str]:
 
 def _tables(result: RecordingNoise) -> list[str]:
     """Return the terms with intervals, then in SI units and by sample, 79 columns at most."""
-    rows = [f' {"axis":5}' + ''.join(f'{name:25}' for name in (
-            f'{NAMES[term]}' for term in TERMS)).rstrip(),
-            f' {"":5}{"µg/√Hz (90 %)":25}{"µg (90 %)":25}µg/√s (90 %)']
-    for noise in result.axes:
-        cells = [_interval(estimate.scaled(MICRO_G)) for estimate in noise.estimates]
-        rows.append(f' {noise.axis:5}' + ''.join(f'{cell:25}' for cell in cells).rstrip())
+    wide, narrow = (6, 25, 25, 25), (6, 12, 12, 12, 13, 13, 9)
+    rows = [row((' axis', *(NAMES[term] for term in TERMS)), wide),
+            row(('', 'µg/√Hz (90 %)', 'µg (90 %)', 'µg/√s (90 %)'), wide)]
+    rows += [row((f' {noise.axis}', *_micro_g_intervals(noise)), wide) for noise in result.axes]
     rows += _walk_lines(result)
-    rows += ['', f' {"":5}{"N":12}{"B":12}{"K":12}{"N by sample":13}{"K by sample":13}'
-             'datasheet',
-             f' {"axis":5}{"m/s²/√Hz":12}{"m/s²":12}{"m/s²/√s":12}{"m/s²":13}{"m/s²":13}µg/√Hz']
+    rows += ['', row(('', 'N', 'B', 'K', 'N by sample', 'K by sample', 'datasheet'), narrow),
+             row((' axis', 'm/s²/√Hz', 'm/s²', 'm/s²/√s', 'm/s²', 'm/s²', 'µg/√Hz'), narrow)]
     rate = np.sqrt(result.rest.rate_hz)
     for noise in result.axes:
-        white, instability, walk = noise.estimates
-        cells = [_value(white), _value(instability), _value(walk), _value(white.scaled(rate)),
-                 _value(walk.scaled(1 / rate)),
-                 _value(white.scaled(1e6 * ONE_SIDED / G0_MPS2))]
-        widths = (12, 12, 12, 13, 13, 0)
-        rows.append(f' {noise.axis:5}' + ''.join(f'{cell:{width}}' for cell, width
-                                                 in zip(cells, widths)).rstrip())
+        white, _, walk = noise.estimates
+        shown = (*noise.estimates, white.scaled(rate), walk.scaled(1 / rate),
+                 white.scaled(1e6 * ONE_SIDED / G0_MPS2))
+        rows.append(row((f' {noise.axis}', *(f'{e.value:.3g}' if e.is_seen else f'< {e.high:.3g}'
+                                             for e in shown)), narrow))
     return rows
+
+
+def _micro_g_intervals(noise: AxisNoise) -> list[str]:
+    """Return N, B and K in µg with their intervals."""
+    return [_interval(estimate.scaled(MICRO_G)) for estimate in noise.estimates]
 
 
 def _walk_lines(result: RecordingNoise) -> list[str]:
@@ -125,26 +103,10 @@ def _interval(estimate: Estimate) -> str:
     return f'{estimate.value:.3g} ({estimate.low:.3g} to {estimate.high:.3g})'
 
 
-def _value(estimate: Estimate) -> str:
-    """Return an estimate, or its upper limit."""
-    return f'{estimate.value:.3g}' if estimate.is_seen else f'< {estimate.high:.3g}'
-
-
 def _paste_lines(result: RecordingNoise) -> list[str]:
     """Return the settings of other programs, ready to paste."""
-    lines = []
-    for program, entries in settings(result.axes, result.rest.rate_hz).items():
-        lines.append(f'# {program}')
-        for setting in entries:
-            lines += setting.lines()
-    return lines
-
-
-def _comments(result: RecordingNoise) -> list[str]:
-    """Return the comments of the parameter file."""
-    return [f'Noise measured in {duration(result.rest.span_s)} at rest of {result.path}.',
-            'Density: over positive frequencies, as datasheets state it.',
-            *_tables(result)]
+    return [line for program, entries in settings(result.axes, result.rest.rate_hz).items()
+            for line in (f'# {program}', *(line for entry in entries for line in entry.lines()))]
 
 
 def _warnings(result: RecordingNoise) -> list[str]:
@@ -193,17 +155,11 @@ def _too_short(result: RecordingNoise) -> list[str]:
         if needed_s:
             longest_s = max(needed_s.values())
             further = 'To see half of the limit above, record about ' \
-                f'{duration(_two_digits(longest_s))}.' if np.isfinite(longest_s) else \
+                f'{duration(longest_s, 2)}.' if np.isfinite(longest_s) else \
                 'The other terms hide it, in longer recordings, too.'
             texts.append(f'{duration(result.rest.span_s)} is too short to see the {NAMES[name]} '
                          f'of {", ".join(needed_s)}. {further}')
     return texts
-
-
-def _two_digits(seconds: float) -> float:
-    """Round a time to two digits of its unit."""
-    unit_s = next((unit_s for unit_s in (86400.0, 3600.0, 60.0) if seconds >= 2 * unit_s), 1.0)
-    return float(f'{seconds / unit_s:.2g}') * unit_s
 
 
 def _unexplained(noise: AxisNoise) -> list[str]:
@@ -275,7 +231,7 @@ def _axis_json(noise: AxisNoise) -> dict[str, Any]:
     time_s = noise.fit.correlation
     return {**terms, 'correlation_s': time_s and {'value': time_s.value,
                                                   'ci': [time_s.low, time_s.high]},
-            'rounding': noise.rounding, 'density_g_per_rthz': density_g_per_rthz(noise),
+            'rounding': noise.rounding, 'density_g_per_rthz': axis_noise.density_g_per_rthz(noise),
             'sample_std_mps2': noise.sample_std, 'resolution_mps2': noise.resolution,
             'lowest': {'tau_s': noise.lowest_s, 'deviation_mps2': noise.lowest},
             'fitted_below_hz': noise.fit.highest_hz}
@@ -303,8 +259,7 @@ def _write_page(folder: Path, result: RecordingNoise) -> list[Path]:
 
 def _page(result: RecordingNoise, figure: Any) -> str:
     """Return the page."""
-    rows = [[noise.axis, *(_interval(estimate.scaled(MICRO_G))
-                           for estimate in noise.estimates),
+    rows = [[noise.axis, *_micro_g_intervals(noise),
              f'{noise.lowest * MICRO_G:.3g} at {noise.lowest_s:.3g} s',
              f'{noise.sample_std:.3g}', f'{noise.fit.highest_hz:.3g}'] for noise in result.axes]
     return html_page.render('adxl_ros.tools', 'noise.html', {
@@ -326,8 +281,7 @@ def _plot(result: RecordingNoise) -> Any:
                       color='#36c', label='measured')
         for name, line, estimate in zip(TERMS, noise.fit.lines(tau_s), noise.estimates):
             if estimate.is_seen:
-                plot.plot(tau_s, line * MICRO_G, '--', lw=1,
-                          label=f'{NAMES[name]}')
+                plot.plot(tau_s, line * MICRO_G, '--', lw=1, label=NAMES[name])
         plot.plot(tau_s, noise.fit.allan_deviation(tau_s) * MICRO_G, color='#222',
                   lw=1, label='all three')
         plot.set(xscale='log', yscale='log', title=f'axis {noise.axis}',
@@ -351,9 +305,9 @@ _EXAMPLES = {
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = argument_parser('noise', __doc__, _EXAMPLES)
+    parse = cli.argument_parser('noise', __doc__, _EXAMPLES)
     parse.add_argument('recording', metavar='RECORDING',
-                       help=f'{RECORDING_HELP}; of a sensor that nobody touches')
+                       help=f'{cli.RECORDING_HELP}; of a sensor that nobody touches')
     parse.add_argument('--params', metavar='FILE', default=None,
                        help='the other values of the sensor (default: the nominal sensor; for a '
                             'recording in m/s² that names no sensor, any IMU)')
@@ -362,7 +316,7 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--report', metavar='DIR',
                        help='write the page report.html, the curve allan.png and allan.csv there')
     parse.add_argument('--json', action='store_true', help='print the result as JSON')
-    add_recording_options(parse)
+    cli.add_recording_options(parse)
     return parse
 
 
@@ -371,45 +325,47 @@ def noise(options: argparse.Namespace) -> int:
     if options.report:
         html_page.check_libraries()
     source = _Source(options)
-    with progress('noise') as show:
+    with cli.progress('noise') as show:
         rest = longest_rest(lambda: source.blocks(show), source.unit)
-        result = recording_noise(options.recording, rest, source.axes,
-                                 lambda done: show(done, 'fit'))
-    report_reading('noise', source.last)
+        result = axis_noise.recording_noise(options.recording, rest, source.axes,
+                                            lambda done: show(done, 'fit'))
+    cli.report_reading('noise', source.last)
     files: list[Path] = []
     if options.report:
-        make_folder(Path(options.report))
+        cli.make_folder(Path(options.report))
         files += _write_page(Path(options.report), result)
     if options.output:
-        fresh = with_noise(source.sensor(rest.rate_hz), result.axes)
         name = Path(options.recording).name
-        provenance = {**fresh.provenance, 'noise_from': name, 'rate_from': name}
-        parameter_file.save(options.output, replace(fresh, provenance=provenance),
-                            _comments(result))
+        fresh = axis_noise.with_noise(source.sensor(rest.rate_hz), result.axes)
+        parameter_file.save(options.output, replace(fresh, provenance={
+            **fresh.provenance, 'noise_from': name, 'rate_from': name}), [
+                f'Noise measured in {duration(rest.span_s)} at rest of {result.path}.',
+                'Density: over positive frequencies, as datasheets state it.', *_tables(result)])
         files.insert(0, Path(options.output))
     if options.json:
         print(json.dumps(_as_json(result), indent=1))
         return 0
-    _print(options, result, files)
+    print('\n'.join([*_head(result), '', *_tables(result), '', *_paste_lines(result), '']))
+    warnings = [f'WARNING {text}' for text in _warnings(result)]
+    following = cli.command('diagnose', f'RECORDING --params {cli.quoted(options.output)} '
+                            '-o gap') if options.output else cli.command(
+        'noise', f'{cli.quoted(options.recording)}{cli.reading_text(options)} -o noise.yaml')
+    cli.print_end([*warnings, *[''] * bool(warnings)], files, following)
     return 0
 
 
 class _Source:
-    """
-    The recording and its unit.
+    """The recording and its unit."""
 
-    last: the newest block.
-    """
+    axes: str  # Measured axes, known after the first block
+    last: Recording  # The newest block
 
     def __init__(self, options: argparse.Namespace) -> None:
-        self._path = options.recording
-        self._params = options.params
-        self._reading = reading_options(options)
-        self._sensor: Sensor | None = None
+        self._path, self._params = options.recording, options.params
+        self._reading = cli.reading_options(options)
         self._unit: Sensor | None = None
-        self.axes = ''  # Measured axes, known after the first block
 
-    def blocks(self, show: ShowDone) -> Iterator[Recording]:
+    def blocks(self, show: cli.ShowDone) -> Iterator[Recording]:
         """Yield the blocks of the recording, and show how much has been read."""
         for block in recording.blocks(self._path, _BLOCK_ROWS, self._reading):
             self.last = block
@@ -426,7 +382,7 @@ class _Source:
 
     def sensor(self, rate_hz: float) -> Sensor:
         """Return the sensor of the parameter file, with the axes and rate of the recording."""
-        assert self._unit is not None and self._sensor is not None
+        assert self._unit is not None
         if self._sensor.effects and self._sensor.axes != self.axes:
             raise UserError(f'{self._path}: has the axes {self.axes}, but the parameters of '
                             f'{self._sensor.serial} are for {self._sensor.axes}; name the '
@@ -435,19 +391,6 @@ class _Source:
         return replace(base, serial=self._unit.serial, rate_hz=round(rate_hz, 6))
 
 
-def _print(options: argparse.Namespace, result: RecordingNoise, files: list[Path]) -> None:
-    """Print the result, the files and the next command."""
-    for line in [*_head(result), '', *_tables(result), '',
-                 *_paste_lines(result), '']:
-        print(line)
-    warnings = _warnings(result)
-    following = command('diagnose', f'RECORDING --params {quoted(options.output)} -o gap') \
-        if options.output else command(
-            'noise', f'{quoted(options.recording)}{reading_text(options)} -o noise.yaml')
-    print_end([*(f'WARNING {text}' for text in warnings), *([''] if warnings else [])], files,
-              following)
-
-
 def main() -> int:
     """Run the tool on the command line."""
-    return run(parser(), noise)
+    return cli.run(parser(), noise)

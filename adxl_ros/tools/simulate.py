@@ -7,7 +7,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
 import sys
@@ -20,19 +20,15 @@ from adxl_ros.links.support import emulated_board
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Concern
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.simulate import simulator
+from adxl_ros.report.screen import entry_list
 from adxl_ros.simulate.motion import INTERNAL_RATE_HZ
-from adxl_ros.simulate.simulator import motion_from_force, motion_from_references
-from adxl_ros.simulate.trajectories import TRAJECTORIES
-from adxl_ros.tools.command_line import (
-    argument_parser,
-    command,
-    effect_list,
-    entry_list,
-    SYNTAX,
-    with_effects,
+from adxl_ros.simulate.response import Columns, simulate_at_stamps, simulate_blocks
+from adxl_ros.simulate.trajectories import (
+    motion_from_force,
+    motion_from_references,
+    TRAJECTORIES,
 )
-from adxl_ros.tools.output import print_end, progress, quoted, report_reading, run
+from adxl_ros.tools import command_line as cli
 import numpy as np
 
 _SHORTEST_S = 1e-9
@@ -47,29 +43,19 @@ _EXAMPLES = {
 }
 """Examples of arguments, by their purpose."""
 
-Output = Callable[[simulator.Columns], None]
+Output = Callable[[Columns], None]
 """Takes a block of simulated samples."""
-
-
-@dataclass(frozen=True)
-class _Run:
-    """A simulation to be carried out."""
-
-    sensor: Sensor  # The sensor, at its sample rate
-    begin_s: float  # Time of the first sample, s
-    duration_s: float  # Time from the first to the last sample, s
-    blocks: Iterator[simulator.Columns]  # The samples
 
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = argument_parser('simulate', __doc__, _EXAMPLES, _details)
+    parse = cli.argument_parser('simulate', __doc__, _EXAMPLES, _details)
     parse.add_argument('trajectory', metavar='TRAJECTORY',
                        help=f'{", ".join(TRAJECTORIES)}, imu, or a recording')
     parse.add_argument('--params', metavar='FILE', default=None,
                        help='the sensor (default: the nominal sensor)')
     parse.add_argument('--effect', action='append', default=[], metavar='NAME[:key=value,...]',
-                       help=f'add an effect: {SYNTAX}')
+                       help=f'add an effect: {cli.SYNTAX}')
     parse.add_argument('--force', metavar='RECORDING',
                        help='specific force for the trajectory imu')
     parse.add_argument('--rate', type=float, metavar='HZ', help='sample rate')
@@ -89,7 +75,7 @@ def _details() -> str:
     about['imu'] = ('Apply the specific force of --force, from any simulator: ax_mps2, ay_mps2, '
                     'az_mps2 or sensor_msgs/Imu.')
     about['RECORDING'] = 'Follow the stage angles of a recording, at its stamps.'
-    return '\n\n'.join([entry_list('trajectories', about), effect_list(library().values()),
+    return '\n\n'.join([entry_list('trajectories', about), cli.effect_list(library().values()),
                         'docs/reference/effects.md has the parameters of each effect.'])
 
 
@@ -99,23 +85,48 @@ def simulate(options: argparse.Namespace) -> int:
     sensor = parameter_file.load(options.params or parameter_file.nominal_path())
     if options.rate is not None:
         sensor = replace(sensor, rate_hz=options.rate)
-    sensor = with_effects(sensor, options.effect)
+    sensor = cli.with_effects(sensor, options.effect)
     _check_reference(sensor, options)
-    simulation = _run(sensor, options)
+    sensor, begin_s, duration_s, blocks = _samples(sensor, options)
     with ExitStack() as stack:
         outputs: list[Output] = []
         if options.port:
-            outputs.append(_BoardOutput(stack, simulation.sensor, options.port))
+            outputs.append(_board_output(stack, sensor, options.port))
         if options.output:
-            outputs.append(_FileOutput(stack, simulation.sensor, options.output))
-        show = stack.enter_context(progress('simulate'))
-        for columns in simulation.blocks:
+            outputs.append(_file_output(stack, sensor, options.output))
+        show = stack.enter_context(cli.progress('simulate'))
+        for columns in blocks:
             for output in outputs:
                 output(columns)
-            elapsed_s = columns['time_s'][-1] - simulation.begin_s
-            show(min(elapsed_s / max(simulation.duration_s, _SHORTEST_S), 1.0))
-    _print_end(options, simulation)
+            elapsed_s = columns['time_s'][-1] - begin_s
+            show(min(elapsed_s / max(duration_s, _SHORTEST_S), 1.0))
+    _print_end(options, sensor, duration_s)
     return 0
+
+
+def _check(options: argparse.Namespace) -> None:
+    """Refuse wrong usage."""
+    names = (*TRAJECTORIES, 'imu')
+    if options.trajectory not in names and not Path(options.trajectory).exists():
+        near = get_close_matches(options.trajectory, names, 1)
+        parser().error(f'{options.trajectory}: neither a trajectory nor a recording'
+                       f'{f"; did you mean {near[0]}?" if near else ""}; the trajectories are '
+                       f'{", ".join(names)}')
+    if not options.output and not options.port:
+        parser().error('the following arguments are required: -o, or --port')
+    bounds = parameter_file.SENSOR_FIELDS['sensor.rate_hz'].metadata
+    if options.rate is not None and not bounds['lower'] <= options.rate <= bounds['upper']:
+        raise UserError(f'--rate {options.rate:g}: outside {bounds["lower"]:g} to '
+                        f'{bounds["upper"]:g} Hz')
+    if options.seed < 0:
+        raise UserError(f'--seed {options.seed}: must be 0 or more')
+    # The name of a trajectory is no file, though a file of that name may be written.
+    source = options.force if options.trajectory in names else options.trajectory
+    if options.output and source:
+        cli.refuse_same_file(options.output, source)
+    if (options.trajectory == 'imu') != bool(options.force):
+        raise UserError('--force RECORDING and the trajectory imu need each other: '
+                        'simulate imu --force RECORDING')
 
 
 def _check_reference(sensor: Sensor, options: argparse.Namespace) -> None:
@@ -130,111 +141,68 @@ def _check_reference(sensor: Sensor, options: argparse.Namespace) -> None:
                   'is left out', file=sys.stderr)
 
 
-def _print_end(options: argparse.Namespace, simulation: _Run) -> None:
-    """Print what was simulated, the file, and the command that reads it."""
-    sensor = simulation.sensor
-    effects = f' with {", ".join(sensor.effects)}' if sensor.effects else ', no effects'
-    result = (f'Simulated {options.trajectory}: {simulation.duration_s:.4g} s at '
-              f'{sensor.rate_hz:.4g} Hz, axes {sensor.axes}. Sensor {sensor.serial}{effects}.')
-    if not options.output:
-        print_end([result], [])
-        return
-    params = f' --params {quoted(options.params)}' if options.params else ''
-    tool, output = ('fit', 'unit.yaml') if options.trajectory == 'sweep' else ('diagnose', 'gap')
-    print_end([result], [options.output], command(
-        tool, f'{quoted(options.output)}{params} -o {output}'))
-
-
-def _check(options: argparse.Namespace) -> None:
-    """Refuse wrong usage."""
-    if options.trajectory not in (*TRAJECTORIES, 'imu') and not Path(options.trajectory).exists():
-        near = get_close_matches(options.trajectory, [*TRAJECTORIES, 'imu'], 1)
-        parser().error(f'{options.trajectory}: neither a trajectory nor a recording'
-                       f'{f"; did you mean {near[0]}?" if near else ""}; the trajectories are '
-                       f'{", ".join(TRAJECTORIES)}, imu')
-    if not options.output and not options.port:
-        parser().error('the following arguments are required: -o, or --port')
-    bounds = parameter_file.SENSOR_FIELDS['sensor.rate_hz'].metadata
-    if options.rate is not None and not bounds['lower'] <= options.rate <= bounds['upper']:
-        raise UserError(f'--rate {options.rate:g}: outside {bounds["lower"]:g} to '
-                        f'{bounds["upper"]:g} Hz')
-    if options.seed < 0:
-        raise UserError(f'--seed {options.seed}: must be 0 or more')
-    for path in filter(None, (options.trajectory, options.force)):
-        if options.output and Path(path).resolve() == Path(options.output).resolve():
-            raise UserError(f'{options.output}: is the input itself; choose another output')
-    if (options.trajectory == 'imu') != bool(options.force):
-        raise UserError('--force RECORDING and the trajectory imu need each other: '
-                        'simulate imu --force RECORDING')
-
-
-class _FileOutput:
-    """Writes samples to a recording."""
-
-    def __init__(self, stack: ExitStack, sensor: Sensor, path: str) -> None:
-        self._write = stack.enter_context(recording.writer(path, sensor))
-        self._path, self._info = path, sensor_info(sensor)
-
-    def __call__(self, columns: simulator.Columns) -> None:
-        others = {name: values for name, values in columns.items() if name != 'time_s'}
-        self._write(Recording(self._path, columns['time_s'], others, self._info))
-
-
-class _BoardOutput:
-    """Sends samples as an emulated board does."""
-
-    def __init__(self, stack: ExitStack, sensor: Sensor, port: str) -> None:
-        emulated_board.check_sensor(sensor)
-        self._sensor, self._port = sensor, port
-        self._descriptor = stack.enter_context(emulated_board.open_terminal(port))
-        self._board: emulated_board.Board | None = None
-
-    def __call__(self, columns: simulator.Columns) -> None:
-        if self._board is None:
-            roles = emulated_board.roles_of(self._sensor, columns)
-            self._board = emulated_board.Board(self._sensor, roles, self._descriptor)
-            command = emulated_board.driver_command(self._port, roles)
-            print(f'simulate: sending: {command}', file=sys.stderr)
-        self._board.send(columns)
-
-
-def _run(sensor: Sensor, options: argparse.Namespace) -> _Run:
-    """Prepare the simulation of the trajectory that the options name."""
-    if options.trajectory == 'imu':
-        return _simulate_force(sensor, options)
+def _samples(sensor: Sensor, options: argparse.Namespace
+             ) -> tuple[Sensor, float, float, Iterator[Columns]]:
+    """Return the sensor at its rate, begin and duration, s, and the samples of a trajectory."""
     if options.trajectory in TRAJECTORIES:
-        motion = TRAJECTORIES[options.trajectory](np.random.default_rng(options.seed))
-        return _Run(sensor, 0.0, motion.duration_s,
-                    simulator.simulate_blocks(sensor, motion, options.seed))
-    return _simulate_recording(sensor, options)
+        begin_s, motion = 0.0, TRAJECTORIES[options.trajectory](
+            np.random.default_rng(options.seed))
+    elif options.trajectory == 'imu':
+        # The specific force of another simulator, at its rate or another.
+        motion, begin_s = motion_from_force(options.force, options.rate is None)
+        if options.rate is None:
+            sensor = replace(sensor, rate_hz=motion.internal_rate_hz)
+            motion = replace(motion, internal_rate_hz=max(sensor.rate_hz, INTERNAL_RATE_HZ))
+    else:
+        # The references of a recording, at its stamps or at another rate.
+        read = cli.read('simulate', options.trajectory)
+        motion, begin_s = motion_from_references(read, sensor), float(read.time_s[0])
+        if options.rate is None:
+            sensor = replace(sensor, rate_hz=read.rate_hz)
+            return (sensor, begin_s, motion.duration_s,
+                    simulate_at_stamps(sensor, motion, read, options.seed))
+    return (sensor, begin_s, motion.duration_s,
+            simulate_blocks(sensor, motion, options.seed, begin_s))
 
 
-def _simulate_force(sensor: Sensor, options: argparse.Namespace) -> _Run:
-    """Apply the specific force of another simulator, at its rate or another."""
-    motion, begin_s = motion_from_force(options.force, options.rate is None)
-    if options.rate is None:
-        sensor = replace(sensor, rate_hz=motion.internal_rate_hz)
-        motion = replace(motion, internal_rate_hz=max(sensor.rate_hz, INTERNAL_RATE_HZ))
-    return _Run(sensor, begin_s, motion.duration_s,
-                simulator.simulate_blocks(sensor, motion, options.seed, begin_s))
+def _file_output(stack: ExitStack, sensor: Sensor, path: str) -> Output:
+    """Return what writes samples to a recording."""
+    write, info = stack.enter_context(recording.writer(path, sensor)), sensor_info(sensor)
+    return lambda columns: write(Recording(path, columns['time_s'], {
+        name: values for name, values in columns.items() if name != 'time_s'}, info))
 
 
-def _simulate_recording(sensor: Sensor, options: argparse.Namespace) -> _Run:
-    """Follow the references of a recording, at its stamps or at another rate."""
-    read = recording.read(options.trajectory)
-    report_reading('simulate', read)
-    motion = motion_from_references(read, sensor)
-    begin_s = float(read.time_s[0])
-    duration_s = float(read.time_s[-1]) - begin_s
-    if options.rate is not None:
-        motion = replace(motion, duration_s=duration_s)
-        return _Run(sensor, begin_s, duration_s,
-                    simulator.simulate_blocks(sensor, motion, options.seed, begin_s))
-    sensor = replace(sensor, rate_hz=read.rate_hz)
-    return _Run(sensor, begin_s, duration_s,
-                simulator.simulate_at_stamps(sensor, motion, read, options.seed))
+def _board_output(stack: ExitStack, sensor: Sensor, port: str) -> Output:
+    """Return what sends samples as an emulated board does."""
+    emulated_board.check_sensor(sensor)
+    descriptor = stack.enter_context(emulated_board.open_terminal(port))
+    boards: list[emulated_board.Board] = []
+
+    def send(columns: Columns) -> None:
+        if not boards:
+            roles = emulated_board.roles_of(sensor, columns)
+            boards.append(emulated_board.Board(sensor, roles, descriptor))
+            print(f'simulate: sending: {emulated_board.driver_command(port, roles)}',
+                  file=sys.stderr)
+        boards[0].send(columns)
+
+    return send
+
+
+def _print_end(options: argparse.Namespace, sensor: Sensor, duration_s: float) -> None:
+    """Print what was simulated, the file, and the command that reads it."""
+    effects = f' with {", ".join(sensor.effects)}' if sensor.effects else ', no effects'
+    result = (f'Simulated {options.trajectory}: {duration_s:.4g} s at {sensor.rate_hz:.4g} Hz, '
+              f'axes {sensor.axes}. Sensor {sensor.serial}{effects}.')
+    if not options.output:
+        cli.print_end([result], [])
+        return
+    params = f' --params {cli.quoted(options.params)}' if options.params else ''
+    tool, output = ('fit', 'unit.yaml') if options.trajectory == 'sweep' else ('diagnose', 'gap')
+    cli.print_end([result], [options.output], cli.command(
+        tool, f'{cli.quoted(options.output)}{params} -o {output}'))
 
 
 def main() -> int:
     """Run the tool on the command line."""
-    return run(parser(), simulate)
+    return cli.run(parser(), simulate)

@@ -30,7 +30,7 @@ from adxl_ros.model.coefficients import fitted_of, parameter_of, put, with_neutr
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Effect, Place
 from adxl_ros.simulate.motion import Motion
-from adxl_ros.simulate.simulator import simulate
+from adxl_ros.simulate.response import simulate
 from adxl_ros.simulate.trajectories import rich
 import numpy as np
 

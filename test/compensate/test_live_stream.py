@@ -4,12 +4,12 @@
 
 from dataclasses import replace
 
-from adxl_ros.compensate import filter_inversion
-from adxl_ros.compensate.live_stream import LiveStream, UNKNOWN_ANGLE_RAD2
+from adxl_ros.compensate import inversions
+from adxl_ros.compensate.live_stream import LiveStream
 from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import put, with_neutral
 from adxl_ros.model.effects.base import Coefficient, Environment, NOMINAL_ENVIRONMENT
-from adxl_ros.model.kinematics import specific_force
+from adxl_ros.model.kinematics import specific_force, UNKNOWN_ANGLE_RAD2
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from geometry_msgs.msg import Vector3Stamped
 import numpy as np
@@ -118,8 +118,8 @@ def test_inversion_of_the_filter_delays_samples() -> None:
     stream = Stream(sensor, undo_filter=True, period_ns=1_000_000)
     for _ in range(20):
         stream.send(sensor, 0.7, 0.4)
-    assert len(stream.data) == 20 - filter_inversion.HALF
+    assert len(stream.data) == 20 - inversions.HALF
     stream.restart_filter(500.0)
-    for _ in range(filter_inversion.HALF):
+    for _ in range(inversions.HALF):
         stream.send(sensor, 0.7, 0.4)
-    assert len(stream.data) == 20 - filter_inversion.HALF, 'the waiting samples are dropped'
+    assert len(stream.data) == 20 - inversions.HALF, 'the waiting samples are dropped'

@@ -4,14 +4,13 @@
 
 from dataclasses import replace
 
-from adxl_ros.compensate.sample_by_sample import LiveEstimator
+from adxl_ros.compensate.live_stream import LiveEstimator
 from adxl_ros.files import imu_message
 from adxl_ros.model import signal_chain
 from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.kinematics import specific_force
+from adxl_ros.model.kinematics import specific_force, tilt
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.model.tilt import tilt
 from geometry_msgs.msg import Vector3Stamped
 import numpy as np
 import pytest

@@ -13,8 +13,8 @@ from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Motion
-from adxl_ros.simulate.simulator import motion_from_force, simulate
-from adxl_ros.simulate.trajectories import shaker
+from adxl_ros.simulate.response import simulate
+from adxl_ros.simulate.trajectories import motion_from_force, shaker
 import numpy as np
 import pytest
 from units import nominal

@@ -13,7 +13,7 @@ from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.report.units import parameter_text
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Motion
-from adxl_ros.simulate.simulator import simulate
+from adxl_ros.simulate.response import simulate
 from adxl_ros.tools.command_line import with_effects
 import numpy as np
 import pytest

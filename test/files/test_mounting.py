@@ -3,7 +3,7 @@
 """The mounting against scipy's rotations."""
 
 from adxl_ros.files import imu_message
-from adxl_ros.model.tilt import Mounting
+from adxl_ros.model.kinematics import Mounting
 import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation

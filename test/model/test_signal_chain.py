@@ -4,19 +4,20 @@
 
 from dataclasses import replace
 
-from adxl_ros.model import analog_stages, noise, signal_chain
+from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
-from adxl_ros.model.covariance import force_covariance
+from adxl_ros.model.covariance import coefficient_tangent, force_covariance
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import (
+    ARRAYS,
     Coefficient,
+    Environment,
+    FLOATS,
     Need,
     Role,
 )
-from adxl_ros.model.kinematics import specific_force
-from adxl_ros.model.scalar_or_array import ARRAYS, FLOATS
+from adxl_ros.model.kinematics import angles, roll_pitch_covariance, specific_force, tilt
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.tilt import angles, roll_pitch_covariance, tilt
 from hypothesis import given, strategies as st
 import numpy as np
 import pytest
@@ -69,7 +70,7 @@ def bit_error_v(sensor: Sensor) -> float:
 
 def near_a_step(sensor: Sensor, force: np.ndarray) -> bool:
     """Return whether the input of the ADC is so near a step that another input has its code."""
-    input_v = np.array(analog_stages.analog_response(sensor)([float(f) for f in force]))
+    input_v = np.array(signal_chain.analog_response(sensor)([float(f) for f in force]))
     step_v = sensor.adc_vref_v / 64
     off_v = np.abs(input_v - np.rint(input_v / step_v) * step_v)
     return bool((off_v <= 2 * bit_error_v(sensor)).any())
@@ -136,6 +137,22 @@ def test_intervals_have_their_stated_coverage(axes: str) -> None:
     for name in ('roll', 'pitch', 'inclination', 'alpha', 'beta'):
         error = getattr(angles, name) - getattr(exact, name)
         assert_coverage((error + np.pi) % (2 * np.pi) - np.pi, getattr(angles, f'{name}_std'))
+
+
+@pytest.mark.parametrize('axes', AXES)
+def test_derivatives_by_coefficients_are_those_of_the_whole_chain(axes: str) -> None:
+    """Each begins at the place of its effect, and a parameter's axes share one difference."""
+    sensor = drawn_sensor(axes, 5)
+    rng = np.random.default_rng(6)
+    force = list(rng.normal(size=(3, 50)) * 6)
+    around = Environment(rng.uniform(0, 900, 50), rng.uniform(0, 50, 50), rng.uniform(4, 6, 50))
+    slopes = coefficient_tangent(sensor)(force, around)
+    for i, name in enumerate(sensor.covariance_names):
+        step, value = 1e-3 * parameter_of(name).scale, get(sensor, [name])
+        above, below = (np.array(signal_chain.static_response(
+            put(sensor, [name], value + sign * step))(force, around)) for sign in (1, -1))
+        expected = (above - below) / (2 * step)
+        np.testing.assert_allclose(slopes[:, i], expected, atol=1e-8 * np.abs(expected).max())
 
 
 def assert_coverage(error: np.ndarray, std: np.ndarray) -> None:

@@ -10,7 +10,7 @@ from adxl_ros.model.coefficients import put, typical, with_neutral
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import ActsOn, Coefficient
 from adxl_ros.simulate.motion import Motion
-from adxl_ros.simulate.simulator import simulate
+from adxl_ros.simulate.response import simulate
 from adxl_ros.simulate.trajectories import rich, TRAJECTORIES
 import numpy as np
 from pace import within

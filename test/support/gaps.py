@@ -9,7 +9,7 @@ from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Knots, Motion
-from adxl_ros.simulate.simulator import simulate
+from adxl_ros.simulate.response import simulate
 from adxl_ros.tools.command_line import with_effects
 import numpy as np
 from units import nominal

@@ -82,6 +82,14 @@ def test_bad_arguments_of_simulate_are_refused(run_tool, tmp_path, arguments, wo
     assert not (tmp_path / 'out.csv').exists()
 
 
+def test_an_output_may_have_the_name_of_a_trajectory_but_not_that_of_the_input(run_tool, tmp_path):
+    done = run_tool('simulate', 'tilt_beta', '--rate', '20', '-o', 'tilt_beta')
+    assert done.returncode == 0, done.stderr
+    done = run_tool('simulate', './tilt_beta', '-o', 'tilt_beta')
+    assert (done.returncode, 'is the input itself' in done.stderr) == (1, True)
+    assert recording.read(tmp_path / 'tilt_beta').rate_hz == 20.0
+
+
 @pytest.mark.parametrize('text, words', [
     ('', 'empty'),
     (HEAD, 'bad.csv'),

@@ -25,9 +25,8 @@ from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.kinematics import specific_force
+from adxl_ros.model.kinematics import specific_force, tilt
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.tilt import tilt
 import numpy as np
 
 _ROUNDS = 2

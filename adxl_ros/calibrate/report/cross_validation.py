@@ -13,8 +13,8 @@ from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.covariance import force_covariance
+from adxl_ros.model.kinematics import tilt
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.tilt import tilt
 import numpy as np
 import scipy
 

@@ -11,7 +11,7 @@ from adxl_ros.model.diagnosis_hints import (
 )
 from adxl_ros.model.effects.base import (
     ActsOn,
-    Effect,
+    effect,
     Need,
     Parameter,
     Parameters,
@@ -21,9 +21,39 @@ from adxl_ros.model.effects.base import (
 )
 import numpy as np
 
+_BITS = ('first_bit_v', 'second_bit_v', 'third_bit_v', 'fourth_bit_v', 'fifth_bit_v',
+         'sixth_bit_v')
+"""Parameters of the bits, the heaviest first."""
 
-def _adc_inl(signals: Signals, p: Parameters) -> None:
+
+_INL_STARTS = (1.0, 2.4, 4.0, 5.8, 7.6, 9.4, 11.2, 13.0, 14.8, 16.6, 18.4, 20.2, 22.0, 23.8, 25.6,
+               27.4, 29.2, 32.0, 36.0, 41.0, 47.0, 54.0, 62.0)
+"""Periods from which a fit starts. Chosen: 1 g of either sign covers 0.4 of the full scale.
+A start that differs by a third of a period there, 0.9, explains half of the power of a sine. Above
+30 the steps are wider, because converters with so many segments are rare."""
+
+
+@effect(Place.ADC,
+        Parameter('amplitude_v', 'V', -0.05, 0.05, 3e-4, 'physics: 4 LSB of 16 bit at 5 V',
+                  'amplitude of the sine by which it deviates from the straight line', ''),
+        Parameter('cosine_v', 'V', -0.05, 0.05, 3e-4, 'physics: 4 LSB of 16 bit at 5 V',
+                  'amplitude of the cosine, which shifts the sine over the codes', '',
+                  typical=0.0, role=Role.OPTIONAL),
+        Parameter('cycles', '1', 0.5, 64.0, 8.0, 'physics: segments of a converter',
+                  'periods of the deviation over the full scale', '', neutral=8.0,
+                  role=Role.SHAPE, starts=_INL_STARTS),
+        *(Parameter(name, 'V', -0.05, 0.05, 3e-4, 'physics: 4 LSB of 16 bit at 5 V',
+                    f'error of the weight of bit {i}, the heaviest being 1', '', typical=0.0,
+                    role=Role.OPTIONAL, shaped=False)
+          for i, name in enumerate(_BITS, 1)),
+        invertible=True,
+        cause='The ADC is nonlinear; calibrate it with a voltage source, or choose another.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.REMOUNT, form=(FormDimension.CODE,),
+                                 proof=(ProofVariable.OUTPUT,)))
+def adc_inl(signals: Signals, p: Parameters) -> None:
     """
+    Integral nonlinearity of the ADC: one curve over its codes for all channels.
+
     Add A·sin φ + C·cos φ, φ = 2π·n·V/V_ref, and wrong weights of the heaviest bits to the volts.
 
     The output of a converter that weighs bit by bit has the errors of all bits that are set (van
@@ -41,73 +71,36 @@ def _adc_inl(signals: Signals, p: Parameters) -> None:
         signals.volts[d] = sum(errors_v, signals.volts[d])
 
 
-_BITS = ('first_bit_v', 'second_bit_v', 'third_bit_v', 'fourth_bit_v', 'fifth_bit_v',
-         'sixth_bit_v')
-"""Parameters of the bits, the heaviest first."""
-
-
-_INL_STARTS = (1.0, 2.4, 4.0, 5.8, 7.6, 9.4, 11.2, 13.0, 14.8, 16.6, 18.4, 20.2, 22.0, 23.8, 25.6,
-               27.4, 29.2, 32.0, 36.0, 41.0, 47.0, 54.0, 62.0)
-"""Periods from which a fit starts. Chosen: 1 g of either sign covers 0.4 of the full scale.
-A start that differs by a third of a period there, 0.9, explains half of the power of a sine. Above
-30 the steps are wider, because converters with so many segments are rare."""
-
-ADC_INL = Effect(
-    name='adc_inl',
-    place=Place.ADC,
-    parameters=(
-        Parameter('amplitude_v', 'V', -0.05, 0.05, 3e-4, 'physics: 4 LSB of 16 bit at 5 V',
-                  'amplitude of the sine by which it deviates from the straight line', ''),
-        Parameter('cosine_v', 'V', -0.05, 0.05, 3e-4, 'physics: 4 LSB of 16 bit at 5 V',
-                  'amplitude of the cosine, which shifts the sine over the codes', '',
-                  typical=0.0, role=Role.OPTIONAL),
-        Parameter('cycles', '1', 0.5, 64.0, 8.0, 'physics: segments of a converter',
-                  'periods of the deviation over the full scale', '', neutral=8.0,
-                  role=Role.SHAPE, starts=_INL_STARTS),
-        *(Parameter(name, 'V', -0.05, 0.05, 3e-4, 'physics: 4 LSB of 16 bit at 5 V',
-                    f'error of the weight of bit {i}, the heaviest being 1', '', typical=0.0,
-                    role=Role.OPTIONAL, shaped=False)
-          for i, name in enumerate(_BITS, 1)),
-    ),
-    apply=_adc_inl,
-    invertible=True,
-    cause='The ADC is nonlinear; calibrate it with a voltage source, or choose another.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.REMOUNT, form=(FormDimension.CODE,),
-                             proof=(ProofVariable.OUTPUT,)),
-)
-"""Integral nonlinearity of the ADC: one curve over its codes for all channels."""
-
-
-def _quantisation(signals: Signals, p: Parameters) -> None:
-    """Multiply the step of the ADC by 2 for each lost bit, of all axes and of each."""
-    signals.lsb_v = signals.lsb_v * 2.0 ** p['lost_bits']
-    for d, lost in enumerate(p['axis_lost_bits']):
-        signals.lsb_ratio[d] = signals.lsb_ratio[d] * 2.0 ** lost
-
-
-QUANTISATION = Effect(
-    name='quantisation',
-    place=Place.ELECTRONICS,
-    parameters=(
+@effect(Place.ELECTRONICS,
         Parameter('lost_bits', 'bit', 0.0, 12.0, 3.0, 'physics: a driver that drops low bits',
                   'number of bits that the ADC loses', ''),
         Parameter('axis_lost_bits', 'bit', 0.0, 12.0, 3.0, 'physics: a converter for each axis',
                   'number of further bits that the axis loses', typical=0.0,
                   role=Role.OPTIONAL),
-    ),
-    apply=_quantisation,
-    smooth=False,
-    acts_on=ActsOn.NOISE,
-    needs=(Need.ADC,),
-    cause='The ADC resolves less than stated; check its setting, reference and format.',
-    diagnosis=DiagnosisHints(detector=Detector.COARSE_CODES,
-                             proof=(ProofVariable.STEP,)),
-)
-"""Quantisation that is coarser than the resolution of the ADC."""
+        smooth=False, acts_on=ActsOn.NOISE, needs=(Need.ADC,),
+        cause='The ADC resolves less than stated; check its setting, reference and format.',
+        diagnosis=DiagnosisHints(detector=Detector.COARSE_CODES, proof=(ProofVariable.STEP,)))
+def quantisation(signals: Signals, p: Parameters) -> None:
+    """Quantisation that is coarser than the resolution of the ADC."""
+    signals.lsb_v = signals.lsb_v * 2.0 ** p['lost_bits']
+    for d, lost in enumerate(p['axis_lost_bits']):
+        signals.lsb_ratio[d] = signals.lsb_ratio[d] * 2.0 ** lost
 
 
-def _spikes(signals: Signals, p: Parameters) -> None:
-    """Add plus or minus A to random samples of each axis, at a mean rate."""
+@effect(Place.ADC,
+        Parameter('rate_hz', 'Hz', 0.0, 1000.0, 0.2, 'physics: loose contacts, switching loads',
+                  'spikes per second and axis', ''),
+        Parameter('amplitude_v', 'V', 0.0, 10.0, 0.05, 'physics: loose contacts',
+                  'size of a spike, of either sign'),
+        smooth=False, acts_on=ActsOn.NOISE,
+        cause='Single samples have large errors; check for loose contacts and loads that switch.',
+        diagnosis=DiagnosisHints(detector=Detector.ISOLATED_SAMPLES, proof=(ProofVariable.STEP,)))
+def spikes(signals: Signals, p: Parameters) -> None:
+    """
+    Spikes: single samples with a large error.
+
+    Add plus or minus A to random samples of each axis, at a mean rate.
+    """
     assert signals.rng is not None
     axes = len(signals.volts)
     drawn = signals.rng.random((*np.shape(signals.environment.time_s), axes, 2))
@@ -117,31 +110,24 @@ def _spikes(signals: Signals, p: Parameters) -> None:
         signals.volts[d] = signals.volts[d] + np.where(hit[..., d], amplitude * sign[..., d], 0.0)
 
 
-SPIKES = Effect(
-    name='spikes',
-    place=Place.ADC,
-    parameters=(
-        Parameter('rate_hz', 'Hz', 0.0, 1000.0, 0.2, 'physics: loose contacts, switching loads',
-                  'spikes per second and axis', ''),
-        Parameter('amplitude_v', 'V', 0.0, 10.0, 0.05, 'physics: loose contacts',
-                  'size of a spike, of either sign'),
-    ),
-    apply=_spikes,
-    smooth=False,
-    acts_on=ActsOn.NOISE,
-    cause='Single samples have large errors; check for loose contacts and loads that switch.',
-    diagnosis=DiagnosisHints(detector=Detector.ISOLATED_SAMPLES,
-                             proof=(ProofVariable.STEP,)),
-)
-"""Spikes: single samples with a large error."""
-
-
 _NEVER = -2 ** 40
 """Index of a start that lies before any recording; chosen: far below 0."""
 
 
-def _stuck(signals: Signals, p: Parameters) -> None:
-    """Hold all axes for a fixed time, beginning at random instants at a mean rate."""
+@effect(Place.CODE,
+        Parameter('rate_hz', 'Hz', 0.0, 1000.0, 0.1, 'physics: a bus that times out',
+                  'starts per second', ''),
+        Parameter('duration_s', 's', 1e-4, 100.0, 0.05, 'physics: a few frames',
+                  'time that the sample is held', '', neutral=0.05, role=Role.SHAPE),
+        smooth=False, acts_on=ActsOn.NOISE,
+        cause='The link repeats samples; check the bus, its load and its buffers.',
+        diagnosis=DiagnosisHints(detector=Detector.REPEATED_SAMPLES, proof=(ProofVariable.STEP,)))
+def stuck(signals: Signals, p: Parameters) -> None:
+    """
+    Stuck samples: the link repeats its last sample for a while.
+
+    Hold all axes for a fixed time, beginning at random instants at a mean rate.
+    """
     assert signals.rng is not None
     shape = np.shape(signals.environment.time_s)
     count = shape[0]
@@ -164,63 +150,26 @@ def _stuck(signals: Signals, p: Parameters) -> None:
         signals.memory['newest'] = newest[-1] - count
 
 
-STUCK = Effect(
-    name='stuck',
-    place=Place.CODE,
-    parameters=(
-        Parameter('rate_hz', 'Hz', 0.0, 1000.0, 0.1, 'physics: a bus that times out',
-                  'starts per second', ''),
-        Parameter('duration_s', 's', 1e-4, 100.0, 0.05, 'physics: a few frames',
-                  'time that the sample is held', '', neutral=0.05, role=Role.SHAPE),
-    ),
-    apply=_stuck,
-    smooth=False,
-    acts_on=ActsOn.NOISE,
-    cause='The link repeats samples; check the bus, its load and its buffers.',
-    diagnosis=DiagnosisHints(detector=Detector.REPEATED_SAMPLES,
-                             proof=(ProofVariable.STEP,)),
-)
-"""Stuck samples: the link repeats its last sample for a while."""
-
-
-def _time_offset(signals: Signals, p: Parameters) -> None:
-    """Take each sample earlier than its stamp."""
+@effect(Place.CLOCK,
+        Parameter('offset_s', 's', -1.0, 1.0, 5e-3, 'physics: buffers between ADC and host',
+                  'delay of the stamps behind the samples', ''),
+        exact=True,
+        cause='The stamps of sensor and stage differ; synchronise the clocks, or state the delay.',
+        # Stamps have a latency of some 0.1 ms (chosen: buffers of a board that works).
+        diagnosis=DiagnosisHints(healthy_std=1e-4, revealed_by=Manoeuvre.SHAKE,
+                                 proof=(ProofVariable.FORCE_RATE,)))
+def time_offset(signals: Signals, p: Parameters) -> None:
+    """Time offset: the stamps are late."""
     signals.time_s = signals.time_s - p['offset_s']
 
 
-TIME_OFFSET = Effect(
-    name='time_offset',
-    place=Place.CLOCK,
-    parameters=(
-        Parameter('offset_s', 's', -1.0, 1.0, 5e-3, 'physics: buffers between ADC and host',
-                  'delay of the stamps behind the samples', ''),
-    ),
-    apply=_time_offset,
-    exact=True,
-    cause='The stamps of sensor and stage differ; synchronise the clocks, or state the delay.',
-    # Stamps have a latency of some 0.1 ms (chosen: buffers of a board that works).
-    diagnosis=DiagnosisHints(healthy_std=1e-4, revealed_by=Manoeuvre.SHAKE,
-                             proof=(ProofVariable.FORCE_RATE,)),
-)
-"""Time offset: the stamps are late."""
-
-
-def _clock_skew(signals: Signals, p: Parameters) -> None:
-    """Take samples earlier than their stamps by a fraction of the time since the beginning."""
-    signals.time_s = signals.time_s - p['ratio'] * signals.time_s
-
-
-CLOCK_SKEW = Effect(
-    name='clock_skew',
-    place=Place.CLOCK,
-    parameters=(
+@effect(Place.CLOCK,
         Parameter('ratio', 's/s', -0.01, 0.01, 1e-4, 'physics: crystals, 100 ppm',
                   'relative excess of the rate of the clock that makes the stamps', ''),
-    ),
-    apply=_clock_skew,
-    exact=True,
-    cause='The clocks of sensor and stage drift apart; discipline them by one source.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS,
-                             proof=(ProofVariable.FORCE_RATE, ProofVariable.TIME)),
-)
-"""Clock skew: the clock that stamps the samples runs fast or slow."""
+        exact=True,
+        cause='The clocks of sensor and stage drift apart; discipline them by one source.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS,
+                                 proof=(ProofVariable.FORCE_RATE, ProofVariable.TIME)))
+def clock_skew(signals: Signals, p: Parameters) -> None:
+    """Clock skew: the clock that stamps the samples runs fast or slow."""
+    signals.time_s = signals.time_s - p['ratio'] * signals.time_s

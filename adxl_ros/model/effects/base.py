@@ -4,9 +4,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import auto, Enum, IntEnum
-from typing import Any, NamedTuple, Protocol
+import math
+from typing import Any, NamedTuple
 
 from adxl_ros.model.constants import AXES, NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.diagnosis_hints import DiagnosisHints
@@ -21,8 +23,32 @@ recordings (arrays) and live samples (floats, which avoid the cost of small arra
 Components = list[Value]
 """Components of a vector: those of the case frame, or one for each measured axis."""
 
+
+class Maths(NamedTuple):
+    """Elementary functions of values; a formula that takes them serves arrays and floats alike."""
+
+    # sqrt, sin, cos: Square root, and sine and cosine of an angle, rad
+    sqrt: Callable[[Value], Value]
+    sin: Callable[[Value], Value]
+    cos: Callable[[Value], Value]
+    atan2: Callable[[Value, Value], Value]  # Angle of the point (second, first value), rad
+    maximum: Callable[[Value, Value], Value]  # The larger of two values
+    # The second value where the first is true, otherwise the third
+    where: Callable[[Value, Value, Value], Value]
+
+
+ARRAYS = Maths(np.sqrt, np.sin, np.cos, np.arctan2, np.maximum, np.where)
+"""Functions for arrays, (n,)."""
+
+FLOATS = Maths(math.sqrt, math.sin, math.cos, math.atan2, max,
+               lambda condition, value, otherwise: value if condition else otherwise)
+"""Functions for single samples: ten times faster than those of numpy."""
+
 Parameters = dict[str, Any]
 """Values by name: a tuple of floats, one for each measured axis, or a float without axes."""
+
+Apply = Callable[['Signals', Parameters], None]
+"""Function of an effect: changes the signals of its place by the values of its parameters."""
 
 
 class Place(IntEnum):
@@ -79,8 +105,8 @@ class Signals:
     alpha: Joint = Joint()
     beta: Joint = Joint()
     shift: Joint = Joint()
-    # STAGE: the vertical in the frame of the stage's base, a unit vector
-    up: Components = field(default_factory=list)
+    # STAGE: the vertical in the frame of the stage's base, a unit vector; at first it is level
+    up: Components = field(default_factory=lambda: [0.0, 0.0, 1.0])
     gravity_mps2: float = 0.0  # STAGE: local gravity, m/s²
     # FORCE: specific force in the case frame, m/s², three components. REFERENCE: the force that
     # the reference states, all of it, which effects turn into the one that acts on the sensor.
@@ -197,7 +223,8 @@ class Parameter:
     source: str  # Source of the typical magnitude: datasheet, paper or physics
     doc: str  # Meaning, in words that continue "it is the ..."
     # Axes that it applies to, with one value for each measured axis; values of other axes are
-    # neutral. Empty for one value without axes.
+    # neutral. Empty for one value without axes. At ELEMENT and ELECTRONICS, the value of an axis
+    # changes the output of that axis only.
     axes: str = AXES
     # Value at which the effect does nothing. A parameter of shape has its typical value there.
     neutral: float = 0.0
@@ -216,23 +243,6 @@ class Parameter:
     def is_size(self) -> bool:
         """Whether it is a strength of the effect, and not a shape or a limit."""
         return self.role in (Role.SIZE, Role.OPTIONAL)
-
-
-class Apply(Protocol):
-    """Function of an effect, which changes the signals of its place."""
-
-    def __call__(self, signals: Signals, p: Parameters, /) -> None:
-        """
-        Apply the effect.
-
-        Parameters
-        ----------
-        signals
-            Signals of the chain, which it changes in place.
-        p
-            Values of the parameters of the effect.
-
-        """
 
 
 @dataclass(frozen=True)
@@ -271,3 +281,13 @@ class Effect:
             return Concern.REFERENCE
         return Concern.STAGE if Need.STAGE in self.needs or self.place is Place.STAGE \
             else Concern.SENSOR
+
+
+def effect(place: Place, *parameters: Parameter, cause: str, **properties: Any
+           ) -> Callable[[Apply], Effect]:
+    """
+    Turn a function into the effect of its name, with the properties of `Effect`.
+
+    The file of an effect of this library is then its parameters and its function.
+    """
+    return lambda apply: Effect(apply.__name__, place, parameters, apply, cause, **properties)

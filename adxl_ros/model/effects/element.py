@@ -2,10 +2,8 @@
 
 """The sensing element: dependence of its output on force along and across the axis."""
 
-from functools import partial
-
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
-from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
+from adxl_ros.model.effects.base import effect, Parameter, Parameters, Place, Role, Signals
 from adxl_ros.model.filters import low_pass, stop
 
 _IN_PLANE, _OUT_OF_PLANE = (1, 0, 0), (2, 2, 1)
@@ -22,157 +20,129 @@ def _bias_by(others: tuple[int, int, int], signals: Signals, p: Parameters) -> N
         signals.output[d] = signals.output[d] + (p1 + p2 * other) * other
 
 
-CROSS_AXIS = Effect(
-    name='cross_axis',
-    place=Place.ELEMENT,
-    parameters=(
+@effect(Place.ELEMENT,
         Parameter('linear', 'g/g', -0.3, 0.3, 0.015, 'ADXL203 datasheet: cross-axis 1.5 %',
                   'p1 of equation 11; to first order the same as a misalignment'),
         Parameter('quadratic_per_g', '1/g', -0.3, 0.3, 0.01, 'paper, figure 4',
                   'p2 of equation 11'),
-    ),
-    apply=partial(_bias_by, _IN_PLANE),
-    invertible=True,
-    cause='The other in-plane axis shifts the bias; calibrate with the plane alpha = 90 deg.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, form=(FormDimension.CROSS_FORCE,),
-                             proof=(ProofVariable.CROSS_FORCE,)),
-)
-"""Bias from the other in-plane axis: g(V_c) of equations 10 and 11, centred and in g.
-
-The z axis gets it from x.
-"""
+        invertible=True,
+        cause='The other in-plane axis shifts the bias; calibrate with the plane alpha = 90 deg.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, form=(FormDimension.CROSS_FORCE,),
+                                 proof=(ProofVariable.CROSS_FORCE,)))
+def cross_axis(signals: Signals, p: Parameters) -> None:
+    """Bias from the other in-plane axis: g(V_c) of equations 10 and 11, centred and in g."""
+    _bias_by(_IN_PLANE, signals, p)
 
 
-CROSS_AXIS_Z = Effect(
-    name='cross_axis_z',
-    place=Place.ELEMENT,
-    parameters=(
+@effect(Place.ELEMENT,
         Parameter('linear', 'g/g', -0.3, 0.3, 0.015, 'ADXL203 datasheet: cross-axis 1.5 %',
                   'q1 of equation 13; to first order the same as a misalignment'),
         Parameter('quadratic_per_g', '1/g', -0.3, 0.3, 0.01, 'paper, figure 6',
                   'q2 of equation 13'),
-    ),
-    apply=partial(_bias_by, _OUT_OF_PLANE),
-    invertible=True,
-    cause='The out-of-plane axis shifts the bias; calibrate with several planes alpha.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, form=(FormDimension.CROSS_FORCE,),
-                             proof=(ProofVariable.FORCE_Z,)),
-)
-"""Bias from the out-of-plane axis: h(V_z) of equations 12 and 13, centred and in g.
-
-The z axis gets it from y.
-"""
+        invertible=True,
+        cause='The out-of-plane axis shifts the bias; calibrate with several planes alpha.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, form=(FormDimension.CROSS_FORCE,),
+                                 proof=(ProofVariable.FORCE_Z,)))
+def cross_axis_z(signals: Signals, p: Parameters) -> None:
+    """Bias from the out-of-plane axis: h(V_z) of equations 12 and 13, centred and in g."""
+    _bias_by(_OUT_OF_PLANE, signals, p)
 
 
-def _scale_factor_cross(signals: Signals, p: Parameters) -> None:
-    """Add s·A_d·A_c to each measured axis."""
+@effect(Place.ELEMENT,
+        Parameter('linear_per_g', '1/g', -0.3, 0.3, 0.01,
+                  'as scale_factor_z: paper, figure 8',
+                  'relative change of the scale factor for 1 g on the other axis'),
+        invertible=True,
+        cause='The other in-plane axis changes the scale factor; calibrate with several planes '
+              'alpha.',
+        diagnosis=DiagnosisHints(form=(FormDimension.FORCE, FormDimension.CROSS_FORCE),
+                                 proof=(ProofVariable.CROSS_FORCE, ProofVariable.OWN_FORCE)))
+def scale_factor_cross(signals: Signals, p: Parameters) -> None:
+    """
+    Scale factor that depends on the other in-plane axis; that of the z axis depends on x.
+
+    The paper has only the dependence on z (15). At rest A_c² of the other axis is g² minus the
+    squares of the other two. A quadratic term would equal a sum of `nonlinearity`,
+    `scale_factor_z` and `scale_factor`, so that the effect has none.
+    """
     for d, s in enumerate(p['linear_per_g']):
         other = signals.sensed[_IN_PLANE[d]]
         signals.output[d] = signals.output[d] + s * signals.sensed[d] * other
 
 
-SCALE_FACTOR_CROSS = Effect(
-    name='scale_factor_cross',
-    place=Place.ELEMENT,
-    parameters=(
-        Parameter('linear_per_g', '1/g', -0.3, 0.3, 0.01,
-                  'as scale_factor_z: paper, figure 8',
-                  'relative change of the scale factor for 1 g on the other axis'),
-    ),
-    apply=_scale_factor_cross,
-    invertible=True,
-    cause='The other in-plane axis changes the scale factor; calibrate with several planes '
-          'alpha.',
-    diagnosis=DiagnosisHints(form=(FormDimension.FORCE, FormDimension.CROSS_FORCE),
-                             proof=(ProofVariable.CROSS_FORCE, ProofVariable.OWN_FORCE)),
-)
-"""Scale factor that depends on the other in-plane axis; that of the z axis depends on x.
-
-The paper has only the dependence on z (15). At rest A_c² of the other axis is g² minus the squares
-of the other two. A quadratic term would equal a sum of `nonlinearity`, `scale_factor_z` and
-`scale_factor`, so that the effect has none.
-"""
-
-
-def _scale_factor_z(signals: Signals, p: Parameters) -> None:
-    """Add A_d·(r1·A_z + r2·A_z²) to the x and y axes, and the same with A_y to the z axis."""
+@effect(Place.ELEMENT,
+        Parameter('linear_per_g', '1/g', -0.3, 0.3, 0.01, 'paper, figure 8',
+                  'r1 over r0 of equation 15'),
+        Parameter('quadratic_per_g2', '1/g^2', -0.3, 0.3, 0.01, 'paper, figure 8',
+                  'r2 over r0 of equation 15'),
+        invertible=True,
+        cause='The out-of-plane axis changes the scale factor; calibrate with several planes '
+              'alpha.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES,
+                                 form=(FormDimension.FORCE, FormDimension.CROSS_FORCE),
+                                 proof=(ProofVariable.FORCE_Z, ProofVariable.OWN_FORCE)))
+def scale_factor_z(signals: Signals, p: Parameters) -> None:
+    """Scale factor by the out-of-plane axis, y for z: equations 15 and 17, centred and in g."""
     for d, (r1, r2) in enumerate(zip(p['linear_per_g'], p['quadratic_per_g2'])):
         other = signals.sensed[_OUT_OF_PLANE[d]]
         signals.output[d] = signals.output[d] + signals.sensed[d] * (r1 + r2 * other) * other
 
 
-SCALE_FACTOR_Z = Effect(
-    name='scale_factor_z',
-    place=Place.ELEMENT,
-    parameters=(
-        Parameter('linear_per_g', '1/g', -0.3, 0.3, 0.01, 'paper, figure 8',
-                  'r1 over r0 of equation 15'),
-        Parameter('quadratic_per_g2', '1/g^2', -0.3, 0.3, 0.01, 'paper, figure 8',
-                  'r2 over r0 of equation 15'),
-    ),
-    apply=_scale_factor_z,
-    invertible=True,
-    cause='The out-of-plane axis changes the scale factor; calibrate with several planes alpha.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES,
-                             form=(FormDimension.FORCE, FormDimension.CROSS_FORCE),
-                             proof=(ProofVariable.FORCE_Z, ProofVariable.OWN_FORCE)),
-)
-"""Scale factor that depends on the out-of-plane axis: equations 15 and 17, centred and in g.
+@effect(Place.ELEMENT,
+        Parameter('cubic_per_g2', '1/g^2', -0.1, 0.1, 7e-4,
+                  'ADXL203 datasheet: nonlinearity 0.2 % of 1.7 g full scale',
+                  'coefficient of the cube of the acceleration along the axis'),
+        invertible=True,
+        cause='The scale factor changes with the input; calibrate with poses between 0 and 1 g.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, form=(FormDimension.FORCE,),
+                                 proof=(ProofVariable.OWN_FORCE,)))
+def nonlinearity(signals: Signals, p: Parameters) -> None:
+    """
+    Odd nonlinearity of an axis: its scale factor changes with its own input.
 
-The scale factor of the z axis depends on y.
-"""
-
-
-def _nonlinearity(signals: Signals, p: Parameters) -> None:
-    """Add k·a³ of the axis's own acceleration, g."""
+    Add k·a³ of the axis's own acceleration, g.
+    """
     for d, k in enumerate(p['cubic_per_g2']):
         sensed = signals.sensed[d]
         signals.output[d] = signals.output[d] + k * sensed * sensed * sensed
 
 
-NONLINEARITY = Effect(
-    name='nonlinearity',
-    place=Place.ELEMENT,
-    parameters=(
-        Parameter('cubic_per_g2', '1/g^2', -0.1, 0.1, 7e-4,
+@effect(Place.ELEMENT,
+        Parameter('quadratic_per_g', '1/g', -0.1, 0.1, 1.2e-3,
                   'ADXL203 datasheet: nonlinearity 0.2 % of 1.7 g full scale',
-                  'coefficient of the cube of the acceleration along the axis'),
-    ),
-    apply=_nonlinearity,
-    invertible=True,
-    cause='The scale factor changes with the input; calibrate with poses between 0 and 1 g.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, form=(FormDimension.FORCE,),
-                             proof=(ProofVariable.OWN_FORCE,)),
-)
-"""Odd nonlinearity of an axis: its scale factor changes with its own input."""
+                  'coefficient of the square of the acceleration along the axis'),
+        invertible=True,
+        cause='Scale factors up and down differ; calibrate, and let no supply clip one side.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, form=(FormDimension.FORCE,),
+                                 proof=(ProofVariable.OWN_FORCE,)))
+def quadratic(signals: Signals, p: Parameters) -> None:
+    """
+    Even nonlinearity of an axis: its scale factors up and down differ.
 
-
-def _quadratic(signals: Signals, p: Parameters) -> None:
-    """Add k·a² of the axis's own acceleration, g."""
+    Add k·a² of the axis's own acceleration, g.
+    """
     for d, k in enumerate(p['quadratic_per_g']):
         sensed = signals.sensed[d]
         signals.output[d] = signals.output[d] + k * sensed * sensed
 
 
-QUADRATIC = Effect(
-    name='quadratic',
-    place=Place.ELEMENT,
-    parameters=(
-        Parameter('quadratic_per_g', '1/g', -0.1, 0.1, 1.2e-3,
-                  'ADXL203 datasheet: nonlinearity 0.2 % of 1.7 g full scale',
-                  'coefficient of the square of the acceleration along the axis'),
-    ),
-    apply=_quadratic,
-    invertible=True,
-    cause='Scale factors up and down differ; calibrate, and let no supply clip one side.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, form=(FormDimension.FORCE,),
-                             proof=(ProofVariable.OWN_FORCE,)),
-)
-"""Even nonlinearity of an axis: its scale factors up and down differ."""
-
-
-def _hysteresis(signals: Signals, p: Parameters) -> None:
+@effect(Place.ELEMENT,
+        Parameter('half_width_g', 'g', -0.1, 0.1, 2e-3, 'physics: friction in die and package',
+                  'largest lag behind the input: half of the width of the loop'),
+        Parameter('reach_g', 'g', 1e-3, 2.0, 0.2, 'physics: part of the range',
+                  'change of the input after a reversal that builds up half of the lag', '',
+                  neutral=0.2, role=Role.SHAPE, starts=(0.04, 0.2, 1.0)),
+        smooth=False,
+        cause='The reading depends on the direction of the last change; approach poses from both '
+              'sides and average, or relieve the package of mounting stress.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS,
+                                 form=(FormDimension.FORCE, FormDimension.DIRECTION,
+                                       FormDimension.LAG),
+                                 proof=(ProofVariable.FORCE_RATE, ProofVariable.OWN_FORCE)))
+def hysteresis(signals: Signals, p: Parameters) -> None:
     """
+    Hysteresis of the sensing element: a Prandtl-Ishlinskii operator of the acceleration.
+
     Let the output lag by a stop operator of the force along the sensing axis.
 
     The lag is at most `half_width_g`. It reaches that when the input has changed by 2·`reach_g`
@@ -184,30 +154,22 @@ def _hysteresis(signals: Signals, p: Parameters) -> None:
             signals.output[d] = signals.output[d] - half_width * lag
 
 
-HYSTERESIS = Effect(
-    name='hysteresis',
-    place=Place.ELEMENT,
-    parameters=(
-        Parameter('half_width_g', 'g', -0.1, 0.1, 2e-3, 'physics: friction in die and package',
-                  'largest lag behind the input: half of the width of the loop'),
-        Parameter('reach_g', 'g', 1e-3, 2.0, 0.2, 'physics: part of the range',
-                  'change of the input after a reversal that builds up half of the lag', '',
-                  neutral=0.2, role=Role.SHAPE, starts=(0.04, 0.2, 1.0)),
-    ),
-    apply=_hysteresis,
-    smooth=False,
-    cause='The reading depends on the direction of the last change; approach poses from both '
-          'sides and average, or relieve the package of mounting stress.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS,
-                             form=(FormDimension.FORCE, FormDimension.DIRECTION,
-                                   FormDimension.LAG),
-                             proof=(ProofVariable.FORCE_RATE, ProofVariable.OWN_FORCE)),
-)
-"""Hysteresis of the sensing element: a Prandtl-Ishlinskii operator of the acceleration."""
+@effect(Place.ELEMENT,
+        Parameter('coefficient_per_g', 'g/g^2', -1.0, 1.0, 0.05,
+                  'physics: asymmetry of the element, clipping of fast peaks',
+                  'shift of the zero-g divided by the mean square of the vibration'),
+        Parameter('tau_s', 's', 0.01, 60.0, 0.5, 'physics: slower than any vibration',
+                  'time over which the mean square is taken', '', neutral=0.5, role=Role.SHAPE,
+                  starts=(0.1, 0.5, 2.5)),
+        cause='Vibration shifts the zero-g; damp the mount, or stay away from its resonance.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SHAKE, form=(FormDimension.LAG,),
+                                 proof=(ProofVariable.TIME,)))
+def vibration_rectification(signals: Signals, p: Parameters) -> None:
+    """
+    Vibration rectification: vibration shifts the zero-g by its mean square.
 
-
-def _vibration_rectification(signals: Signals, p: Parameters) -> None:
-    """Add k times the mean square of the acceleration along the axis about its mean, g."""
+    Add k times the mean square of the acceleration along the axis about its mean, g.
+    """
     tau_s = p['tau_s']
     for d, k in enumerate(p['coefficient_per_g']):
         if not k:
@@ -217,22 +179,3 @@ def _vibration_rectification(signals: Signals, p: Parameters) -> None:
         vibration = sensed - low_pass(sensed, tau_s, signals.dt_s, mean)
         signals.output[d] = signals.output[d] + k * low_pass(vibration * vibration, tau_s,
                                                              signals.dt_s, square)
-
-
-VIBRATION_RECTIFICATION = Effect(
-    name='vibration_rectification',
-    place=Place.ELEMENT,
-    parameters=(
-        Parameter('coefficient_per_g', 'g/g^2', -1.0, 1.0, 0.05,
-                  'physics: asymmetry of the element, clipping of fast peaks',
-                  'shift of the zero-g divided by the mean square of the vibration'),
-        Parameter('tau_s', 's', 0.01, 60.0, 0.5, 'physics: slower than any vibration',
-                  'time over which the mean square is taken', '', neutral=0.5, role=Role.SHAPE,
-                  starts=(0.1, 0.5, 2.5)),
-    ),
-    apply=_vibration_rectification,
-    cause='Vibration shifts the zero-g; damp the mount, or stay away from its resonance.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SHAKE, form=(FormDimension.LAG,),
-                             proof=(ProofVariable.TIME,)),
-)
-"""Vibration rectification: vibration shifts the zero-g by its mean square."""

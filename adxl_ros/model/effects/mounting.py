@@ -8,7 +8,7 @@ from math import cos, sin
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import (
     Components,
-    Effect,
+    effect,
     Parameter,
     Parameters,
     Place,
@@ -16,14 +16,6 @@ from adxl_ros.model.effects.base import (
     Signals,
 )
 from adxl_ros.model.filters import resonator
-
-
-def _misalignment(signals: Signals, p: Parameters) -> None:
-    """Project the specific force in the case frame on the sensing axes."""
-    force = list(signals.sensed)
-    for d, angles in enumerate(zip(p['alpha_rad'], p['beta_rad'])):
-        tx, ty, tz = direction(d, *angles)
-        signals.sensed[d] = tx * force[0] + ty * force[1] + tz * force[2]
 
 
 @lru_cache(maxsize=64)
@@ -38,41 +30,27 @@ def direction(axis: int, alpha_rad: float, beta_rad: float) -> Components:
     return [[ca * cb, sb, -sa * cb], [-sb, ca * cb, sa * cb], [sb, -sa * cb, ca * cb]][axis]
 
 
-MISALIGNMENT = Effect(
-    name='misalignment',
-    place=Place.MOUNTING,
-    parameters=(
+@effect(Place.MOUNTING,
         Parameter('alpha_rad', 'rad', -0.5, 0.5, 0.0175,
                   'ADXL203 datasheet: package alignment 1 deg',
                   'tilt of the sensing axis out of the plane (z: about x), equations 18 and 19'),
         Parameter('beta_rad', 'rad', -0.5, 0.5, 0.0175,
                   'ADXL203 datasheet: package alignment 1 deg, x to y 0.1 deg',
                   'turn of the sensing axis in the plane (z: about y), equations 18 and 19'),
-    ),
-    apply=_misalignment,
-    exact=True,
-    invertible=True,
-    cause='The sensing axes are not those of the case; calibrate, or mount the package better.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES,
-                             proof=(ProofVariable.CROSS_FORCE, ProofVariable.FORCE_Z)),
-)
-"""Directions of the sensing axes in the case: equations 18 and 19, and the same for z."""
+        exact=True, invertible=True,
+        cause='The sensing axes are not those of the case; calibrate, or mount the package '
+              'better.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES,
+                                 proof=(ProofVariable.CROSS_FORCE, ProofVariable.FORCE_Z)))
+def misalignment(signals: Signals, p: Parameters) -> None:
+    """Directions of the sensing axes in the case: equations 18 and 19, and the same for z."""
+    force = list(signals.sensed)
+    for d, angles in enumerate(zip(p['alpha_rad'], p['beta_rad'])):
+        tx, ty, tz = direction(d, *angles)
+        signals.sensed[d] = tx * force[0] + ty * force[1] + tz * force[2]
 
 
-def _mount_resonance(signals: Signals, p: Parameters) -> None:
-    """Filter a part of the force by ω²/(s² + 2·ζ·ω·s + ω²)."""
-    for d, gain in enumerate(p['gain']):
-        if gain:
-            sensed = signals.sensed[d]
-            transmitted = resonator(sensed, p['frequency_hz'], p['damping_ratio'], signals.dt_s,
-                                    signals.memory.setdefault(d, {}))
-            signals.sensed[d] = sensed + gain * (transmitted - sensed)
-
-
-MOUNT_RESONANCE = Effect(
-    name='mount_resonance',
-    place=Place.MOUNTING,
-    parameters=(
+@effect(Place.MOUNTING,
         Parameter('gain', '1', -2.0, 2.0, 1.0, 'physics: 0 is rigid, 1 all through the mount',
                   'part of the force that comes through the mount'),
         Parameter('frequency_hz', 'Hz', 2.0, 450.0, 120.0, 'physics: a board on standoffs',
@@ -80,10 +58,18 @@ MOUNT_RESONANCE = Effect(
                   starts=(8.0, 14.0, 24.0, 40.0, 70.0, 120.0, 250.0)),
         Parameter('damping_ratio', '1', 0.001, 0.95, 0.05, 'physics: metal and FR4',
                   'damping divided by the critical one', '', neutral=0.05, role=Role.SHAPE),
-    ),
-    apply=_mount_resonance,
-    cause='The mount is a spring; stiffen it, or keep the motion away from its resonance.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SHAKE, form=(FormDimension.LAG,),
-                             proof=(ProofVariable.FREQUENCY,)),
-)
-"""Resonance of the mount: it transmits the motion like a spring and a damper."""
+        cause='The mount is a spring; stiffen it, or keep the motion away from its resonance.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SHAKE, form=(FormDimension.LAG,),
+                                 proof=(ProofVariable.FREQUENCY,)))
+def mount_resonance(signals: Signals, p: Parameters) -> None:
+    """
+    Resonance of the mount: it transmits the motion like a spring and a damper.
+
+    Filter a part of the force by ω²/(s² + 2·ζ·ω·s + ω²).
+    """
+    for d, gain in enumerate(p['gain']):
+        if gain:
+            sensed = signals.sensed[d]
+            transmitted = resonator(sensed, p['frequency_hz'], p['damping_ratio'], signals.dt_s,
+                                    signals.memory.setdefault(d, {}))
+            signals.sensed[d] = sensed + gain * (transmitted - sensed)

@@ -16,7 +16,7 @@ from adxl_ros.model.diagnosis_hints import (
 )
 from adxl_ros.model.effects.base import (
     ActsOn,
-    Effect,
+    effect,
     Need,
     Parameter,
     Parameters,
@@ -27,28 +27,17 @@ from adxl_ros.model.effects.base import (
 import numpy as np
 
 
-def _noise_excess(signals: Signals, p: Parameters) -> None:
-    """Multiply the noise density by 1 + r."""
-    for d, ratio in enumerate(p['ratio']):
-        signals.noise_ratio[d] = signals.noise_ratio[d] * (1 + ratio)
-
-
-NOISE_EXCESS = Effect(
-    name='noise_excess',
-    place=Place.ELECTRONICS,
-    parameters=(
+@effect(Place.ELECTRONICS,
         Parameter('ratio', '1', -0.99, 100.0, 0.3,
                   'ADXL203 datasheet: 190 instead of 110 ug/sqrt(Hz) at 3 V',
                   'noise density divided by the stated one, minus 1'),
-    ),
-    apply=_noise_excess,
-    acts_on=ActsOn.NOISE,
-    needs=(Need.NOISE,),
-    cause='The noise is not the stated one; check the supply, its decoupling and the cable.',
-    diagnosis=DiagnosisHints(detector=Detector.NOISE_LEVEL,
-                             proof=(ProofVariable.FREQUENCY,)),
-)
-"""White noise beyond the stated density."""
+        acts_on=ActsOn.NOISE, needs=(Need.NOISE,),
+        cause='The noise is not the stated one; check the supply, its decoupling and the cable.',
+        diagnosis=DiagnosisHints(detector=Detector.NOISE_LEVEL, proof=(ProofVariable.FREQUENCY,)))
+def noise_excess(signals: Signals, p: Parameters) -> None:
+    """White noise beyond the stated density."""
+    for d, ratio in enumerate(p['ratio']):
+        signals.noise_ratio[d] = signals.noise_ratio[d] * (1 + ratio)
 
 
 _LOWEST_HZ = 1e-5
@@ -71,31 +60,6 @@ class _Shaping(NamedTuple):
     sections: np.ndarray
     # States of the sections in stationary noise, of k independent standard normals, (k, k)
     stationary: np.ndarray
-
-
-def _flicker(signals: Signals, p: Parameters) -> None:
-    """
-    Add noise of the one-sided density k²/f, g²/Hz, from 10⁻⁴ Hz up to a fifth of the rate.
-
-    Ornstein-Uhlenbeck processes of equal variance, whose corners are evenly spaced on a
-    logarithmic axis, sum up to 1/f (van der Ziel 1950). Their sum is sampled exactly.
-    """
-    assert signals.rng is not None
-    shape = (*np.shape(signals.environment.time_s), len(p['density_g_per_rthz']))
-    if not shape[0]:
-        return
-    # scipy.signal takes 0.5 s to import.
-    from scipy.signal import sosfilt
-    shaping = _shaping(1 / signals.dt_s)
-    if 'state' not in signals.memory:
-        drawn = signals.rng.standard_normal((len(shaping.stationary), *shape[1:]))
-        state = np.tensordot(shaping.stationary, drawn, 1)
-        signals.memory['state'] = np.stack([state, np.zeros_like(state)], axis=1)
-    noise, signals.memory['state'] = sosfilt(
-        shaping.sections, signals.rng.standard_normal(shape), axis=0, zi=signals.memory['state'])
-    for d, density in enumerate(p['density_g_per_rthz']):
-        signals.volts[d] = (signals.volts[d]
-                            + density * noise[..., d] * signals.nominal_scale_v_per_g[d])
 
 
 @lru_cache(maxsize=8)
@@ -159,28 +123,60 @@ def _stationary(poles: np.ndarray, zeros: np.ndarray) -> np.ndarray:
     return states @ single
 
 
-FLICKER = Effect(
-    name='flicker',
-    place=Place.ADC,
-    parameters=(
+@effect(Place.ADC,
         Parameter('density_g_per_rthz', 'g/sqrt(Hz)', 0.0, 0.1, 1e-4,
                   'physics: corner near 1 Hz at 110 ug/sqrt(Hz)',
                   'density at 1 Hz; it falls with the root of the frequency'),
-    ),
-    apply=_flicker,
-    acts_on=ActsOn.NOISE,
-    cause='The electronics have 1/f noise; average shorter and take the zero more often.',
-    # A healthy unit has 0.2 mg rms over five decades of frequency at most (tuned by hand on
-    # simulated recordings).
-    diagnosis=DiagnosisHints(drift=DriftSpectrum.FLICKER, healthy_density=6e-5,
-                             revealed_by=Manoeuvre.HEAT,
-                             proof=(ProofVariable.FREQUENCY,)),
-)
-"""Flicker noise: 1/f noise as a sum of Ornstein-Uhlenbeck processes, drawn by one filter."""
-
-
-def _bias_walk(signals: Signals, p: Parameters) -> None:
+        acts_on=ActsOn.NOISE,
+        cause='The electronics have 1/f noise; average shorter and take the zero more often.',
+        # A healthy unit has 0.2 mg rms over five decades of frequency at most (tuned by hand on
+        # simulated recordings).
+        diagnosis=DiagnosisHints(drift=DriftSpectrum.FLICKER, healthy_density=6e-5,
+                                 revealed_by=Manoeuvre.HEAT, proof=(ProofVariable.FREQUENCY,)))
+def flicker(signals: Signals, p: Parameters) -> None:
     """
+    Flicker noise: 1/f noise as a sum of Ornstein-Uhlenbeck processes, drawn by one filter.
+
+    Add noise of the one-sided density k²/f, g²/Hz, from 10⁻⁴ Hz up to a fifth of the rate.
+
+    Ornstein-Uhlenbeck processes of equal variance, whose corners are evenly spaced on a
+    logarithmic axis, sum up to 1/f (van der Ziel 1950). Their sum is sampled exactly.
+    """
+    assert signals.rng is not None
+    shape = (*np.shape(signals.environment.time_s), len(p['density_g_per_rthz']))
+    if not shape[0]:
+        return
+    # scipy.signal takes 0.5 s to import.
+    from scipy.signal import sosfilt
+    shaping = _shaping(1 / signals.dt_s)
+    if 'state' not in signals.memory:
+        drawn = signals.rng.standard_normal((len(shaping.stationary), *shape[1:]))
+        state = np.tensordot(shaping.stationary, drawn, 1)
+        signals.memory['state'] = np.stack([state, np.zeros_like(state)], axis=1)
+    noise, signals.memory['state'] = sosfilt(
+        shaping.sections, signals.rng.standard_normal(shape), axis=0, zi=signals.memory['state'])
+    for d, density in enumerate(p['density_g_per_rthz']):
+        signals.volts[d] = (signals.volts[d]
+                            + density * noise[..., d] * signals.nominal_scale_v_per_g[d])
+
+
+@effect(Place.ADC,
+        Parameter('density_g_per_rts', 'g/sqrt(s)', 0.0, 0.1, 2e-5,
+                  'physics: slow stress in package and solder',
+                  'rms of the wandering zero-g divided by the root of time'),
+        Parameter('return_per_s', '1/s', 0.0, 1.0, 1e-2, 'physics: bounds of the stress',
+                  'inverse correlation time of a walk that has bounds', typical=0.0,
+                  role=Role.OPTIONAL),
+        acts_on=ActsOn.NOISE,
+        cause='The zero-g wanders; take the zero again more often, or choose a quieter sensor.',
+        # A healthy unit drifts by 0.3 mg within 100 s at most (tuned by hand on simulated
+        # recordings).
+        diagnosis=DiagnosisHints(drift=DriftSpectrum.RANDOM_WALK, healthy_density=3e-5,
+                                 revealed_by=Manoeuvre.HEAT, proof=(ProofVariable.FREQUENCY,)))
+def bias_walk(signals: Signals, p: Parameters) -> None:
+    """
+    Random walk of the zero-g: acceleration random walk, rate noise of an Allan deviation.
+
     Add the sum of independent steps, g; after a time t its rms is k·√t.
 
     A walk that returns at the rate r is a Gauss-Markov process: its rms ends at k/√(2·r).
@@ -208,51 +204,22 @@ def _bias_walk(signals: Signals, p: Parameters) -> None:
         signals.volts[d] = signals.volts[d] + walk[..., d] * scale
 
 
-BIAS_WALK = Effect(
-    name='bias_walk',
-    place=Place.ADC,
-    parameters=(
-        Parameter('density_g_per_rts', 'g/sqrt(s)', 0.0, 0.1, 2e-5,
-                  'physics: slow stress in package and solder',
-                  'rms of the wandering zero-g divided by the root of time'),
-        Parameter('return_per_s', '1/s', 0.0, 1.0, 1e-2, 'physics: bounds of the stress',
-                  'inverse correlation time of a walk that has bounds', typical=0.0,
-                  role=Role.OPTIONAL),
-    ),
-    apply=_bias_walk,
-    acts_on=ActsOn.NOISE,
-    cause='The zero-g wanders; take the zero again more often, or choose a quieter sensor.',
-    # A healthy unit drifts by 0.3 mg within 100 s at most (tuned by hand on simulated
-    # recordings).
-    diagnosis=DiagnosisHints(drift=DriftSpectrum.RANDOM_WALK, healthy_density=3e-5,
-                             revealed_by=Manoeuvre.HEAT,
-                             proof=(ProofVariable.FREQUENCY,)),
-)
-"""Random walk of the zero-g: acceleration random walk, rate noise of an Allan deviation."""
-
-
-def _mains_hum(signals: Signals, p: Parameters) -> None:
-    """Add A·sin(2π·f·t + φ) to the volts of each axis."""
-    wave = np.sin(2 * np.pi * p['frequency_hz'] * signals.environment.time_s + p['phase_rad'])
-    for d, amplitude in enumerate(p['amplitude_v']):
-        signals.volts[d] = signals.volts[d] + amplitude * wave
-
-
-MAINS_HUM = Effect(
-    name='mains_hum',
-    place=Place.ADC,
-    parameters=(
+@effect(Place.ADC,
         Parameter('amplitude_v', 'V', -1.0, 1.0, 1e-3, 'physics: unshielded cable',
                   'amplitude of the sine'),
         Parameter('frequency_hz', 'Hz', 1.0, 1000.0, 50.0, 'mains: 50 or 60 Hz',
                   'frequency of the sine', '', neutral=50.0, role=Role.SHAPE),
         Parameter('phase_rad', 'rad', -7.0, 7.0, 1.0, 'chosen: any', 'phase at time 0', '',
                   typical=0.0, role=Role.OPTIONAL),
-    ),
-    apply=_mains_hum,
-    acts_on=ActsOn.NOISE,
-    cause='The mains couple into the signal; shield and twist the cable, and ground one end.',
-    diagnosis=DiagnosisHints(detector=Detector.MAINS_LINE,
-                             proof=(ProofVariable.FREQUENCY,)),
-)
-"""Mains hum: a sine at the input of the ADC."""
+        acts_on=ActsOn.NOISE,
+        cause='The mains couple into the signal; shield and twist the cable, and ground one end.',
+        diagnosis=DiagnosisHints(detector=Detector.MAINS_LINE, proof=(ProofVariable.FREQUENCY,)))
+def mains_hum(signals: Signals, p: Parameters) -> None:
+    """
+    Mains hum: a sine at the input of the ADC.
+
+    Add A·sin(2π·f·t + φ) to the volts of each axis.
+    """
+    wave = np.sin(2 * np.pi * p['frequency_hz'] * signals.environment.time_s + p['phase_rad'])
+    for d, amplitude in enumerate(p['amplitude_v']):
+        signals.volts[d] = signals.volts[d] + amplitude * wave

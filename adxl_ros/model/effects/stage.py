@@ -1,43 +1,60 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The stage: its site, base, joints and encoders, and where the sensor sits on it."""
+"""
+The references of a motion: the stage with its site and encoders, or another instrument.
+
+Where another instrument or simulator states the specific force, the effects of REFERENCE turn it
+into the one that acts.
+"""
 
 from math import cos, sin
 
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
-from adxl_ros.model.effects.base import Effect, Joint, Need, Parameter, Parameters, Place, Signals
+from adxl_ros.model.effects.base import (
+    effect,
+    Joint,
+    Need,
+    Parameter,
+    Parameters,
+    Place,
+    Role,
+    Signals,
+)
 from adxl_ros.model.filters import play
 from adxl_ros.model.kinematics import angular_motion, carried_acceleration
 import numpy as np
 
 
-def _gravity(signals: Signals, p: Parameters) -> None:
-    """Add the offset to local gravity, m/s²."""
-    signals.gravity_mps2 = signals.gravity_mps2 + p['offset_mps2']
-
-
-GRAVITY = Effect(
-    name='gravity',
-    place=Place.STAGE,
-    parameters=(
+@effect(Place.STAGE,
         Parameter('offset_mps2', 'm/s^2', -5.0, 5.0, 0.01,
                   'geodesy: 9.780 at the equator, 9.832 at the poles',
                   'local gravity minus the stated one', ''),
-    ),
-    apply=_gravity,
-    exact=True,
-    invertible=True,
-    needs=(Need.STAGE,),
-    cause='Local gravity is not the stated one; look it up for latitude and height.',
-    diagnosis=DiagnosisHints(imitated=True, revealed_by=Manoeuvre.REMOUNT,
-                             proof=(ProofVariable.OWN_FORCE,)),
-)
-"""Local gravity that differs from the stated one."""
+        exact=True, invertible=True, needs=(Need.STAGE,),
+        cause='Local gravity is not the stated one; look it up for latitude and height.',
+        diagnosis=DiagnosisHints(imitated=True, revealed_by=Manoeuvre.REMOUNT,
+                                 proof=(ProofVariable.OWN_FORCE,)))
+def gravity(signals: Signals, p: Parameters) -> None:
+    """Local gravity that differs from the stated one."""
+    signals.gravity_mps2 = signals.gravity_mps2 + p['offset_mps2']
 
 
-def _base_tilt(signals: Signals, p: Parameters) -> None:
-    """Turn the vertical about the base's x, and then about its y, the axis of alpha."""
+@effect(Place.STAGE,
+        Parameter('x_rad', 'rad', -0.5, 0.5, 1.75e-3, 'paper: level of 0.1 deg',
+                  "turn of the vertical about the base's x, across the axis of alpha", ''),
+        Parameter('y_rad', 'rad', -0.5, 0.5, 1.75e-3, 'paper: level of 0.1 deg',
+                  'turn of the vertical about the axis of alpha; it equals an offset of alpha',
+                  ''),
+        exact=True, needs=(Need.STAGE,),
+        cause='The base of the stage is not level; level it, or measure its tilt.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES,
+                                 proof=(ProofVariable.BETA, ProofVariable.ALPHA)))
+def base_tilt(signals: Signals, p: Parameters) -> None:
+    """
+    Tilt of the stage's base: it is not level.
+
+    Turn the vertical about the base's x, and then about its y, the axis of alpha.
+    """
     x, y, z = signals.up
     c, s = cos(p['x_rad']), sin(p['x_rad'])
     y, z = y * c - z * s, y * s + z * c
@@ -45,54 +62,40 @@ def _base_tilt(signals: Signals, p: Parameters) -> None:
     signals.up = [x * c + z * s, y, z * c - x * s]
 
 
-BASE_TILT = Effect(
-    name='base_tilt',
-    place=Place.STAGE,
-    parameters=(
-        Parameter('x_rad', 'rad', -0.5, 0.5, 1.75e-3, 'paper: level of 0.1 deg',
-                  "turn of the vertical about the base's x, across the axis of alpha", ''),
-        Parameter('y_rad', 'rad', -0.5, 0.5, 1.75e-3, 'paper: level of 0.1 deg',
-                  'turn of the vertical about the axis of alpha; it equals an offset of alpha',
-                  ''),
-    ),
-    apply=_base_tilt,
-    exact=True,
-    needs=(Need.STAGE,),
-    cause='The base of the stage is not level; level it, or measure its tilt.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES,
-                             proof=(ProofVariable.BETA, ProofVariable.ALPHA)),
-)
-"""Tilt of the stage's base: it is not level."""
-
-
-def _stage_offset(signals: Signals, p: Parameters) -> None:
-    """Add the offsets to the encoders' angles."""
+@effect(Place.STAGE,
+        Parameter('alpha_rad', 'rad', -0.5, 0.5, 1.75e-3, 'paper: level of 0.1 deg',
+                  'true alpha minus the encoder', ''),
+        Parameter('beta_rad', 'rad', -0.5, 0.5, 1.75e-3, 'paper: level of 0.1 deg',
+                  'true beta minus the encoder', ''),
+        exact=True, needs=(Need.STAGE,),
+        cause='The zero of an encoder is wrong; set it by a level, or remount the sensor by '
+              '180 deg.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.REMOUNT, half_turn='beta_rad',
+                                 proof=(ProofVariable.BETA, ProofVariable.ALPHA)))
+def stage_offset(signals: Signals, p: Parameters) -> None:
+    """Offset of the stage's encoders: true angle minus reading."""
     for joint in ('alpha', 'beta'):
         read = getattr(signals, joint)
         setattr(signals, joint, read._replace(position=read.position + p[f'{joint}_rad']))
 
 
-STAGE_OFFSET = Effect(
-    name='stage_offset',
-    place=Place.STAGE,
-    parameters=(
-        Parameter('alpha_rad', 'rad', -0.5, 0.5, 1.75e-3, 'paper: level of 0.1 deg',
-                  'true alpha minus the encoder', ''),
-        Parameter('beta_rad', 'rad', -0.5, 0.5, 1.75e-3, 'paper: level of 0.1 deg',
-                  'true beta minus the encoder', ''),
-    ),
-    apply=_stage_offset,
-    exact=True,
-    needs=(Need.STAGE,),
-    cause='The zero of an encoder is wrong; set it by a level, or remount the sensor by 180 deg.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.REMOUNT, half_turn='beta_rad',
-                             proof=(ProofVariable.BETA, ProofVariable.ALPHA)),
-)
-"""Offset of the stage's encoders: true angle minus reading."""
+@effect(Place.STAGE,
+        *(Parameter(f'{joint}_{wave}_rad', 'rad', -0.2, 0.2, 1e-3,
+                    'physics: a disc of radius 20 mm, 20 um off its axis',
+                    f'true {joint} minus the encoder, amplitude of the {wave}', '')
+          for joint in ('alpha', 'beta') for wave in ('sine', 'cosine')),
+        needs=(Need.STAGE,),
+        cause='The disc of an encoder is not centred on its axis; '
+              'use two reading heads, or a table of errors.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES,
+                                 form=(FormDimension.ALPHA, FormDimension.BETA),
+                                 proof=(ProofVariable.BETA, ProofVariable.ALPHA)))
+def stage_eccentricity(signals: Signals, p: Parameters) -> None:
+    """
+    Eccentricity of the stage's encoder discs: an error with one period per turn.
 
-
-def _stage_eccentricity(signals: Signals, p: Parameters) -> None:
-    """Add s·sin q + c·cos q to each joint, and its derivatives to the motion."""
+    Add s·sin q + c·cos q to each joint, and its derivatives to the motion.
+    """
     for joint in ('alpha', 'beta'):
         s, c = p[f'{joint}_sine_rad'], p[f'{joint}_cosine_rad']
         if s or c:
@@ -104,31 +107,25 @@ def _stage_eccentricity(signals: Signals, p: Parameters) -> None:
                 acceleration + slope * acceleration + bend * velocity * velocity))
 
 
-STAGE_ECCENTRICITY = Effect(
-    name='stage_eccentricity',
-    place=Place.STAGE,
-    parameters=tuple(
-        Parameter(f'{joint}_{wave}_rad', 'rad', -0.2, 0.2, 1e-3,
-                  'physics: a disc of radius 20 mm, 20 um off its axis',
-                  f'true {joint} minus the encoder, amplitude of the {wave}', '')
-        for joint in ('alpha', 'beta') for wave in ('sine', 'cosine')),
-    apply=_stage_eccentricity,
-    needs=(Need.STAGE,),
-    cause='The disc of an encoder is not centred on its axis; '
-          'use two reading heads, or a table of errors.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES,
-                             form=(FormDimension.ALPHA, FormDimension.BETA),
-                             proof=(ProofVariable.BETA, ProofVariable.ALPHA)),
-)
-"""Eccentricity of the stage's encoder discs: an error with one period per turn."""
-
-
 _ROUNDING = 1e-9
 """Relative rounding error of a dead band; chosen: far above that of float64."""
 
 
-def _backlash(signals: Signals, p: Parameters) -> None:
-    """Let each joint follow with a dead band; it moves while the flanks of its gears touch."""
+@effect(Place.STAGE,
+        Parameter('alpha_rad', 'rad', 0.0, 0.2, 1e-3, 'physics: worm gears, 3 arcmin',
+                  'dead band of alpha, its full width', ''),
+        Parameter('beta_rad', 'rad', 0.0, 0.2, 1e-3, 'physics: worm gears, 3 arcmin',
+                  'dead band of beta, its full width', ''),
+        smooth=False, needs=(Need.STAGE,),
+        cause='The gears have play; approach each pose from the same side, or preload them.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS, form=(FormDimension.DIRECTION,),
+                                 proof=(ProofVariable.BETA, ProofVariable.ALPHA)))
+def backlash(signals: Signals, p: Parameters) -> None:
+    """
+    Backlash of the stage: a joint follows its encoder with play.
+
+    Let each joint follow with a dead band; it moves while the flanks of its gears touch.
+    """
     for joint in ('alpha', 'beta'):
         half = p[f'{joint}_rad'] / 2
         if half:
@@ -139,47 +136,135 @@ def _backlash(signals: Signals, p: Parameters) -> None:
             setattr(signals, joint, Joint(position, velocity * touches, acceleration * touches))
 
 
-BACKLASH = Effect(
-    name='backlash',
-    place=Place.STAGE,
-    parameters=(
-        Parameter('alpha_rad', 'rad', 0.0, 0.2, 1e-3, 'physics: worm gears, 3 arcmin',
-                  'dead band of alpha, its full width', ''),
-        Parameter('beta_rad', 'rad', 0.0, 0.2, 1e-3, 'physics: worm gears, 3 arcmin',
-                  'dead band of beta, its full width', ''),
-    ),
-    apply=_backlash,
-    smooth=False,
-    needs=(Need.STAGE,),
-    cause='The gears have play; approach each pose from the same side, or preload them.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS, form=(FormDimension.DIRECTION,),
-                             proof=(ProofVariable.BETA, ProofVariable.ALPHA)),
-)
-"""Backlash of the stage: a joint follows its encoder with play."""
-
-
-def _lever_arm(signals: Signals, p: Parameters) -> None:
-    """Add the centripetal and tangential acceleration ω × (ω × r) + ω̇ × r, m/s²."""
+@effect(Place.FORCE,
+        *(Parameter(f'{axis}_m', 'm', -2.0, 2.0, 0.02, 'physics: size of a board',
+                    f"from the axis to the sensor along the sensor's {axis}", '')
+          for axis in AXES),
+        exact=True, needs=(Need.STAGE,),
+        cause='The sensor is not on the axis of rotation; mount it there, or state the arm.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS,
+                                 proof=(ProofVariable.ALPHA_RATE, ProofVariable.BETA_RATE,
+                                        ProofVariable.ALPHA_ACCELERATION,
+                                        ProofVariable.BETA_ACCELERATION)))
+def lever_arm(signals: Signals, p: Parameters) -> None:
+    """Lever arm: rotation accelerates a sensor that is not on the axes of the stage."""
     r = [p['x_m'], p['y_m'], p['z_m']]
     if any(r):
         added = carried_acceleration(*angular_motion(signals.alpha, signals.beta), r)
         signals.force = [f + a for f, a in zip(signals.force, added)]
 
 
-LEVER_ARM = Effect(
-    name='lever_arm',
-    place=Place.FORCE,
-    parameters=tuple(
-        Parameter(f'{axis}_m', 'm', -2.0, 2.0, 0.02, 'physics: size of a board',
-                  f"from the axis to the sensor along the sensor's {axis}", '')
-        for axis in AXES),
-    apply=_lever_arm,
-    exact=True,
-    needs=(Need.STAGE,),
-    cause='The sensor is not on the axis of rotation; mount it there, or state the arm.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS,
-                             proof=(ProofVariable.ALPHA_RATE, ProofVariable.BETA_RATE,
-                                    ProofVariable.ALPHA_ACCELERATION,
-                                    ProofVariable.BETA_ACCELERATION)),
-)
-"""Lever arm: rotation accelerates a sensor that is not on the axes of the stage."""
+@effect(Place.REFERENCE,
+        *(Parameter(f'{axis}_rad', 'rad', -0.5, 0.5, 0.0175,
+                    'physics: markers are placed to some 1 deg',
+                    f'turn of the specific force about {axis}, from the reference to the '
+                    'sensor', '')
+          for axis in AXES),
+        exact=True,
+        cause='The frame of the reference is turned against that of the sensor; state the '
+              'rotation, or align the two.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, imitated_by='misalignment',
+                                 proof=(ProofVariable.CROSS_FORCE, ProofVariable.FORCE_Z)))
+def reference_frame(signals: Signals, p: Parameters) -> None:
+    """
+    Rotation between the frame of the reference and that of the sensor.
+
+    Turn the force of the reference about its x, then about y, then about z.
+    """
+    x, y, z = signals.force
+    c, s = cos(p['x_rad']), sin(p['x_rad'])
+    y, z = y * c - z * s, y * s + z * c
+    c, s = cos(p['y_rad']), sin(p['y_rad'])
+    x, z = x * c + z * s, z * c - x * s
+    c, s = cos(p['z_rad']), sin(p['z_rad'])
+    signals.force = [x * c - y * s, x * s + y * c, z]
+
+
+@effect(Place.REFERENCE,
+        Parameter('delay_s', 's', 0.0, 1.0, 5e-3, 'physics: filters and transport of a tracker',
+                  'delay of the stamps of the reference behind its motion', ''),
+        exact=True,
+        cause='The reference is late, or the stamps of the sensor are early; synchronise the '
+              'clocks, or state the delay.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS, imitated_by='time_offset',
+                                 proof=(ProofVariable.FORCE_RATE,)))
+def reference_delay(signals: Signals, p: Parameters) -> None:
+    """Delay of the reference: its stamps are late."""
+    signals.time_s = signals.time_s - p['delay_s']
+
+
+_ORDER = 3.0
+"""Number of equal filters, between a Butterworth filter, 1, and a Gaussian, many. Chosen: the
+gains of both are met to 1.4 % rms where they exceed 0.2, and that of a mean to 2 %."""
+_MARGIN = 10.0
+"""Margin at both ends that the filter runs into, in lengths of its kernel. Chosen: far beyond the
+kernel."""
+
+
+def _restoring_gain(frequency_hz: np.ndarray, p: Parameters) -> np.ndarray:
+    """
+    Return the complex gain that restores motion, (k,).
+
+    Where the filter passes it is 1/H. Where it leaves less than errors of the reference, nothing
+    can be restored, and the gain falls to 0, as that of a Wiener filter.
+    """
+    relative = (2 * np.pi * frequency_hz * p['length_s']) ** p['steepness']
+    log_passed = -_ORDER * np.log1p(relative / (2 * _ORDER))
+    passed = np.exp(log_passed)
+    restoring = passed / (passed ** 2 + (p['lost_gain'] * (1 - passed)) ** 2)
+    if not p['phase']:
+        return restoring
+    return restoring * np.exp(-1j * p['phase'] * _smallest_phase(log_passed))
+
+
+def _smallest_phase(log_gain: np.ndarray) -> np.ndarray:
+    """Return the phase of a causal filter by the logarithm of its gain, rad, (k,)."""
+    cepstrum = np.fft.irfft(log_gain)
+    half = len(cepstrum) // 2
+    cepstrum[1:half] *= 2
+    cepstrum[half + 1:] = 0.0
+    return np.fft.rfft(cepstrum).imag[:len(log_gain)]
+
+
+@effect(Place.REFERENCE,
+        Parameter('length_s', 's', 0.0, 0.5, 5e-3,
+                  'practice: marker positions are smoothed at 3 to 12 Hz, lengths of 40 to 10 ms',
+                  'length σ of the kernel; half of the power is lost near 0.14/σ', '',
+                  typical=0.02, starts=(0.003, 0.006, 0.012, 0.025, 0.05)),
+        Parameter('steepness', '1', 1.5, 12.0, 2.0,
+                  'physics: 2.3 is a Gaussian, 3.2 a Butterworth filter of order 2',
+                  'exponent n of the attenuation', '', neutral=2.0, role=Role.SHAPE,
+                  starts=(2.3, 4.5)),
+        Parameter('lost_gain', '1', 0.1, 0.5, 0.2,
+                  'measured: optical tracking against an accelerometer, 0.1 to 0.4',
+                  'gain of the filter below which errors of the reference hide the motion', '',
+                  neutral=0.2, role=Role.SHAPE, starts=(0.12, 0.35)),
+        Parameter('phase', '1', 0.0, 1.0, 1.0,
+                  'physics: 0 is smoothed forth and back, 1 while it is recorded',
+                  'phase divided by that of a causal filter', '', neutral=1.0, role=Role.SHAPE,
+                  starts=(0.0, 1.0)),
+        cause='The reference is smoother than the motion; use it with less smoothing, or compare '
+              'slow motion only.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS, form=(FormDimension.LAG,),
+                                 smooths_reference=True, proof=(ProofVariable.FREQUENCY,)))
+def reference_filter(signals: Signals, p: Parameters) -> None:
+    """
+    Filter of the reference: it is smoother than the motion, as optical tracking is.
+
+    Undo a filter of the gain (1 + (ω·σ)^n/6)^(−3), as far as motion is left.
+    """
+    step_s = signals.dt_s
+    first_s, last_s = float(signals.time_s[0]), float(signals.time_s[-1])
+    even_s = first_s + step_s * np.arange(max(round((last_s - first_s) / step_s), 2) + 1)
+    count = len(even_s)
+    margin = min(round(_MARGIN * p['length_s'] / step_s), count - 2)
+    # A transform of such a length is fast.
+    size = 1 << (count + 2 * margin - 1).bit_length()
+    restoring = _restoring_gain(np.fft.rfftfreq(size, step_s), p) - 1
+    for d, stated in enumerate(signals.force):
+        even = np.interp(even_s, signals.time_s, stated)
+        middle = (even[0] + even[-1]) / 2
+        padded = np.pad(even - middle, margin, mode='reflect', reflect_type='odd')
+        lacking = np.fft.irfft(np.fft.rfft(padded, size) * restoring, size)
+        signals.force[d] = stated + np.interp(signals.time_s, even_s,
+                                              lacking[margin:margin + count])

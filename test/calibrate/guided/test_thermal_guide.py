@@ -12,7 +12,7 @@ from adxl_ros.model.coefficients import with_neutral
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Envelope
 from adxl_ros.simulate.motion import Held, Motion
-from adxl_ros.simulate.simulator import simulate
+from adxl_ros.simulate.response import simulate
 from adxl_ros.tools.command_line import with_effects
 import numpy as np
 import pytest

@@ -4,7 +4,7 @@
 
 from itertools import pairwise
 
-from adxl_ros.compensate import filter_inversion, paper_inverse
+from adxl_ros.compensate import inversions
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.coefficients import put, with_neutral
 from adxl_ros.model.effects.base import Coefficient
@@ -33,7 +33,7 @@ def test_amplitude_and_phase_are_restored():
         return np.sin(62.8 * t) + 0.5 * np.cos(377 * t) + 0.2 * np.sin(942 * t)
 
     time_s, volts = filtered([felt, lambda t: 2 * felt(t)])
-    back = filter_inversion.undo(volts, time_s, RC_S, RATE_HZ)[300:-20]
+    back = inversions.undo_filter(volts, time_s, RC_S, RATE_HZ)[300:-20]
     expected = np.column_stack([felt(time_s), 2 * felt(time_s)])[300:-20]
     assert np.abs(back - expected).max() < 2e-3
 
@@ -44,11 +44,11 @@ def test_the_inverse_does_not_depend_on_blocks(sizes):
     time_s, volts = filtered([np.sin, np.cos])
     cuts = np.cumsum([0, *sizes])
     blocks = [(i, time_s[a:b], volts[a:b]) for i, (a, b) in enumerate(pairwise(cuts))]
-    parts = list(filter_inversion.undo_blocks(blocks, RC_S, RATE_HZ))
+    parts = list(inversions.undo_filter_blocks(blocks, RC_S, RATE_HZ))
     assert [token for token, _ in parts] == list(range(len(sizes)))
     back = np.concatenate([part for _, part in parts])
-    at_once = filter_inversion.undo(volts, time_s, RC_S, RATE_HZ)
-    if min(sizes) >= filter_inversion.HALF:
+    at_once = inversions.undo_filter(volts, time_s, RC_S, RATE_HZ)
+    if min(sizes) >= inversions.HALF:
         np.testing.assert_allclose(back, at_once, atol=1e-12)
     assert np.abs(back - at_once)[50:].max() < 1e-3
 
@@ -57,7 +57,7 @@ def test_a_stream_gives_the_same_samples_with_a_delay_of_eight():
     """The zero-phase inverse is delayed sample by sample, and keeps the stamps of the samples."""
     time_s, volts = filtered([np.sin, np.cos])
     kept = np.r_[0:500, 700:1200]
-    delayed = filter_inversion.DelayedInversion(RC_S, RATE_HZ)
+    delayed = inversions.DelayedInversion(RC_S, RATE_HZ)
     out, late = [], []
     for i in kept:
         for stamp, back, token in delayed(float(time_s[i]), volts[i].tolist(), i):
@@ -67,10 +67,10 @@ def test_a_stream_gives_the_same_samples_with_a_delay_of_eight():
     out = np.array(out)
     count = len(out)
     np.testing.assert_array_equal(out[:, 0], kept[:count])
-    assert count == len(kept) - filter_inversion.HALF
-    expected = filter_inversion.undo(volts[kept], time_s[kept], RC_S, RATE_HZ)[:count]
+    assert count == len(kept) - inversions.HALF
+    expected = inversions.undo_filter(volts[kept], time_s[kept], RC_S, RATE_HZ)[:count]
     np.testing.assert_allclose(out[:, 1:], expected, atol=1e-9)
-    assert sorted(late)[len(late) // 2] == filter_inversion.HALF
+    assert sorted(late)[len(late) // 2] == inversions.HALF
 
 
 def test_the_predicted_variance_of_restored_noise_is_right():
@@ -79,9 +79,9 @@ def test_the_predicted_variance_of_restored_noise_is_right():
                  [Coefficient('bandwidth', 'resistance_ratio', 'x')], [-0.2])
     time_s = np.arange(200_000) / sensor.rate_hz
     volts = Response(sensor, Motion(200.0, Held(0.5), Held(0.7)), 3)(time_s)
-    back = filter_inversion.undo(volts, time_s, noise.electronics(sensor).rc_s, sensor.rate_hz)
+    back = inversions.undo_filter(volts, time_s, noise.electronics(sensor).rc_s, sensor.rate_hz)
     assert back[100:-100].std(axis=0) ** 2 == pytest.approx(
-        filter_inversion.noise_variance_v2(sensor), rel=0.02)
+        inversions.noise_variance_v2(sensor), rel=0.02)
 
 
 def unit(rng, **options):
@@ -103,6 +103,6 @@ def test_the_papers_inverse_is_approximate_and_the_other_exact(axes):
     force = poses()
     volts = signal_chain.static_response(sensor)(force)
     exact = np.subtract(signal_chain.inverse(sensor)(volts), force)
-    paper = np.subtract(paper_inverse.inverse(sensor)(volts), force)
+    paper = np.subtract(inversions.paper_inverse(sensor)(volts), force)
     assert np.abs(exact).max() < 1e-9
     assert 1e-4 < np.abs(paper[:2]).max() < 0.05

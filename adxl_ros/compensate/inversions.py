@@ -1,24 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Inversion of the RC filter: u = v + RC·dv/dt, in amplitude and phase.
+The inverse of the RC filter, and the paper's approximate inverse of the chain.
 
-The derivative is the maximally flat central difference over `HALF` samples each way (Fornberg
-1988). It is exact for polynomials of degree 2·HALF, within 1 % of amplitude up to a third of the
-sample rate, and without phase. In a stream a sample is available `HALF` samples later, and keeps
-its own stamp. The inversion also amplifies noise; see `noise_variance_v2`.
+The filter is undone by u = v + RC·dv/dt, in amplitude and phase. The derivative is the maximally
+flat central difference over `HALF` samples each way (Fornberg 1988). It is exact for polynomials
+of degree 2·HALF, within 1 % of amplitude up to a third of the sample rate, and without phase. In a
+stream a sample is available `HALF` samples later, and keeps its own stamp. The inversion also
+amplifies noise; see `noise_variance_v2`.
+
+The paper's inverse serves comparisons. The default is `signal_chain.inverse`, which is exact.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 import itertools
 from math import factorial
 from typing import TypeVar
 
 from adxl_ros.model import noise
+from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.effects.base import (
+    ARRAYS,
+    Components,
+    Environment,
+    Maths,
+    NOMINAL_ENVIRONMENT,
+    Place,
+)
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.signal_chain import gravity_mps2, static_chain
 import numpy as np
 
 Token = TypeVar('Token')
@@ -38,7 +51,8 @@ def derivative_weights(half: int) -> np.ndarray:
     return np.array([*(-w for w in reversed(one_side)), 0.0, *one_side])
 
 
-def undo(volts: np.ndarray, time_s: np.ndarray, rc_s: np.ndarray, rate_hz: float) -> np.ndarray:
+def undo_filter(volts: np.ndarray, time_s: np.ndarray, rc_s: np.ndarray, rate_hz: float
+                ) -> np.ndarray:
     """
     Undo the filter of consecutive samples.
 
@@ -63,10 +77,10 @@ def undo(volts: np.ndarray, time_s: np.ndarray, rc_s: np.ndarray, rate_hz: float
     return volts + rc_s * rate_hz * slope
 
 
-def undo_blocks(blocks: Iterable[tuple[Token, np.ndarray, np.ndarray]], rc_s: np.ndarray,
-                rate_hz: float) -> Iterator[tuple[Token, np.ndarray]]:
+def undo_filter_blocks(blocks: Iterable[tuple[Token, np.ndarray, np.ndarray]],
+                       rc_s: np.ndarray, rate_hz: float) -> Iterator[tuple[Token, np.ndarray]]:
     """
-    Undo the filter block by block, with the result of `undo` for the whole.
+    Undo the filter block by block, with the result of `undo_filter` for the whole.
 
     blocks: for each block: a token, stamps, s, (n,), and volts behind the filter, V, (n, m); rc_s:
     time constants of the filter by axis, s, (m,); yields: for each block: its token, and volts
@@ -80,8 +94,9 @@ def undo_blocks(blocks: Iterable[tuple[Token, np.ndarray, np.ndarray]], rc_s: np
             following_s, following_v = np.empty(0), np.empty((0, len(rc_s)))
             if following is not None:
                 following_s, following_v = following[1][:HALF], following[2][:HALF]
-            undone_v = undo(np.concatenate([previous_v, volts, following_v]),
-                            np.concatenate([previous_s, time_s, following_s]), rc_s, rate_hz)
+            undone_v = undo_filter(
+                np.concatenate([previous_v, volts, following_v]),
+                np.concatenate([previous_s, time_s, following_s]), rc_s, rate_hz)
             yield token, undone_v[len(previous_s):len(previous_s) + len(time_s)]
             previous_s = np.concatenate([previous_s, time_s])[-HALF:]
             previous_v = np.concatenate([previous_v, volts])[-HALF:]
@@ -90,7 +105,7 @@ def undo_blocks(blocks: Iterable[tuple[Token, np.ndarray, np.ndarray]], rc_s: np
 
 def noise_variance_v2(sensor: Sensor) -> np.ndarray:
     """
-    Return the variance of one sample behind `undo` by axis, V², (m,).
+    Return the variance of one sample behind `undo_filter` by axis, V², (m,).
 
     The analog noise is an AR(1) sequence of correlation exp(−|lag|/RC), the ADC's is white.
     """
@@ -107,7 +122,7 @@ def noise_variance_v2(sensor: Sensor) -> np.ndarray:
 
 
 class DelayedInversion:
-    """`undo` for a stream: returns a sample when it has `HALF` neighbours after it."""
+    """`undo_filter` for a stream: returns a sample when it has `HALF` neighbours after it."""
 
     def __init__(self, rc_s: np.ndarray, rate_hz: float) -> None:
         """
@@ -152,3 +167,63 @@ class DelayedInversion:
         else:
             self._index += 1
         return stamp_s, undone_v, token
+
+
+_NEAR_ZERO_G = 1e-6
+"""Input below which the scale factor is taken at `_NEAR_ZERO_G`, g; chosen: it avoids 0/0."""
+
+
+def paper_inverse(sensor: Sensor, maths: Maths = ARRAYS) -> Callable[..., Components]:
+    """
+    Prepare the paper's inverse, equations 14 to 21, which ignores the errors of the other axes.
+
+    First each axis is linear (3), and z follows from equation 5 if it is not measured. Then the
+    bias by the other axes is subtracted, and the result is divided by the scale factor at those
+    inputs (14, 16). Finally the misalignment is removed, one axis after the other (20, 21).
+
+    Returns
+    -------
+    callable
+        Maps the volts of each axis, and an `Environment` (the nominal one unless given), to three
+        components of specific force, m/s².
+
+    """
+    measured = [AXES.index(axis) for axis in sensor.axes]
+    gravity_g = gravity_mps2(sensor) / G0_MPS2
+    chain = static_chain(sensor)
+    mounted = chain.signals(NOMINAL_ENVIRONMENT, force=list(G0_MPS2 * np.eye(3)))
+    chain(Place.MOUNTING, mounted)
+    directions = [np.asarray(row).tolist() for row in mounted.sensed]  # Θ of (18) and (19)
+
+    def respond(inputs: Components) -> Components:
+        signals = chain.signals(NOMINAL_ENVIRONMENT, sensed=inputs)
+        chain(Place.ELEMENT, signals)
+        return signals.output
+
+    def converted(output: Components, environment: Environment) -> Components:
+        return chain.volts(chain.signals(environment, output=output), Place.ELECTRONICS)
+
+    def invert(volts: Components, environment: Environment = NOMINAL_ENVIRONMENT) -> Components:
+        at_0_g = converted([0.0 * volts[0]] * 3, environment)
+        at_1_g = converted([0.0 * volts[0] + 1.0] * 3, environment)
+        linear = [0.0 * volts[0]] * 3
+        for d, v, v0, v1 in zip(measured, volts, at_0_g, at_1_g):
+            linear[d] = (v - v0) / (v1 - v0)                                        # (3)
+        if 2 not in measured:
+            z2 = gravity_g ** 2 - linear[0] ** 2 - linear[1] ** 2
+            linear[2] = sensor.z_sign * maths.sqrt(maths.maximum(z2, 0.0))          # (5)
+        sensed = list(linear)
+        for d in measured:
+            inputs = list(linear)
+            inputs[d] = 0.0 * linear[d]
+            bias = respond(inputs)[d]
+            inputs[d] = linear[d] + 2 * _NEAR_ZERO_G * (abs(linear[d]) < _NEAR_ZERO_G)
+            scale = (respond(inputs)[d] - bias) / inputs[d]
+            sensed[d] = (linear[d] - bias) / scale                                  # (14), (16)
+        force = list(sensed)
+        for d in measured:                                                          # (20), (21)
+            others = sum(directions[d][c] * force[c] for c in range(3) if c != d)
+            force[d] = (sensed[d] - others) / directions[d][d]
+        return [f * G0_MPS2 for f in force]
+
+    return invert
