@@ -40,7 +40,7 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.report.quantities import Interval
 from adxl_ros.simulate.motion import Motion
-from adxl_ros.simulate.simulator import simulate_at_stamps
+from adxl_ros.simulate.response import simulate_at_stamps
 import numpy as np
 
 ShowProgress = Callable[[str, float], None]
