@@ -9,19 +9,21 @@ are known; what the steps of the encoders leave open is simulated, and is the er
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from difflib import get_close_matches
 from functools import cached_property
 import os
-from typing import Any, NamedTuple
+from typing import Any
 
 from adxl_ros.errors import install_hint, one_line, UserError
+from adxl_ros.files import robot_readings
+from adxl_ros.files.robot_readings import Readings
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.simulate.motion import Held
-from adxl_ros.simulate.smoothed_paths import ForcePath, noise_step, SmoothedPath
+from adxl_ros.simulate.smoothed_paths import ForcePath, noise_step, PathErrors, SmoothedPath
 import numpy as np
 from scipy.interpolate import CubicSpline
+from scipy.ndimage import uniform_filter1d
 
 _HIGHEST_RATE_HZ = 1000.0
 """Highest rate at which the kinematics are evaluated, Hz. Chosen: the rate of the simulator."""
@@ -29,23 +31,12 @@ _PER_READING = 2
 """Evaluations of the kinematics for each reading of a joint. Chosen: splines join them."""
 _SMALLEST_STEP = 1e-9
 """Step of an encoder, rad or m, that is exact. Chosen: rounding of floats in a log."""
+_AROUND_S = 0.3
+"""Time around which the error of the force is taken, s. Chosen: a part of a move."""
 _OFFSET_RAD = 1e-4
 """Offset of a joint whose effect on the force is taken, rad. Chosen: linear to 1e-4."""
 _COMPLIANCE_S2 = 1e-5
 """Compliance of the links whose effect is taken, s². Chosen: a resonance of 50 Hz."""
-_LONGEST_GAP_S = 0.25
-"""Longest time without a reading of a joint, s. Chosen: a move of a robot is longer."""
-
-
-class Readings(NamedTuple):
-    """What a recording says of a robot."""
-
-    path: str  # The recording, for messages
-    # Time, s, (k,), and reading, rad or m, (k,), of each joint by its name
-    joints: Mapping[str, tuple[np.ndarray, np.ndarray]]
-    # Time, s, (k,), and pose of the base in the world: x, y, z, m, and a quaternion x, y, z, w,
-    # (k, 7); None for a base that is at rest and level
-    base: tuple[np.ndarray, np.ndarray] | None = None
 
 
 class Robot:
@@ -91,14 +82,13 @@ class Robot:
         chain = [model.names[i] for i in model.supports[model.frames[model.getFrameId(frame)]
                                                         .parentJoint] if i]
         self.joints = tuple(chain[moves:])  # Names of the joints between base and frame
-        if not self.joints and not moves:
-            raise UserError(f'{urdf}: no joint moves {frame}, so that its pose never changes; '
-                            'for a moving base record odom')
         fixed = [i for i in range(1, model.njoints) if model.names[i] not in chain]
         self._model = pinocchio.buildReducedModel(model, fixed, pinocchio.neutral(model))
         self._data = self._model.createData()
         self._frame = self._model.getFrameId(frame)
         self.frame, self.urdf, self._moves = frame, str(urdf), moves
+        # Name of the link that the base is
+        self.root = model.frames[1 + moves].name if model.nframes > 1 else ''
 
     def motion(self, joints: np.ndarray, base: np.ndarray | None, gravity_mps2: float
                ) -> np.ndarray:
@@ -259,6 +249,21 @@ class RobotPath(ForcePath):
         modes['flexible'] = (self._moved(yielded)[0] - self.motion[0]) / _COMPLIANCE_S2
         return modes
 
+    def errors(self, time_s: np.ndarray, component: int) -> PathErrors:
+        """
+        Return what is to be expected of the error of one component, m/s², at times, s, (n,).
+
+        Standard deviation and memory are those of `error_mps2` around each time.
+        """
+        error = self.error_mps2[:, component]
+        step_s = self._grid_s[1] - self._grid_s[0]
+        around = max(round(_AROUND_S / step_s), 3)
+        square, product = (uniform_filter1d(v, around) for v in (
+            error ** 2, error * np.append(error[1:], error[-1])))
+        memory = np.clip(product / np.maximum(square, _SMALLEST_STEP ** 2), 1e-3, 1.0)
+        return PathErrors(np.interp(time_s, self._grid_s, np.sqrt(square)),
+                          np.interp(time_s, self._grid_s, -np.log(memory) / step_s))
+
     @cached_property
     def error_mps2(self) -> np.ndarray:
         """
@@ -285,14 +290,53 @@ def _tracks(robot: Robot, readings: Readings) -> list[tuple[np.ndarray, np.ndarr
             f'{"move" if len(missing) > 1 else "moves"} {robot.frame} in {robot.urdf}; recorded '
             f'are {", ".join(readings.joints) or "no joints"}')
     tracks = [(name, *readings.joints[name]) for name in robot.joints]
-    if robot._moves and readings.base is not None:
+    if readings.base is not None:
         times, pose = readings.base
         signs = np.cumprod(np.append(1.0, np.where(np.sum(
             pose[1:, 3:] * pose[:-1, 3:], axis=1) < 0, -1.0, 1.0)))
         tracks += [(f'base {axis}', times, values) for axis, values in zip(
             'x y z qx qy qz qw'.split(), np.hstack([pose[:, :3], pose[:, 3:] * signs[:, None]]).T)]
+    if not tracks:
+        raise UserError(f'{robot.urdf}: no joint moves {robot.frame}, and {readings.path} has no '
+                        'pose of a moving base; record odom, or tf')
     for name, times, values in tracks:
         if len(times) < 8 or not np.all(np.diff(times) > 0) or not np.isfinite(values).all():
             raise UserError(f'{readings.path}: {name} has {len(times)} readings; at least 8 '
                             'finite ones with rising stamps are needed')
     return [(times, values) for _, times, values in tracks]
+
+
+def robot_path(urdf: str | os.PathLike, frame: str, path: str, epoch_ns: int,
+               gravity_mps2: float = G0_MPS2, topic: str = '') -> RobotPath:
+    """
+    Return the specific force in a frame of a robot, by a recording of its joints.
+
+    Parameters
+    ----------
+    urdf, frame
+        The robot, and the frame that carries the sensor.
+    path
+        The recording; see `robot_readings.read`.
+    epoch_ns
+        Stamp of time 0, ns.
+    gravity_mps2
+        Local gravity, m/s².
+    topic
+        Topic of the joints; empty for the only one.
+
+    Returns
+    -------
+    RobotPath
+        The force, with its errors.
+
+    Raises
+    ------
+    UserError
+        The URDF, the frame, a joint or the recording is wrong.
+
+    """
+    robot = Robot(urdf, frame)
+    readings = robot_readings.read(path, epoch_ns, topic, robot.root, bool(robot.joints))
+    if readings.base is not None:
+        robot = Robot(urdf, frame, moves=True)
+    return RobotPath(robot, readings, gravity_mps2)
