@@ -164,6 +164,8 @@ def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 class RobotPath(ForcePath):
     """Specific force in a frame of a robot, and what errors of the robot would add to it."""
 
+    is_robot = True
+
     def __init__(self, robot: Robot, readings: Readings, gravity_mps2: float = G0_MPS2,
                  step_rad: float | None = None) -> None:
         """
@@ -198,6 +200,7 @@ class RobotPath(ForcePath):
         self._smoothed = self._paths(self._tracks)
         self.motion = self._moved(self._smoothed)
         super().__init__(self._grid_s, self.motion[0])
+        self._rotation = CubicSpline(self._grid_s, np.hstack(list(self.motion[1:3])))
         self.joints = robot.joints
 
     def _paths(self, tracks: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
@@ -215,7 +218,7 @@ class RobotPath(ForcePath):
     def rotation(self, time_s: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Return angular rate, rad/s, and acceleration, rad/s², in the frame, by component."""
         inside_s = np.clip(time_s, self._grid_s[0], self._grid_s[-1])
-        both = CubicSpline(self._grid_s, np.hstack(list(self.motion[1:3])))(inside_s).T
+        both = self._rotation(inside_s).T
         return list(both[:3]), list(both[3:])
 
     def angles(self, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -229,7 +232,7 @@ class RobotPath(ForcePath):
         return np.arctan2(np.hypot(x, y), z), np.unwrap(np.arctan2(-y, x))
 
     @cached_property
-    def modes(self) -> dict[str, np.ndarray]:
+    def modes(self) -> dict[str, np.ndarray]:  # type: ignore[override]
         """
         Force per unit of each error of the robot, at `time_s`, (n, 3).
 

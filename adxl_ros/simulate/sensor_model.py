@@ -16,7 +16,7 @@ from adxl_ros.model import noise
 from adxl_ros.model.coefficients import put, with_neutral
 from adxl_ros.model.constants import AXES, NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Effect, Environment, Need, Place, Signals
+from adxl_ros.model.effects.base import Concern, Effect, Environment, Place, Signals
 from adxl_ros.model.filters import low_pass
 from adxl_ros.model.population import Population
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
@@ -327,6 +327,6 @@ def _reason_to_leave_out(effect: Effect, delay_s: float) -> str:
         return 'is an error of the reference that the sensor was compared with'
     if effect.name == 'lever_arm':
         return 'needs the rotation: set the position of the sensor in the simulator'
-    if effect.place is Place.STAGE or Need.STAGE in effect.needs:
+    if effect.concern is Concern.STAGE:
         return 'is a property of stage and site: set it in the simulator'
     return ''

@@ -5,9 +5,11 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from math import factorial
+from types import MappingProxyType
 
 from adxl_ros.model.effects.base import Components
 import numpy as np
@@ -400,6 +402,14 @@ def _moving(reading: np.ndarray) -> np.ndarray:
 
 class ForcePath:
     """Specific force of a recording or of another simulator, as cubic splines."""
+
+    is_robot = False  # Whether what follows is known
+    modes: Mapping[str, np.ndarray] = MappingProxyType({})
+    """Force at `time_s` per unit of each error of a robot, (n, 3)."""
+
+    def rotation(self, time_s: np.ndarray) -> tuple[Components, Components] | None:
+        """Return angular rate, rad/s, and acceleration, rad/s², in the frame; None if unknown."""
+        return None
 
     def __init__(self, time_s: np.ndarray, force_mps2: np.ndarray) -> None:
         """
