@@ -20,6 +20,7 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import (
     ActsOn,
     ARRAYS,
+    Concern,
     Effect,
     Environment,
     Need,
