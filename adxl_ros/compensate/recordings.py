@@ -20,6 +20,7 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import (
     ActsOn,
     ARRAYS,
+    Concern,
     Effect,
     Environment,
     Need,
@@ -125,7 +126,7 @@ def effects_left(sensor: Sensor, undo_filter: bool) -> list[Effect]:
     effects = [effect_named(name) for name in sensor.effects]
     return [effect for effect in effects
             if effect.acts_on is ActsOn.MEAN and not effect.invertible
-            and effect.place < Place.CLOCK and Need.STAGE not in effect.needs
+            and effect.place < Place.CLOCK and effect.concern is not Concern.STAGE
             and not (undo_filter and Need.FILTER in effect.needs)]
 
 

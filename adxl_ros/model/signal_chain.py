@@ -9,7 +9,8 @@ and a batch of sensors (arrays, (1, n)).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 import zlib
@@ -18,6 +19,7 @@ from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import (
     ARRAYS,
+    Coefficient,
     Components,
     Environment,
     Maths,
@@ -71,7 +73,7 @@ class RunningEffect:
         # At the neutral values of its sizes and limits an effect does nothing.
         self.is_neutral = bool(sizes) and all(
             np.all(np.equal(self.parameters.get(p.name, p.neutral), p.neutral)) for p in sizes)
-        self.place, self.apply = effect.place, effect.apply
+        self.name, self.place, self.apply = name, effect.place, effect.apply
         self.key = (name, *sorted(self.parameters.items()))
         self.memory: dict[str, Any] = {}
         # An invertible effect is a function of one sample, and draws nothing.
@@ -125,6 +127,39 @@ class Chain:
                 self(place, signals)
         return [zero + scale * out for zero, scale, out in
                 zip(signals.zero_g_v, signals.scale_v_per_g, signals.output)]
+
+    def put_units(self, names: Sequence[Coefficient], values: np.ndarray) -> None:
+        """Give each of n sensors coefficients of its own, (n, k); the others are shared."""
+        for effect in self._running():
+            for parameter in {name.parameter for name in names if name.effect == effect.name}:
+                by_axis = {name.axis: values[:, k].copy() for k, name in enumerate(names)
+                           if (name.effect, name.parameter) == (effect.name, parameter)}
+                shared = effect.parameters[parameter]
+                effect.parameters[parameter] = by_axis.get('', shared) if not isinstance(
+                    shared, tuple) else tuple(by_axis.get(axis, value) for axis, value in
+                                              zip(self.sensor.axes, shared))
+
+    def anew(self, rows: np.ndarray | slice) -> Chain:
+        """Return the chain of some sensors as after power-on; random generators are shared."""
+        def of_rows(value: Any) -> Any:
+            if isinstance(value, tuple):
+                return tuple(map(of_rows, value))
+            return value[rows] if np.ndim(value) else value
+
+        new = copy(self)
+        new.effects = {place: [copy(effect) for effect in effects]
+                       for place, effects in self.effects.items()}
+        for effect in new._running():
+            effect.memory = {}
+            effect.parameters = {name: of_rows(v) for name, v in effect.parameters.items()}
+        return new
+
+    def memories(self) -> list[dict[Any, Any]]:
+        """Return what each effect remembers."""
+        return [effect.memory for effect in self._running()]
+
+    def _running(self) -> list[RunningEffect]:
+        return [effect for effects in self.effects.values() for effect in effects]
 
     def through_adc(self, input_v: Components) -> Components:
         """Return volts behind the ADC's effects, by measured axis, without its steps."""

@@ -16,7 +16,7 @@ from adxl_ros.files.recording_columns import JOINTS
 from adxl_ros.model import noise
 from adxl_ros.model.constants import MAD_TO_STD, NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Need, Place
+from adxl_ros.model.effects.base import Concern
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.simulate.motion import Held, INTERNAL_RATE_HZ, Motion, Path
@@ -308,7 +308,7 @@ class Prediction:
 def _needs_stage(name: str) -> bool:
     """Return whether an effect needs the angles of a stage."""
     effect = effect_named(name)
-    return effect.place is Place.STAGE or Need.STAGE in effect.needs
+    return effect.concern is Concern.STAGE
 
 
 def _log_noise(residual: np.ndarray) -> np.ndarray:

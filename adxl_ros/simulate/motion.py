@@ -119,9 +119,13 @@ def lagrange_weights(position: np.ndarray) -> np.ndarray:
 
 def check_needs(sensor: Sensor, motion: Motion) -> None:
     """Refuse an effect that has nothing to act on."""
-    missing = {}
+    missing, is_robot = {}, getattr(motion.force, 'is_robot', False)
     if motion.force is not None:
         missing[Need.STAGE] = 'this manoeuvre has none, only specific force'
+        if not is_robot:
+            missing[Need.ROTATION] = 'it is not known beside a specific force'
+    if not is_robot:
+        missing[Need.ROBOT] = 'the motion is not that of a robot; give --urdf'
     if not sensor.adc_bits > 0:
         missing[Need.ADC] = 'the sensor has none: sensor.adc_bits is 0'
     if not np.any(sensor.noise_density_g_per_rthz):

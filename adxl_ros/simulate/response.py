@@ -210,6 +210,8 @@ class Response:
                 self._force_path = self._kept('reference', self._key(Place.REFERENCE),
                                               self._acting_force)
             signals.force = list(self._force_path(instants_s))
+            if self._chain.effects[Place.FORCE] and isinstance(motion.force, ForcePath):
+                signals.rotation = motion.force.rotation(instants_s)
             return signals
         if place is Place.STAGE:
             signals.alpha, signals.beta, signals.shift = (
@@ -235,6 +237,7 @@ class Response:
             return force
         signals = Signals(NOMINAL_ENVIRONMENT, time_s=force.time_s, force=force(force.time_s),
                           dt_s=float(np.median(np.diff(force.time_s))))
+        signals.modes = {name: list(mode.T) for name, mode in force.modes.items()}
         self._chain(Place.REFERENCE, signals)
         return ForcePath(signals.time_s, np.column_stack(signals.force))
 

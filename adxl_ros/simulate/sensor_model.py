@@ -5,20 +5,24 @@
 from __future__ import annotations
 
 from collections import deque
+from copy import copy
 from dataclasses import replace
 from os import PathLike
 from typing import Any
 
-from adxl_ros.errors import UserError
+from adxl_ros.errors import install_hint, UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.model import noise
+from adxl_ros.model.coefficients import put, with_neutral
 from adxl_ros.model.constants import AXES, NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Effect, Environment, Need, Place, Signals
+from adxl_ros.model.effects.base import Concern, Effect, Environment, Place, Signals
 from adxl_ros.model.filters import low_pass
+from adxl_ros.model.population import Population
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.model.signal_chain import Chain
 from adxl_ros.simulate.motion import check_needs, lagrange_weights, Motion, POINTS
+from adxl_ros.simulate.unit_draws import unit_draws
 import numpy as np
 
 _SAME_STEP = 1e-6
@@ -29,36 +33,97 @@ class SensorModel:
     """
     A sensor in a simulator: specific force of each time step in, readings out.
 
-    All sensors of a batch are copies of one unit with noise of their own. The chain runs at the
-    time steps of the simulator. Otherwise it is that of `simulate`, and one sensor gives the same
-    readings with the same seed.
+    All sensors of a batch are copies of one unit with noise of their own, or units of their own.
+    The chain runs at the time steps of the simulator. Otherwise it is that of `simulate`, and one
+    sensor gives the same readings with the same seed. It runs in numpy on the host: arrays of a
+    device are copied.
     """
 
-    def __init__(self, params: Sensor | str | PathLike, seed: int = 0) -> None:
-        """Put the sensors at the time of power-on."""
+    def __init__(self, params: Sensor | str | PathLike, seed: int = 0,
+                 units: str | PathLike | Population | None = None) -> None:
+        """
+        Put the sensors at the time of power-on.
+
+        Parameters
+        ----------
+        params
+            The unit, or its parameter file.
+        seed
+            Seed of units and noise.
+        units
+            Which unit each sensor is: None for copies of the one of `params`, 'datasheet' for
+            parts within its tolerances, 'calibration' for parts within the covariance of its
+            coefficients, or the population.yaml of a fleet.
+
+        Raises
+        ------
+        UserError
+            A file cannot be read, or states no distribution of units.
+
+        """
         # The unit
         self.sensor = params if isinstance(params, Sensor) else parameter_file.load(params)
         check_needs(self.sensor, Motion(0.0))
+        self.draws = unit_draws(self.sensor, units) if units is not None else None
         self._delay_s = float(self.sensor.values.get('time_offset', {}).get('offset_s', 0.0))
         reasons = {name: _reason_to_leave_out(effect_named(name), self._delay_s)
                    for name in self.sensor.effects}
         # Reason by name of an effect of the unit that is not simulated
         self.left_out = {name: reason for name, reason in reasons.items() if reason}
+        # Drawn coefficients of the sensors, (n, k); None before the first step, or without draws
+        self.coefficients: np.ndarray | None = None
+        self._units_rng, self._white = (np.random.default_rng([seed, n]) for n in (1, 0))
+        simulated = self.sensor
+        if self.draws:
+            # An effect with neutral values is skipped, and here they are replaced.
+            simulated = with_neutral(simulated, {name.effect for name in self.draws.names})
+            simulated = put(simulated, self.draws.names, [1e-9] * len(self.draws.names))
         self._chain = Chain(
-            self.sensor, [name for name in self.sensor.effects if name not in self.left_out], seed)
-        self._filters: list[dict[str, Any]] = [{} for _ in self.sensor.axes]
-        self._white = np.random.default_rng([seed, 0])
-        self._noise: np.ndarray | None = None
-        self._past: deque[np.ndarray] = deque()
+            simulated, [name for name in simulated.effects if name not in self.left_out], seed)
         self._past_weights = np.zeros(0)
         self._shape: tuple[int, ...] = ()
         self._dt_s = 0.0
         self._std_v = np.zeros(0)
-        self._steps = 0
+        self._switch_on(0)
 
-    def __call__(self, specific_force: np.ndarray, dt: float,
-                 temperature: float | np.ndarray = NOMINAL_TEMPERATURE_C,
-                 supply: float | np.ndarray = NOMINAL_SUPPLY_V) -> np.ndarray:
+    def _switch_on(self, count: int) -> None:
+        """Forget all that sensors remember."""
+        self._filters: list[dict[str, Any]] = [{} for _ in self.sensor.axes]
+        self._noise: np.ndarray | None = None
+        self._past: deque[np.ndarray] = deque()
+        self._steps = np.zeros(count)
+        self._reset = np.zeros(0, int)  # Sensors that begin anew in the next step
+
+    def reset(self, env_ids: Any = None) -> None:
+        """
+        Begin anew: the sensors are other units, and their noise and filters have no past.
+
+        Parameters
+        ----------
+        env_ids
+            Numbers of the sensors, a mask or a slice; None for all. Before the first step it has
+            nothing to do.
+
+        """
+        count = len(self._steps)
+        if count:
+            rows = np.arange(count)[slice(None) if env_ids is None else
+                                    env_ids if isinstance(env_ids, slice) else _on_host(env_ids)]
+            self._reset = np.union1d(self._reset, rows)
+            self._draw(rows)
+
+    def _draw(self, rows: np.ndarray) -> None:
+        """Draw the units of some sensors."""
+        if self.draws is None:
+            return
+        if self.coefficients is None:
+            self.coefficients = np.empty((len(self._steps), len(self.draws.names)))
+        self.coefficients[rows] = self.draws.draw(len(rows), self._units_rng)
+        self._chain.put_units(self.draws.names, self.coefficients)
+
+    def __call__(self, specific_force: Any, dt: float,
+                 temperature: Any = NOMINAL_TEMPERATURE_C,
+                 supply: Any = NOMINAL_SUPPLY_V) -> Any:
         """
         Advance by one time step.
 
@@ -66,7 +131,7 @@ class SensorModel:
         ----------
         specific_force
             Specific force in the frame of the sensor at this step, m/s²: (3,), or (n, 3) for n
-            sensors. At rest, an axis that points up has +g.
+            sensors; an array of numpy, torch or jax. At rest, an axis that points up has +g.
         dt
             Time step, s; the same in each call.
         temperature
@@ -76,9 +141,10 @@ class SensorModel:
 
         Returns
         -------
-        ndarray
-            Readings by the nominal conversion, m/s², in the shape of the force, as in
-            `imu/data_raw`; 0 for an axis that the sensor does not have.
+        array
+            Readings by the nominal conversion, m/s², as in `imu/data_raw`: an array of the same
+            library, shape, type and device as the force; 0 for an axis that the sensor does not
+            have.
 
         Raises
         ------
@@ -86,20 +152,46 @@ class SensorModel:
             The shape or the time step is wrong, or changes, or a value is not finite.
 
         """
-        force = np.asarray(specific_force, float)
-        self._check(force, dt)
+        force = np.asarray(_on_host(specific_force), float)
         count = force.size // 3
+        self._check(force, dt)
+        environment = [_of_each(name, values, count) for name, values in (
+            ('temperature', temperature), ('supply', supply))]
+        rows = force.reshape(-1, 3)
+        begun = self._reset
+        if len(begun) == count:
+            self._switch_on(count)
+            self._chain = self._chain.anew(slice(None))
+            begun = self._reset
+        readings = self._advance(rows, environment)
+        if len(begun):
+            new = copy(self)
+            new._switch_on(len(begun))
+            new._chain = self._chain.anew(begun)
+            readings[begun] = new._advance(rows[begun], [v[:, begun] for v in environment])
+            self._take_over(new, begun)
+        return _like(readings.reshape(force.shape), specific_force)
+
+    def _advance(self, rows: np.ndarray, environment: list[np.ndarray]) -> np.ndarray:
+        """Return the readings of all sensors at the next step, m/s², (n, 3)."""
         # Time is the first axis of the components, as in a recording; sensors are the second.
-        now = Environment(*(_of_each(name, values, count) for name, values in (
-            ('time', self._steps * self._dt_s), ('temperature', temperature),
-            ('supply', supply))))
-        rows = self._delayed(force.reshape(-1, 3))
-        volts = self._digital_v(self._analog(now, [rows[None, :, c] for c in range(3)]))
-        self._steps += 1
-        readings = np.zeros((count, 3))
+        now = Environment(self._steps[None] * self._dt_s, *environment)
+        delayed = self._delayed(rows)
+        volts = self._digital_v(self._analog(now, [delayed[None, :, c] for c in range(3)]))
+        self._steps = self._steps + 1
+        readings = np.zeros((len(rows), 3))
         readings[:, [AXES.index(axis) for axis in self.sensor.axes]] = to_nominal_mps2(
             volts, self.sensor)
-        return readings.reshape(force.shape)
+        return readings
+
+    def _take_over(self, new: SensorModel, rows: np.ndarray) -> None:
+        """Take the memory of sensors that began anew."""
+        for whole, part in zip(self._chain.memories(), new._chain.memories()):
+            _put_rows(whole, part, rows)
+        for whole, part in zip((*self._filters, vars(self)), (*new._filters, {
+                key: vars(new)[key] for key in ('_noise', '_past', '_steps')})):
+            _put_rows(whole, part, rows)
+        self._reset = np.zeros(0, int)
 
     def _check(self, force: np.ndarray, dt_s: float) -> None:
         """Refuse a call that does not continue the last one."""
@@ -109,8 +201,11 @@ class SensorModel:
             raise UserError(f'dt is {dt_s} s; it must be positive')
         if not np.isfinite(force).all():
             raise UserError('the specific force is not finite; check the simulation')
-        if not self._steps:
+        if not len(self._steps):
             self._shape, self._dt_s = force.shape, float(dt_s)
+            self._std_v = noise.analog_std_v(replace(self.sensor, rate_hz=1 / self._dt_s))
+            self._switch_on(force.size // 3)
+            self._draw(np.arange(force.size // 3))
         if force.shape != self._shape:
             raise UserError(f'specific force has the shape {force.shape}, but {self._shape} '
                             'before; make a new SensorModel')
@@ -122,7 +217,7 @@ class SensorModel:
         """Return the force of the instant that `time_offset` sets, from the past samples."""
         if self._delay_s <= 0:
             return rows
-        if not self._steps:
+        if not self._past:
             steps = self._delay_s / self._dt_s
             newest = max(int(steps) + 1 - POINTS // 2, 0)
             self._past_weights = lagrange_weights(np.array([steps - newest]))[0]
@@ -150,8 +245,6 @@ class SensorModel:
 
     def _draw_noise(self, signals: Signals) -> np.ndarray | None:
         """Draw the noise behind the filter, V, (n, m), as `Response` does; None without any."""
-        if not self._steps:
-            self._std_v = noise.analog_std_v(replace(self.sensor, rate_hz=1 / self._dt_s))
         if not self._std_v.any():
             return None
         decay = np.array([np.exp(-self._dt_s / rc_s) if rc_s else 0.0 for rc_s in signals.rc_s])
@@ -162,14 +255,66 @@ class SensorModel:
         return self._noise * self._std_v
 
 
+class SensorNoise:
+    """
+    A `SensorModel` with the interface of `NoiseModel` in Isaac Lab and mjlab.
+
+    The configuration has `params` and `dt`, and may have `units` and `seed`; see `SensorModel`.
+    Both simulators ask for a subclass of their own `NoiseModel`: `export` writes it.
+    """
+
+    def __init__(self, noise_model_cfg: Any, num_envs: int, device: str) -> None:
+        """Take the configuration; the device is that of the data."""
+        self._model = SensorModel(noise_model_cfg.params, getattr(noise_model_cfg, 'seed', 0),
+                                  getattr(noise_model_cfg, 'units', None))
+        self._dt_s = noise_model_cfg.dt
+
+    def reset(self, env_ids: Any = None) -> None:
+        """Draw some units again, and clear their memory; all of them for None."""
+        self._model.reset(env_ids)
+
+    def __call__(self, data: Any) -> Any:
+        """Return the readings of the specific force of one step, m/s², (num_envs, 3)."""
+        return self._model(data, self._dt_s)
+
+
 def _of_each(name: str, values: float | np.ndarray, count: int) -> np.ndarray:
     """Return a number, or a number for each sensor, as (1, n)."""
-    numbers = np.asarray(values, float)
+    numbers = np.asarray(_on_host(values), float)
     if numbers.shape not in ((), (count,)):
         raise UserError(f'{name} has the shape {numbers.shape}; expected a number or ({count},)')
     if not np.isfinite(numbers).all():
         raise UserError(f'{name} is not finite; check the simulation')
     return np.broadcast_to(numbers, (1, count))
+
+
+def _on_host(array: Any) -> np.ndarray:
+    """Return an array of any library and device as one of numpy."""
+    return np.asarray(array.detach().cpu() if hasattr(array, 'detach') else array)
+
+
+def _like(values: np.ndarray, like: Any) -> Any:
+    """Return values as an array of the same library, type and device as another one."""
+    if isinstance(like, np.ndarray) or np.ndim(like) == 1 and isinstance(like, (list, tuple)):
+        return values
+    try:
+        from array_api_compat import array_namespace, device
+    except ImportError:
+        raise UserError('arrays of other libraries than numpy need array-api-compat; '
+                        f'{install_hint("array-api-compat")}') from None
+    return array_namespace(like).asarray(values, dtype=like.dtype, device=device(like))
+
+
+def _put_rows(whole: Any, part: Any, rows: np.ndarray) -> None:
+    """Put the memory of some sensors into that of all; sensors are the axis of other length."""
+    for key in part if isinstance(part, dict) else range(len(part)):
+        old, new = whole.get(key) if isinstance(whole, dict) else whole[key], part[key]
+        if isinstance(new, dict | deque) and old is not None:
+            _put_rows(old, new, rows)
+        elif isinstance(new, np.ndarray) and np.shape(old) != new.shape:
+            axis = next(i for i, (m, n) in enumerate(zip(old.shape, new.shape)) if m != n)
+            whole[key] = np.array(old)
+            np.moveaxis(whole[key], axis, 0)[rows] = np.moveaxis(new, axis, 0)
 
 
 def _reason_to_leave_out(effect: Effect, delay_s: float) -> str:
@@ -182,6 +327,6 @@ def _reason_to_leave_out(effect: Effect, delay_s: float) -> str:
         return 'is an error of the reference that the sensor was compared with'
     if effect.name == 'lever_arm':
         return 'needs the rotation: set the position of the sensor in the simulator'
-    if effect.place is Place.STAGE or Need.STAGE in effect.needs:
+    if effect.concern is Concern.STAGE:
         return 'is a property of stage and site: set it in the simulator'
     return ''

@@ -5,9 +5,11 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from math import factorial
+from types import MappingProxyType
 
 from adxl_ros.model.effects.base import Components
 import numpy as np
@@ -123,18 +125,18 @@ class SmoothedPath:
     """
 
     def __init__(self, time_s: np.ndarray, reading: np.ndarray, step: float,
-                 degree: int = _DEGREE) -> None:
+                 degree: int = _DEGREE, is_seen: bool = False) -> None:
         """
         Prepare for the readings of an encoder.
 
         time_s: ascending times, s, (n,); reading: readings, rad or m, (n,); NaN where there is
-        none.
+        none; is_seen: whether the step is that of the readings, and not stated.
         """
         sampled = np.isfinite(reading)
         self._time_s, self._reading = time_s[sampled], reading[sampled]
         self._windows: dict[int, scipy.interpolate.BSpline | scipy.interpolate.PPoly] = {}
-        self._step = visible_step(self._reading, step)
-        if self._step == step and _is_interpolated(self._reading, step):
+        self._step = step if is_seen else visible_step(self._reading, step)
+        if not is_seen and self._step == step and _is_interpolated(self._reading, step):
             kept = _places_of_readings(self._reading, _SMALLEST_CHANGE * step)
             self._time_s, self._reading = self._time_s[kept], self._reading[kept]
         self._strength = self._matched_strength(self._step)
@@ -254,9 +256,9 @@ def visible_step(reading: np.ndarray, step: float) -> float:
     if not _is_interpolated(reading, step):
         return step
     thinned = reading[::_samples_per_reading(reading, _SMALLEST_CHANGE * step)]
-    if _noise_step(thinned, _SMALLEST_CHANGE * step) > _FINER * step:
+    if noise_step(thinned, _SMALLEST_CHANGE * step) > _FINER * step:
         return step
-    finer = _noise_step(reading, _SMALLEST_CHANGE * step)
+    finer = noise_step(reading, _SMALLEST_CHANGE * step)
     return finer if finer > _SMALLEST_CHANGE * step else 0.0
 
 
@@ -281,7 +283,7 @@ def _places_of_readings(reading: np.ndarray, smallest: float) -> np.ndarray:
         for a, b in pairwise(corners.tolist())]))
 
 
-def _noise_step(reading: np.ndarray, smallest: float) -> float:
+def noise_step(reading: np.ndarray, smallest: float) -> float:
     """Return the encoder step that has as much noise as readings in motion, (n,), have."""
     moving = np.diff(reading, 5)[np.abs(np.diff(reading))[4:] > smallest]
     return float(np.sqrt(12 * np.mean(moving ** 2) / _FIFTH_DIFFERENCE)) if len(moving) else 0.0
@@ -400,6 +402,14 @@ def _moving(reading: np.ndarray) -> np.ndarray:
 
 class ForcePath:
     """Specific force of a recording or of another simulator, as cubic splines."""
+
+    is_robot = False  # Whether what follows is known
+    modes: Mapping[str, np.ndarray] = MappingProxyType({})
+    """Force at `time_s` per unit of each error of a robot, (n, 3)."""
+
+    def rotation(self, time_s: np.ndarray) -> tuple[Components, Components] | None:
+        """Return angular rate, rad/s, and acceleration, rad/s², in the frame; None if unknown."""
+        return None
 
     def __init__(self, time_s: np.ndarray, force_mps2: np.ndarray) -> None:
         """

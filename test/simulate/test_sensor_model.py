@@ -2,15 +2,21 @@
 
 """The chain as a call for simulators, compared with a simulated recording."""
 
+from dataclasses import replace
 from time import process_time
+from types import SimpleNamespace
 
 from adxl_ros.errors import UserError
+from adxl_ros.files import population_file
+from adxl_ros.model.coefficients import put
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import library
+from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.population import PooledCoefficient, Population
 from adxl_ros.model.sensor import to_nominal_mps2
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
-from adxl_ros.simulate.sensor_model import SensorModel
+from adxl_ros.simulate.sensor_model import SensorModel, SensorNoise
 from adxl_ros.tools.command_line import with_effects
 import numpy as np
 import pytest
@@ -126,6 +132,8 @@ def test_4096_sensors_run_in_real_time(capsys):
 
     for name, call in (('chain', SensorModel(quiet(*MEAN))),
                        ('chain with white noise', SensorModel(unit(*MEAN))),
+                       ('units that differ', SensorModel(nominal('xyz', rate_hz=RATE_HZ), 0,
+                                                         'datasheet')),
                        ('Gaussian', gaussian)):
         call(force, 1 / RATE_HZ)
         begin_s = process_time()
@@ -137,3 +145,105 @@ def test_4096_sensors_run_in_real_time(capsys):
             print(f'\n4096 sensors, {name}: {1e3 * time_s / steps:.2f} ms a step, '
                   f'{time_s / times_s["Gaussian"]:.1f} times a Gaussian', end='')
     assert times_s['chain'] < steps / RATE_HZ
+    assert times_s['units that differ'] < 1e-3 * steps
+
+
+@pytest.mark.parametrize('effect', sorted(set(library()) - STAGE - CLOCK - NOISE))
+def test_a_sensor_that_is_reset_reads_as_a_new_one(effect):
+    """And the others go on as if nothing had happened."""
+    sensor, force = quiet(effect, 'time_offset:offset_s=0.012'), swing()
+    model, begin = SensorModel(sensor), 120
+    batch = np.repeat(force[:, None], 3, axis=1)
+    readings = []
+    for step, f in enumerate(batch):
+        if step == begin:
+            model.reset(np.array([1]))
+        readings.append(model(f, 1 / RATE_HZ, temperature=temperature_c()[step]))
+    alone, new = SensorModel(sensor), SensorModel(sensor)
+    expected = np.array([alone(f, 1 / RATE_HZ, temperature=t)
+                         for f, t in zip(force, temperature_c())])
+    anew = np.array([new(f, 1 / RATE_HZ, temperature=t)
+                     for f, t in zip(force[begin:], temperature_c()[begin:])])
+    assert np.array(readings)[:, [0, 2]] == pytest.approx(
+        np.repeat(expected[:, None], 2, axis=1), abs=1e-9)
+    assert np.array(readings)[begin:, 1] == pytest.approx(anew, abs=1e-9)
+
+
+def test_noise_and_drift_of_reset_sensors_are_those_of_others():
+    """Sensors that are reset at random have the noise of a single model, and shorter walks."""
+    sensor = unit('bias_walk:density_g_per_rts=1e-3')
+    model, rng, since = SensorModel(sensor, 1), np.random.default_rng(0), np.zeros(2000)
+    for _ in range(60):
+        again = rng.random(2000) < 0.05
+        model.reset(again)
+        since[again] = 0
+        readings = model(np.zeros((2000, 3)), 1 / RATE_HZ)[:, 0] / G0_MPS2
+        since += 1
+    white = SensorModel(unit(), 2)(np.zeros((2000, 3)), 1 / RATE_HZ)[:, 0] / G0_MPS2
+    walk = 1e-6 * since / RATE_HZ
+    assert np.mean(readings ** 2) == pytest.approx(np.mean(white ** 2 + walk), rel=0.1)
+    late = since > 30
+    assert np.mean(readings[late] ** 2) > 1.5 * np.mean(readings[~late] ** 2)
+
+
+def test_units_of_a_datasheet_keep_its_tolerances():
+    sensor = nominal('xy', rate_hz=RATE_HZ)
+    model = SensorModel(sensor, units='datasheet')
+    model(np.zeros((5000, 3)), 1 / RATE_HZ)
+    of = {str(name): model.coefficients[:, k] for k, name in enumerate(model.draws.names)}
+    assert of['bias.offset_v.x'].std() == pytest.approx(0.025, rel=0.05)
+    assert np.abs(of['scale_factor.offset_v_per_g.y']).max() <= 0.04
+    assert of['scale_factor.offset_v_per_g.y'].std() == pytest.approx(0.04 / 3, rel=0.05)
+    assert model.draws.held == ('bandwidth',)
+    first = model.coefficients.copy()
+    model.reset(slice(0, 10))
+    assert (model.coefficients != first).all(axis=1).tolist() == [True] * 10 + [False] * 4990
+
+
+def test_units_around_a_calibration_have_its_covariance():
+    """The readings spread as the covariance says, with its correlations."""
+    names = [Coefficient('bias', 'offset_v', 'x'), Coefficient('scale_factor',
+                                                               'offset_v_per_g', 'x')]
+    covariance = np.array([[4e-6, 3e-6], [3e-6, 9e-6]])
+    sensor = replace(put(quiet('bias', 'scale_factor'), names, [0.02, 0.01]),
+                     covariance=covariance, covariance_names=tuple(names), adc_bits=0)
+    force = np.tile([G0_MPS2, 0.0, 0.0], (20000, 1))
+    readings_g = SensorModel(sensor, units='calibration')(force, 1 / RATE_HZ)[:, 0] / G0_MPS2
+    assert readings_g.mean() == pytest.approx(1.03, abs=1e-4)
+    assert readings_g.var() == pytest.approx(covariance.sum(), rel=0.05)
+
+
+def test_units_of_a_fleet(tmp_path):
+    pooled = PooledCoefficient(2.45, 1e-3, 0.02, 0.015, 0.03, 0.021, 12)
+    population_file.write(tmp_path / 'population.yaml',
+                          Population('fleet', {'zero_g_x_v': pooled}), [])
+    model = SensorModel(nominal('xyz'), units=tmp_path / 'population.yaml')
+    model(np.zeros((5000, 3)), 1 / RATE_HZ)
+    assert model.coefficients.mean() == pytest.approx(2.45 - 2.5, abs=2e-3)
+    assert model.coefficients.std() == pytest.approx(0.021, rel=0.05)
+    with pytest.raises(UserError, match='no coefficients to draw'):
+        SensorModel(nominal('xyz'), units='calibration')
+
+
+@pytest.mark.parametrize('library_name', ['array_api_strict', 'torch', 'jax.numpy'])
+def test_arrays_of_other_libraries_have_the_same_numbers(library_name):
+    """They come back as arrays of their library and type."""
+    pytest.importorskip('array_api_compat')
+    xp = pytest.importorskip(library_name)
+    force = swing()[:50, None] + np.zeros((1, 4, 1))
+    model, other = SensorModel(unit(*MEAN), 3), SensorModel(unit(*MEAN), 3)
+    for f in force:
+        given = xp.asarray(f, dtype=xp.float32)
+        readings = other(given, 1 / RATE_HZ)
+        assert type(readings) is type(given) and readings.dtype == given.dtype
+        assert np.asarray(readings) == pytest.approx(
+            model(f.astype(np.float32), 1 / RATE_HZ), abs=1e-6)
+
+
+def test_simulators_call_it_as_their_noise_model():
+    """The interface of `NoiseModel` in Isaac Lab and mjlab: configuration, reset, call."""
+    cfg = SimpleNamespace(params=unit('bias'), dt=1 / RATE_HZ, units=None)
+    noise = SensorNoise(cfg, 4, 'cpu')
+    noise.reset(None)
+    alone = SensorModel(unit('bias'))
+    assert noise(np.zeros((4, 3))) == pytest.approx(alone(np.zeros((4, 3)), 1 / RATE_HZ))

@@ -111,6 +111,11 @@ class Signals:
     # FORCE: specific force in the case frame, m/s², three components. REFERENCE: the force that
     # the reference states, all of it, which effects turn into the one that acts on the sensor.
     force: Components = field(default_factory=list)
+    # FORCE: angular rate, rad/s, and acceleration, rad/s², of the case by a robot; None for a
+    # stage, whose joints have them
+    rotation: tuple[Components, Components] | None = None
+    # REFERENCE: force per unit of each error of a robot, m/s²; see `simulate.robot`
+    modes: dict[str, Components] = field(default_factory=dict)
     # MOUNTING: specific force along the sensing axes, g, always three components. Axes that are
     # not measured keep the component along the axis of the case.
     sensed: Components = field(default_factory=list)
@@ -205,6 +210,9 @@ class Need(Enum):
     """Part of the chain without which an effect has nothing to act on."""
 
     STAGE = 'stage'
+    ROTATION = 'rotation'
+    """Of a stage, or of the frame of a robot."""
+    ROBOT = 'robot'
     FILTER = 'filter'
     ADC = 'adc'
     NOISE = 'noise'
@@ -279,7 +287,8 @@ class Effect:
         """Return what it is an error of."""
         if self.place is Place.REFERENCE:
             return Concern.REFERENCE
-        return Concern.STAGE if Need.STAGE in self.needs or self.place is Place.STAGE \
+        return Concern.STAGE if self.place is Place.STAGE \
+            or {Need.STAGE, Need.ROTATION} & set(self.needs) \
             else Concern.SENSOR
 
 

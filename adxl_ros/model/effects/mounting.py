@@ -3,19 +3,23 @@
 """The mounting: directions of the sensing axes, and the spring between them and the case."""
 
 from functools import lru_cache
-from math import cos, sin
+from typing import Any
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import (
+    ARRAYS,
     Components,
     effect,
+    FLOATS,
     Parameter,
     Parameters,
     Place,
     Role,
     Signals,
+    Value,
 )
 from adxl_ros.model.filters import resonator
+import numpy as np
 
 
 @lru_cache(maxsize=64)
@@ -26,8 +30,24 @@ def direction(axis: int, alpha_rad: float, beta_rad: float) -> Components:
     Θx = R_y(α)·R_z(β)·[1 0 0]ᵀ (18), Θy = R_x(α)·R_z(β)·[0 1 0]ᵀ (19), and in the same manner
     Θz = R_x(α)·R_y(β)·[0 0 1]ᵀ.
     """
-    sa, ca, sb, cb = sin(alpha_rad), cos(alpha_rad), sin(beta_rad), cos(beta_rad)
+    return _direction(axis, alpha_rad, beta_rad)
+
+
+def _direction(axis: int, alpha_rad: Value, beta_rad: Value) -> Components:
+    maths = ARRAYS if np.ndim(alpha_rad) or np.ndim(beta_rad) else FLOATS
+    sa, ca, sb, cb = (f(angle) for angle in (alpha_rad, beta_rad)
+                      for f in (maths.sin, maths.cos))
     return [[ca * cb, sb, -sa * cb], [-sb, ca * cb, sa * cb], [sb, -sa * cb, ca * cb]][axis]
+
+
+def _directions(memory: dict[Any, Any], alpha_rad: tuple, beta_rad: tuple) -> list[Components]:
+    """Return the sensing axes; those of many units, with angles (n,), are kept in the memory."""
+    if not any(map(np.ndim, (*alpha_rad, *beta_rad))):
+        return [direction(d, *angles) for d, angles in enumerate(zip(alpha_rad, beta_rad))]
+    if memory.get('alpha_rad') is not alpha_rad:
+        memory.update(alpha_rad=alpha_rad, directions=[
+            _direction(d, *angles) for d, angles in enumerate(zip(alpha_rad, beta_rad))])
+    return memory['directions']
 
 
 @effect(Place.MOUNTING,
@@ -45,8 +65,7 @@ def direction(axis: int, alpha_rad: float, beta_rad: float) -> Components:
 def misalignment(signals: Signals, p: Parameters) -> None:
     """Directions of the sensing axes in the case: equations 18 and 19, and the same for z."""
     force = list(signals.sensed)
-    for d, angles in enumerate(zip(p['alpha_rad'], p['beta_rad'])):
-        tx, ty, tz = direction(d, *angles)
+    for d, (tx, ty, tz) in enumerate(_directions(signals.memory, p['alpha_rad'], p['beta_rad'])):
         signals.sensed[d] = tx * force[0] + ty * force[1] + tz * force[2]
 
 

@@ -140,17 +140,18 @@ def backlash(signals: Signals, p: Parameters) -> None:
         *(Parameter(f'{axis}_m', 'm', -2.0, 2.0, 0.02, 'physics: size of a board',
                     f"from the axis to the sensor along the sensor's {axis}", '')
           for axis in AXES),
-        exact=True, needs=(Need.STAGE,),
+        exact=True, needs=(Need.ROTATION,),
         cause='The sensor is not on the axis of rotation; mount it there, or state the arm.',
         diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS,
                                  proof=(ProofVariable.ALPHA_RATE, ProofVariable.BETA_RATE,
                                         ProofVariable.ALPHA_ACCELERATION,
                                         ProofVariable.BETA_ACCELERATION)))
 def lever_arm(signals: Signals, p: Parameters) -> None:
-    """Lever arm: rotation accelerates a sensor that is not on the axes of the stage."""
+    """Lever arm: rotation accelerates a sensor beside the axes of the stage, or the frame."""
     r = [p['x_m'], p['y_m'], p['z_m']]
     if any(r):
-        added = carried_acceleration(*angular_motion(signals.alpha, signals.beta), r)
+        rotation = signals.rotation or angular_motion(signals.alpha, signals.beta)
+        added = carried_acceleration(*rotation, r)
         signals.force = [f + a for f, a in zip(signals.force, added)]
 
 
@@ -268,3 +269,43 @@ def reference_filter(signals: Signals, p: Parameters) -> None:
         lacking = np.fft.irfft(np.fft.rfft(padded, size) * restoring, size)
         signals.force[d] = stated + np.interp(signals.time_s, even_s,
                                               lacking[margin:margin + count])
+
+
+ROBOT_JOINTS = 8
+"""Joints of a robot whose offsets are errors of their own; chosen: an arm has six or seven."""
+
+
+@effect(Place.REFERENCE,
+        *(Parameter(f'joint{number}_rad', 'rad', -0.5, 0.5, 5e-3,
+                    'practice: joints are mastered to some 0.1 deg',
+                    f'true angle of joint {number} of the chain minus its encoder; m for a '
+                    'linear one', '') for number in range(1, ROBOT_JOINTS + 1)),
+        exact=True, needs=(Need.ROBOT,),
+        cause='The zero of a joint is wrong, so that the robot stands otherwise than its encoders '
+              'say; master the joint again.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, imitated_by='misalignment',
+                                 proof=(ProofVariable.CROSS_FORCE, ProofVariable.FORCE_Z)))
+def joint_offset(signals: Signals, p: Parameters) -> None:
+    """Offsets of the joints of a robot: true angle minus reading."""
+    for number in range(1, ROBOT_JOINTS + 1):
+        _add_mode(signals, f'joint{number}', p[f'joint{number}_rad'])
+
+
+@effect(Place.REFERENCE,
+        Parameter('compliance_s2', 's^2', -0.01, 0.01, 1e-4,
+                  'physics: a first resonance of 16 Hz, 1/(2*pi*f)^2',
+                  'angle by which a joint lags, divided by its angular acceleration', ''),
+        needs=(Need.ROBOT,),
+        cause='The links or gears of the robot yield to their own inertia; move more slowly, or '
+              'model them.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS, form=(FormDimension.LAG,),
+                                 proof=(ProofVariable.FORCE_RATE,)))
+def flexible_link(signals: Signals, p: Parameters) -> None:
+    """Flexible links of a robot: its joints follow their encoders by q − c·d²q/dt²."""
+    _add_mode(signals, 'flexible', p['compliance_s2'])
+
+
+def _add_mode(signals: Signals, name: str, size: float) -> None:
+    """Add a multiple of what an error of a robot adds to the force."""
+    if size and name in signals.modes:
+        signals.force = [f + size * m for f, m in zip(signals.force, signals.modes[name])]

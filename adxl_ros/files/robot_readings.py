@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Readings of a robot's joints, and of its base, from a bag or a CSV file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import os
+from typing import NamedTuple
+
+from adxl_ros.errors import UserError
+from adxl_ros.files import cdr
+from adxl_ros.files.bag_messages import Bag, open_bag, typestore
+import numpy as np
+
+_JOINT_STATE = 'sensor_msgs/msg/JointState'
+_ODOMETRY = 'nav_msgs/msg/Odometry'
+_TRANSFORMS = 'tf2_msgs/msg/TFMessage'
+_BASE = ('x_m', 'y_m', 'z_m', 'qx', 'qy', 'qz', 'qw')
+"""Columns of the pose of the base in a CSV file, behind `base_`."""
+
+Track = tuple[np.ndarray, np.ndarray]
+"""Time, s, (k,), and values, (k,) or (k, 7)."""
+
+
+class Readings(NamedTuple):
+    """What a recording says of a robot."""
+
+    path: str  # The recording, for messages
+    joints: Mapping[str, Track]  # Readings, rad or m, by name of the joint
+    # Pose of the base in the world: x, y, z, m, and a quaternion x, y, z, w; None for a base that
+    # is at rest and level
+    base: Track | None = None
+
+
+def read(path: str | os.PathLike, epoch_ns: int, topic: str = '', root: str = '',
+         needs_joints: bool = True) -> Readings:
+    """
+    Read joints and base of a robot.
+
+    Parameters
+    ----------
+    path
+        A bag with `sensor_msgs/JointState`, and `nav_msgs/Odometry` or tf where the base moves; or
+        a CSV file with `time_s`, columns NAME_rad or NAME_m, and base_x_m ... base_qw.
+    epoch_ns
+        Stamp of time 0, ns.
+    topic
+        Topic of the joints; empty for the only one.
+    root
+        Frame of the base, as tf names it.
+    needs_joints
+        Whether a bag without joints is refused.
+
+    Returns
+    -------
+    Readings
+        Times, s, and values of each joint.
+
+    Raises
+    ------
+    UserError
+        There are no joints, or several topics of them.
+
+    """
+    if os.path.splitext(path)[1] == '.csv':
+        return _from_csv(str(path))
+    with open_bag(path) as bag:
+        joints = _joints(bag, _topic(bag, topic), epoch_ns) if needs_joints else {}
+        return Readings(str(path), joints, _base(bag, root, epoch_ns))
+
+
+def _from_csv(path: str) -> Readings:
+    import pandas
+    table = pandas.read_csv(path, comment='#')
+    if 'time_s' not in table:
+        raise UserError(f'{path}: no column time_s beside the joints of a robot')
+    time_s = table['time_s'].to_numpy(float)
+
+    def track(columns: list[str]) -> Track:
+        values = table[columns].to_numpy(float)
+        known = np.isfinite(values).all(axis=1)
+        return time_s[known], values[known]
+
+    joints = {}
+    for column in table.columns:
+        name, _, unit = column.rpartition('_')
+        if unit in ('rad', 'm') and not column.startswith('base_'):
+            times, values = track([column])
+            joints[name] = times, values[:, 0]
+    base = [f'base_{name}' for name in _BASE]
+    return Readings(path, joints, track(base) if set(base) <= set(table.columns) else None)
+
+
+def _topic(bag: Bag, topic: str) -> str:
+    """Return the topic of the joints."""
+    topics = sorted(name for name, kind in bag.types if kind == _JOINT_STATE)
+    named = [name for name in topics if name.strip('/') == topic.strip('/')]
+    found = named if topic else [name for name in topics if name.endswith('/joint_states')
+                                 and not name.endswith('stage/joint_states')] or topics
+    if len(found) != 1:
+        raise UserError(f'{bag.path}: {len(found) or "no"} topics of sensor_msgs/JointState'
+                        f'{f" named {topic}" if topic else ""}; there are '
+                        f'{", ".join(topics) or "none"}; name one by --joints TOPIC')
+    return found[0]
+
+
+def _joints(bag: Bag, topic: str, epoch_ns: int) -> dict[str, Track]:
+    """Return the readings of all joints of a topic."""
+    readings: dict[str, tuple[list[np.ndarray], list[np.ndarray]]] = {}
+    parts = [piece.messages[topic] for piece in bag.pieces([topic]) if topic in piece.messages]
+    try:
+        for table in cdr.joined_tables(parts, cdr.joint_state):
+            names = [text for key, text in table.layout.texts.items() if key != 'frame_id']
+            if 'position' not in table.layout.fields:
+                continue
+            for name, values in zip(names, table.numbers('position').T):
+                times, positions = readings.setdefault(name, ([], []))
+                times.append(table.stamp_ns())
+                positions.append(values)
+    except cdr.CdrError as error:
+        raise UserError(f'{bag.path}: topic {topic}: {error}') from None
+    return {name: _track(times, positions, epoch_ns) for name, (times, positions)
+            in readings.items()}
+
+
+def _track(stamps_ns: list[np.ndarray], values: list[np.ndarray], epoch_ns: int) -> Track:
+    """Join parts in the order of their stamps, each stamp once."""
+    stamp_ns, first = np.unique(np.concatenate(stamps_ns), return_index=True)
+    return (stamp_ns - epoch_ns) / 1e9, np.concatenate(values)[first]
+
+
+def _base(bag: Bag, root: str, epoch_ns: int) -> Track | None:
+    """Return the pose of the base by odometry, or else by tf; None where neither moves it."""
+    store, kinds = typestore(), dict(sorted(bag.types))
+    odometry = [topic for topic, kind in kinds.items() if kind == _ODOMETRY]
+    topics = odometry[:1] or [topic for topic, kind in kinds.items()
+                              if kind == _TRANSFORMS and topic.endswith('tf')]
+    stamps, poses = [], []
+    for topic, raw in bag.messages(topics):
+        message = store.deserialize_cdr(raw, kinds[topic])
+        for header, place, turn in [(
+                message.header, message.pose.pose.position, message.pose.pose.orientation)] \
+                if odometry else [(t.header, t.transform.translation, t.transform.rotation)
+                                  for t in message.transforms if t.child_frame_id == root]:
+            stamps.append(header.stamp.sec * 1_000_000_000 + header.stamp.nanosec)
+            poses.append([place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w])
+    if not stamps or not np.ptp(poses, axis=0).any():
+        return None
+    return _track([np.array(stamps)], [np.array(poses)], epoch_ns)

@@ -1,0 +1,345 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+A robot as the reference: the specific force in a frame of its URDF, by its joint encoders.
+
+Pinocchio has the kinematics. Joints are smoothed as those of a stage, so that their derivatives
+are known; what the steps of the encoders leave open is simulated, and is the error of the force.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from difflib import get_close_matches
+from functools import cached_property
+import os
+from typing import Any
+
+from adxl_ros.errors import install_hint, one_line, UserError
+from adxl_ros.files import robot_readings
+from adxl_ros.files.robot_readings import Readings
+from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.simulate.motion import Held
+from adxl_ros.simulate.smoothed_paths import ForcePath, noise_step, PathErrors, SmoothedPath
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import uniform_filter1d
+
+_HIGHEST_RATE_HZ = 1000.0
+"""Highest rate at which the kinematics are evaluated, Hz. Chosen: the rate of the simulator."""
+_PER_READING = 2
+"""Evaluations of the kinematics for each reading of a joint. Chosen: splines join them."""
+_SMALLEST_STEP = 1e-9
+"""Step of an encoder, rad or m, that is exact. Chosen: rounding of floats in a log."""
+_AROUND_S = 0.3
+"""Time around which the error of the force is taken, s. Chosen: a part of a move."""
+_OFFSET_RAD = 1e-4
+"""Offset of a joint whose effect on the force is taken, rad. Chosen: linear to 1e-4."""
+_COMPLIANCE_S2 = 1e-5
+"""Compliance of the links whose effect is taken, s². Chosen: a resonance of 50 Hz."""
+
+
+class Robot:
+    """The kinematics of a robot, from its joints to one frame."""
+
+    def __init__(self, urdf: str | os.PathLike, frame: str, moves: bool = False) -> None:
+        """
+        Read a URDF.
+
+        Parameters
+        ----------
+        urdf
+            The file.
+        frame
+            Name of the link, or frame, that carries the sensor.
+        moves
+            Whether the base moves in the world.
+
+        Raises
+        ------
+        UserError
+            The file is no URDF, has no such frame, or pinocchio is not installed.
+
+        """
+        try:
+            import pinocchio
+        except ImportError:
+            raise UserError('--urdf needs pinocchio: apt install ros-jazzy-pinocchio, or '
+                            f'{install_hint("pin")}') from None
+        self._pin: Any = pinocchio
+        if not os.path.isfile(urdf):
+            raise UserError(f'{urdf}: no such file; give the URDF (xacro FILE > robot.urdf)')
+        try:
+            free = (pinocchio.JointModelFreeFlyer(),) if moves else ()
+            model = pinocchio.buildModelFromUrdf(str(urdf), *free)
+        except Exception as error:
+            raise UserError(f'{urdf}: no URDF that pinocchio reads: {one_line(error)}') from None
+        if not model.existFrame(frame):
+            frames = [f.name for f in model.frames if f.name != 'universe']
+            near = get_close_matches(frame, frames, 3, 0.3) or frames[:5]
+            raise UserError(f'{urdf}: no frame {frame}; it has {len(frames)}, such as '
+                            f'{", ".join(near)}')
+        chain = [model.names[i] for i in model.supports[model.frames[model.getFrameId(frame)]
+                                                        .parentJoint] if i]
+        self.joints = tuple(chain[moves:])  # Names of the joints between base and frame
+        fixed = [i for i in range(1, model.njoints) if model.names[i] not in chain]
+        self._model = pinocchio.buildReducedModel(model, fixed, pinocchio.neutral(model))
+        self._data = self._model.createData()
+        self._frame = self._model.getFrameId(frame)
+        self.frame, self.urdf, self._moves = frame, str(urdf), moves
+        # Name of the link that the base is
+        self.root = model.frames[1 + moves].name if model.nframes > 1 else ''
+
+    def motion(self, joints: np.ndarray, base: np.ndarray | None, gravity_mps2: float
+               ) -> np.ndarray:
+        """
+        Return the motion of the frame.
+
+        Parameters
+        ----------
+        joints
+            Position, rate and acceleration of the joints, rad or m and s, (3, n, j).
+        base
+            The same of the pose of the base, x, y, z and quaternion x, y, z, w, (3, n, 7).
+        gravity_mps2
+            Local gravity, m/s².
+
+        Returns
+        -------
+        ndarray
+            In the frame: specific force, m/s², angular rate, rad/s, angular acceleration, rad/s²,
+            and the unit vector upward, (4, n, 3).
+
+        """
+        pin, model, data = self._pin, self._model, self._data
+        q, v, a = (np.zeros((joints.shape[1], size)) for size in (model.nq, model.nv, model.nv))
+        if base is not None:
+            q[:, :7], v[:, :6], a[:, :6] = _free_flyer(base)
+        for number, name in enumerate(self.joints):
+            joint = model.joints[model.getJointId(name)]
+            angle, v[:, joint.idx_v], a[:, joint.idx_v] = joints[:, :, number]
+            # Pinocchio has cosine and sine of a joint without limits.
+            values = (angle,) if joint.nq == 1 else (np.cos(angle), np.sin(angle))
+            for k, value in enumerate(values):
+                q[:, joint.idx_q + k] = value
+        result = np.empty((4, len(q), 3))
+        up = np.array([0.0, 0.0, 1.0])
+        for i in range(len(q)):
+            pin.forwardKinematics(model, data, q[i], v[i], a[i])
+            turn = pin.updateFramePlacement(model, data, self._frame).rotation.T
+            vertical = turn @ up
+            acceleration = pin.getFrameClassicalAcceleration(model, data, self._frame, pin.LOCAL)
+            rate = pin.getFrameVelocity(model, data, self._frame, pin.LOCAL)
+            result[0, i] = acceleration.linear + gravity_mps2 * vertical
+            result[1, i], result[2, i] = rate.angular, acceleration.angular
+            result[3, i] = vertical
+        return result
+
+
+def _free_flyer(base: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return position, rate and acceleration of a free joint as pinocchio has them."""
+    (x, q), (dx, dq), (ddx, ddq) = ((b[:, :3], b[:, 3:]) for b in base)
+    norm = np.linalg.norm(q, axis=1, keepdims=True)
+    q, dq, ddq = q / norm, dq / norm, ddq / norm
+    inverse = q * [-1, -1, -1, 1]
+    omega = 2 * _product(inverse, dq)[:, :3]
+    alpha = 2 * _product(inverse, ddq)[:, :3]
+
+    def local(vector: np.ndarray) -> np.ndarray:
+        pure = np.column_stack([vector, np.zeros(len(vector))])
+        return _product(_product(inverse, pure), q)[:, :3]
+
+    velocity = local(dx)
+    return (np.hstack([x, q]), np.hstack([velocity, omega]),
+            np.hstack([local(ddx) - np.cross(omega, velocity), alpha]))
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return products of quaternions x, y, z, w, (n, 4)."""
+    va, wa, vb, wb = a[:, :3], a[:, 3:], b[:, :3], b[:, 3:]
+    return np.hstack([wa * vb + wb * va + np.cross(va, vb),
+                      wa * wb - np.sum(va * vb, axis=1, keepdims=True)])
+
+
+class RobotPath(ForcePath):
+    """Specific force in a frame of a robot, and what errors of the robot would add to it."""
+
+    is_robot = True
+
+    def __init__(self, robot: Robot, readings: Readings, gravity_mps2: float = G0_MPS2,
+                 step_rad: float | None = None) -> None:
+        """
+        Smooth the readings, and run the kinematics.
+
+        Parameters
+        ----------
+        robot
+            The kinematics.
+        readings
+            Readings of its joints, and of its base.
+        gravity_mps2
+            Local gravity, m/s².
+        step_rad
+            Step of the encoders, rad; None for that which each joint's readings show.
+
+        Raises
+        ------
+        UserError
+            A joint of the chain has no readings, or too few.
+
+        """
+        self._robot, self._gravity_mps2 = robot, gravity_mps2
+        self._tracks = _tracks(robot, readings)
+        self._steps = [noise_step(values, _SMALLEST_STEP) if step_rad is None else step_rad
+                       for _, values in self._tracks]
+        begin_s = max(times[0] for times, _ in self._tracks)
+        end_s = min(times[-1] for times, _ in self._tracks)
+        readings_hz = max(1 / float(np.median(np.diff(times))) for times, _ in self._tracks)
+        rate_hz = min(_PER_READING * readings_hz, _HIGHEST_RATE_HZ)
+        self._grid_s = np.linspace(begin_s, end_s, max(int((end_s - begin_s) * rate_hz), 8))
+        self._smoothed = self._paths(self._tracks)
+        self.motion = self._moved(self._smoothed)
+        super().__init__(self._grid_s, self.motion[0])
+        self._rotation = CubicSpline(self._grid_s, np.hstack(list(self.motion[1:3])))
+        self.joints = robot.joints
+
+    def _paths(self, tracks: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+        """Return derivatives 0 to 2 of the tracks on the grid, (3, n, k)."""
+        paths = [SmoothedPath(times, values, step, is_seen=True) if np.ptp(values) else Held(float(values[0]))
+                 for (times, values), step in zip(tracks, self._steps)]
+        return np.array([[path(self._grid_s, order) for path in paths]
+                         for order in range(3)]).transpose(0, 2, 1)
+
+    def _moved(self, tracks: np.ndarray) -> np.ndarray:
+        count = len(self._robot.joints)
+        base = tracks[:, :, count:] if tracks.shape[2] > count else None
+        return self._robot.motion(tracks[:, :, :count], base, self._gravity_mps2)
+
+    def rotation(self, time_s: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Return angular rate, rad/s, and acceleration, rad/s², in the frame, by component."""
+        inside_s = np.clip(time_s, self._grid_s[0], self._grid_s[-1])
+        both = self._rotation(inside_s).T
+        return list(both[:3]), list(both[3:])
+
+    def angles(self, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return alpha and beta of a stage that turns the frame as the robot does, rad, (n,) each.
+
+        Gravity at rest is g·[sin α·cos β, −sin α·sin β, cos α].
+        """
+        inside_s = np.clip(time_s, self._grid_s[0], self._grid_s[-1])
+        x, y, z = CubicSpline(self._grid_s, self.motion[3])(inside_s).T
+        return np.arctan2(np.hypot(x, y), z), np.unwrap(np.arctan2(-y, x))
+
+    @cached_property
+    def modes(self) -> dict[str, np.ndarray]:  # type: ignore[override]
+        """
+        Force per unit of each error of the robot, at `time_s`, (n, 3).
+
+        `joint1` ... per rad, or m, of an offset of a joint. `flexible` per s²: all joints follow
+        their encoders by q − c·d²q/dt², as links that yield to their inertia.
+        """
+        smoothed, modes = self._smoothed, {}
+        for number in range(len(self._robot.joints)):
+            moved = smoothed.copy()
+            moved[0, :, number] += _OFFSET_RAD
+            modes[f'joint{number + 1}'] = (self._moved(moved)[0] - self.motion[0]) / _OFFSET_RAD
+        lag = CubicSpline(self._grid_s, smoothed[2])
+        yielded = smoothed.copy()
+        count = len(self._robot.joints)
+        yielded[:, :, :count] -= _COMPLIANCE_S2 * np.array(
+            [lag(self._grid_s, order)[:, :count] for order in range(3)])
+        modes['flexible'] = (self._moved(yielded)[0] - self.motion[0]) / _COMPLIANCE_S2
+        return modes
+
+    def errors(self, time_s: np.ndarray, component: int) -> PathErrors:
+        """
+        Return what is to be expected of the error of one component, m/s², at times, s, (n,).
+
+        Standard deviation and memory are those of `error_mps2` around each time.
+        """
+        error = self.error_mps2[:, component]
+        step_s = self._grid_s[1] - self._grid_s[0]
+        around = max(round(_AROUND_S / step_s), 3)
+        square, product = (uniform_filter1d(v, around) for v in (
+            error ** 2, error * np.append(error[1:], error[-1])))
+        memory = np.clip(product / np.maximum(square, _SMALLEST_STEP ** 2), 1e-3, 1.0)
+        return PathErrors(np.interp(time_s, self._grid_s, np.sqrt(square)),
+                          np.interp(time_s, self._grid_s, -np.log(memory) / step_s))
+
+    @cached_property
+    def error_mps2(self) -> np.ndarray:
+        """
+        A draw of the error that the steps of the encoders leave, m/s², at `time_s`, (n, 3).
+
+        The smoothed motion is read by encoders whose steps lie elsewhere, and smoothed again.
+        """
+        rng = np.random.default_rng(0)
+        tracks = []
+        for (times, values), step, smooth in zip(self._tracks, self._steps, self._smoothed[0].T):
+            read = np.interp(times, self._grid_s, smooth)
+            offset = step * rng.random()
+            tracks.append((times, np.rint((read + offset) / step) * step - offset if step
+                           and np.ptp(values) else read))
+        return self._moved(self._paths(tracks))[0] - self.motion[0]
+
+
+def _tracks(robot: Robot, readings: Readings) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return times and readings of the chain's joints, and then of the base's coordinates."""
+    missing = [name for name in robot.joints if name not in readings.joints]
+    if missing:
+        raise UserError(
+            f'{readings.path}: no position of {", ".join(missing)}, which '
+            f'{"move" if len(missing) > 1 else "moves"} {robot.frame} in {robot.urdf}; recorded '
+            f'are {", ".join(readings.joints) or "no joints"}')
+    tracks = [(name, *readings.joints[name]) for name in robot.joints]
+    if readings.base is not None:
+        times, pose = readings.base
+        signs = np.cumprod(np.append(1.0, np.where(np.sum(
+            pose[1:, 3:] * pose[:-1, 3:], axis=1) < 0, -1.0, 1.0)))
+        tracks += [(f'base {axis}', times, values) for axis, values in zip(
+            'x y z qx qy qz qw'.split(), np.hstack([pose[:, :3], pose[:, 3:] * signs[:, None]]).T)]
+    if not tracks:
+        raise UserError(f'{robot.urdf}: no joint moves {robot.frame}, and {readings.path} has no '
+                        'pose of a moving base; record odom, or tf')
+    for name, times, values in tracks:
+        if len(times) < 8 or not np.all(np.diff(times) > 0) or not np.isfinite(values).all():
+            raise UserError(f'{readings.path}: {name} has {len(times)} readings; at least 8 '
+                            'finite ones with rising stamps are needed')
+    return [(times, values) for _, times, values in tracks]
+
+
+def robot_path(urdf: str | os.PathLike, frame: str, path: str, epoch_ns: int,
+               gravity_mps2: float = G0_MPS2, topic: str = '') -> RobotPath:
+    """
+    Return the specific force in a frame of a robot, by a recording of its joints.
+
+    Parameters
+    ----------
+    urdf, frame
+        The robot, and the frame that carries the sensor.
+    path
+        The recording; see `robot_readings.read`.
+    epoch_ns
+        Stamp of time 0, ns.
+    gravity_mps2
+        Local gravity, m/s².
+    topic
+        Topic of the joints; empty for the only one.
+
+    Returns
+    -------
+    RobotPath
+        The force, with its errors.
+
+    Raises
+    ------
+    UserError
+        The URDF, the frame, a joint or the recording is wrong.
+
+    """
+    robot = Robot(urdf, frame)
+    readings = robot_readings.read(path, epoch_ns, topic, robot.root, bool(robot.joints))
+    if readings.base is not None:
+        robot = Robot(urdf, frame, moves=True)
+    return RobotPath(robot, readings, gravity_mps2)
