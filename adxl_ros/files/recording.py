@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 import os
 from pathlib import Path
 
@@ -190,7 +191,7 @@ def _with_proposal(path: str | os.PathLike, error: HeaderError) -> UserError:
     return UserError(f'{error}; {text}', options)
 
 
-def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> Recording:
     """
     Read the ideal specific force of another simulator.
 
@@ -204,10 +205,8 @@ def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> tuple[np.ndarray, 
 
     Returns
     -------
-    time_s : ndarray
-        Times, s, (n,).
-    force_mps2 : ndarray
-        Specific force in the case frame, m/s², (n, 3).
+    Recording
+        Specific force in the case frame, m/s², with times since `epoch_ns`.
 
     Raises
     ------
@@ -218,8 +217,8 @@ def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> tuple[np.ndarray, 
     parts = (bag_reader.blocks(path, _BLOCK_ROWS, ideal=True) if _is_bag(path)
              else _with_sound_rate(csv_file.blocks(path, _BLOCK_ROWS, needed=ACCEL), None))
     ideal = concatenate(parts)
-    time_s = ideal.time_s + (ideal.epoch_ns - epoch_ns) / 1e9
-    return time_s, np.column_stack([ideal.columns[name] for name in ACCEL])
+    return replace(ideal, time_s=ideal.time_s + (ideal.epoch_ns - epoch_ns) / 1e9,
+                   epoch_ns=epoch_ns)
 
 
 @contextmanager

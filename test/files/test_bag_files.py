@@ -300,9 +300,9 @@ def test_invalid_bags_are_refused_in_one_line(
 def test_ideal_force(tmp_path: Path) -> None:
     messages = [imu(t, (i, 2, 3), '/world/imu', (0, 0, 0)) for i, t in enumerate(T)]
     path = bags.bag_of(tmp_path / 'run', messages)
-    time_s, force = recording.read_ideal(path, EPOCH_NS)
-    assert (time_s == (np.array(T) - EPOCH_NS) / 1e9).all()
-    assert force.tolist() == [[0, 2, 3], [1, 2, 3], [2, 2, 3]]
+    ideal = recording.read_ideal(path, EPOCH_NS)
+    assert (ideal.time_s == (np.array(T) - EPOCH_NS) / 1e9).all()
+    assert [ideal.columns[name].tolist() for name in ACCEL] == [[0, 1, 2], [2] * 3, [3] * 3]
     two = [*messages, *(imu(t, topic='/other/imu') for t in T)]
     with pytest.raises(UserError, match='several topics of type sensor_msgs/msg/Imu'):
         recording.read_ideal(bags.bag_of(tmp_path / 'two', two))

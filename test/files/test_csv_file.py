@@ -8,7 +8,7 @@ import sys
 from adxl_ros.errors import UserError
 from adxl_ros.files import delimited_text, recording
 from adxl_ros.files.csv_file import csv_writer
-from adxl_ros.files.recording_columns import check_unit, Recording
+from adxl_ros.files.recording_columns import ACCEL, check_unit, Recording
 from adxl_ros.files.stream_info import sensor_info
 import numpy as np
 from pace import within
@@ -193,10 +193,10 @@ def test_the_result_does_not_depend_on_the_blocks(
 
 def test_ideal_force(tmp_path: Path) -> None:
     path = written(tmp_path, 'time_s,ay_mps2,ax_mps2,az_mps2,x_v\n0,2,1,3,\n0.5,5,4,6,7\n')
-    time_s, force = recording.read_ideal(path)
-    assert time_s.tolist() == [0.0, 0.5]
-    assert force.tolist() == [[1, 2, 3], [4, 5, 6]]
-    assert recording.read_ideal(path, -10**9)[0].tolist() == [1.0, 1.5]
+    ideal = recording.read_ideal(path)
+    assert ideal.time_s.tolist() == [0.0, 0.5]
+    assert [ideal.columns[name].tolist() for name in ACCEL] == [[1, 4], [2, 5], [3, 6]]
+    assert recording.read_ideal(path, -10**9).time_s.tolist() == [1.0, 1.5]
     with pytest.raises(UserError, match='no column az_mps2'):
         recording.read_ideal(written(tmp_path, 'time_s,ax_mps2,ay_mps2\n0,1,2\n'))
 
