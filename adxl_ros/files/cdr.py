@@ -76,12 +76,6 @@ class Layout:
         self.fixed += range(start, start + size)
         self.texts[name] = self._raw[start:start + size].rstrip(b'\0').decode(errors='replace')
 
-    def header(self) -> None:
-        """Pass over a std_msgs/Header."""
-        self.numbers('sec', 'i4')
-        self.numbers('nanosec', 'u4')
-        self.text('frame_id')
-
     def _aligned(self, size: int) -> int:
         return self._offset + (_BODY_OFFSET - self._offset) % size
 
@@ -91,28 +85,27 @@ class Layout:
             raise CdrError(f'{len(self._raw)} bytes are too few for it')
 
 
+def header(raw: bytes) -> Layout:
+    """Find the stamp and the frame of a message with a header."""
+    layout = Layout(raw)
+    layout.numbers('sec', 'i4')
+    layout.numbers('nanosec', 'u4')
+    layout.text('frame_id')
+    return layout
+
+
 def imu(raw: bytes) -> Layout:
     """Find the fields of a sensor_msgs/Imu."""
-    layout = Layout(raw)
-    layout.header()
+    layout = header(raw)
     for name, count in (('orientation', 4), ('angular_velocity', 3), ('linear_acceleration', 3)):
         layout.numbers(name, 'f8', count)
         layout.numbers(f'{name}_covariance', 'f8', 9)
     return layout
 
 
-def vector3_stamped(raw: bytes) -> Layout:
-    """Find the fields of a geometry_msgs/Vector3Stamped."""
-    layout = Layout(raw)
-    layout.header()
-    layout.numbers('vector', 'f8', 3)
-    return layout
-
-
 def joint_state(raw: bytes) -> Layout:
     """Find the names, positions and velocities of a sensor_msgs/JointState."""
-    layout = Layout(raw)
-    layout.header()
+    layout = header(raw)
     for i in range(layout.length()):
         layout.text(f'name{i}')
     for name in ('position', 'velocity'):
@@ -120,20 +113,24 @@ def joint_state(raw: bytes) -> Layout:
     return layout
 
 
-def temperature(raw: bytes) -> Layout:
-    """Find the fields of a sensor_msgs/Temperature."""
-    layout = Layout(raw)
-    layout.header()
-    layout.numbers('temperature', 'f8')
-    return layout
+def _one_field(name: str, code: str, count: int = 1) -> Callable[[bytes], Layout]:
+    """Return what finds the field that follows the header."""
+    def find(raw: bytes) -> Layout:
+        layout = header(raw)
+        layout.numbers(name, code, count)
+        return layout
+
+    return find
 
 
-def battery_state(raw: bytes) -> Layout:
-    """Find the voltage of a sensor_msgs/BatteryState."""
-    layout = Layout(raw)
-    layout.header()
-    layout.numbers('voltage', 'f4')
-    return layout
+vector3_stamped = _one_field('vector', 'f8', 3)
+"""Finds the fields of a geometry_msgs/Vector3Stamped."""
+
+temperature = _one_field('temperature', 'f8')
+"""Finds the fields of a sensor_msgs/Temperature."""
+
+battery_state = _one_field('voltage', 'f4')
+"""Finds the voltage of a sensor_msgs/BatteryState."""
 
 
 @dataclass(frozen=True)
