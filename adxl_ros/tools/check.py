@@ -11,7 +11,6 @@ from pathlib import Path
 import textwrap
 from typing import Any
 
-from adxl_ros.check.findings import check_recording, Findings
 from adxl_ros.diagnose.data_checks import DataFault
 from adxl_ros.diagnose.diagnosis import what_shows
 from adxl_ros.diagnose.report import shows_row
@@ -22,6 +21,7 @@ from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.report import page as html_page
 from adxl_ros.report.quantities import duration
+from adxl_ros.signals.findings import check_recording, Findings
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
 from adxl_ros.signals.recording_contents import RecordingContents
 from adxl_ros.tools.command_line import (
