@@ -124,28 +124,7 @@ def installed_path(name: str | os.PathLike) -> Path:
 
 
 def load(path: str | os.PathLike, may_measure: bool = False) -> Sensor:
-    """
-    Read and check a parameter file, or the installed file of a sensor by its name.
-
-    Parameters
-    ----------
-    path
-        The file.
-    may_measure
-        Whether values that can be measured may be missing; they are in `Sensor.unstated` then.
-
-    Returns
-    -------
-    Sensor
-        The sensor.
-
-    Raises
-    ------
-    UserError
-        The file cannot be read, is not YAML, or has a missing, unknown or wrong value. The
-        message names file, line and column.
-
-    """
+    """Return the installed file of a sensor by its name, such as MPU-6050; a path stays."""
     path = installed_path(path)
     flat, marks = _read(path)
 
@@ -162,23 +141,10 @@ def load(path: str | os.PathLike, may_measure: bool = False) -> Sensor:
 def from_flat(flat: Mapping[str, Any], make_error: MakeError, may_measure: bool = False
               ) -> Sensor:
     """
-    Make a `Sensor` of flat parameters, and check all of them.
+    Make a `Sensor` of flat parameters by dotted key (`sensor.serial`), and check all of them.
 
-    Parameters
-    ----------
-    flat
-        Values by dotted key (`sensor.serial`, `bias.offset_v`, ...). Keys of other nodes may be
-        among them.
-    make_error
-        Makes the exception to raise from a key and a reason.
-    may_measure
-        See `load`.
-
-    Returns
-    -------
-    Sensor
-        The sensor.
-
+    Keys of other nodes may be among them. `make_error` makes the exception to raise from a key
+    and a reason.
     """
     if flat.get('format') != FORMAT:
         raise make_error('format', f'version {flat.get("format")!r}, but this package reads '
@@ -276,7 +242,11 @@ def compose(path: str | os.PathLike) -> yaml.Node | None:
 
 
 def _yaml_error(path: str | os.PathLike, error: yaml.YAMLError) -> UserError:
-    """Return the error of a file that is not YAML, with its place where the parser names one."""
+    """
+    Read a YAML file as a tree of nodes, which know their places; None for an empty file.
+
+    An error names line and column.
+    """
     problem, mark = str(error), None
     if isinstance(error, yaml.MarkedYAMLError):
         problem, mark = str(error.problem), error.problem_mark

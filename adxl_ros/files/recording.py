@@ -69,30 +69,10 @@ def read(path: str | os.PathLike, reading: ReadingOptions = AS_IT_IS) -> Recordi
 def blocks(path: str | os.PathLike, rows: int, reading: ReadingOptions = AS_IT_IS
            ) -> Generator[Recording, None, None]:
     """
-    Read a recording in blocks; the memory is bounded by a block.
+    Read a recording in blocks of at most `rows` samples; the memory is bounded by a block.
 
     All blocks have the same columns, except for a CSV column that turns out to be text further
     down. Alignments, cut and remarks of a block are those up to its end.
-
-    Parameters
-    ----------
-    path
-        The recording.
-    rows
-        Largest number of samples of a block.
-    reading
-        Topic, columns and stamps where the recording does not state them.
-
-    Returns
-    -------
-    iterator
-        The blocks in the order of time.
-
-    Raises
-    ------
-    UserError
-        The recording cannot be read, or holds values that no sensor gives.
-
     """
     read_blocks = bag_reader.blocks(path, rows, reading=reading) if _is_bag(path) else \
         _table_blocks(path, rows, reading)
@@ -170,27 +150,10 @@ def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> Recording:
 @contextmanager
 def writer(path: str | os.PathLike, sensor: Sensor) -> Iterator[Callable[[Recording], None]]:
     """
-    Open a new recording, and yield a function that appends a block of samples to it.
+    Read the ideal specific force of another simulator, with times since `epoch_ns`.
 
-    The recording appears under its name when the block ends without an error, or not at all.
-
-    Parameters
-    ----------
-    path
-        The recording; its ending determines the format.
-    sensor
-        The unit whose nominal conversion a bag holds. A CSV file does not need it.
-
-    Yields
-    ------
-    callable
-        Takes the samples to append.
-
-    Raises
-    ------
-    UserError
-        The recording cannot be written.
-
+    It is a CSV file with `time_s, ax_mps2, ay_mps2, az_mps2`, or a bag with one topic of type
+    sensor_msgs/Imu, or several of which one is `imu/data_raw`.
     """
     if Path(path).suffix == '.csv':
         with csv_writer(path) as append:
@@ -201,7 +164,12 @@ def writer(path: str | os.PathLike, sensor: Sensor) -> Iterator[Callable[[Record
 
 
 def _csv_info(recording: Recording) -> dict[str, str]:
-    """Return the `# key: value` lines of a recording's CSV file."""
+    """
+    Open a new recording, and yield a function that appends a block of samples to it.
+
+    The recording appears under its name when the block ends without an error, or not at all; its
+    ending determines the format. A bag holds the nominal conversion of `sensor`.
+    """
     info = {key: value for key, value in recording.info.items() if key != 'epoch_ns'}
     return {**info, 'epoch_ns': str(recording.epoch_ns)} if recording.epoch_ns else info
 
@@ -230,7 +198,7 @@ def write(path: str | os.PathLike, recording: Recording, sensor: Sensor) -> None
 
 
 def _is_bag(path: str | os.PathLike) -> bool:
-    """Return whether a file is a bag or CSV; refuse other formats and misleading names."""
+    """Write a whole recording; see `writer`."""
     file_path = Path(path)
     if file_path.is_dir():
         return True
