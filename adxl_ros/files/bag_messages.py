@@ -22,7 +22,7 @@ from typing import Any, Protocol
 
 from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files import mcap_file
-from adxl_ros.files.cdr import collected_pieces, Piece, Raws
+from adxl_ros.files.mcap_file import collected_pieces, Piece, Raws
 from adxl_ros.model.constants import MEASURED_AXES
 import numpy as np
 import yaml

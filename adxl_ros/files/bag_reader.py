@@ -12,10 +12,11 @@ from pathlib import Path
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.files.bag_messages import Bag, find_ideal, find_topics, open_bag, read_info, Topics
-from adxl_ros.files.cdr import Piece, Raws
 from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
+from adxl_ros.files.mcap_file import Piece, Raws
 from adxl_ros.files.recording_columns import (
     ACCEL,
+    Alignment,
     BadStamps,
     COMMANDS,
     describe_bursts,
@@ -315,7 +316,7 @@ def _block(bag: Bag, samples: _Samples, tracks: dict[str, Track], commands: dict
     for name, track in tracks.items():
         columns[name] = track.interpolate(stamp_ns)
         track.forget(int(stamp_ns[-1]))
-        alignments[name] = track.alignment
+        alignments[name] = Alignment(*track.alignment)
     for name, command in commands.items():
         columns[name] = command.in_force(stamp_ns)
         command.forget(int(stamp_ns[-1]))
