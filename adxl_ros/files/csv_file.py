@@ -293,7 +293,7 @@ def find_form(path: str) -> Form:
             _HEAD_LINES)]
     written = [line for line in lines if line.strip() and not line.lstrip().startswith('#')]
     if not written:
-        raise NoNumbers(f'{path}: is empty; a recording has a header and a line for each sample')
+        raise UserError(f'{path}: is empty')
     plain = [_plain(line.encode()).decode() for line in lines]
     best, form = (0, 0), None
     for rows in (lines, plain) if plain != lines else (lines,):
