@@ -209,7 +209,9 @@ class _Converter:
     def convert(self, block: TableBlock) -> Recording:
         """Return the samples of a block."""
         outputs = self._outputs(block)
-        is_sample = ~np.isnan(outputs).all(axis=1)
+        # In the package's own recordings, every line is a sample.
+        is_sample = ~np.isnan(outputs).all(axis=1) | (
+            self.is_native and not self.reading.drop_bad_stamps)
         self._empty += int((~is_sample).sum())
         self._check_outputs(block, outputs, is_sample)
         time_s, is_kept = self._times(block, is_sample)
