@@ -116,15 +116,6 @@ def sync(path: Path) -> None:
 
 _KEPT_BYTES = 256 << 20
 """Part of a file that stays in the cache for whoever reads it next (chosen)."""
-_LARGE_BYTES = 2 << 30
-"""Size from which a file that is read leaves the cache (chosen): smaller ones are read again."""
-
-
-def release_read(file: BinaryIO) -> None:
-    """Give back the page cache of what was read of a large file, up to the present place."""
-    if os.fstat(file.fileno()).st_size > _LARGE_BYTES:
-        # From its begin on, because the system keeps a large page that is only partly within.
-        os.posix_fadvise(file.fileno(), 0, file.tell(), os.POSIX_FADV_DONTNEED)
 
 
 def release_written(file: BinaryIO) -> None:

@@ -20,9 +20,9 @@ import shutil
 from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
-from adxl_ros.errors import install_hint, UserError
+from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files import mcap_file
-from adxl_ros.files.cdr import collected_pieces, Piece, Raws
+from adxl_ros.files.mcap_file import collected_pieces, Piece, Raws
 from adxl_ros.model.constants import MEASURED_AXES
 import numpy as np
 import yaml
@@ -155,7 +155,7 @@ class _RosbagsPart:
 
 def _unreadable(path: Path, error: Exception) -> UserError:
     """Return the error of a file that rosbags cannot read."""
-    reason = ' '.join(str(error).split()) or f'damaged ({type(error).__name__})'
+    reason = one_line(error) or f'damaged ({type(error).__name__})'
     return UserError(f'{path}: cannot read it as a rosbag2 recording: {reason}')
 
 
@@ -217,34 +217,29 @@ def _unzipped(stack: ExitStack, path: Path) -> Path:
 
 
 def _files(path: Path) -> list[Path]:
-    """Return the files of a recording in the order of time."""
+    """Return the files of a recording in the order of time, as metadata.yaml lists them."""
     if not path.is_dir():
         return [path]
-    listed = _listed_files(path)
-    files = sorted((file for file in path.iterdir() if file.name.endswith(_ENDINGS)),
-                   key=_file_number) if listed is None else listed
-    if not files:
-        raise UserError(f'{path}: is a directory without metadata.yaml, .mcap or .db3 files; '
-                        'expected a rosbag2 recording')
-    for file in files:
-        if not file.exists():
-            raise UserError(f'{path}: metadata.yaml names {file.name}, which is not there')
-    return files
-
-
-def _listed_files(path: Path) -> list[Path] | None:
-    """Return the files that metadata.yaml names; None where it does not exist."""
     metadata = path / 'metadata.yaml'
+    if not metadata.exists():
+        files = sorted((file for file in path.iterdir() if file.name.endswith(_ENDINGS)),
+                       key=_file_number)
+        if not files:
+            raise UserError(f'{path}: is a directory without metadata.yaml, .mcap or .db3 files; '
+                            'expected a rosbag2 recording')
+        return files
     try:
-        with open(metadata, encoding='utf-8') as file:
-            content = yaml.safe_load(file)
+        content = yaml.safe_load(metadata.read_bytes())
         names = content['rosbag2_bagfile_information']['relative_file_paths']
-        return [path / Path(name).name for name in names]
-    except FileNotFoundError:
-        return None
+        files = [path / Path(name).name for name in names]
     except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError) as error:
         raise UserError(f'{metadata}: does not list the files of a recording: '
-                        f'{" ".join(str(error).split())}; run ros2 bag reindex') from None
+                        f'{one_line(error)}; run ros2 bag reindex') from None
+    missing = [file.name for file in files if not file.exists()]
+    if missing or not files:
+        raise UserError(f'{path}: metadata.yaml names {missing[0] if missing else "no file"}, '
+                        'which is not there')
+    return files
 
 
 def _file_number(path: Path) -> tuple[int, str]:
@@ -292,84 +287,62 @@ class Topics:
 
 def find_topics(bag: Bag, topic: str = '') -> Topics:
     """Find the topics by their names, in any namespace, and their types."""
-    imu = _chosen(bag, topic) if topic else _only(bag, 'imu/data_raw', IMU) or _only_imu(bag)
+    imu = _find_imu(bag, topic)
     space = imu.removesuffix('imu/data_raw')
     if space == imu:
         space = imu[:imu.rfind('/') + 1]
     joints = _beside(bag, space, 'stage/joint_states', JOINT_STATE)
     stage = (joints or f'{space}stage/joint_states').removesuffix('joint_states')
+    # With several sensors, the only sensor_info may be that of another one.
+    is_alone = imu.endswith('imu/data_raw') or len(_imu_topics(bag)) == 1
     return Topics(imu, joints,
-                  _info(bag, imu, space),
+                  (_beside if is_alone else _typed)(bag, space, 'sensor_info', DIAGNOSTIC_STATUS),
                   # Other nodes use these names, too: a topic of another type is ignored.
-                  _typed(bag, space + 'temperature', TEMPERATURE),
-                  _typed(bag, space + 'supply', BATTERY_STATE),
-                  _typed(bag, stage + 'command', JOINT_STATE))
+                  _typed(bag, space, 'temperature', TEMPERATURE),
+                  _typed(bag, space, 'supply', BATTERY_STATE),
+                  _typed(bag, stage, 'command', JOINT_STATE))
 
 
-def _chosen(bag: Bag, topic: str) -> str:
-    """Return the full name of the topic that the user has named."""
-    kinds = {kind for name, kind in bag.types if name.lstrip('/') == topic.lstrip('/')}
-    if IMU in kinds:
-        return next(name for name, kind in bag.types
-                    if kind == IMU and name.lstrip('/') == topic.lstrip('/'))
-    if kinds:
-        raise UserError(f'{bag.path}: topic {topic} is of type {", ".join(sorted(kinds))}, '
-                        f'expected {IMU}; {_imu_choices(bag)}')
-    raise UserError(f'{bag.path}: no topic {topic}; {_imu_choices(bag)}')
+def find_ideal(bag: Bag) -> Topics:
+    """Find another simulator's specific force: the only topic of its type, or imu/data_raw."""
+    topics = _imu_topics(bag)
+    return Topics(topics[0] if len(topics) == 1 else _find_imu(bag, ''))
+
+
+def _find_imu(bag: Bag, named: str) -> str:
+    """Return the topic that the user has named, that of this package, or the only one."""
+    topics = _imu_topics(bag)
+    if named:
+        same = {name: kind for name, kind in sorted(bag.types)
+                if name.lstrip('/') == named.lstrip('/')}
+        chosen = next((name for name in same if name in topics), None)
+        if chosen is None:
+            kinds = f'topic {named} is of type {", ".join(same.values())}, expected {IMU}' \
+                if same else f'no topic {named}'
+            raise UserError(f'{bag.path}: {kinds}; ' + (
+                f'name one of {", ".join(topics)}' if topics else f'it holds {_contents(bag)}'))
+        return chosen
+    own = _only(bag, 'imu/data_raw', IMU)
+    if own or len(topics) == 1:
+        return own or topics[0]
+    if topics:
+        raise UserError(f'{bag.path}: several topics of type {IMU}, none of them imu/data_raw: '
+                        f'{", ".join(topics)}; choose one: --topic {topics[0]}')
+    raise UserError(f'{bag.path}: no topic of type {IMU}; it holds {_contents(bag)}')
 
 
 def _imu_topics(bag: Bag) -> list[str]:
     return sorted(topic for topic, kind in bag.types if kind == IMU)
 
 
-def _imu_choices(bag: Bag) -> str:
-    """Return which topics `--topic` can name, for messages."""
-    topics = _imu_topics(bag)
-    return f'name one of {", ".join(topics)}' if topics else f'it holds {_contents(bag)}'
-
-
-def _only_imu(bag: Bag) -> str:
-    """Return the only topic of the sensor's type."""
-    topics = _imu_topics(bag)
-    if len(topics) == 1:
-        return topics[0]
-    if topics:
-        raise UserError(f'{bag.path}: several topics of type {IMU}, none of them imu/data_raw: '
-                        f'{", ".join(topics)}; choose one: --topic {topics[0]}')
-    raise UserError(f'{bag.path}: no topic imu/data_raw of type {IMU}, and no other of this type; '
-                    f'it holds {_contents(bag)}')
-
-
-def _info(bag: Bag, imu: str, space: str) -> str | None:
-    """Return the topic on which the sensor states its values."""
-    if imu.endswith('imu/data_raw') or len(_imu_topics(bag)) == 1:
-        return _beside(bag, space, 'sensor_info', DIAGNOSTIC_STATUS)
-    # With several sensors, the only sensor_info may be that of another one.
-    return _typed(bag, space + 'sensor_info', DIAGNOSTIC_STATUS)
-
-
-def find_ideal(bag: Bag) -> Topics:
-    """Find another simulator's specific force: the only topic of type sensor_msgs/Imu."""
-    candidates = sorted(topic for topic, kind in bag.types if kind == IMU)
-    if len(candidates) == 1:
-        return Topics(candidates[0])
-    if not candidates:
-        raise UserError(f'{bag.path}: no topic of type {IMU}; it holds {_contents(bag)}')
-    imu = _only(bag, 'imu/data_raw', IMU)
-    if imu is None:
-        raise UserError(f'{bag.path}: several topics of type {IMU}, none of them imu/data_raw: '
-                        f'{", ".join(candidates)}; record one')
-    return Topics(imu)
-
-
-def _typed(bag: Bag, topic: str, kind: str) -> str | None:
-    """Return a topic if the bag holds it with this type, else None."""
-    return topic if (topic, kind) in bag.types else None
+def _typed(bag: Bag, space: str, name: str, kind: str) -> str | None:
+    """Return the topic in a namespace if the bag holds it with this type, else None."""
+    return space + name if (space + name, kind) in bag.types else None
 
 
 def _beside(bag: Bag, space: str, name: str, kind: str) -> str | None:
     """Return the topic in the sensor's own namespace or, if there is none, the only one."""
-    return _typed(bag, space + name, kind) or _only(bag, name, kind)
+    return _typed(bag, space, name, kind) or _only(bag, name, kind)
 
 
 def _only(bag: Bag, name: str, kind: str) -> str | None:

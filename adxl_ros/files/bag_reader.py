@@ -5,17 +5,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Mapping
+import itertools
 import os
 from pathlib import Path
-import struct
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.files.bag_messages import Bag, find_ideal, find_topics, open_bag, read_info, Topics
-from adxl_ros.files.cdr import Piece, Raws
 from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
+from adxl_ros.files.mcap_file import Piece, Raws
 from adxl_ros.files.recording_columns import (
     ACCEL,
+    Alignment,
     BadStamps,
     COMMANDS,
     describe_bursts,
@@ -133,13 +134,9 @@ class _Samples:
         if not parts:
             self.arrived_ns = self.arrived_ns[-1:]
             return
-        size = _count(parts)
-        stamp_ns = np.empty(size, np.int64)
-        accel = np.empty((size, 3))
-        for table in _tables(self.where, parts, cdr.imu):
-            stamp_ns[table.rows] = table.stamp_ns()
-            accel[table.rows] = table.numbers('linear_acceleration')
-            self._check_frame(table)
+        stamp_ns, accel = _values(self.where, parts, cdr.imu, 'linear_acceleration', 3,
+                                  self._check_frame)
+        size = len(stamp_ns)
         if self._last_ns is None:
             self._begin(parts[0][:1], int(stamp_ns[0]))
             self._first_ns = int(stamp_ns[0])
@@ -148,9 +145,9 @@ class _Samples:
             stamp_ns = self._first_ns + np.rint(number * 1e9 / self._reading.rate_hz).astype(
                 np.int64)
         self.arrived_ns = np.concatenate([self.arrived_ns[-1:], stamp_ns])
-        if self._reading.drop_bad_stamps:
-            stamp_ns, accel = self._increasing(stamp_ns, accel)
-        self._check_time(stamp_ns)
+        is_kept = self._increasing(stamp_ns)
+        stamp_ns, accel = stamp_ns[is_kept], accel[is_kept]
+        self._last_ns = int(stamp_ns[-1]) if len(stamp_ns) else self._last_ns
         self._check_values(stamp_ns, accel)
         self.count += len(stamp_ns)
         self.stamp_ns = np.concatenate([self.stamp_ns, stamp_ns])
@@ -165,17 +162,23 @@ class _Samples:
         return (f'{self.where}: left out, messages whose stamp does not increase: '
                 f'{left_out}',)
 
-    def _increasing(self, stamp_ns: np.ndarray, accel: np.ndarray
-                    ) -> tuple[np.ndarray, np.ndarray]:
-        """Leave out and count the samples whose stamp does not increase."""
-        before = stamp_ns[0] - 1 if self._last_ns is None else self._last_ns
-        latest = np.maximum.accumulate(np.concatenate([[before], stamp_ns]))[:-1]
+    def _increasing(self, stamp_ns: np.ndarray) -> np.ndarray:
+        """Return which stamps, ns, (n,), increase; refuse the others unless they are left out."""
+        latest = np.maximum.accumulate(np.concatenate([
+            [stamp_ns[0] - 1 if self._last_ns is None else self._last_ns], stamp_ns]))[:-1]
         is_kept = stamp_ns > latest
+        if not is_kept.all() and not self._reading.drop_bad_stamps:
+            i = int(is_kept.argmin())
+            verb = 'stands still' if stamp_ns[i] == latest[i] else 'runs backwards'
+            raise UserError(f'{self.where}: time {verb}: message {self.count + i + 1} is stamped '
+                            f'{seconds(stamp_ns[i])} after {seconds(latest[i])}'
+                            f'{describe_bursts((stamp_ns - stamp_ns[0]) / 1e9)}; '
+                            '--drop-bad-stamps leaves such messages out')
         duplicates = int((stamp_ns == latest).sum())
-        before_them = self.bad_stamps
-        self.bad_stamps = BadStamps(before_them.duplicates + duplicates,
-                                    before_them.backward + int((~is_kept).sum()) - duplicates)
-        return stamp_ns[is_kept], accel[is_kept]
+        self.bad_stamps = BadStamps(
+            self.bad_stamps.duplicates + duplicates,
+            self.bad_stamps.backward + int((~is_kept).sum()) - duplicates)
+        return is_kept
 
     def ready(self, tracks: dict[str, Track]) -> int:
         """Return how many samples have all their references; the last one always waits."""
@@ -210,21 +213,6 @@ class _Samples:
                             'record each sensor on a topic of its own')
         self._frame = frame
 
-    def _check_time(self, stamp_ns: np.ndarray) -> None:
-        if not len(stamp_ns):
-            return
-        before = stamp_ns[0] - 1 if self._last_ns is None else self._last_ns
-        earlier = np.concatenate([[before], stamp_ns[:-1]])
-        wrong = stamp_ns <= earlier
-        if wrong.any():
-            i = int(wrong.argmax())
-            verb = 'stands still' if stamp_ns[i] == earlier[i] else 'runs backwards'
-            raise UserError(f'{self.where}: time {verb}: message {self.count + i + 1} is stamped '
-                            f'{seconds(stamp_ns[i])} after {seconds(earlier[i])}'
-                            f'{describe_bursts((stamp_ns - stamp_ns[0]) / 1e9)}; '
-                            '--drop-bad-stamps leaves such messages out')
-        self._last_ns = int(stamp_ns[-1])
-
     def _check_values(self, stamp_ns: np.ndarray, accel: np.ndarray) -> None:
         wrong = ~(np.abs(accel) <= LIMIT)
         if wrong.any():
@@ -234,11 +222,6 @@ class _Samples:
                             f'{accel[i, axis]:g} m/s², expected a number within ±{LIMIT:g}')
 
 
-def _count(parts: list[Raws]) -> int:
-    """Return the number of messages."""
-    return sum(map(len, parts))
-
-
 def _tables(where: str, parts: list[Raws],
             find: Callable[[bytes], cdr.Layout]) -> Iterator[cdr.Table]:
     """Group messages by layout; a damaged one is an error that names file and topic."""
@@ -246,6 +229,40 @@ def _tables(where: str, parts: list[Raws],
         yield from cdr.joined_tables(parts, find)
     except cdr.CdrError as error:
         raise UserError(f'{where}: a message is damaged: {error}') from None
+
+
+def _values(where: str, parts: list[Raws], find: Callable[[bytes], cdr.Layout], name: str,
+            size: int = 1, look: Callable[[cdr.Table], None] = lambda table: None
+            ) -> tuple[np.ndarray, np.ndarray]:
+    """Return stamps, ns, (k,), and a field, (k, size), of messages; `look` sees each layout."""
+    count = sum(map(len, parts))
+    stamp_ns, values = np.empty(count, np.int64), np.empty((count, size))
+    for table in _tables(where, parts, find):
+        stamp_ns[table.rows] = table.stamp_ns()
+        values[table.rows] = table.numbers(name)
+        look(table)
+    return stamp_ns, values
+
+
+def _joints(where: str, parts: list[Raws], names: Mapping[str, str]
+            ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return stamps and positions by column; a joint that a message does not name is NaN there."""
+    count = sum(map(len, parts))
+    stamp_ns = np.empty(count, np.int64)
+    values = {column: np.full(count, np.nan) for column in names.values()}
+    for table in _tables(where, parts, cdr.joint_state):
+        stamp_ns[table.rows] = table.stamp_ns()
+        joints = [text for key, text in table.layout.texts.items() if key != 'frame_id']
+        if 'position' in table.layout.fields:
+            for joint, value in zip(joints, table.numbers('position').T):
+                if joint in names:
+                    values[names[joint]][table.rows] = value
+    return {column: (stamp_ns, value) for column, value in values.items()}
+
+
+_SCALARS = {'temperature_c': (cdr.temperature, 'temperature'),
+            'supply_v': (cdr.battery_state, 'voltage')}
+"""Layout and field of the messages of a reference that is one number."""
 
 
 def _tracks(bag: Bag, topics: Topics) -> dict[str, Track]:
@@ -264,10 +281,10 @@ def _add_references(bag: Bag, topics: Topics, tracks: dict[str, Track],
         where = f'{bag.path}: topic {topic}'
         if topic == topics.joints:
             columns = _joints(where, parts, JOINTS)
-        elif topic == topics.temperature:
-            columns = {'temperature_c': _scalar(where, parts, cdr.temperature, 'temperature')}
         else:
-            columns = {'supply_v': _scalar(where, parts, cdr.battery_state, 'voltage')}
+            column = 'temperature_c' if topic == topics.temperature else 'supply_v'
+            stamp_ns, values = _values(where, parts, *_SCALARS[column])
+            columns = {column: (stamp_ns, values[:, 0])}
         for column, (stamp_ns, value) in columns.items():
             wrong = np.abs(value) > LIMIT
             if wrong.any():
@@ -288,33 +305,6 @@ def _add_commands(where: str, commands: dict[str, Command], parts: list[Raws],
                              np.where(np.abs(value) <= LIMIT, value, np.nan))
 
 
-def _scalar(where: str, parts: list[Raws], find: Callable[[bytes], cdr.Layout],
-            name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return stamps, ns, (k,), and the values of one field, (k,)."""
-    stamp_ns, value = np.empty(_count(parts), np.int64), np.empty(_count(parts))
-    for table in _tables(where, parts, find):
-        stamp_ns[table.rows] = table.stamp_ns()
-        value[table.rows] = table.numbers(name)[:, 0]
-    return stamp_ns, value
-
-
-def _joints(where: str, parts: list[Raws], names: Mapping[str, str]
-            ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return stamps and positions by column; a joint that a message does not name is NaN there."""
-    stamp_ns = np.empty(_count(parts), np.int64)
-    values = {column: np.full(_count(parts), np.nan) for column in names.values()}
-    for table in _tables(where, parts, cdr.joint_state):
-        stamp_ns[table.rows] = table.stamp_ns()
-        joints = [text for key, text in table.layout.texts.items() if key != 'frame_id']
-        if 'position' not in table.layout.fields:
-            continue
-        position = table.numbers('position')
-        for joint, value in zip(joints, position.T):
-            if joint in names:
-                values[names[joint]][table.rows] = value
-    return {column: (stamp_ns, value) for column, value in values.items()}
-
-
 def _block(bag: Bag, samples: _Samples, tracks: dict[str, Track], commands: dict[str, Command],
            info: dict[str, str], part: slice) -> Recording:
     """Make a block of waiting samples, with references and commands at their stamps."""
@@ -326,7 +316,7 @@ def _block(bag: Bag, samples: _Samples, tracks: dict[str, Track], commands: dict
     for name, track in tracks.items():
         columns[name] = track.interpolate(stamp_ns)
         track.forget(int(stamp_ns[-1]))
-        alignments[name] = track.alignment
+        alignments[name] = Alignment(*track.alignment)
     for name, command in commands.items():
         columns[name] = command.in_force(stamp_ns)
         command.forget(int(stamp_ns[-1]))
@@ -345,12 +335,6 @@ def drop_unsampled(recording: Recording) -> None:
             recording.alignments.pop(column, None)
 
 
-_STAMP = {0: struct.Struct('>iI'), 1: struct.Struct('<iI')}
-"""Seconds and nanoseconds at the begin of a header, by the lowest bit of the CDR identifier."""
-
-_STAMP_BYTE = 4
-"""Place of the stamp, after the identifier (DDSI-RTPS, 10.2)."""
-
 _ROWS = 65536
 """Messages of a block (chosen: some MB)."""
 
@@ -361,23 +345,13 @@ def has_log_times(path: str | os.PathLike) -> bool:
 
 
 def log_times(path: str | os.PathLike, topic: str) -> Iterator[np.ndarray]:
-    """
-    Read header stamp and log time of the samples of a bag in blocks.
-
-    yields: header stamp and log time by message, ns, (k, 2).
-    """
+    """Yield header stamp and log time of the samples of a bag, ns, (k, 2), in blocks."""
     with open_bag(path) as bag:
         imu = find_topics(bag, topic).imu
-        times: list[tuple[int, int]] = []
-        for _, raw, log_ns in bag.logged_messages([imu]):
-            try:
-                seconds, nanoseconds = _STAMP[raw[1] & 1].unpack_from(raw, _STAMP_BYTE)
-            except (IndexError, struct.error):
-                raise UserError(f'{bag.path}: topic {imu}: a message is damaged: it ends before '
-                                'its stamp') from None
-            times.append((seconds * 1_000_000_000 + nanoseconds, log_ns))
-            if len(times) == _ROWS:
-                yield np.array(times)
-                times = []
-        if times:
-            yield np.array(times)
+        messages = bag.logged_messages([imu])
+        while block := list(itertools.islice(messages, _ROWS)):
+            stamp_ns = np.empty(len(block), np.int64)
+            for table in _tables(f'{bag.path}: topic {imu}', [[raw for _, raw, _ in block]],
+                                 cdr.header):
+                stamp_ns[table.rows] = table.stamp_ns()
+            yield np.column_stack([stamp_ns, [log_ns for _, _, log_ns in block]])

@@ -10,9 +10,8 @@ written, as one table of bytes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-import itertools
 import struct
 
 import numpy as np
@@ -76,12 +75,6 @@ class Layout:
         self.fixed += range(start, start + size)
         self.texts[name] = self._raw[start:start + size].rstrip(b'\0').decode(errors='replace')
 
-    def header(self) -> None:
-        """Pass over a std_msgs/Header."""
-        self.numbers('sec', 'i4')
-        self.numbers('nanosec', 'u4')
-        self.text('frame_id')
-
     def _aligned(self, size: int) -> int:
         return self._offset + (_BODY_OFFSET - self._offset) % size
 
@@ -91,28 +84,27 @@ class Layout:
             raise CdrError(f'{len(self._raw)} bytes are too few for it')
 
 
+def header(raw: bytes) -> Layout:
+    """Find the stamp and the frame of a message with a header."""
+    layout = Layout(raw)
+    layout.numbers('sec', 'i4')
+    layout.numbers('nanosec', 'u4')
+    layout.text('frame_id')
+    return layout
+
+
 def imu(raw: bytes) -> Layout:
     """Find the fields of a sensor_msgs/Imu."""
-    layout = Layout(raw)
-    layout.header()
+    layout = header(raw)
     for name, count in (('orientation', 4), ('angular_velocity', 3), ('linear_acceleration', 3)):
         layout.numbers(name, 'f8', count)
         layout.numbers(f'{name}_covariance', 'f8', 9)
     return layout
 
 
-def vector3_stamped(raw: bytes) -> Layout:
-    """Find the fields of a geometry_msgs/Vector3Stamped."""
-    layout = Layout(raw)
-    layout.header()
-    layout.numbers('vector', 'f8', 3)
-    return layout
-
-
 def joint_state(raw: bytes) -> Layout:
     """Find the names, positions and velocities of a sensor_msgs/JointState."""
-    layout = Layout(raw)
-    layout.header()
+    layout = header(raw)
     for i in range(layout.length()):
         layout.text(f'name{i}')
     for name in ('position', 'velocity'):
@@ -120,20 +112,24 @@ def joint_state(raw: bytes) -> Layout:
     return layout
 
 
-def temperature(raw: bytes) -> Layout:
-    """Find the fields of a sensor_msgs/Temperature."""
-    layout = Layout(raw)
-    layout.header()
-    layout.numbers('temperature', 'f8')
-    return layout
+def _one_field(name: str, code: str, count: int = 1) -> Callable[[bytes], Layout]:
+    """Return what finds the field that follows the header."""
+    def find(raw: bytes) -> Layout:
+        layout = header(raw)
+        layout.numbers(name, code, count)
+        return layout
+
+    return find
 
 
-def battery_state(raw: bytes) -> Layout:
-    """Find the voltage of a sensor_msgs/BatteryState."""
-    layout = Layout(raw)
-    layout.header()
-    layout.numbers('voltage', 'f4')
-    return layout
+vector3_stamped = _one_field('vector', 'f8', 3)
+"""Finds the fields of a geometry_msgs/Vector3Stamped."""
+
+temperature = _one_field('temperature', 'f8')
+"""Finds the fields of a sensor_msgs/Temperature."""
+
+battery_state = _one_field('voltage', 'f4')
+"""Finds the voltage of a sensor_msgs/BatteryState."""
 
 
 @dataclass(frozen=True)
@@ -157,11 +153,7 @@ class Table:
         return sec * 1_000_000_000 + nanosec
 
 
-Raws = Sequence[bytes] | np.ndarray
-"""Messages of one type: their bytes one by one, or as rows of equal length, (n, size)."""
-
-
-def tables(raws: Raws, find: Callable[[bytes], Layout]) -> Iterator[Table]:
+def tables(raws: Sequence[bytes] | np.ndarray, find: Callable[[bytes], Layout]) -> Iterator[Table]:
     """Group messages by layout."""
     if isinstance(raws, np.ndarray):
         yield from _tables_of_rows(np.arange(len(raws)), raws, find)
@@ -186,7 +178,8 @@ def _tables_of_rows(rows: np.ndarray, data: np.ndarray, find: Callable[[bytes], 
         rows, data = rows[differs], data[differs]
 
 
-def joined_tables(parts: Sequence[Raws], find: Callable[[bytes], Layout]) -> Iterator[Table]:
+def joined_tables(parts: Sequence[Sequence[bytes] | np.ndarray],
+                  find: Callable[[bytes], Layout]) -> Iterator[Table]:
     """Group messages by layout, part by part."""
     begin = 0
     for raws in parts:
@@ -216,43 +209,3 @@ def fill(template: bytes, layout: Layout, stamp_ns: np.ndarray,
     for name, place in zip(values, places):
         records[name] = values[name].reshape(-1, place.count)
     return data
-
-
-_PIECE_MESSAGES = 4096
-"""Messages that are collected to a piece (chosen: some MB)."""
-
-
-@dataclass(frozen=True)
-class Piece:
-    """Consecutive messages of some topics."""
-
-    messages: Mapping[str, Raws]  # The messages by topic, in the order of recording
-    # Where each of them stands in the order of all, by topic, (n,), ascending
-    places: Mapping[str, np.ndarray]
-
-    def split(self, topic: str, count: int) -> tuple[Piece, Piece]:
-        """Split behind a message."""
-        last = self.places[topic][count - 1]
-        cuts = {name: int(np.searchsorted(places, last, 'right'))
-                for name, places in self.places.items()}
-        return (Piece({name: raws[:cuts[name]] for name, raws in self.messages.items()},
-                      {name: places[:cuts[name]] for name, places in self.places.items()}),
-                Piece({name: raws[cuts[name]:] for name, raws in self.messages.items()},
-                      {name: places[cuts[name]:] for name, places in self.places.items()}))
-
-
-def collected_pieces(messages: Iterable[tuple[str, bytes, int]]) -> Iterator[Piece]:
-    """Collect messages with topic and log time, ns, to pieces."""
-    iterator = iter(messages)
-    while batch := list(itertools.islice(iterator, _PIECE_MESSAGES)):
-        yield collected([(topic, raw) for topic, raw, _ in batch])
-
-
-def collected(messages: list[tuple[str, bytes]]) -> Piece:
-    """Collect messages with their topics to one piece."""
-    raws: dict[str, list[bytes]] = {topic: [] for topic, _ in messages}
-    places: dict[str, list[int]] = {topic: [] for topic in raws}
-    for place, (topic, raw) in enumerate(messages):
-        raws[topic].append(raw)
-        places[topic].append(place)
-    return Piece(raws, {topic: np.array(numbers) for topic, numbers in places.items()})

@@ -5,25 +5,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import combinations
 import re
-import shlex
 
 from adxl_ros.files.column_mapping import (
     ColumnMapping,
+    is_sensor_step,
+    likely_unit,
+    listed,
     LSB,
     Quantity,
     ROLES,
+    shell_quoted,
     signed,
     Source,
+    Table,
+    time_unit_of_step,
     unit_in_name,
     UNITS,
     UNSIGNED,
 )
-from adxl_ros.files.mapped_recording import likely_unit, listed
 from adxl_ros.files.recording_columns import burst_samples, stamped_rate_hz
-from adxl_ros.files.tables import Table
 from adxl_ros.model.constants import AXES, G0_MPS2
 import numpy as np
 
@@ -77,17 +79,11 @@ _REFERENCES = {
 _ATTITUDE = re.compile(r'(?i)yaw|heading|quat')
 """Names beside an attitude that software has estimated."""
 
-_EPOCHS = ((1e9, 'ns'), (1e6, 'us'), (1e3, 'ms'), (1.0, 's'))
+_EPOCHS = ((1e9, 'ns'), (1e6, 'us'), (1e3, 'ms'), (1.0, 'epoch'))
 """Counts of a second of each unit."""
 
 _EPOCH_S = (9e8, 4e9)
 """Bounds of times since 1970, s: 1998 to 2096."""
-
-_SHORTEST_STEP_S = 5e-5
-"""Shortest step of stamps, s. Chosen: twice the rate of the fastest sensor."""
-
-_LONGEST_STEP_S = 1.05
-"""Longest step of stamps, s. Chosen: 1 Hz, the slowest rate of the package, with jitter."""
 
 _CONSTANT = 0.3
 """Largest relative scatter of a length that is that of gravity (chosen: a hand that turns a
@@ -124,85 +120,58 @@ _COUNTS = (64, 100, 128, 256, 512, 1000, 1024, 1365, 2048, 4096, 8192, 16384, 32
 """Usual counts of 1 g."""
 
 
-@dataclass(frozen=True)
-class Proposal:
-    """A mapping that is proposed."""
-
-    mapping: ColumnMapping  # Columns and units by role
-    # lsb_per_g, lsb_at_0g: Counts of 1 g, and at 0 g; 0 where no column is in LSB
-    lsb_per_g: float
-    lsb_at_0g: float
-    reasons: Sequence[str]  # What it follows from
-    stamps: str = ''  # Options without which the stamps are refused; empty where they are sound
-    note: str = ''  # What the user has to add, in brackets; empty for nothing
-
-    def options(self) -> str:
-        """Return the options, quoted for a shell."""
-        text = f'--columns {shell_quoted(str(self.mapping))}'
-        text += f' {self.stamps}' if self.stamps else ''
-        text += f' --lsb-per-g {self.lsb_per_g:.0f}' if self.lsb_per_g else ''
-        return text + (f' --lsb-at-0g {self.lsb_at_0g:.0f}' if self.lsb_at_0g else '')
-
-
-def is_sensor_step(step_s: float, is_whole: bool) -> bool:
-    """Return whether samples come at such steps; at whole seconds they hardly do."""
-    return _SHORTEST_STEP_S <= step_s <= _LONGEST_STEP_S and not (is_whole and step_s >= 1)
-
-
-def time_unit_of_step(step: float, is_whole: bool) -> str:
-    """Return the likely unit of stamps."""
-    return next((unit for unit in ('s', 'ms', 'us', 'ns') if is_sensor_step(
-        step / UNITS[Quantity.TIME][unit].divisor, is_whole)), 's')
-
-
-def shell_quoted(text: str) -> str:
-    """Return a word for a shell, in quotes even where it needs none."""
-    quoted = shlex.quote(text)
-    return quoted if quoted != text else f"'{text}'"
-
-
-def propose(table: Table) -> Proposal | None:
-    """Return the best mapping of a table; None where no column looks like a sensor's."""
+def describe(table: Table) -> tuple[str, str]:
+    """Describe the columns of a table, and the options that most likely read it."""
+    seen = f'the columns are {listed(table.names)}' + f' ({table.form})' * bool(table.form)
     values = {name: np.where(np.abs(column) < _LARGEST, column, np.nan)
               for name, column in table.sample().items()}
     time = _time_column(table, values)
     outputs = _outputs(table, {name: column for name, column in values.items() if name != time})
     readings = np.column_stack([values[name] for name in outputs]) if outputs else np.zeros((0, 1))
     readings = readings[np.isfinite(readings).all(axis=1)]
-    if not len(readings):
-        return None
-    sources: dict[str, Source] = {}
-    reasons = []
+    unit, zero, length, is_stated = _unit(table, outputs, readings)
+    if not unit:
+        return (f'{seen}; none looks like an accelerometer: name the columns, for example',
+                "--columns 'time=COLUMN:s,x=COLUMN:g,y=COLUMN:g,z=COLUMN:g'")
+    about = f' about {zero:.4g}' * (zero != 0)
+    reason = f'the readings have a length of {length:.4g}{about}'
+    reason += f', so {unit}' * (not is_stated)
+    sources = {axis: Source(name, unit) for axis, name in zip(AXES, outputs)}
+    stamps, note = '--rate HZ', ' (write the sample rate for HZ)'
     if time:
-        unit, reason = _time_unit(table, time, values[time])
-        sources['time'] = Source(time, unit)
-        reasons.append(reason)
+        source, time_reason = _time_source(table, time, values[time])
+        reason, sources = f'{time_reason} and {reason}', {'time': source, **sources}
+        stamps, note = _stamp_options(values[time], source), _note(unit, zero)
+    sources |= _references(table, values, {*outputs, time or ''})
+    options = f'--columns {shell_quoted(str(ColumnMapping(sources)))}'
+    options += f' {stamps}' * bool(stamps)
+    if unit in (LSB, UNSIGNED):
+        options += f' --lsb-per-g {round(length) if zero else _counts(length):.0f}'
+        options += f' --lsb-at-0g {zero:.0f}' * bool(zero)
+    return f'{seen}; the best guess, because {reason}{note}:', options
+
+
+def _unit(table: Table, outputs: Sequence[str], readings: np.ndarray
+          ) -> tuple[str, float, float, bool]:
+    """
+    Return the unit of readings, (n, m); empty where they are not those of an accelerometer.
+
+    Also the reading at 0 g, the length of gravity about it, and whether the table states the unit.
+    """
+    if not len(readings):
+        return '', 0.0, 0.0, False
     stated = table.units.get(outputs[0]) or unit_in_name(outputs[0], Quantity.OUTPUT)
-    names = outputs if table.has_names else []
     is_unsigned = stated in (None, LSB) and _has_lost_sign(readings)
     zero, length = _zero_and_length(signed(readings) if is_unsigned else readings)
     unit = UNSIGNED if is_unsigned else stated or ('' if zero else likely_unit(length)) or \
-        _count_or_volts(zero or length, readings, names)
-    if not unit or (len(outputs) == len(AXES)
-                    and not _is_gravity(readings, unit, zero, length)):
-        return None
-    sources |= {axis: Source(name, unit) for axis, name in zip(AXES, outputs)}
-    about = f' about {zero:.4g}' * (zero != 0)
-    reasons.append(f'the readings have a length of {length:.4g}{about}'
-                   + f', so {unit}' * (not stated))
-    sources |= _references(table, values, {*outputs, time or ''})
-    is_count = unit in (LSB, UNSIGNED)
-    per_g = (round(length) if zero else _counts(length)) if is_count else 0.0
-    note = _note(time is not None, unit, zero)
-    stamps = _stamp_options(values[time], sources['time']) if time else '--rate HZ'
-    return Proposal(ColumnMapping(sources), per_g, zero if is_count else 0.0, reasons, stamps,
-                    note)
+        _count_or_volts(zero or length, readings, outputs if table.has_names else [])
+    if unit and len(outputs) == len(AXES) and not _is_gravity(readings, unit, zero, length):
+        unit = ''
+    return unit, zero, length, bool(stated)
 
 
-def _note(has_time: bool, unit: str, zero: float) -> str:
+def _note(unit: str, zero: float) -> str:
     """Return what the user has to add to the options, in brackets."""
-    if not has_time:
-        return ' (write the sample rate for HZ)'
     output = UNITS[Quantity.OUTPUT][unit]
     ratio = float(output.convert(np.array(zero))) / _NOMINAL_V
     is_other = output.is_volts and zero != 0 and abs(ratio - 1) > _NEAR_NOMINAL
@@ -212,24 +181,11 @@ def _note(has_time: bool, unit: str, zero: float) -> str:
 def _stamp_options(values: np.ndarray, source: Source) -> str:
     """Return the option that stamps need which stand still or step back; empty for none."""
     time_s = UNITS[Quantity.TIME][source.unit].convert(values[np.isfinite(values)] - values[0])
-    steps = np.diff(time_s)
-    if (steps > 0).all():
+    if (np.diff(time_s) > 0).all():
         return ''
     if burst_samples(time_s) > 1:
         return f'--rate {stamped_rate_hz(time_s):.4g}'
     return '--drop-bad-stamps'
-
-
-def describe(table: Table, is_listed: bool = False) -> tuple[str, str]:
-    """Describe the columns of a table, and the options that most likely read it."""
-    form = f' ({table.form})' if table.form else ''
-    seen = '' if is_listed and not form else f'the columns are {listed(table.names)}{form}; '
-    proposal = propose(table)
-    if proposal is None:
-        return f'{seen}none looks like an accelerometer: name the columns, for example', \
-            "--columns 'time=COLUMN:s,x=COLUMN:g,y=COLUMN:g,z=COLUMN:g'"
-    reasons = ' and '.join(proposal.reasons)
-    return f'{seen}the best guess, because {reasons}{proposal.note}:', proposal.options()
 
 
 def _time_column(table: Table, values: Mapping[str, np.ndarray]) -> str | None:
@@ -255,23 +211,22 @@ def _is_count(values: np.ndarray) -> bool:
     return bool((np.diff(values) == 1).all()) and abs(values[0]) <= 1
 
 
-def _time_unit(table: Table, name: str, values: np.ndarray) -> tuple[str, str]:
-    """Return the unit of a time and the reason."""
+def _time_source(table: Table, name: str, values: np.ndarray) -> tuple[Source, str]:
+    """Return a time with its unit, and the reason."""
     finite = values[np.isfinite(values)]
     steps = np.diff(finite)
     step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
     stated = table.units.get(name) or (unit_in_name(name, Quantity.TIME) if table.has_names
                                        else None)
-    is_whole = bool((finite == np.rint(finite)).all())
     # A unit in the name counts unless no sensor has samples at such steps.
     if stated and is_sensor_step(step / UNITS[Quantity.TIME][stated].divisor, False):
-        return stated, f'{name} has steps of {step:.4g} {stated}'
+        return Source(name, stated), f'{name} has steps of {step:.4g} {stated}'
     for second, unit in _EPOCHS:
         if _EPOCH_S[0] < finite[0] / second < _EPOCH_S[1] and \
                 is_sensor_step(step / second, False):
-            return ('epoch' if unit == 's' else unit), f'{name} counts from 1970'
-    unit = time_unit_of_step(step, is_whole)
-    return unit, f'{name} has steps of {step:.4g}, so {unit}'
+            return Source(name, unit), f'{name} counts from 1970'
+    unit = time_unit_of_step(step, bool((finite == np.rint(finite)).all()))
+    return Source(name, unit), f'{name} has steps of {step:.4g}, so {unit}'
 
 
 def _outputs(table: Table, values: Mapping[str, np.ndarray]) -> list[str]:

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""How a recording is read: columns of foreign files, their units, stamps and the mounting."""
+"""A table, and how it is read as a recording: columns, units, stamps and the mounting."""
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 import re
+import shlex
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.recording_columns import ACCEL, Recording, VOLTS
 from adxl_ros.model.constants import AXES, G0_MPS2
 import numpy as np
 
@@ -20,6 +20,48 @@ _EXAMPLE = 'time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg'
 
 _ENTRY = re.compile(r"""\s*([^=,\s]+)\s*=\s*((?:"[^"]*"|'[^']*'|[^,"'])+?)\s*(?:,|\n|$)""")
 """An entry of a mapping: a role, and its column with an optional unit."""
+
+
+@dataclass(frozen=True)
+class TableBlock:
+    """Rows of a table."""
+
+    columns: Mapping[str, np.ndarray]  # Arrays (n,) by column name; an empty cell is NaN
+    # Returns file and place of a cell for messages, by its row in the block and its column
+    where: Callable[[int, str], str]
+    info: Mapping[str, str] = field(default_factory=dict)  # Keys and values that the file states
+    done: float = 1.0  # Fraction of the file that has been read at the end of the rows
+    cut: str = ''  # Where a damaged file ends; empty if it is whole
+
+
+@dataclass(frozen=True)
+class Table:
+    """A file with columns."""
+
+    path: str  # The file
+    names: tuple[str, ...]  # Its columns, each once
+    # Yields the rows of some columns, in the order of the file. In a column of the second
+    # argument, a cell that is no number is an error; another such column is left out.
+    blocks: Callable[[Collection[str], Collection[str]], Iterator[TableBlock]]
+    units: Mapping[str, str] = field(default_factory=dict)  # Units that the format states
+    default_mapping: str = ''  # Mapping that the definition of the format states
+    header_line: int | None = None  # Line of a text file with the names; 0 where it has none
+    repeated: str = ''  # A name that stands twice; empty for none
+    form: str = ''  # How the file is written, for messages; empty where nothing is special
+
+    @property
+    def has_names(self) -> bool:
+        """Return whether the file names its columns; else they are numbers from 1."""
+        return self.header_line != 0
+
+    @property
+    def header(self) -> str:
+        """Return file and line of the names for messages."""
+        return f'{self.path}:{self.header_line}' if self.header_line else self.path
+
+    def sample(self) -> Mapping[str, np.ndarray]:
+        """Return the first rows of all columns of numbers."""
+        return next((block.columns for block in self.blocks(self.names, ())), {})
 
 
 @dataclass(frozen=True)
@@ -195,9 +237,7 @@ def signed(values: np.ndarray) -> np.ndarray:
 class Unit:
     """A unit: value in the unit of the package = value · factor / divisor + offset."""
 
-    quantity: Quantity  # What it measures
-    # divisor, factor, offset: The conversion. A division by a power of ten is exact where a
-    # product is not.
+    # A division by a power of ten is exact where a product is not.
     divisor: float = 1.0
     factor: float = 1.0
     offset: float = 0.0
@@ -206,62 +246,35 @@ class Unit:
     def convert(self, values: np.ndarray) -> np.ndarray:
         """Return values in the unit of the package."""
         with np.errstate(over='ignore'):  # such a value is refused afterwards
-            return values * self.factor / self.divisor + self.offset
+            converted = values * self.factor / self.divisor
+            return converted + self.offset if self.offset else converted  # keeps -0.0
 
 
 UNITS: Mapping[Quantity, Mapping[str, Unit]] = {
-    Quantity.TIME: {
-        's': Unit(Quantity.TIME),
-        'ms': Unit(Quantity.TIME, 1e3),
-        'us': Unit(Quantity.TIME, 1e6),
-        'ns': Unit(Quantity.TIME, 1e9),
-        'epoch': Unit(Quantity.TIME),
-    },
-    Quantity.OUTPUT: {
-        'g': Unit(Quantity.OUTPUT, factor=G0_MPS2),
-        'mg': Unit(Quantity.OUTPUT, 1e3, G0_MPS2),
-        'mps2': Unit(Quantity.OUTPUT),
-        LSB: Unit(Quantity.OUTPUT, factor=G0_MPS2),
-        UNSIGNED: Unit(Quantity.OUTPUT, factor=G0_MPS2),
-        'v': Unit(Quantity.OUTPUT, is_volts=True),
-        'mv': Unit(Quantity.OUTPUT, 1e3, is_volts=True),
-    },
-    Quantity.ANGLE: {
-        'rad': Unit(Quantity.ANGLE),
-        'deg': Unit(Quantity.ANGLE, 180.0, np.pi),
-    },
-    Quantity.LENGTH: {
-        'm': Unit(Quantity.LENGTH),
-        'mm': Unit(Quantity.LENGTH, 1e3),
-    },
-    Quantity.TEMPERATURE: {
-        'c': Unit(Quantity.TEMPERATURE),
-        'k': Unit(Quantity.TEMPERATURE, offset=-273.15),
-        'f': Unit(Quantity.TEMPERATURE, 9.0, 5.0, -160.0 / 9.0),
-    },
-    Quantity.VOLTAGE: {
-        'v': Unit(Quantity.VOLTAGE),
-        'mv': Unit(Quantity.VOLTAGE, 1e3),
-    },
+    Quantity.TIME: {'s': Unit(), 'ms': Unit(1e3), 'us': Unit(1e6), 'ns': Unit(1e9),
+                    'epoch': Unit()},
+    Quantity.OUTPUT: {'g': Unit(factor=G0_MPS2), 'mg': Unit(1e3, G0_MPS2), 'mps2': Unit(),
+                      LSB: Unit(factor=G0_MPS2), UNSIGNED: Unit(factor=G0_MPS2),
+                      'v': Unit(is_volts=True), 'mv': Unit(1e3, is_volts=True)},
+    Quantity.ANGLE: {'rad': Unit(), 'deg': Unit(180.0, np.pi)},
+    Quantity.LENGTH: {'m': Unit(), 'mm': Unit(1e3)},
+    Quantity.TEMPERATURE: {'c': Unit(), 'k': Unit(offset=-273.15),
+                           'f': Unit(9.0, 5.0, -160.0 / 9.0)},
+    Quantity.VOLTAGE: {'v': Unit(), 'mv': Unit(1e3)},
 }
 """Units by quantity and name."""
 
-_ALIASES = {
-    'µs': 'us', 'μs': 'us', 'usec': 'us', 'micros': 'us', 'microseconds': 'us',
-    'sec': 's', 'secs': 's', 'second': 's', 'seconds': 's',
-    'msec': 'ms', 'millis': 'ms', 'milliseconds': 'ms', 'nsec': 'ns', 'nanoseconds': 'ns',
-    'unix': 'epoch', 'posix': 'epoch',
-    'm/s^2': 'mps2', 'm/s²': 'mps2', 'm/s2': 'mps2', 'ms2': 'mps2', 'ms^2': 'mps2',
-    'm/s/s': 'mps2', 'ms-2': 'mps2', 'ms^-2': 'mps2', 'm_s2': 'mps2', 'mss': 'mps2',
-    'm·s⁻²': 'mps2', 'm.s-2': 'mps2', 'm s^-2': 'mps2', 'm s-2': 'mps2',
-    'millig': 'mg', 'gs': 'g',
-    'counts': LSB, 'count': LSB, 'raw': LSB, 'digits': LSB,
-    'volt': 'v', 'volts': 'v', 'millivolt': 'mv', 'millivolts': 'mv',
-    '°': 'deg', 'degree': 'deg', 'degrees': 'deg', 'radian': 'rad', 'radians': 'rad',
-    '°c': 'c', 'degc': 'c', 'celsius': 'c', 'deg_c': 'c', 'deg c': 'c',
-    '°f': 'f', 'degf': 'f', 'fahrenheit': 'f', 'kelvin': 'k',
+_SPELLINGS = {
+    's': 'sec secs second seconds', 'ms': 'msec millis milliseconds',
+    'us': 'µs μs usec micros microseconds', 'ns': 'nsec nanoseconds', 'epoch': 'unix posix',
+    'mps2': 'm/s^2 m/s² m/s2 ms2 ms^2 m/s/s ms-2 ms^-2 m_s2 mss m·s⁻² m.s-2 m_s^-2 m_s-2',
+    'mg': 'millig', 'g': 'gs', LSB: 'counts count raw digits',
+    'v': 'volt volts', 'mv': 'millivolt millivolts',
+    'deg': '° degree degrees', 'rad': 'radian radians',
+    'c': '°c degc celsius deg_c', 'f': '°f degf fahrenheit', 'k': 'kelvin',
 }
-"""Other spellings of units, in lower case."""
+_ALIASES = {word: name for name, words in _SPELLINGS.items() for word in words.split()}
+"""Names of units by their other spellings, in lower case, with _ for a blank."""
 
 _BRACKETS = re.compile(r'[(\[{]\s*([^()\[\]{}]+?)\s*[)\]}]')
 """A part of a column's name in brackets."""
@@ -272,7 +285,7 @@ _WORD_ENDS = re.compile(r'[_\s.]+|\[\d+\]|[(\[{].*[)\]}]|(?<=[a-z])(?=[A-Z])')
 
 def unit_name(text: str, quantity: Quantity) -> str | None:
     """Return the name of a unit that is written in any way."""
-    word = text.strip().lower()
+    word = '_'.join(text.lower().split())
     name = _ALIASES.get(word, word)
     return name if name in UNITS[quantity] else None
 
@@ -302,35 +315,50 @@ class ReadingOptions:
     # How the axes of the file are those of the sensor frame; None where they are
     mounting: Mounting | None = None
 
-    @property
-    def changes_columns(self) -> bool:
-        """Return whether the columns of a table are converted."""
-        return self != ReadingOptions(topic=self.topic, mounting=self.mounting)
-
 
 AS_IT_IS = ReadingOptions()
 """Nothing is replaced."""
 
 
-def mounted(blocks: Iterable[Recording], mounting: Mounting) -> Generator[Recording, None, None]:
-    """Turn the blocks of a recording."""
-    for block in blocks:
-        names = block.sensor_columns
-        if len(names) != len(mounting.signs):
-            raise UserError(f'--axes: names the axes {AXES[:len(mounting.signs)]}, but '
-                            f'{block.path} has {block.axes}')
-        outputs = np.column_stack([block.columns[name] for name in names])
-        turned = mounting.turn(outputs - _zero(block, mounting)) + _zero(block, mounting)
-        yield replace(block, columns={**block.columns, **dict(zip(names, turned.T.copy()))})
+_LISTED_NAMES = 12
+"""Largest number of columns that a message names (chosen: some lines of a terminal)."""
+
+_NEAR = 0.25
+"""Largest logarithm of the ratio of a length to that of gravity in its unit (chosen: bias and
+scale errors are smaller, and the units are further apart)."""
+
+_SHORTEST_STEP_S = 5e-5
+"""Shortest step of stamps, s. Chosen: twice the rate of the fastest sensor."""
+
+_LONGEST_STEP_S = 1.05
+"""Longest step of stamps, s. Chosen: 1 Hz, the slowest rate of the package, with jitter."""
 
 
-def _zero(block: Recording, mounting: Mounting) -> float:
-    """Return the output at zero specific force, in the unit of the output."""
-    if block.sensor_columns[0] in ACCEL or min(mounting.signs) > 0:
-        return 0.0
-    zeros = block.stream_info.nominal_values(block.axes).get('nominal_zero_g_v', np.zeros(0))
-    if not len(zeros) or np.ptp(zeros) > 0:
-        raise UserError(f'--axes: inverts an axis of {block.path}, whose {VOLTS[0]} is in volts '
-                        'about an unknown zero; write a line "# nominal_zero_g_v: ..." with the '
-                        'same value for each axis, or state the mounting in the parameter file')
-    return float(zeros[0])
+def listed(names: Sequence[str]) -> str:
+    """Return the first names of columns for a message."""
+    further = len(names) - _LISTED_NAMES
+    return ', '.join(names[:_LISTED_NAMES]) + f' and {further} more' * (further > 0)
+
+
+def likely_unit(length: float) -> str:
+    """Return the unit in which readings have the length of gravity; empty where none fits."""
+    lengths = {'g': 1.0, 'mps2': G0_MPS2, 'mg': 1e3}
+    return next((unit for unit, gravity in lengths.items()
+                 if abs(np.log(max(length, 1e-12) / gravity)) < _NEAR), '')
+
+
+def is_sensor_step(step_s: float, is_whole: bool) -> bool:
+    """Return whether samples come at such steps; at whole seconds they hardly do."""
+    return _SHORTEST_STEP_S <= step_s <= _LONGEST_STEP_S and not (is_whole and step_s >= 1)
+
+
+def time_unit_of_step(step: float, is_whole: bool) -> str:
+    """Return the likely unit of stamps."""
+    return next((unit for unit in ('s', 'ms', 'us', 'ns') if is_sensor_step(
+        step / UNITS[Quantity.TIME][unit].divisor, is_whole)), 's')
+
+
+def shell_quoted(text: str) -> str:
+    """Return a word for a shell, in quotes even where it needs none."""
+    quoted = shlex.quote(text)
+    return quoted if quoted != text else f"'{text}'"

@@ -1,186 +1,415 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""CSV recordings in the columns and units of the package, read and written in blocks."""
+"""
+Text tables of any delimiter, decimal mark and header, read in blocks; and CSV files, written.
+
+The first lines show the form of a file, and each block of lines is rewritten to commas and decimal
+points. Pandas parses a block. A block that it refuses is read a second time, field by field, which
+accepts text and quotes, and finds the line and column to name in a message.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+import csv
+from dataclasses import dataclass
+from io import BytesIO
+from itertools import islice
 import os
 import re
-from typing import NoReturn
+from typing import Any, BinaryIO
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import atomic_path, release_written
-from adxl_ros.files.delimited_text import after, Layout, Lines, parse_numbers, read_lines
-from adxl_ros.files.recording_columns import (
-    ACCEL,
-    LIMIT,
-    Recording,
-    REFERENCES,
-    sensor_columns,
-    TIME,
-    VOLTS,
-)
+from adxl_ros.files.column_mapping import TableBlock
 import numpy as np
 
-TIME_LIMIT_S = 9e9
-"""Largest magnitude of a time, s: in nanoseconds it fits into 64 bits (9.2e18)."""
+_CHUNK_BYTES = 1 << 22
+"""Bytes that are read at a time (chosen: bounds the memory, and large enough for pandas)."""
+_LONGEST_LINE_BYTES = 1 << 20
+"""Longer lines are refused, bytes (chosen: no recording has them; a file without newlines must
+not fill the memory)."""
+_PANDAS_BYTES = 1 << 20
+"""Bytes of a block from which pandas parses it (chosen: its import takes 0.4 s, in which Python
+parses 2 MB)."""
+_HEAD_LINES = 200
+"""Lines that show the form of a file (chosen: more than any preamble seen)."""
+_FEWEST_NUMBERS = 2
+"""Fewest numbers of a line of samples with text (chosen: `rate, 100` is in a preamble)."""
+_LONGEST_CELL = 24
+"""Characters of a cell in a message. Chosen: a number with all its digits."""
 
-_UNITS = {
-    's': ('s', ('ms', 'us', 'ns', 'min', 'h', 'sec')),
-    'v': ('V', ('mv', 'uv', 'kv', 'volt', 'volts', 'lsb', 'adc', 'counts')),
-    'mps2': ('m/s²', ('g', 'mg', 'ug', 'ms2', 'm_s2', 'mss', 'cmps2', 'mmps2', 'gal')),
-    'rad': ('rad', ('deg', 'degree', 'degrees', 'mrad', 'urad', 'arcmin', 'arcsec', 'rev',
-                    'turns')),
-    'm': ('m', ('mm', 'cm', 'um', 'nm')),
-    'c': ('°C', ('k', 'f', 'degc', 'degf', 'celsius', 'kelvin', 'fahrenheit')),
-}
-"""Symbols of the package's units by the end of a column's name, and other ends that people write.
-A column with another unit is refused, not taken for a further column."""
+_DELIMITERS = {'\t': 'tabs', ';': 'semicolons', ',': 'commas', ' ': 'blanks'}
+"""Names of delimiters; the first that fits is taken."""
 
+_OWN_NAME = 'time_s'
+"""Column of the package's own recordings."""
 
-class HeaderError(UserError):
-    """The columns are not those of a recording; a mapping may read them."""
-
-
-def blocks(path: str | os.PathLike, rows: int,
-           needed: tuple[str, ...] | None = None) -> Generator[Recording, None, None]:
-    """Read a CSV recording in blocks of at most `rows` samples."""
-    path = str(path)
-    info: dict[str, str] = {}
-    reader = None
-    count = 0
-    for lines in read_lines(path, info):
-        if reader is None:
-            reader = _Reader(lines, info, needed)
-            lines = after(lines, lines.numbers[0])
-        if not lines.data:
-            continue
-        columns = reader.columns(lines)
-        part = Recording(path, columns.pop(TIME), columns, dict(info), epoch_ns=reader.epoch_ns,
-                         done=lines.done)
-        for start in range(0, len(part), rows):
-            yield part.rows(start, start + rows)
-        count += len(part)
-    if reader is None:
-        raise UserError(f'{path}: is empty; a recording has a header and a line for each sample')
-    if not count:
-        raise UserError(f'{path}: has a header, but no samples')
+_INFO = re.compile(r'#+\s*([A-Za-z_][\w.]*)\s*:(?:\s+(.*))?$')
+"""A comment line with key and value."""
+_NO_MARKS = bytes(set(range(256)) - set(b',\n#\0'))
+"""Bytes besides the ends of fields and lines, comments, and zeros, at which pandas ends a text."""
+_FIELD = re.compile(r'\s*([-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?(nan|inf|infinity))?\s*',
+                    re.ASCII | re.IGNORECASE)
+"""A field that is a number, or empty."""
+_NUMBER = re.compile(r'[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan|inf)', re.IGNORECASE)
+"""A number with a decimal point or comma."""
+_DATE = re.compile(rb'"?(\d{4})[-/](\d\d)[-/](\d\d)[T ](\d\d:\d\d:\d\d(?:[.,]\d{1,9})?)'
+                   rb'(?:Z|([-+]\d\d):?(\d\d))?"?')
+"""A date and time by ISO 8601; without an offset it counts as UTC."""
+_LABEL = re.compile(rb'"?[A-Za-z_][\w ]*"?\s*[:=]\s*(?=[-+.]?\d)')
+"""A label before a number, as in `x: 0.1` and `"x": 0.1`."""
+_COMMENT = re.compile(r'\s*(#|//|%)')
+"""Begin of a comment."""
 
 
-def epoch_ns(path: str, info: Mapping[str, str]) -> int:
-    """Return the origin of the times that comments state, ns; else 0."""
-    text = info.get('epoch_ns', '0')
-    if not re.fullmatch(r'-?\d{1,19}', text) or abs(int(text)) >= 1 << 63:
-        raise UserError(f'{path}: epoch_ns is {text!r}, expected whole nanoseconds')
-    return int(text)
+class NoNumbers(UserError):
+    """A table holds no numbers; it may be a list of something."""
 
 
-class _Reader:
-    """Parses and checks blocks of lines, one after the other."""
+@dataclass(frozen=True)
+class Form:
+    """How a text table is written."""
 
-    def __init__(self, lines: Lines, info: Mapping[str, str], needed: tuple[str, ...] | None
-                 ) -> None:
-        """Parse the header, the first of the lines."""
+    # The columns as the header states them; their numbers from 1 where it does not, or states a
+    # name twice
+    names: tuple[str, ...]
+    repeated: str  # A name that stands twice; empty for none
+    header_line: int  # Number of the line with the names, from 1; 0 where there is none
+    first_line: int  # Number of the first line with samples
+    delimiter: str  # A tab, semicolon, comma or blank; several blanks are one
+    decimal_comma: bool  # Whether numbers have a decimal comma
+    is_worded: bool  # Whether lines have dates, labels or quotes, which `_plain` removes
+
+    def __str__(self) -> str:
+        """Describe the form for messages; empty for commas with a header."""
+        parts = [f'separated by {_DELIMITERS[self.delimiter]}'] * (self.delimiter != ',')
+        parts += ['decimal commas'] * self.decimal_comma + ['no header'] * (not self.header_line)
+        return ', '.join(parts)
+
+    def rewritten(self, data: bytes) -> bytes:
+        """Return lines with commas between fields, and decimal points."""
+        if self.is_worded:
+            data = _plain(data)
+        if self.delimiter == ',':
+            return data
+        # A comma in a text would look like a delimiter.
+        data = data.replace(b',', b'.')
+        if self.delimiter == ' ':
+            data = re.sub(rb'(?m)^[ \t]+|[ \t]+$', b'', data)
+            return re.sub(rb'[ \t]+', b',', data)
+        return data.replace(self.delimiter.encode(), b',')
+
+
+@dataclass(frozen=True)
+class _Lines:
+    """Lines of samples, with commas and decimal points."""
+
+    path: str  # The file
+    data: bytes  # The lines, each with a newline
+    numbers: Sequence[int]  # Their numbers in the file, from 1
+    done: float  # Fraction of the file that has been read at their end
+    is_open_ended: bool  # Whether the last one has no newline in the file
+    marks: bytes  # The lines without `_NO_MARKS`; empty where that is not known
+
+    def rows(self) -> list[list[str]]:
+        """Return the fields of all lines."""
+        rows: list[list[str]] = []
         try:
-            fields = lines.fields(0)
-        except UserError as error:
-            raise HeaderError(str(error)) from None
-        names = tuple(name.strip() for name in fields)
-        sensor = _sensor_columns(f'{lines.path}:{lines.numbers[0]}', names, needed)
-        self.epoch_ns = epoch_ns(lines.path, info)
-        self._needed = (TIME, *sensor)
-        self._references = [name for name in names if name in REFERENCES]
-        self._layout = Layout(names, [name for name in names if name],
-                              {*self._needed, *self._references})
-        self._last_time_s, self._last_line = -np.inf, 0
+            for line in self.data.decode().split('\n')[:len(self.numbers)]:
+                rows += csv.reader([line])
+        except csv.Error as error:
+            raise UserError(f'{self.path}:{self.numbers[len(rows)]}: cannot read the line: {error}'
+                            ) from None
+        return rows
 
-    def columns(self, lines: Lines) -> dict[str, np.ndarray]:
-        """Parse and check the samples of some lines; return the columns that are numbers."""
-        columns = parse_numbers(self._layout, lines)
-        self._check_values(lines, columns)
-        self._check_time(lines, columns[TIME])
-        return columns
+    def where(self, row: int, index: int) -> str:
+        """Return the place of a field for messages."""
+        return f'{self.path}:{self.numbers[row]}:{index + 1}'
 
-    def _check_values(self, lines: Lines, columns: Mapping[str, np.ndarray]) -> None:
-        """Refuse the first row with a number that no sensor, reference or clock gives."""
-        refused: list[tuple[int, str]] = []
-        for name in (*self._needed, *self._references):
-            wrong = ~(np.abs(columns[name]) <= _limit(name))
-            if name in self._references:
-                wrong &= ~np.isnan(columns[name])
-            if wrong.any():
-                refused.append((int(wrong.argmax()), name))
-        if refused:
-            row, name = min(refused)
-            self._refuse(lines, row, name, columns[name][row])
-
-    def _refuse(self, lines: Lines, row: int, name: str, value: float) -> NoReturn:
-        """Raise the error of a number that is empty, not finite or too large."""
-        index = self._layout.names.index(name)
-        text = lines.fields(row)[index].strip()
-        reason = f'is {text}, beyond ±{_limit(name):g}; delete the line or correct its unit'
-        if not text:
-            reason = 'is empty; every sample needs it'
-        elif not np.isfinite(value):
-            reason = f'is {text}, not a finite number; delete the line'
-        raise UserError(f'{lines.where(row, index)}: {name} {reason}')
-
-    def _check_time(self, lines: Lines, time_s: np.ndarray) -> None:
-        """Refuse times, s, (n,), that do not increase; remember the last one."""
-        earlier = np.concatenate([[self._last_time_s], time_s[:-1]])
-        wrong = ~(time_s > earlier)
-        if wrong.any():
-            row = int(wrong.argmax())
-            before = lines.numbers[row - 1] if row else self._last_line
-            verb = 'stands still' if time_s[row] == earlier[row] else 'runs backwards'
-            where = lines.where(row, self._layout.names.index(TIME))
-            raise UserError(f'{where}: time {verb}: {TIME} is {float(time_s[row])!r} after '
-                            f'{float(earlier[row])!r} on line {before}')
-        self._last_time_s, self._last_line = float(time_s[-1]), lines.numbers[-1]
+    def cut_hint(self, row: int) -> str:
+        """Return what to do about the last line of a file that is cut off, else ''."""
+        is_cut = self.is_open_ended and row == len(self.numbers) - 1
+        return '; the file ends in the middle of this line: delete it' * is_cut
 
 
-def _limit(name: str) -> float:
-    """Return the largest magnitude of a column, in its unit."""
-    return TIME_LIMIT_S if name == TIME else LIMIT
+def read_blocks(path: str, form: Form, names: Collection[str], required: Collection[str]
+                ) -> Iterator[TableBlock]:
+    """
+    Yield some columns of numbers in blocks of rows.
+
+    In a required column, text is an error; another column is left out from there on. Where none
+    is required, rows of another length are left out, too.
+    """
+    used = [name for name in form.names if name in names]
+    info: dict[str, str] = {}
+    for lines in _read_lines(path, form, info):
+        columns = _by_pandas(lines, form.names, used) if len(lines.data) >= _PANDAS_BYTES else None
+        columns = columns or _field_by_field(lines, form, used, required)
+        used = list(columns)
+
+        def where(row: int, column: str, lines: _Lines = lines) -> str:
+            return f'{lines.where(row, form.names.index(column))}: {column}'
+
+        yield TableBlock(columns, where, dict(info), lines.done)
 
 
-def _sensor_columns(where: str, names: Sequence[str], needed: tuple[str, ...] | None
-                    ) -> tuple[str, ...]:
-    """Check the names of the columns, and return those with the output of the sensor."""
-    for mark, text in ((';', 'semicolons'), ('\t', 'tabs')):
-        if len(names) == 1 and mark in names[0]:
-            raise HeaderError(f'{where}: the columns are separated by {text}, expected commas '
-                              'and a decimal point')
-    for name, count in Counter(names).items():
-        if name and count > 1:
-            fields = [str(i + 1) for i, other in enumerate(names) if other == name]
-            raise HeaderError(f'{where}:{fields[1]}: column {name} stands {count} times, '
-                              f'in the fields {", ".join(fields)}; keep one')
-    # Where one form of output is there, the other may stand there in any unit.
-    outputs = next((kind for kind in (VOLTS, ACCEL) if set(kind) & set(names)), (*VOLTS, *ACCEL))
-    for column in (TIME, *outputs, *REFERENCES):
-        if column not in names:
-            _refuse_other_unit(where, names, column)
-    named = [name for name in names if name]
-    for column in (TIME, *(needed or ())):
-        if column not in names:
-            raise HeaderError(f'{where}: no column {column}; the columns are {", ".join(named)}')
+def _read_lines(path: str, form: Form, info: dict[str, str]) -> Iterator[_Lines]:
+    """Yield the lines of samples; keys and values of comments are added to `info`."""
+    with _opened(path) as file:
+        size = max(os.fstat(file.fileno()).st_size, 1)
+        last = 0
+        for data in _whole_lines(path, file):
+            is_open_ended = not data.endswith(b'\n')
+            if b'\r' in data:
+                data = data.replace(b'\r\n', b'\n')
+            data += b'\n' * is_open_ended
+            *preamble, data = data.split(b'\n', max(form.first_line - 1 - last, 0))
+            for line in preamble:
+                _add_info(line, info)
+            marks = data.translate(None, _NO_MARKS)
+            first = last + len(preamble) + 1
+            last = first + marks.count(b'\n') - 1
+            numbers: Sequence[int] = range(first, last + 1)
+            # An empty line, or one field, follows the end of a line.
+            if b'#' in marks or b'\n\n' in marks or marks.startswith(b'\n'):
+                rows = [(line, number) for line, number in zip(data.split(b'\n'), numbers)
+                        if line.strip() and not _add_info(line, info)]
+                data = b''.join(line + b'\n' for line, _ in rows)
+                numbers, marks = [number for _, number in rows], b''
+            if form.is_worded or form.delimiter != ',':
+                data, marks = form.rewritten(data), b''
+            if data:
+                yield _Lines(path, data, numbers, file.tell() / size, is_open_ended, marks)
+
+
+def _add_info(line: bytes, info: dict[str, str]) -> bool:
+    """Return whether a line is a comment; its key and value are added to `info`."""
+    text = line.strip()
+    if text.startswith(b'#') and (entry := _INFO.match(text.decode())):
+        info[entry[1]] = (entry[2] or '').strip()
+    return text.startswith(b'#')
+
+
+@contextmanager
+def _opened(path: str) -> Iterator[BinaryIO]:
     try:
-        return needed or sensor_columns(named, where)
-    except UserError as error:
-        raise HeaderError(str(error)) from None
+        with open(path, 'rb') as file:
+            yield file
+    except OSError as error:
+        raise UserError(f'{path}: cannot read: {error.strerror or error}') from None
 
 
-def _refuse_other_unit(where: str, names: Sequence[str], column: str) -> None:
-    stem, unit = column.rsplit('_', 1)
-    symbol, others = _UNITS[unit]
-    for i, name in enumerate(names):
-        if name.lower() in {f'{stem}_{other}' for other in others}:
-            raise HeaderError(f'{where}:{i + 1}: column {name} is in another unit; expected '
-                              f'{symbol}, in a column named {column}')
+def _whole_lines(path: str, file: BinaryIO) -> Iterator[bytes]:
+    """Yield a file in UTF-8, without its mark, in parts that end with a line."""
+    mark = file.read(3)
+    if mark[:2] in (b'\xff\xfe', b'\xfe\xff'):
+        raise UserError(f'{path}:1:1: is UTF-16; save the file as UTF-8')
+    file.seek(3 if mark == b'\xef\xbb\xbf' else 0)
+    while data := file.read(_CHUNK_BYTES):
+        if not data.endswith(b'\n'):
+            data += file.readline(_LONGEST_LINE_BYTES + 1)
+        if len(data) > _CHUNK_BYTES + _LONGEST_LINE_BYTES:
+            raise UserError(f'{path}: a line is longer than {_LONGEST_LINE_BYTES} bytes; '
+                            'this is no CSV recording')
+        yield data if data.isascii() else _utf8(data)
+
+
+def _utf8(data: bytes) -> bytes:
+    """Return text that is UTF-8 or, failing that, Windows-1252 as UTF-8."""
+    try:
+        data.decode()
+    except UnicodeDecodeError:
+        return data.decode('cp1252', errors='replace').encode()
+    return data
+
+
+def _by_pandas(lines: _Lines, names: Sequence[str], used: Sequence[str]
+               ) -> dict[str, np.ndarray] | None:
+    """Parse all lines at once; None where one of them must be parsed field by field."""
+    # Pandas would fill a short line, and cut a long one.
+    marks = lines.marks or lines.data.translate(None, _NO_MARKS)
+    if marks != (b',' * (len(names) - 1) + b'\n') * len(lines.numbers):
+        return None
+    import pandas
+    # Newer versions always round correctly, and warn of the option.
+    is_old = tuple(map(int, pandas.__version__.split('.')[:2])) < (3, 1)
+    options = {'float_precision': 'round_trip'} if is_old else {}
+    indices = [names.index(name) for name in used]
+    try:
+        frame = pandas.read_csv(
+            BytesIO(lines.data), header=None, names=list(range(len(names))), usecols=indices,
+            index_col=False, dtype=float, keep_default_na=False, na_values=[''],
+            low_memory=False, **options)
+    except (ValueError, OverflowError):
+        return None
+    if len(frame) != len(lines.numbers):
+        return None
+    return {name: frame[index].to_numpy() for name, index in zip(used, indices)}
+
+
+def _field_by_field(lines: _Lines, form: Form, used: Sequence[str], required: Collection[str]
+                    ) -> dict[str, np.ndarray]:
+    """Parse with Python; refuse a field that is no number, and drop other columns with text."""
+    rows = lines.rows()
+    expected = len(form.names)
+    if not required:
+        rows = [row for row in rows if len(row) == expected]
+    for i, row in enumerate(rows):
+        if len(row) != expected:
+            source = 'the header' if form.header_line else 'the first line'
+            raise UserError(f'{lines.where(i, min(len(row), expected))}: {len(row)} fields, '
+                            f'but {source} has {expected}{lines.cut_hint(i)}')
+    columns = {}
+    for name in used:
+        index = form.names.index(name)
+        cells = [row[index] for row in rows]
+        wrong = next((i for i, cell in enumerate(cells) if not _FIELD.fullmatch(cell)), None)
+        if wrong is None:
+            columns[name] = np.array([float(cell) if cell.strip() else np.nan for cell in cells])
+        elif name in required:
+            text = cells[wrong]
+            text = text if len(text) <= _LONGEST_CELL else f'{text[:_LONGEST_CELL]}…'
+            damage = '; the file is damaged here: delete the zero bytes' * (chr(0) in text)
+            raise UserError(f'{lines.where(wrong, index)}: {name} is {text!r}, not a number'
+                            f'{damage}{lines.cut_hint(wrong)}')
+    return columns
+
+
+def find_form(path: str) -> Form:
+    """
+    Return the form of a table by its first lines.
+
+    The samples are the lines with as many fields as hold most of the numbers. Of two such forms
+    the one with fewer fields counts, as with labels and quotes left out and dates as numbers. The
+    header is the line with text and as many fields that is nearest before them, or a first line
+    with the package's name of the time.
+    """
+    with _opened(path) as file:
+        lines = [line.decode() for line in islice(
+            (line for data in _whole_lines(path, file) for line in data.splitlines()),
+            _HEAD_LINES)]
+    written = [line for line in lines if line.strip() and not line.lstrip().startswith('#')]
+    if not written:
+        raise UserError(f'{path}: is empty')
+    plain = [_plain(line.encode()).decode() for line in lines]
+    best, form = (0, 0), None
+    for rows in (lines, plain) if plain != lines else (lines,):
+        for delimiter in _DELIMITERS:
+            numbers: Counter[int] = Counter()
+            first: dict[int, int] = {}
+            for index, line in enumerate(rows):
+                count = 0 if _COMMENT.match(line) else _numbers(line, delimiter)
+                fields = _fields(line, delimiter)
+                # One number with empty cells is a row, one with a text may be a preamble.
+                if count >= _FEWEST_NUMBERS or (count and count == sum(map(bool, fields))):
+                    numbers[len(fields)] += count
+                    first.setdefault(len(fields), index)
+            size = max(numbers, key=lambda size: numbers[size], default=0)
+            if size and (numbers[size], -size) > best:
+                best = numbers[size], -size
+                form = _form(lines, rows, first[size], delimiter)
+    names = _fields(written[0], ',')
+    if _OWN_NAME in names and not (form and form.header_line):
+        number = lines.index(written[0]) + 1
+        return _named(names, number, number + 1, ',', False, False)
+    if form is None:
+        raise NoNumbers(f'{path}: the first {_HEAD_LINES} lines hold no row of numbers; expected '
+                        'a header, and a line of numbers for each sample')
+    return form
+
+
+def _form(lines: Sequence[str], rows: Sequence[str], index: int, delimiter: str) -> Form:
+    """Return the form of a table whose samples begin at a line, by its lines and plain lines."""
+    is_worded = rows is not lines
+    count = len(_fields(rows[index], delimiter))
+    header_line, header = _header(lines[:index], delimiter, count)
+    labels = _LABEL.findall(_DATE.sub(b'0', lines[index].encode())) if is_worded else []
+    if not header and len(labels) == count:
+        header_line, header = index + 1, [label.decode().strip('":= ') for label in labels]
+    decimal_comma = delimiter != ',' and any(
+        re.fullmatch(r'[-+]?\d*,\d+([eE][-+]?\d+)?', field) for line in rows[index:]
+        if not _COMMENT.match(line) for field in _fields(line, delimiter))
+    return _named(header or [''] * count, header_line, index + 1, delimiter, decimal_comma,
+                  is_worded)
+
+
+def _named(names: Sequence[str], *about: Any) -> Form:
+    """Return a form with distinct names: one that is empty or stands twice gives its number."""
+    names = [' '.join(name.split()) for name in names]
+    repeated = next((name for name in names if name and names.count(name) > 1), '')
+    return Form(tuple(name if name and names.count(name) == 1 else str(i + 1)
+                      for i, name in enumerate(names)), repeated, *about)
+
+
+def _header(lines: Sequence[str], delimiter: str, count: int) -> tuple[int, list[str]]:
+    """Return number and names of the header right before the samples; 0 without one."""
+    units: list[str] = []
+    number = 0
+    for index, line in reversed(list(enumerate(lines))):
+        # Quotes around the whole of a line are left out.
+        names = _names(re.sub(r'^"([^"]*)"\s*$', r'\1', line), delimiter, count)
+        if names is None:
+            if line.strip() and not _COMMENT.match(line):
+                break
+            continue
+        number = index + 1
+        # A row of units below the names has each in brackets, or empty.
+        if units or not all(not name or re.fullmatch(r'[(\[].*[)\]]', name) for name in names):
+            return number, [f'{name} {unit}'.strip()
+                            for name, unit in zip(names, units or [''] * count)]
+        units = names
+    return number, units
+
+
+def _names(line: str, delimiter: str, count: int) -> list[str] | None:
+    """Return the fields of a line if they can be names, also in a comment; else None."""
+    text = _COMMENT.sub('', line, count=1)
+    for mark in dict.fromkeys((delimiter, ',', '\t', ';')):
+        fields = _fields(text, mark)
+        # A row of samples may end in a delimiter, and its header not.
+        fields += [''] * (len(fields) == count - 1 and count > 2)
+        if len(fields) == count and any(fields) and not _numbers(text, mark):
+            return fields
+    return None
+
+
+def _fields(line: str, delimiter: str) -> list[str]:
+    """Return the fields of a line without blanks around them."""
+    if delimiter == ' ':
+        return line.split()
+    try:
+        return [field.strip() for field in next(csv.reader([line], delimiter=delimiter), [])]
+    except csv.Error:
+        return []
+
+
+def _numbers(line: str, delimiter: str) -> int:
+    """Return how many numbers a line has; 0 where it has one field only."""
+    fields = _fields(line, delimiter)
+    return 0 if len(fields) < 2 else sum(bool(_NUMBER.fullmatch(field)) for field in fields)
+
+
+def _plain(data: bytes) -> bytes:
+    """Return lines without labels and quotes, and with seconds since 1970 in place of dates."""
+    data = _LABEL.sub(b'', _DATE.sub(_since_1970, data))
+    data = re.sub(rb'(?m)^\s*"([^"\n]*)"[ \t\r]*$', rb'\1', data)
+    return re.sub(rb'(?m)^[ \t]*\{|\}[,\s]*?$', b'', data)
+
+
+def _since_1970(date: re.Match[bytes]) -> bytes:
+    """Return the seconds since 1970 of a date and time, in nanoseconds."""
+    year, month, day, time, hours, minutes = (part.decode() if part else '0'
+                                              for part in date.groups())
+    try:
+        stamp = np.datetime64(f'{year}-{month}-{day}T{time.replace(",", ".")}', 'ns')
+    except ValueError:
+        return date[0]
+    offset_s = 3600 * int(hours) + (-60 if hours.startswith('-') else 60) * int(minutes)
+    seconds, nanoseconds = divmod(int(stamp.astype(np.int64)), 1_000_000_000)
+    return b'%d.%09d' % (seconds - offset_s, nanoseconds)
 
 
 Append = Callable[..., None]
@@ -197,27 +426,23 @@ def csv_writer(path: str | os.PathLike, digits: int | None = None) -> Iterator[A
     digits that bring back the same float64, or all but those of the first column are rounded to
     some significant digits. NaN is written empty.
     """
-    has_header = False
     with atomic_path(path) as fresh, open(fresh, 'wb') as file:
         def append(columns: Mapping[str, np.ndarray], info: Mapping[str, str] | None = None
                    ) -> None:
-            nonlocal has_header
-            if not has_header:
+            if not file.tell():
                 file.writelines(f'# {key}: {" ".join(value.split())}\n'.encode()
                                 for key, value in (info or {}).items())
                 file.write((','.join(columns) + '\n').encode())
-                has_header = True
-            arrays = {name: np.asarray(values) for name, values in columns.items()}
-            if digits is not None:
-                arrays = {name: values if i == 0 else _rounded(values, digits)
-                          for i, (name, values) in enumerate(arrays.items())}
-            file.write(_rows(arrays))
+            file.write(_csv_rows({
+                name: np.asarray(values) if i == 0 or digits is None else
+                _rounded(np.asarray(values), digits)
+                for i, (name, values) in enumerate(columns.items())}))
             release_written(file)
 
         yield append
 
 
-def _rows(columns: dict[str, np.ndarray]) -> bytes:
+def _csv_rows(columns: dict[str, np.ndarray]) -> bytes:
     """Return rows of text: by pyarrow where it is installed, which takes a tenth of the time."""
     try:
         import pyarrow.csv

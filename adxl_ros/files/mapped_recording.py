@@ -6,21 +6,29 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass, field
+import re
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.column_mapping import (
     ColumnMapping,
+    is_sensor_step,
+    likely_unit,
+    listed,
     LSB,
     ReadingOptions,
     ROLES,
+    shell_quoted,
     signed,
     Source,
+    Table,
+    TableBlock,
+    time_unit_of_step,
     Unit,
     unit_in_name,
+    unit_name,
     UNITS,
     UNSIGNED,
 )
-from adxl_ros.files.csv_file import epoch_ns, TIME_LIMIT_S
 from adxl_ros.files.recording_columns import (
     ACCEL,
     BadStamps,
@@ -28,13 +36,17 @@ from adxl_ros.files.recording_columns import (
     JOINTS,
     LIMIT,
     Recording,
+    sensor_columns,
+    stamped_rate_hz,
     TIME,
     VOLTS,
 )
-from adxl_ros.files.tables import Table, TableBlock
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.kinematics import stage_angles
 import numpy as np
+
+_TIME_LIMIT_S = 9e9
+"""Largest magnitude of a time, s: in nanoseconds it fits into 64 bits (9.2e18)."""
 
 _EPOCH_S = 1e8
 """First time from which times count from 1970, s: three years (chosen: no sensor runs so long)."""
@@ -46,17 +58,18 @@ sensor is mostly near 1 g)."""
 _TURN_RAD = 2 * np.pi
 """Largest roll and pitch, rad."""
 
-_LISTED_NAMES = 12
-"""Largest number of columns that a message names (chosen: some lines of a terminal)."""
+_FEWEST_STAMPS = 8
+"""Stamps whose steps show their unit. Chosen: a lost sample hides no median."""
 
-_NEAR = 0.25
-"""Largest logarithm of the ratio of a length to that of gravity in its unit (chosen: bias and
-scale errors are smaller, and the units are further apart)."""
+_WHOLE = 1e-3
+"""Largest distance of a stamp from a whole number by rounding, in its unit."""
 
-_NATIVE = {TIME: ('time', 's'), 'alpha_rad': ('alpha', 'rad'), 'beta_rad': ('beta', 'rad'),
-           'shift_m': ('shift', 'm'), 'temperature_c': ('temperature', 'c'),
-           'supply_v': ('supply', 'v')}
-"""Role and unit of the package's columns besides those of the sensor."""
+_SAME_RATE = 0.1
+"""Largest relative difference of a stated sample rate from that of the stamps. Chosen."""
+
+_NATIVE = {TIME: 'time', **{column: joint for joint, column in JOINTS.items()},
+           'temperature_c': 'temperature', 'supply_v': 'supply'}
+"""Role of the package's columns besides those of the sensor."""
 
 
 @dataclass(frozen=True)
@@ -70,29 +83,69 @@ class _Column:
     is_stated: bool
 
 
-def native_mapping(names: tuple[str, ...], where: str) -> ColumnMapping | None:
-    """Return the mapping of a table that has the columns of the package; None where it has not."""
-    sources = {role: Source(name, unit) for name, (role, unit) in _NATIVE.items()
-               if name in names}
-    for columns, unit in ((VOLTS, 'v'), (ACCEL, 'mps2')):
-        axes = {axis: Source(name, unit) for axis, name in zip(AXES, columns) if name in names}
-        if axes:
-            return ColumnMapping({**sources, **axes}, where) if 'x' in axes else None
-    return None
+class NotNativeError(UserError):
+    """The columns are not those of a recording; a mapping may read them."""
 
 
-def blocks(table: Table, mapping: ColumnMapping, reading: ReadingOptions, rows: int
-           ) -> Generator[Recording, None, None]:
-    """Read a table as a recording in blocks of at most `rows` samples."""
-    converter = _Converter(table, _resolved(table, mapping, reading), mapping, reading)
+def native_mapping(table: Table, output: tuple[str, ...] = ()) -> ColumnMapping:
+    """
+    Return the mapping of a table in the columns and units of the package.
+
+    output: the columns of the sensor that must be there; else those that are.
+    """
+    names = table.names
+    if table.repeated:
+        raise NotNativeError(f'{table.header}: column {table.repeated} stands twice; keep one')
+    # Where one form of output is there, the other may stand there in any unit.
+    outputs = next((kind for kind in (output, VOLTS, ACCEL) if set(kind) & set(names)),
+                   (*VOLTS, *ACCEL))
+    roles = {**_NATIVE, **{column: AXES[i % len(AXES)] for i, column in enumerate(outputs)}}
+    for column, role in roles.items():
+        other = None if column in names else _in_other_unit(names, column, role)
+        if other is not None:
+            raise NotNativeError(f'{table.header}:{other + 1}: column {names[other]} is in '
+                                 f'another unit; expected the column {column}')
+    for column in (TIME, *output):
+        if column not in names:
+            raise NotNativeError(f'{table.header}: no column {column}'
+                                 + f'; the columns are {listed(names)}' * bool(output))
+    try:
+        outputs = output or sensor_columns(names, table.header)
+    except UserError as error:
+        raise NotNativeError(str(error)) from None
+    return ColumnMapping({
+        **{role: Source(name, ROLES[role].value) for name, role in _NATIVE.items()
+           if name in names},
+        **{axis: Source(name, name.rpartition('_')[2]) for axis, name in zip(AXES, outputs)}},
+        table.path)
+
+
+def _in_other_unit(names: tuple[str, ...], column: str, role: str) -> int | None:
+    """Return the index of a column of the same name with another unit."""
+    stem = column.rpartition('_')[0]
+    return next((i for i, name in enumerate(names) if re.match(f'(?i){stem}_', name)
+                 and unit_name(name[len(stem) + 1:], ROLES[role])), None)
+
+
+def blocks(table: Table, mapping: ColumnMapping | None, reading: ReadingOptions, rows: int,
+           output: tuple[str, ...] = ()) -> Generator[Recording, None, None]:
+    """
+    Read a table as a recording in blocks of at most `rows` samples.
+
+    Without a mapping it must have the columns of the package, and further ones are kept, too.
+    """
+    stated = mapping or native_mapping(table, output)
+    converter = _Converter(table, _resolved(table, stated, reading), stated, reading,
+                           mapping is None)
+    names = list(dict.fromkeys(column.name for column in converter.columns.values()))
     count = 0
-    for block in table.blocks(converter.names):
+    for block in table.blocks(table.names if mapping is None else names, names):
         recording = converter.convert(block)
         for start in range(0, len(recording), rows):
             yield recording.rows(start, start + rows)
         count += len(recording)
     if not count:
-        raise UserError(f'{table.path}: has no samples')
+        raise UserError(f'{table.path}: has a header, but no samples')
 
 
 def _resolved(table: Table, mapping: ColumnMapping, reading: ReadingOptions
@@ -106,17 +159,17 @@ def _resolved(table: Table, mapping: ColumnMapping, reading: ReadingOptions
     if len({column.unit.is_volts for column in outputs}) > 1:
         raise UserError(f'{mapping.where}: some axes are in volts and others are not; state one '
                         'kind')
-    lsb = [column.unit_name in (LSB, UNSIGNED) for column in outputs]
+    counts = [column.name for column in outputs if column.unit_name in (LSB, UNSIGNED)]
     for option, values in (('--lsb-per-g', reading.lsb_per_g), ('--lsb-at-0g', reading.lsb_at_0g)):
         if values and len(values) not in (1, len(outputs)):
             raise UserError(f'{option}: has {len(values)} values for {len(outputs)} axes; write '
                             'one for all, or one for each')
-    if (reading.lsb_per_g or reading.lsb_at_0g) and not any(lsb):
+    if (reading.lsb_per_g or reading.lsb_at_0g) and not counts:
         raise UserError(f'--lsb-per-g: no column is in LSB; write for example '
                         f'x={outputs[0].name}:lsb')
-    if any(lsb) and not reading.lsb_per_g:
-        raise UserError(f'{mapping.where}: {outputs[lsb.index(True)].name} is in LSB; add '
-                        '--lsb-per-g with the counts of 1 g, as in the datasheet')
+    if counts and not reading.lsb_per_g:
+        raise UserError(f'{mapping.where}: {counts[0]} is in LSB; add --lsb-per-g with the counts '
+                        'of 1 g, as in the datasheet')
     return columns
 
 
@@ -134,19 +187,6 @@ def _column(table: Table, mapping: ColumnMapping, role: str) -> _Column:
     return _Column(name, UNITS[ROLES[role]][unit], unit, bool(stated))
 
 
-def listed(names: tuple[str, ...]) -> str:
-    """Return the first names of columns for a message."""
-    further = len(names) - _LISTED_NAMES
-    return ', '.join(names[:_LISTED_NAMES]) + f' and {further} more' * (further > 0)
-
-
-def likely_unit(length: float) -> str:
-    """Return the unit in which readings have the length of gravity; empty where none fits."""
-    lengths = {'g': 1.0, 'mps2': G0_MPS2, 'mg': 1e3}
-    return next((unit for unit, gravity in lengths.items()
-                 if abs(np.log(max(length, 1e-12) / gravity)) < _NEAR), '')
-
-
 @dataclass
 class _Converter:
     """Converts the blocks of one table."""
@@ -155,9 +195,10 @@ class _Converter:
     columns: Mapping[str, _Column]  # Its columns by role
     mapping: ColumnMapping  # What states them
     reading: ReadingOptions  # See `ReadingOptions`
+    is_native: bool  # Whether the columns are those of the package
     _remarks: list[str] = field(default_factory=list)
     _epoch_ns: int | None = None
-    _begin: float = 0.0
+    _begin: float = 0.0  # Origin of the times in the unit of the stamps
     _last_s: float = -np.inf
     _count: int = 0
     _empty: int = 0
@@ -165,47 +206,30 @@ class _Converter:
     _backward: int = 0
     _last_beta_rad: float = 0.0
 
-    @property
-    def names(self) -> list[str]:
-        """Return the columns of the table that are read."""
-        return list(dict.fromkeys(column.name for column in self.columns.values()))
-
     def convert(self, block: TableBlock) -> Recording:
         """Return the samples of a block."""
-        is_first = self._epoch_ns is None
         outputs = self._outputs(block)
-        is_sample = ~np.isnan(outputs).all(axis=1)
+        # In the package's own recordings, every line is a sample.
+        is_sample = ~np.isnan(outputs).all(axis=1) | (
+            self.is_native and not self.reading.drop_bad_stamps)
         self._empty += int((~is_sample).sum())
         self._check_outputs(block, outputs, is_sample)
         time_s, is_kept = self._times(block, is_sample)
-        columns = dict(zip(self._output_names(), outputs[is_kept].T.copy()))
-        references = {role: self._reference(block, role)[is_kept] for role in self.columns
-                      if role != 'time' and role not in AXES}
-        columns.update(self._references(references))
-        if is_first and is_kept.any():
-            self._begin_remarks(outputs[is_kept], time_s[is_kept])
+        kinds = VOLTS if self.columns['x'].unit.is_volts else ACCEL
+        columns = dict(zip(kinds, outputs.T)) | self._references(block)
+        if self.is_native:
+            columns = {**columns, **{name: values for name, values in block.columns.items()
+                                     if name not in columns and name != TIME}}
+        columns = {name: np.ascontiguousarray(values[is_kept])
+                   for name, values in columns.items()}
+        if not self._count and is_kept.any():
+            self._look_at_first(block, outputs[is_kept], time_s[is_kept])
         self._count += int(is_kept.sum())
         info = {key: text for key, text in block.info.items() if key != 'epoch_ns'}
         return Recording(self.table.path, time_s[is_kept], columns, info, cut=block.cut,
                          epoch_ns=self._epoch_ns or 0, done=block.done,
                          remarks=(*self._remarks, *self._counts()),
                          bad_stamps=BadStamps(self._duplicates, self._backward))
-
-    def _reference(self, block: TableBlock, role: str) -> np.ndarray:
-        """Return a reference in the unit of the package, (n,); NaN where it was not sampled."""
-        column = self.columns[role]
-        values = block.columns[column.name]
-        wrong = np.abs(values) > LIMIT
-        is_tilt = role in ('roll', 'pitch') and column.unit_name == 'rad'
-        if is_tilt and (np.abs(values) > _TURN_RAD).any():
-            row = int((np.abs(values) > _TURN_RAD).argmax())
-            raise UserError(f'{block.where(row, column.name)} is {values[row]:g} rad, more than a '
-                            f'turn; if it is in degrees, write {role}={column.name}:deg')
-        if wrong.any():
-            row = int(wrong.argmax())
-            raise UserError(f'{block.where(row, column.name)} is {values[row]:g}, no {role}; '
-                            'delete the line')
-        return column.unit.convert(values)
 
     def _outputs(self, block: TableBlock) -> np.ndarray:
         """Return the output of the sensor, (n, m), V or m/s²."""
@@ -223,9 +247,6 @@ class _Converter:
             outputs.append(column.unit.convert(values))
         return np.column_stack(outputs)
 
-    def _output_names(self) -> tuple[str, ...]:
-        return VOLTS if self.columns['x'].unit.is_volts else ACCEL
-
     def _check_outputs(self, block: TableBlock, outputs: np.ndarray, is_sample: np.ndarray
                        ) -> None:
         """Refuse a sample with a reading that is empty, not finite or too large."""
@@ -234,15 +255,47 @@ class _Converter:
             row, index = np.argwhere(wrong)[0].tolist()
             column = self.columns[AXES[index]]
             value = block.columns[column.name][row]
-            reason = 'is empty; every sample needs it' if np.isnan(value) else \
+            reason = 'is empty or NaN; every sample needs it' if np.isnan(value) else \
                 f'is {value:g}, no reading of a sensor in {column.unit_name}; delete the line, ' \
                 'or correct the unit'
             raise UserError(f'{block.where(row, column.name)} {reason}')
 
+    def _references(self, block: TableBlock) -> dict[str, np.ndarray]:
+        """Return the columns of references by name, (n,) each; NaN where not sampled."""
+        values = {role: self._reference(block, role) for role in self.columns
+                  if role != 'time' and role not in AXES}
+        if 'roll' in values:
+            values['alpha'], beta_rad = stage_angles(values['roll'], values['pitch'])
+            values['beta'] = self._unwrapped(beta_rad)
+        return {name: values[role] for name, role in _NATIVE.items() if role in values}
+
+    def _reference(self, block: TableBlock, role: str) -> np.ndarray:
+        """Return a reference in the unit of the package, (n,); NaN where it was not sampled."""
+        column = self.columns[role]
+        values = block.columns[column.name]
+        is_tilt = role in ('roll', 'pitch') and column.unit_name == 'rad'
+        for limit, reason in ((_TURN_RAD if is_tilt else np.inf,
+                               f'rad, more than a turn; if it is in degrees, write '
+                               f'{role}={column.name}:deg'),
+                              (LIMIT, f'{column.unit_name}, no {role}; delete the line')):
+            wrong = np.abs(values) > limit
+            if wrong.any():
+                row = int(wrong.argmax())
+                raise UserError(f'{block.where(row, column.name)} is {values[row]:g} {reason}')
+        return column.unit.convert(values)
+
+    def _unwrapped(self, beta_rad: np.ndarray) -> np.ndarray:
+        """Return beta without steps of a turn, rad, (n,); rows without it stay NaN."""
+        sampled = np.isfinite(beta_rad)
+        turned = beta_rad.copy()
+        turned[sampled] = np.unwrap(np.concatenate([[self._last_beta_rad], beta_rad[sampled]]))[1:]
+        if sampled.any():
+            self._last_beta_rad = float(turned[sampled][-1])
+        return turned
+
     def _times(self, block: TableBlock, is_sample: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return stamps, s, (n,), and which rows are kept, (n,)."""
         if self.reading.rate_hz is not None:
-            self._epoch_ns = self._epoch_ns or 0
             number = self._count + np.cumsum(is_sample) - 1
             return number / self.reading.rate_hz, is_sample
         column = self.columns['time']
@@ -250,30 +303,33 @@ class _Converter:
         missing = is_sample & ~np.isfinite(stamps)
         if missing.any():
             row = int(missing.argmax())
-            text = 'empty' if np.isnan(stamps[row]) else 'not finite'
+            text = 'empty or NaN' if np.isnan(stamps[row]) else 'not finite'
             raise UserError(f'{block.where(row, column.name)} is {text}; every sample needs a '
                             'time: delete the line, or give --rate HZ to stamp by index')
-        time_s = self._since_epoch(block, stamps, is_sample, column)
+        if self._epoch_ns is None and is_sample.any():
+            self._find_epoch(block, float(column.unit.convert(stamps[is_sample][:1])[0]))
+        time_s = column.unit.convert(stamps - self._begin)
+        wrong = is_sample & (np.abs(time_s) > _TIME_LIMIT_S)
+        if wrong.any():
+            row = int(wrong.argmax())
+            raise UserError(f'{block.where(row, column.name)} is {time_s[row]:g} s as '
+                            f'{column.unit_name}, more than 200 years; state its unit, for '
+                            'example ms, us or ns')
         is_kept = is_sample & self._increasing(block, time_s, is_sample, column)
         if is_kept.any():
             self._last_s = float(time_s[is_kept][-1])
         return time_s, is_kept
 
-    def _since_epoch(self, block: TableBlock, stamps: np.ndarray, is_sample: np.ndarray,
-                     column: _Column) -> np.ndarray:
-        """Return times since the origin, s, (n,); the origin is found in the first block."""
-        unit = column.unit
-        if self._epoch_ns is None and is_sample.any():
-            first_s = float(unit.convert(stamps[is_sample][:1])[0])
-            if abs(first_s) > TIME_LIMIT_S:
-                raise UserError(f'{block.where(int(is_sample.argmax()), column.name)} is '
-                                f'{first_s:g} s as {column.unit_name}, more than 200 years; '
-                                'state its unit, for example ms, us or ns')
-            stated = epoch_ns(self.table.path, dict(block.info))
-            whole_s = int(first_s) if first_s > _EPOCH_S and not stated else 0
-            self._epoch_ns = stated or whole_s * 1_000_000_000
-            self._begin = whole_s * unit.divisor / unit.factor
-        return unit.convert(stamps - self._begin)
+    def _find_epoch(self, block: TableBlock, first_s: float) -> None:
+        """Find the origin of the times: as comments state it, or near the first one."""
+        text = block.info.get('epoch_ns', '0')
+        if not re.fullmatch(r'-?\d{1,19}', text) or abs(int(text)) >= 1 << 63:
+            raise UserError(f'{self.table.path}: epoch_ns is {text!r}, expected whole nanoseconds')
+        is_since_1970 = _EPOCH_S < first_s <= _TIME_LIMIT_S and not self.is_native
+        whole_s = int(first_s) if is_since_1970 and not int(text) else 0
+        self._epoch_ns = int(text) or whole_s * 1_000_000_000
+        unit = self.columns['time'].unit
+        self._begin = whole_s * unit.divisor / unit.factor
 
     def _increasing(self, block: TableBlock, time_s: np.ndarray, is_sample: np.ndarray,
                     column: _Column) -> np.ndarray:
@@ -295,30 +351,10 @@ class _Converter:
                 'leaves such samples out, --rate HZ stamps by index')
         return ~wrong
 
-    def _references(self, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the columns of references by name, (n,) each."""
-        columns = {JOINTS[role]: values[role] for role in JOINTS if role in values}
-        if 'roll' in values:
-            alpha_rad, beta_rad = stage_angles(values['roll'], values['pitch'])
-            columns[JOINTS['alpha']] = alpha_rad
-            columns[JOINTS['beta']] = self._unwrapped(beta_rad)
-        if 'temperature' in values:
-            columns['temperature_c'] = values['temperature']
-        if 'supply' in values:
-            columns['supply_v'] = values['supply']
-        return columns
-
-    def _unwrapped(self, beta_rad: np.ndarray) -> np.ndarray:
-        """Return beta without steps of a turn, rad, (n,); rows without it stay NaN."""
-        sampled = np.isfinite(beta_rad)
-        turned = beta_rad.copy()
-        turned[sampled] = np.unwrap(np.concatenate([[self._last_beta_rad], beta_rad[sampled]]))[1:]
-        if sampled.any():
-            self._last_beta_rad = float(turned[sampled][-1])
-        return turned
-
-    def _begin_remarks(self, outputs: np.ndarray, time_s: np.ndarray) -> None:
-        """Note what is assumed, and what the first stamps show."""
+    def _look_at_first(self, block: TableBlock, outputs: np.ndarray, time_s: np.ndarray) -> None:
+        """Note what is assumed; refuse readings and stamps that are in another unit."""
+        if len(time_s) > _FEWEST_STAMPS and self.reading.rate_hz is None:
+            self._check_step(block, time_s)
         self._check_length(outputs)
         assumed = [f'{column.name} in {column.unit_name}' for column in self.columns.values()
                    if not column.is_stated]
@@ -329,6 +365,25 @@ class _Converter:
         if bursts:
             self._remarks.append(f'{self.table.path}: {bursts.removeprefix("; ")}; this rate is '
                                  'used, and --rate HZ stamps by index')
+
+    def _check_step(self, block: TableBlock, time_s: np.ndarray) -> None:
+        """Refuse stamps whose steps no sensor has, unless the file states their rate."""
+        column = self.columns['time']
+        rate_hz = stamped_rate_hz(time_s)
+        stated_hz = Recording(self.table.path, time_s, {}, dict(block.info)).stream_info.rate_hz
+        if stated_hz and abs(stated_hz / rate_hz - 1) < _SAME_RATE:
+            return
+        stamps, step = time_s * column.unit.divisor, column.unit.divisor / rate_hz
+        is_whole = bool((np.abs(stamps - np.rint(stamps)) < _WHOLE).all())
+        if is_sensor_step(1 / rate_hz, is_whole):
+            return
+        unit = time_unit_of_step(step, is_whole)
+        fitting = {**self.mapping.sources, 'time': Source(column.name, unit)}
+        raise UserError(
+            f'{self.table.path}: {column.name} has steps of {step:.4g}, which as '
+            f'{column.unit_name} are {rate_hz:.3g} Hz; if that is right, give --rate '
+            f'{rate_hz:.3g}, and if they are {unit}:',
+            f'--columns {shell_quoted(str(ColumnMapping(fitting)))}')
 
     def _check_length(self, outputs: np.ndarray) -> None:
         """Compare the length of the readings with gravity: a wrong unit shows in it."""
@@ -348,11 +403,9 @@ class _Converter:
 
     def _counts(self) -> Iterator[str]:
         """Yield how many rows were left out so far."""
-        path = self.table.path
-        if self._empty:
-            yield f'{path}: left out, lines without a reading of the sensor: {self._empty}'
-        if self._duplicates:
-            yield f'{path}: left out, samples with the stamp of the one before: ' \
-                  f'{self._duplicates}'
-        if self._backward:
-            yield f'{path}: left out, samples whose stamp steps back: {self._backward}'
+        for count, what in (
+                (self._empty, 'lines without a reading of the sensor'),
+                (self._duplicates, 'samples with the stamp of the one before'),
+                (self._backward, 'samples whose stamp steps back')):
+            if count:
+                yield f'{self.table.path}: left out, {what}: {count}'

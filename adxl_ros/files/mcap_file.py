@@ -13,10 +13,11 @@ that they can be read in turn up to the first one that is not whole.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from io import BytesIO
-from itertools import pairwise
+from itertools import islice, pairwise
 import os
 from pathlib import Path
 import struct
@@ -24,8 +25,6 @@ from typing import Any, BinaryIO, NamedTuple
 import zlib
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.atomic_write import release_read
-from adxl_ros.files.cdr import collected, collected_pieces, Piece, Raws
 import numpy as np
 
 _MESSAGE = 5
@@ -79,6 +78,52 @@ _DATA_BYTE = 40
 """Place of the data in the content of a chunk record without the name of its compression."""
 
 
+Raws = Sequence[bytes] | np.ndarray
+"""Messages of one type: their bytes one by one, or as rows of equal length, (n, size)."""
+
+_LARGE_BYTES = 2 << 30
+"""Size from which a file that is read leaves the cache (chosen): smaller ones are read again."""
+
+_PIECE_MESSAGES = 4096
+"""Messages that are collected to a piece (chosen: some MB)."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Consecutive messages of some topics."""
+
+    messages: Mapping[str, Raws]  # The messages by topic, in the order of recording
+    # Where each of them stands in the order of all, by topic, (n,), ascending
+    places: Mapping[str, np.ndarray]
+
+    def split(self, topic: str, count: int) -> tuple[Piece, Piece]:
+        """Split behind a message."""
+        last = self.places[topic][count - 1]
+        cuts = {name: int(np.searchsorted(places, last, 'right'))
+                for name, places in self.places.items()}
+        return (Piece({name: raws[:cuts[name]] for name, raws in self.messages.items()},
+                      {name: places[:cuts[name]] for name, places in self.places.items()}),
+                Piece({name: raws[cuts[name]:] for name, raws in self.messages.items()},
+                      {name: places[cuts[name]:] for name, places in self.places.items()}))
+
+
+def collected_pieces(messages: Iterable[tuple[str, bytes, int]]) -> Iterator[Piece]:
+    """Collect messages with topic and log time, ns, to pieces."""
+    iterator = iter(messages)
+    while batch := list(islice(iterator, _PIECE_MESSAGES)):
+        yield collected([(topic, raw) for topic, raw, _ in batch])
+
+
+def collected(messages: list[tuple[str, bytes]]) -> Piece:
+    """Collect messages with their topics to one piece."""
+    raws: dict[str, list[bytes]] = {topic: [] for topic, _ in messages}
+    places: dict[str, list[int]] = {topic: [] for topic in raws}
+    for place, (topic, raw) in enumerate(messages):
+        raws[topic].append(raw)
+        places[topic].append(place)
+    return Piece(raws, {topic: np.array(numbers) for topic, numbers in places.items()})
+
+
 class IndexFault(ValueError):
     """A message index that does not describe its chunk."""
 
@@ -116,13 +161,20 @@ def read_chunk(file: Any, chunk: Any, topics: Mapping[int, str]) -> Piece:
                   + len(chunk.compression))
         data = np.frombuffer(decompress(file.read(chunk.compressed_size), chunk.compression,
                                         chunk.uncompressed_size, crc), np.uint8)
-        release_read(file)
+        _release_read(file)
         return _ordered({topic: _messages(data, channel, _index(file, chunk, channel))
                          for channel, topic in _channels(chunk, topics).items()})
     except IndexFault:
         names: Any = dict(topics)
         records: Any = msgsrc(chunk, names, 0, chunk.message_end_time + 1, file)
         return collected([(topic, raw) for _, _, topic, raw in records if raw is not None])
+
+
+def _release_read(file: BinaryIO) -> None:
+    """Give back the page cache of what was read of a large file, up to the present place."""
+    if os.fstat(file.fileno()).st_size > _LARGE_BYTES:
+        # From its begin on, because the system keeps a large page that is only partly within.
+        os.posix_fadvise(file.fileno(), 0, file.tell(), os.POSIX_FADV_DONTNEED)
 
 
 def _channels(chunk: Any, topics: Mapping[int, str]) -> dict[int, str]:

@@ -123,28 +123,7 @@ def installed_path(name: str | os.PathLike) -> Path:
 
 
 def load(path: str | os.PathLike, may_measure: bool = False) -> Sensor:
-    """
-    Read and check a parameter file, or the installed file of a sensor by its name.
-
-    Parameters
-    ----------
-    path
-        The file.
-    may_measure
-        Whether values that can be measured may be missing; they are in `Sensor.unstated` then.
-
-    Returns
-    -------
-    Sensor
-        The sensor.
-
-    Raises
-    ------
-    UserError
-        The file cannot be read, is not YAML, or has a missing, unknown or wrong value. The
-        message names file, line and column.
-
-    """
+    """Return the installed file of a sensor by its name, such as MPU-6050; a path stays."""
     path = installed_path(path)
     flat, marks = _read(path)
 
@@ -161,23 +140,10 @@ def load(path: str | os.PathLike, may_measure: bool = False) -> Sensor:
 def from_flat(flat: Mapping[str, Any], make_error: MakeError, may_measure: bool = False
               ) -> Sensor:
     """
-    Make a `Sensor` of flat parameters, and check all of them.
+    Make a `Sensor` of flat parameters by dotted key (`sensor.serial`), and check all of them.
 
-    Parameters
-    ----------
-    flat
-        Values by dotted key (`sensor.serial`, `bias.offset_v`, ...). Keys of other nodes may be
-        among them.
-    make_error
-        Makes the exception to raise from a key and a reason.
-    may_measure
-        See `load`.
-
-    Returns
-    -------
-    Sensor
-        The sensor.
-
+    Keys of other nodes may be among them. `make_error` makes the exception to raise from a key
+    and a reason.
     """
     if flat.get('format') != FORMAT:
         raise make_error('format', f'version {flat.get("format")!r}, but this package reads '
@@ -221,41 +187,13 @@ def save(path: str | os.PathLike, sensor: Sensor, comments: Iterable[str] = ()) 
     """
     Write a parameter file, whole or not at all. Reading it gives the same floats.
 
-    Parameters
-    ----------
-    path
-        The file.
-    sensor
-        The sensor to write.
-    comments
-        Lines for people, before the parameters.
-
-    Raises
-    ------
-    UserError
-        The file cannot be written.
-
+    comments: lines for people, before the parameters.
     """
     write_text(path, as_text(sensor, comments))
 
 
 def as_text(sensor: Sensor, comments: Iterable[str] = ()) -> str:
-    """
-    Return the text of a parameter file.
-
-    Parameters
-    ----------
-    sensor
-        The sensor.
-    comments
-        Lines for people, before the parameters.
-
-    Returns
-    -------
-    str
-        The text.
-
-    """
+    """Return the text of a parameter file."""
     tree: dict[str, Any] = {}
     for key, value in to_flat(sensor).items():
         *parents, leaf = key.split('.')
@@ -278,11 +216,8 @@ def float_text(value: float) -> str:
     return text if '.' in text else text.replace('e', '.0e')
 
 
-def _represent_float(dumper: yaml.SafeDumper, value: float) -> yaml.Node:
-    return dumper.represent_scalar('tag:yaml.org,2002:float', float_text(value))
-
-
-_Dumper.add_representer(float, _represent_float)
+_Dumper.add_representer(float, lambda dumper, value: dumper.represent_scalar(
+    'tag:yaml.org,2002:float', float_text(value)))
 
 
 def compose(path: str | os.PathLike) -> yaml.Node | None:
@@ -306,7 +241,11 @@ def compose(path: str | os.PathLike) -> yaml.Node | None:
 
 
 def _yaml_error(path: str | os.PathLike, error: yaml.YAMLError) -> UserError:
-    """Return the error of a file that is not YAML, with its place where the parser names one."""
+    """
+    Read a YAML file as a tree of nodes, which know their places; None for an empty file.
+
+    An error names line and column.
+    """
     problem, mark = str(error), None
     if isinstance(error, yaml.MarkedYAMLError):
         problem, mark = str(error.problem), error.problem_mark
@@ -371,39 +310,38 @@ class _FlatReader:
         unstated = [field for key, field in SENSOR_FIELDS.items()
                     if may_measure and key not in self.flat
                     and field.metadata['placeholder'] is not None]
-        values = {field.name: self._field(field) for field in SENSOR_FIELDS.values()
-                  if field not in unstated}
-        axes = values['axes']
-        values |= {field.name: _placeholder(field, axes) for field in unstated}
-        for key, field in SENSOR_FIELDS.items():
-            value = values[field.name]
-            if isinstance(value, np.ndarray) and len(value) != len(axes):
-                raise self.make_error(key, f'{len(value)} values for {len(axes)} axes ({axes})')
+        # The axes come first, as they say how many values the others have.
+        axes = self._field(SENSOR_FIELDS['sensor.axes'])
+        values = {field.name: _placeholder(field, axes) if field in unstated else
+                  self._field(field, axes) for field in SENSOR_FIELDS.values()}
         if values['z_sign'] == 0:
             raise self.make_error('sensor.z_sign', '0, but must be 1 (upright) or -1')
         effects = self._names('effects')
         coefficients = {name: self._coefficients(name, axes) for name in effects}
         covariance, covariance_names = self._covariance(effects, axes)
-        provenance = {key.removeprefix('provenance.'): str(value)
-                      for key, value in self.flat.items() if key.startswith('provenance.')}
-        link = {key.removeprefix(_LINK): value for key, value in self.flat.items()
-                if key.startswith(_LINK)}
         datasheet_name = str(self.flat.get('datasheet.name', '')) \
             if 'datasheet.figures' in self.flat else ''
         return Sensor(**values, effects=effects, values=coefficients, covariance=covariance,
-                      covariance_names=covariance_names, provenance=provenance,
-                      envelope=self._envelope(), datasheet_name=datasheet_name,
-                      datasheet=self._datasheet(), link=link,
+                      covariance_names=covariance_names, envelope=self._envelope(),
+                      provenance={key: str(value)
+                                  for key, value in self._below('provenance.').items()},
+                      datasheet_name=datasheet_name, datasheet=self._datasheet(),
+                      link=self._below(_LINK),
                       unstated=tuple(field.name for field in unstated))
 
-    def _field(self, field: Field[Any]) -> Any:
+    def _below(self, begin: str) -> dict[str, Any]:
+        """Return the values of the keys with this begin, by the rest of the key."""
+        return {key.removeprefix(begin): value for key, value in self.flat.items()
+                if key.startswith(begin)}
+
+    def _field(self, field: Field[Any], axes: str = '') -> Any:
         """Return the value of a field of `Sensor`."""
         key, kind = field.metadata['key'], field.type
         if key not in self.flat:
             raise self.make_error(key, f'missing; it is the {field.metadata["doc"]}')
         value = self.flat[key]
         if kind == 'np.ndarray':
-            value = self._numbers(key, value)
+            value = self._numbers(key, value, axes)
         elif kind == 'float':
             value = self._numbers(key, [value])[0].item()
         elif not isinstance(value, {'int': int, 'str': str}[str(kind)]) or isinstance(value, bool):
@@ -423,8 +361,8 @@ class _FlatReader:
                 raise self.make_error(
                     key, f'{value:g} {unit} is outside {lower:g} to {upper:g}')
 
-    def _numbers(self, key: str, value: Any) -> np.ndarray:
-        """Return a number or a list of numbers as an array."""
+    def _numbers(self, key: str, value: Any, axes: str = '') -> np.ndarray:
+        """Return a number or a list of numbers, one for each of the axes, as an array."""
         numbers = value if isinstance(value, (list, tuple, np.ndarray)) else [value]
         for number in numbers:
             if not isinstance(number, float):
@@ -432,6 +370,8 @@ class _FlatReader:
                     key, f'{number!r} is not a floating-point number{_as_float(number)}')
             if not np.isfinite(number):
                 raise self.make_error(key, f'{number} is not a finite number')
+        if axes and len(numbers) != len(axes):
+            raise self.make_error(key, f'{len(numbers)} values for {len(axes)} axes ({axes})')
         return np.array(numbers, float)
 
     def _names(self, key: str) -> tuple[str, ...]:
@@ -463,21 +403,20 @@ class _FlatReader:
     def _values(self, effect: Effect, parameter: Parameter, axes: str) -> np.ndarray:
         """Return the value of a parameter by axis, (m,), or () where it has no axes."""
         key = str(Coefficient(effect.name, parameter.name))
-        if key not in self.flat and parameter.role is Role.OPTIONAL:
-            return neutral(effect, axes)[parameter.name]
         if key not in self.flat:
+            if parameter.role is Role.OPTIONAL:
+                return neutral(effect, axes)[parameter.name]
             raise self.make_error(key, f'missing; it is the {parameter.doc}, {parameter.unit}'
                                   f'{", by axis" if parameter.axes else ""}')
-        values = self._numbers(key, self.flat[key])
-        if parameter.axes and len(values) != len(axes):
-            raise self.make_error(key, f'{len(values)} values for {len(axes)} axes ({axes})')
-        if not parameter.axes and isinstance(self.flat[key], (list, tuple)):
+        if parameter.axes:
+            values = self._numbers(key, self.flat[key], axes)
+        elif isinstance(self.flat[key], (list, tuple)):
             raise self.make_error(
                 key, f'{self.flat[key]} is a list; it is one number without axes')
+        else:
+            values = self._numbers(key, self.flat[key])[0]
         self._check_bounds(key, values, parameter.lower, parameter.upper, parameter.unit)
-        if not parameter.axes:
-            return values[0]
-        for axis, value in zip(axes, values):
+        for axis, value in zip(axes, np.atleast_1d(values)) if parameter.axes else ():
             if axis not in parameter.axes and value != parameter.neutral:
                 raise self.make_error(key, f'{value:g} for {axis}, which it does not act on; '
                                       f'write {parameter.neutral!r}')

@@ -17,6 +17,7 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files.parameter_file import compose
 from adxl_ros.model.population import PooledCoefficient, Population
 from adxl_ros.package_version import package_version
 import yaml
@@ -52,16 +53,8 @@ def _rounded(value: Any) -> Any:
 
 def read(path: str | os.PathLike) -> Population:
     """Read and check a population."""
-    try:
-        text = Path(path).read_text(encoding='utf-8')
-        contents = yaml.safe_load(text)
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else 'not UTF-8'
-        raise UserError(f'{path}: cannot be read: {reason}') from None
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark
-        place = f', line {mark.line + 1}, column {mark.column + 1}' if mark else ''
-        raise UserError(f'{path}{place}: not YAML: {error.problem}') from None
+    node = compose(path)
+    contents = yaml.constructor.SafeConstructor().construct_document(node) if node else None
     if not isinstance(contents, dict) or contents.get('format') != FORMAT \
             or not isinstance(contents.get('coefficients'), dict):
         raise UserError(f'{path}: no population of format {FORMAT}; give the population.yaml '

@@ -11,41 +11,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 import os
 from pathlib import Path
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import bag_reader, csv_file, mapped_recording
+from adxl_ros.files import bag_reader, mapped_recording
 from adxl_ros.files.bag_writer import BagWriter
-from adxl_ros.files.column_guess import describe, is_sensor_step, shell_quoted, time_unit_of_step
-from adxl_ros.files.column_mapping import (
-    AS_IT_IS,
-    ColumnMapping,
-    mounted,
-    parse_mapping,
-    Quantity,
-    ReadingOptions,
-    Source,
-    unit_in_name,
-    UNITS,
-)
-from adxl_ros.files.csv_file import csv_writer, HeaderError
-from adxl_ros.files.recording_columns import ACCEL, concatenate, Recording, TIME
-from adxl_ros.files.tables import is_text, open_table, Table
+from adxl_ros.files.column_guess import describe
+from adxl_ros.files.column_mapping import AS_IT_IS, Mounting, parse_mapping, ReadingOptions
+from adxl_ros.files.csv_file import csv_writer
+from adxl_ros.files.recording_columns import ACCEL, concatenate, Recording, TIME, VOLTS
+from adxl_ros.files.tables import open_table
+from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 _BLOCK_ROWS = 65536
 """Samples that are read at a time (chosen: some MB)."""
-
-_FEWEST_STAMPS = 8
-"""Stamps whose steps show their unit. Chosen: a lost sample hides no median."""
-
-_WHOLE = 1e-3
-"""Largest distance of a stamp from a whole number by rounding, in its unit."""
-
-_SAME_RATE = 0.1
-"""Largest relative difference of a stated sample rate from that of the stamps. Chosen."""
 
 _MAGIC_BYTES = 16
 """Bytes at the beginning of a file that show its format."""
@@ -86,111 +69,55 @@ def read(path: str | os.PathLike, reading: ReadingOptions = AS_IT_IS) -> Recordi
 def blocks(path: str | os.PathLike, rows: int, reading: ReadingOptions = AS_IT_IS
            ) -> Generator[Recording, None, None]:
     """
-    Read a recording in blocks; the memory is bounded by a block.
+    Read a recording in blocks of at most `rows` samples; the memory is bounded by a block.
 
     All blocks have the same columns, except for a CSV column that turns out to be text further
     down. Alignments, cut and remarks of a block are those up to its end.
-
-    Parameters
-    ----------
-    path
-        The recording.
-    rows
-        Largest number of samples of a block.
-    reading
-        Topic, columns and stamps where the recording does not state them.
-
-    Returns
-    -------
-    iterator
-        The blocks in the order of time.
-
-    Raises
-    ------
-    UserError
-        The recording cannot be read, or holds values that no sensor gives.
-
     """
-    read_blocks = _blocks(path, rows, reading)
-    if reading.mounting is None:
-        return read_blocks
-    return mounted(read_blocks, reading.mounting)
+    read_blocks = bag_reader.blocks(path, rows, reading=reading) if _is_bag(path) else \
+        _table_blocks(path, rows, reading)
+    return _mounted(read_blocks, reading.mounting) if reading.mounting else read_blocks
 
 
-def _blocks(path: str | os.PathLike, rows: int, reading: ReadingOptions
-            ) -> Generator[Recording, None, None]:
-    """Return the blocks along the axes of the file; see `blocks`."""
-    if _is_bag(path):
-        return bag_reader.blocks(path, rows, reading=reading)
-    if is_text(path) and not reading.changes_columns and not reading.topic:
-        return _with_sound_rate(_native_blocks(path, rows), None)
+def _table_blocks(path: str | os.PathLike, rows: int, reading: ReadingOptions
+                  ) -> Generator[Recording, None, None]:
+    """Yield the blocks of a table; propose a mapping where it has none."""
     table = open_table(path, reading.topic)
-    mapping = reading.mapping or _mapping_of(table)
-    if mapping is None:
+    mapping = reading.mapping or (
+        parse_mapping(table.default_mapping) if table.default_mapping else None)
+    try:
+        yield from mapped_recording.blocks(table, mapping, reading, rows)
+    except mapped_recording.NotNativeError as error:
         text, options = describe(table)
-        raise UserError(f'{path}: {text}', options)
-    read_blocks = mapped_recording.blocks(table, mapping, reading, rows)
-    return read_blocks if reading.rate_hz else _with_sound_rate(read_blocks, mapping)
+        raise UserError(f'{error}; {text}', options) from None
 
 
-def _with_sound_rate(read_blocks: Iterator[Recording], mapping: ColumnMapping | None
-                     ) -> Generator[Recording, None, None]:
-    """Yield the blocks of a table; refuse stamps that are in another unit, by their steps."""
-    is_first = True
-    for block in read_blocks:
-        if is_first and len(block) > _FEWEST_STAMPS:
-            _check_step(block, mapping or mapped_recording.native_mapping(
-                (TIME, *block.columns), block.path))
-            is_first = False
-        yield block
+def _mounted(blocks: Iterator[Recording], mounting: Mounting) -> Generator[Recording, None, None]:
+    """Turn the blocks of a recording."""
+    for block in blocks:
+        names = block.sensor_columns
+        if len(names) != len(mounting.signs):
+            raise UserError(f'--axes: names the axes {AXES[:len(mounting.signs)]}, but '
+                            f'{block.path} has {block.axes}')
+        outputs = np.column_stack([block.columns[name] for name in names])
+        zero = _zero(block, mounting)
+        turned = mounting.turn(outputs - zero) + zero
+        yield replace(block, columns={**block.columns, **dict(zip(names, turned.T.copy()))})
 
 
-def _check_step(block: Recording, mapping: ColumnMapping | None) -> None:
-    """Refuse stamps whose steps no sensor has, unless the file states their rate."""
-    step_s, stated_hz = 1 / block.rate_hz, block.stream_info.rate_hz
-    if mapping is None or (stated_hz and abs(step_s * stated_hz - 1) < _SAME_RATE):
-        return
-    source = mapping.sources['time']
-    read_as = source.unit or unit_in_name(source.column, Quantity.TIME) or 's'
-    divisor = UNITS[Quantity.TIME][read_as].divisor
-    raw = block.time_s * divisor
-    is_whole = bool((np.abs(raw - np.rint(raw)) < _WHOLE).all())
-    if is_sensor_step(step_s, is_whole):
-        return
-    unit = time_unit_of_step(step_s * divisor, is_whole)
-    fitting = {**mapping.sources, 'time': Source(source.column, unit)}
-    raise UserError(
-        f'{block.path}: {source.column} has steps of {step_s * divisor:.4g}, which as {read_as} '
-        f'are {block.rate_hz:.3g} Hz; if that is right, give --rate {block.rate_hz:.3g}, and if '
-        f'they are {unit}:', f'--columns {shell_quoted(str(ColumnMapping(fitting)))}')
+def _zero(block: Recording, mounting: Mounting) -> float:
+    """Return the output at zero specific force, in the unit of the output."""
+    if block.sensor_columns[0] in ACCEL or min(mounting.signs) > 0:
+        return 0.0
+    zeros = block.stream_info.nominal_values(block.axes).get('nominal_zero_g_v', np.zeros(0))
+    if not len(zeros) or np.ptp(zeros) > 0:
+        raise UserError(f'--axes: inverts an axis of {block.path}, whose {VOLTS[0]} is in volts '
+                        'about an unknown zero; write a line "# nominal_zero_g_v: ..." with the '
+                        'same value for each axis, or state the mounting in the parameter file')
+    return float(zeros[0])
 
 
-def _mapping_of(table: Table) -> ColumnMapping | None:
-    """Return the mapping by the definition of a format, or by the package's own columns."""
-    if table.default_mapping:
-        return parse_mapping(table.default_mapping)
-    return mapped_recording.native_mapping(table.names, table.path)
-
-
-def _native_blocks(path: str | os.PathLike, rows: int) -> Generator[Recording, None, None]:
-    """Yield the blocks of a CSV file in the package's columns; propose a mapping for others."""
-    try:
-        yield from csv_file.blocks(path, rows)
-    except HeaderError as error:
-        raise _with_proposal(path, error) from None
-
-
-def _with_proposal(path: str | os.PathLike, error: HeaderError) -> UserError:
-    """Add the best mapping to an error about the columns of a text table."""
-    try:
-        table = open_table(path)
-    except UserError:
-        return error
-    text, options = describe(table, is_listed=', '.join(table.names[:2]) in str(error))
-    return UserError(f'{error}; {text}', options)
-
-
-def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> Recording:
     """
     Read the ideal specific force of another simulator.
 
@@ -204,10 +131,8 @@ def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> tuple[np.ndarray, 
 
     Returns
     -------
-    time_s : ndarray
-        Times, s, (n,).
-    force_mps2 : ndarray
-        Specific force in the case frame, m/s², (n, 3).
+    Recording
+        Specific force in the case frame, m/s², with times since `epoch_ns`.
 
     Raises
     ------
@@ -216,36 +141,19 @@ def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> tuple[np.ndarray, 
 
     """
     parts = (bag_reader.blocks(path, _BLOCK_ROWS, ideal=True) if _is_bag(path)
-             else _with_sound_rate(csv_file.blocks(path, _BLOCK_ROWS, needed=ACCEL), None))
+             else mapped_recording.blocks(open_table(path), None, AS_IT_IS, _BLOCK_ROWS, ACCEL))
     ideal = concatenate(parts)
-    time_s = ideal.time_s + (ideal.epoch_ns - epoch_ns) / 1e9
-    return time_s, np.column_stack([ideal.columns[name] for name in ACCEL])
+    return replace(ideal, time_s=ideal.time_s + (ideal.epoch_ns - epoch_ns) / 1e9,
+                   epoch_ns=epoch_ns)
 
 
 @contextmanager
 def writer(path: str | os.PathLike, sensor: Sensor) -> Iterator[Callable[[Recording], None]]:
     """
-    Open a new recording, and yield a function that appends a block of samples to it.
+    Read the ideal specific force of another simulator, with times since `epoch_ns`.
 
-    The recording appears under its name when the block ends without an error, or not at all.
-
-    Parameters
-    ----------
-    path
-        The recording; its ending determines the format.
-    sensor
-        The unit whose nominal conversion a bag holds. A CSV file does not need it.
-
-    Yields
-    ------
-    callable
-        Takes the samples to append.
-
-    Raises
-    ------
-    UserError
-        The recording cannot be written.
-
+    It is a CSV file with `time_s, ax_mps2, ay_mps2, az_mps2`, or a bag with one topic of type
+    sensor_msgs/Imu, or several of which one is `imu/data_raw`.
     """
     if Path(path).suffix == '.csv':
         with csv_writer(path) as append:
@@ -256,7 +164,12 @@ def writer(path: str | os.PathLike, sensor: Sensor) -> Iterator[Callable[[Record
 
 
 def _csv_info(recording: Recording) -> dict[str, str]:
-    """Return the `# key: value` lines of a recording's CSV file."""
+    """
+    Open a new recording, and yield a function that appends a block of samples to it.
+
+    The recording appears under its name when the block ends without an error, or not at all; its
+    ending determines the format. A bag holds the nominal conversion of `sensor`.
+    """
     info = {key: value for key, value in recording.info.items() if key != 'epoch_ns'}
     return {**info, 'epoch_ns': str(recording.epoch_ns)} if recording.epoch_ns else info
 
@@ -285,7 +198,7 @@ def write(path: str | os.PathLike, recording: Recording, sensor: Sensor) -> None
 
 
 def _is_bag(path: str | os.PathLike) -> bool:
-    """Return whether a file is a bag or CSV; refuse other formats and misleading names."""
+    """Write a whole recording; see `writer`."""
     file_path = Path(path)
     if file_path.is_dir():
         return True

@@ -167,15 +167,13 @@ def sensor_columns(names: Iterable[str], where: str) -> tuple[str, ...]:
     names = tuple(names)
     kind = VOLTS if any(name in names for name in VOLTS) else ACCEL
     present = tuple(name for name in kind if name in names)
-    listed = ', '.join(names) or 'none'
     if not present:
         raise UserError(f'{where}: no column of a sensor: needs x_v[, y_v][, z_v] or '
-                        f'ax_mps2[, ay_mps2][, az_mps2]; the columns are {listed}')
+                        'ax_mps2[, ay_mps2][, az_mps2]')
     expected = kind[:len(present)]
     if present != expected:
         missing = next(name for name in expected if name not in present)
-        raise UserError(f'{where}: no column {missing} beside {", ".join(present)}; '
-                        f'the columns are {listed}')
+        raise UserError(f'{where}: no column {missing} beside {", ".join(present)}')
     return present
 
 

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.recording_columns import Alignment
 import numpy as np
 
 LONGEST_MOVE_NS = 1e8
@@ -121,17 +120,17 @@ class Track:
             self._stamp_ns, self._value = self._stamp_ns[start:], self._value[start:]
 
     @property
-    def alignment(self) -> Alignment:
+    def alignment(self) -> tuple[float, float]:
         """
-        How well the reference was aligned so far.
+        How well the reference was aligned so far: residual, in its unit, and largest gap, s.
 
         The residual is the rms difference between each message and the straight line between its
         neighbours. Interpolation over twice the period misses it, so that it bounds the error
         over one period. It is 0 where every sample has a message with its own stamp.
         """
         if not self._gap_ns or not self._square_count:
-            return Alignment(0.0, self._gap_ns * 1e-9)
-        return Alignment((self._square_sum / self._square_count) ** 0.5, self._gap_ns * 1e-9)
+            return 0.0, self._gap_ns * 1e-9
+        return (self._square_sum / self._square_count) ** 0.5, self._gap_ns * 1e-9
 
 
 def _largest_gap_ns(sample_ns: np.ndarray, message_ns: np.ndarray) -> int:

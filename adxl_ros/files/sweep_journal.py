@@ -52,7 +52,7 @@ class PoseRecord:
     def to_json(self) -> dict[str, Any]:
         """Return the keys and values of the record's line; NaN and None have no key."""
         line = {key: value for key, value in asdict(self).items()
-                if value is not None and not _is_nan(value)}
+                if value is not None and value == value}  # NaN differs from itself
         if 'alpha_rad' not in line:
             del line['check']
         return line
@@ -64,9 +64,8 @@ class PoseRecord:
         if missing:
             raise ValueError(f'the pose has no {", ".join(missing)}')
         values = {f.name: line[f.name] for f in fields(cls) if f.name in line}
-        for name in ('mean_v', 'std_v'):
-            values[name] = tuple(values[name])
-        return cls(**values)
+        return cls(**{**values, 'mean_v': tuple(values['mean_v']),
+                      'std_v': tuple(values['std_v'])})
 
 
 @dataclass(frozen=True)
@@ -75,10 +74,6 @@ class PoseDropped:
 
     pose: int  # Number of the pose
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the keys and values of the line."""
-        return {'drop': self.pose}
-
 
 @dataclass(frozen=True)
 class PoseSkipped:
@@ -86,18 +81,10 @@ class PoseSkipped:
 
     pose: int  # Number of the pose
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the keys and values of the line."""
-        return {'skip': self.pose, 'drop': self.pose}
-
 
 @dataclass(frozen=True)
 class MountingUnchecked:
     """A note that the operator skipped the check of the mounting."""
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the keys and values of the line."""
-        return {'mounting': 'not checked'}
 
 
 @dataclass(frozen=True)
@@ -107,14 +94,39 @@ class Fitted:
     rests: tuple[PoseRecord, ...] | None  # Poses of the fit; None in journals of earlier versions
     done: bool  # Whether no pose was open, so that the calibration is over
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the keys and values of the line."""
-        rests = {} if self.rests is None else {'rests': [r.to_json() for r in self.rests]}
-        return {**rests, 'done': self.done}
-
 
 JournalEntry: TypeAlias = PoseRecord | PoseDropped | PoseSkipped | MountingUnchecked | Fitted
 """What a line of a journal after its head may hold."""
+
+
+def _line(entry: JournalEntry) -> dict[str, Any]:
+    """Return the keys and values of the line of an entry."""
+    if isinstance(entry, PoseRecord):
+        return entry.to_json()
+    if isinstance(entry, Fitted):
+        rests = {} if entry.rests is None else {'rests': [r.to_json() for r in entry.rests]}
+        return {**rests, 'done': entry.done}
+    if isinstance(entry, MountingUnchecked):
+        return {'mounting': 'not checked'}
+    skip = {'skip': entry.pose} if isinstance(entry, PoseSkipped) else {}
+    return {**skip, 'drop': entry.pose}
+
+
+def _entry(line: Mapping[str, Any]) -> JournalEntry | None:
+    """Return the entry of a line; None for a line of another version without a meaning here."""
+    if 'pose' in line:
+        return PoseRecord.from_json(line)
+    if 'skip' in line:
+        return PoseSkipped(line['skip'])
+    if 'drop' in line:
+        return PoseDropped(line['drop'])
+    if 'mounting' in line:
+        return MountingUnchecked()
+    if 'done' in line:
+        rests = line.get('rests')
+        return Fitted(None if rests is None else tuple(map(PoseRecord.from_json, rests)),
+                      bool(line['done']))
+    return None
 
 
 class JournalContents(NamedTuple):
@@ -122,6 +134,15 @@ class JournalContents(NamedTuple):
 
     head: dict[str, Any]  # What must be the same for poses to belong together, by key
     entries: list[JournalEntry]  # All entries, in the order in which they were written
+
+    def is_over(self, head: Mapping[str, Any]) -> bool:
+        """
+        Return whether the calibration is over, so that another may begin.
+
+        One that was fitted with open poses can be resumed. For another head it is over.
+        """
+        last = self.entries[-1] if self.entries else None
+        return isinstance(last, Fitted) and (last.done or bool(differences(self.head, head)))
 
 
 class Unfinished(NamedTuple):
@@ -172,7 +193,7 @@ class Journal:
 
     def append(self, entry: JournalEntry) -> None:
         """Write one entry and wait until it is on the disk."""
-        self._append_line(entry.to_json())
+        self._append_line(_line(entry))
 
     def close(self) -> None:
         """Close the file, so that others can lock it."""
@@ -195,18 +216,22 @@ class Journal:
         """Return the entries of an interrupted calibration, or begin a new file with the head."""
         try:
             contents, size = _parse(self.path)
+            is_kept = contents is not None and (start_over or contents.is_over(head))
         except NotJournalError as error:
             if not start_over:
                 raise UserError(
                     f'{error}; {len(accepted_poses(error.entries))} poses before it can be read; '
                     'name another journal, or begin again with resume:=anew (this file is kept)'
                 ) from None
-            self._put_aside(None)
-            contents = None
-        if contents is not None and (start_over or _is_over(contents, head)):
-            self._put_aside(contents)
-            contents = None
-        if contents is None:
+            contents, size, is_kept = None, 0, True
+        if is_kept:
+            # A finished journal is kept until the next one is finished, others for ever.
+            last = contents.entries[-1] if contents and contents.entries else None
+            name = 'previous' if isinstance(last, Fitted) and last.done else \
+                datetime.now(timezone.utc).strftime('%Y%m%dT%H%M%S.%fZ')
+            with atomic_path(self.path.with_name(f'{self.path.name}.{name}')) as copy:
+                shutil.copyfile(self.path, copy)
+        if contents is None or is_kept:
             self._file.truncate(0)
             self._append_line(head)
             sync(self.path.parent)
@@ -217,22 +242,10 @@ class Journal:
         self._file.truncate(size)
         return contents.entries
 
-    def _put_aside(self, contents: JournalContents | None) -> None:
-        """Copy the file: a finished journal until the next one is finished, others for ever."""
-        finished = contents is not None and bool(contents.entries) and \
-            isinstance(contents.entries[-1], Fitted) and contents.entries[-1].done
-        name = 'previous' if finished else \
-            datetime.now(timezone.utc).strftime('%Y%m%dT%H%M%S.%fZ')
-        with atomic_path(self.path.with_name(f'{self.path.name}.{name}')) as copy:
-            shutil.copyfile(self.path, copy)
-
 
 def read(path: str | os.PathLike) -> JournalContents:
     """Read the head and the entries of a journal."""
-    try:
-        contents, _ = _parse(Path(path))
-    except OSError as error:
-        raise UserError(f'{path}: cannot be read: {error.strerror}') from None
+    contents, _ = _parse(Path(path))
     if contents is None:
         raise UserError(f'{path}: an empty journal')
     return contents
@@ -246,12 +259,9 @@ def unfinished(path: str | os.PathLike, head: Mapping[str, Any]) -> Unfinished |
         contents, _ = _parse(Path(path))
     except NotJournalError as error:
         return Unfinished(len(accepted_poses(error.entries)), error.obstacle)
-    except OSError as error:
-        raise UserError(f'{path}: cannot be read: {error.strerror}') from None
-    if contents is None:
-        return None
-    poses, new_head = len(accepted_poses(contents.entries)), _as_read(head)
-    if not poses or _is_over(contents, new_head):
+    new_head = _as_read(head)
+    poses = len(accepted_poses(contents.entries)) if contents else 0
+    if contents is None or not poses or contents.is_over(new_head):
         return None
     return Unfinished(poses, differences(contents.head, new_head))
 
@@ -294,83 +304,41 @@ def poses_to_fit(entries: Sequence[JournalEntry]) -> list[PoseRecord]:
     return accepted_poses(entries)
 
 
-def _is_over(contents: JournalContents, head: Mapping[str, Any]) -> bool:
-    """
-    Return whether a calibration is over, so that another may begin.
-
-    A calibration that was fitted with open poses can be resumed. For another head it is over.
-    """
-    if not contents.entries or not isinstance(contents.entries[-1], Fitted):
-        return False
-    return contents.entries[-1].done or bool(differences(contents.head, head))
-
-
 def _parse(path: Path) -> tuple[JournalContents | None, int]:
     """Return the contents, None without a head, and the size of the complete lines, bytes."""
-    data = path.read_bytes()
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise UserError(f'{path}: cannot be read: {error.strerror}') from None
     # A crash may have left the beginning of the head, or its length without its bytes.
     if b'\n' not in data and data.strip(b'\0') and not data.startswith(b'{'):
         raise NotJournalError(path, 1, 'it does not begin with {', [])
     # The text after the last newline is a line that a crash has cut.
     lines = data.split(b'\n')[:-1]
-    if not lines:
-        return None, 0
-    head = _head(path, lines[0])
+    head: dict[str, Any] = {}
     entries: list[JournalEntry] = []
-    for number, raw in enumerate(lines[1:], 2):
+    for number, raw in enumerate(lines, 1):
         try:
-            entry = _entry(_object(raw))
+            line = json.loads(raw)
+            if not isinstance(line, dict):
+                raise ValueError('not an object')
+            if number > 1:
+                entry = _entry(line)
+                entries += [] if entry is None else [entry]
+            elif line.get('format') == FORMAT:
+                head = line
+            else:
+                raise ValueError(f'format {line.get("format")!r}, but this package reads version '
+                                 f'{FORMAT}')
         except (ValueError, TypeError) as error:
             raise NotJournalError(path, number, error, entries) from None
-        if entry is not None:
-            entries.append(entry)
-    return JournalContents(head, entries), sum(len(raw) + 1 for raw in lines)
-
-
-def _head(path: Path, raw: bytes) -> dict[str, Any]:
-    """Read the first line; raises `NotJournalError` for another format."""
-    try:
-        head = _object(raw)
-    except ValueError as error:
-        raise NotJournalError(path, 1, error, []) from None
-    if head.get('format') != FORMAT:
-        raise NotJournalError(path, 1, f'format {head.get("format")!r}, but this package '
-                              f'reads version {FORMAT}', [])
-    return head
-
-
-def _object(raw: bytes) -> dict[str, Any]:
-    """Read a line as a JSON object; raises `ValueError` for any other line."""
-    line = json.loads(raw)
-    if not isinstance(line, dict):
-        raise ValueError('not an object')
-    return line
-
-
-def _entry(line: Mapping[str, Any]) -> JournalEntry | None:
-    """Return the entry of a line; None for a line of another version without a meaning here."""
-    if 'pose' in line:
-        return PoseRecord.from_json(line)
-    if 'skip' in line:
-        return PoseSkipped(line['skip'])
-    if 'drop' in line:
-        return PoseDropped(line['drop'])
-    if 'mounting' in line:
-        return MountingUnchecked()
-    if 'done' in line:
-        rests = line.get('rests')
-        records = None if rests is None else tuple(PoseRecord.from_json(rest) for rest in rests)
-        return Fitted(records, bool(line['done']))
-    return None
+    return (JournalContents(head, entries) if lines else None,
+            sum(len(raw) + 1 for raw in lines))
 
 
 def _as_read(head: Mapping[str, Any]) -> dict[str, Any]:
     """Return a head as it is read from a file: with its format, and tuples as lists."""
     return json.loads(json.dumps({'format': FORMAT, **head}))
-
-
-def _is_nan(value: object) -> bool:
-    return isinstance(value, float) and math.isnan(value)
 
 
 def _short(value: Any) -> str:

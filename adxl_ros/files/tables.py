@@ -7,18 +7,19 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import redirect_stdout
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from io import StringIO
 import os
 from pathlib import Path
 import re
-from typing import Any, Protocol
+from typing import Any
 import zipfile
 import zlib
 
 from adxl_ros.errors import install_hint, one_line, UserError
-from adxl_ros.files.column_mapping import Quantity, unit_in_name, UNITS
-from adxl_ros.files.delimited_text import NoNumbers, open_text, TableBlock
+from adxl_ros.files.column_mapping import Quantity, Table, TableBlock, unit_in_name, UNITS
+from adxl_ros.files.csv_file import find_form, NoNumbers, read_blocks
 from adxl_ros.model.kinematics import stage_angles
 import numpy as np
 
@@ -36,44 +37,6 @@ _MAPPINGS = {
 vehicle_imu has changes of velocity, so that it is only named."""
 
 
-class Table(Protocol):
-    """A file with columns."""
-
-    @property
-    def path(self) -> str:
-        """Return the file."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Return the columns, each once."""
-
-    @property
-    def has_names(self) -> bool:
-        """Return whether the file names its columns; else their names are their numbers from 1."""
-
-    @property
-    def form(self) -> str:
-        """Describe how the file is written, for messages; empty where nothing is special."""
-
-    @property
-    def units(self) -> Mapping[str, str]:
-        """Return the units that the format states, by column."""
-
-    @property
-    def default_mapping(self) -> str:
-        """Return the mapping that the definition of the format states; empty for none."""
-
-    def blocks(self, names: Collection[str]) -> Iterator[TableBlock]:
-        """
-        Yield the rows with some columns of numbers, in the order of the file.
-
-        A column in which a cell is no number is refused.
-        """
-
-    def sample(self) -> Mapping[str, np.ndarray]:
-        """Return the first rows of all columns of numbers."""
-
-
 def open_table(path: str | os.PathLike, topic: str = '') -> Table:
     """Open a table of any format, by the end of its name; `topic` is the message of a log."""
     path = str(path)
@@ -82,12 +45,26 @@ def open_table(path: str | os.PathLike, topic: str = '') -> Table:
         return _open_ulog(path, topic)
     if topic:
         raise UserError(f'--topic {topic}: {path} is no bag; leave --topic out')
-    return _FORMATS.get(ending, open_text)(path)
+    return _FORMATS.get(ending, _open_text)(path)
 
 
-def is_text(path: str | os.PathLike) -> bool:
-    """Return whether a file is delimited text, by the end of its name."""
-    return Path(path).suffix.lower() not in TABLE_ENDINGS
+def _open_text(path: str) -> Table:
+    form = find_form(path)
+    return Table(path, form.names, partial(read_blocks, path, form),
+                 header_line=form.header_line, repeated=form.repeated, form=str(form))
+
+
+def _in_memory(path: str, columns: Mapping[str, np.ndarray], cut: str = '', **about: Any) -> Table:
+    """Return a table of arrays (n,) by name; `cut` tells where a damaged file ends."""
+    def blocks(names: Collection[str], _: Collection[str]) -> Iterator[TableBlock]:
+        rows = len(next(iter(columns.values())))
+        for start in range(0, rows, _BLOCK_ROWS):
+            stop = min(start + _BLOCK_ROWS, rows)
+            yield TableBlock({name: np.asarray(columns[name][start:stop], float)
+                              for name in names},
+                             _row_places(path, start), done=stop / rows, cut=cut)
+
+    return Table(path, tuple(columns), blocks, **about)
 
 
 def _row_places(path: str, first: int) -> Callable[[int, str], str]:
@@ -95,36 +72,7 @@ def _row_places(path: str, first: int) -> Callable[[int, str], str]:
     return lambda row, column: f'{path}: row {first + row + 1} of {column}'
 
 
-@dataclass(frozen=True)
-class _ArrayTable:
-    """A table whose columns are in memory."""
-
-    path: str  # The file
-    columns: Mapping[str, np.ndarray]  # Arrays (n,) by name
-    units: Mapping[str, str] = field(default_factory=dict)
-    default_mapping: str = ''
-    has_names: bool = True
-    form: str = ''
-    cut: str = ''  # Where a damaged file ends; empty if it is whole
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(self.columns)
-
-    def blocks(self, names: Collection[str]) -> Iterator[TableBlock]:
-        rows = len(next(iter(self.columns.values())))
-        for start in range(0, rows, _BLOCK_ROWS):
-            stop = min(start + _BLOCK_ROWS, rows)
-            yield TableBlock({name: np.asarray(self.columns[name][start:stop], float)
-                              for name in names},
-                             _row_places(self.path, start), done=stop / rows, cut=self.cut)
-
-    def sample(self) -> Mapping[str, np.ndarray]:
-        return {name: np.asarray(values[:_BLOCK_ROWS], float)
-                for name, values in self.columns.items()}
-
-
-def _open_npz(path: str) -> _ArrayTable:
+def _open_npz(path: str) -> Table:
     """Read the arrays of a file; those of another length than most are left out."""
     columns: dict[str, np.ndarray] = {}
     try:
@@ -138,8 +86,8 @@ def _open_npz(path: str) -> _ArrayTable:
     if not columns:
         raise UserError(f'{path}: holds no array of numbers with several rows')
     rows = Counter(map(len, columns.values())).most_common(1)[0][0]
-    return _ArrayTable(path, {name: values for name, values in columns.items()
-                              if len(values) == rows})
+    return _in_memory(path, {name: values for name, values in columns.items()
+                             if len(values) == rows})
 
 
 def _array_columns(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
@@ -156,81 +104,53 @@ def _array_columns(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
     return {f'{name}[{i}]': values[:, i] for i in range(values.shape[1])}
 
 
-@dataclass(frozen=True)
-class _ParquetTable:
-    """A Parquet file, read with the library pyarrow."""
-
-    path: str  # The file
-    names: tuple[str, ...]  # Its columns of numbers and of times
-    units: Mapping[str, str]  # Units of the columns of times, which are given in ns
-    has_names: bool = True
-    form: str = ''
-    default_mapping: str = ''
-
-    def blocks(self, names: Collection[str]) -> Iterator[TableBlock]:
-        import pyarrow
-        with _opened_parquet(self.path) as file:
-            total, first = max(file.metadata.num_rows, 1), 0
-            batches = file.iter_batches(_BLOCK_ROWS, columns=list(names))
-            while True:
-                try:
-                    batch = next(batches)
-                except StopIteration:
-                    return
-                except (OSError, pyarrow.ArrowException) as error:
-                    raise _no_parquet(self.path, error) from None
-                columns = {name: _parquet_numbers(batch.column(name)) for name in names}
-                last = first + batch.num_rows
-                yield TableBlock(columns, _row_places(self.path, first), done=last / total)
-                first = last
-
-    def sample(self) -> Mapping[str, np.ndarray]:
-        return next((block.columns for block in self.blocks(self.names)), {})
-
-
-def _open_parquet(path: str) -> _ParquetTable:
-    with _opened_parquet(path) as file:
-        import pyarrow.types as kinds
-        times = {field.name: 'ns' for field in file.schema_arrow
-                 if kinds.is_timestamp(field.type) or kinds.is_duration(field.type)}
-        names = tuple(field.name for field in file.schema_arrow if field.name in times
-                      or kinds.is_integer(field.type) or kinds.is_floating(field.type))
-    if not names:
-        raise NoNumbers(f'{path}: has no column of numbers')
-    return _ParquetTable(path, names, times)
-
-
-def _opened_parquet(path: str) -> Any:
-    """Open a file; the library closes it at the end of a block `with`."""
+def _open_parquet(path: str) -> Table:
+    """Open a Parquet file with the library pyarrow: its columns of numbers and of times."""
     try:
         import pyarrow
         import pyarrow.parquet
     except ImportError:
         raise UserError(f'{path}: Parquet needs the Python package pyarrow: '
                         f'{install_hint("pyarrow")}') from None
+    errors = (OSError, pyarrow.ArrowException)
+
+    def refusal(error: Exception) -> UserError:
+        return UserError(f'{path}: cannot read it as Parquet: {one_line(error)}')
+
+    def blocks(names: Collection[str], _: Collection[str]) -> Iterator[TableBlock]:
+        first = 0
+        try:
+            with pyarrow.parquet.ParquetFile(path) as file:
+                for batch in file.iter_batches(_BLOCK_ROWS, columns=list(names)):
+                    last = first + batch.num_rows
+                    yield TableBlock({name: numbers(batch.column(name)) for name in names},
+                                     _row_places(path, first), done=last / file.metadata.num_rows)
+                    first = last
+        except errors as error:
+            raise refusal(error) from None
+
+    def numbers(column: Any) -> np.ndarray:
+        """Return a column as floats; an empty cell is NaN."""
+        if pyarrow.types.is_temporal(column.type):
+            column = column.cast(pyarrow.int64())
+        return np.asarray(column.cast(pyarrow.float64(), safe=False).to_numpy(
+            zero_copy_only=False), float)
+
     try:
-        return pyarrow.parquet.ParquetFile(path)
-    except (OSError, pyarrow.ArrowException) as error:
-        raise _no_parquet(path, error) from None
+        schema = pyarrow.parquet.read_schema(path)
+    except errors as error:
+        raise refusal(error) from None
+    kinds = pyarrow.types
+    units = {each.name: each.type.unit for each in schema
+             if kinds.is_timestamp(each.type) or kinds.is_duration(each.type)}
+    names = tuple(each.name for each in schema if each.name in units
+                  or kinds.is_integer(each.type) or kinds.is_floating(each.type))
+    if not names:
+        raise NoNumbers(f'{path}: has no column of numbers')
+    return Table(path, names, blocks, units)
 
 
-def _no_parquet(path: str, error: Exception) -> UserError:
-    return UserError(f'{path}: cannot read it as Parquet: {one_line(error)}')
-
-
-def _parquet_numbers(column: Any) -> np.ndarray:
-    """Return a column as floats; an empty cell is NaN, a time is in ns."""
-    import pyarrow as arrow
-    kind = column.type
-    if arrow.types.is_timestamp(kind):
-        column = column.cast(arrow.timestamp('ns', tz=kind.tz)).cast(arrow.int64())
-    elif arrow.types.is_duration(kind):
-        column = column.cast(arrow.duration('ns')).cast(arrow.int64())
-    return np.asarray(column.cast(arrow.float64(), safe=False).to_numpy(zero_copy_only=False),
-                      float)
-
-
-def _open_ulog(path: str, topic: str) -> _ArrayTable:
+def _open_ulog(path: str, topic: str) -> Table:
     """Read one message of a log of PX4 with the library pyulog: it is a table."""
     log = _read_ulog(path)
     # The first instance of a message has no number.
@@ -258,9 +178,9 @@ def _open_ulog(path: str, topic: str) -> _ArrayTable:
     mapping = _MAPPINGS.get(data.name, '').format(time=time)
     if 'temperature' not in columns:
         mapping = mapping.partition(',temperature=')[0]
-    return _ArrayTable(path, columns, {'timestamp': 'us', 'timestamp_sample': 'us'}, mapping,
-                       cut=f'{path}: is damaged; what can be read of it is used'
-                       if log.file_corruption else '')
+    cut = f'{path}: is damaged; what can be read of it is used' * bool(log.file_corruption)
+    return _in_memory(path, columns, cut, default_mapping=mapping,
+                      units={'timestamp': 'us', 'timestamp_sample': 'us'})
 
 
 def _read_ulog(path: str) -> Any:
@@ -327,7 +247,7 @@ def read_pose_table(path: str | os.PathLike) -> PoseTable:
     choices: tuple[tuple[str, ...], ...] = (('start_s', 'stop_s'), ('time_s', 'time_s'), ())
     times = next(names for names in choices if set(names) <= set(table.names))
     names = list(dict.fromkeys([columns[role] for role in pair] + [*times]))
-    blocks = list(table.blocks(names))
+    blocks = list(table.blocks(names, names))
     values = {name: np.concatenate([block.columns[name] for block in blocks]) for name in names}
     angles = [_radians(table.path, columns[role], values[columns[role]]) for role in pair]
     if pair == ('roll', 'pitch'):

@@ -20,7 +20,6 @@ from time import monotonic
 import traceback
 from typing import Any, NamedTuple, TYPE_CHECKING
 
-from adxl_ros.check.findings import BLOCK_ROWS, check_recording, Findings
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import recorded_unit, Recording, unit_of
@@ -36,6 +35,7 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.package_version import package_version
 from adxl_ros.signals.allan_deviation import longest_rest
 from adxl_ros.signals.axis_noise import recording_noise
+from adxl_ros.signals.findings import BLOCK_ROWS, check_recording, Findings
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
 import numpy as np
 

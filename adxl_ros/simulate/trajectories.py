@@ -6,12 +6,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-import os
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import recording
-from adxl_ros.files.recording_columns import JOINTS, Recording
+from adxl_ros.files.recording_columns import ACCEL, JOINTS, Recording
 from adxl_ros.model.constants import NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import Held, INTERNAL_RATE_HZ, Knots, Motion, Path
@@ -314,17 +312,16 @@ _MIN_FORCE_SAMPLES = 4
 """Fewest samples of specific force; a cubic spline needs them."""
 
 
-def motion_from_force(path: str | os.PathLike, resampled: bool, epoch_ns: int = 0
-                      ) -> tuple[Motion, float]:
+def motion_from_force(ideal: Recording, resampled: bool) -> tuple[Motion, float]:
     """
-    Make a motion from the specific force of a recording.
+    Make a motion from the specific force of another simulator, in the case frame.
 
-    path: recording with specific force in the case frame, m/s²; returns: the motion, and the time
-    at which it begins, s.
+    returns: the motion, and the time at which it begins, s.
     """
-    time_s, force_mps2 = recording.read_ideal(path, epoch_ns)
+    time_s = ideal.time_s
+    force_mps2 = np.column_stack([ideal.columns[name] for name in ACCEL])
     if len(time_s) < _MIN_FORCE_SAMPLES:
-        raise UserError(f'{path}: {len(time_s)} samples of specific force; at least '
+        raise UserError(f'{ideal.path}: {len(time_s)} samples of specific force; at least '
                         f'{_MIN_FORCE_SAMPLES} are needed')
     begin_s = float(time_s[0])
     duration_s = float(time_s[-1] - begin_s)

@@ -11,7 +11,6 @@ from pathlib import Path
 import textwrap
 from typing import Any
 
-from adxl_ros.check.findings import check_recording, Findings
 from adxl_ros.diagnose.diagnosis import what_shows
 from adxl_ros.diagnose.next_experiment import by_effect
 from adxl_ros.diagnose.reference import DataFault
@@ -23,6 +22,7 @@ from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.report import page as html_page
 from adxl_ros.report.quantities import duration, short_time
 from adxl_ros.report.screen import COLUMNS, row
+from adxl_ros.signals.findings import check_recording, Findings
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
 from adxl_ros.signals.recording_contents import RecordingContents
 from adxl_ros.tools import command_line as cli

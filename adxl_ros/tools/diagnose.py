@@ -94,8 +94,8 @@ def diagnose(options: argparse.Namespace) -> int:
     html_page.check_libraries()
     with cli.progress('reading') as show:
         recordings = [cli.read('diagnose', path, reading) for path in options.recording]
-        sim = motion_from_force(options.sim, False, recordings[0].epoch_ns)[0] if options.sim \
-            else None
+        sim = motion_from_force(recording.read_ideal(options.sim, recordings[0].epoch_ns), False
+                                )[0] if options.sim else None
         sensor, _ = measure_unstated(load_sensor(options.params, recordings[0]), recordings[0])
         prior_lines: list[str] = []
         if population is not None:

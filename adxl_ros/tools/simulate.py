@@ -149,7 +149,8 @@ def _samples(sensor: Sensor, options: argparse.Namespace
             np.random.default_rng(options.seed))
     elif options.trajectory == 'imu':
         # The specific force of another simulator, at its rate or another.
-        motion, begin_s = motion_from_force(options.force, options.rate is None)
+        motion, begin_s = motion_from_force(recording.read_ideal(options.force),
+                                            options.rate is None)
         if options.rate is None:
             sensor = replace(sensor, rate_hz=motion.internal_rate_hz)
             motion = replace(motion, internal_rate_hz=max(sensor.rate_hz, INTERNAL_RATE_HZ))

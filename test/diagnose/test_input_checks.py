@@ -94,7 +94,8 @@ def test_a_simulator_of_another_time_does_not_overlap(run_tool, tmp_path):
 @pytest.mark.parametrize('late_s', [1000.0, 0.7, 0.02])
 def test_align_shifts_the_simulator(tmp_path, late_s):
     """`--align` removes a shift, and leaves a latency of the sensor where it is."""
-    force = motion_from_force(tmp_path / ideal(tmp_path, late_s), False)[0]
+    force = motion_from_force(recording.read_ideal(tmp_path / ideal(tmp_path, late_s)),
+                              False)[0]
     comparison = compare_checked(made(unit()), unit(), force, True)
     residual_g = comparison.residual_v(comparison.sensor)[comparison.used]
     assert np.sqrt(np.mean(residual_g ** 2)) < (1e-3 if late_s > 0.1 else 1e-2)

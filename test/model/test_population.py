@@ -66,7 +66,7 @@ def test_a_stranger_is_named_and_keeps_its_estimates():
 @pytest.mark.parametrize('text, words', [
     ('', 'no population of format 1'),
     ('format: 2\ncoefficients: {}\n', 'no population of format 1'),
-    ('format: [1\n', 'line 2, column 1: not YAML'),
+    ('format: [1\n', ':2:1: not YAML'),
     ('format: 1\ncoefficients: {zero_g_x_v: 3}\n', 'coefficients.zero_g_x_v: 3 is no mapping'),
     ('format: 1\ncoefficients: {zero_g_x_v: {mean: .nan}}\n',
      'coefficients.zero_g_x_v.mean: nan is no number')])

@@ -9,6 +9,9 @@ from pathlib import Path
 import shlex
 import subprocess
 
+from adxl_ros.calibrate.fits import gravity_fit
+from adxl_ros.diagnose import comparison
+from adxl_ros.signals import findings
 from bags import bag_of, imu, stamps
 import numpy as np
 from processes import run_in_process
@@ -30,6 +33,11 @@ def samples(seconds: float = 60.0) -> tuple[np.ndarray, np.ndarray]:
     first = place.astype(int)
     force = directions[first] * (1 - moved) + directions[first + 1] * moved
     return time_s, G * force + rng.normal(0, 0.02, force.shape)
+
+
+def test_the_needs_of_other_tools_are_theirs() -> None:
+    assert findings.FEWEST_GRAVITY_POSES == gravity_fit.MIN_RESTS
+    assert findings.SHORTEST_MOTION_S == comparison.SHORTEST_S
 
 
 def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess:

@@ -278,12 +278,12 @@ def test_numbered_columns_and_a_mapping_file(run_tool, tmp_path) -> None:
     (SHORT.replace('-0.02,1.002', 'off,1.002', 1), ['--columns', XYZ_G],
      "log.csv:4:3: y is 'off', not a number"),
     (SHORT.replace('0.02,0.01', '0.02,', 1), ['--columns', XYZ_G],
-     'log.csv:4:2: x is empty; every sample needs it'),
+     'log.csv:4:2: x is empty or NaN; every sample needs it'),
     (SHORT.replace('0.02,0.01', ',0.01', 1), ['--columns', XYZ_G],
-     'log.csv:4:1: t is empty; every sample needs a time'),
+     'log.csv:4:1: t is empty or NaN; every sample needs a time'),
     (SHORT.replace('\n0.02,', '\n0.02;', 1), ['--columns', XYZ_G],
      'log.csv:4:4: 3 fields, but the header has 4'),
-    ('name,state\na,b\nc,d\n', [], 'log.csv:1: no column time_s; the columns are name, state'),
+    ('name,state\na,b\nc,d\n', [], 'log.csv: the first 200 lines hold no row of numbers'),
     ('height,width\n1,2\n3,4\n', [], 'none looks like an accelerometer: name the columns'),
 ])
 def test_wrong_input_has_one_line_that_says_what_to_write(run_tool, tmp_path, text, options, words

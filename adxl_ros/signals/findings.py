@@ -7,8 +7,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
-from adxl_ros.calibrate.fits.gravity_fit import MIN_RESTS
-from adxl_ros.diagnose.data_checks import SHORTEST_S as SHORTEST_MOTION_S
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import recording
 from adxl_ros.files.bag_reader import has_log_times, log_times
@@ -44,6 +42,11 @@ _MOVED_RAD = 0.01
 _FOLLOWED = {'temperature_c': ('temperature', 1.0), 'supply_v': ('supply', 0.1)}
 """Name of a reference and its smallest range, °C and V, that shows effects at rest. Chosen: a
 typical drift of the zero-g is then 0.1 mg."""
+FEWEST_GRAVITY_POSES = 10
+"""Orientations that a fit against gravity needs: one more than zero-g, scale factors and
+misalignments have values."""
+SHORTEST_MOTION_S = 30.0
+"""Shortest recording on a moving stage that `diagnose` compares, s."""
 _FEWEST_STAGE_POSES = 4
 """Orientations on a stage that a linear fit needs. Chosen: both ends of two axes."""
 
@@ -187,9 +190,9 @@ def _fit(contents: RecordingContents) -> Ability:
                        f'has {held}, needs {_FEWEST_STAGE_POSES} orientations at least')
     if len(contents.axes) < len(AXES):
         return Ability('fit', False, 'has no stage angles, and gravity alone needs x, y and z')
-    is_able = contents.poses >= MIN_RESTS
+    is_able = contents.poses >= FEWEST_GRAVITY_POSES
     return Ability('fit', is_able, f'against gravity, {held}' if is_able else
-                   f'has {held} and no stage angles, needs {MIN_RESTS} orientations')
+                   f'has {held} and no stage angles, needs {FEWEST_GRAVITY_POSES} orientations')
 
 
 def _diagnose(contents: RecordingContents) -> Ability:
