@@ -17,12 +17,12 @@ import time
 from adxl_ros.calibrate.fits import gravity_fit, linear
 from adxl_ros.calibrate.guided import pose_plan
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.calibrate.report import acceptance, cross_validation, text_tables
-from adxl_ros.calibrate.report.text_tables import (
-    acceptance_lines,
+from adxl_ros.calibrate.report import acceptance, held_out as unseen
+from adxl_ros.calibrate.report.acceptance import acceptance_lines, error_table, gravity_lines
+from adxl_ros.calibrate.report.coefficients import (
     added_effect_lines,
-    error_table,
-    gravity_lines,
+    added_effects,
+    compare,
     truth_table,
 )
 from adxl_ros.closed_output import ended_by_closed_output
@@ -242,8 +242,8 @@ def _run_sweep(folder: Path, speed: float, seed: int) -> None:
         poses = _show_sweep(graph, output)
     fitted = parameter_file.load(output)
     _print('', *error_table(_held_out_errors(sensor, fitted, poses)), '',
-           *truth_table(text_tables.compare(fitted, truth)), '', *acceptance_lines(fitted),
-           *added_effect_lines(text_tables.added_effects(fitted, truth)), '',
+           *truth_table(compare(fitted, truth)), '', *acceptance_lines(fitted),
+           *added_effect_lines(added_effects(fitted, truth)), '',
            *file_lines({'Page': report / 'report.html', 'Calibration': output}))
 
 
@@ -261,12 +261,12 @@ def _draw_unit(sensor: Sensor, seed: int) -> Sensor:
 
 
 def _held_out_errors(nominal: Sensor, fitted: Sensor, poses: Poses
-                     ) -> list[cross_validation.HeldOutErrors]:
+                     ) -> list[unseen.HeldOutErrors]:
     """Return the errors of datasheet, linear and fitted coefficients on the check poses."""
     held_out = poses.subset(poses.check)
     models = {'nominal': nominal, 'linear': linear.fit(nominal, poses.subset(~poses.check)),
               fitted.model: fitted}
-    return [cross_validation.summarise(model, cross_validation.pose_errors(sensor, held_out))
+    return [unseen.summarise(model, unseen.pose_errors(sensor, held_out))
             for model, sensor in models.items()]
 
 

@@ -14,8 +14,7 @@ import termios
 
 from adxl_ros.calibrate.guided.controller import Controller, ControllerState, IDLE_TEXT
 from adxl_ros.calibrate.guided.guide import NextPose
-from adxl_ros.calibrate.guided.screen_contents import KeyAction, LiveReading, Phase, ScreenContents
-from adxl_ros.calibrate.guided.session import live_reading, Session, SessionDisplay
+from adxl_ros.calibrate.guided.screen_contents import KeyAction, Phase, ScreenContents
 from adxl_ros.nodes.run_node import executable, held_output
 from adxl_ros.nodes.topics import create_publisher, Level, Status, status_message, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -163,8 +162,6 @@ class DisplayPublisher:
         if obstacle:
             node.get_logger().info(obstacle)
         controller.may_ask = self._own_screen is not None
-        self._session: Session | None = None
-        self._display: SessionDisplay | None = None
         self._publisher = create_publisher(node, String, '~/display', 1, latched=True)
         node.create_timer(_PERIOD_S, self.update, clock=STEADY)
 
@@ -194,31 +191,19 @@ class DisplayPublisher:
             self._own_screen = None
 
     def _publish(self, phase: Phase, text: str) -> None:
-        controller, unit = self._controller, self._controller.unit
-        display = self._session_display()
+        controller, stream = self._controller, self._controller.stream
+        unit, session, newest = stream.unit, controller.session, stream.newest
         keys = () if phase is Phase.FIT else self._keys()
+        if session is not None:
+            live = session.newest.reading(session.guide.stillness(session.newest))
+        else:
+            live = None if newest is None else newest.reading(newest.stillness())
         self._publisher.publish(String(data=ScreenContents(
             phase=phase.value, text=text, unit=f'{unit.serial} ({unit.axes})' if unit else '',
-            output=str(controller.settings.output), keys=keys,
-            live=self._idle_reading() if display is None else display.live(),
-            progress=None if display is None else display.progress(),
-            estimate=None if display is None else display.estimate(),
+            output=str(controller.settings.output), keys=keys, live=live,
+            progress=None if session is None else session.guide.progress(),
+            estimate=None if session is None else session.estimate(),
             outcome=controller.outcome).to_json()))
-
-    def _session_display(self) -> SessionDisplay | None:
-        """Return the display of the running session; None while there is none."""
-        session = self._controller.session
-        if session is not self._session:
-            self._session = session
-            self._display = None if session is None else SessionDisplay(session)
-        return self._display
-
-    def _idle_reading(self) -> LiveReading | None:
-        """Return what the sensor reads while no session runs; None before the first samples."""
-        newest, unit = self._controller.newest, self._controller.unit
-        if newest is None or unit is None:
-            return None
-        return live_reading(newest, unit, newest.stillness())
 
     def _keys(self) -> tuple[KeyAction, ...]:
         """Return the keys that have an action now."""

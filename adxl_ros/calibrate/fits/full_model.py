@@ -29,15 +29,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from adxl_ros.calibrate.fits import linear, linearisation
-from adxl_ros.calibrate.fits.linearisation import Linearised, linearised
-from adxl_ros.calibrate.pose_response import (
-    angle_jacobian,
+from adxl_ros.calibrate.fits.linearisation import (
     AngleErrors,
+    Linearised,
+    linearised,
     PoseCovariance,
-    predicted_volts,
     StageError,
 )
-from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.poses import angle_jacobian, Poses, predicted_volts
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
 from adxl_ros.model.constants import AXES

@@ -11,8 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from adxl_ros.calibrate.pose_response import angle_jacobian
-from adxl_ros.calibrate.poses import Poses, reference_force
+from adxl_ros.calibrate.poses import angle_jacobian, planes, Poses, reference_force
 from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get
@@ -151,8 +150,6 @@ _MIN_INPUTS = 3
 """Smallest number of distinct inputs that determine a quadratic."""
 _MIN_INPUT_SPAN_G = 0.3
 """Smallest span of the inputs that determine a quadratic, g."""
-_SAME_PLANE_RAD = np.radians(1.0)
-"""Largest difference of neighbouring angles alpha in one plane, rad."""
 _REPLICAS = 200
 """Sweeps of the parametric bootstrap: the standard deviations are known to 5 %."""
 
@@ -225,13 +222,6 @@ def regress_axes(sensor: Sensor, poses: Poses) -> list[AxisRegression]:
                         'fit --model linear')
     start = fit(sensor, poses)
     return [_regress_axis(d, start, poses) for d in range(2)]
-
-
-def planes(alpha_rad: np.ndarray) -> list[np.ndarray]:
-    """Group poses by plane: indices of those whose alpha agree within 1°."""
-    order = np.argsort(alpha_rad, kind='stable')
-    cuts = np.flatnonzero(np.diff(alpha_rad[order]) > _SAME_PLANE_RAD) + 1
-    return np.split(order, cuts)
 
 
 def _regress_axis(d: int, start: Sensor, poses: Poses) -> AxisRegression:

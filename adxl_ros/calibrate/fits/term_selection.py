@@ -77,22 +77,9 @@ def candidates(poses: Poses) -> tuple[str, ...]:
     return ('stage_eccentricity', *following)
 
 
-def fit(sensor: Sensor, poses: Poses) -> Sensor:
-    """
-    Fit the full model with selected terms.
-
-    Parameters
-    ----------
-    sensor, poses
-        As for `full_model.fit_full`.
-
-    Returns
-    -------
-    Sensor
-        The fitted unit with its covariance.
-
-    """
-    return fit_selected(sensor, poses).full.fitted
+def fit(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()) -> Sensor:
+    """Fit the full model with selected terms, and with some effects in any case."""
+    return fit_selected(sensor, poses, effects).full.fitted
 
 
 def fit_affine(sensor: Sensor, poses: Poses) -> full_model.FullFit:

@@ -1,18 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Zero-g over temperature, fitted to a sensor that rests while it warms and cools."""
+"""
+Zero-g over temperature, fitted to a sensor that rests while it warms and cools.
+
+- Blocks of a resting sensor, which are the input.
+- Which parts of a wanted range the temperature has passed, and the error to expect there.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import NamedTuple
 
+from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
+from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
 from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.filters import loop, stop
+from adxl_ros.model.filters import loop, play, stop
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 import scipy
@@ -46,15 +54,6 @@ _RELATIVE_STEP = 0.02
 """Step of the derivative by a shape, divided by its value. Chosen: smooth."""
 
 
-@dataclass(frozen=True)
-class ThermalBlocks:
-    """Means of k blocks of a resting sensor with m axes, in the order of time."""
-
-    time_s: np.ndarray  # Middle of each block, s, (k,)
-    temperature_c: np.ndarray  # Temperature of each block, °C, (k,)
-    volts: np.ndarray  # Mean output, V, (k, m)
-
-
 class History(NamedTuple):
     """A dependence on the history of the temperature."""
 
@@ -84,7 +83,8 @@ class ThermalFit:
         base_k = calibrated_c - NOMINAL_TEMPERATURE_C
         slopes = np.column_stack([warmer_k - base_k, warmer_k ** 2 - base_k ** 2])
         worst = np.zeros(len(slopes))
-        for axis, residual_g in zip(_axes(self.names), self.residual_g):
+        axes = dict.fromkeys(name.axis for name in self.names if name.axis)
+        for axis, residual_g in zip(axes, self.residual_g):
             places = [self.names.index(Coefficient('temperature_bias', parameter, axis))
                       for parameter in ('per_k', 'per_k2')]
             part = self.covariance[np.ix_(places, places)]
@@ -93,33 +93,13 @@ class ThermalFit:
         return worst
 
 
-def fit(sensor: Sensor, blocks: ThermalBlocks, with_history: bool = True) -> ThermalFit:
+def fit(sensor: Sensor, blocks: Poses, with_history: bool = True) -> ThermalFit:
     """
-    Fit slope and curvature of the zero-g over temperature.
+    Fit slope and curvature of the zero-g over temperature; refuse blocks that do not show them.
 
     The zero-g of each orientation is free, because the pose is unknown. Neighbouring residuals
-    are correlated (AR(1), by Cochrane and Orcutt). An effect of the history is kept where it
-    gains enough, and only after a reversal.
-
-    Parameters
-    ----------
-    sensor
-        The unit.
-    blocks
-        Means at rest.
-    with_history
-        Whether `thermal_lag` and `thermal_hysteresis` are tried.
-
-    Returns
-    -------
-    ThermalFit
-        The fit.
-
-    Raises
-    ------
-    UserError
-        The blocks are too few, or the temperature hardly changes.
-
+    are correlated (AR(1), by Cochrane and Orcutt). An effect of the history, `thermal_lag` or
+    `thermal_hysteresis`, is kept where it gains enough, and only after a reversal.
     """
     model = _Model(sensor, blocks)
     histories: dict[str, History] = {}
@@ -148,7 +128,7 @@ class _Axis(NamedTuple):
 class _Model:
     """The design of all axes."""
 
-    def __init__(self, sensor: Sensor, blocks: ThermalBlocks) -> None:
+    def __init__(self, sensor: Sensor, blocks: Poses) -> None:
         self._sensor, self._blocks = sensor, blocks
         temperature_c = blocks.temperature_c
         if len(temperature_c) < _FEWEST_BLOCKS:
@@ -242,7 +222,8 @@ class _Model:
     def _history(self, history: History) -> np.ndarray:
         """Return the output of an effect of size 1, g, (k,)."""
         if history.effect == 'thermal_lag':
-            return lagging(self._blocks.time_s, self._blocks.temperature_c, history.shape) \
+            return _lagging(self._blocks.time_s.mean(axis=1), self._blocks.temperature_c,
+                            history.shape) \
                 - self._blocks.temperature_c
         return -loop(self._blocks.temperature_c, history.shape, {})
 
@@ -283,25 +264,8 @@ _SHAPES = {'thermal_lag': 'tau_s', 'thermal_hysteresis': 'reach_k'}
 """Shape of each effect of the history."""
 
 
-def lagging(time_s: np.ndarray, values: np.ndarray, tau_s: float) -> np.ndarray:
-    """
-    Filter by 1/(1 + τ·s), exactly for straight lines between the samples.
-
-    Parameters
-    ----------
-    time_s
-        Ascending times, s, (k,).
-    values
-        Input, (k,).
-    tau_s
-        Time constant, s.
-
-    Returns
-    -------
-    ndarray
-        Output, (k,); it begins at the first input.
-
-    """
+def _lagging(time_s: np.ndarray, values: np.ndarray, tau_s: float) -> np.ndarray:
+    """Filter by 1/(1 + τ·s), exactly for straight lines between the samples, (k,)."""
     steps_s = np.diff(time_s)
     decay = np.exp(-steps_s / tau_s)
     ramp = (1 - decay) * tau_s / np.maximum(steps_s, np.finfo(float).tiny)
@@ -317,20 +281,7 @@ def applied(base: Sensor, fitted: ThermalFit, calibrated_c: float) -> Sensor:
     """
     Put a fit over temperature into a calibrated unit, whose zero-g stays right.
 
-    Parameters
-    ----------
-    base
-        The calibrated unit.
-    fitted
-        The fit.
-    calibrated_c
-        Temperature at which the zero-g of the unit was calibrated, °C.
-
-    Returns
-    -------
-    Sensor
-        The unit with effects and covariance of both.
-
+    calibrated_c: temperature at which the zero-g of the unit was calibrated, °C.
     """
     names, effects = fitted.names, dict.fromkeys(name.effect for name in fitted.names)
     kept = [i for i, name in enumerate(base.covariance_names) if name.effect not in EFFECTS]
@@ -340,19 +291,17 @@ def applied(base: Sensor, fitted: ThermalFit, calibrated_c: float) -> Sensor:
                      values={e: v for e, v in base.values.items() if e not in dropped})
     sensor = put(with_neutral(before, [*effects, 'bias']), names, fitted.values)
     joint = np.eye(len(kept) + len(names))
-    shifts_v = []
-    for d, axis in enumerate(base.axes):
-        bias = Coefficient('bias', 'offset_v', axis)
-        shift_v = _zero_g_v(base, d, calibrated_c) - _zero_g_v(sensor, d, calibrated_c)
-        shifts_v.append((bias, shift_v))
+    biases = [Coefficient('bias', 'offset_v', axis) for axis in base.axes]
+    shifts_v = [_zero_g_v(base, d, calibrated_c) - _zero_g_v(sensor, d, calibrated_c)
+                for d in range(len(base.axes))]
+    for d, (axis, bias) in enumerate(zip(base.axes, biases)):
         if bias not in kept_names:
             continue
         for power, parameter in enumerate(('per_k', 'per_k2'), 1):
             column = len(kept) + names.index(Coefficient('temperature_bias', parameter, axis))
             joint[kept_names.index(bias), column] = -base.scale_v_per_g[d] * (
                 calibrated_c - NOMINAL_TEMPERATURE_C) ** power
-    biases = [bias for bias, _ in shifts_v]
-    sensor = put(sensor, biases, get(sensor, biases) + [shift for _, shift in shifts_v])
+    sensor = put(sensor, biases, get(sensor, biases) + shifts_v)
     blocks = scipy.linalg.block_diag(base.covariance[np.ix_(kept, kept)], fitted.covariance)
     covariance = joint @ blocks @ joint.T
     return replace(sensor, covariance=covariance, covariance_names=(*kept_names, *names))
@@ -368,6 +317,126 @@ def _zero_g_v(sensor: Sensor, d: int, temperature_c: float) -> float:
         values['per_k'][d] + warmer_k * values['per_k2'][d]))
 
 
-def _axes(names: Sequence[Coefficient]) -> list[str]:
-    """Return the axes of coefficients in their order."""
-    return list(dict.fromkeys(name.axis for name in names if name.axis))
+PARTS = 10
+"""Parts of the wanted range that are to be passed in each direction. Chosen: a curve of degree two
+is certain between them."""
+_STEADY_K = 0.25
+"""Change of temperature, K, that is no change of direction. Chosen: above the noise of a
+thermometer."""
+
+
+@dataclass(frozen=True)
+class Passed:
+    """Parts of the wanted range that the temperature has passed."""
+
+    middles_c: np.ndarray  # Middle of each part, °C, (parts,)
+    # warming, cooling: Whether the temperature has passed it in that direction, (parts,) bool
+    warming: np.ndarray
+    cooling: np.ndarray
+    rises: bool  # Whether the temperature rose last
+
+    @property
+    def complete(self) -> bool:
+        """Return whether all parts are passed in both directions."""
+        return bool(self.warming.all() and self.cooling.all())
+
+    def advice(self) -> str:
+        """Return what to do next, for people."""
+        half_c = (self.middles_c[1] - self.middles_c[0]) / 2
+        open_warm, open_cool = self.middles_c[~self.warming], self.middles_c[~self.cooling]
+        if self.complete:
+            return 'both directions are covered'
+        if len(open_warm) and (self.rises or not len(open_cool)):
+            if self.rises:
+                return f'warm it to {open_warm[-1] + half_c:.0f} °C'
+            return (f'cool it to {open_warm[0] - half_c:.0f} °C, then warm it to '
+                    f'{open_warm[-1] + half_c:.0f} °C')
+        if not self.rises:
+            return f'cool it to {open_cool[0] - half_c:.0f} °C'
+        return (f'warm it to {open_cool[-1] + half_c:.0f} °C, then cool it to '
+                f'{open_cool[0] - half_c:.0f} °C')
+
+
+def passed(temperatures_c: np.ndarray, range_c: tuple[float, float]) -> Passed:
+    """
+    Return which parts of a range the temperature has passed.
+
+    temperatures_c: temperatures in the order of time, °C, (k,).
+    """
+    low_c, high_c = range_c
+    middles_c = low_c + (high_c - low_c) * (np.arange(PARTS) + 0.5) / PARTS
+    steady_c = play(np.asarray(temperatures_c, float), _STEADY_K, {})
+    before_c, after_c = steady_c[:-1, None], steady_c[1:, None]
+    warming = ((before_c < middles_c) & (middles_c <= after_c)).any(axis=0)
+    cooling = ((after_c <= middles_c) & (middles_c < before_c)).any(axis=0)
+    changes = np.diff(steady_c)
+    changes = changes[changes != 0]
+    rises = bool(not len(changes) or changes[-1] > 0)
+    return Passed(middles_c, np.asarray(warming), np.asarray(cooling), rises)
+
+
+def expected_error_mg(fit: ThermalFit, covered: Passed, calibrated_c: float) -> float:
+    """
+    Return the expected error of the zero-g of the worst axis at the worst part of a range.
+
+    A part that is not passed in both directions may have a loop of typical width.
+    """
+    typical_g = parameter_of(Coefficient('thermal_hysteresis', 'half_width_g', 'x')).scale
+    unseen_g = np.where(covered.warming & covered.cooling, 0.0, typical_g)
+    return 1e3 * float(np.hypot(fit.error_g(covered.middles_c, calibrated_c), unseen_g).max())
+
+
+BLOCK_S = 10.0
+"""Length of a block, s. Chosen: short beside the lag of a thermometer."""
+_FEWEST_SAMPLES = 10
+"""Fewest samples of a block. Chosen: their scatter shows whether the sensor rests."""
+_MOST_BLOCKS = 2000
+"""Largest number of blocks. Chosen: a fit of less than a second."""
+_MOVING = 3.0
+"""Scatter of a block, divided by the median of all blocks, above which the sensor moves. Chosen:
+far above the scatter of a standard deviation of ten samples."""
+_SAME_ORIENTATION_G = 0.1
+"""Range of the block means, g, up to which a recording has one orientation. Chosen: above any
+zero-g over temperature."""
+
+
+def rest_blocks(recording: Recording, unit: Sensor) -> Poses | None:
+    """Cut a recording of a resting sensor into blocks with a temperature."""
+    temperature_c = recording.columns.get('temperature_c')
+    if temperature_c is None or not np.isfinite(temperature_c).any():
+        return None
+    volts, time_s = recording.volts(unit), recording.time_s
+    span_s = float(time_s[-1] - time_s[0])
+    block_s = max(BLOCK_S, span_s / _MOST_BLOCKS,
+                  _FEWEST_SAMPLES * float(np.median(np.diff(time_s))))
+    edges = np.unique(np.searchsorted(time_s, time_s[0] + block_s * np.arange(
+        int(span_s / block_s) + 1)))
+    parts = [slice(a, b) for a, b in pairwise(edges)
+             if b - a >= _FEWEST_SAMPLES and np.isfinite(temperature_c[a:b]).any()
+             and np.isfinite(volts[a:b]).all()]
+    if not parts:
+        return None
+    mean_v = np.array([volts[p].mean(axis=0) for p in parts])
+    scatter_v = np.array([volts[p].std(axis=0) for p in parts])
+    at_rest = (scatter_v <= _MOVING * np.median(scatter_v, axis=0) + unit.lsb_v).all(axis=1)
+    counts = np.array([p.stop - p.start for p in parts])[:, None]
+    missing = np.full(len(parts), np.nan)
+    poses = Poses(
+        volts=mean_v, std_v=scatter_v / np.sqrt(counts), alpha_rad=missing, beta_rad=missing,
+        time_s=np.array([[time_s[p.start], time_s[p.stop - 1]] for p in parts]),
+        check=np.zeros(len(parts), bool),
+        temperature_c=np.array([np.nanmean(temperature_c[p]) for p in parts])).subset(at_rest)
+    range_g = np.ptp(poses.volts, axis=0) / unit.nominal_scale_v_per_g if len(poses) else 0.0
+    return poses if len(poses) and np.max(range_g) < _SAME_ORIENTATION_G else None
+
+
+def blocks_of(poses: Poses) -> Poses:
+    """Return the poses with a temperature, in the order of time."""
+    order = np.argsort(poses.time_s[:, 0], kind='stable')
+    return poses.subset(order[np.isfinite(poses.temperature_c[order])])
+
+
+def calibrated_temperature_c(base: Sensor) -> float:
+    """Return the temperature at which a unit was calibrated, °C; else that of the datasheet."""
+    range_c = base.envelope.temperature_c
+    return float(np.mean(range_c)) if range_c else NOMINAL_TEMPERATURE_C

@@ -8,7 +8,7 @@ The pose plan: which poses a sweep visits, in which order.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -90,6 +90,30 @@ def with_checks(targets: list[Target], check_poses: int) -> list[Target]:
     checks = [Target(_whole_degrees(target.alpha_rad), _whole_degrees(target.beta_rad), True)
               for target in spread(check_poses)]
     return targets + nearest(targets[-1], checks)
+
+
+class Course:
+    """The poses of a plan: which are taken or left out, and which is to be taken next."""
+
+    def __init__(self, targets: Sequence[Target], accepted: Collection[int],
+                 skipped: Iterable[int]) -> None:
+        self.targets, self.accepted = targets, accepted  # Poses, and numbers of the taken ones
+        self.skipped = set(skipped) - set(accepted)  # Numbers of those that are left out
+        self.index = self.next_open()  # Number of the pose to go to, from 0
+
+    @property
+    def target(self) -> Target | None:
+        """Return the pose to go to; None at the end."""
+        return self.targets[self.index] if self.index < len(self.targets) else None
+
+    @property
+    def closed(self) -> set[int]:
+        """Return the numbers of the poses that are taken or left out."""
+        return self.skipped.union(self.accepted)
+
+    def next_open(self) -> int:
+        """Return the number of the first open pose; the number of poses if none is."""
+        return min({*range(len(self.targets))} - self.closed, default=len(self.targets))
 
 
 def travel_rad(targets: Sequence[Target]) -> float:

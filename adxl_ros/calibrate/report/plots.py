@@ -11,8 +11,8 @@ from typing import Any
 
 from adxl_ros.calibrate.fits import linear
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
-from adxl_ros.calibrate.poses import Poses, reference_force
-from adxl_ros.calibrate.report.cross_validation import HeldOutErrors
+from adxl_ros.calibrate.poses import planes, Poses, reference_force
+from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.files.atomic_write import write_bytes
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2, Z_90
@@ -132,7 +132,7 @@ def _paths(axis: Any, data: _AxisData, chosen: np.ndarray, paper_figure: int) ->
     alpha_deg = np.degrees(data.poses.alpha_rad)
     backward = np.gradient(data.poses.beta_rad) < 0
     force_g, deviation_mv = data.force_g[:, data.d], data.deviation_mv
-    for plane in linear.planes(data.poses.alpha_rad[chosen]):
+    for plane in planes(data.poses.alpha_rad[chosen]):
         index = np.flatnonzero(chosen)[np.sort(plane)]
         line, = axis.plot(force_g[index], deviation_mv[index], lw=1,
                           label=f'{alpha_deg[index].mean():.0f}°')
@@ -160,7 +160,7 @@ def _across(axis: Any, data: _AxisData) -> None:
 def _modelled(axis: Any, data: _AxisData) -> None:
     """Draw the measured and the modelled deviation against the reference, plane by plane."""
     alpha_rad, force_g = data.poses.alpha_rad, data.force_g[:, data.d]
-    for plane in linear.planes(alpha_rad):
+    for plane in planes(alpha_rad):
         index = np.sort(plane)
         line, = axis.plot(force_g[index], data.deviation_mv[index], 'o', ms=3,
                           label=f'{np.degrees(alpha_rad[index]).mean():.0f}°')

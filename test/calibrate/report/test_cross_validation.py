@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from adxl_ros.calibrate import calibration
 from adxl_ros.calibrate.fits.full_model import TERMS
-from adxl_ros.calibrate.report import acceptance, cross_validation
-from adxl_ros.calibrate.report.error_budget import ErrorBudget, ErrorBudgets
+from adxl_ros.calibrate.report import acceptance, held_out as unseen
+from adxl_ros.calibrate.report.held_out import ErrorBudget, ErrorBudgets
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects.base import Coefficient
@@ -45,7 +45,7 @@ def true_errors(truth, result):
     finite = np.isfinite(held_out.errors.tilt_rad)
     mg = (got - force)[finite, :len(truth.axes)] / G0_MPS2 * 1e3
     return (np.sqrt(np.mean(mg ** 2)),
-            np.degrees(np.sqrt(np.mean(cross_validation.angle_between(got, force)[finite] ** 2))))
+            np.degrees(np.sqrt(np.mean(unseen.angle_between(got, force)[finite] ** 2))))
 
 
 @pytest.mark.parametrize(('check', 'units', 'within'), [(16, 4, 0.35), (0, 2, 0.5)],
@@ -138,7 +138,7 @@ def test_intervals_have_their_coverage_for_correlated_errors(correlation, min_co
         for k in range(1, 230):
             errors[k] = correlation * errors[k - 1] + np.sqrt(1 - correlation ** 2) * noise[k]
         errors = errors[100:]
-        low, high = cross_validation.rms_interval(errors)
+        low, high = unseen.rms_interval(errors)
         covered += low < 1 < high
         naive += 1 / 1.11 < np.sqrt(np.mean(errors ** 2)) < 1.11
     assert min_coverage < covered / 400 < 0.97

@@ -1,32 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Results of a calibration as lines of a terminal with 79 columns.
+Coefficients of a unit as people read them.
 
 - Comparison of fitted coefficients with the true ones of a simulated unit.
-- Errors of a unit in plain words: of its datasheet values, and from turn-on to turn-on.
+- Drift of a unit from one calibration to the next.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from adxl_ros.calibrate.fits import full_model
-from adxl_ros.calibrate.fits.gravity_fit import GravityFit
-from adxl_ros.calibrate.poses import has_angles, Poses, reference_force
-from adxl_ros.calibrate.report import acceptance
-from adxl_ros.calibrate.report.cross_validation import HeldOutErrors
-from adxl_ros.calibrate.report.error_budget import sample_noise_mps2
 from adxl_ros.errors import UserError
-from adxl_ros.model import signal_chain
+from adxl_ros.files import calibration_store
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
-from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
+from adxl_ros.model.constants import AXES, Z_90
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.effects.element import OTHER_AXIS
 from adxl_ros.model.effects.mounting import direction
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.report.quantities import decimals, duration
+from adxl_ros.report.quantities import decimals
 import numpy as np
 
 _SCALE = Coefficient('scale_factor', 'offset_v_per_g')
@@ -169,45 +165,10 @@ def _alpha_beta(axis: int, along: np.ndarray) -> tuple[float, float]:
     return float(alpha), float(np.arcsin(sine))
 
 
-_RIDGE = 1e-3
-"""Weight of a change of 0, relative to a rest, for a direction that no rest of a recording has.
-Chosen: small beside one rest."""
 _NEGLIGIBLE_MG = 0.01
-"""Error or scatter below which only this limit is shown, mg. Chosen: no sensor repeats that
-well."""
+"""Error below which only this limit is shown, mg. Chosen: no sensor repeats that well."""
 _SMALL_MG = 10.0
 """Error below which mg is the unit, and above which g is. Chosen: two digits read as 9.9 mg."""
-
-
-def turn_on_lines(fitted: Sensor, recordings: Sequence[Poses]) -> list[str]:
-    """Report the scatter of the zero-g over recordings of one unit."""
-    if len(recordings) < 2:
-        return []
-    changes_mg = np.array([_zero_g_change_mg(fitted, poses) for poses in recordings])
-    scatter_mg = np.std(changes_mg, axis=0, ddof=1)
-    texts = [f'{value:.2g}' if value > _NEGLIGIBLE_MG else f'< {_NEGLIGIBLE_MG:g}'
-             for value in scatter_mg]
-    by_axis = ', '.join(f'{axis} {text}' for axis, text in zip(fitted.axes, texts))
-    return [f'turn-on to turn-on: the zero-g scatters by {by_axis} mg (standard deviation over '
-            f'{len(recordings)} recordings)']
-
-
-def _zero_g_change_mg(fitted: Sensor, poses: Poses) -> np.ndarray:
-    """Return the zero-g of a recording minus that of the fit by axis, mg, (m,)."""
-    if has_angles(poses).any():
-        poses = poses.subset(has_angles(poses))
-        force = list(reference_force(poses, fitted.local_gravity_mps2))
-        predicted = signal_chain.static_response(fitted)(force, poses.environment)
-        residual_v = poses.volts - np.column_stack(predicted)
-        return np.asarray(1e3 * np.mean(residual_v / fitted.scale_v_per_g, axis=0))
-    # Against gravity a change shows along the direction of each rest only.
-    force_mps2 = np.column_stack(signal_chain.inverse(fitted)(
-        list(poses.volts.T), poses.environment))
-    magnitude_mps2 = np.linalg.norm(force_mps2, axis=1)
-    direction = force_mps2 / magnitude_mps2[:, None]
-    excess_mg = 1e3 * (magnitude_mps2 / fitted.local_gravity_mps2 - 1)
-    normal = direction.T @ direction + _RIDGE * np.eye(direction.shape[1])
-    return np.asarray(np.linalg.solve(normal, direction.T @ excess_mg))
 
 
 def errors_in_words(fitted: Sensor) -> str:
@@ -228,30 +189,10 @@ def _force_text(force_g: float) -> str:
     return f'{force_g:+.2g} g' if abs(force_mg) >= _SMALL_MG else f'{force_mg:+.2g} mg'
 
 
-_MODELS = {'nominal': 'datasheet values', 'linear': 'linear calibration',
-           'physical': 'physical calibration', 'full': 'full calibration'}
-"""Models in words."""
 _LONGEST_LABEL = 26
 """Columns that a coefficient's name may take, so that its line has at most 79."""
 _COVERED = 0.9
 """Share of the 90 % intervals that contain the true value if the intervals are right."""
-
-
-def error_table(models: Sequence[HeldOutErrors]) -> list[str]:
-    """Lay out the errors of the models on held-out poses; the file holds the last model."""
-    lines = [f' {"":24}tilt error     acceleration error     (rms)']
-    lines += [f' {_MODELS[errors.model]:22} {_three_digits(errors.tilt_deg.rms):>9} ° '
-              f'{_three_digits(errors.accel_mg.rms):>18} mg' for errors in models]
-    lines[-1] += '           <- saved'
-    return lines
-
-
-def _three_digits(value: float) -> str:
-    """Write a value so that the decimal points of a right-aligned column stand in one line."""
-    if np.isnan(value):
-        return '-   '
-    decimals = 1 if value >= 10 else 2 if value >= 1 else 3
-    return f'{value:.{decimals}f}'.ljust(len(f'{value:.3f}'))
 
 
 def truth_table(comparisons: Sequence[Comparison]) -> list[str]:
@@ -287,60 +228,134 @@ def rounded(row: Comparison, value: float) -> str:
     return f'{round(value, places) + 0.0:.{places}f}'
 
 
-def acceptance_lines(fitted: Sensor) -> list[str]:
-    """
-    Return whether the calibration error is within its limit, as lines.
-
-    The limit is that of the datasheet, or the noise of one sample where no datasheet states one.
-    """
-    provenance = fitted.provenance
-    span = [f'       By rests within {duration(float(provenance["span_s"]))}; a longer drift is '
-            'not in this figure.'] if 'span_s' in provenance else []
-    if 'own_accel_mg' not in provenance:
-        return [f' {acceptance.NOT_SHOWN}  no pose was kept out of the fit to assess it']
-    error_mg = float(provenance['own_accel_mg'])
-    limit_mps2, kind, allows = acceptance.nonlinearity_mps2(fitted), 'datasheet', \
-        'the datasheet allows'
-    if not limit_mps2:
-        limit_mps2, kind, allows = sample_noise_mps2(fitted), 'noise', 'the noise of one sample is'
-    limit = f'{acceptance.two_digits(1e3 * limit_mps2 / G0_MPS2)} mg'
-    accel = provenance.get(f'verdict_{kind}', '')
-    tilt = provenance.get(f'verdict_tilt_{kind}', '')
-    result = f'calibration error {acceptance.two_digits(error_mg)} mg; {allows} {limit}'
-    if acceptance.FAIL in (accel, tilt):
-        if accel != acceptance.FAIL:
-            tilt_deg = float(provenance['own_tilt_deg'])
-            result = f'tilt error {tilt_deg:.2g}°, more than {limit} causes'
-        advice = 'More poses, or longer ones, reduce it.'
-        if len(fitted.axes) == 1:
-            advice = 'One axis does not see the force across it: align it, or accept this error.'
-        elif kind == 'datasheet':
-            advice = 'The sensor is worse than its datasheet states: do not use this file.'
-        return [f' {acceptance.FAIL}  {result}', f'       {advice}', *span]
-    if acceptance.NOT_SHOWN in (accel, tilt):
-        return [f' {acceptance.NOT_SHOWN}  {result}',
-                '            The check poses are too few to show that the error is within it.',
-                *span]
-    return [f' {acceptance.PASS}  {result}', *span]
-
-
 def added_effect_lines(effects: Sequence[str]) -> list[str]:
     """Name each effect that the fit has and the simulated unit does not have."""
     return [f'       The fit has the term {effect}, which this unit does not have.'
             for effect in effects]
 
 
-def gravity_lines(fit: GravityFit) -> list[str]:
-    """Lay out the errors of a calibration against gravity, before and after."""
-    used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
-    before, after, held_out = (
-        _three_digits(1e3 * float(np.sqrt(np.mean(values[used] ** 2))) / G0_MPS2)
-        for values in (fit.before_mps2, fit.residual_mps2, fit.held_out_mps2))
-    lines = [f' error of the magnitude of gravity, rms over {len(used)} rests',
-             f' {"datasheet values":22} {before:>9} mg',
-             f' {"gravity calibration":22} {after:>9} mg    <- saved',
-             f' {"a fifth of time held out":22}{held_out:>8} mg']
-    if fit.outliers:
-        count = len(fit.outliers)
-        lines.append(f' {count} {"outlier was" if count == 1 else "outliers were"} left out')
-    return lines
+_TEMPERATURE_SLOPE = Coefficient('temperature_bias', 'per_k')
+"""Parameter whose typical datasheet value predicts the drift by temperature."""
+_MIN_WARMING_C = 1.0
+"""Smallest difference of temperature that is reported, °C; chosen."""
+_TYPICAL_SLOPE_PER_K = 1e-4
+"""Typical slope of zero-g where the datasheet states none, g/K; ADXL203 datasheet: 0.1 mg/K."""
+
+
+class _Quantity(NamedTuple):
+    """A quantity that is compared between calibrations."""
+
+    label: str  # Its name for people
+    field: str  # Field of a sensor that holds it
+    parameter: Coefficient  # The fitted parameter
+    unit: str  # Unit of a change
+
+
+_QUANTITIES = (
+    _Quantity('zero-g', 'zero_g_v', Coefficient('bias', 'offset_v'), 'mg'),
+    _Quantity('scale factor', 'scale_v_per_g', Coefficient('scale_factor', 'offset_v_per_g'),
+              'permille'))
+
+
+@dataclass(frozen=True)
+class DriftHistory:
+    """Calibrations of one unit, oldest first."""
+
+    # The stored calibrations, then the newest. Empty where the newest is the only one.
+    sensors: tuple[Sensor, ...]
+
+    @staticmethod
+    def from_store(newest: Sensor, stored: Sequence[Sensor]) -> DriftHistory:
+        """Append the newest calibration to the stored ones of other data and the same axes."""
+        data = newest.provenance.get('data_sha256')
+        by_data: dict[str, Sensor] = {}
+        for sensor in stored:
+            # Two fits of the same data show no drift: only the last one counts.
+            if sensor.axes == newest.axes and (
+                    data is None or sensor.provenance.get('data_sha256') != data):
+                by_data[sensor.provenance.get('data_sha256')
+                        or calibration_store.calibration_id(sensor)] = sensor
+        return DriftHistory((*by_data.values(), newest) if by_data else ())
+
+    def table(self) -> tuple[list[str], list[list[str]]]:
+        """Return head and rows: each calibration, and its change from the one before."""
+        axes = self.sensors[-1].axes
+        head = ['date', 'id', 'model', 'temperature, °C', *(
+            f'{quantity.label} {axis}' for quantity in _QUANTITIES for axis in axes)]
+        return head, [_row(*pair) for pair in zip((None, *self.sensors), self.sensors)]
+
+    def changes(self) -> list[str]:
+        """Return lines on the changes since the calibration before that exceed their intervals."""
+        before, now = self.sensors[-2:]
+        changes = []
+        for quantity in _QUANTITIES:
+            change, std = _change(before, now, quantity)
+            for axis, difference, half_width in zip(now.axes, change, Z_90 * std):
+                if abs(difference) > half_width:
+                    changes.append(f'{quantity.label} of {axis} changed by {difference:+.2f} +- '
+                                   f'{half_width:.2f} {quantity.unit}')
+        identity = calibration_store.calibration_id(before)
+        earlier, later = map(calibration_store.date_of, (before, now))
+        since = f'Since {identity}' if earlier is None or later is None else \
+            f'In {(later - earlier).total_seconds() / 86400:.1f} days since {identity}'
+        lines = [f'{since}: {"; ".join(changes)}.' if changes else
+                 f'{since} nothing has changed beyond the 90 % intervals.']
+        warming = _temperature_c(now) - _temperature_c(before)
+        if abs(warming) > _MIN_WARMING_C and changes:
+            slope, _ = now.datasheet.get(_TEMPERATURE_SLOPE, (_TYPICAL_SLOPE_PER_K, 0.0))
+            lines.append(f"The temperature differs by {warming:+.1f} °C. With the datasheet's "
+                         'typical slope, zero-g changes by '
+                         f'{1e3 * slope * abs(warming):.2f} mg from that.')
+        return lines
+
+    @property
+    def dates(self) -> list[str]:
+        """Return the dates of the calibrations, as text."""
+        return [_date(sensor, f'no. {i}') for i, sensor in enumerate(self.sensors, 1)]
+
+    def series(self, quantity: int) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return the drift of a quantity relative to the newest calibration.
+
+        quantity: 0 for zero-g, mg, 1 for scale factor, permille; returns: differences and
+        standard deviations of the values, (k, m) each.
+        """
+        chosen, newest = _QUANTITIES[quantity], self.sensors[-1]
+        return (np.array([_change(newest, sensor, chosen)[0] for sensor in self.sensors]),
+                np.array([_std(sensor, chosen) for sensor in self.sensors]))
+
+
+def _row(before: Sensor | None, now: Sensor) -> list[str]:
+    """Return one calibration as cells of a table, with its change from the one before."""
+    cells = []
+    for quantity in _QUANTITIES:
+        for d in range(len(now.axes)):
+            change = '' if before is None else \
+                f' ({_change(before, now, quantity)[0][d]:+.2f} {quantity.unit})'
+            cells.append(f'{getattr(now, quantity.field)[d]:.5f}{change}')
+    return [_date(now), calibration_store.calibration_id(now), now.model,
+            now.provenance.get('temperature_c', '-'), *cells]
+
+
+def _change(before: Sensor, now: Sensor, quantity: _Quantity) -> tuple[np.ndarray, np.ndarray]:
+    """Return the change of a quantity and its standard deviation, mg or permille, (m,)."""
+    change = getattr(now, quantity.field) - getattr(before, quantity.field)
+    return change / now.scale_v_per_g * 1e3, np.hypot(_std(before, quantity), _std(now, quantity))
+
+
+def _std(sensor: Sensor, quantity: _Quantity) -> np.ndarray:
+    """Return the standard deviation of a quantity, mg or permille, (m,)."""
+    std = dict(zip(sensor.covariance_names, np.sqrt(np.diag(sensor.covariance))))
+    return np.array([std.get(replace(quantity.parameter, axis=axis), 0.0)
+                     for axis in sensor.axes]) / sensor.scale_v_per_g * 1e3
+
+
+def _date(sensor: Sensor, unknown: str = '') -> str:
+    return sensor.provenance.get('date', unknown)[:16].replace('T', ' ')
+
+
+def _temperature_c(sensor: Sensor) -> float:
+    try:
+        return float(sensor.provenance.get('temperature_c', 'nan'))
+    except ValueError:
+        return float('nan')

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The report of a calibration: a page in one file that opens offline, and its plots as PNG."""
+"""The page of a calibration: one file that opens offline, with figures that plotly.js draws."""
 
 from __future__ import annotations
 
@@ -9,22 +9,23 @@ from contextlib import suppress
 import os
 from pathlib import Path
 import re
-from typing import Any, NamedTuple
+from typing import Any
 
-from adxl_ros.calibrate.calibration import CalibrationResult
-from adxl_ros.calibrate.poses import reference_force
-from adxl_ros.calibrate.report import cross_validation, page_figures, plots, text_tables
-from adxl_ros.calibrate.report.acceptance import (
-    Assessment,
-    FAIL,
-    nonlinearity_mps2,
-    NOT_SHOWN,
-    PASS,
+from adxl_ros.calibrate.fits import linear
+from adxl_ros.calibrate.fits.gravity_fit import GravityFit
+from adxl_ros.calibrate.poses import Poses, reference_force
+from adxl_ros.calibrate.report import acceptance, coefficients, held_out, plots
+from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
+from adxl_ros.calibrate.report.coefficients import DriftHistory
+from adxl_ros.calibrate.report.held_out import (
+    determining_alpha,
+    ErrorBudget,
+    ErrorStatistic,
+    HeldOutErrors,
+    rms_mg,
+    sample_noise_mps2,
 )
-from adxl_ros.calibrate.report.cross_validation import ErrorStatistic, HeldOutErrors
-from adxl_ros.calibrate.report.error_budget import ErrorBudget, rms_mg, sample_noise_mps2
-from adxl_ros.calibrate.report.page_figures import DriftHistory
-from adxl_ros.calibrate.report.text_tables import compare
+from adxl_ros.calibrate.result import CalibrationResult
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.atomic_write import write_bytes, write_text
@@ -33,9 +34,22 @@ from adxl_ros.model.coefficients import get
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report import page as html_page
-from adxl_ros.report.figures import Figure, png, whisker
+from adxl_ros.report.figures import (
+    AXIS_COLOURS,
+    axis_number,
+    Figure,
+    figure,
+    line,
+    png,
+    points,
+    QUIET_COLOUR,
+    rounded,
+    whisker,
+)
 import numpy as np
 
+FILES = ('report.html', 'calibration.png')
+"""Files of a report."""
 _PANELS = ((0, 1), (2, 3), (4, 5))
 """Panels of `plots.sweep` that stand side by side on the page."""
 _COLOURS = {PASS: 'green', NOT_SHOWN: 'amber', FAIL: 'red'}
@@ -56,26 +70,17 @@ _BEYOND_WHISKER = 1.08
 """Half of a whisker's range divided by the largest value in it. Chosen: no dot is cut."""
 
 
-class _SphereData(NamedTuple):
-    """Errors over the sphere of k poses."""
-
-    models: list[str]  # Names of the models
-    quantities: list[list[str]]  # Label and unit of each quantity
-    errors: list[np.ndarray]  # Errors of each model by pose and quantity, (k, q) each
-    force: np.ndarray  # Specific force in the case, m/s², (k, 3)
-    labels: list[str]  # Text of each pose
-
-
 def write(folder: str | os.PathLike, result: CalibrationResult,
           store: str | os.PathLike = '') -> None:
     """Write `report.html`, and the plots of the unit as `calibration.png`."""
     html_page.check_libraries()
     past = calibration_store.history(store, result.fitted.serial).calibrations \
         if str(store) else []
-    write_text(Path(folder) / 'report.html', page(result, [sensor for _, sensor in past]))
+    page_path, plot_path = (Path(folder) / name for name in FILES)
+    write_text(page_path, page(result, [sensor for _, sensor in past]))
     # If the poses do not suffice for the figures of the paper, the page states the reason.
     with suppress(UserError):
-        draw(Path(folder) / 'calibration.png', result)
+        draw(plot_path, result)
 
 
 def draw(path: str | os.PathLike, result: CalibrationResult) -> None:
@@ -83,7 +88,13 @@ def draw(path: str | os.PathLike, result: CalibrationResult) -> None:
     if result.gravity_fit is not None:
         write_bytes(path, png(plots.gravity_rests(result.name, result.gravity_fit)))
     else:
-        plots.draw_sweep(path, result.nominal, result.paper_sensor, result.poses)
+        plots.draw_sweep(path, result.nominal, _paper_sensor(result), result.poses)
+
+
+def _paper_sensor(result: CalibrationResult) -> Sensor:
+    """Return the unit by a model that the paper's figures can show."""
+    return result.fitted if result.fitted.model in ('physical', 'full') else \
+        linear.fit_physical(result.nominal, result.poses.subset(~result.poses.check))
 
 
 def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
@@ -91,8 +102,17 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
     fitted = result.fitted
     assessment = next((row for row in result.assessments if row.model == fitted.model), None)
     errors = next((row for row in result.held_out if row.model == fitted.model), None)
-    history, coefficients = DriftHistory.from_store(fitted, past), _coefficients(fitted)
-    pictures, fault = _paper_figures(result)
+    history, rows = DriftHistory.from_store(fitted, past), _coefficients(fitted)
+    figures: dict[str, Figure] = {}
+    if result.gravity_fit is not None:
+        figures['errors'] = _gravity_errors(result.gravity_fit)
+    elif assessment is not None and errors is not None:
+        figures['errors'] = _pose_errors(
+            errors, assessment, result.poses.subset(result.inliers), fitted.axes)
+    if history.sensors:
+        figures['drift'] = _drift(history)
+    pictures, fault, paper_model = _paper_figures(result)
+    temperature_c = fitted.envelope.temperature_c
     return html_page.render('adxl_ros.calibrate.report', 'calibration.html', {
         'title': f'Calibration of {fitted.serial}, {fitted.provenance["date"][:10]}',
         'about': [f'{fitted.model} model', f'{len(result.poses)} poses', f'axes {fitted.axes}'],
@@ -102,26 +122,31 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
         'Take more poses: too few were held out to assess this calibration.',
         'file_name': re.sub(r'[^\w.-]+', '_', fitted.serial) + '.yaml',
         'download': html_page.download_url(parameter_file.as_text(fitted, result.comments())),
-        'figures': _figures(result, assessment, errors, history),
+        'figures': figures,
         'open_circles': errors.poses_without_alpha if errors else 0,
         'sphere': _sphere(result),
-        'coefficients': coefficients,
-        'beyond': [row for row in coefficients if row['outcome'] == _BEYOND],
+        'coefficients': rows,
+        'beyond': [row for row in rows if row['outcome'] == _BEYOND],
         'datasheet': fitted.datasheet_name,
         'limit_head': _limit_head(fitted),
         'limits': _limits(result),
         'budget': _budget(assessment.accel) if assessment and errors else None,
         'history': history.table() if history.sensors else None,
         'changes': history.changes() if history.sensors else [],
-        'paper_model': '' if result.gravity_fit else result.paper_sensor.model,
+        'paper_model': paper_model,
         'pictures': pictures, 'pictures_fault': fault,
         'report_lines': result.report_lines,
-        'provenance': _provenance(fitted)})
+        'provenance': [
+            ['serial', fitted.serial], ['model', fitted.model],
+            ['effects', ', '.join(fitted.effects)],
+            *([key.replace('_', ' '), value] for key, value in fitted.provenance.items()),
+            ['valid for temperatures', f'{temperature_c[0]:.1f} to {temperature_c[1]:.1f} °C'
+             if temperature_c else 'not measured']]})
 
 
 def _badge(fitted: Sensor) -> dict[str, str]:
     """Return the acceptance as the terminal shows it, and its colour."""
-    first, *others = (line.strip() for line in text_tables.acceptance_lines(fitted))
+    first, *others = (line.strip() for line in acceptance.acceptance_lines(fitted))
     outcome = next(outcome for outcome in (NOT_SHOWN, PASS, FAIL) if first.startswith(outcome))
     sentence = '. '.join([first.removeprefix(outcome).strip(), *others])
     return {'colour': _COLOURS[outcome], 'word': outcome,
@@ -168,24 +193,9 @@ def _digits(value: float) -> str:
     return f'{value:.{decimals}f}' if value >= 5e-4 else '< 0.001'
 
 
-def _figures(result: CalibrationResult, assessment: Assessment | None,
-             errors: HeldOutErrors | None, history: DriftHistory
-             ) -> dict[str, Figure]:
-    """Return the figures of the page by name."""
-    figures = {}
-    if result.gravity_fit is not None:
-        figures['errors'] = page_figures.gravity_errors(result.gravity_fit)
-    elif assessment is not None and errors is not None:
-        figures['errors'] = page_figures.pose_errors(
-            errors, assessment, result.poses.subset(result.inliers), result.fitted.axes)
-    if history.sensors:
-        figures['drift'] = page_figures.drift(history.series())
-    return figures
-
-
 def _limit_head(fitted: Sensor) -> list[str]:
     """Return the head of the table of limits."""
-    datasheet_mps2 = nonlinearity_mps2(fitted)
+    datasheet_mps2 = acceptance.nonlinearity_mps2(fitted)
     datasheet = f'datasheet ({1e3 * datasheet_mps2 / G0_MPS2:.2g} mg)' if datasheet_mps2 \
         else 'datasheet'
     noise = f'noise ({1e3 * sample_noise_mps2(fitted) / G0_MPS2:.2g} mg)'
@@ -234,43 +244,32 @@ def _budget(budget: ErrorBudget) -> dict[str, Any]:
 
 
 def _sphere(result: CalibrationResult) -> dict[str, Any]:
-    """Return the data of the sphere's script."""
-    data = _stage_sphere(result) if result.gravity_fit is None else _gravity_sphere(result)
-    up = data.force / np.linalg.norm(data.force, axis=1, keepdims=True)
-
-    def point(i: int) -> dict[str, Any]:
-        return {'u': [round(float(c), 5) for c in up[i]], 'label': data.labels[i],
-                'held_out': bool(result.poses.check[i]),
-                'values': [list(map(_number, errors[i])) for errors in data.errors]}
-
-    return {'models': data.models, 'quantities': data.quantities,
-            'poses': [point(i) for i in range(len(data.labels))]}
-
-
-def _gravity_sphere(result: CalibrationResult) -> _SphereData:
-    fit, poses = result.gravity_fit, result.poses
-    assert fit is not None
-    inverse = signal_chain.inverse(result.fitted)
-    force = np.column_stack(inverse(list(poses.volts.T), poses.environment))
-    errors = [np.column_stack([1e3 * values / G0_MPS2])
-              for values in (fit.before_mps2, fit.residual_mps2)]
-    return _SphereData(['nominal', 'gravity'], [['magnitude minus gravity', 'mg']], errors, force,
-                       [f'rest {i + 1}' for i in range(len(poses))])
-
-
-def _stage_sphere(result: CalibrationResult) -> _SphereData:
-    poses, fitted = result.poses, result.fitted
-    force = np.column_stack(reference_force(poses, fitted.local_gravity_mps2))
-    units = {row.model: row.fitted[0] for row in result.held_out} | {fitted.model: fitted}
-    errors = []
-    for unit in units.values():
-        unit_errors = cross_validation.pose_errors(unit, poses)
-        errors.append(np.column_stack([np.degrees(unit_errors.tilt_rad),
-                                       1e3 * unit_errors.accel_mps2 / G0_MPS2]))
-    labels = [f'pose {i + 1}, alpha {np.degrees(a):.1f}°, beta {np.degrees(b):.1f}°'
-              for i, (a, b) in enumerate(zip(poses.alpha_rad, poses.beta_rad))]
-    quantities = [['error of tilt', '°'], *([f'error of {a}', 'mg'] for a in fitted.axes)]
-    return _SphereData(list(units), quantities, errors, force, labels)
+    """Return the data of the sphere's script: errors of each model by pose and quantity."""
+    fitted, poses, fit = result.fitted, result.poses, result.gravity_fit
+    if fit is not None:
+        force = np.column_stack(signal_chain.inverse(fitted)(
+            list(poses.volts.T), poses.environment))
+        errors = {'nominal': 1e3 * fit.before_mps2[:, None] / G0_MPS2,
+                  'gravity': 1e3 * fit.residual_mps2[:, None] / G0_MPS2}
+        quantities = [['magnitude minus gravity', 'mg']]
+        labels = [f'rest {i + 1}' for i in range(len(poses))]
+    else:
+        force = np.column_stack(reference_force(poses, fitted.local_gravity_mps2))
+        units = {row.model: row.fitted[0] for row in result.held_out} | {fitted.model: fitted}
+        errors = {}
+        for model, unit in units.items():
+            of_unit = held_out.pose_errors(unit, poses)
+            errors[model] = np.column_stack([np.degrees(of_unit.tilt_rad),
+                                             1e3 * of_unit.accel_mps2 / G0_MPS2])
+        quantities = [['error of tilt', '°'], *([f'error of {a}', 'mg'] for a in fitted.axes)]
+        labels = [f'pose {i}, alpha {alpha:.1f}°, beta {beta:.1f}°' for i, (alpha, beta) in
+                  enumerate(np.degrees([poses.alpha_rad, poses.beta_rad]).T, 1)]
+    up = force / np.linalg.norm(force, axis=1, keepdims=True)
+    return {'models': list(errors), 'quantities': quantities, 'poses': [
+        {'u': [round(float(c), 5) for c in up[i]], 'label': label,
+         'held_out': bool(poses.check[i]),
+         'values': [list(map(_number, values[i])) for values in errors.values()]}
+        for i, label in enumerate(labels)]}
 
 
 def _number(value: float) -> float | None:
@@ -282,13 +281,14 @@ def _coefficients(fitted: Sensor) -> list[dict[str, Any]]:
     half_widths = Z_90 * np.sqrt(np.diag(fitted.covariance))
     departures = get(fitted, fitted.covariance_names)
     rows = []
-    for row, name, value, half_width in zip(compare(fitted, fitted), fitted.covariance_names,
-                                            departures, half_widths):
+    for row, name, value, half_width in zip(
+            coefficients.compare(fitted, fitted), fitted.covariance_names, departures,
+            half_widths):
         typical, maximum = fitted.datasheet.get(name.without_axis, (0.0, 0.0))
         largest = max(typical, maximum, abs(value) + half_width, 1e-12) * _BEYOND_WHISKER
         unit = '' if row.unit == '1' else f' {row.unit}'
-        text = f'{text_tables.rounded(row, row.fitted)} ± ' \
-            f'{text_tables.rounded(row, row.half_width)}{unit}'
+        text = f'{coefficients.rounded(row, row.fitted)} ± ' \
+            f'{coefficients.rounded(row, row.half_width)}{unit}'
         beyond = _against_datasheet(abs(value) - half_width, typical, maximum)
         rows.append({
             'label': f'{row.label} {row.axis}', 'name': str(name), 'text': text,
@@ -316,28 +316,104 @@ def _against_datasheet(magnitude: float, typical: float, maximum: float) -> str:
     return 'beyond typical' if typical and magnitude > typical else 'within'
 
 
-def _paper_figures(result: CalibrationResult) -> tuple[list[str], str]:
-    """Return the figures of the paper as URLs of pictures, or the reason why there are none."""
+def _paper_figures(result: CalibrationResult) -> tuple[list[str], str, str]:
+    """Return the figures of the paper as URLs, else why there are none, and their model."""
     if result.gravity_fit is not None:
-        return [_picture(plots.gravity_rests(result.name, result.gravity_fit))], ''
-    pictures = [_picture(plots.held_out(
-        result.held_out, result.poses.subset(result.inliers)))] if result.held_out else []
+        drawn = plots.gravity_rests(result.name, result.gravity_fit)
+        return [html_page.picture_url(drawn)], '', ''
+    figures = [plots.held_out(result.held_out, result.poses.subset(result.inliers))] \
+        if result.held_out else []
+    fault, model = '', 'physical'
     try:
-        return pictures + [
-            _picture(plots.sweep(result.nominal, result.paper_sensor, result.poses, pair))
-            for pair in _PANELS], ''
+        unit = _paper_sensor(result)
+        model = unit.model
+        figures += [plots.sweep(result.nominal, unit, result.poses, pair) for pair in _PANELS]
     except UserError as error:
-        return pictures, str(error)
+        fault = str(error)
+    return [html_page.picture_url(drawn) for drawn in figures], fault, model
 
 
-def _picture(figure: Any) -> str:
-    return html_page.picture_url(figure)
+_BAND_COLOUR = 'rgba(31,95,191,0.12)'
+_ROOM = {'l': 8, 'r': 12, 't': 36, 'b': 8}
+"""Margins with room for a legend, pixels."""
+_DATES = 4
+"""Largest number of dates at an axis. Chosen: they fit beside each other on a phone."""
 
 
-def _provenance(fitted: Sensor) -> list[list[str]]:
-    temperature_c = fitted.envelope.temperature_c
-    return [['serial', fitted.serial], ['model', fitted.model],
-            ['effects', ', '.join(fitted.effects)],
-            *([key.replace('_', ' '), value] for key, value in fitted.provenance.items()),
-            ['valid for temperatures', f'{temperature_c[0]:.1f} to {temperature_c[1]:.1f} °C'
-             if temperature_c else 'not measured']]
+def _pose_errors(errors: HeldOutErrors, assessment: Assessment, poses: Poses, axes: str) -> Figure:
+    """Draw the errors at the held-out poses with the band that 90 % of them should be in."""
+    number = np.arange(1, errors.pose_count + 1)
+    held = poses.subset(errors.pose_index)
+    angles_deg = np.degrees([held.alpha_rad, held.beta_rad])
+    labels = [f'pose {i}, alpha {alpha:.1f}°, beta {beta:.1f}°'
+              for i, (alpha, beta) in enumerate(angles_deg.T, 1)]
+    accel_mg = errors.errors.accel_mps2 / G0_MPS2 * 1e3
+    half_mg = Z_90 * 1e3 * float(np.sqrt(assessment.accel.expected)) / G0_MPS2
+    traces = [_band(len(number), -half_mg, half_mg, 1)]
+    symbols = np.where(determining_alpha(errors.errors), 'circle', 'circle-open').tolist()
+    traces += [_dots(number, accel_mg[:, d], f'{axis}', AXIS_COLOURS[axis], labels, 'mg', 1)
+               for d, axis in enumerate(axes)]
+    for trace in traces[1:]:
+        trace['marker']['symbol'] = symbols
+    tilt_deg = np.degrees(errors.errors.tilt_rad)
+    if not np.isfinite(tilt_deg).any():
+        return figure(traces, 320, margin=_ROOM, xaxis={'title': {'text': 'held-out pose'}},
+                      yaxis={'title': {'text': 'acceleration, mg'}})
+    # The error of tilt has two components: 90 % of its lengths are within √(ln 10) of the rms.
+    high_deg = float(np.degrees(np.sqrt(assessment.tilt.expected * np.log(10))))
+    traces += [_band(len(number), 0.0, high_deg, 2),
+               _dots(number, tilt_deg, 'tilt', '#6b46a8', labels, '°', 2)]
+    return figure(traces, 440, margin=_ROOM,
+                  xaxis={'title': {'text': 'held-out pose'}, 'anchor': 'y2'},
+                  yaxis={'title': {'text': 'acceleration, mg'}, 'domain': [0.54, 1]},
+                  yaxis2={'title': {'text': 'tilt, °'}, 'domain': [0, 0.46],
+                          'rangemode': 'tozero'})
+
+
+def _gravity_errors(fit: GravityFit) -> Figure:
+    """Draw the error of the magnitude of gravity at each rest, and its expected 90 % bars."""
+    used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
+    scale = 1e3 / G0_MPS2
+    traces = [points(used + 1, scale * fit.held_out_mps2[used],
+                     Z_90 * scale * fit.expected_mps2[used], 'held out', AXIS_COLOURS['x'])]
+    return figure(traces, 320, margin=_ROOM, xaxis={'title': {'text': 'rest'}},
+                  yaxis={'title': {'text': 'magnitude minus gravity, mg'}})
+
+
+def _drift(history: DriftHistory) -> Figure:
+    """Draw zero-g and scale factor of a unit over its calibrations, relative to the newest."""
+    traces, layout, dates = [], {}, history.dates
+    number_of = np.arange(len(dates))
+    labelled = np.unique(np.linspace(0, len(dates) - 1, _DATES).astype(int))
+    for number, label in enumerate(('zero-g, mg', 'scale factor, ‰'), 1):
+        values, std = history.series(number - 1)
+        for d, axis in enumerate(history.sensors[-1].axes):
+            trace = points(number_of, values[:, d], Z_90 * std[:, d], axis,
+                           AXIS_COLOURS[axis])
+            traces.append(trace | {'mode': 'lines+markers', 'text': dates,
+                                   'hovertemplate': '%{text}: %{y:.3~g}',
+                                   'showlegend': number == 1, 'legendgroup': axis,
+                                   'yaxis': axis_number('y', number)})
+        layout[axis_number('yaxis', number)] = {
+            'title': {'text': label}, 'domain': [0.54, 1] if number == 1 else [0, 0.46]}
+    return figure(traces, 340, margin=_ROOM, **layout,
+                  xaxis={'anchor': 'y2', 'tickvals': labelled.tolist(),
+                         'ticktext': [dates[i][:10] for i in labelled]})
+
+
+def _band(count: int, low: float, high: float, panel: int) -> Figure:
+    """Draw the band of the expected errors in a panel."""
+    edges = [0.5, count + 0.5]
+    return line([*edges, *edges[::-1]], [low, low, high, high], 'expected 90 %', QUIET_COLOUR,
+                fill='toself', fillcolor=_BAND_COLOUR, hoverinfo='skip',
+                line={'color': QUIET_COLOUR, 'width': 0.5}, xaxis='x',
+                yaxis=axis_number('y', panel), showlegend=panel == 1)
+
+
+def _dots(number: np.ndarray, values: np.ndarray, name: str, colour: str, labels: list[str],
+          unit: str, panel: int) -> Figure:
+    """Draw one error of each pose in a panel."""
+    return {'type': 'scatter', 'mode': 'markers', 'x': number.tolist(), 'y': rounded(values),
+            'name': name, 'text': labels, 'xaxis': 'x', 'yaxis': axis_number('y', panel),
+            'hovertemplate': '%{text}: %{y:.3~g} ' + unit + '<extra>' + name + '</extra>',
+            'marker': {'color': colour, 'size': 7}}
