@@ -304,7 +304,8 @@ def _require_one_mounting(full: FullFit, recordings: Sequence[RecordedPoses]) ->
             f'zero-g of {axes[worst - 3]} is shifted by {1e3 * changes[worst]:.2f} mg'
         raise UserError(
             f'{recording.source}: {change} from the fit of all recordings '
-            f'({deviations[worst]:.0f} standard deviations): another unit or another mounting; fit this recording separately')
+            f'({deviations[worst]:.0f} standard deviations): another unit or another '
+            'mounting; fit this recording separately')
 
 
 def _turn_and_shifts(full: FullFit, poses: Poses) -> tuple[np.ndarray, np.ndarray]:

@@ -153,12 +153,13 @@ def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor,
     _require_determined(rests[kept], parameters, excess_g2)
     variance = magnitude_variance(rests, parameters) + excess_g2
     covariance = np.linalg.inv(fisher_information(rests[kept], parameters, excess_g2))
-    covariance *= _t_factor(excess_g2, variance[kept])
-    effects = effect_values(parameters, sensor)
+    # An excess that ν rests determine widens its share of the variance by ν/(ν − 2).
+    covariance *= 1 + excess_g2 / variance[kept].mean() * 2 / max(
+        kept.sum() - len(NAMES) - 2, 1)
+    values, units = effect_values(parameters, sensor)
     residual = _residual(rests, parameters)
     return GravityFit(
-        values=effects.values,
-        covariance=covariance * np.outer(effects.units, effects.units),
+        values=values, covariance=covariance * np.outer(units, units),
         before_mps2=G0_MPS2 * (np.linalg.norm(rests.mean, axis=1) - rests.gravity_g),
         residual_mps2=G0_MPS2 * residual,
         held_out_mps2=G0_MPS2 * _held_out(rests, kept, parameters, variance, residual, stretches),
@@ -202,14 +203,8 @@ def _fit(rests: NominalRests, start: np.ndarray) -> _Estimate:
 
 def _subset_fits(rests: NominalRests, start: np.ndarray) -> Callable[[np.ndarray], _Estimate]:
     """Return a function that fits the rests of a mask, (k,) bool, once for each mask."""
-    @cache
-    def fit(mask: bytes) -> _Estimate:
-        return _fit(rests[np.frombuffer(mask, bool)], start)
-
-    def fit_kept(kept: np.ndarray) -> _Estimate:
-        return fit(kept.tobytes())
-
-    return fit_kept
+    fit = cache(lambda mask: _fit(rests[np.frombuffer(mask, bool)], start))
+    return lambda kept: fit(kept.tobytes())
 
 
 def _excess(squares: np.ndarray, variance: np.ndarray, freedom: int) -> float:
@@ -220,13 +215,6 @@ def _excess(squares: np.ndarray, variance: np.ndarray, freedom: int) -> float:
         return 0.0
     return float(scipy.optimize.brentq(surplus, 0.0, squares.sum() / freedom, rtol=1e-9,
                                        xtol=1e-30))
-
-
-def _t_factor(excess_g2: float, variance: np.ndarray) -> float:
-    """Return the factor of the covariance for an excess that ν rests determine: ν/(ν − 2)."""
-    # The factor applies only to the share of the excess in the variance.
-    freedom = len(variance) - len(NAMES)
-    return 1 + excess_g2 / variance.mean() * 2 / max(freedom - 2, 1)
 
 
 def _inliers(rests: NominalRests, start: np.ndarray, fit: Callable[[np.ndarray], _Estimate]

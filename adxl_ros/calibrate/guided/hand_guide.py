@@ -164,8 +164,8 @@ class HandRests(Guide):
                               covariance=covariance, covariance_names=NAMES)
         force = force_g(rests.mean, self._parameters)
         self.covered = gravity_model.covered(force / np.linalg.norm(force, axis=1, keepdims=True))
-        self._gain = gravity_model.information_gain(information, self._parameters,
-                                                    rests.gravity_g).gain
+        self._gain, _ = gravity_model.information_gain(information, self._parameters,
+                                                       rests.gravity_g)
         self._choose_next_up()
 
     def _choose_next_up(self) -> None:
