@@ -8,22 +8,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-from adxl_ros.calibrate.fits import (
-    full_model,
-    gravity_fit as gravity,
-    linear,
-    term_selection,
-    thermal_fit,
-)
-from adxl_ros.calibrate.fits.full_model import FullFit
+from adxl_ros.calibrate.fits import full_model, gravity_fit, linear, term_selection, thermal_fit
 from adxl_ros.calibrate.fits.linearisation import volts_covariance
-from adxl_ros.calibrate.poses import (
-    check_polarity,
-    join_poses,
-    Poses,
-    predicted_volts,
-    reference_force,
-)
+from adxl_ros.calibrate.poses import check_polarity, Poses, predicted_volts, reference_force
 from adxl_ros.calibrate.report import acceptance, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment
 from adxl_ros.calibrate.report.held_out import HeldOutErrors, rms_mg
@@ -59,6 +46,10 @@ class RecordedPoses:
     filters: Sequence[FilterNoise | None] = ()
 
 
+def _joined(recordings: Sequence[RecordedPoses]) -> Poses:
+    return Poses.joined([recording.poses for recording in recordings])
+
+
 def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None = None,
               effects: Sequence[str] = (), data_sha256: str = '',
               population: Population | None = None) -> CalibrationResult:
@@ -91,7 +82,7 @@ def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | 
         The poses do not determine the model, or the recordings contradict each other.
 
     """
-    poses = join_poses([recording.poses for recording in recordings])
+    poses = _joined(recordings)
     source = ', '.join(recording.source for recording in recordings)
     lines: list[str] = []
     if poses.has_angles.any():
@@ -127,13 +118,13 @@ class _StageFit:
     refit: held_out.Fit  # The same fit to other poses, for cross-validation
     report_lines: Sequence[str] = ()  # Report of a full fit
     warnings: Sequence[str] = ()  # What is wrong with the poses or a full fit
-    full: FullFit | None = None  # The full fit; None for other models
+    full: full_model.FullFit | None = None  # The full fit; None for other models
 
 
 def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None,
                    effects: Sequence[str], source: str, data_sha256: str,
                    population: Population | None) -> CalibrationResult:
-    poses = join_poses([recording.poses for recording in recordings])
+    poses = _joined(recordings)
     check_polarity(sensor, poses)
     fit, refusals = _richest_fit(sensor, recordings, model, effects, population)
     if population is not None:
@@ -204,7 +195,7 @@ def _richest_fit(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str
                  effects: Sequence[str], population: Population | None
                  ) -> tuple[_StageFit, list[str]]:
     """Fit a model, or the richest one that the poses determine; also say why no richer one."""
-    poses = join_poses([recording.poses for recording in recordings])
+    poses = _joined(recordings)
     poses = poses.subset(~poses.check)
     fits: dict[str, Callable[[], _StageFit]] = {
         'full': lambda: _fit_full(sensor, poses, recordings, effects),
@@ -284,7 +275,7 @@ _MIN_VARIANCE = 1e-30
 """Lower bound of the variance of a turn, rad², or shift, g², so that it can be a divisor."""
 
 
-def _require_one_mounting(full: FullFit, recordings: Sequence[RecordedPoses]) -> None:
+def _require_one_mounting(full: full_model.FullFit, recordings: Sequence[RecordedPoses]) -> None:
     """
     Refuse recordings if the mounting or the zero-g of one of them differs.
 
@@ -308,7 +299,7 @@ def _require_one_mounting(full: FullFit, recordings: Sequence[RecordedPoses]) ->
             'mounting; fit this recording separately')
 
 
-def _turn_and_shifts(full: FullFit, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
+def _turn_and_shifts(full: full_model.FullFit, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
     """Fit the turn of the case, rad, (3,), and the zero-g shifts, g, (m,); values and std."""
     unit = full.unit
     force = reference_force(poses, unit.local_gravity_mps2)
@@ -326,13 +317,13 @@ def _turn_and_shifts(full: FullFit, poses: Poses) -> tuple[np.ndarray, np.ndarra
 
 def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, data_sha256: str,
                      population: Population | None) -> CalibrationResult:
-    fit = gravity.fit_gravity(poses.volts, poses.std_v, sensor)
+    fit = gravity_fit.fit_gravity(poses.volts, poses.std_v, sensor)
     kept = np.setdiff1d(np.arange(len(poses)), fit.outliers)
     before, after, unseen = (rms_mg(np.mean(values[kept] ** 2)) for values in (
         fit.before_mps2, fit.residual_mps2, fit.held_out_mps2))
     fitted = replace(
         sensor, model='gravity', effects=('bias', 'scale_factor', 'misalignment'),
-        values=fit.values, covariance=fit.covariance, covariance_names=gravity.NAMES)
+        values=fit.values, covariance=fit.covariance, covariance_names=gravity_fit.NAMES)
     prior_lines: list[str] = []
     if population is not None:
         combined = posterior(fitted, population)

@@ -18,15 +18,8 @@ from adxl_ros.files.tables import PoseTable
 from adxl_ros.model import analog_stages, signal_chain
 from adxl_ros.model.coefficients import get, parameter_of, put
 from adxl_ros.model.constants import AXES
-from adxl_ros.model.effects.base import (
-    Coefficient,
-    Components,
-    Environment,
-    Joint,
-    NOMINAL_ENVIRONMENT,
-    Place,
-    Signals,
-)
+from adxl_ros.model.effects import base
+from adxl_ros.model.effects.base import Coefficient, Components, Environment, NOMINAL_ENVIRONMENT
 from adxl_ros.model.kinematics import specific_force, UPRIGHT
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.recorded_sensor import CERTAIN_CORRELATION, find_polarity_fault
@@ -111,6 +104,17 @@ class Poses:
             numbers[name] = np.where(missing, by_angle, given + first)
         return replace(poses, **numbers)
 
+    @staticmethod
+    def joined(parts: Sequence[Poses]) -> Poses:
+        """Join the poses of several recordings of one unit, each with settings of its own."""
+        joined = {field.name: np.concatenate([getattr(part, field.name) for part in parts])
+                  for field in fields(Poses)}
+        for name in ('alpha_setting', 'beta_setting'):
+            settings = [getattr(part, name) for part in parts]
+            first = np.cumsum([0, *(int(n.max(initial=-1)) + 1 for n in settings[:-1])])
+            joined[name] = np.concatenate([numbers + f for numbers, f in zip(settings, first)])
+        return Poses(**joined)
+
     def subset(self, chosen: np.ndarray) -> Poses:
         """Select poses by mask or by index."""
         return Poses(*(getattr(self, field.name)[chosen] for field in fields(self)))
@@ -127,17 +131,6 @@ class Poses:
     def has_angles(self) -> np.ndarray:
         """Return which poses have both angles, (k,) bool."""
         return np.isfinite(self.alpha_rad) & np.isfinite(self.beta_rad)
-
-
-def join_poses(parts: list[Poses]) -> Poses:
-    """Join the poses of several recordings of one unit; each recording has settings of its own."""
-    joined = {field.name: np.concatenate([getattr(part, field.name) for part in parts])
-              for field in fields(Poses)}
-    for name in ('alpha_setting', 'beta_setting'):
-        settings = [getattr(part, name) for part in parts]
-        first = np.cumsum([0, *(int(numbers.max(initial=-1)) + 1 for numbers in settings[:-1])])
-        joined[name] = np.concatenate([numbers + f for numbers, f in zip(settings, first)])
-    return Poses(**joined)
 
 
 def _settings_by_angle(angle_rad: np.ndarray, start_s: np.ndarray) -> np.ndarray:
@@ -231,9 +224,10 @@ def stage_force(unit: Sensor, alpha_rad: np.ndarray, beta_rad: np.ndarray) -> Co
     alpha_rad, beta_rad: angles of the encoder, rad, (k,); returns: three components in the case
     frame, m/s², (k,).
     """
-    signals = Signals(NOMINAL_ENVIRONMENT, alpha=Joint(alpha_rad), beta=Joint(beta_rad),
-                      up=list(UPRIGHT), gravity_mps2=unit.local_gravity_mps2)
-    for apply, values in analog_stages.effects_at(unit, Place.STAGE):
+    signals = base.Signals(
+        NOMINAL_ENVIRONMENT, alpha=base.Joint(alpha_rad), beta=base.Joint(beta_rad),
+        up=list(UPRIGHT), gravity_mps2=unit.local_gravity_mps2)
+    for apply, values in analog_stages.effects_at(unit, base.Place.STAGE):
         apply(signals, values)
     return specific_force(signals.alpha.position, signals.beta.position, signals.gravity_mps2,
                           0.0, signals.up)

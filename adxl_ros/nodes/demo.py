@@ -19,12 +19,7 @@ from adxl_ros.calibrate.guided import pose_plan
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import acceptance, held_out as unseen
 from adxl_ros.calibrate.report.acceptance import acceptance_lines, error_table, gravity_lines
-from adxl_ros.calibrate.report.coefficients import (
-    added_effect_lines,
-    added_effects,
-    compare,
-    truth_table,
-)
+from adxl_ros.calibrate.report.coefficients import added_effect_lines, compare, truth_table
 from adxl_ros.closed_output import ended_by_closed_output
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording, sweep_journal
@@ -243,12 +238,16 @@ def _run_sweep(folder: Path, speed: float, seed: int) -> None:
     fitted = parameter_file.load(output)
     _print('', *error_table(_held_out_errors(sensor, fitted, poses)), '',
            *truth_table(compare(fitted, truth)), '', *acceptance_lines(fitted),
-           *added_effect_lines(added_effects(fitted, truth)), '',
+           *added_effect_lines(fitted, truth), '',
            *file_lines({'Page': report / 'report.html', 'Calibration': output}))
 
 
 def _draw_unit(sensor: Sensor, seed: int) -> Sensor:
-    """Draw the coefficients of a unit: 0.5 to 1.5 times a multiple of their typical values."""
+    """
+    Draw the coefficients of a unit: 0.5 to 1.5 times a multiple of their typical values.
+
+    The linear cross-axis terms are part of the misalignment, as in the fits.
+    """
     rng = np.random.default_rng(seed)
     values: dict[str, dict[str, np.ndarray]] = {}
     for name, multiple in _UNIT_EFFECTS.items():
@@ -256,7 +255,7 @@ def _draw_unit(sensor: Sensor, seed: int) -> Sensor:
         for p in effect_named(name).parameters:
             values[name][p.name] = np.array([
                 multiple * p.scale * rng.choice((-1, 1)) * rng.uniform(*_SPREAD)
-                if axis in p.axes else 0.0 for axis in sensor.axes])
+                * (p.name != 'linear') if axis in p.axes else 0.0 for axis in sensor.axes])
     return replace(sensor, effects=tuple(_UNIT_EFFECTS), values=values)
 
 

@@ -29,13 +29,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from adxl_ros.calibrate.fits import linear, linearisation
-from adxl_ros.calibrate.fits.linearisation import (
-    AngleErrors,
-    Linearised,
-    linearised,
-    PoseCovariance,
-    StageError,
-)
+from adxl_ros.calibrate.fits.linearisation import Linearised, linearised, StageError
 from adxl_ros.calibrate.poses import angle_jacobian, Poses, predicted_volts
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
@@ -208,10 +202,11 @@ def _starts(unit: Sensor, poses: Poses, names: tuple[Coefficient, ...], stated: 
     constants). Shape parameters are searched over their range; the likeliest values are starts.
     """
     def likeliest(effect: str, parameter: Parameter, values: np.ndarray) -> list[Sensor]:
-        """Return units with values within the bounds of a shape parameter, likeliest first."""
+        """Return units with values within the bounds of a parameter, the likeliest first."""
         of_effect = unit.values[effect]
-        units = [replace(unit, values={**unit.values, effect: {**of_effect, parameter.name: np.full(
-            np.shape(of_effect[parameter.name]), value)}})
+        shape = np.shape(of_effect[parameter.name])
+        units = [replace(unit, values={
+            **unit.values, effect: {**of_effect, parameter.name: np.full(shape, value)}})
             for value in values if parameter.lower <= value <= parameter.upper]
         misfit = [linearised(trial, poses, names, prior_precision(names)).misfit(stated)
                   for trial in units]
@@ -222,8 +217,9 @@ def _starts(unit: Sensor, poses: Poses, names: tuple[Coefficient, ...], stated: 
         for parameter in effect_named(effect).parameters:
             if parameter.role is not Role.SHAPE or parameter.held:
                 continue
-            best, *others = likeliest(effect, parameter, parameter.scale * _SHAPE_STEP ** np.arange(
-                -_SHAPE_STEPS, _SHAPE_STEPS + 1))[:_SHAPE_STARTS]
+            steps = np.arange(-_SHAPE_STEPS, _SHAPE_STEPS + 1)
+            best, *others = likeliest(
+                effect, parameter, parameter.scale * _SHAPE_STEP ** steps)[:_SHAPE_STARTS]
             value = float(np.ravel(best.values[effect][parameter.name])[0])
             finer = likeliest(effect, parameter,
                               value * _SHAPE_STEP ** np.linspace(-1, 1, _FINE_SHAPES))
@@ -240,15 +236,16 @@ class _Search:
         self._precision = prior_precision(names)  # Inverse prior variances, (p,)
         self._sizes = np.array([parameter_of(name).scale for name in names])
         self._unit, self._stage = unit, stated  # Unit with coefficients, and stage error
-        self._errors = AngleErrors.zeros(len(poses))  # Predicted errors of the angles
-        self._poses = poses  # The poses turned by these errors; see `_turned_linearly`
+        # Predicted errors of the angles, and the poses turned by them; see `_turned_linearly`
+        self._errors, self._poses = linearisation.AngleErrors.zeros(len(poses)), poses
         self._kept = np.ones(len(poses), bool)  # Poses that are no outliers
         # Volts by which the model departs from its linearisation, (m,)
         self._curvature_v = np.zeros(len(unit.axes))
 
     def run(self) -> FullFit:
         """Iterate until all converge."""
-        self._unit = put(self._unit, self._names, self._solved(self._measured, _START_STEPS).values)
+        start = self._solved(self._measured, _START_STEPS)
+        self._unit = put(self._unit, self._names, start.values)
         converged, deviance, noise_v = False, np.inf, self._measured.std_v.mean(axis=0)
         for number in range(_MAX_ROUNDS):
             self._estimate_stage(number)
@@ -306,11 +303,11 @@ class _Search:
         errors = solved.covariance.predicted_errors(solved.about.residual)
         start = get(self._unit, self._names)
 
-        def attempt(share: float) -> tuple[np.ndarray, AngleErrors]:
+        def attempt(share: float) -> tuple[np.ndarray, linearisation.AngleErrors]:
             return (start + share * (solved.values - start),
                     self._errors.interpolated(errors, share))
 
-        def cost(values: np.ndarray, angles: AngleErrors) -> float:
+        def cost(values: np.ndarray, angles: linearisation.AngleErrors) -> float:
             residual = self._measured.volts - predicted_volts(
                 put(self._unit, self._names, values), _turned(self._measured, angles.total_rad))
             return float(np.sum((residual / weighted.std_v)[self._kept] ** 2)
@@ -350,7 +347,7 @@ class _Iterate(Iterate):
     """An iterate with the linearised poses, their covariance, and the information, (p, p)."""
 
     about: Linearised
-    covariance: PoseCovariance
+    covariance: linearisation.PoseCovariance
     information: np.ndarray
 
     @property

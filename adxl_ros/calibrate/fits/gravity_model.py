@@ -74,12 +74,6 @@ def effect_values(parameters: np.ndarray, sensor: Sensor
                              'beta_rad': np.array([0.0, values[6], values[8]])}}, units
 
 
-def sensing_axes(parameters: np.ndarray) -> np.ndarray:
-    """Return the directions of the sensing axes in the gauge, rows Θx, Θy, Θz, (3, 3)."""
-    (sy, cy), (sa, ca), (sb, cb) = _sines(parameters)
-    return np.array([[1.0, 0.0, 0.0], [-sy, cy, 0.0], [sb, -sa * cb, ca * cb]])
-
-
 def _sines(parameters: np.ndarray) -> list[tuple[Any, Any]]:
     """
     Return sine and cosine of each angle: beta of y, alpha of z and beta of z.
@@ -108,7 +102,7 @@ def _components(mean: np.ndarray, parameters: np.ndarray, sines: list[tuple[Any,
 
 
 def magnitude(mean: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-    """Return the magnitude of the specific force of rests, g, (k,), or (s, k); see `linearised`."""
+    """Return the magnitudes of rests, g, (k,), or (s, k); see `linearised`."""
     return _length(_components(mean, parameters, _sines(parameters)))
 
 
@@ -250,8 +244,10 @@ def information_gain(information: np.ndarray, parameters: np.ndarray, gravity_g:
     the variance of the predicted magnitude, g², by the number of axes that are not horizontal:
     with one or two axes along gravity a pose is easier to hold.
     """
-    outputs = parameters[:3] + (1 + parameters[3:6]) * (
-        gravity_g * UP @ sensing_axes(parameters).T)
+    (sy, cy), (sa, ca), (sb, cb) = _sines(parameters)
+    # The directions of the sensing axes in the gauge, rows Θx, Θy, Θz.
+    axes = np.array([[1.0, 0.0, 0.0], [-sy, cy, 0.0], [sb, -sa * cb, ca * cb]])
+    outputs = parameters[:3] + (1 + parameters[3:6]) * (gravity_g * UP @ axes.T)
     rows = magnitude_jacobian(outputs, parameters)
     variance = np.einsum('ki,ij,kj->k', rows, np.linalg.inv(information), rows)
     return variance / np.count_nonzero(CANDIDATES, axis=1), rows
@@ -307,8 +303,3 @@ def points_up(name: str) -> str:
     if ' and ' not in name:
         return f'{name} points up'
     return f'{name.removesuffix(" equally")} point up equally'
-
-
-def name_nearest(up: np.ndarray) -> str:
-    """Name the candidate nearest a direction, (3,)."""
-    return name_up(int(np.argmax(UP @ up)))

@@ -19,14 +19,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 
-from adxl_ros.calibrate.poses import (
-    angle_jacobian,
-    coefficient_jacobian,
-    Poses,
-    predicted_volts,
-)
+from adxl_ros.calibrate.poses import angle_jacobian, coefficient_jacobian, Poses, predicted_volts
 from adxl_ros.model.coefficients import get
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
@@ -307,7 +302,7 @@ class Linearised:
         covariance = self.covariance(error)
         step, information = self.solve(covariance)
         errors = covariance.predicted_errors(self.residual - self.design @ step)
-        bound = _huber_bound(self.residual.shape[1])
+        bound = float(scipy.special.chdtri(self.residual.shape[1], _HUBER_CHANCE))
         distance = errors.squared_distances[self.kept]
         robust = np.where(distance < bound, distance,
                           2 * np.sqrt(bound * np.maximum(distance, bound)) - bound)
@@ -369,12 +364,6 @@ def _from_search(x: np.ndarray) -> StageError:
     total = np.exp(x[0])
     return StageError(float(total * np.sqrt(1 - x[1])), float(total * np.sqrt(x[1])),
                       float(np.exp(x[2])))
-
-
-@cache
-def _huber_bound(axes: int) -> float:
-    """Return the squared distance beyond which a pose has less weight."""
-    return float(scipy.special.chdtri(axes, _HUBER_CHANCE))
 
 
 def linearised(unit: Sensor, poses: Poses, names: Sequence[Coefficient], precision: np.ndarray,

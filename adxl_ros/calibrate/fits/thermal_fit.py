@@ -178,13 +178,17 @@ class _Model:
         if history.effect:
             names.append(Coefficient(history.effect, _SHAPES[history.effect]))
             values = np.append(values, history.shape)
+            step = _RELATIVE_STEP * history.shape
+            above, below = (self._history(history._replace(shape=history.shape + s))
+                            for s in (step, -step))
+            by_shape = (above - below) / (2 * step)
         precision = np.diag([(PRIOR_WIDTH * parameter_of(name).scale) ** -2.0 for name in names])
         for a, place in zip(solved, places):
             columns, free = a.design[:, :len(place)], a.design[:, len(place):]
             if history.effect:
                 place = [*place, len(names) - 1]
                 size = a.values[len(place) - 2]
-                columns = np.column_stack([columns, size * self._shape_slope(history)])
+                columns = np.column_stack([columns, size * by_shape])
             white, white_free = (self._whitened(v, a.correlation) for v in (columns, free))
             white = white - white_free @ np.linalg.lstsq(white_free, white, rcond=None)[0]
             precision[np.ix_(place, place)] += white.T @ white / a.variance_g2
@@ -226,13 +230,6 @@ class _Model:
                             history.shape) \
                 - self._blocks.temperature_c
         return -loop(self._blocks.temperature_c, history.shape, {})
-
-    def _shape_slope(self, history: History) -> np.ndarray:
-        """Differentiate that output by the shape, (k,)."""
-        step = _RELATIVE_STEP * history.shape
-        above, below = (self._history(history._replace(shape=history.shape + s))
-                        for s in (step, -step))
-        return (above - below) / (2 * step)
 
     def _solved(self, d: int, history: History) -> _Axis:
         """Fit one axis, its correlation among neighbours included."""

@@ -3,8 +3,8 @@
 """
 What all guides share: a guide leads through the poses of one calibration.
 
-- The samples that it looks at: the newest ones of a stream, those of a dwell, and readings of
-  temperature and supply over time.
+- What it looks at: the newest samples of a stream, those of a dwell, readings of temperature and
+  supply over time, and those of the encoder of a stage.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 import math
 from typing import NamedTuple
 
@@ -189,6 +190,82 @@ class Dwell:
                           std_v=tuple(std[0].tolist()))
 
 
+_CLOCK_OFFSET_S = 2.0
+"""Largest offset of the clocks of stage and sensor, s; chosen: above any delay of messages."""
+_LONGEST_IN_S = 600
+"""Longest time that is stated in seconds; a longer time is stated in hours."""
+_KEPT_OFFSETS = 20
+"""Offsets of the two clocks that stay in memory; chosen: a second of messages at 20 Hz."""
+_FEWEST_OFFSETS = 4
+"""Offsets of the two clocks that a comparison needs; chosen: one message alone may be late."""
+SILENT_S = 3.0
+"""The encoder counts as silent after this, s; chosen: several of its longest usual periods."""
+
+
+class EncoderTrack:
+    """The newest readings of the encoder, against the stamps of the samples."""
+
+    def __init__(self) -> None:
+        self.newest_ns: int | None = None  # Stamp of the newest reading, ns
+        self.angles_rad: tuple[float, float] | None = None  # Newest alpha and beta, rad
+        self._readings: deque[tuple[int, float, float]] = deque(maxlen=_KEPT_READINGS)
+        self._offsets_s: deque[float] = deque(maxlen=_KEPT_OFFSETS)
+        self._is_compared = True
+
+    def read(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> bool:
+        """Take a reading; return whether its clock went back."""
+        restarted = went_back(self.newest_ns, stamp_ns)
+        if restarted:
+            self._readings.clear()
+        self._readings.append((stamp_ns, alpha_rad, beta_rad))
+        self.newest_ns, self.angles_rad = stamp_ns, (alpha_rad, beta_rad)
+        self._is_compared = False
+        return restarted
+
+    def compare_clock(self, sample_ns: int) -> None:
+        """Compare the clock of a new reading with the newest stamp of the samples, ns."""
+        if not self._is_compared and self.newest_ns is not None:
+            self._offsets_s.append((self.newest_ns - sample_ns) * 1e-9)
+        self._is_compared = True
+
+    def forget_clock(self) -> None:
+        """Forget the comparisons, since the clock of the samples has changed."""
+        self._offsets_s.clear()
+
+    def clock_fault(self) -> str:
+        """Return what is wrong with the clock of the encoder, or ''."""
+        # The smallest offset is that of the message with the least delay.
+        ahead_s = min(self._offsets_s, key=abs) \
+            if len(self._offsets_s) >= _FEWEST_OFFSETS else 0.0
+        size_s = abs(ahead_s)
+        if size_s <= _CLOCK_OFFSET_S:
+            return ''
+        size = f'{size_s:.1f} s' if size_s < _LONGEST_IN_S else f'{size_s / 3600:.3g} h'
+        return (f'stage/joint_states is stamped {size} {"ahead of" if ahead_s > 0 else "behind"} '
+                'imu/data_raw: stage and sensor must share one clock (use_sim_time for both or '
+                'for none, or synchronise their computers)')
+
+    def silence(self, sample_ns: int) -> str:
+        """Return one line on the time without readings up to a stamp, ns; '' if it is short."""
+        if self.newest_ns is None:
+            return 'nothing on stage/joint_states'
+        silent_s = (sample_ns - self.newest_ns) * 1e-9
+        return f'nothing on stage/joint_states for {silent_s:.0f} s' if silent_s > SILENT_S else ''
+
+    def between(self, first_ns: int, last_ns: int) -> np.ndarray:
+        """Return the angles alpha and beta between two stamps, rad, (n, 2)."""
+        inside = [angles_rad for stamp_ns, *angles_rad in self._readings
+                  if first_ns <= stamp_ns <= last_ns]
+        return np.array(inside).reshape(-1, 2)
+
+    def mean_between(self, first_ns: int, last_ns: int) -> tuple[float, float]:
+        """Average the angles between two stamps, rad; without any, take the newest ones."""
+        inside = self.between(first_ns, last_ns)
+        alpha_rad, beta_rad = np.mean(
+            inside if len(inside) else np.array([self.angles_rad]), axis=0)
+        return float(alpha_rad), float(beta_rad)
+
+
 class NextPose(NamedTuple):
     """The pose to go to, as it is announced."""
 
@@ -271,10 +348,11 @@ class Guide:
         text, self._new_refusal = self._new_refusal, ''
         return text
 
-    def ambient(self, first_ns: int, last_ns: int) -> dict[str, float]:
-        """Return temperature and supply between two stamps, as `PoseRecord` has them."""
-        return {'temperature_c': self.readings['temperature'].mean(first_ns, last_ns),
-                'supply_v': self.readings['supply'].mean(first_ns, last_ns)}
+    def with_ambient(self, record: PoseRecord) -> PoseRecord:
+        """Add temperature and supply to a record."""
+        temperature_c, supply_v = (readings.mean(record.start_ns, record.stop_ns)
+                                   for readings in self.readings.values())
+        return replace(record, temperature_c=temperature_c, supply_v=supply_v)
 
     def temperature_fault(self, now_c: float, span_c: float) -> str:
         """Refuse a pose whose temperature differs from that of the first pose."""

@@ -190,10 +190,9 @@ class HandRests(Guide):
         for rest in self._finder.rests():
             mean_v, std_v = self._finder.means([rest])
             span = int(stamps_ns[rest.start]), int(stamps_ns[rest.stop - 1])
-            yield PoseRecord(
+            yield self.with_ambient(PoseRecord(
                 pose=number, start_ns=span[0], stop_ns=span[1], samples=rest.stop - rest.start,
-                mean_v=tuple(mean_v[0].tolist()), std_v=tuple(std_v[0].tolist()),
-                **self.ambient(*span))
+                mean_v=tuple(mean_v[0].tolist()), std_v=tuple(std_v[0].tolist())))
 
 
 class HandGuide(HandRests):
@@ -229,7 +228,8 @@ class HandGuide(HandRests):
         """Return the progress of the calibration, for the screen."""
         up = self.up()
         position = '' if up is None else \
-            f'{gravity_model.points_up(gravity_model.name_nearest(up))} now'
+            gravity_model.points_up(gravity_model.name_up(
+                int(np.argmax(gravity_model.UP @ up)))) + ' now'
         return Progress(
             number=self.pose_number, destination=self.destination(), position=position,
             accepted=len(self.accepted), total=ENOUGH_RESTS, skipped=0,

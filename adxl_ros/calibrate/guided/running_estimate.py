@@ -16,15 +16,10 @@ import math
 
 from adxl_ros.calibrate.fits import full_model, linearisation
 from adxl_ros.calibrate.fits.linearisation import linearised, StageError
-from adxl_ros.calibrate.guided.pose_checks import angle_fault, signed_text
-from adxl_ros.calibrate.guided.pose_plan import nearest, spread, Target, with_checks
+from adxl_ros.calibrate.guided import pose_plan
+from adxl_ros.calibrate.guided.pose_plan import angle_fault, signed_text, Target
 from adxl_ros.calibrate.guided.screen_contents import CoefficientRow
-from adxl_ros.calibrate.poses import (
-    angle_jacobian,
-    coefficient_jacobian,
-    Poses,
-    predicted_volts,
-)
+from adxl_ros.calibrate.poses import angle_jacobian, coefficient_jacobian, Poses, predicted_volts
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
@@ -111,12 +106,12 @@ class RunningEstimate:
         return f'{finding}; check the pose, the mounting and the wiring{advice}'
 
     def _angles_of(self, target: Target, volts: np.ndarray, slack_v: np.ndarray
-                   ) -> np.ndarray | None:
+                   ) -> tuple[float, float] | None:
         """
         Find the angles near a pose that explain volts, by damped Gauss-Newton steps.
 
         volts, slack_v: the volts that are read, and their standard deviations about the model, V,
-        (m,); returns: alpha and beta, rad, (2,); None if no angles explain the volts. An angle
+        (m,); returns: alpha and beta, rad; None if no angles explain the volts. An angle
         that the volts do not show stays as it is.
         """
         start_rad = np.array([target.alpha_rad, target.beta_rad])
@@ -128,7 +123,10 @@ class RunningEstimate:
             step_rad = np.linalg.solve(slope.T @ slope + damping * np.eye(2),
                                        slope.T @ residual - damping * change_rad)
             change_rad = change_rad + np.clip(step_rad, -_LONGEST_STEP_RAD, _LONGEST_STEP_RAD)
-        return None if np.abs(residual).max() > _EXPLAINED_STDS else start_rad + change_rad
+        if np.abs(residual).max() > _EXPLAINED_STDS:
+            return None
+        alpha_rad, beta_rad = (start_rad + change_rad).tolist()
+        return alpha_rad, beta_rad
 
     def _pose(self, alpha_rad: float, beta_rad: float) -> Poses:
         return Poses.without_volts(np.array([alpha_rad]), np.array([beta_rad]), self.pose_std_v)
@@ -138,7 +136,7 @@ class RunningEstimate:
         if not targets:
             return self
         angles_rad = np.array([(target.alpha_rad, target.beta_rad) for target in targets])
-        poses = Poses.without_volts(*angles_rad.T, self.pose_std_v)
+        poses = Poses.without_volts(angles_rad[:, 0], angles_rad[:, 1], self.pose_std_v)
         model = linearised(self.unit, poses, self.names, np.zeros(len(self.names)))
         information = model.information(model.covariance(self.stage))
         return replace(self, covariance=np.linalg.inv(
@@ -174,7 +172,8 @@ def from_records(sensor: Sensor, records: Sequence[PoseRecord], dwell_s: float,
                  previous: RunningEstimate | None = None) -> RunningEstimate:
     """Estimate a unit from the poses of a journal, check poses left out; see `from_poses`."""
     fitted = [record for record in records if not record.check]
-    poses = Poses.from_records(fitted) if fitted else no_poses(len(sensor.axes))
+    poses = Poses.from_records(fitted) if fitted else \
+        Poses.without_volts(np.zeros(0), np.zeros(0), np.zeros(len(sensor.axes)))
     return from_poses(sensor, poses, dwell_s, sensor.stage_std_rad, previous)
 
 
@@ -201,11 +200,6 @@ def from_poses(sensor: Sensor, poses: Poses, dwell_s: float, stage_rad: float,
                            len(poses))
 
 
-def no_poses(axes: int) -> Poses:
-    """Return the poses of a unit before its first pose, for a number of axes."""
-    return Poses.without_volts(np.zeros(0), np.zeros(0), np.zeros(axes))
-
-
 def tilt_error_rad(sensor: Sensor, pose_std_v: np.ndarray) -> float:
     """
     Predict the rms error of alpha and beta over the sphere.
@@ -213,7 +207,7 @@ def tilt_error_rad(sensor: Sensor, pose_std_v: np.ndarray) -> float:
     pose_std_v: standard deviation of the readings, V, (m,).
     """
     alpha_rad, beta_rad = np.array([(target.alpha_rad, target.beta_rad)
-                                    for target in spread(_EVALUATION_POSES)]).T
+                                    for target in pose_plan.spread(_EVALUATION_POSES)]).T
     force_mps2 = specific_force(alpha_rad, beta_rad, sensor.local_gravity_mps2)
 
     def tilt_stds_rad(unit: Sensor) -> np.ndarray:
@@ -280,10 +274,10 @@ def quick(sensor: Sensor, dwell_s: float, tilt_error_rad: float, check_poses: in
     for count in range(fewest, len(chosen) + 1):
         # Each pose is the nearest to the one before, from the lowest angles on.
         first = min(chosen[:count], key=lambda target: (target.alpha_rad, target.beta_rad))
-        targets = [first, *nearest(first, [t for t in chosen[:count] if t is not first])]
+        targets = [first, *pose_plan.nearest(first, [t for t in chosen[:count] if t is not first])]
         if start.with_poses(targets).tilt_error_rad() <= tilt_error_rad:
             break
-    return with_checks(targets, check_poses)
+    return pose_plan.with_checks(targets, check_poses)
 
 
 def datasheet_estimate(sensor: Sensor, dwell_s: float) -> RunningEstimate:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from adxl_ros.calibrate import calibration
-from adxl_ros.calibrate.guided import pose_checks, pose_plan, running_estimate
+from adxl_ros.calibrate.guided import pose_plan, running_estimate
 from adxl_ros.calibrate.guided.guide import NewestSamples
 from adxl_ros.calibrate.guided.hand_guide import HandGuide
 from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, Estimate, StageMode
@@ -20,18 +20,9 @@ from adxl_ros.calibrate.guided.thermal_guide import ThermalGuide, ThermalSetting
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import page
 from adxl_ros.errors import UserError
-from adxl_ros.files import calibration_store
+from adxl_ros.files import calibration_store, sweep_journal
 from adxl_ros.files.atomic_write import remove_unfinished
-from adxl_ros.files.sweep_journal import (
-    accepted_poses,
-    Fitted,
-    Journal,
-    JournalEntry,
-    MountingUnchecked,
-    PoseRecord,
-    skipped_poses,
-    unfinished,
-)
+from adxl_ros.files.sweep_journal import JournalEntry, MountingUnchecked, PoseRecord
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor, with_axes
 import numpy as np
@@ -119,7 +110,7 @@ class SessionSettings:
 
     def question(self, unit: Sensor) -> str:
         """Return the question what to do with an interrupted calibration; '' without one."""
-        interrupted = unfinished(self.journal, self.head(unit))
+        interrupted = sweep_journal.unfinished(self.journal, self.head(unit))
         if interrupted is None:
             return ''
         if interrupted.obstacle:
@@ -155,13 +146,13 @@ class Session:
         self.newest = NewestSamples(unit)  # The newest samples
         self.fault = ''  # What is wrong with the samples, or ''
         # The accepted poses on disk
-        self.journal = Journal(settings.journal, settings.head(unit), start_over)
+        self.journal = sweep_journal.Journal(settings.journal, settings.head(unit), start_over)
         self._remove_unfinished()
         self._fitted: list[PoseRecord] = []
         self._estimate: tuple[tuple[int, int], Estimate] | None = None
         entries = self.journal.entries
         self._is_mounting_unchecked = any(isinstance(e, MountingUnchecked) for e in entries)
-        accepted = accepted_poses(entries)
+        accepted = sweep_journal.accepted_poses(entries)
         self.resumed = len(accepted)  # Number of the poses of an interrupted calibration
         # stage, guide: Lead through the poses; `stage` is None without a stage
         self.stage: StageGuide | None = None
@@ -172,7 +163,7 @@ class Session:
             self.guide = ThermalGuide(unit, self._base, settings.thermal, accepted)
         else:
             self.guide = self.stage = StageGuide(unit, targets, settings.capture, accepted,
-                                                 skipped_poses(entries))
+                                                 sweep_journal.skipped_poses(entries))
 
     @property
     def accepted_count(self) -> int:
@@ -190,7 +181,7 @@ class Session:
             return ''
         if not fault:
             self.newest.feed(stamps_ns, volts)
-            fault = pose_checks.rate_fault(self.newest.rate_hz(), self.unit)
+            fault = pose_plan.rate_fault(self.newest.rate_hz(), self.unit)
         if not fault:
             self.guide.feed(stamps_ns, volts)
         before, self.fault = self.fault, fault
@@ -262,7 +253,8 @@ class Session:
         Without this note the next start fits and writes the files again.
         """
         try:
-            self.journal.append(Fitted(tuple(self._fitted), not self.guide.open_poses))
+            done = not self.guide.open_poses
+            self.journal.append(sweep_journal.Fitted(tuple(self._fitted), done))
         except UserError as error:
             raise UserError(f'{self.settings.output} is written, but {error}') from None
 

@@ -4,7 +4,7 @@
 The guide of a sweep on a stage: samples and encoder angles go in, accepted poses come out.
 
 The stage arrives, or the operator captures. The sensor comes to rest, and a full dwell at rest is
-averaged. Motion begins the dwell again. `pose_checks` can refuse the pose.
+averaged. Motion begins the dwell again. A check can refuse the pose.
 """
 
 from __future__ import annotations
@@ -12,18 +12,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
-from adxl_ros.calibrate.guided import pose_checks, pose_plan, running_estimate
-from adxl_ros.calibrate.guided.guide import Dwell, Guide, NextPose, went_back
-from adxl_ros.calibrate.guided.pose_checks import EncoderTrack, SILENT_S
+from adxl_ros.calibrate.guided import guide, pose_plan, running_estimate, screen_contents
+from adxl_ros.calibrate.guided.guide import Dwell, EncoderTrack, Guide, NextPose
 from adxl_ros.calibrate.guided.pose_plan import Course, MOVE_S, Target
-from adxl_ros.calibrate.guided.screen_contents import (
-    CaptureSettings,
-    Estimate,
-    Phase,
-    Progress,
-    StageMode,
-    Status,
-)
+from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, Phase, StageMode, Status
 from adxl_ros.calibrate.pose_extraction import angle_tolerance_rad, SettingTracker
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import JournalEntry, MountingUnchecked, PoseRecord, PoseSkipped
@@ -86,7 +78,7 @@ class StageSweep(Guide):
     def verify(self) -> None:
         """Take earlier poses again before others, to check the mounting."""
         if self.course.target is not None and self.accepted:
-            self.to_verify = pose_checks.to_take_again(list(self.accepted.values()))
+            self.to_verify = pose_plan.to_take_again(list(self.accepted.values()))
             self.go(self.to_verify[0].pose)
 
     def capture(self) -> str:
@@ -96,7 +88,7 @@ class StageSweep(Guide):
             silence = self.encoder.silence(self.newest_ns or 0)
             if self.encoder.angles_rad is None or silence:
                 return f'{silence}: in stage.mode encoder its angle counts'
-            fault = self.encoder.clock_fault() or pose_checks.angle_fault(
+            fault = self.encoder.clock_fault() or pose_plan.angle_fault(
                 target, *self.encoder.angles_rad, self.settings.near_rad)
             if fault:
                 return f'{fault}; turn the stage there and capture again'
@@ -156,7 +148,7 @@ class StageSweep(Guide):
         """Take samples: their stamps, ns, (n,), and volts, (n, m)."""
         if not len(stamps_ns):
             return
-        if went_back(self.newest_ns, stamps_ns[0]):
+        if guide.went_back(self.newest_ns, stamps_ns[0]):
             back_s = ((self.newest_ns or 0) - int(stamps_ns[0])) * 1e-9
             self._new_refusal = f'imu/data_raw went back in time by {back_s:.0f} s: the pose ' \
                 'begins again'
@@ -195,9 +187,9 @@ class StageSweep(Guide):
             (target.alpha_rad, target.beta_rad)
         settings_of_joints = self._tracker.settings(*span, *angles_rad)
         record = replace(
-            record, alpha_rad=angles_rad[0], beta_rad=angles_rad[1], check=target.check,
-            alpha_setting=settings_of_joints[0], beta_setting=settings_of_joints[1],
-            **self.ambient(*span))
+            self.with_ambient(record), alpha_rad=angles_rad[0], beta_rad=angles_rad[1],
+            check=target.check, alpha_setting=settings_of_joints[0],
+            beta_setting=settings_of_joints[1])
         if refusal := _fault(self, record, rest):
             self.refuse(refusal)
         elif self.to_verify:
@@ -232,9 +224,9 @@ def _moved_away(sweep: StageSweep, record: PoseRecord) -> str:
         return ''
     if settings.stage_mode is StageMode.ENCODER:
         now_rad = sweep.encoder.angles_rad or (record.alpha_rad, record.beta_rad)
-        return pose_checks.angle_fault(
+        return pose_plan.angle_fault(
             sweep.course.targets[record.pose], *now_rad, settings.near_rad) or \
-            pose_checks.motion_fault(sweep.encoder.between(record.start_ns, record.stop_ns),
+            pose_plan.motion_fault(sweep.encoder.between(record.start_ns, record.stop_ns),
                                      settings.tolerance_rad)
     captured_v = dwell.volts(dwell.rests()[0]).mean(axis=0)
     change_g = np.abs(np.array(record.mean_v) - captured_v) / sensor.nominal_scale_v_per_g
@@ -248,7 +240,7 @@ def _moved_away(sweep: StageSweep, record: PoseRecord) -> str:
 def _fault(sweep: StageSweep, record: PoseRecord, rest: Rest) -> str:
     """Return why a pose is refused, or ''."""
     settings = sweep.settings
-    fault = _moved_away(sweep, record) or pose_checks.saturation_fault(
+    fault = _moved_away(sweep, record) or pose_plan.saturation_fault(
         sweep.sensor, sweep.dwell.volts(rest)) or sweep.temperature_fault(
             record.temperature_c, settings.temperature_span_c)
     if fault or sweep.to_verify:
@@ -266,7 +258,7 @@ def _verify_mounting(sweep: StageSweep, record: PoseRecord) -> None:
                              abs(record.beta_rad - before.beta_rad))
     else:
         tolerance_rad = max(tolerance_rad, sweep.settings.tolerance_rad)
-    change = pose_checks.changed(sweep.sensor, before, record, tolerance_rad)
+    change = pose_plan.changed(sweep.sensor, before, record, tolerance_rad)
     if change and sweep.settings.stage_mode is not StageMode.MANUAL:
         raise MountingError(change)
     if change:
@@ -328,7 +320,7 @@ class StageGuide(StageSweep):
             return Status(Phase.STAGE, fault, True)
         silence = self.encoder.silence(self.newest_ns or 0) if self.uses_encoder else ''
         if silence and (self.has_arrived or by_encoder):
-            return Status(Phase.STAGE, silence, waited_s > SILENT_S)
+            return Status(Phase.STAGE, silence, waited_s > guide.SILENT_S)
         if self.refusal:
             return Status(Phase.REFUSED, self.refusal, True)
         late = waited_s > self.settings.timeout_s
@@ -339,7 +331,7 @@ class StageGuide(StageSweep):
             return Status(Phase.OPERATOR,
                           f'turn the stage to {self.destination()}, then capture{waited}', False)
         angles_rad = self.encoder.angles_rad
-        distance = silence if silence or angles_rad is None else pose_checks.angle_fault(
+        distance = silence if silence or angles_rad is None else pose_plan.angle_fault(
             target, *angles_rad, self.settings.tolerance_rad) or 'arrived'
         since = f' for {waited_s:.0f} s' if late else ''
         return Status(Phase.STAGE, f'the stage has not arrived at {self.destination()}{since}: '
@@ -356,7 +348,7 @@ class StageGuide(StageSweep):
         return Status(Phase.REST, f'{place}: {stillness.describe_mps2(self.sensor)}{since}'
                       f'{advice}', late)
 
-    def progress(self) -> Progress:
+    def progress(self) -> screen_contents.Progress:
         """Return the progress of the sweep, for the screen."""
         target, angles_rad, position = self.course.target, self.encoder.angles_rad, ''
         if target is not None and angles_rad is not None:
@@ -370,19 +362,19 @@ class StageGuide(StageSweep):
         ends_ns = [record.stop_ns for record in list(self.accepted.values())[self._resumed:]]
         pose_s = self.settings.dwell_s + MOVE_S if len(ends_ns) < _FEWEST_INTERVALS else \
             float(np.median(np.abs(np.diff(ends_ns)))) * 1e-9
-        return Progress(
+        return screen_contents.Progress(
             number=self.pose_number, destination=self.destination(), position=position,
             accepted=len(self.accepted), total=len(self.course.targets),
             skipped=len(self.course.skipped), open_poses=self.open_poses,
             remaining_s=self.open_poses * pose_s, dwelt_s=min(at_rest_s, self.settings.dwell_s),
             dwell_s=self.settings.dwell_s)
 
-    def estimate_contents(self) -> Estimate:
+    def estimate_contents(self) -> screen_contents.Estimate:
         """Return what the poses determine so far, for the screen."""
         targets, closed = self.course.targets, self.course.closed
         final = self.estimate.with_poses([target for number, target in enumerate(targets)
                                           if number not in closed and not target.check])
-        return Estimate(
+        return screen_contents.Estimate(
             coverage=pose_plan.by_plane(targets, self.accepted), covered_faces='',
             coefficients=self.estimate.rows(),
             tilt_error_deg=running_estimate.degrees_or_none(self.tilt_error_rad()),

@@ -6,21 +6,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import math
 
 from adxl_ros.calibrate.fits import thermal_fit
 from adxl_ros.calibrate.fits.thermal_fit import PARTS
-from adxl_ros.calibrate.guided import running_estimate
+from adxl_ros.calibrate.guided import running_estimate, screen_contents
 from adxl_ros.calibrate.guided.guide import Dwell, Guide, NextPose, went_back
-from adxl_ros.calibrate.guided.screen_contents import (
-    CoefficientRow,
-    Coverage,
-    Estimate,
-    Phase,
-    Progress,
-    Status,
-)
+from adxl_ros.calibrate.guided.screen_contents import CoefficientRow, Coverage, Phase, Status
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import JournalEntry, PoseRecord
@@ -70,16 +63,16 @@ class ThermalGuide(Guide):
             if len(dwell) > _PATIENCE * samples:
                 self._dwell = None
             return None
-        record = dwell.record(max(self.accepted, default=-1) + 1, rest, samples)
-        ambient = self.ambient(record.start_ns, record.stop_ns)
+        record = self.with_ambient(
+            dwell.record(max(self.accepted, default=-1) + 1, rest, samples))
         self.refuse('no temperature: nothing on the topic temperature; publish the reading of a '
-                    'thermometer at the sensor' if not math.isfinite(ambient['temperature_c']) else
+                    'thermometer at the sensor' if not math.isfinite(record.temperature_c) else
                     self.saturated_text('block') if self.sensor.saturated(
                         dwell.volts(rest)[:samples]).any() else '')
         if self.refusal:
             self._dwell = dwell.after(record.stop_ns)
             return None
-        return replace(record, **ambient)
+        return record
 
     def take(self, record: PoseRecord) -> None:
         """Count a block that is on disk."""
@@ -141,17 +134,17 @@ class ThermalGuide(Guide):
             text += 'the sensor moves; '
         return Status(Phase.DWELL if at_rest else Phase.REST, text + self.destination(), False)
 
-    def progress(self) -> Progress:
+    def progress(self) -> screen_contents.Progress:
         """Return the progress of the calibration, for the screen."""
         direction = 'warming' if self._passed.rises else 'cooling'
         position = f'{self._blocks_c[-1]:.1f} °C, {direction}' if self.accepted else ''
         done = int(self._passed.warming.sum() + self._passed.cooling.sum())
-        return Progress(
+        return screen_contents.Progress(
             number=self.pose_number, destination=self.destination(), position=position,
             accepted=done, total=2 * PARTS, skipped=0, open_poses=self.open_poses,
             remaining_s=None, dwelt_s=None, dwell_s=None)
 
-    def estimate_contents(self) -> Estimate:
+    def estimate_contents(self) -> screen_contents.Estimate:
         """Return what the blocks determine so far, for the screen."""
         fit, (low_c, high_c) = self._fit, self._settings.range_c
         rows: tuple[CoefficientRow, ...] = ()
@@ -162,7 +155,7 @@ class ThermalGuide(Guide):
         error = f'not known yet over {low_c:g} to {high_c:g} °C' if self._error_mg is None else \
             (f'zero-g {self._error_mg:.2g} mg expected over {low_c:g} to {high_c:g} °C, after '
              f'{self._blocks_c.min():.1f} to {self._blocks_c.max():.1f} °C')
-        return Estimate(
+        return screen_contents.Estimate(
             coverage=(Coverage('warming', int(self._passed.warming.sum()), PARTS),
                       Coverage('cooling', int(self._passed.cooling.sum()), PARTS)),
             covered_faces='', coefficients=rows, tilt_error_deg=None, final_tilt_error_deg=None,

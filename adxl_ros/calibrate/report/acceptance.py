@@ -12,18 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
-from adxl_ros.calibrate.report.held_out import (
-    axis_variance,
-    degrees_of_freedom,
-    ErrorBudget,
-    ErrorBudgets,
-    ErrorStatistic,
-    HeldOutErrors,
-    rms_interval,
-    rms_mg,
-    sample_noise_mps2,
-    tilt_variance,
-)
+from adxl_ros.calibrate.report import held_out
+from adxl_ros.calibrate.report.held_out import ErrorBudget, ErrorBudgets, HeldOutErrors, rms_mg
 from adxl_ros.model.coefficients import get, parameter_of
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.covariance import force_covariance
@@ -100,7 +90,7 @@ def assess(model: str, budgets: ErrorBudgets, sensor: Sensor) -> Assessment:
     manufacturer's own calibration leaves. The limit by the noise is the noise of one sample, rms
     over the axes. The limits of tilt are the tilt errors that such errors of each axis cause.
     """
-    datasheet, noise = nonlinearity_mps2(sensor) ** 2, sample_noise_mps2(sensor) ** 2
+    datasheet, noise = nonlinearity_mps2(sensor) ** 2, held_out.sample_noise_mps2(sensor) ** 2
     accel, tilt = budgets
     return Assessment(model, accel, tilt, _outcome(accel, datasheet), _outcome(accel, noise),
                       _outcome(tilt, datasheet * tilt.tilt_per_axis),
@@ -133,11 +123,11 @@ def gravity_error_budgets(fit: GravityFit, fitted: Sensor, force: np.ndarray, ke
     by_noise = float(np.mean(fit.expected_mps2[kept] ** 2)) - excess
     covariance = force_covariance(fitted, list(force[kept].T), np.zeros(len(fitted.axes)))
     gravity, used = fitted.local_gravity_mps2, np.ones(len(kept), bool)
-    measured, nu = float(np.mean(errors ** 2)), degrees_of_freedom(errors)
+    measured, nu = float(np.mean(errors ** 2)), held_out.degrees_of_freedom(errors)
     quantile = float(scipy.special.chdtri(nu, _UPPER_QUANTILE))
     upper = max(measured * nu / quantile - by_noise, excess)
-    accel = axis_variance(covariance, [0, 1, 2], used)
-    tilt = tilt_variance(covariance, force[kept], gravity, used)
+    accel = held_out.axis_variance(covariance, [0, 1, 2], used)
+    tilt = held_out.tilt_variance(covariance, force[kept], gravity, used)
     # Each of three axes has the error of a magnitude; two of the three turn the vertical.
     return ErrorBudgets(
         ErrorBudget(measured, by_noise, 0.0, accel, excess, accel + upper),
@@ -169,7 +159,7 @@ def table(assessments: Sequence[Assessment], models: Sequence[HeldOutErrors]) ->
 def explanation(assessment: Assessment, sensor: Sensor) -> list[str]:
     """State the limits, and the parts of the error of the saved model."""
     accel = assessment.accel
-    limit_mps2, noise_mps2 = nonlinearity_mps2(sensor), sample_noise_mps2(sensor)
+    limit_mps2, noise_mps2 = nonlinearity_mps2(sensor), held_out.sample_noise_mps2(sensor)
     tilt = '' if np.isnan(assessment.error_deg) else f' and {assessment.error_deg:.3f} deg'
     datasheet = f'limit by the datasheet {1e3 * limit_mps2 / G0_MPS2:.2g} mg (typical ' \
         'nonlinearity at full scale)' if limit_mps2 else 'no limit by a datasheet'
@@ -206,7 +196,7 @@ def limit_table(assessment: Assessment, sensor: Sensor) -> list[str]:
     for name, limit_mps2, accel, tilt in (
             ('limit by the datasheet', nonlinearity_mps2(sensor), assessment.accel_datasheet,
              assessment.tilt_datasheet),
-            ('noise of one sample', sample_noise_mps2(sensor), assessment.accel_noise,
+            ('noise of one sample', held_out.sample_noise_mps2(sensor), assessment.accel_noise,
              assessment.tilt_noise)):
         if accel:
             rows.append((name, 1e3 * limit_mps2 / G0_MPS2, _tilt_deg(assessment, limit_mps2),
@@ -281,7 +271,7 @@ def narrow_table(assessments: Sequence[Assessment], models: Sequence[HeldOutErro
     return lines
 
 
-def _cell(statistic: ErrorStatistic, datasheet: str, noise: str) -> str:
+def _cell(statistic: held_out.ErrorStatistic, datasheet: str, noise: str) -> str:
     cell = '-' if np.isnan(statistic.rms) else f'{statistic.rms:.3f}/{statistic.largest:.3f}'
     return f'{cell:>14} {datasheet:9} {noise:9}'
 
@@ -294,7 +284,7 @@ def gravity_line(assessment: Assessment, held_out_mps2: np.ndarray) -> str:
     of time, m/s², (k,).
     """
     mg = held_out_mps2 / G0_MPS2 * 1e3
-    low, high = rms_interval(mg)
+    low, high = held_out.rms_interval(mg)
     return (f'held-out stretches of time: {np.sqrt(np.mean(mg ** 2)):.3f} ({low:.3f} to '
             f'{high:.3f}) mg rms, '
             f'{np.abs(mg).max():.3f} max; datasheet {assessment.accel_datasheet or "-"}, noise '
@@ -324,7 +314,7 @@ def provenance_entries(assessment: Assessment | None, models: Sequence[HeldOutEr
             'limited_by': assessment.limited_by}
 
 
-def _with_interval(statistic: ErrorStatistic) -> str:
+def _with_interval(statistic: held_out.ErrorStatistic) -> str:
     if np.isnan(statistic.rms):
         return f'{"-":>23}'
     low, high = statistic.interval
@@ -368,7 +358,8 @@ def acceptance_lines(fitted: Sensor) -> list[str]:
     limit_mps2, kind, allows = nonlinearity_mps2(fitted), 'datasheet', \
         'the datasheet allows'
     if not limit_mps2:
-        limit_mps2, kind, allows = sample_noise_mps2(fitted), 'noise', 'the noise of one sample is'
+        limit_mps2, kind = held_out.sample_noise_mps2(fitted), 'noise'
+        allows = 'the noise of one sample is'
     limit = f'{two_digits(1e3 * limit_mps2 / G0_MPS2)} mg'
     accel = provenance.get(f'verdict_{kind}', '')
     tilt = provenance.get(f'verdict_tilt_{kind}', '')

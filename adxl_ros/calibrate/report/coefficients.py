@@ -14,21 +14,17 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from adxl_ros.calibrate.fits import full_model
-from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store
-from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
+from adxl_ros.model.coefficients import get, parameter_of, with_neutral
 from adxl_ros.model.constants import AXES, Z_90
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.effects.element import OTHER_AXIS
-from adxl_ros.model.effects.mounting import direction
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report.quantities import decimals
 import numpy as np
 
-_SCALE = Coefficient('scale_factor', 'offset_v_per_g')
-"""Parameter that takes the length of a direction."""
-_ABSOLUTE = {Coefficient('bias', 'offset_v'): 'nominal_zero_g_v',
-             _SCALE: 'nominal_scale_v_per_g'}
+_ABSOLUTE = {'bias.offset_v': 'nominal_zero_g_v',
+             'scale_factor.offset_v_per_g': 'nominal_scale_v_per_g'}
 """Parameters that are departures from a nominal value, and the field of that value."""
 _LABELS = {
     'bias.offset_v': 'zero-g',
@@ -45,10 +41,6 @@ _LABELS = {
     'nonlinearity.cubic_per_g2': 'cubic',
 }
 """Parameters in words; {other} is the axis that acts on the measured axis."""
-_ANGLES = (Coefficient('misalignment', 'alpha_rad'), Coefficient('misalignment', 'beta_rad'))
-"""Parameters of the direction of an axis."""
-_LINEAR = (Coefficient('cross_axis', 'linear'), Coefficient('cross_axis_z', 'linear'))
-"""Parameters that act as a misalignment does, to first order."""
 
 
 @dataclass(frozen=True)
@@ -73,96 +65,25 @@ def compare(fitted: Sensor, truth: Sensor) -> list[Comparison]:
     """
     Compare each fitted coefficient with the true one, in the order of the fit.
 
-    A misalignment and a linear cross-axis term are the same to first order. Where the fit has no
-    linear cross-axis term, the true one counts as part of the true misalignment.
+    A misalignment and a linear cross-axis term are the same to first order, so that the true unit
+    must have the gauge of the fits: no linear cross-axis terms.
     """
-    if fitted.axes != truth.axes:
-        raise UserError(f'the fitted unit has the axes {fitted.axes}, the true unit has '
-                        f'{truth.axes}; compare parameter files of one unit')
-    names = fitted.covariance_names
-    truth = _in_gauge_of_fit(truth, names)
+    names, rows = fitted.covariance_names, []
+    truth = with_neutral(truth, [name.effect for name in names])
     half_widths = Z_90 * np.sqrt(np.diag(fitted.covariance))
-    return [_compared(name, *values) for name, *values in zip(
-        names, _absolute(fitted, names), half_widths, _absolute(truth, names))]
-
-
-def added_effects(fitted: Sensor, truth: Sensor) -> list[str]:
-    """Return the effects of the fit that neither the full model nor the unit has."""
-    expected = {*full_model.default_terms(fitted.axes), *truth.effects}
-    return [effect for effect in fitted.effects if effect not in expected]
-
-
-def _compared(name: Coefficient, fitted: float, half_width: float, truth: float) -> Comparison:
-    """Compare one coefficient, with its label in words and angles in degrees."""
-    key = str(name.without_axis)
-    acts = name.axis and name.effect in OTHER_AXIS
-    other = AXES[OTHER_AXIS[name.effect][AXES.index(name.axis)]] if acts else ''
-    unit, scale = parameter_of(name).unit, 1.0
-    if unit == 'rad':
-        unit, scale = '°', float(np.degrees(1.0))
-    return Comparison(key, name.axis, _LABELS.get(key, key).format(other=other),
-                      unit.replace('^2', '²'), *(float(scale * value) for value in (
-                          fitted, half_width, truth)))
-
-
-def _absolute(sensor: Sensor, names: tuple[Coefficient, ...]) -> np.ndarray:
-    """Return coefficients; zero-g and scale factor include their nominal values, (p,)."""
-    values = get(sensor, names)
-    for i, name in enumerate(names):
-        nominal = _ABSOLUTE.get(name.without_axis)
-        if nominal:
-            values[i] += getattr(sensor, nominal)[sensor.axes.index(name.axis)]
-    return values
-
-
-def _in_gauge_of_fit(truth: Sensor, names: tuple[Coefficient, ...]) -> Sensor:
-    """Return the true unit with the terms of the fit, other linear terms as misalignment."""
-    effects = [name.effect for name in (*names, *_LINEAR, *_ANGLES, _SCALE)]
-    equivalent = truth = with_neutral(truth, effects)
-    for axis in truth.axes:
-        moved = [name for name in _on(axis, _LINEAR) if name not in names]
-        if moved and all(name in names for name in _on(axis, _ANGLES)):
-            equivalent = put(equivalent, *_as_misalignment(truth, axis, moved))
-    return equivalent
-
-
-def _on(axis: str, parameters: Sequence[Coefficient]) -> list[Coefficient]:
-    """Name the coefficients of parameters on one axis."""
-    return [replace(parameter, axis=axis) for parameter in parameters]
-
-
-def _as_misalignment(truth: Sensor, axis: str, moved: list[Coefficient]
-                     ) -> tuple[list[Coefficient], list[float]]:
-    """
-    Move linear cross-axis terms of one axis into its misalignment and its scale factor.
-
-    A_d + p·A_c = (Θ_d + p·Θ_c)·f is again a projection of the specific force, along another
-    direction and scaled by its length. Products of p with the other terms are neglected.
-    """
-    case_axis = AXES.index(axis)
-    along = _direction(truth, case_axis)
-    for name in moved:
-        linear, = get(truth, [name])
-        along = along + linear * _direction(truth, OTHER_AXIS[name.effect][case_axis])
-    length = float(np.linalg.norm(along))
-    d = truth.axes.index(axis)
-    scale = truth.scale_v_per_g[d] * length - truth.nominal_scale_v_per_g[d]
-    changed = [*_on(axis, (*_ANGLES, _SCALE)), *moved]
-    return changed, [*_alpha_beta(case_axis, along / length), float(scale), *[0.0] * len(moved)]
-
-
-def _direction(sensor: Sensor, axis: int) -> np.ndarray:
-    """Return the direction of an axis in the case; an unmeasured axis is aligned."""
-    if AXES[axis] not in sensor.axes:
-        return np.eye(3)[axis]
-    return np.array(direction(axis, *get(sensor, _on(AXES[axis], _ANGLES))))
-
-
-def _alpha_beta(axis: int, along: np.ndarray) -> tuple[float, float]:
-    """Return alpha and beta of a unit vector, rad: the inverse of `misalignment.direction`."""
-    x, y, z = along
-    alpha, sine = [(np.arctan2(-z, x), y), (np.arctan2(z, y), -x), (np.arctan2(-y, z), x)][axis]
-    return float(alpha), float(np.arcsin(sine))
+    for name, *values in zip(names, get(fitted, names), half_widths, get(truth, names)):
+        key, unit, scale = str(name.without_axis), parameter_of(name).unit, 1.0
+        if key in _ABSOLUTE:
+            nominal = getattr(fitted, _ABSOLUTE[key])[fitted.axes.index(name.axis)]
+            values[0], values[2] = values[0] + nominal, values[2] + nominal
+        if unit == 'rad':
+            unit, scale = '°', float(np.degrees(1.0))
+        acts = name.axis and name.effect in OTHER_AXIS
+        other = AXES[OTHER_AXIS[name.effect][AXES.index(name.axis)]] if acts else ''
+        rows.append(Comparison(
+            key, name.axis, _LABELS.get(key, key).format(other=other), unit.replace('^2', '²'),
+            *(float(scale * value) for value in values)))
+    return rows
 
 
 _NEGLIGIBLE_MG = 0.01
@@ -197,29 +118,17 @@ _COVERED = 0.9
 
 def truth_table(comparisons: Sequence[Comparison]) -> list[str]:
     """Lay out each fitted coefficient beside the true one, in 79 columns."""
-    width = _label_width(comparisons)
+    longest = max((len(row.label) for row in comparisons), default=0)
+    width = max(min(longest + 1, _LONGEST_LABEL), len('coefficient'))
+    lines = [f' {"coefficient":{width}}     fitted (90 %) {"":16}true']
+    for row in comparisons:
+        truth = '0' if row.truth == 0 else rounded(row, row.truth)
+        lines.append(f' {row.label[:width]:{width}} {row.axis:1} {rounded(row, row.fitted):>10} ± '
+                     f'{rounded(row, row.half_width):8} {row.unit:5} {truth:>10}   '
+                     f'{"ok" if row.inside else "MISSED"}')
     inside = sum(row.inside for row in comparisons)
-    return [f' {"coefficient":{width}}     fitted (90 %) {"":16}true',
-            *(_truth_row(row, width) for row in comparisons),
-            f' ({inside} of {len(comparisons)} inside their 90 % intervals; about '
+    return [*lines, f' ({inside} of {len(comparisons)} inside their 90 % intervals; about '
             f'{_COVERED * len(comparisons):.0f} are expected)']
-
-
-def _truth_row(row: Comparison, width: int) -> str:
-    """Lay out one coefficient, with a label of the given width."""
-    truth = '0' if row.truth == 0 else rounded(row, row.truth)
-    return (f'{_fitted_row(row, width)} {truth:>10}   {"ok" if row.inside else "MISSED"}')
-
-
-def _label_width(rows: Sequence[Comparison]) -> int:
-    longest = max((len(row.label) for row in rows), default=0)
-    return max(min(longest + 1, _LONGEST_LABEL), len('coefficient'))
-
-
-def _fitted_row(row: Comparison, width: int) -> str:
-    """Lay out the fitted value of a coefficient, with a label of the given width."""
-    return (f' {row.label[:width]:{width}} {row.axis:1} {rounded(row, row.fitted):>10} ± '
-            f'{rounded(row, row.half_width):8} {row.unit:5}')
 
 
 def rounded(row: Comparison, value: float) -> str:
@@ -228,10 +137,11 @@ def rounded(row: Comparison, value: float) -> str:
     return f'{round(value, places) + 0.0:.{places}f}'
 
 
-def added_effect_lines(effects: Sequence[str]) -> list[str]:
-    """Name each effect that the fit has and the simulated unit does not have."""
+def added_effect_lines(fitted: Sensor, truth: Sensor) -> list[str]:
+    """Name each effect of the fit that neither the full model nor the simulated unit has."""
+    expected = {*full_model.default_terms(fitted.axes), *truth.effects}
     return [f'       The fit has the term {effect}, which this unit does not have.'
-            for effect in effects]
+            for effect in fitted.effects if effect not in expected]
 
 
 _TEMPERATURE_SLOPE = Coefficient('temperature_bias', 'per_k')

@@ -322,7 +322,8 @@ class ErrorBudget:
         return parts[int(np.argmax([getattr(self, part) for part in parts]))]
 
 
-_NO_BUDGET = ErrorBudget(*[float('nan')] * 6)
+_NAN = float('nan')
+_NO_BUDGET = ErrorBudget(_NAN, _NAN, _NAN, _NAN, _NAN, _NAN)
 """Budget of a quantity that no pose shows."""
 
 
@@ -349,27 +350,29 @@ def error_budgets(errors: HeldOutErrors, poses: Poses, stage: Sensor | None = No
     if used.any():
         parts = [axis_variance(covariance, axes, used) for covariance in by_cause]
         accel = _budget((measured.force_mps2 - corrected)[used][:, axes],
-                        float(np.mean(measured.accel_mps2[used] ** 2)), *parts,
+                        float(np.mean(measured.accel_mps2[used] ** 2)), parts,
                         accel_scatter - parts[0] * has_noise)
     if has_tilt.any():
         parts = [tilt_variance(covariance, reference, gravity, has_tilt)
                  for covariance in by_cause]
         tilt = _budget(angle_between(measured.force_mps2, corrected)[has_tilt],
-                       float(np.mean(measured.tilt_rad[has_tilt] ** 2)), *parts,
+                       float(np.mean(measured.tilt_rad[has_tilt] ** 2)), parts,
                        tilt_scatter - parts[0] * has_noise)
         tilt = replace(tilt, tilt_per_axis=tilt_variance(
             probe, reference, gravity, has_tilt) / _PROBE_MPS2 ** 2)
     return ErrorBudgets(accel, tilt)
 
 
-def _budget(errors: np.ndarray, measured: float, by_noise: float, by_coefficients: float,
-            by_stated_stage: float, unexplainable: float) -> ErrorBudget:
+def _budget(errors: np.ndarray, measured: float, predicted: Sequence[float], unexplainable: float
+            ) -> ErrorBudget:
     """
     Split a mean square of errors against the corrected reference.
 
-    errors: the errors, (k,) or (k, m), in the order of the visit; unexplainable: mean square that
-    no model explains, without noise; NaN where it is unknown.
+    errors: the errors, (k,) or (k, m), in the order of the visit; predicted: the parts by noise,
+    coefficients and stated stage error; unexplainable: mean square that no model explains, without
+    noise; NaN where it is unknown.
     """
+    by_noise, by_coefficients, by_stated_stage = predicted
     mean_square, nu = float(np.mean(errors ** 2)), degrees_of_freedom(errors)
     lower = mean_square * nu / float(scipy.special.chdtri(nu, _CHANCE))
     upper = mean_square * nu / float(scipy.special.chdtri(nu, _UPPER_QUANTILE))

@@ -17,14 +17,6 @@ from adxl_ros.calibrate.poses import Poses, reference_force
 from adxl_ros.calibrate.report import acceptance, coefficients, held_out, plots
 from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
 from adxl_ros.calibrate.report.coefficients import DriftHistory
-from adxl_ros.calibrate.report.held_out import (
-    determining_alpha,
-    ErrorBudget,
-    ErrorStatistic,
-    HeldOutErrors,
-    rms_mg,
-    sample_noise_mps2,
-)
 from adxl_ros.calibrate.result import CalibrationResult
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
@@ -33,19 +25,8 @@ from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.report import page as html_page
-from adxl_ros.report.figures import (
-    AXIS_COLOURS,
-    axis_number,
-    Figure,
-    figure,
-    line,
-    png,
-    points,
-    QUIET_COLOUR,
-    rounded,
-    whisker,
-)
+from adxl_ros.report import figures, page as html_page
+from adxl_ros.report.figures import AXIS_COLOURS, axis_number, Figure, QUIET_COLOUR
 import numpy as np
 
 FILES = ('report.html', 'calibration.png')
@@ -86,7 +67,7 @@ def write(folder: str | os.PathLike, result: CalibrationResult,
 def draw(path: str | os.PathLike, result: CalibrationResult) -> None:
     """Write the plots of a calibrated unit as PNG."""
     if result.gravity_fit is not None:
-        write_bytes(path, png(plots.gravity_rests(result.name, result.gravity_fit)))
+        write_bytes(path, figures.png(plots.gravity_rests(result.name, result.gravity_fit)))
     else:
         plots.draw_sweep(path, result.nominal, _paper_sensor(result), result.poses)
 
@@ -103,14 +84,14 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
     assessment = next((row for row in result.assessments if row.model == fitted.model), None)
     errors = next((row for row in result.held_out if row.model == fitted.model), None)
     history, rows = DriftHistory.from_store(fitted, past), _coefficients(fitted)
-    figures: dict[str, Figure] = {}
+    drawn: dict[str, Figure] = {}
     if result.gravity_fit is not None:
-        figures['errors'] = _gravity_errors(result.gravity_fit)
+        drawn['errors'] = _gravity_errors(result.gravity_fit)
     elif assessment is not None and errors is not None:
-        figures['errors'] = _pose_errors(
+        drawn['errors'] = _pose_errors(
             errors, assessment, result.poses.subset(result.inliers), fitted.axes)
     if history.sensors:
-        figures['drift'] = _drift(history)
+        drawn['drift'] = _drift(history)
     pictures, fault, paper_model = _paper_figures(result)
     temperature_c = fitted.envelope.temperature_c
     return html_page.render('adxl_ros.calibrate.report', 'calibration.html', {
@@ -122,7 +103,7 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
         'Take more poses: too few were held out to assess this calibration.',
         'file_name': re.sub(r'[^\w.-]+', '_', fitted.serial) + '.yaml',
         'download': html_page.download_url(parameter_file.as_text(fitted, result.comments())),
-        'figures': figures,
+        'figures': drawn,
         'open_circles': errors.poses_without_alpha if errors else 0,
         'sphere': _sphere(result),
         'coefficients': rows,
@@ -177,8 +158,8 @@ def _tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dic
     return tiles
 
 
-def _before_after(label: str, before: ErrorStatistic, after: ErrorStatistic, unit: str
-                  ) -> dict[str, str]:
+def _before_after(label: str, before: held_out.ErrorStatistic,
+                  after: held_out.ErrorStatistic, unit: str) -> dict[str, str]:
     """Return an error by the datasheet values and by the calibration; empty where not known."""
     if np.isnan(after.rms):
         return {}
@@ -198,7 +179,7 @@ def _limit_head(fitted: Sensor) -> list[str]:
     datasheet_mps2 = acceptance.nonlinearity_mps2(fitted)
     datasheet = f'datasheet ({1e3 * datasheet_mps2 / G0_MPS2:.2g} mg)' if datasheet_mps2 \
         else 'datasheet'
-    noise = f'noise ({1e3 * sample_noise_mps2(fitted) / G0_MPS2:.2g} mg)'
+    noise = f'noise ({1e3 * held_out.sample_noise_mps2(fitted) / G0_MPS2:.2g} mg)'
     return ['model', 'poses', 'tilt error, °', 'alpha, °', 'beta, °', 'acceleration error, mg',
             'calibration error, mg', f'acceleration, {datasheet}', f'acceleration, {noise}',
             'tilt, datasheet', 'tilt, noise', 'limited by']
@@ -225,20 +206,20 @@ def _outcome_cells(row: Assessment) -> list[str]:
         row.limited_by]
 
 
-def _error_cell(statistic: ErrorStatistic) -> str:
+def _error_cell(statistic: held_out.ErrorStatistic) -> str:
     if np.isnan(statistic.rms):
         return '-'
     return f'{_digits(statistic.rms)} (max {_digits(statistic.largest)})'
 
 
-def _budget(budget: ErrorBudget) -> dict[str, Any]:
+def _budget(budget: held_out.ErrorBudget) -> dict[str, Any]:
     """Return the parts of the acceleration error as parts of a bar, and in words."""
     squares = {name: float(getattr(budget, name)) for name in _PART_COLOURS}
     total = max(sum(squares.values()), 1e-30)
-    return {'expected': f'{_digits(rms_mg(budget.expected))} mg',
-            'measured': f'{_digits(rms_mg(budget.measured))} mg',
+    return {'expected': f'{_digits(held_out.rms_mg(budget.expected))} mg',
+            'measured': f'{_digits(held_out.rms_mg(budget.measured))} mg',
             'separable': budget.separable,
-            'parts': [{'name': name, 'text': f'{_digits(rms_mg(square))} mg',
+            'parts': [{'name': name, 'text': f'{_digits(held_out.rms_mg(square))} mg',
                        'percent': round(100 * square / total, 2), 'colour': _PART_COLOURS[name]}
                       for name, square in squares.items()]}
 
@@ -293,7 +274,7 @@ def _coefficients(fitted: Sensor) -> list[dict[str, Any]]:
         rows.append({
             'label': f'{row.label} {row.axis}', 'name': str(name), 'text': text,
             'datasheet': _range_text(typical, maximum, row.unit), 'outcome': beyond,
-            'mark': whisker(
+            'mark': figures.whisker(
                 value, value - half_width, value + half_width, (-largest, largest), text,
                 typical or maximum, beyond.startswith('beyond'))})
     return rows
@@ -321,16 +302,16 @@ def _paper_figures(result: CalibrationResult) -> tuple[list[str], str, str]:
     if result.gravity_fit is not None:
         drawn = plots.gravity_rests(result.name, result.gravity_fit)
         return [html_page.picture_url(drawn)], '', ''
-    figures = [plots.held_out(result.held_out, result.poses.subset(result.inliers))] \
+    pictures = [plots.held_out(result.held_out, result.poses.subset(result.inliers))] \
         if result.held_out else []
     fault, model = '', 'physical'
     try:
         unit = _paper_sensor(result)
         model = unit.model
-        figures += [plots.sweep(result.nominal, unit, result.poses, pair) for pair in _PANELS]
+        pictures += [plots.sweep(result.nominal, unit, result.poses, pair) for pair in _PANELS]
     except UserError as error:
         fault = str(error)
-    return [html_page.picture_url(drawn) for drawn in figures], fault, model
+    return [html_page.picture_url(drawn) for drawn in pictures], fault, model
 
 
 _BAND_COLOUR = 'rgba(31,95,191,0.12)'
@@ -340,7 +321,8 @@ _DATES = 4
 """Largest number of dates at an axis. Chosen: they fit beside each other on a phone."""
 
 
-def _pose_errors(errors: HeldOutErrors, assessment: Assessment, poses: Poses, axes: str) -> Figure:
+def _pose_errors(errors: held_out.HeldOutErrors, assessment: Assessment, poses: Poses, axes: str
+                 ) -> Figure:
     """Draw the errors at the held-out poses with the band that 90 % of them should be in."""
     number = np.arange(1, errors.pose_count + 1)
     held = poses.subset(errors.pose_index)
@@ -350,20 +332,21 @@ def _pose_errors(errors: HeldOutErrors, assessment: Assessment, poses: Poses, ax
     accel_mg = errors.errors.accel_mps2 / G0_MPS2 * 1e3
     half_mg = Z_90 * 1e3 * float(np.sqrt(assessment.accel.expected)) / G0_MPS2
     traces = [_band(len(number), -half_mg, half_mg, 1)]
-    symbols = np.where(determining_alpha(errors.errors), 'circle', 'circle-open').tolist()
+    symbols = np.where(held_out.determining_alpha(errors.errors), 'circle', 'circle-open').tolist()
     traces += [_dots(number, accel_mg[:, d], f'{axis}', AXIS_COLOURS[axis], labels, 'mg', 1)
                for d, axis in enumerate(axes)]
     for trace in traces[1:]:
         trace['marker']['symbol'] = symbols
     tilt_deg = np.degrees(errors.errors.tilt_rad)
     if not np.isfinite(tilt_deg).any():
-        return figure(traces, 320, margin=_ROOM, xaxis={'title': {'text': 'held-out pose'}},
-                      yaxis={'title': {'text': 'acceleration, mg'}})
+        return figures.figure(traces, 320, margin=_ROOM,
+                              xaxis={'title': {'text': 'held-out pose'}},
+                              yaxis={'title': {'text': 'acceleration, mg'}})
     # The error of tilt has two components: 90 % of its lengths are within √(ln 10) of the rms.
     high_deg = float(np.degrees(np.sqrt(assessment.tilt.expected * np.log(10))))
     traces += [_band(len(number), 0.0, high_deg, 2),
                _dots(number, tilt_deg, 'tilt', '#6b46a8', labels, '°', 2)]
-    return figure(traces, 440, margin=_ROOM,
+    return figures.figure(traces, 440, margin=_ROOM,
                   xaxis={'title': {'text': 'held-out pose'}, 'anchor': 'y2'},
                   yaxis={'title': {'text': 'acceleration, mg'}, 'domain': [0.54, 1]},
                   yaxis2={'title': {'text': 'tilt, °'}, 'domain': [0, 0.46],
@@ -374,9 +357,9 @@ def _gravity_errors(fit: GravityFit) -> Figure:
     """Draw the error of the magnitude of gravity at each rest, and its expected 90 % bars."""
     used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
     scale = 1e3 / G0_MPS2
-    traces = [points(used + 1, scale * fit.held_out_mps2[used],
+    traces = [figures.points(used + 1, scale * fit.held_out_mps2[used],
                      Z_90 * scale * fit.expected_mps2[used], 'held out', AXIS_COLOURS['x'])]
-    return figure(traces, 320, margin=_ROOM, xaxis={'title': {'text': 'rest'}},
+    return figures.figure(traces, 320, margin=_ROOM, xaxis={'title': {'text': 'rest'}},
                   yaxis={'title': {'text': 'magnitude minus gravity, mg'}})
 
 
@@ -388,7 +371,7 @@ def _drift(history: DriftHistory) -> Figure:
     for number, label in enumerate(('zero-g, mg', 'scale factor, ‰'), 1):
         values, std = history.series(number - 1)
         for d, axis in enumerate(history.sensors[-1].axes):
-            trace = points(number_of, values[:, d], Z_90 * std[:, d], axis,
+            trace = figures.points(number_of, values[:, d], Z_90 * std[:, d], axis,
                            AXIS_COLOURS[axis])
             traces.append(trace | {'mode': 'lines+markers', 'text': dates,
                                    'hovertemplate': '%{text}: %{y:.3~g}',
@@ -396,7 +379,7 @@ def _drift(history: DriftHistory) -> Figure:
                                    'yaxis': axis_number('y', number)})
         layout[axis_number('yaxis', number)] = {
             'title': {'text': label}, 'domain': [0.54, 1] if number == 1 else [0, 0.46]}
-    return figure(traces, 340, margin=_ROOM, **layout,
+    return figures.figure(traces, 340, margin=_ROOM, **layout,
                   xaxis={'anchor': 'y2', 'tickvals': labelled.tolist(),
                          'ticktext': [dates[i][:10] for i in labelled]})
 
@@ -404,16 +387,17 @@ def _drift(history: DriftHistory) -> Figure:
 def _band(count: int, low: float, high: float, panel: int) -> Figure:
     """Draw the band of the expected errors in a panel."""
     edges = [0.5, count + 0.5]
-    return line([*edges, *edges[::-1]], [low, low, high, high], 'expected 90 %', QUIET_COLOUR,
-                fill='toself', fillcolor=_BAND_COLOUR, hoverinfo='skip',
-                line={'color': QUIET_COLOUR, 'width': 0.5}, xaxis='x',
-                yaxis=axis_number('y', panel), showlegend=panel == 1)
+    return figures.line(
+        [*edges, *edges[::-1]], [low, low, high, high], 'expected 90 %', QUIET_COLOUR,
+        fill='toself', fillcolor=_BAND_COLOUR, hoverinfo='skip', xaxis='x',
+        yaxis=axis_number('y', panel), showlegend=panel == 1,
+        line={'color': QUIET_COLOUR, 'width': 0.5})
 
 
 def _dots(number: np.ndarray, values: np.ndarray, name: str, colour: str, labels: list[str],
           unit: str, panel: int) -> Figure:
     """Draw one error of each pose in a panel."""
-    return {'type': 'scatter', 'mode': 'markers', 'x': number.tolist(), 'y': rounded(values),
-            'name': name, 'text': labels, 'xaxis': 'x', 'yaxis': axis_number('y', panel),
-            'hovertemplate': '%{text}: %{y:.3~g} ' + unit + '<extra>' + name + '</extra>',
-            'marker': {'color': colour, 'size': 7}}
+    return {'type': 'scatter', 'mode': 'markers', 'x': number.tolist(),
+            'y': figures.rounded(values), 'name': name, 'text': labels, 'xaxis': 'x',
+            'yaxis': axis_number('y', panel), 'marker': {'color': colour, 'size': 7},
+            'hovertemplate': '%{text}: %{y:.3~g} ' + unit + '<extra>' + name + '</extra>'}
