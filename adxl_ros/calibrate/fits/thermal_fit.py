@@ -9,7 +9,6 @@ Zero-g over temperature, fitted to a sensor that rests while it warms and cools.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -39,7 +38,7 @@ _FEWEST_BLOCKS = 12
 """Fewest blocks of an orientation. Chosen: twice the coefficients of one axis."""
 PRIOR_WIDTH = 5.0
 """Prior standard deviation of a coefficient divided by its typical size, as in the diagnosis."""
-_LAGS_S = tuple(np.geomspace(10.0, 1000.0, 7))
+_LAGS_S = np.geomspace(10.0, 1000.0, 7)
 """Time constants of `thermal_lag` that are tried, s. Chosen: each is twice the one before."""
 _REACHES = tuple(np.geomspace(0.02, 0.5, 6))
 """Reaches of `thermal_hysteresis` that are tried, divided by the range of temperature. Chosen: a
@@ -102,17 +101,13 @@ def fit(sensor: Sensor, blocks: Poses, with_history: bool = True) -> ThermalFit:
     `thermal_hysteresis`, is kept where it gains enough, and only after a reversal.
     """
     model = _Model(sensor, blocks)
-    histories: dict[str, History] = {}
-    gains: dict[str, float] = {}
+    tried = [model.best_shape('thermal_lag', _LAGS_S),
+             model.best_shape('thermal_hysteresis', np.array(_REACHES) * model.span_k)] \
+        if with_history and model.reverses else []
     plain = model.score(History())
-    if with_history and model.reverses:
-        for effect, shapes in (('thermal_lag', _LAGS_S), ('thermal_hysteresis', tuple(
-                np.array(_REACHES) * model.span_k))):
-            histories[effect] = model.best_shape(effect, shapes)
-            gains[effect] = model.score(histories[effect]) - plain
-    best = max(gains, key=lambda effect: gains[effect], default='')
-    history = histories[best] if best and gains[best] > _SMALLEST_GAIN else History()
-    return model.solve(history, gains)
+    gains = {history.effect: model.score(history) - plain for history in tried}
+    best = max(tried, key=lambda history: gains[history.effect], default=History())
+    return model.solve(best if gains.get(best.effect, 0) > _SMALLEST_GAIN else History(), gains)
 
 
 class _Axis(NamedTuple):
@@ -153,7 +148,7 @@ class _Model:
         coefficients = len(axes) + 1 if history.effect else 0
         return float(likelihood - 0.5 * coefficients * np.log(count))
 
-    def best_shape(self, effect: str, shapes: Sequence[float]) -> History:
+    def best_shape(self, effect: str, shapes: np.ndarray) -> History:
         """Return the history of an effect with its most probable shape."""
         scores = [self.score(History(effect, shape)) for shape in shapes]
         best = int(np.argmax(scores))
@@ -343,15 +338,13 @@ class Passed:
         open_warm, open_cool = self.middles_c[~self.warming], self.middles_c[~self.cooling]
         if self.complete:
             return 'both directions are covered'
-        if len(open_warm) and (self.rises or not len(open_cool)):
-            if self.rises:
-                return f'warm it to {open_warm[-1] + half_c:.0f} °C'
-            return (f'cool it to {open_warm[0] - half_c:.0f} °C, then warm it to '
-                    f'{open_warm[-1] + half_c:.0f} °C')
-        if not self.rises:
-            return f'cool it to {open_cool[0] - half_c:.0f} °C'
-        return (f'warm it to {open_cool[-1] + half_c:.0f} °C, then cool it to '
-                f'{open_cool[0] - half_c:.0f} °C')
+        warms = len(open_warm) and (self.rises or not len(open_cool))
+        parts = open_warm if warms else open_cool
+        cool, warm = (f'cool it to {parts[0] - half_c:.0f} °C',
+                      f'warm it to {parts[-1] + half_c:.0f} °C')
+        # The other end first, unless the temperature already moves there.
+        order = (cool, warm) if warms else (warm, cool)
+        return order[1] if bool(warms) == self.rises else ', then '.join(order)
 
 
 def passed(temperatures_c: np.ndarray, range_c: tuple[float, float]) -> Passed:

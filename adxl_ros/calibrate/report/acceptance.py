@@ -178,11 +178,11 @@ def explanation(assessment: Assessment, sensor: Sensor) -> list[str]:
         lines.append(f'expected {rms_mg(accel.expected):.3f} mg = {", ".join(part.values())} '
                      f'(squares add); measured {rms_mg(accel.measured):.3f} mg'
                      + (', which differs by chance' if by_chance else ''))
-    limits = [
-        f'{_tilt_deg(assessment, limit):.2g} deg by the {name}: {outcome}'
-        for name, limit, outcome in (('datasheet', limit_mps2, assessment.tilt_datasheet),
-                                     ('noise', noise_mps2, assessment.tilt_noise)) if outcome]
     if assessment.tilt_noise:
+        outcomes = (('datasheet', limit_mps2, assessment.tilt_datasheet),
+                    ('noise', noise_mps2, assessment.tilt_noise))
+        limits = [f'{_tilt_deg(assessment, limit):.2g} deg by the {name}: {outcome}'
+                  for name, limit, outcome in outcomes if outcome]
         lines.append(f'limits of tilt: {", ".join(limits)}')
     if not accel.separable:
         lines.append('no pose was visited twice: stage and model are inseparable')

@@ -136,36 +136,27 @@ def _badge(fitted: Sensor) -> dict[str, str]:
 
 def _tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dict[str, str]]:
     """Return tilt and acceleration error before and after, and what limits them."""
-    if result.gravity_fit is not None:
-        fit = result.gravity_fit
+    tiles = []
+    if (fit := result.gravity_fit) is not None:
         used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
-        before, after = (1e3 * float(np.sqrt(np.mean(v[used] ** 2))) / G0_MPS2
+        before, after = (_digits(held_out.rms_mg(float(np.mean(v[used] ** 2))))
                          for v in (fit.before_mps2, fit.held_out_mps2))
-        tiles = [{'label': 'error of the magnitude of gravity',
-                  'text': f'{_digits(before)} → {_digits(after)} mg',
+        tiles = [{'label': 'error of the magnitude of gravity', 'text': f'{before} → {after} mg',
                   'note': f'rms over {len(used)} rests, held out'}]
-    elif result.held_out:
-        first, last = result.held_out[0], result.held_out[-1]
-        tiles = [_before_after('tilt error', first.tilt_deg, last.tilt_deg, '°'),
-                 _before_after('acceleration error', first.accel_mg, last.accel_mg, 'mg')]
-        tiles = [tile for tile in tiles if tile]
-    else:
-        tiles = []
+    for label, unit, name in (('tilt error', '°', 'tilt_deg'),
+                              ('acceleration error', 'mg', 'accel_mg')):
+        first, last = (getattr(result.held_out[i], name) for i in (0, -1)) \
+            if result.held_out else (None, None)
+        if last is not None and not np.isnan(last.rms):
+            low, high = map(_digits, last.interval)
+            tiles.append({
+                'label': label, 'text': f'{_digits(first.rms)} → {_digits(last.rms)} {unit}',
+                'note': f'rms on held-out poses, 90 %: {low} to {high} {unit}'})
     if assessment is not None:
         tiles.append({'label': 'limited by', 'text': assessment.limited_by,
                       'note': f'calibration error {_digits(assessment.error_mg)} mg, without '
                               'noise and stage error of the check'})
     return tiles
-
-
-def _before_after(label: str, before: held_out.ErrorStatistic,
-                  after: held_out.ErrorStatistic, unit: str) -> dict[str, str]:
-    """Return an error by the datasheet values and by the calibration; empty where not known."""
-    if np.isnan(after.rms):
-        return {}
-    low, high = after.interval
-    return {'label': label, 'text': f'{_digits(before.rms)} → {_digits(after.rms)} {unit}',
-            'note': f'rms on held-out poses, 90 %: {_digits(low)} to {_digits(high)} {unit}'}
 
 
 def _digits(value: float) -> str:
@@ -187,29 +178,20 @@ def _limit_head(fitted: Sensor) -> list[str]:
 
 def _limits(result: CalibrationResult) -> list[list[str]]:
     """Return the errors of each model, and one outcome for each limit."""
-    row_of = {row.model: row for row in result.assessments}
-    rows = []
-    for errors in result.held_out:
-        statistics = (errors.tilt_deg, errors.alpha_deg, errors.beta_deg, errors.accel_mg)
-        row = [errors.model, str(errors.pose_count), *map(_error_cell, statistics)]
-        assessed = row_of.get(errors.model)
-        rows.append(row + (['-'] * 6 if assessed is None else _outcome_cells(assessed)))
-    if not rows:
-        rows = [[row.model, str(len(result.poses)), *['-'] * 4, *_outcome_cells(row)]
-                for row in result.assessments]
+    errors_of = {errors.model: errors for errors in result.held_out}
+    row_of, rows = {row.model: row for row in result.assessments}, []
+    for model in errors_of or row_of:
+        errors, row = errors_of.get(model), row_of.get(model)
+        statistics = [getattr(errors, name, None) for name in (
+            'tilt_deg', 'alpha_deg', 'beta_deg', 'accel_mg')]
+        rows.append([
+            model, str(errors.pose_count if errors else len(result.poses)),
+            *('-' if s is None or np.isnan(s.rms) else
+              f'{_digits(s.rms)} (max {_digits(s.largest)})' for s in statistics),
+            *(['-'] * 6 if row is None else [
+                _digits(row.error_mg), row.accel_datasheet or '-', row.accel_noise or '-',
+                row.tilt_datasheet or '-', row.tilt_noise or '-', row.limited_by])])
     return rows
-
-
-def _outcome_cells(row: Assessment) -> list[str]:
-    return [_digits(row.error_mg), *(outcome or '-' for outcome in (
-        row.accel_datasheet, row.accel_noise, row.tilt_datasheet, row.tilt_noise)),
-        row.limited_by]
-
-
-def _error_cell(statistic: held_out.ErrorStatistic) -> str:
-    if np.isnan(statistic.rms):
-        return '-'
-    return f'{_digits(statistic.rms)} (max {_digits(statistic.largest)})'
 
 
 def _budget(budget: held_out.ErrorBudget) -> dict[str, Any]:
@@ -270,31 +252,20 @@ def _coefficients(fitted: Sensor) -> list[dict[str, Any]]:
         unit = '' if row.unit == '1' else f' {row.unit}'
         text = f'{coefficients.rounded(row, row.fitted)} ± ' \
             f'{coefficients.rounded(row, row.half_width)}{unit}'
-        beyond = _against_datasheet(abs(value) - half_width, typical, maximum)
+        # The lower end of the interval decides.
+        lower = abs(value) - half_width
+        beyond = '' if not (typical or maximum) else _BEYOND if 0 < maximum < lower else \
+            'beyond typical' if 0 < typical < lower else 'within'
+        factor = float(np.degrees(1.0)) if row.unit == '°' else 1.0
+        ranges = [f'{word} ±{factor * figure:.2g}' for word, figure in (
+            ('typical', typical), ('maximum', maximum)) if figure]
         rows.append({
             'label': f'{row.label} {row.axis}', 'name': str(name), 'text': text,
-            'datasheet': _range_text(typical, maximum, row.unit), 'outcome': beyond,
+            'datasheet': ', '.join(ranges) or '-', 'outcome': beyond,
             'mark': figures.whisker(
                 value, value - half_width, value + half_width, (-largest, largest), text,
                 typical or maximum, beyond.startswith('beyond'))})
     return rows
-
-
-def _range_text(typical: float, maximum: float, unit: str) -> str:
-    """Return the departures that the datasheet permits."""
-    factor = float(np.degrees(1.0)) if unit == '°' else 1.0
-    texts = [f'{word} ±{factor * value:.2g}'
-             for word, value in (('typical', typical), ('maximum', maximum)) if value]
-    return ', '.join(texts) or '-'
-
-
-def _against_datasheet(magnitude: float, typical: float, maximum: float) -> str:
-    """Compare the lower end of a magnitude's interval with datasheet values, 0 if not stated."""
-    if not (typical or maximum):
-        return ''
-    if maximum and magnitude > maximum:
-        return _BEYOND
-    return 'beyond typical' if typical and magnitude > typical else 'within'
 
 
 def _paper_figures(result: CalibrationResult) -> tuple[list[str], str, str]:
