@@ -145,13 +145,12 @@ def _tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dic
                   'note': f'rms over {len(used)} rests, held out'}]
     for label, unit, name in (('tilt error', '°', 'tilt_deg'),
                               ('acceleration error', 'mg', 'accel_mg')):
-        first, last = (getattr(result.held_out[i], name) for i in (0, -1)) \
-            if result.held_out else (None, None)
-        if last is not None and not np.isnan(last.rms):
-            low, high = map(_digits, last.interval)
-            tiles.append({
-                'label': label, 'text': f'{_digits(first.rms)} → {_digits(last.rms)} {unit}',
-                'note': f'rms on held-out poses, 90 %: {low} to {high} {unit}'})
+        statistics = [getattr(errors, name) for errors in result.held_out]
+        if statistics and not np.isnan(statistics[-1].rms):
+            before, after = (_digits(statistics[i].rms) for i in (0, -1))
+            low, high = map(_digits, statistics[-1].interval)
+            tiles.append({'label': label, 'text': f'{before} → {after} {unit}',
+                          'note': f'rms on held-out poses, 90 %: {low} to {high} {unit}'})
     if assessment is not None:
         tiles.append({'label': 'limited by', 'text': assessment.limited_by,
                       'note': f'calibration error {_digits(assessment.error_mg)} mg, without '
