@@ -166,7 +166,7 @@ class _Model:
         names: list[Coefficient] = []
         places: list[list[int]] = []
         for d, axis in enumerate(axes):
-            of_axis = [Coefficient(*name, axis) for name in self._parameters(d, history)]
+            of_axis = [Coefficient(*name, axis) for name in self._columns(d, history)]
             places.append(list(range(len(names), len(names) + len(of_axis))))
             names += of_axis
         values = np.concatenate([a.values[:len(p)] for a, p in zip(solved, places)])
@@ -192,43 +192,34 @@ class _Model:
             np.array([float(np.std(a.residual_g)) for a in solved]),
             (float(self._blocks.temperature_c.min()), float(self._blocks.temperature_c.max())))
 
-    def _parameters(self, d: int, history: History) -> list[tuple[str, str]]:
-        """Return effect and parameter of the columns of one axis."""
-        scale = [('temperature_scale', 'per_k')] if self._has_scale(d) else []
-        size = [(history.effect, _SIZES[history.effect])] if history.effect else []
-        return [('temperature_bias', 'per_k'), ('temperature_bias', 'per_k2'), *scale, *size]
-
-    def _has_scale(self, d: int) -> bool:
-        """Return whether the orientations separate the scale factor of an axis from its zero-g."""
-        return float(np.ptp(self._forces_g(d))) > _SCALE_FORCES_G
-
-    def _forces_g(self, d: int) -> np.ndarray:
-        """Return the mean force of each orientation along an axis, g, (orientations,)."""
-        return np.array([self._outputs_g[self._orientation == i, d].mean()
-                         for i in range(self._orientation[-1] + 1)])
-
-    def _design(self, d: int, history: History) -> np.ndarray:
-        """Return the columns of one axis, g per unit; those of the orientations are last."""
+    def _columns(self, d: int, history: History) -> dict[tuple[str, str], np.ndarray]:
+        """Return the columns of one axis by effect and parameter, g per unit, (k,) each."""
         warmer_k = self._blocks.temperature_c - NOMINAL_TEMPERATURE_C
-        columns = [warmer_k, warmer_k ** 2]
-        if self._has_scale(d):
-            columns.append(self._forces_g(d)[self._orientation] * warmer_k)
+        columns = {('temperature_bias', 'per_k'): warmer_k,
+                   ('temperature_bias', 'per_k2'): warmer_k ** 2}
+        forces_g = np.array([self._outputs_g[self._orientation == i, d].mean()
+                             for i in range(self._orientation[-1] + 1)])
+        # The orientations must separate the scale factor of an axis from its zero-g.
+        if float(np.ptp(forces_g)) > _SCALE_FORCES_G:
+            columns['temperature_scale', 'per_k'] = forces_g[self._orientation] * warmer_k
         if history.effect:
-            columns.append(self._history(history))
-        orientations = np.arange(self._orientation[-1] + 1)
-        return np.column_stack([*columns, self._orientation[:, None] == orientations])
+            columns[history.effect, _SIZES[history.effect]] = self._history(history)
+        return columns
 
     def _history(self, history: History) -> np.ndarray:
         """Return the output of an effect of size 1, g, (k,)."""
+        temperature_c = self._blocks.temperature_c
         if history.effect == 'thermal_lag':
-            return _lagging(self._blocks.time_s.mean(axis=1), self._blocks.temperature_c,
-                            history.shape) \
-                - self._blocks.temperature_c
-        return -loop(self._blocks.temperature_c, history.shape, {})
+            return _lagging(self._blocks.time_s.mean(axis=1), temperature_c, history.shape) \
+                - temperature_c
+        return -loop(temperature_c, history.shape, {})
 
     def _solved(self, d: int, history: History) -> _Axis:
         """Fit one axis, its correlation among neighbours included."""
-        design, output_g, correlation = self._design(d, history), self._outputs_g[:, d], 0.0
+        output_g, correlation = self._outputs_g[:, d], 0.0
+        # The zero-g of each orientation has the last columns.
+        design = np.column_stack([*self._columns(d, history).values(), self._orientation[:, None]
+                                  == np.arange(self._orientation[-1] + 1)])
         for _ in range(_ITERATIONS):
             white, target = (self._whitened(v, correlation) for v in (design, output_g))
             size = np.sqrt((white ** 2).sum(axis=0))
@@ -261,12 +252,10 @@ def _lagging(time_s: np.ndarray, values: np.ndarray, tau_s: float) -> np.ndarray
     steps_s = np.diff(time_s)
     decay = np.exp(-steps_s / tau_s)
     ramp = (1 - decay) * tau_s / np.maximum(steps_s, np.finfo(float).tiny)
-    output = np.empty(len(values))
-    output[0] = values[0]
-    for i in range(1, len(values)):
-        output[i] = decay[i - 1] * output[i - 1] + (ramp[i - 1] - decay[i - 1]) * values[i - 1] \
-            + (1 - ramp[i - 1]) * values[i]
-    return output
+    output = [values[0]]
+    for d, r, before, now in zip(decay, ramp, values, values[1:]):
+        output.append(d * output[-1] + (r - d) * before + (1 - r) * now)
+    return np.array(output)
 
 
 def applied(base: Sensor, fitted: ThermalFit, calibrated_c: float) -> Sensor:
