@@ -171,7 +171,7 @@ def determining_alpha(errors: PoseErrors) -> np.ndarray:
 
 def _statistic(values: np.ndarray) -> ErrorStatistic:
     sizes = np.abs(values[np.isfinite(values)])
-    return ErrorStatistic(_rms(values), float(sizes.max(initial=0.0)) if sizes.size else np.nan,
+    return ErrorStatistic(_rms(values), float(sizes.max()) if sizes.size else float('nan'),
                           rms_interval(values))
 
 
