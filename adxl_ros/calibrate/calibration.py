@@ -392,7 +392,7 @@ Chosen: neither form is exact."""
 
 
 def calibrate_thermal(base: Sensor, poses: Poses, source: str, data_sha256: str = '',
-              range_c: tuple[float, float] | None = None) -> CalibrationResult:
+                      range_c: tuple[float, float] | None = None) -> CalibrationResult:
     """Fit zero-g over temperature, and the slope of the scale factor where orientations allow."""
     blocks = thermal_fit.blocks_of(poses)
     fit = thermal_fit.fit(base, blocks)

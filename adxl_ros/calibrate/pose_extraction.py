@@ -140,7 +140,7 @@ class SettingTracker:
         moved = _encoder_moved(np.fmin(low, mean), np.fmax(high, mean), self._mean_rad,
                                self._tolerance_rad)
         moved |= _command_moved(*self._commands.extremes(start_ns),
-                               np.array(self._commands.before))
+                                np.array(self._commands.before))
         alpha, beta = self._settings + (moved | self._unseen)
         return int(alpha), int(beta)
 

@@ -227,7 +227,7 @@ def _moved_away(sweep: StageSweep, record: PoseRecord) -> str:
         return pose_plan.angle_fault(
             sweep.course.targets[record.pose], *now_rad, settings.near_rad) or \
             pose_plan.motion_fault(sweep.encoder.between(record.start_ns, record.stop_ns),
-                                     settings.tolerance_rad)
+                                   settings.tolerance_rad)
     captured_v = dwell.volts(dwell.rests()[0]).mean(axis=0)
     change_g = np.abs(np.array(record.mean_v) - captured_v) / sensor.nominal_scale_v_per_g
     axis = int(change_g.argmax())

@@ -424,7 +424,7 @@ def axis_variance(covariance: np.ndarray, axes: list[int], used: np.ndarray) -> 
 
 
 def tilt_variance(covariance: np.ndarray, force: np.ndarray, gravity: float, used: np.ndarray
-                   ) -> float:
+                  ) -> float:
     """Return the mean square of tilt over the poses used, rad², by the part across the force."""
     up = force / np.linalg.norm(force, axis=1, keepdims=True)
     trace = np.einsum('iik->k', covariance)

@@ -316,21 +316,21 @@ def _pose_errors(errors: held_out.HeldOutErrors, assessment: Assessment, poses: 
     high_deg = float(np.degrees(np.sqrt(assessment.tilt.expected * np.log(10))))
     traces += [_band(len(number), 0.0, high_deg, 2),
                _dots(number, tilt_deg, 'tilt', '#6b46a8', labels, '°', 2)]
-    return figures.figure(traces, 440, margin=_ROOM,
-                  xaxis={'title': {'text': 'held-out pose'}, 'anchor': 'y2'},
-                  yaxis={'title': {'text': 'acceleration, mg'}, 'domain': [0.54, 1]},
-                  yaxis2={'title': {'text': 'tilt, °'}, 'domain': [0, 0.46],
-                          'rangemode': 'tozero'})
+    return figures.figure(
+        traces, 440, margin=_ROOM, xaxis={'title': {'text': 'held-out pose'}, 'anchor': 'y2'},
+        yaxis={'title': {'text': 'acceleration, mg'}, 'domain': [0.54, 1]},
+        yaxis2={'title': {'text': 'tilt, °'}, 'domain': [0, 0.46], 'rangemode': 'tozero'})
 
 
 def _gravity_errors(fit: GravityFit) -> Figure:
     """Draw the error of the magnitude of gravity at each rest, and its expected 90 % bars."""
     used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
     scale = 1e3 / G0_MPS2
-    traces = [figures.points(used + 1, scale * fit.held_out_mps2[used],
-                     Z_90 * scale * fit.expected_mps2[used], 'held out', AXIS_COLOURS['x'])]
+    traces = [figures.points(
+        used + 1, scale * fit.held_out_mps2[used], Z_90 * scale * fit.expected_mps2[used],
+        'held out', AXIS_COLOURS['x'])]
     return figures.figure(traces, 320, margin=_ROOM, xaxis={'title': {'text': 'rest'}},
-                  yaxis={'title': {'text': 'magnitude minus gravity, mg'}})
+                          yaxis={'title': {'text': 'magnitude minus gravity, mg'}})
 
 
 def _drift(history: DriftHistory) -> Figure:
@@ -342,16 +342,17 @@ def _drift(history: DriftHistory) -> Figure:
         values, std = history.series(number - 1)
         for d, axis in enumerate(history.sensors[-1].axes):
             trace = figures.points(number_of, values[:, d], Z_90 * std[:, d], axis,
-                           AXIS_COLOURS[axis])
+                                   AXIS_COLOURS[axis])
             traces.append(trace | {'mode': 'lines+markers', 'text': dates,
                                    'hovertemplate': '%{text}: %{y:.3~g}',
                                    'showlegend': number == 1, 'legendgroup': axis,
                                    'yaxis': axis_number('y', number)})
         layout[axis_number('yaxis', number)] = {
             'title': {'text': label}, 'domain': [0.54, 1] if number == 1 else [0, 0.46]}
-    return figures.figure(traces, 340, margin=_ROOM, **layout,
-                  xaxis={'anchor': 'y2', 'tickvals': labelled.tolist(),
-                         'ticktext': [dates[i][:10] for i in labelled]})
+    return figures.figure(
+        traces, 340, margin=_ROOM, **layout,
+        xaxis={'anchor': 'y2', 'tickvals': labelled.tolist(),
+               'ticktext': [dates[i][:10] for i in labelled]})
 
 
 def _band(count: int, low: float, high: float, panel: int) -> Figure:

@@ -87,7 +87,7 @@ def test_table_of_the_truth() -> None:
 
 def test_table_of_errors() -> None:
     errors = held_out.PoseErrors(*np.zeros((2, 3)), np.full((3, 2), 0.45),
-                                         np.radians(np.full(3, 7.2)), np.zeros((3, 3)))
+                                 np.radians(np.full(3, 7.2)), np.zeros((3, 3)))
     fitted = replace(errors, accel_mps2=errors.accel_mps2 / 100, tilt_rad=np.full(3, np.nan))
     models = [held_out.summarise('nominal', errors),
               held_out.summarise('full', fitted)]
