@@ -15,11 +15,10 @@ from functools import partial
 from itertools import product
 import os
 
-from adxl_ros.calibrate import pose_response
 from adxl_ros.calibrate.fits import full_model, term_selection
+from adxl_ros.calibrate.fits.linearisation import StageError
 from adxl_ros.calibrate.guided import pose_plan, running_estimate
-from adxl_ros.calibrate.pose_response import StageError
-from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.poses import Poses, predicted_volts
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
 from adxl_ros.model.constants import Z_90
@@ -152,7 +151,7 @@ def _resting(truth: Sensor, read_rad: np.ndarray, rng: np.random.Generator) -> P
 
 def _read(truth: Sensor, poses: Poses, true_rad: np.ndarray, rng: np.random.Generator) -> Poses:
     there = replace(poses, alpha_rad=true_rad[:, 0], beta_rad=true_rad[:, 1])
-    volts = pose_response.predicted_volts(truth, there)
+    volts = predicted_volts(truth, there)
     return replace(poses, volts=volts + poses.std_v * rng.normal(size=volts.shape))
 
 

@@ -10,11 +10,11 @@ from functools import partial
 import os
 from typing import NamedTuple
 
-from adxl_ros.calibrate import pose_extraction, pose_response
+from adxl_ros.calibrate import pose_extraction
 from adxl_ros.calibrate.fits import full_model, linear, term_selection
+from adxl_ros.calibrate.fits.linearisation import StageError
 from adxl_ros.calibrate.guided.pose_plan import sweep
-from adxl_ros.calibrate.pose_response import StageError
-from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.poses import Poses, stage_force
 from adxl_ros.compensate import inversions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info
@@ -131,7 +131,7 @@ def sweep_bound(truth: Sensor, swept: Poses, true_rad: np.ndarray, stage: StageE
 def angle_errors(fitted: Sensor, bound: Sensor, poses: Poses, true_rad: np.ndarray
                  ) -> AngleErrors:
     """Compare the tilt by a calibrated unit with the truth."""
-    force = pose_response.stage_force(bound, *true_rad.T)
+    force = stage_force(bound, *true_rad.T)
     up = np.where(np.asarray(force[2]) < 0, -1, 1)
     variance_v2 = np.mean(poses.std_v, axis=0) ** 2
     true = _angles(bound, force, up, variance_v2)
@@ -163,7 +163,7 @@ def _angles(sensor: Sensor, force: Components, up: np.ndarray, variance_v2: np.n
 def force_errors(fitted: Sensor, truth: Sensor, poses: Poses, true_rad: np.ndarray
                  ) -> tuple[np.ndarray, np.ndarray]:
     """Return the errors of the measured axes and their standard deviations by the calibration."""
-    true = pose_response.stage_force(truth, *true_rad.T)
+    true = stage_force(truth, *true_rad.T)
     up = np.where(np.asarray(true[2]) < 0, -1, 1)
     measured = signal_chain.inverse(fitted, up)(list(poses.volts.T))
     covariance = force_covariance(fitted, measured, np.mean(poses.std_v, axis=0) ** 2)

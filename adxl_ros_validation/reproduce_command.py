@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from adxl_ros.calibrate import calibration, pose_extraction
-from adxl_ros.calibrate.report import plots as sweep_figures, report_html, text_tables
+from adxl_ros.calibrate.report import acceptance, page as unit_page, plots as sweep_figures
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.atomic_write import write_text
@@ -91,13 +91,13 @@ def _of_recordings(sensor: Sensor, paths: Sequence[str], folder: Path) -> _Repro
         recordings.append(calibration.RecordedPoses(
             Path(path).name, pose_extraction.extract_poses(read, unit)))
     result = calibration.calibrate(unit, recordings, 'full')
-    report_html.draw(folder / FIGURES / 'sweep.png', result)
+    unit_page.draw(folder / FIGURES / 'sweep.png', result)
     lines = '\n'.join(result.comments())
     paper = (f'The paper: alpha {report.in_words("alpha")}; '
              f'beta {report.in_words("beta")}.')
     page = (f"# The paper's calibration of {', '.join(paths)}\n\n```\n{lines}\n```\n\n{paper}\n\n"
             f'## Figures\n\n![Figures 2 to 8]({FIGURES}/sweep.png)\n')
-    return _Reproduction(page, [*text_tables.error_table(result.held_out), f' {paper}'])
+    return _Reproduction(page, [*acceptance.error_table(result.held_out), f' {paper}'])
 
 
 def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path

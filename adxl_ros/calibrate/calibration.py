@@ -4,27 +4,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-import os
 
-from adxl_ros.calibrate.fits import full_model, gravity_fit as gravity, linear, term_selection
-from adxl_ros.calibrate.fits.full_model import FullFit
-from adxl_ros.calibrate.poses import check_polarity, has_angles, join_poses, Poses, reference_force
-from adxl_ros.calibrate.provenance import envelope, require_one_mounting, with_provenance
-from adxl_ros.calibrate.report import acceptance, cross_validation, error_budget, text_tables
+from adxl_ros.calibrate.fits import full_model, gravity_fit, linear, term_selection, thermal_fit
+from adxl_ros.calibrate.fits.linearisation import volts_covariance
+from adxl_ros.calibrate.poses import check_polarity, Poses, predicted_volts, reference_force
+from adxl_ros.calibrate.report import acceptance, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment
-from adxl_ros.calibrate.report.cross_validation import HeldOutErrors
+from adxl_ros.calibrate.report.held_out import HeldOutErrors, rms_mg
+from adxl_ros.calibrate.result import CalibrationResult, envelope, with_provenance
 from adxl_ros.errors import UserError
-from adxl_ros.files import calibration_store, parameter_file
-from adxl_ros.files.atomic_write import keep_previous
-from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get, parameter_of
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
-from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.population import Population, posterior
 from adxl_ros.model.sensor import Sensor
@@ -35,8 +29,11 @@ STAGE_FITS = {'linear': linear.fit, 'physical': linear.fit_physical, 'full': ter
 """Models that are fitted against the stage, simplest first."""
 _LISTED_RESTS = 5
 """Largest number of rests that a line lists (chosen: fits into a line)."""
-_SAME_FIT_TOLERANCE = 1e-6
-"""Largest relative difference of coefficients of the same fit: the rounding in a file."""
+_RIDGE = 1e-3
+"""Weight of a change of 0, relative to a rest, for a direction that no rest of a recording has.
+Chosen: small beside one rest."""
+_NEGLIGIBLE_MG = 0.01
+"""Scatter below which only this limit is shown, mg. Chosen: no sensor repeats that well."""
 
 
 @dataclass(frozen=True)
@@ -49,105 +46,8 @@ class RecordedPoses:
     filters: Sequence[FilterNoise | None] = ()
 
 
-@dataclass(frozen=True)
-class CalibrationResult:
-    """A calibrated unit with its assessment."""
-
-    # nominal, fitted: The unit before and after the fit
-    nominal: Sensor
-    fitted: Sensor
-    report_lines: list[str]  # Errors, acceptance and fit as text: the head of the parameter file
-    # The same for a terminal of 80 columns, the most important lines first
-    summary_lines: list[str]
-    poses: Poses  # k poses, check poses among them
-    # Acceptance of each model; the last one is that of `fitted`
-    assessments: tuple[Assessment, ...] = ()
-    # Errors of the models on held-out poses, the nominal sensor first
-    held_out: tuple[HeldOutErrors, ...] = ()
-    gravity_fit: gravity.GravityFit | None = None  # The fit of a calibration against gravity
-    outliers: tuple[int, ...] = ()  # Indices of the outliers, which the fit leaves out
-    # What is wrong with the poses or the fit, and why no richer model was fitted
-    warnings: tuple[str, ...] = ()
-
-    def comments(self) -> list[str]:
-        """Return coefficients and assessment as text: the head of the parameter file."""
-        return [*coefficient_lines(self.fitted), '', *self.report_lines]
-
-    def save(self, path: str | os.PathLike) -> None:
-        """
-        Write the parameter file atomically; a file of another fit becomes NAME.previous.
-
-        Parameters
-        ----------
-        path
-            The file.
-
-        Raises
-        ------
-        UserError
-            The file cannot be written. The previous file is unchanged.
-
-        """
-        # A session that saves the same fit twice must not replace the previous calibration.
-        if not self._is_in(path):
-            keep_previous(path)
-        parameter_file.save(path, self.fitted, self.comments())
-
-    def keep(self, folder: str | os.PathLike) -> str:
-        """
-        Copy the calibration to the store. A store that cannot be written raises no error.
-
-        Parameters
-        ----------
-        folder
-            The store; empty for none.
-
-        Returns
-        -------
-        str
-            One line with the path, or with the reason why there is no copy.
-
-        """
-        if not str(folder):
-            return 'not kept in a store'
-        stored = calibration_store.history(folder, self.fitted.serial).calibrations
-        existing = [path for path, _ in stored if self._is_in(path)]
-        try:
-            path = existing[0] if existing else \
-                calibration_store.put(folder, self.fitted, self.comments())
-        except UserError as error:
-            return f'no copy in the store: {error}'
-        return f'kept as {path}' if path else \
-            f'not kept in {folder}: the serial number {NO_UNIT} names no unit; set ' \
-            'sensor.serial'
-
-    def _is_in(self, path: str | os.PathLike) -> bool:
-        """Return whether a file holds this fit: the same data, model and coefficients."""
-        try:
-            saved = parameter_file.load(path)
-        except UserError:
-            return False
-        fitted, names = self.fitted, self.fitted.covariance_names
-        return (saved.model, saved.effects, saved.covariance_names) == (
-            fitted.model, fitted.effects, names) and \
-            saved.provenance.get('data_sha256') == fitted.provenance['data_sha256'] and \
-            bool(np.allclose(get(saved, names), get(fitted, names), rtol=_SAME_FIT_TOLERANCE))
-
-    @property
-    def name(self) -> str:
-        """Return the serial number and the sources of the poses."""
-        return f'{self.fitted.serial} ({self.fitted.provenance["source"]})'
-
-    @property
-    def inliers(self) -> np.ndarray:
-        """Mark the poses that are no outliers, (k,) bool; only these are in `held_out`."""
-        return ~np.isin(np.arange(len(self.poses)), self.outliers)
-
-    @property
-    def paper_sensor(self) -> Sensor:
-        """Return the unit by a model that the paper's figures can show."""
-        return self.fitted if self.fitted.model in ('physical', 'full') else \
-            linear.fit_physical(self.nominal, self.poses.subset(~self.poses.check))
+def _joined(recordings: Sequence[RecordedPoses]) -> Poses:
+    return Poses.joined([recording.poses for recording in recordings])
 
 
 def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None = None,
@@ -182,48 +82,32 @@ def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | 
         The poses do not determine the model, or the recordings contradict each other.
 
     """
-    result = _calibrated(sensor, recordings, model, effects, data_sha256, population)
-    lines = text_tables.turn_on_lines(result.fitted, [item.poses for item in recordings])
-    return _with_warnings(result, lines)
-
-
-def _with_warnings(result: CalibrationResult, lines: Sequence[str]) -> CalibrationResult:
-    """Add warnings, which the report has, too."""
-    return replace(result, warnings=(*result.warnings, *lines),
-                   report_lines=[*result.report_lines, *lines])
-
-
-def _calibrated(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None,
-                effects: Sequence[str], data_sha256: str, population: Population | None
-                ) -> CalibrationResult:
-    """Fit against the stage, or against gravity; see `calibrate`."""
-    poses = join_poses([recording.poses for recording in recordings])
+    poses = _joined(recordings)
     source = ', '.join(recording.source for recording in recordings)
-    if has_angles(poses).any():
-        model = model or ('full' if effects else None)
-        referenced = [replace(recording, poses=recording.poses.subset(has_angles(recording.poses)))
-                      for recording in recordings]
-        result = _against_stage(sensor, referenced, model, effects, data_sha256, population)
-        return _with_warnings(result, _without_angles_lines(poses))
-    if model not in (None, 'full'):
+    lines: list[str] = []
+    if poses.has_angles.any():
+        with_angles = [replace(recording, poses=recording.poses.subset(recording.poses.has_angles))
+                       for recording in recordings]
+        result = _against_stage(sensor, with_angles, model or ('full' if effects else None),
+                                effects, source, data_sha256, population)
+        starts_s = poses.time_s[~poses.has_angles, 0]
+        if len(starts_s):
+            listed = ', '.join(f'{start_s:.1f}' for start_s in starts_s[:_LISTED_RESTS])
+            further = ' ...' * (len(starts_s) > _LISTED_RESTS)
+            lines = [f'rests without angles, left out: {len(starts_s)} (from {listed}{further} s)']
+    elif model not in (None, 'full'):
         raise UserError(f'{source}: the {model} model is fitted against stage angles (alpha_rad '
                         'and beta_rad), which are missing; leave --model out to calibrate a '
                         'three-axis sensor against gravity')
-    if sensor.axes != AXES:
+    elif sensor.axes != AXES:
         raise UserError(f'{source}: no stage angles and only the axes {sensor.axes}: the '
                         'magnitude of gravity needs x, y and z; record alpha_rad and beta_rad')
-    span_s = sum(float(np.ptp(recording.poses.time_s)) for recording in recordings)
-    return _against_gravity(sensor, poses, source, span_s, data_sha256, population)
-
-
-def _without_angles_lines(poses: Poses) -> list[str]:
-    """Return which rests have no angles, as text; none where all have."""
-    starts_s = poses.time_s[~has_angles(poses), 0]
-    if not len(starts_s):
-        return []
-    listed = ', '.join(f'{start_s:.1f}' for start_s in starts_s[:_LISTED_RESTS])
-    further = ' ...' * (len(starts_s) > _LISTED_RESTS)
-    return [f'rests without angles, left out: {len(starts_s)} (from {listed}{further} s)']
+    else:
+        span_s = sum(float(np.ptp(recording.poses.time_s)) for recording in recordings)
+        result = _against_gravity(sensor, poses, source, span_s, data_sha256, population)
+    lines += _turn_on_lines(result.fitted, [recording.poses for recording in recordings])
+    return replace(result, warnings=(*result.warnings, *lines),
+                   report_lines=[*result.report_lines, *lines])
 
 
 @dataclass(frozen=True)
@@ -231,53 +115,52 @@ class _StageFit:
     """A fit against the stage."""
 
     fitted: Sensor  # The fitted unit
-    # Function that makes the same fit to other poses, for cross-validation
-    refit: cross_validation.Fit
+    refit: held_out.Fit  # The same fit to other poses, for cross-validation
     report_lines: Sequence[str] = ()  # Report of a full fit
-    refusals: Sequence[str] = ()  # Reasons why richer models are not fitted
     warnings: Sequence[str] = ()  # What is wrong with the poses or a full fit
-    full: FullFit | None = None  # The full fit; None for other models
+    full: full_model.FullFit | None = None  # The full fit; None for other models
 
 
 def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None,
-                   effects: Sequence[str], data_sha256: str, population: Population | None
-                   ) -> CalibrationResult:
-    poses = join_poses([recording.poses for recording in recordings])
+                   effects: Sequence[str], source: str, data_sha256: str,
+                   population: Population | None) -> CalibrationResult:
+    poses = _joined(recordings)
     check_polarity(sensor, poses)
-    fit = _richest_fit(sensor, recordings, model, effects, population)
+    fit, refusals = _richest_fit(sensor, recordings, model, effects, population)
     if population is not None:
         fit = _with_population(fit, population)
-    full, fitted = fit.full, fit.fitted
+    full, fitted, fit_lines = fit.full, fit.fitted, list(fit.report_lines)
     fitting = np.flatnonzero(~poses.check)
     outliers = tuple(fitting[list(full.outliers)].tolist()) if full else ()
-    inliers = poses.subset(~np.isin(np.arange(len(poses)), outliers))
-    held_out, assessments = _assessed(sensor, inliers, fit)
+    errors, assessments = _assessed(
+        sensor, poses.subset(~np.isin(np.arange(len(poses)), outliers)), fit)
     assessment = next((row for row in assessments if row.model == fitted.model), None)
-    residual_mg = _rms_residual_mg(fitted, poses.subset(fitting))
-    fit_lines = list(fit.report_lines)
+    force = np.column_stack(reference_force(poses, fitted.local_gravity_mps2))
+    predicted = np.column_stack(signal_chain.static_response(fitted)(
+        list(force.T), poses.environment))
+    residual_mg = ((poses.volts - predicted) / fitted.scale_v_per_g * 1e3)[fitting]
     if fitted.model == 'full':
         fitted, filter_lines = with_filter(
             fitted, [recording.filters for recording in recordings if recording.filters])
         fit_lines += filter_lines
-    force = np.column_stack(reference_force(poses, fitted.local_gravity_mps2))
     error_mps2 = np.nan_to_num(np.sqrt(assessment.accel.calibration)).item() if assessment else 0.0
     fitted = replace(fitted, envelope=envelope(fitted, force, poses, error_mps2))
-    fitted = with_provenance(
-        fitted, ', '.join(recording.source for recording in recordings), poses, data_sha256,
-        {'reference': 'stage', **_prior_entry(population), 'residual_mg': f'{residual_mg:.4f}',
-         **({'converged': _yes_or_no(full.converged)} if full else {}),
-         **acceptance.provenance_entries(assessment, held_out)})
+    fitted = with_provenance(fitted, source, poses, data_sha256, {
+        'reference': 'stage', **({'prior': population.name} if population else {}),
+        'residual_mg': f'{np.sqrt(np.mean(residual_mg ** 2)):.4f}',
+        **({'converged': _yes_or_no(full.converged)} if full else {}),
+        **acceptance.provenance_entries(assessment, errors)})
     explanation = acceptance.explanation(assessment, fitted) if assessment else []
     unit_lines = acceptance.unit_line(fitted)
     return CalibrationResult(
         nominal=sensor, fitted=fitted, poses=poses, assessments=assessments,
-        held_out=held_out, outliers=outliers, warnings=(*fit.warnings, *fit.refusals),
-        report_lines=[*fit.refusals, *cross_validation.table(held_out),
-                      *acceptance.table(assessments, held_out), *explanation, *unit_lines,
+        held_out=errors, outliers=outliers, warnings=(*fit.warnings, *refusals),
+        report_lines=[*refusals, *held_out.table(errors),
+                      *acceptance.table(assessments, errors), *explanation, *unit_lines,
                       *fit_lines],
-        summary_lines=[*acceptance.headline(assessment, held_out), *unit_lines,
-                       *acceptance.narrow_table(assessments, held_out), *explanation,
-                       *fit_lines, *fit.refusals])
+        summary_lines=[*acceptance.headline(assessment, errors), *unit_lines,
+                       *acceptance.narrow_table(assessments, errors), *explanation,
+                       *fit_lines, *refusals])
 
 
 def _with_population(fit: _StageFit, population: Population) -> _StageFit:
@@ -300,40 +183,53 @@ def _assessed(sensor: Sensor, inliers: Poses, fit: _StageFit
     stage = fit.full.unit if fit.full else None
     models = list(STAGE_FITS)
     simpler = {name: STAGE_FITS[name] for name in models[:models.index(fit.fitted.model)]}
-    held_out = cross_validation.cross_validate(
+    errors = held_out.cross_validate(
         {'nominal': lambda sensor, _: sensor, **simpler, fit.fitted.model: fit.refit},
         sensor, inliers, stage)
-    assessments = tuple(
-        acceptance.assess(errors.model, error_budget.error_budgets(errors, inliers, stage), sensor)
-        for errors in held_out if errors.model != 'nominal')
-    return tuple(held_out), assessments
+    return tuple(errors), tuple(
+        acceptance.assess(row.model, held_out.error_budgets(row, inliers, stage), sensor)
+        for row in errors if row.model != 'nominal')
 
 
 def _richest_fit(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None,
-                 effects: Sequence[str], population: Population | None) -> _StageFit:
-    """Fit the given model, or the richest one that the poses and the population determine."""
-    if model == 'linear' and population is not None:
-        return _fit_open(sensor, recordings, population)
-    if model:
-        return _fit(model, sensor, recordings, effects)
-    refusals: list[str] = []
-    for name in ('full', 'physical'):
-        try:
-            return replace(_fit(name, sensor, recordings, effects), refusals=refusals)
-        except UserError as error:
-            refusals.append(f'not {name}: {error}')
-    if sensor.axes == AXES and not effects:
-        with suppress(UserError):
-            return _fit_affine(sensor, recordings)
-    if population is not None:
-        return replace(_fit_open(sensor, recordings, population), refusals=refusals)
-    return replace(_fit('linear', sensor, recordings, effects), refusals=refusals)
-
-
-def _fit_affine(sensor: Sensor, recordings: Sequence[RecordedPoses]) -> _StageFit:
-    """Fit the twelve coefficients of a three-axis unit to poses that determine no more."""
-    poses = join_poses([recording.poses for recording in recordings])
+                 effects: Sequence[str], population: Population | None
+                 ) -> tuple[_StageFit, list[str]]:
+    """Fit a model, or the richest one that the poses determine; also say why no richer one."""
+    poses = _joined(recordings)
     poses = poses.subset(~poses.check)
+    fits: dict[str, Callable[[], _StageFit]] = {
+        'full': lambda: _fit_full(sensor, poses, recordings, effects),
+        'physical': lambda: _StageFit(linear.fit_physical(sensor, poses), linear.fit_physical),
+        'affine': lambda: _fit_affine(sensor, poses),
+        'linear': lambda: _fit_linear(sensor, poses, population)}
+    if model:
+        return fits[model](), []
+    refusals: list[str] = []
+    for name in ('full', 'physical', 'affine'):
+        if name == 'affine' and (sensor.axes != AXES or effects):
+            continue
+        try:
+            return fits[name](), refusals if name == 'physical' else []
+        except UserError as error:
+            if name != 'affine':
+                refusals.append(f'not {name}: {error}')
+    return fits['linear'](), refusals
+
+
+def _fit_full(sensor: Sensor, poses: Poses, recordings: Sequence[RecordedPoses],
+              effects: Sequence[str]) -> _StageFit:
+    """Fit the full model to recordings of one unit in one mounting."""
+    full, terms = term_selection.fit_selected(sensor, poses, effects)
+    if len(recordings) > 1:
+        _require_one_mounting(full, recordings)
+    return _StageFit(
+        full.fitted, partial(term_selection.fit, effects=effects),
+        term_selection.report_lines(full, poses, terms), term_selection.warnings(full, poses),
+        full)
+
+
+def _fit_affine(sensor: Sensor, poses: Poses) -> _StageFit:
+    """Fit the twelve coefficients of a three-axis unit to poses that determine no more."""
     full = term_selection.fit_affine(sensor, poses)
     std = np.sqrt(np.diag(np.linalg.inv(full.information)))
     still_open = [name for name, value in zip(full.names, std)
@@ -343,134 +239,217 @@ def _fit_affine(sensor: Sensor, recordings: Sequence[RecordedPoses]) -> _StageFi
     if still_open:
         lines.append(f'open, by its prior alone: {", ".join(map(str, still_open))}; add poses '
                      'with this axis up and down')
-
-    def refit(sensor: Sensor, poses: Poses) -> Sensor:
-        return term_selection.fit_affine(sensor, poses).fitted
-
-    return _StageFit(full.fitted, refit, [*lines, *term_selection.report_lines(full, poses, [])],
-                     warnings=[*lines, *term_selection.warnings(full, poses)], full=full)
+    return _StageFit(
+        full.fitted, lambda sensor, poses: term_selection.fit_affine(sensor, poses).fitted,
+        [*lines, *term_selection.report_lines(full, poses, [])],
+        [*lines, *term_selection.warnings(full, poses)], full)
 
 
-def _fit_open(sensor: Sensor, recordings: Sequence[RecordedPoses], population: Population
-              ) -> _StageFit:
-    """Fit the linear model to poses that may leave to the population what it has."""
-    poses = join_poses([recording.poses for recording in recordings])
+def _fit_linear(sensor: Sensor, poses: Poses, population: Population | None) -> _StageFit:
+    """Fit the linear model; poses may leave to the population what it has."""
+    if population is None:
+        return _StageFit(linear.fit(sensor, poses), linear.fit)
     axes = {name.axis for name in population.prior(sensor).names if name.effect == 'scale_factor'}
     fit_line = partial(linear.fit, may_be_open=set(sensor.axes) <= axes)
-    fitted = fit_line(sensor, poses.subset(~poses.check))
+    fitted = fit_line(sensor, poses)
     combined = posterior(fitted, population)
     if not combined.is_stranger:
         return _StageFit(fitted, fit_line)
     try:
-        return _fit('linear', sensor, recordings, ())
+        return _fit_linear(sensor, poses, None)
     except UserError as error:
         raise UserError(f'{error}; {combined.line}') from None
 
 
-def _fit(model: str, sensor: Sensor, recordings: Sequence[RecordedPoses], effects: Sequence[str]
-         ) -> _StageFit:
-    """Fit one model to all poses except the check poses."""
-    poses = join_poses([recording.poses for recording in recordings])
-    poses = poses.subset(~poses.check)
-    if model != 'full':
-        return _StageFit(STAGE_FITS[model](sensor, poses), STAGE_FITS[model])
-
-    def fit_full(sensor: Sensor, poses: Poses) -> Sensor:
-        return term_selection.fit_selected(sensor, poses, effects).full.fitted
-
-    full, terms = term_selection.fit_selected(sensor, poses, effects)
-    if len(recordings) > 1:
-        require_one_mounting(full, [recording.poses for recording in recordings],
-                             [recording.source for recording in recordings])
-    return _StageFit(full.fitted, fit_full, term_selection.report_lines(full, poses, terms),
-                     warnings=term_selection.warnings(full, poses), full=full)
+_MAX_TURN_RAD = np.radians(0.3)
+"""Largest turn of the case between recordings, rad. Chosen: above the 0.1° of the stage's level in
+either recording, far below a new mounting."""
+_MAX_ZERO_G_SHIFT_G = 0.02
+"""Largest shift of the zero-g between recordings, g. Chosen: a healthy unit may shift by so much
+between two days."""
+_MIN_DEVIATIONS = 6.0
+"""Smallest turn or shift that counts, in its standard deviations. Chosen: never by chance."""
+_MIN_EIGENVALUE_RATIO = 1e-10
+"""Smallest relative eigenvalue of the information whose direction counts as determined."""
+_MIN_VARIANCE = 1e-30
+"""Lower bound of the variance of a turn, rad², or shift, g², so that it can be a divisor."""
 
 
-def _rms_residual_mg(fitted: Sensor, poses: Poses) -> float:
-    predicted = np.column_stack(signal_chain.static_response(fitted)(
-        reference_force(poses, fitted.local_gravity_mps2), poses.environment))
-    residual = (poses.volts - predicted) / fitted.scale_v_per_g * 1e3
-    return float(np.sqrt(np.mean(residual ** 2)))
+def _require_one_mounting(full: full_model.FullFit, recordings: Sequence[RecordedPoses]) -> None:
+    """
+    Refuse recordings if the mounting or the zero-g of one of them differs.
+
+    A turn of the case and a shift of the zero-g of each axis are fitted by least squares to the
+    residuals of each recording about the common fit.
+    """
+    axes = full.unit.axes
+    limits = np.repeat([_MAX_TURN_RAD, _MAX_ZERO_G_SHIFT_G], [3, len(axes)])
+    for recording in recordings:
+        changes, std = _turn_and_shifts(full, recording.poses)
+        deviations = np.where(np.abs(changes) > limits, np.abs(changes) / std, 0.0)
+        worst = int(np.argmax(deviations))
+        if deviations[worst] <= _MIN_DEVIATIONS:
+            continue
+        change = f'case is turned by {np.degrees(changes[worst]):.2f} deg about {AXES[worst]}' \
+            if worst < 3 else \
+            f'zero-g of {axes[worst - 3]} is shifted by {1e3 * changes[worst]:.2f} mg'
+        raise UserError(
+            f'{recording.source}: {change} from the fit of all recordings '
+            f'({deviations[worst]:.0f} standard deviations): another unit or another '
+            'mounting; fit this recording separately')
+
+
+def _turn_and_shifts(full: full_model.FullFit, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
+    """Fit the turn of the case, rad, (3,), and the zero-g shifts, g, (m,); values and std."""
+    unit = full.unit
+    force = reference_force(poses, unit.local_gravity_mps2)
+    by_force = np.moveaxis(signal_chain.jacobian(
+        signal_chain.analog_response(unit), force, poses.environment), 2, 0)
+    turned = np.stack([np.cross(axis, np.column_stack(force)) for axis in np.eye(3)], axis=2)
+    shifted = np.broadcast_to(np.diag(unit.scale_v_per_g),
+                              (len(poses), len(unit.axes), len(unit.axes)))
+    information, gradient = volts_covariance(unit, poses, full.stage).normal_equations(
+        np.concatenate([by_force @ turned, shifted], axis=2),
+        poses.volts - predicted_volts(unit, poses))
+    covariance = np.linalg.pinv(information, rcond=_MIN_EIGENVALUE_RATIO)
+    return covariance @ gradient, np.sqrt(np.maximum(np.diag(covariance), _MIN_VARIANCE))
 
 
 def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, data_sha256: str,
                      population: Population | None) -> CalibrationResult:
-    fit = gravity.fit_gravity(poses.volts, poses.std_v, sensor)
+    fit = gravity_fit.fit_gravity(poses.volts, poses.std_v, sensor)
     kept = np.setdiff1d(np.arange(len(poses)), fit.outliers)
-    before, after, held_out = (_rms_mg(values[kept]) for values in (
+    before, after, unseen = (rms_mg(np.mean(values[kept] ** 2)) for values in (
         fit.before_mps2, fit.residual_mps2, fit.held_out_mps2))
     fitted = replace(
         sensor, model='gravity', effects=('bias', 'scale_factor', 'misalignment'),
-        values=fit.values, covariance=fit.covariance, covariance_names=gravity.NAMES)
+        values=fit.values, covariance=fit.covariance, covariance_names=gravity_fit.NAMES)
     prior_lines: list[str] = []
     if population is not None:
         combined = posterior(fitted, population)
         fitted, prior_lines = combined.sensor, [f'prior: {combined.line}']
     force = np.column_stack(signal_chain.inverse(fitted)(list(poses.volts.T), poses.environment))
-    budgets = error_budget.gravity_error_budgets(fit, fitted, force, kept)
+    budgets = acceptance.gravity_error_budgets(fit, fitted, force, kept)
     assessment = acceptance.assess('gravity', budgets, fitted)
     fitted = replace(fitted, envelope=envelope(fitted, force[kept], poses,
                                                float(np.sqrt(budgets.accel.model))))
     fitted = with_provenance(fitted, source, poses, data_sha256, {
-        'reference': 'gravity', **_prior_entry(population), 'residual_mg': f'{after:.4f}',
-        'held_out_mg': f'{held_out:.4f}', 'span_s': f'{span_s:.1f}',
-        'converged': _yes_or_no(fit.converged),
-        **acceptance.provenance_entries(assessment, ())})
+        'reference': 'gravity', **({'prior': population.name} if population else {}),
+        'residual_mg': f'{after:.4f}', 'held_out_mg': f'{unseen:.4f}', 'span_s': f'{span_s:.1f}',
+        'converged': _yes_or_no(fit.converged), **acceptance.provenance_entries(assessment, ())})
+    fit_lines = [] if fit.converged else [term_selection.NOT_CONVERGED]
+    if fit.outliers:
+        rests = ', '.join(f'{i + 1} (from {poses.time_s[i, 0]:.1f} s)' for i in fit.outliers)
+        fit_lines.append(f'outliers, left out: rest {rests}')
     lines = [f'magnitude of gravity over {len(kept)} rests, rms in mg: nominal {before:.2f}, '
-             f'nine parameters {after:.3f}, held out {held_out:.3f}',
-             *_gravity_fit_lines(fit, poses),
-             acceptance.gravity_line(assessment, fit.held_out_mps2[kept]),
+             f'nine parameters {after:.3f}, held out {unseen:.3f}',
+             *fit_lines, acceptance.gravity_line(assessment, fit.held_out_mps2[kept]),
              *acceptance.explanation(assessment, fitted), *acceptance.unit_line(fitted),
              *prior_lines]
     return CalibrationResult(
         nominal=sensor, fitted=fitted, poses=poses, assessments=(assessment,), gravity_fit=fit,
-        warnings=(*_gravity_fit_lines(fit, poses), *prior_lines),
-        report_lines=lines, summary_lines=[*acceptance.headline(assessment, ()), *lines])
-
-
-def _gravity_fit_lines(fit: gravity.GravityFit, poses: Poses) -> list[str]:
-    lines = [] if fit.converged else [term_selection.NOT_CONVERGED]
-    if fit.outliers:
-        rests = ', '.join(f'{i + 1} (from {poses.time_s[i, 0]:.1f} s)' for i in fit.outliers)
-        lines.append(f'outliers, left out: rest {rests}')
-    return lines
-
-
-def coefficient_lines(sensor: Sensor) -> list[str]:
-    """Return the fitted coefficients with their 90 % intervals as text."""
-    std = dict(zip(sensor.covariance_names, np.sqrt(np.diag(sensor.covariance))))
-    lines = [f'{sensor.serial}: {sensor.model} model, coefficient +- half of its 90 % interval']
-    for effect in sensor.values:
-        for parameter in effect_named(effect).parameters:
-            if parameter.name not in sensor.values[effect]:
-                continue
-            label, values = _labelled(sensor, effect, parameter.name)
-            axes = list(sensor.axes) if np.ndim(values) else ['']
-            names = [Coefficient(effect, parameter.name, axis) for axis in axes]
-            entries = [f'{name.axis} {value:.6g} +- {Z_90 * std[name]:.2g}'.lstrip()
-                       for name, value in zip(names, np.ravel(values)) if name in std]
-            if entries:
-                lines.append(f'  {label:34} {"   ".join(entries)} {parameter.unit}')
-    return lines
-
-
-def _labelled(sensor: Sensor, effect: str, parameter: str) -> tuple[str, np.ndarray]:
-    """Return label and values of a parameter; zero-g and scale factor are absolute."""
-    if (effect, parameter) == ('bias', 'offset_v'):
-        return 'zero-g', sensor.zero_g_v
-    if (effect, parameter) == ('scale_factor', 'offset_v_per_g'):
-        return 'scale factor', sensor.scale_v_per_g
-    return f'{effect}.{parameter}', sensor.values[effect][parameter]
-
-
-def _prior_entry(population: Population | None) -> dict[str, str]:
-    """Return the entry of the provenance that names a prior; none without one."""
-    return {} if population is None else {'prior': population.name}
+        warnings=(*fit_lines, *prior_lines), report_lines=lines,
+        summary_lines=[*acceptance.headline(assessment, ()), *lines])
 
 
 def _yes_or_no(condition: bool) -> str:
     return 'yes' if condition else 'no'
 
 
-def _rms_mg(values_mps2: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values_mps2 ** 2)) / G0_MPS2 * 1e3)
+def _turn_on_lines(fitted: Sensor, recordings: Sequence[Poses]) -> list[str]:
+    """Report the scatter of the zero-g over recordings of one unit."""
+    if len(recordings) < 2:
+        return []
+    changes_mg = np.array([_zero_g_change_mg(fitted, poses) for poses in recordings])
+    texts = [f'{value:.2g}' if value > _NEGLIGIBLE_MG else f'< {_NEGLIGIBLE_MG:g}'
+             for value in np.std(changes_mg, axis=0, ddof=1)]
+    by_axis = ', '.join(f'{axis} {text}' for axis, text in zip(fitted.axes, texts))
+    return [f'turn-on to turn-on: the zero-g scatters by {by_axis} mg (standard deviation over '
+            f'{len(recordings)} recordings)']
+
+
+def _zero_g_change_mg(fitted: Sensor, poses: Poses) -> np.ndarray:
+    """Return the zero-g of a recording minus that of the fit by axis, mg, (m,)."""
+    if poses.has_angles.any():
+        poses = poses.subset(poses.has_angles)
+        force = list(reference_force(poses, fitted.local_gravity_mps2))
+        predicted = signal_chain.static_response(fitted)(force, poses.environment)
+        residual_v = poses.volts - np.column_stack(predicted)
+        return np.asarray(1e3 * np.mean(residual_v / fitted.scale_v_per_g, axis=0))
+    # Against gravity a change shows along the direction of each rest only.
+    force_mps2 = np.column_stack(signal_chain.inverse(fitted)(
+        list(poses.volts.T), poses.environment))
+    magnitude_mps2 = np.linalg.norm(force_mps2, axis=1)
+    direction = force_mps2 / magnitude_mps2[:, None]
+    excess_mg = 1e3 * (magnitude_mps2 / fitted.local_gravity_mps2 - 1)
+    normal = direction.T @ direction + _RIDGE * np.eye(direction.shape[1])
+    return np.asarray(np.linalg.solve(normal, direction.T @ excess_mg))
+
+
+_RIVAL_SHARE = 0.5
+"""Gain of an effect, divided by that of the best one, from which the two are not separated.
+Chosen: neither form is exact."""
+
+
+def calibrate_thermal(base: Sensor, poses: Poses, source: str, data_sha256: str = '',
+                      range_c: tuple[float, float] | None = None) -> CalibrationResult:
+    """Fit zero-g over temperature, and the slope of the scale factor where orientations allow."""
+    blocks = thermal_fit.blocks_of(poses)
+    fit = thermal_fit.fit(base, blocks)
+    calibrated_c = thermal_fit.calibrated_temperature_c(base)
+    fitted = thermal_fit.applied(base, fit, calibrated_c)
+    has_scale = any(name.effect == 'temperature_scale' for name in fit.names)
+    low_c, high_c = range_c or fit.span_c
+    misfit_mps2 = float(np.sqrt(np.mean(fit.residual_g ** 2))) * G0_MPS2
+    fitted = replace(fitted, envelope=replace(
+        base.envelope, temperature_c=fit.span_c, zero_g_per_k=0.0,
+        scale_per_k=0.0 if has_scale else base.envelope.scale_per_k,
+        misfit_mps2=float(np.hypot(base.envelope.misfit_mps2, misfit_mps2))))
+    fitted = with_provenance(fitted, source, poses, data_sha256, {
+        'reference': 'rest over temperature', 'base': base.provenance.get('id', base.serial),
+        'residual_mg': f'{misfit_mps2 / G0_MPS2 * 1e3:.4f}',
+        'sweep': f'{len(blocks)} blocks at rest, {fit.span_c[0]:.1f} to '
+                 f'{fit.span_c[1]:.1f} degC'})
+    covered = thermal_fit.passed(blocks.temperature_c, (low_c, high_c))
+    error_mg = thermal_fit.expected_error_mg(fit, covered, calibrated_c)
+    lines = [
+        f'zero-g over temperature: {len(blocks)} blocks at rest, '
+        f'{fit.span_c[0]:.1f} to {fit.span_c[1]:.1f} °C',
+        *_slope_lines(fitted, fit),
+        'residual ' + ', '.join(f'{axis} {value * 1e3:.2g}' for axis, value in zip(
+            base.axes, fit.residual_g)) + ' mg rms',
+        *_history_lines(fit),
+        f'expected error of the zero-g over {low_c:.0f} to {high_c:.0f} °C: {error_mg:.2g} mg',
+        f'zero-g stays as calibrated at {calibrated_c:.1f} °C']
+    if not has_scale:
+        lines.append('scale factor over temperature: not fitted, it needs a second orientation')
+    return CalibrationResult(nominal=base, fitted=fitted, poses=poses, report_lines=lines,
+                             summary_lines=lines)
+
+
+def _slope_lines(fitted: Sensor, fit: thermal_fit.ThermalFit) -> list[str]:
+    """Return slope and curvature of each axis with half of their 90 % intervals."""
+    std = dict(zip(fit.names, Z_90 * np.sqrt(np.diag(fit.covariance))))
+    lines = []
+    for axis in fitted.axes:
+        slope, curvature = (Coefficient('temperature_bias', parameter, axis)
+                            for parameter in ('per_k', 'per_k2'))
+        k, k2 = get(fitted, [slope, curvature])
+        lines.append(f'  {axis}  {k * 1e3:+.3f} ± {std[slope] * 1e3:.3f} mg/K at 25 °C, '
+                     f'{k2 * 1e6:+.2f} ± {std[curvature] * 1e6:.2f} µg/K²')
+    return lines
+
+
+def _history_lines(fit: thermal_fit.ThermalFit) -> list[str]:
+    """Say which dependence on the history the blocks support."""
+    if not fit.gains:
+        return ['history of the temperature: not tested, it needs warming and cooling']
+    effect = fit.history.effect
+    if not effect:
+        return ['warming and cooling agree: no thermal_lag, no thermal_hysteresis']
+    unit = 's' if effect == 'thermal_lag' else 'K'
+    line = f'warming and cooling differ: {effect} ({fit.history.shape:.3g} {unit})'
+    rivals = [other for other, gain in fit.gains.items()
+              if other != effect and gain > _RIVAL_SHARE * fit.gains[effect]]
+    return [line, *(f'{other} explains it nearly as well: these blocks do not separate them'
+                    for other in rivals)]

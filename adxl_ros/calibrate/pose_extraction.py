@@ -41,13 +41,13 @@ def angle_tolerance_rad(sensor: Sensor) -> float:
     return max(ENCODER_STEPS * sensor.stage_resolution_rad, SAME_ANGLE_RAD)
 
 
-def encoder_moved(low_rad: np.ndarray, high_rad: np.ndarray, mean_rad: np.ndarray,
-                  tolerance_rad: float) -> np.ndarray:
+def _encoder_moved(low_rad: np.ndarray, high_rad: np.ndarray, mean_rad: np.ndarray,
+                   tolerance_rad: float) -> np.ndarray:
     """Return whether the encoder has moved between poses; False without readings."""
     return np.fmax(high_rad - mean_rad, mean_rad - low_rad) > tolerance_rad
 
 
-def command_moved(low_rad: np.ndarray, high_rad: np.ndarray, held_rad: np.ndarray) -> np.ndarray:
+def _command_moved(low_rad: np.ndarray, high_rad: np.ndarray, held_rad: np.ndarray) -> np.ndarray:
     """Return whether the command has moved between poses."""
     changed = np.fmax(high_rad - held_rad, held_rad - low_rad) > COMMAND_RAD
     return changed | (np.isnan(held_rad) & np.isfinite(high_rad))
@@ -67,13 +67,14 @@ def recorded_settings(rests: np.ndarray, readings_rad: np.ndarray | None,
     start, stop = rests[order].T
     moved = np.zeros(max(len(start) - 1, 0), bool)
     if readings_rad is not None and len(moved):
-        mean = np.array([mean_of_finite(readings_rad[a:b]) for a, b in zip(start, stop)])
+        mean = np.array([_mean_of_finite(readings_rad[a:b]) for a, b in zip(start, stop)])
         low, high = _extremes(readings_rad, (start + stop) // 2)
-        moved |= encoder_moved(np.fmin(low, mean[1:]), np.fmax(high, mean[1:]),
-                               _last_finite(mean)[:-1], tolerance_rad)
+        moved |= _encoder_moved(np.fmin(low, mean[1:]), np.fmax(high, mean[1:]),
+                                _last_finite(mean)[:-1], tolerance_rad)
     if commands_rad is not None and len(moved):
         commands = np.where(np.isfinite(commands_rad), commands_rad, np.nan)
-        moved |= command_moved(*_extremes(commands, start + 1), _in_force(commands, start[:-1]))
+        moved |= _command_moved(*_extremes(commands, start + 1),
+                                _last_finite(commands)[start[:-1]])
     settings = np.zeros(len(start), int)
     settings[order[1:]] = np.cumsum(moved)
     return settings
@@ -86,20 +87,13 @@ def _extremes(values: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndar
             np.array([np.fmax.reduce(part, initial=np.nan) for part in parts]))
 
 
-def _in_force(commands: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return the last command given up to each row; NaN before the first one."""
-    given = np.flatnonzero(np.isfinite(commands))
-    values = np.concatenate([[np.nan], commands[given]])
-    return values[np.searchsorted(given, rows, 'right')]
-
-
 def _last_finite(values: np.ndarray) -> np.ndarray:
     """Replace each NaN by the last finite value before it; NaN stays where there is none."""
     last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), -1))
     return np.where(last < 0, np.nan, values[last])
 
 
-def mean_of_finite(values: np.ndarray) -> float:
+def _mean_of_finite(values: np.ndarray) -> float:
     """Return the mean of the finite values; NaN without any."""
     finite = values[np.isfinite(values)]
     return float(finite.mean()) if finite.size else float('nan')
@@ -107,15 +101,17 @@ def mean_of_finite(values: np.ndarray) -> float:
 
 class SettingTracker:
     """
-    Numbers the settings of alpha and beta while a sweep runs.
+    Numbers the settings of alpha and beta while a sweep runs, after those of its earlier poses.
 
     Memory is bounded: since the last pose, readings older than the newest 20 000 are reduced to
     their extremes.
     """
 
-    def __init__(self, tolerance_rad: float, highest: tuple[int, int] = (-1, -1)) -> None:
+    def __init__(self, tolerance_rad: float, taken: Sequence[PoseRecord] = ()) -> None:
         self._tolerance_rad = tolerance_rad
-        self._settings = np.array(highest)
+        numbers = [[-1 if number is None else number for number in (
+            record.alpha_setting, record.beta_setting)] for record in taken]
+        self._settings = np.max([[-1, -1], *numbers], axis=0)
         self._mean_rad = np.full(2, np.nan)
         self._readings, self._commands = _Window(), _Window()
         self._unseen = True
@@ -146,10 +142,10 @@ class SettingTracker:
         """Return the numbers of the settings of alpha and beta in the next pose."""
         middle_ns, mean = (start_ns + stop_ns) // 2, np.array([alpha_rad, beta_rad])
         low, high = self._readings.extremes(middle_ns)
-        moved = encoder_moved(np.fmin(low, mean), np.fmax(high, mean), self._mean_rad,
-                              self._tolerance_rad)
-        moved |= command_moved(*self._commands.extremes(start_ns),
-                               np.array(self._commands.before))
+        moved = _encoder_moved(np.fmin(low, mean), np.fmax(high, mean), self._mean_rad,
+                               self._tolerance_rad)
+        moved |= _command_moved(*self._commands.extremes(start_ns),
+                                np.array(self._commands.before))
         alpha, beta = self._settings + (moved | self._unseen)
         return int(alpha), int(beta)
 
@@ -174,11 +170,7 @@ class _Window:
         self._older = np.full((2, 2), np.nan)
 
     def add(self, stamp_ns: int, angles_rad: tuple[float, ...]) -> None:
-        """
-        Append angles.
-
-        angles_rad: angles of both joints, rad, (2,).
-        """
+        """Append the angles of both joints, rad, (2,)."""
         self.newest = angles_rad
         self._recent.append((stamp_ns, angles_rad))
         if len(self._recent) > _MAX_READINGS:
@@ -210,13 +202,12 @@ _MIN_SAMPLES = 0.9
 """Smallest share of the samples of a pose in the journal that its recording must have."""
 
 
-def named_rests(recording: Recording, records: Sequence[PoseRecord]) -> list[Rest]:
+def _named_rests(recording: Recording, records: Sequence[PoseRecord]) -> list[Rest]:
     """Find the rows of the rests that a journal names by their first and last stamp."""
-    stamps = recording.stamp_ns
-    rests = []
+    rests, stamps_ns = [], recording.stamp_ns
     for number, record in enumerate(records, 1):
-        start = int(np.searchsorted(stamps, record.start_ns, 'left'))
-        stop = int(np.searchsorted(stamps, record.stop_ns, 'right'))
+        start = int(np.searchsorted(stamps_ns, record.start_ns, 'left'))
+        stop = int(np.searchsorted(stamps_ns, record.stop_ns, 'right'))
         if stop - start < _MIN_SAMPLES * record.samples:
             raise UserError(f'{recording.path}: has {stop - start} samples between the stamps of '
                             f'pose {number} of the journal, which has {record.samples}; give '
@@ -230,79 +221,57 @@ def extract_poses(recording: Recording, sensor: Sensor,
                   records: Sequence[PoseRecord] | None = None) -> Poses:
     """Find the rests of a recording, or take those of a journal, and average each."""
     volts, angles = recording.volts(sensor), recording.stage_angles
-    noise = datasheet_noise(sensor)
     if records is None:
         finder = recording_finder(sensor, angles is not None)
         finder.feed(recording.time_s, volts, angles)
         rests = finder.rests()
     else:
-        rests = named_rests(recording, records)
+        rests = _named_rests(recording, records)
     if not rests:
         raise UserError(f'{recording.path}: the sensor is nowhere at rest; hold it still for at '
                         'least 1 s in each pose')
-    mean, std = rest_means(recording.time_s, volts, rests, sensor.rate_hz, noise)
+
+    def means(values: np.ndarray | None) -> np.ndarray:
+        return np.array([np.nan if values is None else
+                         _mean_of_finite(values[rest.start:rest.stop]) for rest in rests])
+
+    def settings(joint: str) -> np.ndarray:
+        numbers = [getattr(record, f'{joint}_setting') for record in records or ()]
+        if records is not None and None not in numbers:
+            return np.array(numbers)
+        readings, commands = (recording.columns.get(name)
+                              for name in (JOINTS[joint], COMMANDS[joint]))
+        if readings is None and commands is None:
+            return None  # type: ignore[return-value]  # `Poses` numbers them by the angles
+        return recorded_settings(np.array([[rest.start, rest.stop] for rest in rests]), readings,
+                                 commands, angle_tolerance_rad(sensor))
+
+    mean, std = rest_means(recording.time_s, volts, rests, sensor.rate_hz,
+                           datasheet_noise(sensor))
     if records is None:
-        pose_angles = _rest_angles(angles, rests)
+        alpha_rad, beta_rad = (means(None if angles is None else angles[:, joint])
+                               for joint in range(2))
         check = np.zeros(len(rests), bool)
     else:
-        pose_angles = np.array([[record.alpha_rad, record.beta_rad] for record in records])
+        alpha_rad, beta_rad = (np.array([getattr(record, name) for record in records])
+                               for name in ('alpha_rad', 'beta_rad'))
         check = np.array([record.check for record in records], bool)
     return Poses(
-        volts=mean, std_v=std, alpha_rad=pose_angles[:, 0], beta_rad=pose_angles[:, 1],
+        volts=mean, std_v=std, alpha_rad=alpha_rad, beta_rad=beta_rad,
         time_s=np.array([[rest.time_start_s, rest.time_stop_s] for rest in rests]), check=check,
-        temperature_c=_rest_means(recording.columns.get('temperature_c'), rests),
-        supply_v=_rest_means(recording.columns.get('supply_v'), rests),
-        alpha_setting=_settings(recording, sensor, rests, 'alpha', records),
-        beta_setting=_settings(recording, sensor, rests, 'beta', records))
-
-
-def _settings(recording: Recording, sensor: Sensor, rests: Sequence[Rest], joint: str,
-              records: Sequence[PoseRecord] | None) -> np.ndarray:
-    """
-    Return the settings of a joint, (k,), by the journal, else by its encoder and commands.
-
-    Without encoder and commands the result is None, and `Poses` numbers the settings by the
-    angles.
-    """
-    name = f'{joint}_setting'
-    if records is not None and all(getattr(record, name) is not None for record in records):
-        return np.array([getattr(record, name) for record in records])
-    readings, commands = (recording.columns.get(name) for name in (JOINTS[joint], COMMANDS[joint]))
-    if readings is None and commands is None:
-        return None  # type: ignore[return-value]
-    return recorded_settings(
-        np.array([[rest.start, rest.stop] for rest in rests]), readings, commands,
-        angle_tolerance_rad(sensor))
-
-
-def _rest_angles(angles: np.ndarray | None, rests: Sequence[Rest]) -> np.ndarray:
-    """Average the encoder over each rest, rad, (k, 2); NaN without a stage."""
-    if angles is None:
-        return np.full((len(rests), 2), np.nan)
-    return np.column_stack([_rest_means(angles[:, joint], rests) for joint in range(2)])
-
-
-def _rest_means(values: np.ndarray | None, rests: Sequence[Rest]) -> np.ndarray:
-    """Average the finite values of each rest, (k,); NaN where there are none."""
-    if values is None:
-        return np.full(len(rests), np.nan)
-    return np.array([mean_of_finite(values[rest.start:rest.stop])
-                     for rest in rests])
+        temperature_c=means(recording.columns.get('temperature_c')),
+        supply_v=means(recording.columns.get('supply_v')),
+        alpha_setting=settings('alpha'), beta_setting=settings('beta'))
 
 
 def estimate_filters(recording: Recording, sensor: Sensor, poses: Poses
                      ) -> list[recorded_sensor.FilterNoise | None]:
     """Estimate the output filter of each axis from the noise of the poses."""
-    volts = recording.volts(sensor)
-    first, last = np.searchsorted(recording.time_s, poses.time_s.T)
-    gapless = []
-    for begin, end in zip(first, last):
+    volts, gapless = recording.volts(sensor), []
+    for begin, end in zip(*np.searchsorted(recording.time_s, poses.time_s.T)):
         steps_s = np.diff(recording.time_s[begin:end + 1])
         if steps_s.size and steps_s.max() * sensor.rate_hz < _MAX_PERIODS:
             gapless.append(volts[begin:end + 1])
-    filters = []
-    for d in range(len(sensor.axes)):
-        rests = [rest[:, d] for rest in gapless]
-        filters.append(recorded_sensor.estimate_filter(
-            rests, sensor.rate_hz, sensor.rc_s, sensor.lsb_v))
-    return filters
+    return [recorded_sensor.estimate_filter([rest[:, d] for rest in gapless], sensor.rate_hz,
+                                            sensor.rc_s, sensor.lsb_v)
+            for d in range(len(sensor.axes))]

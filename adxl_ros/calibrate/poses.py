@@ -3,7 +3,8 @@
 """
 Poses: mean output at rest with the angles of the stage's encoder.
 
-- Poses whose angles a table states, and poses without angles.
+- What a unit reads in them: predicted volts and their derivatives.
+- Angles that a table states.
 """
 
 from __future__ import annotations
@@ -14,13 +15,19 @@ from dataclasses import dataclass, fields, replace
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.files.tables import PoseTable
+from adxl_ros.model import signal_chain
+from adxl_ros.model.coefficients import get, parameter_of, put
 from adxl_ros.model.constants import AXES
-from adxl_ros.model.effects.base import Components, Environment, NOMINAL_ENVIRONMENT, Value
-from adxl_ros.model.kinematics import specific_force
+from adxl_ros.model.effects import base
+from adxl_ros.model.effects.base import Coefficient, Components, Environment, NOMINAL_ENVIRONMENT
+from adxl_ros.model.kinematics import specific_force, UPRIGHT
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.recorded_sensor import CERTAIN_CORRELATION, find_polarity_fault
 from adxl_ros.signals.rest_detection import SAME_ANGLE_RAD
 import numpy as np
+
+_SAME_PLANE_RAD = np.radians(1.0)
+"""Largest difference of neighbouring angles alpha in one plane, rad."""
 
 
 @dataclass(frozen=True)
@@ -83,18 +90,30 @@ class Poses:
         def column(name: str) -> np.ndarray:
             return np.array([getattr(record, name) for record in records])
 
-        def settings(name: str) -> np.ndarray:
-            return np.array([-1 if getattr(record, name) is None else getattr(record, name)
-                             for record in records], int)
-
-        stamps_ns = np.array([[record.start_ns, record.stop_ns] for record in records])
-        check = np.array([record.check for record in records], bool)
+        stamps_ns = np.column_stack([column('start_ns'), column('stop_ns')])
         poses = Poses(column('mean_v'), column('std_v'), column('alpha_rad'), column('beta_rad'),
-                      stamps_ns * 1e-9, check, column('temperature_c'), column('supply_v'))
-        # Journals of earlier versions have no numbers of settings.
-        numbers = {name: _with_missing(settings(name), getattr(poses, name))
-                   for name in ('alpha_setting', 'beta_setting')}
+                      stamps_ns * 1e-9, column('check').astype(bool), column('temperature_c'),
+                      column('supply_v'))
+        # Poses of earlier versions have no numbers of settings: they get those by the angles.
+        numbers = {}
+        for name in ('alpha_setting', 'beta_setting'):
+            by_angle = getattr(poses, name)
+            given = np.array([-1 if number is None else number for number in column(name)], int)
+            missing = given < 0
+            first = by_angle.max() + 1 if missing.any() else 0
+            numbers[name] = np.where(missing, by_angle, given + first)
         return replace(poses, **numbers)
+
+    @staticmethod
+    def joined(parts: Sequence[Poses]) -> Poses:
+        """Join the poses of several recordings of one unit, each with settings of its own."""
+        joined = {field.name: np.concatenate([getattr(part, field.name) for part in parts])
+                  for field in fields(Poses)}
+        for name in ('alpha_setting', 'beta_setting'):
+            settings = [getattr(part, name) for part in parts]
+            first = np.cumsum([0, *(int(n.max(initial=-1)) + 1 for n in settings[:-1])])
+            joined[name] = np.concatenate([numbers + f for numbers, f in zip(settings, first)])
+        return Poses(**joined)
 
     def subset(self, chosen: np.ndarray) -> Poses:
         """Select poses by mask or by index."""
@@ -103,24 +122,15 @@ class Poses:
     @property
     def environment(self) -> Environment:
         """Return temperature and supply of each rest; nominal ones where not measured."""
-        return NOMINAL_ENVIRONMENT._replace(
-            temperature_c=_finite_or(self.temperature_c, NOMINAL_ENVIRONMENT.temperature_c),
-            supply_v=_finite_or(self.supply_v, NOMINAL_ENVIRONMENT.supply_v))
+        measured = {name: getattr(self, name) for name in ('temperature_c', 'supply_v')}
+        return NOMINAL_ENVIRONMENT._replace(**{
+            name: np.where(np.isfinite(values), values, getattr(NOMINAL_ENVIRONMENT, name))
+            for name, values in measured.items()})
 
-
-def join_poses(parts: list[Poses]) -> Poses:
-    """Join the poses of several recordings of one unit; each recording has settings of its own."""
-    joined = {field.name: np.concatenate([getattr(part, field.name) for part in parts])
-              for field in fields(Poses)}
-    for name in ('alpha_setting', 'beta_setting'):
-        first = 0
-        numbers = []
-        for part in parts:
-            setting = getattr(part, name)
-            numbers.append(setting + first)
-            first += int(setting.max(initial=-1)) + 1
-        joined[name] = np.concatenate(numbers)
-    return Poses(**joined)
+    @property
+    def has_angles(self) -> np.ndarray:
+        """Return which poses have both angles, (k,) bool."""
+        return np.isfinite(self.alpha_rad) & np.isfinite(self.beta_rad)
 
 
 def _settings_by_angle(angle_rad: np.ndarray, start_s: np.ndarray) -> np.ndarray:
@@ -131,14 +141,11 @@ def _settings_by_angle(angle_rad: np.ndarray, start_s: np.ndarray) -> np.ndarray
     return settings
 
 
-def _with_missing(numbers: np.ndarray, default: np.ndarray) -> np.ndarray:
-    """Replace negative numbers of settings by numbers that no other pose has, (k,) int."""
-    missing = numbers < 0
-    return np.where(missing, default, numbers + default.max() + 1) if missing.any() else numbers
-
-
-def _finite_or(values: np.ndarray, default: Value) -> np.ndarray:
-    return np.where(np.isfinite(values), values, default)
+def planes(alpha_rad: np.ndarray) -> list[np.ndarray]:
+    """Group poses by plane: indices of those whose alpha agree within 1°."""
+    order = np.argsort(alpha_rad, kind='stable')
+    cuts = np.flatnonzero(np.diff(alpha_rad[order]) > _SAME_PLANE_RAD) + 1
+    return np.split(order, cuts)
 
 
 def reference_force(poses: Poses, gravity_mps2: float) -> Components:
@@ -170,38 +177,85 @@ noted by hand is not exact)."""
 
 
 def with_table_angles(poses: Poses, table: PoseTable, epoch_ns: int) -> Poses:
-    """Give rests the angles of a table."""
-    if table.span_s is None:
-        if len(table.angles_rad) != len(poses):
-            raise UserError(
-                f'{table.path}: has {len(table.angles_rad)} poses, but the recording has '
-                f'{len(poses)} rests, which begin at {_starts(poses)}; write a row for each rest '
-                '(with empty angles where they are not known), or add the columns start_s and '
-                'stop_s')
-        angles = table.angles_rad
-    else:
-        angles = _by_time(poses, table, table.span_s - epoch_ns * 1e-9)
+    """Give rests the angles of a table, by the times of its poses or in their order."""
+    starts = ', '.join(f'{start_s:.1f}' for start_s in poses.time_s[:, 0]) + ' s'
+    angles = table.angles_rad
+    if table.span_s is None and len(angles) != len(poses):
+        raise UserError(
+            f'{table.path}: has {len(angles)} poses, but the recording has {len(poses)} rests, '
+            f'which begin at {starts}; write a row for each rest (with empty angles where they '
+            'are not known), or add the columns start_s and stop_s')
+    if table.span_s is not None:
+        angles, length_s = np.full((len(poses), 2), np.nan), np.diff(poses.time_s, axis=1)[:, 0]
+        begin_s, end_s = poses.time_s.T
+        for (start_s, stop_s), pose in zip(table.span_s - epoch_ns * 1e-9, table.angles_rad):
+            shared_s = np.minimum(end_s, stop_s) - np.maximum(begin_s, start_s)
+            angles[shared_s >= _SHARE * length_s * (stop_s > start_s)] = pose
         if np.isnan(angles).any(axis=1).all():
             raise UserError(f'{table.path}: no pose lies at a rest of the recording; the rests '
-                            f'begin at {_starts(poses)}')
+                            f'begin at {starts}')
     return Poses(poses.volts, poses.std_v, angles[:, 0], angles[:, 1], poses.time_s, poses.check,
                  poses.temperature_c, poses.supply_v)
 
 
-def _by_time(poses: Poses, table: PoseTable, span_s: np.ndarray) -> np.ndarray:
-    """Return the angles of each rest, (k, 2), by the times of the poses."""
-    angles = np.full((len(poses), 2), np.nan)
-    for (start_s, stop_s), pose in zip(span_s, table.angles_rad):
-        shared_s = np.minimum(poses.time_s[:, 1], stop_s) - np.maximum(poses.time_s[:, 0], start_s)
-        length_s = np.diff(poses.time_s, axis=1)[:, 0] if stop_s > start_s else 0.0
-        angles[shared_s >= _SHARE * length_s] = pose
-    return angles
+_ANGLE_STEP_RAD = 1e-4
+"""Step of the central differences by an angle, rad. Chosen: the chain is smooth, so that the error
+of the slope, of order step², is far below the noise."""
+_COEFFICIENT_STEP = 1e-3
+"""Step of the central differences by a coefficient, in typical sizes. Chosen: the chain is nearly
+linear over a thousandth of a typical size."""
 
 
-def _starts(poses: Poses) -> str:
-    return ', '.join(f'{start_s:.1f}' for start_s in poses.time_s[:, 0]) + ' s'
+def predicted_volts(unit: Sensor, poses: Poses, shift_rad: tuple[float, float] = (0.0, 0.0)
+                    ) -> np.ndarray:
+    """
+    Predict the mean output of a unit in poses.
+
+    returns: volts, (k, m).
+    """
+    force = stage_force(unit, poses.alpha_rad + shift_rad[0], poses.beta_rad + shift_rad[1])
+    return np.column_stack(signal_chain.static_response(unit)(force, poses.environment))
 
 
-def has_angles(poses: Poses) -> np.ndarray:
-    """Return which poses have both angles, (k,) bool."""
-    return np.isfinite(poses.alpha_rad) & np.isfinite(poses.beta_rad)
+def stage_force(unit: Sensor, alpha_rad: np.ndarray, beta_rad: np.ndarray) -> Components:
+    """
+    Return the specific force at rest on a stage with the stage effects of a unit.
+
+    alpha_rad, beta_rad: angles of the encoder, rad, (k,); returns: three components in the case
+    frame, m/s², (k,).
+    """
+    signals = base.Signals(
+        NOMINAL_ENVIRONMENT, alpha=base.Joint(alpha_rad), beta=base.Joint(beta_rad),
+        up=list(UPRIGHT), gravity_mps2=unit.local_gravity_mps2)
+    signal_chain.Chain(unit)(base.Place.STAGE, signals)
+    return specific_force(signals.alpha.position, signals.beta.position, signals.gravity_mps2,
+                          0.0, signals.up)
+
+
+def angle_jacobian(unit: Sensor, poses: Poses) -> np.ndarray:
+    """
+    Differentiate the predicted volts by alpha and beta.
+
+    returns: jacobian, V/rad, (k, m, 2).
+    """
+    def slope(alpha_rad: float, beta_rad: float) -> np.ndarray:
+        above = predicted_volts(unit, poses, (alpha_rad, beta_rad))
+        below = predicted_volts(unit, poses, (-alpha_rad, -beta_rad))
+        return (above - below) / (2 * _ANGLE_STEP_RAD)
+
+    return np.stack([slope(_ANGLE_STEP_RAD, 0.0), slope(0.0, _ANGLE_STEP_RAD)], axis=2)
+
+
+def coefficient_jacobian(unit: Sensor, poses: Poses, names: Sequence[Coefficient]) -> np.ndarray:
+    """
+    Differentiate the predicted volts by coefficients.
+
+    names: coefficients, (p,); returns: jacobian, V per unit of the coefficient, (k, m, p).
+    """
+    def slope(name: Coefficient) -> np.ndarray:
+        value, step = get(unit, [name]), _COEFFICIENT_STEP * parameter_of(name).scale
+        above = predicted_volts(put(unit, [name], value + step), poses)
+        below = predicted_volts(put(unit, [name], value - step), poses)
+        return (above - below) / (2 * step)
+
+    return np.stack([slope(name) for name in names], axis=2)

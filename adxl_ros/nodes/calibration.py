@@ -167,7 +167,7 @@ class Calibration(Node):
         self._controller = controller.Controller(
             settings, sensor, controller.Resume(own.resume), self._samples, self, anonymous)
         if own.autostart:
-            self._controller.wait_for_sensor()
+            self._controller.start()
         self._connect()
         self._has_run = False
         self._idle_since_ns: int | None = None
@@ -186,7 +186,8 @@ class Calibration(Node):
 
     def close(self) -> None:
         """Close the journal and the screen."""
-        self._controller.close()
+        if self._controller.session is not None:
+            self._controller.session.journal.close()
         self._display.close()
 
     def _connect(self) -> None:
@@ -198,17 +199,18 @@ class Calibration(Node):
             self._stage = topics.Inbox(self, JointState, 'stage/joint_states', _STAGE_QUEUE)
             topics.create_subscription(self, JointState, 'stage/command', self._on_command, _QUEUE)
         topics.create_subscription(
-            self, Temperature, 'temperature', lambda message: self._controller.read_temperature(
-                _stamp_ns(message), message.temperature), _QUEUE)
+            self, Temperature, 'temperature', lambda message: self._controller.read_quantity(
+                'temperature', _stamp_ns(message), message.temperature), _QUEUE)
         topics.create_subscription(
-            self, BatteryState, 'supply', lambda message: self._controller.read_supply(
-                _stamp_ns(message), message.voltage), _QUEUE)
+            self, BatteryState, 'supply', lambda message: self._controller.read_quantity(
+                'supply', _stamp_ns(message), message.voltage), _QUEUE)
         start = self._controller.start
         requests: dict[str, Callable[[], Answer]] = {
             'start': start, 'resume': partial(start, start_over=False),
-            'start_over': partial(start, start_over=True), 'redo': self._controller.redo,
-            'skip': self._controller.skip, 'finish': self._controller.finish,
-            'abort': self._controller.abort}
+            'start_over': partial(start, start_over=True),
+            'redo': partial(self._controller.change_pose, 'redo'),
+            'skip': partial(self._controller.change_pose, 'skip'),
+            'finish': self._controller.finish, 'abort': self._controller.abort}
         for name, request in requests.items():
             self.create_service(Trigger, f'~/{name}', self._service(request))
         # The answer comes when the pose is on disk. Until then the node must take samples.
@@ -250,14 +252,18 @@ class Calibration(Node):
         self._controller.read_sensor_info(topics.stream_info(message, 'sensor_info'))
 
     def _read_stage(self) -> None:
-        """Give the angles of the stage that have come to the controller."""
+        """Give the angles of the stage that have come to the guide."""
         for reading in topics.joint_readings(self._stage.take() if self._has_stage else ()):
             alpha_rad, beta_rad = _angles(reading.position)
-            if math.isfinite(alpha_rad) and math.isfinite(beta_rad):
-                self._controller.read_stage(reading.stamp_ns, alpha_rad, beta_rad)
+            session = self._controller.session
+            if session is not None and session.stage is not None \
+                    and math.isfinite(alpha_rad) and math.isfinite(beta_rad):
+                session.stage.read_encoder(reading.stamp_ns, alpha_rad, beta_rad)
 
     def _on_command(self, message: JointState) -> None:
-        self._controller.read_command(*_angles(dict(zip(message.name, message.position))))
+        session = self._controller.session
+        if session is not None and session.stage is not None:
+            session.stage.read_command(*_angles(dict(zip(message.name, message.position))))
 
     def _service(self, request: Callable[[], Answer]) -> Callable[..., Trigger.Response]:
         """Make the callback of a service that calls a request of the controller."""

@@ -18,7 +18,9 @@ import time
 from adxl_ros.calibrate.fits import gravity_fit, linear
 from adxl_ros.calibrate.guided import pose_plan
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.calibrate.report import acceptance, cross_validation, text_tables
+from adxl_ros.calibrate.report import acceptance, held_out as unseen
+from adxl_ros.calibrate.report.acceptance import acceptance_lines, error_table, gravity_lines
+from adxl_ros.calibrate.report.coefficients import added_effect_lines, compare, truth_table
 from adxl_ros.closed_output import ended_by_closed_output
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording, sweep_journal
@@ -222,30 +224,34 @@ def _run_sweep(folder: Path, speed: float, seed: int) -> None:
             'sweep.check_poses': _CHECK_POSES})
         poses = _show_sweep(graph, output)
     fitted = parameter_file.load(output)
-    _print('', *text_tables.error_table(_held_out_errors(sensor, fitted, poses)), '',
-           *text_tables.truth_table(text_tables.compare(fitted, truth)), '',
-           *text_tables.acceptance_lines(fitted),
-           *text_tables.added_effect_lines(text_tables.added_effects(fitted, truth)), '',
+    _print('', *error_table(_held_out_errors(sensor, fitted, poses)), '',
+           *truth_table(compare(fitted, truth)), '', *acceptance_lines(fitted),
+           *added_effect_lines(fitted, truth), '',
            *file_lines({'Page': report / 'report.html', 'Calibration': output}))
 
 
 def _draw_unit(sensor: Sensor, seed: int) -> Sensor:
-    """Draw the coefficients of a unit: 0.5 to 1.5 times a multiple of their typical values."""
+    """
+    Draw the coefficients of a unit: 0.5 to 1.5 times a multiple of their typical values.
+
+    The linear cross-axis terms are part of the misalignment, as in the fits.
+    """
     rng = np.random.default_rng(seed)
     values = {name: {p.name: np.array([
-        multiple * p.scale * rng.choice((-1, 1)) * rng.uniform(*_SPREAD) if axis in p.axes else 0.0
+        multiple * p.scale * rng.choice((-1, 1)) * rng.uniform(*_SPREAD)
+        * (p.name != 'linear') if axis in p.axes else 0.0
         for axis in sensor.axes]) for p in effect_named(name).parameters}
         for name, multiple in _UNIT_EFFECTS.items()}
     return replace(sensor, effects=tuple(_UNIT_EFFECTS), values=values)
 
 
 def _held_out_errors(nominal: Sensor, fitted: Sensor, poses: Poses
-                     ) -> list[cross_validation.HeldOutErrors]:
+                     ) -> list[unseen.HeldOutErrors]:
     """Return the errors of datasheet, linear and fitted coefficients on the check poses."""
     held_out = poses.subset(poses.check)
     models = {'nominal': nominal, 'linear': linear.fit(nominal, poses.subset(~poses.check)),
               fitted.model: fitted}
-    return [cross_validation.summarise(model, cross_validation.pose_errors(sensor, held_out))
+    return [unseen.summarise(model, unseen.pose_errors(sensor, held_out))
             for model, sensor in models.items()]
 
 

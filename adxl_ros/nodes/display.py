@@ -15,7 +15,6 @@ import termios
 from adxl_ros.calibrate.guided.controller import Controller, ControllerState, IDLE_TEXT
 from adxl_ros.calibrate.guided.guide import NextPose
 from adxl_ros.calibrate.guided.screen_contents import KeyAction, Phase, ScreenContents
-from adxl_ros.calibrate.guided.session import live_reading, Session, SessionDisplay
 from adxl_ros.nodes.jobs import executable, held_output
 from adxl_ros.nodes.topics import create_publisher, Level, Status, status_message, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -159,8 +158,6 @@ class DisplayPublisher:
         if obstacle:
             node.get_logger().info(obstacle)
         controller.may_ask = self._own_screen is not None
-        self._session: Session | None = None
-        self._display: SessionDisplay | None = None
         self._publisher = create_publisher(node, String, '~/display', 1, latched=True)
         node.create_timer(_PERIOD_S, self.update, clock=STEADY)
 
@@ -190,22 +187,17 @@ class DisplayPublisher:
             self._own_screen = None
 
     def _publish(self, phase: Phase, text: str) -> None:
-        controller, unit = self._controller, self._controller.unit
-        if controller.session is not self._session:
-            self._session = controller.session
-            self._display = SessionDisplay(self._session) if self._session else None
-        display, newest = self._display, controller.newest
-        keys = _KEYS.get(controller.state,
-                         _BY_HAND if controller.settings.operator_captures else _RUNNING)
-        live = None
-        if display is not None:
-            live = display.live()
-        elif newest is not None and unit is not None:
-            live = live_reading(newest, unit, newest.stillness())
+        controller, stream = self._controller, self._controller.stream
+        unit, session, newest = stream.unit, controller.session, stream.newest
+        keys = () if phase is Phase.FIT else _KEYS.get(
+            controller.state, _BY_HAND if controller.settings.operator_captures else _RUNNING)
+        if session is not None:
+            live = session.newest.reading(session.guide.stillness(session.newest))
+        else:
+            live = None if newest is None else newest.reading(newest.stillness())
         self._publisher.publish(String(data=ScreenContents(
             phase=phase.value, text=text, unit=f'{unit.serial} ({unit.axes})' if unit else '',
-            output=str(controller.settings.output),
-            keys=() if phase is Phase.FIT else keys, live=live,
-            progress=None if display is None else display.progress(),
-            estimate=None if display is None else display.estimate(),
+            output=str(controller.settings.output), keys=keys, live=live,
+            progress=None if session is None else session.guide.progress(),
+            estimate=None if session is None else session.estimate(),
             outcome=controller.outcome).to_json()))

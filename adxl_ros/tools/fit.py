@@ -8,11 +8,11 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from adxl_ros.calibrate import calibration, pose_extraction, thermal_calibration
+from adxl_ros.calibrate import calibration, pose_extraction
 from adxl_ros.calibrate.fits import thermal_fit
 from adxl_ros.calibrate.poses import Poses, with_table_angles
-from adxl_ros.calibrate.report import acceptance, report_html, text_tables
-from adxl_ros.calibrate.report.text_tables import errors_in_words
+from adxl_ros.calibrate.report import acceptance, page
+from adxl_ros.calibrate.report.coefficients import errors_in_words
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, population_file, sweep_journal
 from adxl_ros.files.calibration_store import sha256
@@ -40,8 +40,6 @@ _LIMITS = {
 """What limits a calibration, and what helps, by cause."""
 _WORK = {'reading': 3.2, 'fit': 3.1, 'report': 4.5}
 """Usual duration of the stages, s. Measured: a sweep of 14 minutes at 1 kHz."""
-_REPORT_FILES = ('report.html', 'calibration.png')
-"""Files of a report."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -126,16 +124,16 @@ def fit(options: argparse.Namespace) -> int:
         sha = sha256(options.recording)
         result = calibration.calibrate(unit, recordings, options.model, options.effect, sha,
                                        population) \
-            if thermal is None else thermal_calibration.calibrate(
+            if thermal is None else calibration.calibrate_thermal(
                 with_axes(base, unit.axes), thermal, Path(options.recording[0]).name, sha)
         result = replace(result, report_lines=[*result.report_lines, *measured])
         if options.report:
             show('report', 0.0)
             cli.make_folder(Path(options.report))
-            report_html.write(options.report, result, options.store)
+            page.write(options.report, result, options.store)
     result.save(options.output)
     cli.note(f'fit: {result.keep(options.store)}')
-    report = [Path(options.report) / name for name in _REPORT_FILES] if options.report else []
+    report = [Path(options.report) / name for name in page.FILES] if options.report else []
     lines = [errors_in_words(result.fitted), '', *_result_lines(result)] if thermal is None else \
         [*result.summary_lines, '']
     cli.print_end([*lines, *measured, ''], [options.output, *report], cli.command(
@@ -149,7 +147,7 @@ def _thermal_blocks(options: argparse.Namespace, read: Recording, unit: Sensor) 
     if len(options.recording) > 1 or options.model or options.journal or options.poses \
             or not options.effect or not set(options.effect) <= set(thermal_fit.EFFECTS):
         return None
-    blocks = thermal_calibration.rest_blocks(read, unit)
+    blocks = thermal_fit.rest_blocks(read, unit)
     if blocks is not None and options.report:
         raise UserError(f'--report {options.report}: a fit over temperature has no page; leave '
                         'it out')
@@ -170,14 +168,14 @@ def _result_lines(result: calibration.CalibrationResult) -> list[str]:
     fitted = result.fitted
     lines = [f'{fitted.serial}: {fitted.model} model of {len(result.inliers)} poses, '
              f'{len(fitted.covariance_names)} coefficients', '',
-             *text_tables.acceptance_lines(fitted)]
+             *acceptance.acceptance_lines(fitted)]
     if result.held_out:
         count = result.held_out[-1].pose_count
         folds = ': a fifth is left out at a time' if count >= len(result.inliers) else ''
         lines += ['', f' on {count} poses that the fit has not seen{folds}',
-                  *text_tables.error_table(result.held_out)]
+                  *acceptance.error_table(result.held_out)]
     elif result.gravity_fit is not None:
-        lines += ['', *text_tables.gravity_lines(result.gravity_fit)]
+        lines += ['', *acceptance.gravity_lines(result.gravity_fit)]
     if result.assessments:
         assessment = result.assessments[-1]
         lines += ['', *acceptance.limit_table(assessment, fitted),

@@ -5,9 +5,9 @@
 
 from dataclasses import replace
 
-from adxl_ros.calibrate import pose_response
 from adxl_ros.calibrate.fits import full_model, linearisation
-from adxl_ros.calibrate.pose_response import PoseCovariance, shared_settings, StageError
+from adxl_ros.calibrate.fits.linearisation import PoseCovariance, shared_settings, StageError
+from adxl_ros.calibrate.poses import angle_jacobian, predicted_volts
 from adxl_ros.model.coefficients import with_neutral
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def dense(slope, poses, error):
 
 def test_products_and_determinant_are_those_of_the_dense_covariance(poses):
     """Woodbury's formula equals the inverse of the dense matrix."""
-    slope = pose_response.angle_jacobian(nominal(), poses)
+    slope = angle_jacobian(nominal(), poses)
     columns = np.random.default_rng(1).normal(size=(len(poses), 2, 5))
     matrix = dense(slope, poses, ERROR)
     covariance = PoseCovariance(slope, poses, shared_settings(poses), ERROR)
@@ -50,7 +50,7 @@ def test_products_and_determinant_are_those_of_the_dense_covariance(poses):
 
 def test_predicted_errors_are_the_best_linear_estimates(poses):
     """Errors of setting and pose are those of the conditional normal distribution."""
-    slope = pose_response.angle_jacobian(nominal(), poses)
+    slope = angle_jacobian(nominal(), poses)
     residual = np.random.default_rng(2).normal(size=poses.volts.shape) * 1e-4
     covariance = PoseCovariance(slope, poses, shared_settings(poses), ERROR)
     weighted = np.linalg.solve(dense(slope, poses, ERROR), residual.ravel()).reshape(
@@ -72,6 +72,6 @@ def test_the_stated_error_counts_where_poses_do_not_determine_it(poses):
     precision = full_model.prior_precision(names)
     few = linearisation.linearised(unit, poses.subset(np.arange(4)), names, precision)
     assert few.stage_error(1e-3).total_rad == pytest.approx(1e-3, rel=1.0)
-    quiet = replace(poses, volts=pose_response.predicted_volts(unit, poses))
+    quiet = replace(poses, volts=predicted_volts(unit, poses))
     many = linearisation.linearised(unit, quiet, names, precision)
     assert many.stage_error(1e-3).total_rad < 1e-4

@@ -4,10 +4,9 @@
 
 from dataclasses import replace
 
-from adxl_ros.calibrate import pose_response
 from adxl_ros.calibrate.fits.linear import EFFECTS
 from adxl_ros.calibrate.guided.pose_plan import sweep
-from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.poses import Poses, stage_force
 from adxl_ros.files import parameter_file
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model import noise, signal_chain
@@ -61,7 +60,7 @@ def swept(rng, truth, planes_rad=PLANES_RAD, check_poses=16, noisy=True, per_set
         setting = np.cumsum(np.abs(np.diff(angle, prepend=angle[0])) > 1e-9)
         return drawn[setting] if per_setting else drawn
     joint_error = error(alpha), error(beta)
-    force = pose_response.stage_force(truth, alpha + joint_error[0], beta + joint_error[1])
+    force = stage_force(truth, alpha + joint_error[0], beta + joint_error[1])
     volts = np.column_stack(signal_chain.static_response(truth)(force))
     count = noise.effective_samples(5000, 1e-3, truth.rc_s)
     std = np.broadcast_to(noise.sample_std_v(truth) / np.sqrt(count), volts.shape)

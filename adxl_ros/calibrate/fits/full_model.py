@@ -29,21 +29,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from adxl_ros.calibrate.fits import linear, linearisation
-from adxl_ros.calibrate.fits.linearisation import Linearised, linearised
-from adxl_ros.calibrate.pose_response import (
-    angle_jacobian,
-    AngleErrors,
-    PoseCovariance,
-    predicted_volts,
-    StageError,
-)
-from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.fits.linearisation import Linearised, linearised, StageError
+from adxl_ros.calibrate.poses import angle_jacobian, Poses, predicted_volts
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Parameter, Place, Role
-from adxl_ros.model.gauss_newton import gauss_newton, halve_until, Iterate, Solution
+from adxl_ros.model.gauss_newton import gauss_newton, halve_until, Iterate
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 import scipy
@@ -178,15 +171,20 @@ def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] | None = None, m
     """
     terms = default_terms(sensor.axes) if terms is None else terms
     effects = [effect_of(term) for term in terms]
-    unit = with_neutral(_start(sensor, poses, bool(max_open)), effects)
-    unit = with_neutral(unit, ['base_tilt'])
-    problem = _Problem(poses, fitted_coefficients(unit.axes, terms),
-                       StageError(sensor.stage_std_rad))
+    try:
+        start = linear.fit(sensor, poses).without_covariance()
+    except UserError:
+        # An open coefficient may not allow a linear fit.
+        if not max_open:
+            raise
+        start = sensor
+    unit = with_neutral(with_neutral(start, effects), ['base_tilt'])
+    names, stated = fitted_coefficients(unit.axes, terms), StageError(sensor.stage_std_rad)
     fits, failure = [], None
-    for start in _starts(unit, problem, effects):
+    for start in _starts(unit, poses, names, stated, effects):
         try:
-            require_determined(start, poses, problem.names, problem.stated, max_open)
-            fits.append(_fit_from(start, problem))
+            require_determined(start, poses, names, stated, max_open)
+            fits.append(_Search(start, poses, names, stated).run())
         except UserError as error:
             failure = failure or error
     if not fits:
@@ -195,130 +193,167 @@ def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] | None = None, m
     return min(fits, key=lambda fit: fit.deviance)
 
 
-def _start(sensor: Sensor, poses: Poses, may_be_open: bool) -> Sensor:
-    """Return the linear fit; the nominal sensor where an open coefficient does not allow one."""
-    try:
-        return linear.fit(sensor, poses).without_covariance()
-    except UserError:
-        if not may_be_open:
-            raise
-        return sensor
-
-
-@dataclass(frozen=True)
-class _Problem:
-    """Poses, coefficients and stated stage error of one fit."""
-
-    poses: Poses  # The measured poses, at the angles of the encoder
-    names: tuple[Coefficient, ...]  # Coefficients to fit, (p,)
-    stated: StageError  # Stated error of the stage
-
-    @property
-    def precision(self) -> np.ndarray:
-        """Return the prior's inverse variances, (p,)."""
-        return prior_precision(self.names)
-
-    def linearised(self, unit: Sensor, poses: Poses, kept: np.ndarray | None = None
-                   ) -> Linearised:
-        """
-        Linearise poses about a unit.
-
-        kept: poses that count, (k,) bool; None for all.
-        """
-        return linearised(unit, poses, self.names, self.precision, kept)
-
-
-def _starts(unit: Sensor, problem: _Problem, effects: Sequence[str]) -> list[Sensor]:
+def _starts(unit: Sensor, poses: Poses, names: tuple[Coefficient, ...], stated: StageError,
+            effects: Sequence[str]) -> list[Sensor]:
     """
     Return the units from which a fit begins.
 
     The volts are nearly linear in all coefficients except shape parameters (periods, time
     constants). Shape parameters are searched over their range; the likeliest values are starts.
     """
+    def likeliest(effect: str, parameter: Parameter, values: np.ndarray) -> list[Sensor]:
+        """Return units with values within the bounds of a parameter, the likeliest first."""
+        of_effect = unit.values[effect]
+        shape = np.shape(of_effect[parameter.name])
+        units = [replace(unit, values={
+            **unit.values, effect: {**of_effect, parameter.name: np.full(shape, value)}})
+            for value in values if parameter.lower <= value <= parameter.upper]
+        misfit = [linearised(trial, poses, names, prior_precision(names)).misfit(stated)
+                  for trial in units]
+        return [units[i] for i in np.argsort(misfit)]
+
     starts = [unit]
-    for effect in effects:
-        if not effect_named(effect).invertible:
-            continue
+    for effect in filter(lambda name: effect_named(name).invertible, effects):
         for parameter in effect_named(effect).parameters:
             if parameter.role is not Role.SHAPE or parameter.held:
                 continue
-            shape = (effect, parameter)
-            coarse = parameter.scale * _SHAPE_STEP ** np.arange(-_SHAPE_STEPS, _SHAPE_STEPS + 1)
-            likely = _likeliest(unit, problem, shape, coarse)[:_SHAPE_STARTS]
-            fine = likely[0] * _SHAPE_STEP ** np.linspace(-1, 1, _FINE_SHAPES)
-            best = _likeliest(unit, problem, shape, fine)[0]
-            starts += [_with_shape(unit, shape, value) for value in (best, *likely[1:])]
+            steps = np.arange(-_SHAPE_STEPS, _SHAPE_STEPS + 1)
+            best, *others = likeliest(
+                effect, parameter, parameter.scale * _SHAPE_STEP ** steps)[:_SHAPE_STARTS]
+            value = float(np.ravel(best.values[effect][parameter.name])[0])
+            finer = likeliest(effect, parameter,
+                              value * _SHAPE_STEP ** np.linspace(-1, 1, _FINE_SHAPES))
+            starts += [finer[0], *others]
     return starts
 
 
-def _likeliest(unit: Sensor, problem: _Problem, shape: tuple[str, Parameter],
-               values: np.ndarray) -> list[float]:
-    """Return the values of a shape parameter that are within its bounds, the likeliest first."""
-    _, parameter = shape
-    within = values[(parameter.lower <= values) & (values <= parameter.upper)]
-    misfit = [problem.linearised(_with_shape(unit, shape, value), problem.poses)
-              .misfit(problem.stated) for value in within]
-    return [float(value) for value in within[np.argsort(misfit)]]
+class _Search:
+    """The fit from one start: stage error, coefficients and angles in turn until all converge."""
 
+    def __init__(self, unit: Sensor, poses: Poses, names: tuple[Coefficient, ...],
+                 stated: StageError) -> None:
+        self._measured, self._names, self._stated = poses, names, stated
+        self._precision = prior_precision(names)  # Inverse prior variances, (p,)
+        self._sizes = np.array([parameter_of(name).scale for name in names])
+        self._unit, self._stage = unit, stated  # Unit with coefficients, and stage error
+        # Predicted errors of the angles, and the poses turned by them; see `_turned_linearly`
+        self._errors, self._poses = linearisation.AngleErrors.zeros(len(poses)), poses
+        self._kept = np.ones(len(poses), bool)  # Poses that are no outliers
+        # Volts by which the model departs from its linearisation, (m,)
+        self._curvature_v = np.zeros(len(unit.axes))
 
-def _with_shape(unit: Sensor, shape: tuple[str, Parameter], value: float) -> Sensor:
-    """Return the unit with a value of a shape parameter, given by effect and parameter."""
-    effect, parameter = shape
-    values = unit.values[effect]
-    changed = {**values, parameter.name: np.full(np.shape(values[parameter.name]), value)}
-    return replace(unit, values={**unit.values, effect: changed})
+    def run(self) -> FullFit:
+        """Iterate until all converge."""
+        start = self._solved(self._measured, _START_STEPS)
+        self._unit = put(self._unit, self._names, start.values)
+        converged, deviance, noise_v = False, np.inf, self._measured.std_v.mean(axis=0)
+        for number in range(_MAX_ROUNDS):
+            self._estimate_stage(number)
+            step_std = self._step()
+            if np.any(self._curvature_v > _MAX_CURVATURE * noise_v):
+                continue
+            about = self._about(self._unit, self._poses)
+            kept_before, deviance_before = self._kept, deviance
+            deviance = about.deviance(self._stage)
+            self._kept = _inliers(about, self._stage)
+            converged = (np.array_equal(self._kept, kept_before) and step_std < _SETTLED_STD
+                         and abs(deviance - deviance_before) < _SETTLED_DEVIANCE)
+            if converged:
+                break
+        return self._result(converged)
+
+    def _about(self, unit: Sensor, poses: Poses) -> Linearised:
+        return linearised(unit, poses, self._names, self._precision, self._kept)
+
+    def _weighted(self) -> Poses:
+        """Return the turned poses with the curvature as further noise."""
+        return replace(self._poses, std_v=np.hypot(self._measured.std_v, self._curvature_v))
+
+    def _estimate_stage(self, number: int) -> None:
+        """Estimate the stage error of a round."""
+        for _ in range(1 if number else _FIRST_ROUND_LEVELS):
+            about = self._about(self._unit, self._weighted())
+            self._stage = about.stage_error(self._stated.total_rad, self._stage)
+            # Angle errors δ that are not predicted yet change the force by δ²/2 of g.
+            self._curvature_v = self._unit.nominal_scale_v_per_g * self._stage.total_rad ** 2 \
+                * _CURVATURE_SHRINK ** number
+
+    def _solved(self, poses: Poses, steps: int) -> _Iterate:
+        """Take Gauss-Newton steps without step control: the chain is nearly linear in them."""
+        def linearise(values: np.ndarray) -> _Iterate:
+            about = self._about(put(self._unit, self._names, values), poses)
+            covariance = about.covariance(self._stage)
+            step, information = about.solve(covariance)
+            step *= min(1.0, _MAX_STEP_SIZES / np.abs(step / self._sizes).max())
+            return _Iterate(values, step, 0.0, about, covariance, information)
+
+        return gauss_newton(
+            linearise, get(self._unit, self._names),
+            lambda _, previous, __: previous is not None and previous.step_std < _LAST_STEP_STD,
+            steps + 1).last
+
+    def _step(self) -> float:
+        """
+        Move coefficients and angles to the most likely ones, or part of the way if better.
+
+        returns: the longest component of the step in standard deviations.
+        """
+        weighted = self._weighted()
+        solved = self._solved(weighted, _ROUND_STEPS)
+        errors = solved.covariance.predicted_errors(solved.about.residual)
+        start = get(self._unit, self._names)
+
+        def attempt(share: float) -> tuple[np.ndarray, linearisation.AngleErrors]:
+            return (start + share * (solved.values - start),
+                    self._errors.interpolated(errors, share))
+
+        def cost(values: np.ndarray, angles: linearisation.AngleErrors) -> float:
+            residual = self._measured.volts - predicted_volts(
+                put(self._unit, self._names, values), _turned(self._measured, angles.total_rad))
+            return float(np.sum((residual / weighted.std_v)[self._kept] ** 2)
+                         + np.sum(self._precision * values ** 2)
+                         + solved.covariance.penalty(angles))
+
+        highest = cost(start, self._errors)
+        (values, self._errors), _, _ = halve_until(
+            attempt, lambda trial: cost(*trial) <= highest, _MAX_HALVINGS)
+        self._unit = put(self._unit, self._names, values)
+        self._poses = _turned_linearly(self._unit, self._measured, self._errors.total_rad)
+        return float(np.abs((values - start) * np.sqrt(np.diag(solved.information))).max())
+
+    def _result(self, converged: bool) -> FullFit:
+        """Return the fit, with the covariance of the sensor's coefficients."""
+        about = self._about(self._unit, self._poses)
+        over_levels = about.covariance_over_levels(self._stage, self._stated.total_rad)
+        of_sensor = [i for i, name in enumerate(self._names) if not belongs_to_stage(name)]
+        effects = tuple(effect for effect in self._unit.effects
+                        if effect_named(effect).place is not Place.STAGE)
+        fitted = replace(
+            self._unit, model='full', effects=effects,
+            values={name: self._unit.values[name] for name in effects},
+            covariance=over_levels[np.ix_(of_sensor, of_sensor)],
+            covariance_names=tuple(self._names[i] for i in of_sensor))
+        errors = about.covariance(self._stage).predicted_errors(about.residual)
+        return FullFit(
+            fitted=fitted, unit=self._unit, names=self._names, stage=self._stage,
+            stated_std_rad=self._stated.total_rad,
+            outliers=tuple(np.flatnonzero(~self._kept).tolist()),
+            information=np.linalg.inv(over_levels), squared_distances=errors.squared_distances,
+            linear_poses=self._poses, deviance=about.deviance(self._stage), converged=converged)
 
 
 @dataclass(frozen=True)
-class _State:
-    """State of the fit between two rounds."""
+class _Iterate(Iterate):
+    """An iterate with the linearised poses, their covariance, and the information, (p, p)."""
 
-    unit: Sensor  # Sensor with the coefficients
-    stage: StageError  # Standard deviations of the stage's error
-    errors: AngleErrors  # Predicted errors of the angles
-    poses: Poses  # The poses turned by these errors; see `_turned_linearly`
-    kept: np.ndarray  # Poses that are no outliers, (k,) bool
-    curvature_v: np.ndarray  # Volts by which the model departs from its linearisation, (m,)
+    about: Linearised
+    covariance: linearisation.PoseCovariance
+    information: np.ndarray
 
-
-def _fit_from(unit: Sensor, problem: _Problem) -> FullFit:
-    """Fit from a start: stage error, coefficients and angles in turn until all converge."""
-    poses = problem.poses
-    everything = np.ones(len(poses), bool)
-    start = _solved(unit, problem, poses, problem.stated, everything, _START_STEPS)
-    state = _State(put(unit, problem.names, start.last.values), problem.stated,
-                   AngleErrors.zeros(len(poses)), poses, everything, np.zeros(len(unit.axes)))
-    converged, deviance = False, np.inf
-    for number in range(_MAX_ROUNDS):
-        state, step_std = _round(state, problem, number)
-        if np.any(state.curvature_v > _MAX_CURVATURE * poses.std_v.mean(axis=0)):
-            continue
-        about = problem.linearised(state.unit, state.poses, state.kept)
-        kept_before, deviance_before = state.kept, deviance
-        deviance = about.deviance(state.stage)
-        state = replace(state, kept=_inliers(about, state.stage))
-        converged = (np.array_equal(state.kept, kept_before) and step_std < _SETTLED_STD
-                     and abs(deviance - deviance_before) < _SETTLED_DEVIANCE)
-        if converged:
-            break
-    return _result(state, problem, converged)
-
-
-def _round(state: _State, problem: _Problem, number: int) -> tuple[_State, float]:
-    """Estimate stage error, coefficients and angles; also return the step length of `_step`."""
-    stage, curvature_v = state.stage, state.curvature_v
-    for _ in range(1 if number else _FIRST_ROUND_LEVELS):
-        std_v = np.hypot(problem.poses.std_v, curvature_v)
-        about = problem.linearised(state.unit, replace(state.poses, std_v=std_v), state.kept)
-        stage = about.stage_error(problem.stated.total_rad, stage)
-        # Angle errors δ that are not predicted yet change the force by δ²/2 of g.
-        curvature_v = state.unit.nominal_scale_v_per_g * stage.total_rad ** 2 \
-            * _CURVATURE_SHRINK ** number
-    std_v = np.hypot(problem.poses.std_v, curvature_v)
-    unit, errors, step_std = _step(replace(
-        state, stage=stage, poses=replace(state.poses, std_v=std_v)), problem)
-    turned = _turned_linearly(unit, problem.poses, errors.total_rad)
-    return _State(unit, stage, errors, turned, state.kept, curvature_v), step_std
+    @property
+    def step_std(self) -> float:
+        """Return the longest component of the step in its standard deviations."""
+        return float(np.abs(self.step * np.sqrt(np.diag(self.information))).max())
 
 
 def _inliers(about: Linearised, stage: StageError) -> np.ndarray:
@@ -329,41 +364,11 @@ def _inliers(about: Linearised, stage: StageError) -> np.ndarray:
     return kept if kept.mean() >= 1 - _MAX_OUTLIERS else np.ones(len(kept), bool)
 
 
-def _result(state: _State, problem: _Problem, converged: bool) -> FullFit:
-    """Return the fit of the last state, with the covariance of the sensor's coefficients."""
-    about = problem.linearised(state.unit, state.poses, state.kept)
-    covariance = about.covariance(state.stage)
-    over_levels = about.covariance_over_levels(state.stage, problem.stated.total_rad)
-    of_sensor = [i for i, name in enumerate(problem.names) if not belongs_to_stage(name)]
-    fitted = replace(
-        _without_stage(state.unit), model='full',
-        covariance=over_levels[np.ix_(of_sensor, of_sensor)],
-        covariance_names=tuple(problem.names[i] for i in of_sensor))
-    return FullFit(
-        fitted=fitted, unit=state.unit, names=problem.names, stage=state.stage,
-        stated_std_rad=problem.stated.total_rad,
-        outliers=tuple(np.flatnonzero(~state.kept).tolist()),
-        information=np.linalg.inv(over_levels),
-        squared_distances=covariance.predicted_errors(about.residual).squared_distances,
-        linear_poses=state.poses, deviance=about.deviance(state.stage), converged=converged)
-
-
 def fitted_coefficients(axes: str, terms: Sequence[str]) -> tuple[Coefficient, ...]:
     """
-    Name the coefficients that a fit of some terms estimates.
+    Name the coefficients that a fit of some terms, effects and names of `GAUGE`, estimates.
 
-    Parameters
-    ----------
-    axes
-        Measured axes of the unit.
-    terms
-        Effects and names of `GAUGE`.
-
-    Returns
-    -------
-    tuple
-        Coefficients of the sensor, then the tilt of the base, then other errors of the stage.
-
+    returns: coefficients of the sensor, then the tilt of the base, then other errors of the stage.
     """
     effects = dict.fromkeys(map(effect_of, terms))
     names = [name for effect in effects for name in names_of(effect_named(effect), axes)
@@ -402,85 +407,12 @@ def _prior_std(name: Coefficient) -> float:
 def fisher_information(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
                        stage: StageError) -> np.ndarray:
     """
-    Return the Fisher information of poses about coefficients, priors included.
+    Return the Fisher information of poses about coefficients, priors included, (p, p).
 
     Its inverse is the Cramér-Rao bound.
-
-    Parameters
-    ----------
-    unit
-        Sensor at whose coefficients the volts are differentiated.
-    poses
-        k poses with the noise of their means, angles and settings.
-    names
-        Coefficients, (p,).
-    stage
-        Standard deviations of the stage's error.
-
-    Returns
-    -------
-    ndarray
-        Information, (p, p).
-
     """
     about = linearised(unit, poses, names, prior_precision(names))
     return about.information(about.covariance(stage))
-
-
-@dataclass(frozen=True)
-class _Iterate(Iterate):
-    """An iterate with the linearised poses, their covariance, and the information, (p, p)."""
-
-    about: Linearised
-    covariance: PoseCovariance
-    information: np.ndarray
-
-    @property
-    def step_std(self) -> float:
-        """Return the longest component of the step in its standard deviations."""
-        return float(np.abs(self.step * np.sqrt(np.diag(self.information))).max())
-
-
-def _solved(unit: Sensor, problem: _Problem, poses: Poses, stage: StageError, kept: np.ndarray,
-            steps: int) -> Solution[_Iterate]:
-    """Take Gauss-Newton steps without step control: the chain is nearly linear in them."""
-    sizes = np.array([parameter_of(name).scale for name in problem.names])
-
-    def linearise(values: np.ndarray) -> _Iterate:
-        about = problem.linearised(put(unit, problem.names, values), poses, kept)
-        covariance = about.covariance(stage)
-        step, information = about.solve(covariance)
-        step *= min(1.0, _MAX_STEP_SIZES / np.abs(step / sizes).max())
-        return _Iterate(values, step, 0.0, about, covariance, information)
-
-    return gauss_newton(
-        linearise, get(unit, problem.names),
-        lambda _, previous, __: previous is not None and previous.step_std < _LAST_STEP_STD,
-        steps + 1)
-
-
-def _step(state: _State, problem: _Problem) -> tuple[Sensor, AngleErrors, float]:
-    """Move coefficients and angles to the most likely ones, or part of the way if better."""
-    solved = _solved(state.unit, problem, state.poses, state.stage, state.kept, _ROUND_STEPS).last
-    covariance, precision = solved.covariance, problem.precision
-    errors = covariance.predicted_errors(solved.about.residual)
-    start = get(state.unit, problem.names)
-
-    def attempt(share: float) -> tuple[np.ndarray, AngleErrors]:
-        return (start + share * (solved.values - start),
-                state.errors.interpolated(errors, share))
-
-    def cost(values: np.ndarray, angles: AngleErrors) -> float:
-        residual = problem.poses.volts - predicted_volts(
-            put(state.unit, problem.names, values), _turned(problem.poses, angles.total_rad))
-        return float(np.sum((residual / state.poses.std_v)[state.kept] ** 2)
-                     + np.sum(precision * values ** 2) + covariance.penalty(angles))
-
-    highest = cost(start, state.errors)
-    (values, angles), _, _ = halve_until(
-        attempt, lambda trial: cost(*trial) <= highest, _MAX_HALVINGS)
-    step_std = np.abs((values - start) * np.sqrt(np.diag(solved.information))).max()
-    return put(state.unit, problem.names, values), angles, float(step_std)
 
 
 def _turned(poses: Poses, errors_rad: np.ndarray) -> Poses:
@@ -505,33 +437,12 @@ def belongs_to_stage(name: Coefficient) -> bool:
     return effect_named(name.effect).place is Place.STAGE
 
 
-def _without_stage(unit: Sensor) -> Sensor:
-    effects = tuple(effect for effect in unit.effects
-                    if effect_named(effect).place is not Place.STAGE)
-    return replace(unit, effects=effects, values={name: unit.values[name] for name in effects})
-
-
 def open_coefficients(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
                       stage: StageError) -> list[Coefficient]:
     """
     Return the coefficients that poses leave as uncertain as their typical size.
 
-    Parameters
-    ----------
-    unit
-        Sensor at whose coefficients the volts are differentiated.
-    poses
-        k poses with the noise of their means, angles and settings.
-    names
-        Coefficients, (p,).
-    stage
-        Standard deviations of the stage's error.
-
-    Returns
-    -------
-    list
-        The open ones; errors of the stage and terms for which the prior suffices are never open.
-
+    Errors of the stage and terms for which the prior suffices are never open.
     """
     scale = np.array([parameter_of(name).scale for name in names])
     required = [not belongs_to_stage(name) and term_of(name) not in (*GAUGE, *_PRIOR_SUFFICES)
@@ -547,22 +458,7 @@ def open_coefficients(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
 
 def require_determined(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
                        stage: StageError, max_open: int = 0) -> None:
-    """
-    Refuse poses that leave coefficients open.
-
-    Parameters
-    ----------
-    unit, poses, names, stage
-        As for `open_coefficients`.
-    max_open
-        Largest number of open coefficients.
-
-    Raises
-    ------
-    UserError
-        The message names the coefficients and poses that would determine them.
-
-    """
+    """Refuse poses that leave more coefficients open; the message names poses that help."""
     undetermined = open_coefficients(unit, poses, names, stage)
     if len(undetermined) <= max_open and poses.volts.size > len(names) - max_open:
         return
@@ -577,30 +473,11 @@ def require_determined(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
 def next_poses(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError,
                count: int = 4) -> list[tuple[float, float]]:
     """
-    Choose the poses that would help most, one by one.
+    Choose the poses that would help most, one by one: alpha and beta of each, rad.
 
     Each pose is the one of a 15° grid that shrinks the joint confidence region of all
     coefficients the most, in units of their typical size (D-optimality; Fedorov 1972). Each is a
     new setting of both joints.
-
-    Parameters
-    ----------
-    unit
-        Sensor at whose coefficients the volts are differentiated.
-    poses
-        The poses so far.
-    names
-        Coefficients, (p,).
-    stage
-        Standard deviations of the stage's error.
-    count
-        Number of poses to choose.
-
-    Returns
-    -------
-    list
-        Alpha and beta of each pose, rad.
-
     """
     grid = linearisation.candidate_poses(np.median(poses.std_v, axis=0))
     scale = np.array([parameter_of(name).scale for name in names])

@@ -16,22 +16,8 @@ from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
 
-from adxl_ros.calibrate.fits.gravity_model import (
-    effect_values,
-    fisher_information,
-    linearised,
-    magnitude,
-    magnitude_jacobian,
-    magnitude_variance,
-    NAMES,
-    nominal_rests,
-    NominalRests,
-    posterior_information,
-    regularised_fit,
-    rests_to_add,
-    TRIAL_STD_G,
-    undetermined,
-)
+from adxl_ros.calibrate.fits import gravity_model
+from adxl_ros.calibrate.fits.gravity_model import magnitude_variance, NAMES, NominalRests
 from adxl_ros.errors import UserError
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
@@ -144,21 +130,27 @@ def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor,
         coefficients and rests to add.
 
     """
-    rests = nominal_rests(mean_v, std_v, sensor)
-    nominal = np.zeros(len(NAMES))
-    _require_determined(rests, nominal, 0.0)
-    fit = _subset_fits(rests, nominal)
-    kept = _inliers(rests, nominal, fit)
+    rests = gravity_model.nominal_rests(mean_v, std_v, sensor)
+    _require_determined(rests, np.zeros(len(NAMES)), 0.0)
+    fits = cache(lambda mask: _fit(rests[np.frombuffer(mask, bool)]))
+
+    def fit(kept: np.ndarray) -> _Estimate:
+        """Fit the rests of a mask, (k,) bool, once for each mask."""
+        return fits(kept.tobytes())
+
+    kept = _inliers(rests, fit)
     parameters, excess_g2, converged = fit(kept)
     _require_determined(rests[kept], parameters, excess_g2)
     variance = magnitude_variance(rests, parameters) + excess_g2
-    covariance = np.linalg.inv(fisher_information(rests[kept], parameters, excess_g2))
-    covariance *= _t_factor(excess_g2, variance[kept])
-    effects = effect_values(parameters, sensor)
+    covariance = np.linalg.inv(
+        gravity_model.fisher_information(rests[kept], parameters, excess_g2))
+    # An excess that ν rests determine widens its share of the variance by ν/(ν − 2).
+    covariance *= 1 + excess_g2 / variance[kept].mean() * 2 / max(
+        kept.sum() - len(NAMES) - 2, 1)
+    values, units = gravity_model.effect_values(parameters, sensor)
     residual = _residual(rests, parameters)
     return GravityFit(
-        values=effects.values,
-        covariance=covariance * np.outer(effects.units, effects.units),
+        values=values, covariance=covariance * np.outer(units, units),
         before_mps2=G0_MPS2 * (np.linalg.norm(rests.mean, axis=1) - rests.gravity_g),
         residual_mps2=G0_MPS2 * residual,
         held_out_mps2=G0_MPS2 * _held_out(rests, kept, parameters, variance, residual, stretches),
@@ -170,7 +162,7 @@ def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor,
 
 def _residual(rests: NominalRests, parameters: np.ndarray) -> np.ndarray:
     """Return magnitude minus local gravity, g, (k,), or (s, k) for s sets of parameters."""
-    return magnitude(rests.mean, parameters) - rests.gravity_g
+    return gravity_model.magnitude(rests.mean, parameters) - rests.gravity_g
 
 
 def _solve(rests: NominalRests, start: np.ndarray, variance: np.ndarray
@@ -180,36 +172,28 @@ def _solve(rests: NominalRests, start: np.ndarray, variance: np.ndarray
     # `least_squares` calls the same routine of MINPACK, and takes twice the time around it.
     parameters, _, _, _, status = scipy.optimize.leastsq(
         lambda p: _residual(rests, p) / std, start,
-        Dfun=lambda p: magnitude_jacobian(rests.mean, p) / std[:, None],
+        Dfun=lambda p: gravity_model.magnitude_jacobian(rests.mean, p) / std[:, None],
         full_output=True, xtol=_TOLERANCE, ftol=_TOLERANCE, gtol=_TOLERANCE, diag=_UNSCALED)
     return parameters, status in _CONVERGED
 
 
-def _fit(rests: NominalRests, start: np.ndarray) -> _Estimate:
+def _fit(rests: NominalRests) -> _Estimate:
     """Fit the parameters, and the excess variance that makes χ² equal its degrees of freedom."""
-    parameters, excess_g2 = start, 0.0
+    parameters, excess_g2 = np.zeros(len(NAMES)), 0.0
     freedom = len(rests.mean) - len(NAMES)
     for number in range(_MAX_ROUNDS):
         variance = magnitude_variance(rests, parameters)
-        solve = _solve_nearby if number else _solve
-        parameters, solved = solve(rests, parameters, variance + excess_g2)
+        start, converged, weights = parameters, False, 1 / (variance + excess_g2)
+        if number:
+            # Near the solution plain Gauss-Newton steps suffice.
+            (parameters,), (converged,) = _nearby(rests, start[None], weights[None])
+        if not converged:
+            parameters, converged = _solve(rests, start, 1 / weights)
         squares = _residual(rests, parameters) ** 2
         before_g2, excess_g2 = excess_g2, _excess(squares, variance, freedom)
         if abs(excess_g2 - before_g2) <= _EXCESS_TOLERANCE * (excess_g2 + variance.min()):
-            return _Estimate(parameters, excess_g2, solved)
+            return _Estimate(parameters, excess_g2, bool(converged))
     return _Estimate(parameters, excess_g2, False)
-
-
-def _subset_fits(rests: NominalRests, start: np.ndarray) -> Callable[[np.ndarray], _Estimate]:
-    """Return a function that fits the rests of a mask, (k,) bool, once for each mask."""
-    @cache
-    def fit(mask: bytes) -> _Estimate:
-        return _fit(rests[np.frombuffer(mask, bool)], start)
-
-    def fit_kept(kept: np.ndarray) -> _Estimate:
-        return fit(kept.tobytes())
-
-    return fit_kept
 
 
 def _excess(squares: np.ndarray, variance: np.ndarray, freedom: int) -> float:
@@ -222,15 +206,7 @@ def _excess(squares: np.ndarray, variance: np.ndarray, freedom: int) -> float:
                                        xtol=1e-30))
 
 
-def _t_factor(excess_g2: float, variance: np.ndarray) -> float:
-    """Return the factor of the covariance for an excess that ν rests determine: ν/(ν − 2)."""
-    # The factor applies only to the share of the excess in the variance.
-    freedom = len(variance) - len(NAMES)
-    return 1 + excess_g2 / variance.mean() * 2 / max(freedom - 2, 1)
-
-
-def _inliers(rests: NominalRests, start: np.ndarray, fit: Callable[[np.ndarray], _Estimate]
-             ) -> np.ndarray:
+def _inliers(rests: NominalRests, fit: Callable[[np.ndarray], _Estimate]) -> np.ndarray:
     """
     Mark the rests that fit the others, (k,) bool.
 
@@ -244,7 +220,7 @@ def _inliers(rests: NominalRests, start: np.ndarray, fit: Callable[[np.ndarray],
     if max_outliers < 1:
         return everything
     results = [_exchanged(rests, begin, fit, max_outliers)
-               for begin in (everything, _robust_inliers(rests, start, max_outliers))]
+               for begin in (everything, _robust_inliers(rests, max_outliers))]
     return min(results, key=lambda kept: _negative_log_likelihood(rests, kept, fit))
 
 
@@ -279,7 +255,7 @@ def _negative_log_likelihood(rests: NominalRests, kept: np.ndarray,
                  + outliers * np.log(_OUTLIER_RANGE_G) + log_choices)
 
 
-def _robust_inliers(rests: NominalRests, start: np.ndarray, max_outliers: int) -> np.ndarray:
+def _robust_inliers(rests: NominalRests, max_outliers: int) -> np.ndarray:
     """
     Mark the rests that are near the best fit to all but `max_outliers` rests, (k,) bool.
 
@@ -289,8 +265,9 @@ def _robust_inliers(rests: NominalRests, start: np.ndarray, max_outliers: int) -
     count = len(rests.mean)
     rng = np.random.default_rng(0)
     few = np.array([rng.choice(count, MIN_RESTS, replace=False) for _ in range(_LTS_STARTS)])
-    parameters = regularised_fit(rests[few], np.tile(start, (_LTS_STARTS, 1)), _LTS_FIRST_STEPS)
-    parameters = regularised_fit(rests, parameters, _LTS_STEPS, count - max_outliers)
+    parameters = gravity_model.regularised_fit(
+        rests[few], np.zeros((_LTS_STARTS, len(NAMES))), _LTS_FIRST_STEPS)
+    parameters = gravity_model.regularised_fit(rests, parameters, _LTS_STEPS, count - max_outliers)
     squares = np.sort(_residual(rests, parameters) ** 2, axis=1)
     trimmed_sums = np.nan_to_num(squares[:, :count - max_outliers].sum(axis=1), nan=np.inf)
     best = parameters[trimmed_sums.argmin()]
@@ -303,8 +280,9 @@ def _studentised(rests: NominalRests, kept: np.ndarray, estimate: _Estimate) -> 
     """Return the distance of each rest from the fit to the others by its std, (k,)."""
     parameters, excess_g2, _ = estimate
     variance = magnitude_variance(rests, parameters) + excess_g2
-    covariance = np.linalg.inv(posterior_information(rests[kept], parameters, excess_g2))
-    jacobian = magnitude_jacobian(rests.mean, parameters)
+    covariance = np.linalg.inv(
+        gravity_model.posterior_information(rests[kept], parameters, excess_g2))
+    jacobian = gravity_model.magnitude_jacobian(rests.mean, parameters)
     leverage = np.einsum('ki,ij,kj->k', jacobian, covariance, jacobian) / variance
     distance = np.abs(_residual(rests, parameters)) / np.sqrt(variance)
     inside = distance / np.sqrt(np.maximum(1 - leverage, _MIN_REMAINDER))
@@ -333,18 +311,6 @@ def _held_out(rests: NominalRests, kept: np.ndarray, parameters: np.ndarray,
     return errors
 
 
-def _solve_nearby(rests: NominalRests, start: np.ndarray, variance: np.ndarray
-                  ) -> tuple[np.ndarray, bool]:
-    """
-    Fit as `_solve`, from a start near the solution, where plain Gauss-Newton steps suffice.
-
-    start: first values of the parameters, (9,); variance: variances of the magnitudes, g², (k,);
-    returns: parameters, (9,), and whether they have converged.
-    """
-    (parameters,), (converged,) = _nearby(rests, start[None], 1 / variance[None])
-    return (parameters, True) if converged else _solve(rests, start, variance)
-
-
 def _nearby(rests: NominalRests, starts: np.ndarray, weights: np.ndarray
             ) -> tuple[np.ndarray, np.ndarray]:
     """
@@ -355,7 +321,7 @@ def _nearby(rests: NominalRests, starts: np.ndarray, weights: np.ndarray
     """
     parameters, converged = starts, np.zeros(len(starts), bool)
     for _ in range(_NEARBY_STEPS):
-        length, _, rows = linearised(rests.mean, parameters)
+        length, _, rows = gravity_model.linearised(rests.mean, parameters)
         weighted = np.swapaxes(rows * weights[..., None], -1, -2)
         try:
             steps = np.linalg.solve(weighted @ rows,
@@ -372,21 +338,23 @@ def _nearby(rests: NominalRests, starts: np.ndarray, weights: np.ndarray
 def _require_determined(rests: NominalRests, parameters: np.ndarray, excess_g2: float) -> None:
     """Refuse rests that do not determine a coefficient, or that do not read gravity."""
     count = len(rests.mean)
-    measured = np.median(magnitude(rests.mean, parameters)) if count else rests.gravity_g
+    measured = np.median(_residual(rests, parameters)) + rests.gravity_g if count else \
+        rests.gravity_g
     if not _MIN_GRAVITY_RATIO < measured / rests.gravity_g < _MAX_GRAVITY_RATIO:
         raise UserError(f'gravity: the rests read {measured * G0_MPS2:.3g} m/s², not '
                         f'{rests.gravity_g * G0_MPS2:.3g}: correct nominal_zero_g_v, '
                         'nominal_scale_v_per_g or local_gravity_mps2')
-    information = posterior_information(rests, parameters, excess_g2)
-    missing = undetermined(information)
+    information = gravity_model.posterior_information(rests, parameters, excess_g2)
+    missing = gravity_model.undetermined(information)
     if count >= MIN_RESTS and not missing:
         return
     names = 'all nine coefficients' if len(missing) == len(NAMES) else \
         ', '.join(map(str, missing))
     reason = f'do not determine {names}' if missing else f'are too few, at least {MIN_RESTS}'
     scatter = f' and scatter by {1e3 * np.sqrt(excess_g2):.2g} mg' if excess_g2 else ''
-    rests_needed = rests_to_add(max(MIN_RESTS - count, 0), information, parameters,
-                                rests.gravity_g, TRIAL_STD_G ** 2 + excess_g2)
+    rests_needed = gravity_model.rests_to_add(
+        max(MIN_RESTS - count, 0), information, parameters, rests.gravity_g,
+        gravity_model.TRIAL_STD_G ** 2 + excess_g2)
     raise UserError(f'gravity: without their angles (fit --poses), the {count} rests {reason}'
                     f'{scatter}{_other_sensor(rests)}; add rests with {", ".join(rests_needed)}')
 

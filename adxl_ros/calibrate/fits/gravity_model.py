@@ -56,71 +56,22 @@ class NominalRests:
 
 
 def nominal_rests(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor) -> NominalRests:
-    """
-    Convert means of rests by the nominal zero-g and scale factor.
-
-    Parameters
-    ----------
-    mean_v, std_v
-        Mean of each rest and its standard deviation, V, (k, 3).
-    sensor
-        Nominal values and local gravity of the unit.
-
-    Returns
-    -------
-    NominalRests
-        The rests in g.
-
-    """
+    """Convert means of rests and their standard deviations, V, (k, 3), by nominal values."""
     scale = sensor.nominal_scale_v_per_g
     return NominalRests((mean_v - sensor.nominal_zero_g_v) / scale,
                         (std_v / scale) ** 2 + _ROUNDING_STD_G ** 2,
                         sensor.local_gravity_mps2 / G0_MPS2)
 
 
-class EffectValues(NamedTuple):
-    """Parameters in the units of the effects."""
-
-    # Parameters of effects, (3,) each, as `Sensor.values` has them
-    values: dict[str, dict[str, np.ndarray]]
-    units: np.ndarray  # Factor from each parameter to the coefficient in NAMES, (9,)
-
-
-def effect_values(parameters: np.ndarray, sensor: Sensor) -> EffectValues:
-    """
-    Convert parameters into the units of the effects.
-
-    Parameters
-    ----------
-    parameters : ndarray
-        The nine parameters, (9,).
-    sensor
-        Nominal values of the unit.
-
-    Returns
-    -------
-    EffectValues
-        Values of the effects, and the factors of the conversion.
-
-    """
+def effect_values(parameters: np.ndarray, sensor: Sensor
+                  ) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
+    """Return the values of the effects, and the factor from each parameter to its coefficient."""
     scale = sensor.nominal_scale_v_per_g
     units = np.concatenate([scale, scale, np.ones(3)])
     values = parameters * units
-    return EffectValues(
-        {'bias': {'offset_v': values[:3]},
-         'scale_factor': {'offset_v_per_g': values[3:6]},
-         'misalignment': {'alpha_rad': np.array([0.0, 0.0, values[7]]),
-                          'beta_rad': np.array([0.0, values[6], values[8]])}}, units)
-
-
-def sensing_axes(parameters: np.ndarray) -> np.ndarray:
-    """
-    Return the directions of the sensing axes in the gauge, rows Θx, Θy, Θz, (3, 3).
-
-    The angles are the last three parameters: beta of y, alpha of z and beta of z.
-    """
-    (sy, cy), (sa, ca), (sb, cb) = _sines(parameters)
-    return np.array([[1.0, 0.0, 0.0], [-sy, cy, 0.0], [sb, -sa * cb, ca * cb]])
+    return {'bias': {'offset_v': values[:3]}, 'scale_factor': {'offset_v_per_g': values[3:6]},
+            'misalignment': {'alpha_rad': np.array([0.0, 0.0, values[7]]),
+                             'beta_rad': np.array([0.0, values[6], values[8]])}}, units
 
 
 def _sines(parameters: np.ndarray) -> list[tuple[Any, Any]]:
@@ -135,22 +86,7 @@ def _sines(parameters: np.ndarray) -> list[tuple[Any, Any]]:
 
 
 def force_g(mean: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-    """
-    Return the specific force of rests in the case frame.
-
-    Parameters
-    ----------
-    mean
-        Means by nominal values, g, (k, 3).
-    parameters : ndarray
-        The nine parameters, (9,).
-
-    Returns
-    -------
-    ndarray
-        Specific force, g, (k, 3).
-
-    """
+    """Return the specific force of rests in the case, g, (k, 3), by their means, g, (k, 3)."""
     return _components(mean, parameters, _sines(parameters)).T
 
 
@@ -166,20 +102,7 @@ def _components(mean: np.ndarray, parameters: np.ndarray, sines: list[tuple[Any,
 
 
 def magnitude(mean: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-    """
-    Return the magnitude of the specific force of rests.
-
-    Parameters
-    ----------
-    mean, parameters
-        As for `linearised`.
-
-    Returns
-    -------
-    ndarray
-        Magnitude, g, (k,) or (s, k).
-
-    """
+    """Return the magnitudes of rests, g, (k,), or (s, k); see `linearised`."""
     return _length(_components(mean, parameters, _sines(parameters)))
 
 
@@ -210,17 +133,8 @@ def linearised(mean: np.ndarray, parameters: np.ndarray) -> Linearised:
     """
     Return the magnitudes with their derivatives.
 
-    Parameters
-    ----------
-    mean, parameters
-        Means by nominal values, g, (k, 3), and the nine parameters, (9,). There may be s sets of
-        parameters, (s, 9), and a set of rests for each, (s, k, 3).
-
-    Returns
-    -------
-    Linearised
-        Magnitudes and derivatives.
-
+    mean, parameters: means by nominal values, g, (k, 3), and the nine parameters, (9,). There may
+    be s sets of parameters, (s, 9), and a set of rests for each, (s, k, 3).
     """
     (sy, cy), (sa, ca), (sb, cb) = sines = _sines(parameters)
     force = _components(mean, parameters, sines)
@@ -240,40 +154,12 @@ def linearised(mean: np.ndarray, parameters: np.ndarray) -> Linearised:
 
 
 def magnitude_jacobian(mean: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-    """
-    Differentiate the magnitudes by the parameters.
-
-    Parameters
-    ----------
-    mean, parameters
-        As for `force_g`.
-
-    Returns
-    -------
-    ndarray
-        Jacobian, g by parameter, (k, 9).
-
-    """
+    """Differentiate the magnitudes by the parameters, (k, 9)."""
     return linearised(mean, parameters).jacobian
 
 
 def magnitude_variance(rests: NominalRests, parameters: np.ndarray) -> np.ndarray:
-    """
-    Return the variance of each magnitude that comes from the noise of the means.
-
-    Parameters
-    ----------
-    rests
-        k rests.
-    parameters : ndarray
-        The nine parameters, (9,).
-
-    Returns
-    -------
-    ndarray
-        Variance, g², (k,).
-
-    """
+    """Return the variance of each magnitude by the noise of the means, g², (k,)."""
     sines = _sines(parameters)
     force = _components(rests.mean, parameters, sines)
     by_sensed = _sensed_gradient(force / _length(force), sines)
@@ -290,22 +176,8 @@ def regularised_fit(rests: NominalRests, start: np.ndarray, steps: int,
     """
     Fit rests with the prior, by Gauss-Newton steps.
 
-    Parameters
-    ----------
-    rests
-        k rests, or s sets of them with an axis of length s in front.
-    start
-        First values of the parameters, (9,), or (s, 9) for s fits side by side.
-    steps
-        Largest count of steps.
-    closest
-        Count of the rests that a step uses, those that fit best; None uses all.
-
-    Returns
-    -------
-    ndarray
-        Parameters, in the shape of `start`.
-
+    There may be s sets of rests with an axis of length s in front, and s starts, (s, 9), for fits
+    side by side. closest: count of the rests that a step uses, those that fit best; None for all.
     """
     def linearise(parameters: np.ndarray) -> Iterate:
         parameters = np.clip(parameters, -_MAX_VALUE, _MAX_VALUE)
@@ -330,46 +202,19 @@ def regularised_fit(rests: NominalRests, start: np.ndarray, steps: int,
 def fisher_information(rests: NominalRests, parameters: np.ndarray, excess_g2: float
                        ) -> np.ndarray:
     """
-    Return the Fisher information of rests about the parameters, without the prior.
+    Return the Fisher information of rests about the parameters, without the prior, (9, 9).
 
-    Parameters
-    ----------
-    rests
-        k rests, which may be none.
-    parameters : ndarray
-        The nine parameters, (9,).
-    excess_g2
-        Variance of the magnitudes beyond the noise of the means, g².
-
-    Returns
-    -------
-    ndarray
-        Information, (9, 9).
-
+    excess_g2: variance of the magnitudes beyond the noise of the means, g².
     """
     if not len(rests.mean):
         return np.zeros((len(NAMES), len(NAMES)))
     rows = magnitude_jacobian(rests.mean, parameters)
-    variance = magnitude_variance(rests, parameters) + excess_g2
-    return rows.T @ (rows / variance[:, None])
+    return rows.T @ (rows / (magnitude_variance(rests, parameters) + excess_g2)[:, None])
 
 
 def posterior_information(rests: NominalRests, parameters: np.ndarray, excess_g2: float
                           ) -> np.ndarray:
-    """
-    Return the information of prior and rests about the parameters.
-
-    Parameters
-    ----------
-    rests, parameters, excess_g2
-        As for `fisher_information`.
-
-    Returns
-    -------
-    ndarray
-        Inverse covariance, (9, 9).
-
-    """
+    """Return the information of prior and rests about the parameters, (9, 9)."""
     return _PRIOR_INFORMATION + fisher_information(rests, parameters, excess_g2)
 
 
@@ -390,40 +235,22 @@ _NEARLY_BEST = 0.5
 is chosen."""
 
 
-class InformationGain(NamedTuple):
-    """What a further rest in each candidate would add."""
-
-    # Variance of the predicted magnitude, g², by the number of axes that are not horizontal,
-    # (26,). With one or two axes along gravity a pose is easier to hold.
-    gain: np.ndarray
-    rows: np.ndarray  # Derivatives of the magnitude by the parameters, (26, 9)
-
-
 def information_gain(information: np.ndarray, parameters: np.ndarray, gravity_g: float
-                     ) -> InformationGain:
+                     ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return what a rest in each candidate would add.
+    Return what a further rest in each candidate would add to the information of the rests so far.
 
-    Parameters
-    ----------
-    information
-        Information of the rests so far, (9, 9).
-    parameters : ndarray
-        The nine parameters of `gravity_model`, (9,).
-    gravity_g
-        Local gravity, g.
-
-    Returns
-    -------
-    InformationGain
-        Gain and derivatives of each candidate.
-
+    returns: gain, (26,), and derivatives of the magnitudes by the parameters, (26, 9). The gain is
+    the variance of the predicted magnitude, g², by the number of axes that are not horizontal:
+    with one or two axes along gravity a pose is easier to hold.
     """
-    outputs = parameters[:3] + (1 + parameters[3:6]) * (
-        gravity_g * UP @ sensing_axes(parameters).T)
+    (sy, cy), (sa, ca), (sb, cb) = _sines(parameters)
+    # The directions of the sensing axes in the gauge, rows Θx, Θy, Θz.
+    axes = np.array([[1.0, 0.0, 0.0], [-sy, cy, 0.0], [sb, -sa * cb, ca * cb]])
+    outputs = parameters[:3] + (1 + parameters[3:6]) * (gravity_g * UP @ axes.T)
     rows = magnitude_jacobian(outputs, parameters)
     variance = np.einsum('ki,ij,kj->k', rows, np.linalg.inv(information), rows)
-    return InformationGain(variance / np.count_nonzero(CANDIDATES, axis=1), rows)
+    return variance / np.count_nonzero(CANDIDATES, axis=1), rows
 
 
 def rests_to_add(count: int, information: np.ndarray, parameters: np.ndarray, gravity_g: float,
@@ -431,24 +258,7 @@ def rests_to_add(count: int, information: np.ndarray, parameters: np.ndarray, gr
     """
     Name the rests with the greatest gain, one by one, until all coefficients are determined.
 
-    Parameters
-    ----------
-    count
-        Smallest count of rests.
-    information
-        Information of the rests so far, (9, 9).
-    parameters : ndarray
-        The nine parameters of `gravity_model`, (9,).
-    gravity_g
-        Local gravity, g.
-    variance_g2
-        Variance of the magnitude of a rest, g².
-
-    Returns
-    -------
-    list
-        Names such as 'x up and y down'.
-
+    count: smallest count of rests; variance_g2: variance of the magnitude of a rest, g².
     """
     rests: list[str] = []
     available = np.ones(len(UP), bool)
@@ -471,20 +281,8 @@ def next_up(gain: np.ndarray, available: np.ndarray, now: np.ndarray | None) -> 
     """
     Choose the candidate to turn to: the nearest of those with nearly the greatest gain.
 
-    Parameters
-    ----------
-    gain
-        Gain of each candidate, (26,).
-    available
-        Candidates that may be chosen, (26,) bool.
-    now
-        Direction that points up at present, (3,), if known.
-
-    Returns
-    -------
-    int or None
-        Index of the candidate; None where none is available.
-
+    gain, available: gain of each candidate, and whether it may be chosen, (26,); now: direction
+    that points up at present, (3,), if known.
     """
     if not available.any():
         return None
@@ -505,8 +303,3 @@ def points_up(name: str) -> str:
     if ' and ' not in name:
         return f'{name} points up'
     return f'{name.removesuffix(" equally")} point up equally'
-
-
-def name_nearest(up: np.ndarray) -> str:
-    """Name the candidate nearest a direction, (3,)."""
-    return name_up(int(np.argmax(UP @ up)))

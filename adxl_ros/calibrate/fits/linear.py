@@ -9,10 +9,8 @@ The manufacturer's linear model: equations 1 to 3.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
-from adxl_ros.calibrate.pose_response import angle_jacobian
-from adxl_ros.calibrate.poses import Poses, reference_force
+from adxl_ros.calibrate.poses import angle_jacobian, planes, Poses, reference_force
 from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get
@@ -33,14 +31,6 @@ _OPEN_STD_V = 0.5
 """Prior standard deviation of a zero-g that may be open, V. Chosen: far wider than any unit."""
 _OPEN_STD_V_PER_G = 0.2
 """Prior standard deviation of a scale factor that may be open, V/g. Chosen: as above."""
-
-
-class _Line(NamedTuple):
-    """A line fitted to one axis."""
-
-    zero_g_v: float  # Volts at 0 g
-    scale_v_per_g: float  # Volts per g
-    covariance: np.ndarray  # Covariance of both, (2, 2)
 
 
 def fit(sensor: Sensor, poses: Poses, may_be_open: bool = False) -> Sensor:
@@ -73,65 +63,54 @@ def fit(sensor: Sensor, poses: Poses, may_be_open: bool = False) -> Sensor:
         An axis has not been turned far enough to determine its scale factor.
 
     """
-    gravity_g = sensor.local_gravity_mps2 / G0_MPS2
     force = np.column_stack(reference_force(poses, sensor.local_gravity_mps2)) / G0_MPS2
-    lines = [_fit_line(axis, force[:, AXES.index(axis)], poses.volts[:, d], poses.std_v[:, d],
-                       gravity_g, _open_line(sensor, d) if may_be_open else None)
-             for d, axis in enumerate(sensor.axes)]
+    nominal = np.column_stack([sensor.nominal_zero_g_v, sensor.nominal_scale_v_per_g])
     count = len(sensor.axes)
-    covariance = np.zeros((2 * count, 2 * count))
-    for d, line in enumerate(lines):
-        covariance[np.ix_([d, count + d], [d, count + d])] = line.covariance
-    zero_g_v = np.array([line.zero_g_v for line in lines])
-    scale_v_per_g = np.array([line.scale_v_per_g for line in lines])
-    values = {'bias': {'offset_v': zero_g_v - sensor.nominal_zero_g_v},
-              'scale_factor': {'offset_v_per_g': scale_v_per_g - sensor.nominal_scale_v_per_g}}
+    lines, covariance = np.zeros((count, 2)), np.zeros((2 * count, 2 * count))
+    for d, axis in enumerate(sensor.axes):
+        reference_g = force[:, AXES.index(axis)]
+        volts, std_v = poses.volts[:, d], poses.std_v[:, d]
+        used = np.abs(reference_g) >= sensor.local_gravity_mps2 / G0_MPS2 * _UPRIGHT_COS
+        if not ((reference_g[used] > 0).any() and (reference_g[used] < 0).any()):
+            used = np.ones(len(volts), bool)
+        span_g = np.ptp(reference_g[used])
+        if may_be_open and span_g < _MIN_SPAN_G:
+            lines[d], of_axis = _fit_open_line(reference_g, volts, std_v, nominal[d])
+        elif used.sum() < 2 or span_g < _MIN_SPAN_G:
+            raise UserError(f'{axis}: its reference spans {span_g:.2f} g over {used.sum()} poses, '
+                            'which does not determine the scale factor; add poses with the axis '
+                            'up and down')
+        else:
+            lines[d], of_axis = _fit_line(reference_g, volts, std_v, used)
+        covariance[np.ix_([d, count + d], [d, count + d])] = of_axis
+    values = {'bias': {'offset_v': lines[:, 0] - sensor.nominal_zero_g_v},
+              'scale_factor': {'offset_v_per_g': lines[:, 1] - sensor.nominal_scale_v_per_g}}
     names = [Coefficient(effect, parameter, axis) for effect, by_parameter in values.items()
              for parameter in by_parameter for axis in sensor.axes]
     return replace(sensor, model='linear', effects=('bias', 'scale_factor'), values=values,
                    covariance=covariance, covariance_names=tuple(names))
 
 
-def _is_upright(reference_g: np.ndarray, gravity_g: float) -> np.ndarray:
-    """Mark the poses that have an axis within 0.5° of the vertical, (k,) bool."""
-    return np.abs(reference_g) >= gravity_g * _UPRIGHT_COS
-
-
-def _fit_line(axis: str, reference_g: np.ndarray, volts: np.ndarray, std_v: np.ndarray,
-              gravity_g: float, prior: _Line | None) -> _Line:
-    used = _is_upright(reference_g, gravity_g)
-    if not ((reference_g[used] > 0).any() and (reference_g[used] < 0).any()):
-        used = np.ones(len(volts), bool)
-    if prior is not None and np.ptp(reference_g[used]) < _MIN_SPAN_G:
-        return _fit_open_line(reference_g, volts, std_v, prior)
-    if used.sum() < 2 or np.ptp(reference_g[used]) < _MIN_SPAN_G:
-        raise UserError(f'{axis}: its reference spans {np.ptp(reference_g[used]):.2f} g over '
-                        f'{used.sum()} poses, which does not determine the scale factor; add '
-                        'poses with the axis up and down')
-    design = np.column_stack([np.ones(used.sum()), reference_g[used]])
-    (zero, scale), *_ = np.linalg.lstsq(design, volts[used], rcond=None)
-    residual = volts - zero - scale * reference_g
-    variance = max(np.sum(residual ** 2) / max(len(volts) - 2, 1), np.mean(std_v ** 2))
-    return _Line(zero, scale, variance * np.linalg.inv(design.T @ design))
-
-
-def _open_line(sensor: Sensor, axis: int) -> _Line:
-    """Return the nominal line of an axis, whose uncertainty is far wider than that of units."""
-    return _Line(float(sensor.nominal_zero_g_v[axis]), float(sensor.nominal_scale_v_per_g[axis]),
-                 np.diag([_OPEN_STD_V ** 2, _OPEN_STD_V_PER_G ** 2]))
-
-
-def _fit_open_line(reference_g: np.ndarray, volts: np.ndarray, std_v: np.ndarray, prior: _Line
-                   ) -> _Line:
-    """Fit a line that its poses do not determine, by its prior."""
+def _fit_line(reference_g: np.ndarray, volts: np.ndarray, std_v: np.ndarray, used: np.ndarray
+              ) -> tuple[np.ndarray, np.ndarray]:
+    """Fit zero-g and scale factor to the poses used; values, (2,), and covariance, (2, 2)."""
     design = np.column_stack([np.ones(len(volts)), reference_g])
-    nominal = np.array([prior.zero_g_v, prior.scale_v_per_g])
+    line = np.linalg.lstsq(design[used], volts[used], rcond=None)[0]
+    residual = volts - design @ line
+    variance = max(np.sum(residual ** 2) / max(len(volts) - 2, 1), np.mean(std_v ** 2))
+    return line, variance * np.linalg.inv(design[used].T @ design[used])
+
+
+def _fit_open_line(reference_g: np.ndarray, volts: np.ndarray, std_v: np.ndarray,
+                   nominal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Fit a line that its poses do not determine, by a prior about the nominal one."""
+    design = np.column_stack([np.ones(len(volts)), reference_g])
     residual = volts - design @ nominal
     variance = max(float(np.var(residual, ddof=min(1, len(volts) - 1))),
                    float(np.mean(std_v ** 2)))
-    covariance = np.linalg.inv(design.T @ design / variance + np.linalg.inv(prior.covariance))
-    zero_g_v, scale_v_per_g = nominal + covariance @ (design.T @ residual) / variance
-    return _Line(float(zero_g_v), float(scale_v_per_g), covariance)
+    prior = np.diag([_OPEN_STD_V ** -2, _OPEN_STD_V_PER_G ** -2])
+    covariance = np.linalg.inv(design.T @ design / variance + prior)
+    return nominal + covariance @ (design.T @ residual) / variance, covariance
 
 
 EFFECTS = ('bias', 'scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z',
@@ -151,8 +130,6 @@ _MIN_INPUTS = 3
 """Smallest number of distinct inputs that determine a quadratic."""
 _MIN_INPUT_SPAN_G = 0.3
 """Smallest span of the inputs that determine a quadratic, g."""
-_SAME_PLANE_RAD = np.radians(1.0)
-"""Largest difference of neighbouring angles alpha in one plane, rad."""
 _REPLICAS = 200
 """Sweeps of the parametric bootstrap: the standard deviations are known to 5 %."""
 
@@ -201,37 +178,12 @@ def fit_physical(sensor: Sensor, poses: Poses) -> Sensor:
 
 
 def regress_axes(sensor: Sensor, poses: Poses) -> list[AxisRegression]:
-    """
-    Fit the regressions of the x and y axes (equations 8 to 17).
-
-    Parameters
-    ----------
-    sensor, poses
-        As for `fit`.
-
-    Returns
-    -------
-    list
-        Regressions of x and of y.
-
-    Raises
-    ------
-    UserError
-        The planes do not determine the model, or the sensor has no x and y.
-
-    """
+    """Fit the regressions of the x and y axes (equations 8 to 17)."""
     if not sensor.axes.startswith('xy'):
         raise UserError(f'the physical model needs the axes x and y, not {sensor.axes}; '
                         'fit --model linear')
     start = fit(sensor, poses)
     return [_regress_axis(d, start, poses) for d in range(2)]
-
-
-def planes(alpha_rad: np.ndarray) -> list[np.ndarray]:
-    """Group poses by plane: indices of those whose alpha agree within 1°."""
-    order = np.argsort(alpha_rad, kind='stable')
-    cuts = np.flatnonzero(np.diff(alpha_rad[order]) > _SAME_PLANE_RAD) + 1
-    return np.split(order, cuts)
 
 
 def _regress_axis(d: int, start: Sensor, poses: Poses) -> AxisRegression:
@@ -314,23 +266,14 @@ def _assemble(sensor: Sensor, poses: Poses, regressions: list[AxisRegression]) -
                    covariance_names=tuple(names))
 
 
-class _ZAxis(NamedTuple):
-    """Zero-g, V, scale factor, V/g, and misalignment of a z axis, rad."""
-
-    zero_g_v: float
-    scale_v_per_g: float
-    alpha_rad: float
-    beta_rad: float
-
-
-def _fit_z_axis(sensor: Sensor, poses: Poses) -> _ZAxis:
-    """Fit zero-g, scale factor and direction of a z axis by least squares."""
+def _fit_z_axis(sensor: Sensor, poses: Poses) -> tuple[float, float, float, float]:
+    """Fit zero-g, V, scale factor, V/g, and misalignment alpha and beta, rad, of a z axis."""
     force = np.column_stack(reference_force(poses, sensor.local_gravity_mps2)) / G0_MPS2
     design = np.column_stack([np.ones(len(poses)), force])
     (zero, tx, ty, tz), *_ = np.linalg.lstsq(design, poses.volts[:, 2], rcond=None)
     scale = np.sqrt(tx * tx + ty * ty + tz * tz)
     beta = np.arcsin(tx / scale)
-    return _ZAxis(zero, scale, np.arcsin(-ty / scale / np.cos(beta)), beta)
+    return zero, scale, np.arcsin(-ty / scale / np.cos(beta)), beta
 
 
 def _covariance(sensor: Sensor, fitted: Sensor, poses: Poses) -> np.ndarray:
@@ -338,14 +281,16 @@ def _covariance(sensor: Sensor, fitted: Sensor, poses: Poses) -> np.ndarray:
     Return the covariance of the sequential estimates by parametric bootstrap, (p, p).
 
     Each step of the fit weights the poses differently, so that no formula of least squares
-    holds. Sweeps
-    are drawn from the fitted model and fitted again, with the noise of the means and an encoder
-    error uniform within its step for each setting of a joint. Deviations are widened where the
-    residuals exceed noise and encoder step (effects that the model does not hold).
+    holds. Sweeps are drawn from the fitted model and fitted again, with the noise of the means and
+    an encoder error uniform within its step for each setting of a joint. Deviations are widened
+    where the residuals exceed noise and encoder step (effects that the model does not hold).
     """
     respond = signal_chain.static_response(fitted)
     predicted = np.column_stack(respond(reference_force(poses, fitted.local_gravity_mps2)))
-    chi2 = np.sum((poses.volts - predicted) ** 2 / _pose_variance(fitted, poses))
+    # An encoder of step r leaves the true angle uniform within it: its variance is r²/12.
+    variance = poses.std_v ** 2 + np.sum(
+        angle_jacobian(fitted, poses) ** 2 * fitted.stage_std_rad ** 2, axis=2)
+    chi2 = np.sum((poses.volts - predicted) ** 2 / variance)
     freedom = max(poses.volts.size - len(fitted.covariance_names), 1)
     widening = np.sqrt(max(chi2 / freedom, 1.0))
     rng = np.random.default_rng(0)
@@ -362,15 +307,3 @@ def _covariance(sensor: Sensor, fitted: Sensor, poses: Poses) -> np.ndarray:
         drawn.append(get(_assemble(sensor, replica, regress_axes(sensor, replica)),
                          fitted.covariance_names))
     return np.cov(np.array(drawn).T)
-
-
-def _pose_variance(fitted: Sensor, poses: Poses) -> np.ndarray:
-    """
-    Return the variance of the volts of a pose about the model, V², (k, m).
-
-    It is that of the mean's noise and of the encoder. An encoder of step r leaves the true angle
-    uniform within it: its variance is r²/12 for each joint.
-    """
-    slope_v_per_rad = angle_jacobian(fitted, poses)
-    return poses.std_v ** 2 + np.sum(
-        slope_v_per_rad ** 2 * fitted.stage_std_rad ** 2, axis=2)

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A fit linearised at its coefficients, and the stage's error by restricted maximum likelihood.
+The covariance of poses about a unit, and a fit linearised at its coefficients.
 
-- A fit linearised at its coefficients, and the stage's error by restricted maximum likelihood.
+- The stage's error by restricted maximum likelihood.
 - Selection of poses by D-optimality: the smallest joint confidence region of all coefficients.
 
-About coefficients θ₀ the volts are V = h(θ₀) + X·(θ − θ₀) + error with the covariance S(σ_s, σ_p)
-of `stage_error`, and θ has a normal prior. For a given stage error the best θ is generalised least
+About coefficients θ₀ the volts are V = h(θ₀) + X·(θ − θ₀) + error with a covariance S(σ_s, σ_p),
+and θ has a normal prior. The angles of the stage have an error with one part for each setting of a
+joint, σ_s, and one for each pose, σ_p. For a given stage error the best θ is generalised least
 squares. The stage error maximises the restricted likelihood (Patterson and Thompson 1971): the
 coefficients are integrated out, so that it is not too small by what they have fitted. The
 covariance of the coefficients in turn is that over all levels of the error (Kackar and Harville
@@ -18,21 +19,200 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 
-from adxl_ros.calibrate import pose_response
-from adxl_ros.calibrate.pose_response import (
-    PoseCovariance,
-    shared_settings,
-    SharedSettings,
-    StageError,
-)
-from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.poses import angle_jacobian, coefficient_jacobian, Poses, predicted_volts
 from adxl_ros.model.coefficients import get
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 import scipy
+
+_MIN_VARIANCE_RAD2 = 1e-24
+"""Smallest variance of an angle as a divisor, rad². Chosen: avoids 0/0 on a perfect stage."""
+
+
+@dataclass(frozen=True)
+class StageError:
+    """Standard deviations of the error of a joint."""
+
+    # Standard deviation of the part that the poses of one setting share, σ_s, rad
+    setting_rad: float
+    pose_rad: float = 0.0  # Standard deviation of the part that is new with each pose, σ_p, rad
+    # Standard deviation of alpha over the geometric mean of those of alpha and beta, r
+    ratio: float = 1.0
+
+    @property
+    def joints(self) -> np.ndarray:
+        """Return the factors r and 1/r of alpha and beta, (2,)."""
+        return np.array([self.ratio, 1 / self.ratio])
+
+    @property
+    def total_rad(self) -> float:
+        """Return the standard deviation of a joint's error in one pose, rad."""
+        return float(np.hypot(self.setting_rad, self.pose_rad))
+
+
+class PoseCovariance:
+    """
+    The covariance S of the volts of k poses with m axes about the model, as an operator.
+
+    jacobian: derivatives of the volts by alpha and beta, V/rad, (k, m, 2); shared: from
+    `shared_settings`; kept: poses that count, (k,) bool; the others have no weight.
+    """
+
+    def __init__(self, jacobian: np.ndarray, poses: Poses, shared: tuple[np.ndarray, int],
+                 error: StageError, kept: np.ndarray | None = None) -> None:
+        # Scaled by r and 1/r, so that both joints have the same standard deviations.
+        self._jacobian, self._error = jacobian * error.joints, error
+        self._kept = np.ones(len(poses), bool) if kept is None else kept
+        self._number, self._shared = shared
+        # The error of a setting with only one pose is an error of that pose.
+        self._pose_rad2 = error.pose_rad ** 2 + np.where(
+            self._number < 0, error.setting_rad ** 2, 0.0)
+        noise = poses.std_v[:, :, None] ** 2 * np.eye(jacobian.shape[1])
+        self.blocks = noise + (self._jacobian * self._pose_rad2[:, None, :]) @ np.swapaxes(
+            self._jacobian, 1, 2)
+        self._root = np.linalg.cholesky(self.blocks)
+        self._whitening = np.linalg.inv(self._root)
+
+    @cached_property
+    def _settings(self) -> np.ndarray:
+        """Return σ_s·Z of the shared settings, V, (k, m, q)."""
+        columns = np.zeros((*self._jacobian.shape[:2], self._shared))
+        for joint in range(2):
+            rows = np.flatnonzero(self._number[:, joint] >= 0)
+            columns[rows, :, self._number[rows, joint]] += self._jacobian[rows, :, joint]
+        return self._error.setting_rad * columns
+
+    @cached_property
+    def _white_settings(self) -> np.ndarray:
+        """Return σ_s·Z whitened block by block, (k·m, q)."""
+        return self.whiten_by_pose(self._settings)
+
+    @cached_property
+    def _settings_root(self) -> np.ndarray:
+        """Return the Cholesky factor of 1 + σ_s²·Zᵀ B⁻¹ Z, (q, q)."""
+        return np.linalg.cholesky(
+            np.eye(self._shared) + self._white_settings.T @ self._white_settings)
+
+    def _solve_settings(self, products: np.ndarray) -> np.ndarray:
+        return scipy.linalg.solve_triangular(self._settings_root, products, lower=True)
+
+    def whiten_by_pose(self, columns: np.ndarray) -> np.ndarray:
+        """Whiten columns by the blocks only, (k, m, c) to (k·m, c); 0 for poses without weight."""
+        white = self._whitening @ columns
+        white[~self._kept] = 0.0
+        return white.reshape(np.prod(white.shape[:2]), white.shape[2])
+
+    def products(self, columns: np.ndarray) -> np.ndarray:
+        """Return CᵀS⁻¹C of columns C, (k, m, c) to (c, c)."""
+        white = self.whiten_by_pose(columns)
+        by_setting = self._solve_settings(self._white_settings.T @ white)
+        return white.T @ white - by_setting.T @ by_setting
+
+    def normal_equations(self, design: np.ndarray, residual: np.ndarray
+                         ) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return XᵀS⁻¹X, (p, p), and XᵀS⁻¹r, (p,), of a design X and residuals r.
+
+        design: derivatives of the volts, (k, m, p); residual: measured volts minus predicted
+        volts, V, (k, m).
+        """
+        products = self.products(np.concatenate([design, residual[:, :, None]], axis=2))
+        return products[:-1, :-1], products[:-1, -1]
+
+    def log_determinant(self) -> float:
+        """Return log |S| of the poses that count."""
+        blocks = np.diagonal(self._root, axis1=1, axis2=2)[self._kept]
+        return 2 * float(np.log(blocks).sum() + np.log(np.diag(self._settings_root)).sum())
+
+    def penalty(self, errors: AngleErrors) -> float:
+        """Return the sum of the squared angle errors over their variances."""
+        pose_rad, setting_rad = (part / self._error.joints for part in (
+            errors.pose_rad, errors.setting_rad))
+        total = np.sum((pose_rad ** 2 / np.maximum(self._pose_rad2, _MIN_VARIANCE_RAD2))[
+            self._kept])
+        for joint in range(2):
+            _, first = np.unique(self._number[:, joint], return_index=True)
+            shared = first[self._number[first, joint] >= 0]
+            total += np.sum(setting_rad[shared, joint] ** 2) / max(
+                self._error.setting_rad ** 2, _MIN_VARIANCE_RAD2)
+        return float(total)
+
+    def predicted_errors(self, residual: np.ndarray) -> AngleErrors:
+        """
+        Predict the angle errors from the residuals (best linear unbiased prediction).
+
+        residual: measured volts minus the predicted volts at the encoder's angles, V, (k, m).
+        """
+        by_setting = self._solve_settings(
+            self._white_settings.T @ self.whiten_by_pose(residual[:, :, None]))
+        factor = scipy.linalg.solve_triangular(self._settings_root, by_setting, lower=True,
+                                               trans=1)[:, 0]
+        setting = np.append(self._error.setting_rad * factor, 0.0)[self._number]
+        white = (self._whitening @ (residual - self._settings @ factor)[:, :, None])[:, :, 0]
+        weighted = np.swapaxes(self._whitening, 1, 2) @ white[:, :, None]
+        pose = self._pose_rad2 * (np.swapaxes(self._jacobian, 1, 2) @ weighted)[:, :, 0]
+        joints = self._error.joints
+        return AngleErrors(np.where(self._number >= 0, setting, 0.0) * joints, pose * joints,
+                           np.sum(white ** 2, axis=1), float(factor @ factor))
+
+
+@dataclass(frozen=True)
+class AngleErrors:
+    """Predicted errors of alpha and beta in k poses."""
+
+    # setting_rad, pose_rad: Parts of the error by setting and by pose, rad, (k, 2)
+    setting_rad: np.ndarray
+    pose_rad: np.ndarray
+    # Squared Mahalanobis distance of each pose from the model, given its settings, (k,)
+    squared_distances: np.ndarray
+    setting_penalty: float  # Sum of the squared errors of the settings over σ_s²
+
+    @classmethod
+    def zeros(cls, count: int) -> AngleErrors:
+        """Return errors of 0 in a number of poses."""
+        return cls(np.zeros((count, 2)), np.zeros((count, 2)), np.zeros(count), 0.0)
+
+    @property
+    def total_rad(self) -> np.ndarray:
+        """Return the sum of both parts, rad, (k, 2)."""
+        return self.setting_rad + self.pose_rad
+
+    def interpolated(self, other: AngleErrors, share: float) -> AngleErrors:
+        """Return errors between these and others."""
+        return replace(
+            other,
+            setting_rad=self.setting_rad + share * (other.setting_rad - self.setting_rad),
+            pose_rad=self.pose_rad + share * (other.pose_rad - self.pose_rad))
+
+
+def shared_settings(poses: Poses) -> tuple[np.ndarray, int]:
+    """
+    Return the numbers of the settings that several poses share.
+
+    returns: the number of the setting of each joint, (k, 2), −1 where no other pose shares it, and
+    how many of them there are, q.
+    """
+    numbers, count = np.full((len(poses), 2), -1), 0
+    for joint, setting in enumerate((poses.alpha_setting, poses.beta_setting)):
+        _, index, size = np.unique(setting, return_inverse=True, return_counts=True)
+        column = np.cumsum(size > 1) - 1 + count
+        numbers[:, joint] = np.where(size[index] > 1, column[index], -1)
+        count += int((size > 1).sum())
+    return numbers, count
+
+
+def volts_covariance(unit: Sensor, poses: Poses, error: StageError,
+                     kept: np.ndarray | None = None) -> PoseCovariance:
+    """
+    Return the covariance of the volts of all poses about the model.
+
+    kept: poses that count, (k,) bool; None for all.
+    """
+    return PoseCovariance(angle_jacobian(unit, poses), poses, shared_settings(poses), error, kept)
+
 
 _MIN_TOTAL_RAD = 1e-7
 """Smallest standard deviation of an angle error, rad. Chosen: no encoder is as good."""
@@ -76,7 +256,7 @@ class Linearised:
     kept: np.ndarray  # Poses that count, (k,) bool
 
     @cached_property
-    def _shared(self) -> SharedSettings:
+    def _shared(self) -> tuple[np.ndarray, int]:
         return shared_settings(self.poses)
 
     def covariance(self, error: StageError) -> PoseCovariance:
@@ -85,17 +265,16 @@ class Linearised:
 
     def solve(self, covariance: PoseCovariance) -> tuple[np.ndarray, np.ndarray]:
         """Return the step to the best coefficients, (p,), and their information, (p, p)."""
-        normal = covariance.normal_equations(self.design, self.residual)
-        information = normal.information + np.diag(self.precision)
-        gradient = normal.gradient - self.precision * self.values
+        information, gradient = covariance.normal_equations(self.design, self.residual)
+        information = information + np.diag(self.precision)
+        gradient = gradient - self.precision * self.values
         scale = 1 / np.sqrt(np.diag(information))
         step = scale * np.linalg.solve(information * np.outer(scale, scale), scale * gradient)
         return step, information
 
     def information(self, covariance: PoseCovariance) -> np.ndarray:
         """Return the information of the coefficients and of their prior, (p, p)."""
-        normal = covariance.normal_equations(self.design, self.residual)
-        return normal.information + np.diag(self.precision)
+        return covariance.products(self.design) + np.diag(self.precision)
 
     def without(self, excluded: np.ndarray) -> Linearised:
         """Return the poses with some coefficients at 0 and not fitted, (p,) bool."""
@@ -123,7 +302,7 @@ class Linearised:
         covariance = self.covariance(error)
         step, information = self.solve(covariance)
         errors = covariance.predicted_errors(self.residual - self.design @ step)
-        bound = _huber_bound(self.residual.shape[1])
+        bound = float(scipy.special.chdtri(self.residual.shape[1], _HUBER_CHANCE))
         distance = errors.squared_distances[self.kept]
         robust = np.where(distance < bound, distance,
                           2 * np.sqrt(bound * np.maximum(distance, bound)) - bound)
@@ -187,39 +366,17 @@ def _from_search(x: np.ndarray) -> StageError:
                       float(np.exp(x[2])))
 
 
-@cache
-def _huber_bound(axes: int) -> float:
-    """Return the squared distance beyond which a pose has less weight."""
-    return float(scipy.special.chdtri(axes, _HUBER_CHANCE))
-
-
 def linearised(unit: Sensor, poses: Poses, names: Sequence[Coefficient], precision: np.ndarray,
                kept: np.ndarray | None = None) -> Linearised:
     """
     Linearise the volts of poses about the coefficients of a unit.
 
-    Parameters
-    ----------
-    unit
-        Sensor with the coefficients.
-    poses
-        k poses at the angles about which the model is linear.
-    names
-        Coefficients, (p,).
-    precision
-        Inverse variances of their prior about 0, (p,).
-    kept
-        Poses that count, (k,) bool; None for all.
-
-    Returns
-    -------
-    Linearised
-        Residuals and Jacobians.
-
+    precision: inverse variances of their prior about 0, (p,); kept: poses that count, (k,) bool;
+    None for all.
     """
-    return Linearised(poses, pose_response.angle_jacobian(unit, poses),
-                      pose_response.coefficient_jacobian(unit, poses, names),
-                      poses.volts - pose_response.predicted_volts(unit, poses), get(unit, names),
+    return Linearised(poses, angle_jacobian(unit, poses),
+                      coefficient_jacobian(unit, poses, names),
+                      poses.volts - predicted_volts(unit, poses), get(unit, names),
                       precision, np.ones(len(poses), bool) if kept is None else kept)
 
 
@@ -232,20 +389,8 @@ def choose_poses(rows: np.ndarray, information: np.ndarray, count: int) -> list[
     """
     Choose poses one by one, each with the greatest gain in log |information|.
 
-    Parameters
-    ----------
-    rows
-        Whitened Jacobian of each of n candidates, (n, m, p).
-    information
-        Information before the first choice, (p, p), of full rank.
-    count
-        Number of poses to choose; a candidate may be chosen again.
-
-    Returns
-    -------
-    list
-        Indices of the candidates, in the order of the choice.
-
+    rows: whitened Jacobian of each of n candidates, (n, m, p); information: that before the first
+    choice, (p, p), of full rank; returns: indices of the candidates, which may repeat.
     """
     chosen = []
     identity = np.eye(rows.shape[1])
@@ -272,25 +417,10 @@ def candidate_poses(std_v: np.ndarray) -> Poses:
 def whitened_jacobian(unit: Sensor, poses: Poses, names: tuple[Coefficient, ...],
                       stage: StageError) -> np.ndarray:
     """
-    Return the Jacobian of each pose by coefficients, whitened by noise and stage error.
+    Return the Jacobian of each pose by coefficients, whitened by noise and stage error, (k, m, p).
 
-    Parameters
-    ----------
-    unit
-        Sensor at whose coefficients the volts are differentiated.
-    poses
-        k poses that share no setting.
-    names
-        Coefficients, (p,).
-    stage
-        Standard deviations of the stage's error.
-
-    Returns
-    -------
-    ndarray
-        Whitened Jacobian, (k, m, p).
-
+    The poses share no setting.
     """
-    design = pose_response.coefficient_jacobian(unit, poses, names)
-    covariance = pose_response.volts_covariance(unit, poses, stage)
+    design = coefficient_jacobian(unit, poses, names)
+    covariance = volts_covariance(unit, poses, stage)
     return covariance.whiten_by_pose(design).reshape(design.shape)

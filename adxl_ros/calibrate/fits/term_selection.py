@@ -77,43 +77,16 @@ def candidates(poses: Poses) -> tuple[str, ...]:
     return ('stage_eccentricity', *following)
 
 
-def fit(sensor: Sensor, poses: Poses) -> Sensor:
-    """
-    Fit the full model with selected terms.
-
-    Parameters
-    ----------
-    sensor, poses
-        As for `full_model.fit_full`.
-
-    Returns
-    -------
-    Sensor
-        The fitted unit with its covariance.
-
-    """
-    return fit_selected(sensor, poses).full.fitted
+def fit(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()) -> Sensor:
+    """Fit the full model with selected terms, and with some effects in any case."""
+    return fit_selected(sensor, poses, effects).full.fitted
 
 
 def fit_affine(sensor: Sensor, poses: Poses) -> full_model.FullFit:
     """
     Fit zero-g, scale factor and misalignment alone, for poses that do not determine more.
 
-    Parameters
-    ----------
-    sensor, poses
-        As for `full_model.fit_full`.
-
-    Returns
-    -------
-    FullFit
-        The fit. The poses may leave three coefficients to their priors.
-
-    Raises
-    ------
-    UserError
-        The poses leave more of them open.
-
+    The poses may leave three coefficients to their priors.
     """
     return full_model.fit_full(sensor, poses, AFFINE, _MAX_OPEN)
 
@@ -251,22 +224,7 @@ def weakest_direction(full: full_model.FullFit) -> WeakestDirection:
 
 
 def report_lines(full: full_model.FullFit, poses: Poses, terms: Sequence[Term]) -> list[str]:
-    """
-    Report the stage, the outliers, the weakest direction and the terms of a fit.
-
-    Parameters
-    ----------
-    full, terms
-        From `term_selection.fit_selected`.
-    poses
-        The fitted poses.
-
-    Returns
-    -------
-    list
-        Lines of text.
-
-    """
+    """Report the stage, the outliers, the weakest direction and the terms of a fit of poses."""
     weakest = weakest_direction(full)
     direction = ' '.join(f'{value:+.2f} {name}' for name, value in weakest.parts)
     next_poses = full_model.next_poses(full.unit, poses, full.names, full.stage)
@@ -283,22 +241,7 @@ def report_lines(full: full_model.FullFit, poses: Poses, terms: Sequence[Term]) 
 
 
 def warnings(full: full_model.FullFit, poses: Poses) -> list[str]:
-    """
-    Return what is wrong with the poses or the fit, one line each.
-
-    Parameters
-    ----------
-    full
-        The fit.
-    poses
-        The fitted poses.
-
-    Returns
-    -------
-    list of str
-        Nothing where all is well.
-
-    """
+    """Return what is wrong with the poses or the fit, one line each."""
     lines = [] if full.converged else [NOT_CONVERGED]
     if full.stage_std_rad > _BAD_STAGE_RATIO * full.stated_std_rad + _MIN_STAGE_EXCESS_RAD:
         lines.append('the reference is worse than stated, or the model lacks an effect that looks '

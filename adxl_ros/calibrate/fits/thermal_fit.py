@@ -1,18 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Zero-g over temperature, fitted to a sensor that rests while it warms and cools."""
+"""
+Zero-g over temperature, fitted to a sensor that rests while it warms and cools.
+
+- Blocks of a resting sensor, which are the input.
+- Which parts of a wanted range the temperature has passed, and the error to expect there.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import NamedTuple
 
+from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
+from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
 from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.filters import loop, stop
+from adxl_ros.model.filters import loop, play, stop
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 import scipy
@@ -31,7 +38,7 @@ _FEWEST_BLOCKS = 12
 """Fewest blocks of an orientation. Chosen: twice the coefficients of one axis."""
 PRIOR_WIDTH = 5.0
 """Prior standard deviation of a coefficient divided by its typical size, as in the diagnosis."""
-_LAGS_S = tuple(np.geomspace(10.0, 1000.0, 7))
+_LAGS_S = np.geomspace(10.0, 1000.0, 7)
 """Time constants of `thermal_lag` that are tried, s. Chosen: each is twice the one before."""
 _REACHES = tuple(np.geomspace(0.02, 0.5, 6))
 """Reaches of `thermal_hysteresis` that are tried, divided by the range of temperature. Chosen: a
@@ -44,15 +51,6 @@ _ITERATIONS = 4
 """Iterations over coefficients and correlation. Chosen: they no longer change then."""
 _RELATIVE_STEP = 0.02
 """Step of the derivative by a shape, divided by its value. Chosen: smooth."""
-
-
-@dataclass(frozen=True)
-class ThermalBlocks:
-    """Means of k blocks of a resting sensor with m axes, in the order of time."""
-
-    time_s: np.ndarray  # Middle of each block, s, (k,)
-    temperature_c: np.ndarray  # Temperature of each block, °C, (k,)
-    volts: np.ndarray  # Mean output, V, (k, m)
 
 
 class History(NamedTuple):
@@ -84,7 +82,8 @@ class ThermalFit:
         base_k = calibrated_c - NOMINAL_TEMPERATURE_C
         slopes = np.column_stack([warmer_k - base_k, warmer_k ** 2 - base_k ** 2])
         worst = np.zeros(len(slopes))
-        for axis, residual_g in zip(_axes(self.names), self.residual_g):
+        axes = dict.fromkeys(name.axis for name in self.names if name.axis)
+        for axis, residual_g in zip(axes, self.residual_g):
             places = [self.names.index(Coefficient('temperature_bias', parameter, axis))
                       for parameter in ('per_k', 'per_k2')]
             part = self.covariance[np.ix_(places, places)]
@@ -93,46 +92,22 @@ class ThermalFit:
         return worst
 
 
-def fit(sensor: Sensor, blocks: ThermalBlocks, with_history: bool = True) -> ThermalFit:
+def fit(sensor: Sensor, blocks: Poses, with_history: bool = True) -> ThermalFit:
     """
-    Fit slope and curvature of the zero-g over temperature.
+    Fit slope and curvature of the zero-g over temperature; refuse blocks that do not show them.
 
     The zero-g of each orientation is free, because the pose is unknown. Neighbouring residuals
-    are correlated (AR(1), by Cochrane and Orcutt). An effect of the history is kept where it
-    gains enough, and only after a reversal.
-
-    Parameters
-    ----------
-    sensor
-        The unit.
-    blocks
-        Means at rest.
-    with_history
-        Whether `thermal_lag` and `thermal_hysteresis` are tried.
-
-    Returns
-    -------
-    ThermalFit
-        The fit.
-
-    Raises
-    ------
-    UserError
-        The blocks are too few, or the temperature hardly changes.
-
+    are correlated (AR(1), by Cochrane and Orcutt). An effect of the history, `thermal_lag` or
+    `thermal_hysteresis`, is kept where it gains enough, and only after a reversal.
     """
     model = _Model(sensor, blocks)
-    histories: dict[str, History] = {}
-    gains: dict[str, float] = {}
+    tried = [model.best_shape('thermal_lag', _LAGS_S),
+             model.best_shape('thermal_hysteresis', np.array(_REACHES) * model.span_k)] \
+        if with_history and model.reverses else []
     plain = model.score(History())
-    if with_history and model.reverses:
-        for effect, shapes in (('thermal_lag', _LAGS_S), ('thermal_hysteresis', tuple(
-                np.array(_REACHES) * model.span_k))):
-            histories[effect] = model.best_shape(effect, shapes)
-            gains[effect] = model.score(histories[effect]) - plain
-    best = max(gains, key=lambda effect: gains[effect], default='')
-    history = histories[best] if best and gains[best] > _SMALLEST_GAIN else History()
-    return model.solve(history, gains)
+    gains = {history.effect: model.score(history) - plain for history in tried}
+    best = max(tried, key=lambda history: gains[history.effect], default=History())
+    return model.solve(best if gains.get(best.effect, 0) > _SMALLEST_GAIN else History(), gains)
 
 
 class _Axis(NamedTuple):
@@ -148,7 +123,7 @@ class _Axis(NamedTuple):
 class _Model:
     """The design of all axes."""
 
-    def __init__(self, sensor: Sensor, blocks: ThermalBlocks) -> None:
+    def __init__(self, sensor: Sensor, blocks: Poses) -> None:
         self._sensor, self._blocks = sensor, blocks
         temperature_c = blocks.temperature_c
         if len(temperature_c) < _FEWEST_BLOCKS:
@@ -173,7 +148,7 @@ class _Model:
         coefficients = len(axes) + 1 if history.effect else 0
         return float(likelihood - 0.5 * coefficients * np.log(count))
 
-    def best_shape(self, effect: str, shapes: Sequence[float]) -> History:
+    def best_shape(self, effect: str, shapes: np.ndarray) -> History:
         """Return the history of an effect with its most probable shape."""
         scores = [self.score(History(effect, shape)) for shape in shapes]
         best = int(np.argmax(scores))
@@ -191,20 +166,24 @@ class _Model:
         names: list[Coefficient] = []
         places: list[list[int]] = []
         for d, axis in enumerate(axes):
-            of_axis = [Coefficient(*name, axis) for name in self._parameters(d, history)]
+            of_axis = [Coefficient(*name, axis) for name in self._columns(d, history)]
             places.append(list(range(len(names), len(names) + len(of_axis))))
             names += of_axis
         values = np.concatenate([a.values[:len(p)] for a, p in zip(solved, places)])
         if history.effect:
             names.append(Coefficient(history.effect, _SHAPES[history.effect]))
             values = np.append(values, history.shape)
+            step = _RELATIVE_STEP * history.shape
+            above, below = (self._history(history._replace(shape=history.shape + s))
+                            for s in (step, -step))
+            by_shape = (above - below) / (2 * step)
         precision = np.diag([(PRIOR_WIDTH * parameter_of(name).scale) ** -2.0 for name in names])
         for a, place in zip(solved, places):
             columns, free = a.design[:, :len(place)], a.design[:, len(place):]
             if history.effect:
                 place = [*place, len(names) - 1]
                 size = a.values[len(place) - 2]
-                columns = np.column_stack([columns, size * self._shape_slope(history)])
+                columns = np.column_stack([columns, size * by_shape])
             white, white_free = (self._whitened(v, a.correlation) for v in (columns, free))
             white = white - white_free @ np.linalg.lstsq(white_free, white, rcond=None)[0]
             precision[np.ix_(place, place)] += white.T @ white / a.variance_g2
@@ -213,49 +192,34 @@ class _Model:
             np.array([float(np.std(a.residual_g)) for a in solved]),
             (float(self._blocks.temperature_c.min()), float(self._blocks.temperature_c.max())))
 
-    def _parameters(self, d: int, history: History) -> list[tuple[str, str]]:
-        """Return effect and parameter of the columns of one axis."""
-        scale = [('temperature_scale', 'per_k')] if self._has_scale(d) else []
-        size = [(history.effect, _SIZES[history.effect])] if history.effect else []
-        return [('temperature_bias', 'per_k'), ('temperature_bias', 'per_k2'), *scale, *size]
-
-    def _has_scale(self, d: int) -> bool:
-        """Return whether the orientations separate the scale factor of an axis from its zero-g."""
-        return float(np.ptp(self._forces_g(d))) > _SCALE_FORCES_G
-
-    def _forces_g(self, d: int) -> np.ndarray:
-        """Return the mean force of each orientation along an axis, g, (orientations,)."""
-        return np.array([self._outputs_g[self._orientation == i, d].mean()
-                         for i in range(self._orientation[-1] + 1)])
-
-    def _design(self, d: int, history: History) -> np.ndarray:
-        """Return the columns of one axis, g per unit; those of the orientations are last."""
+    def _columns(self, d: int, history: History) -> dict[tuple[str, str], np.ndarray]:
+        """Return the columns of one axis by effect and parameter, g per unit, (k,) each."""
         warmer_k = self._blocks.temperature_c - NOMINAL_TEMPERATURE_C
-        columns = [warmer_k, warmer_k ** 2]
-        if self._has_scale(d):
-            columns.append(self._forces_g(d)[self._orientation] * warmer_k)
+        columns = {('temperature_bias', 'per_k'): warmer_k,
+                   ('temperature_bias', 'per_k2'): warmer_k ** 2}
+        forces_g = np.array([self._outputs_g[self._orientation == i, d].mean()
+                             for i in range(self._orientation[-1] + 1)])
+        # The orientations must separate the scale factor of an axis from its zero-g.
+        if float(np.ptp(forces_g)) > _SCALE_FORCES_G:
+            columns['temperature_scale', 'per_k'] = forces_g[self._orientation] * warmer_k
         if history.effect:
-            columns.append(self._history(history))
-        orientations = np.arange(self._orientation[-1] + 1)
-        return np.column_stack([*columns, self._orientation[:, None] == orientations])
+            columns[history.effect, _SIZES[history.effect]] = self._history(history)
+        return columns
 
     def _history(self, history: History) -> np.ndarray:
         """Return the output of an effect of size 1, g, (k,)."""
+        temperature_c = self._blocks.temperature_c
         if history.effect == 'thermal_lag':
-            return lagging(self._blocks.time_s, self._blocks.temperature_c, history.shape) \
-                - self._blocks.temperature_c
-        return -loop(self._blocks.temperature_c, history.shape, {})
-
-    def _shape_slope(self, history: History) -> np.ndarray:
-        """Differentiate that output by the shape, (k,)."""
-        step = _RELATIVE_STEP * history.shape
-        above, below = (self._history(history._replace(shape=history.shape + s))
-                        for s in (step, -step))
-        return (above - below) / (2 * step)
+            return _lagging(self._blocks.time_s.mean(axis=1), temperature_c, history.shape) \
+                - temperature_c
+        return -loop(temperature_c, history.shape, {})
 
     def _solved(self, d: int, history: History) -> _Axis:
         """Fit one axis, its correlation among neighbours included."""
-        design, output_g, correlation = self._design(d, history), self._outputs_g[:, d], 0.0
+        output_g, correlation = self._outputs_g[:, d], 0.0
+        # The zero-g of each orientation has the last columns.
+        design = np.column_stack([*self._columns(d, history).values(), self._orientation[:, None]
+                                  == np.arange(self._orientation[-1] + 1)])
         for _ in range(_ITERATIONS):
             white, target = (self._whitened(v, correlation) for v in (design, output_g))
             size = np.sqrt((white ** 2).sum(axis=0))
@@ -283,54 +247,22 @@ _SHAPES = {'thermal_lag': 'tau_s', 'thermal_hysteresis': 'reach_k'}
 """Shape of each effect of the history."""
 
 
-def lagging(time_s: np.ndarray, values: np.ndarray, tau_s: float) -> np.ndarray:
-    """
-    Filter by 1/(1 + τ·s), exactly for straight lines between the samples.
-
-    Parameters
-    ----------
-    time_s
-        Ascending times, s, (k,).
-    values
-        Input, (k,).
-    tau_s
-        Time constant, s.
-
-    Returns
-    -------
-    ndarray
-        Output, (k,); it begins at the first input.
-
-    """
+def _lagging(time_s: np.ndarray, values: np.ndarray, tau_s: float) -> np.ndarray:
+    """Filter by 1/(1 + τ·s), exactly for straight lines between the samples, (k,)."""
     steps_s = np.diff(time_s)
     decay = np.exp(-steps_s / tau_s)
     ramp = (1 - decay) * tau_s / np.maximum(steps_s, np.finfo(float).tiny)
-    output = np.empty(len(values))
-    output[0] = values[0]
-    for i in range(1, len(values)):
-        output[i] = decay[i - 1] * output[i - 1] + (ramp[i - 1] - decay[i - 1]) * values[i - 1] \
-            + (1 - ramp[i - 1]) * values[i]
-    return output
+    output = [values[0]]
+    for d, r, before, now in zip(decay, ramp, values, values[1:]):
+        output.append(d * output[-1] + (r - d) * before + (1 - r) * now)
+    return np.array(output)
 
 
 def applied(base: Sensor, fitted: ThermalFit, calibrated_c: float) -> Sensor:
     """
     Put a fit over temperature into a calibrated unit, whose zero-g stays right.
 
-    Parameters
-    ----------
-    base
-        The calibrated unit.
-    fitted
-        The fit.
-    calibrated_c
-        Temperature at which the zero-g of the unit was calibrated, °C.
-
-    Returns
-    -------
-    Sensor
-        The unit with effects and covariance of both.
-
+    calibrated_c: temperature at which the zero-g of the unit was calibrated, °C.
     """
     names, effects = fitted.names, dict.fromkeys(name.effect for name in fitted.names)
     kept = [i for i, name in enumerate(base.covariance_names) if name.effect not in EFFECTS]
@@ -340,19 +272,17 @@ def applied(base: Sensor, fitted: ThermalFit, calibrated_c: float) -> Sensor:
                      values={e: v for e, v in base.values.items() if e not in dropped})
     sensor = put(with_neutral(before, [*effects, 'bias']), names, fitted.values)
     joint = np.eye(len(kept) + len(names))
-    shifts_v = []
-    for d, axis in enumerate(base.axes):
-        bias = Coefficient('bias', 'offset_v', axis)
-        shift_v = _zero_g_v(base, d, calibrated_c) - _zero_g_v(sensor, d, calibrated_c)
-        shifts_v.append((bias, shift_v))
+    biases = [Coefficient('bias', 'offset_v', axis) for axis in base.axes]
+    shifts_v = [_zero_g_v(base, d, calibrated_c) - _zero_g_v(sensor, d, calibrated_c)
+                for d in range(len(base.axes))]
+    for d, (axis, bias) in enumerate(zip(base.axes, biases)):
         if bias not in kept_names:
             continue
         for power, parameter in enumerate(('per_k', 'per_k2'), 1):
             column = len(kept) + names.index(Coefficient('temperature_bias', parameter, axis))
             joint[kept_names.index(bias), column] = -base.scale_v_per_g[d] * (
                 calibrated_c - NOMINAL_TEMPERATURE_C) ** power
-    biases = [bias for bias, _ in shifts_v]
-    sensor = put(sensor, biases, get(sensor, biases) + [shift for _, shift in shifts_v])
+    sensor = put(sensor, biases, get(sensor, biases) + shifts_v)
     blocks = scipy.linalg.block_diag(base.covariance[np.ix_(kept, kept)], fitted.covariance)
     covariance = joint @ blocks @ joint.T
     return replace(sensor, covariance=covariance, covariance_names=(*kept_names, *names))
@@ -368,6 +298,124 @@ def _zero_g_v(sensor: Sensor, d: int, temperature_c: float) -> float:
         values['per_k'][d] + warmer_k * values['per_k2'][d]))
 
 
-def _axes(names: Sequence[Coefficient]) -> list[str]:
-    """Return the axes of coefficients in their order."""
-    return list(dict.fromkeys(name.axis for name in names if name.axis))
+PARTS = 10
+"""Parts of the wanted range that are to be passed in each direction. Chosen: a curve of degree two
+is certain between them."""
+_STEADY_K = 0.25
+"""Change of temperature, K, that is no change of direction. Chosen: above the noise of a
+thermometer."""
+
+
+@dataclass(frozen=True)
+class Passed:
+    """Parts of the wanted range that the temperature has passed."""
+
+    middles_c: np.ndarray  # Middle of each part, °C, (parts,)
+    # warming, cooling: Whether the temperature has passed it in that direction, (parts,) bool
+    warming: np.ndarray
+    cooling: np.ndarray
+    rises: bool  # Whether the temperature rose last
+
+    @property
+    def complete(self) -> bool:
+        """Return whether all parts are passed in both directions."""
+        return bool(self.warming.all() and self.cooling.all())
+
+    def advice(self) -> str:
+        """Return what to do next, for people."""
+        half_c = (self.middles_c[1] - self.middles_c[0]) / 2
+        open_warm, open_cool = self.middles_c[~self.warming], self.middles_c[~self.cooling]
+        if self.complete:
+            return 'both directions are covered'
+        warms = len(open_warm) and (self.rises or not len(open_cool))
+        parts = open_warm if warms else open_cool
+        cool, warm = (f'cool it to {parts[0] - half_c:.0f} °C',
+                      f'warm it to {parts[-1] + half_c:.0f} °C')
+        # The other end first, unless the temperature already moves there.
+        order = (cool, warm) if warms else (warm, cool)
+        return order[1] if bool(warms) == self.rises else ', then '.join(order)
+
+
+def passed(temperatures_c: np.ndarray, range_c: tuple[float, float]) -> Passed:
+    """
+    Return which parts of a range the temperature has passed.
+
+    temperatures_c: temperatures in the order of time, °C, (k,).
+    """
+    low_c, high_c = range_c
+    middles_c = low_c + (high_c - low_c) * (np.arange(PARTS) + 0.5) / PARTS
+    steady_c = play(np.asarray(temperatures_c, float), _STEADY_K, {})
+    before_c, after_c = steady_c[:-1, None], steady_c[1:, None]
+    warming = ((before_c < middles_c) & (middles_c <= after_c)).any(axis=0)
+    cooling = ((after_c <= middles_c) & (middles_c < before_c)).any(axis=0)
+    changes = np.diff(steady_c)
+    changes = changes[changes != 0]
+    rises = bool(not len(changes) or changes[-1] > 0)
+    return Passed(middles_c, np.asarray(warming), np.asarray(cooling), rises)
+
+
+def expected_error_mg(fit: ThermalFit, covered: Passed, calibrated_c: float) -> float:
+    """
+    Return the expected error of the zero-g of the worst axis at the worst part of a range.
+
+    A part that is not passed in both directions may have a loop of typical width.
+    """
+    typical_g = parameter_of(Coefficient('thermal_hysteresis', 'half_width_g', 'x')).scale
+    unseen_g = np.where(covered.warming & covered.cooling, 0.0, typical_g)
+    return 1e3 * float(np.hypot(fit.error_g(covered.middles_c, calibrated_c), unseen_g).max())
+
+
+BLOCK_S = 10.0
+"""Length of a block, s. Chosen: short beside the lag of a thermometer."""
+_FEWEST_SAMPLES = 10
+"""Fewest samples of a block. Chosen: their scatter shows whether the sensor rests."""
+_MOST_BLOCKS = 2000
+"""Largest number of blocks. Chosen: a fit of less than a second."""
+_MOVING = 3.0
+"""Scatter of a block, divided by the median of all blocks, above which the sensor moves. Chosen:
+far above the scatter of a standard deviation of ten samples."""
+_SAME_ORIENTATION_G = 0.1
+"""Range of the block means, g, up to which a recording has one orientation. Chosen: above any
+zero-g over temperature."""
+
+
+def rest_blocks(recording: Recording, unit: Sensor) -> Poses | None:
+    """Cut a recording of a resting sensor into blocks with a temperature."""
+    temperature_c = recording.columns.get('temperature_c')
+    if temperature_c is None or not np.isfinite(temperature_c).any():
+        return None
+    volts, time_s = recording.volts(unit), recording.time_s
+    span_s = float(time_s[-1] - time_s[0])
+    block_s = max(BLOCK_S, span_s / _MOST_BLOCKS,
+                  _FEWEST_SAMPLES * float(np.median(np.diff(time_s))))
+    edges = np.unique(np.searchsorted(time_s, time_s[0] + block_s * np.arange(
+        int(span_s / block_s) + 1)))
+    parts = [slice(a, b) for a, b in pairwise(edges)
+             if b - a >= _FEWEST_SAMPLES and np.isfinite(temperature_c[a:b]).any()
+             and np.isfinite(volts[a:b]).all()]
+    if not parts:
+        return None
+    mean_v = np.array([volts[p].mean(axis=0) for p in parts])
+    scatter_v = np.array([volts[p].std(axis=0) for p in parts])
+    at_rest = (scatter_v <= _MOVING * np.median(scatter_v, axis=0) + unit.lsb_v).all(axis=1)
+    counts = np.array([p.stop - p.start for p in parts])[:, None]
+    missing = np.full(len(parts), np.nan)
+    poses = Poses(
+        volts=mean_v, std_v=scatter_v / np.sqrt(counts), alpha_rad=missing, beta_rad=missing,
+        time_s=np.array([[time_s[p.start], time_s[p.stop - 1]] for p in parts]),
+        check=np.zeros(len(parts), bool),
+        temperature_c=np.array([np.nanmean(temperature_c[p]) for p in parts])).subset(at_rest)
+    range_g = np.ptp(poses.volts, axis=0) / unit.nominal_scale_v_per_g if len(poses) else 0.0
+    return poses if len(poses) and np.max(range_g) < _SAME_ORIENTATION_G else None
+
+
+def blocks_of(poses: Poses) -> Poses:
+    """Return the poses with a temperature, in the order of time."""
+    order = np.argsort(poses.time_s[:, 0], kind='stable')
+    return poses.subset(order[np.isfinite(poses.temperature_c[order])])
+
+
+def calibrated_temperature_c(base: Sensor) -> float:
+    """Return the temperature at which a unit was calibrated, °C; else that of the datasheet."""
+    range_c = base.envelope.temperature_c
+    return float(np.mean(range_c)) if range_c else NOMINAL_TEMPERATURE_C

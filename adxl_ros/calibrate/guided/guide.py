@@ -1,24 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What a guide is: it leads through the poses of one calibration, with a stage or by hand.
+What all guides share: a guide leads through the poses of one calibration.
 
-- The newest samples of a stream, and readings of temperature and supply over time.
-- What the guides of a sensor share that no stage carries.
+- What it looks at: the newest samples of a stream, those of a dwell, readings of temperature and
+  supply over time, and those of the encoder of a stage.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections import deque
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+import math
+from typing import NamedTuple
 
-from adxl_ros.calibrate.guided.screen_contents import Estimate, Progress, Status
+from adxl_ros.calibrate.guided.screen_contents import AxisReading, LiveReading, RestReading
 from adxl_ros.files.recording_columns import stamped_rate_hz
-from adxl_ros.files.sweep_journal import JournalEntry, PoseRecord
+from adxl_ros.files.sweep_journal import JournalEntry, PoseDropped, PoseRecord
+from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.signals.rest_detection import datasheet_noise, RestFinder, Stillness
+from adxl_ros.signals.rest_detection import (
+    datasheet_noise,
+    Rest,
+    rest_means,
+    RestFinder,
+    Stillness,
+)
 import numpy as np
 
 _REST_WINDOW_S = 1.2
@@ -28,22 +37,18 @@ _SHOWN_S = 0.5
 _FEWEST_SAMPLES = 20
 """Samples that stay at the lowest rates; chosen: they give the rate."""
 _BACK_NS = 1_000_000_000
-"""A stamp that is earlier than the one before by more is of another clock, ns.
-
-Chosen: messages in wrong order differ by less.
-"""
+"""A stamp that is earlier than the one before by more is of another clock, ns; chosen: messages
+in wrong order differ by less."""
 _KEPT_READINGS = 100_000
 """Readings that stay in memory; chosen: 1000 s at 100 Hz."""
 STALE_NS = 60_000_000_000
-"""A reading counts for samples up to this far from its stamp, ns.
-
-Chosen: temperature and supply hardly change in a minute.
-"""
+"""A reading counts for samples up to this far from its stamp, ns; chosen: temperature and supply
+hardly change in a minute."""
 
 
-def went_back(newest_ns: int, stamp_ns: int) -> bool:
+def went_back(newest_ns: int | None, stamp_ns: int) -> bool:
     """Return whether stamps go back, since the driver was restarted or a clock was set."""
-    return stamp_ns < newest_ns - _BACK_NS
+    return newest_ns is not None and stamp_ns < newest_ns - _BACK_NS
 
 
 class NewestSamples:
@@ -51,44 +56,46 @@ class NewestSamples:
 
     def __init__(self, sensor: Sensor) -> None:
         self._sensor = sensor
-        self._keep = max(round(_REST_WINDOW_S * sensor.rate_hz), _FEWEST_SAMPLES)
-        self._show = max(round(_SHOWN_S * sensor.rate_hz), _FEWEST_SAMPLES)
         self.stamps_ns = np.zeros(0, np.int64)  # Stamps, ns, (n,)
         self.volts = np.zeros((0, len(sensor.axes)))  # Samples, V, (n, m)
 
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
-        """
-        Take samples.
-
-        stamps_ns: their stamps, ns, (n,); volts: the samples, V, (n, m).
-        """
-        self.stamps_ns = np.concatenate([self.stamps_ns, stamps_ns])[-self._keep:]
-        self.volts = np.concatenate([self.volts, volts])[-self._keep:]
-
-    def mean_mps2(self) -> list[float]:
-        """Return the mean of each axis, m/s², (m,)."""
-        return self._shown().mean(axis=0).tolist()
-
-    def rms_mps2(self) -> list[float]:
-        """Return the rms of each axis about its mean, m/s², (m,)."""
-        return self._shown().std(axis=0).tolist()
+        """Take samples: their stamps, ns, (n,), and volts, (n, m)."""
+        keep = self._count(_REST_WINDOW_S)
+        self.stamps_ns = np.concatenate([self.stamps_ns, stamps_ns])[-keep:]
+        self.volts = np.concatenate([self.volts, volts])[-keep:]
 
     def stillness(self) -> Stillness | None:
         """Return whether the samples are at rest, by the datasheet's noise; None if too few."""
-        finder = RestFinder(self._sensor.rate_hz, len(self._sensor.axes),
-                            datasheet_noise(self._sensor), learn=False)
+        dwell = Dwell(self._sensor, int(self.stamps_ns[0]) if len(self.stamps_ns) else 0)
         if len(self.stamps_ns):
-            finder.feed((self.stamps_ns - self.stamps_ns[0]) * 1e-9, self.volts)
-        return finder.stillness()
+            dwell.feed(self.stamps_ns, self.volts)
+        return dwell.stillness()
 
     def rate_hz(self) -> float:
         """Return the rate of the stamps, Hz; NaN while there are too few of them."""
         if len(self.stamps_ns) < _FEWEST_SAMPLES:
-            return float('nan')
+            return math.nan
         return stamped_rate_hz((self.stamps_ns - self.stamps_ns[0]) * 1e-9)
 
-    def _shown(self) -> np.ndarray:
-        return to_nominal_mps2(self.volts[-self._show:], self._sensor)
+    def reading(self, stillness: Stillness | None) -> LiveReading | None:
+        """Return what the sensor reads at present, for the screen; None without samples."""
+        if not len(self.volts):
+            return None
+        unit, rate_hz = self._sensor, self.rate_hz()
+        shown = to_nominal_mps2(self.volts[-self._count(_SHOWN_S):], unit)
+        axes = tuple(map(AxisReading, unit.axes, shown.mean(axis=0).tolist(),
+                         shown.std(axis=0).tolist()))
+        rest = None
+        if stillness is not None:
+            scale = G0_MPS2 / float(unit.nominal_scale_v_per_g[stillness.axis])
+            rest = RestReading(bool(stillness.at_rest), unit.axes[stillness.axis],
+                               stillness.statistic, float(stillness.value) * scale,
+                               float(stillness.limit) * scale)
+        return LiveReading(axes, rate_hz if math.isfinite(rate_hz) else None, rest)
+
+    def _count(self, seconds: float) -> int:
+        return max(round(seconds * self._sensor.rate_hz), _FEWEST_SAMPLES)
 
 
 class Readings:
@@ -100,7 +107,7 @@ class Readings:
 
     def add(self, stamp_ns: int, value: float) -> None:
         """Take a reading; one that is not finite is left out."""
-        if not np.isfinite(value):
+        if not math.isfinite(value):
             return
         if self._stamps_ns and stamp_ns < self._stamps_ns[-1]:
             self._stamps_ns.clear()
@@ -115,16 +122,153 @@ class Readings:
         if begin == end and end and first_ns - self._stamps_ns[end - 1] < STALE_NS:
             begin = end - 1
         if begin == end:
-            return float('nan')
+            return math.nan
         return float(np.mean([self._values[i] for i in range(begin, end)]))
 
 
-class Surroundings:
-    """Temperature and supply over time."""
+class Dwell:
+    """Samples from an arrival on, and the rests among them."""
+
+    def __init__(self, sensor: Sensor, arrived_ns: int) -> None:
+        self.arrived_ns = arrived_ns
+        self._sensor = sensor
+        self._finder = RestFinder(sensor.rate_hz, len(sensor.axes), datasheet_noise(sensor),
+                                  learn=False)
+        self._stamps: list[np.ndarray] = []
+        self._volts: list[np.ndarray] = []
+
+    def __len__(self) -> int:
+        """Return the number of samples since the arrival."""
+        return sum(map(len, self._stamps))
+
+    def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
+        """Take samples: their stamps, ns, (n,), and volts, (n, m)."""
+        new = stamps_ns >= self.arrived_ns
+        self._stamps.append(stamps_ns[new])
+        self._volts.append(volts[new])
+        # From the arrival: float64 seconds since 1970 resolve only 0.2 µs.
+        self._finder.feed((stamps_ns[new] - self.arrived_ns) * 1e-9, volts[new])
+
+    def rests(self) -> list[Rest]:
+        """Return the rests so far; the last one may still go on."""
+        return self._finder.rests() if self._stamps else []
+
+    def full_rest(self, samples: int) -> Rest | None:
+        """Return the first rest of at least a number of samples."""
+        return next((r for r in self.rests() if r.stop - r.start >= samples), None)
+
+    def stillness(self) -> Stillness | None:
+        """Return whether the newest samples are at rest; None while they are too few."""
+        return self._finder.stillness()
+
+    def at_rest(self) -> bool:
+        """Return whether the newest samples are known to be at rest."""
+        stillness = self.stillness()
+        return stillness is not None and stillness.at_rest
+
+    def volts(self, rest: Rest) -> np.ndarray:
+        """Return the samples of a rest, V, (n, m)."""
+        return np.concatenate(self._volts)[rest.start:rest.stop]
+
+    def samples(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return all samples: their stamps, ns, (n,), and volts, (n, m)."""
+        return np.concatenate(self._stamps), np.concatenate(self._volts)
+
+    def after(self, stop_ns: int) -> Dwell | None:
+        """Return the dwell that begins with the first sample after a stamp, ns, if any."""
+        stamps_ns, volts = self.samples()
+        later = stamps_ns > stop_ns
+        if not later.any():
+            return None
+        dwell = Dwell(self._sensor, int(stamps_ns[later][0]))
+        dwell.feed(stamps_ns[later], volts[later])
+        return dwell
+
+    def record(self, pose: int, rest: Rest, samples: int) -> PoseRecord:
+        """Average the first samples of a rest."""
+        (stamps, volts), start, stop = self.samples(), rest.start, rest.start + samples
+        times = (stamps - self.arrived_ns) * 1e-9
+        mean, std = rest_means(times, volts, [Rest(start, stop, times[start], times[stop - 1])],
+                               self._sensor.rate_hz, datasheet_noise(self._sensor))
+        return PoseRecord(pose=pose, start_ns=int(stamps[start]), stop_ns=int(stamps[stop - 1]),
+                          samples=samples, mean_v=tuple(mean[0].tolist()),
+                          std_v=tuple(std[0].tolist()))
+
+
+_CLOCK_OFFSET_S = 2.0
+"""Largest offset of the clocks of stage and sensor, s; chosen: above any delay of messages."""
+_LONGEST_IN_S = 600
+"""Longest time that is stated in seconds; a longer time is stated in hours."""
+_KEPT_OFFSETS = 20
+"""Offsets of the two clocks that stay in memory; chosen: a second of messages at 20 Hz."""
+_FEWEST_OFFSETS = 4
+"""Offsets of the two clocks that a comparison needs; chosen: one message alone may be late."""
+SILENT_S = 3.0
+"""The encoder counts as silent after this, s; chosen: several of its longest usual periods."""
+
+
+class EncoderTrack:
+    """The newest readings of the encoder, against the stamps of the samples."""
 
     def __init__(self) -> None:
-        self.temperature_c = Readings()  # Readings of the temperature, °C
-        self.supply_v = Readings()  # Readings of the supply, V
+        self.newest_ns: int | None = None  # Stamp of the newest reading, ns
+        self.angles_rad: tuple[float, float] | None = None  # Newest alpha and beta, rad
+        self._readings: deque[tuple[int, float, float]] = deque(maxlen=_KEPT_READINGS)
+        self._offsets_s: deque[float] = deque(maxlen=_KEPT_OFFSETS)
+        self._is_compared = True
+
+    def read(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> bool:
+        """Take a reading; return whether its clock went back."""
+        restarted = went_back(self.newest_ns, stamp_ns)
+        if restarted:
+            self._readings.clear()
+        self._readings.append((stamp_ns, alpha_rad, beta_rad))
+        self.newest_ns, self.angles_rad = stamp_ns, (alpha_rad, beta_rad)
+        self._is_compared = False
+        return restarted
+
+    def compare_clock(self, sample_ns: int) -> None:
+        """Compare the clock of a new reading with the newest stamp of the samples, ns."""
+        if not self._is_compared and self.newest_ns is not None:
+            self._offsets_s.append((self.newest_ns - sample_ns) * 1e-9)
+        self._is_compared = True
+
+    def forget_clock(self) -> None:
+        """Forget the comparisons, since the clock of the samples has changed."""
+        self._offsets_s.clear()
+
+    def clock_fault(self) -> str:
+        """Return what is wrong with the clock of the encoder, or ''."""
+        # The smallest offset is that of the message with the least delay.
+        ahead_s = min(self._offsets_s, key=abs) \
+            if len(self._offsets_s) >= _FEWEST_OFFSETS else 0.0
+        size_s = abs(ahead_s)
+        if size_s <= _CLOCK_OFFSET_S:
+            return ''
+        size = f'{size_s:.1f} s' if size_s < _LONGEST_IN_S else f'{size_s / 3600:.3g} h'
+        return (f'stage/joint_states is stamped {size} {"ahead of" if ahead_s > 0 else "behind"} '
+                'imu/data_raw: stage and sensor must share one clock (use_sim_time for both or '
+                'for none, or synchronise their computers)')
+
+    def silence(self, sample_ns: int) -> str:
+        """Return one line on the time without readings up to a stamp, ns; '' if it is short."""
+        if self.newest_ns is None:
+            return 'nothing on stage/joint_states'
+        silent_s = (sample_ns - self.newest_ns) * 1e-9
+        return f'nothing on stage/joint_states for {silent_s:.0f} s' if silent_s > SILENT_S else ''
+
+    def between(self, first_ns: int, last_ns: int) -> np.ndarray:
+        """Return the angles alpha and beta between two stamps, rad, (n, 2)."""
+        inside = [angles_rad for stamp_ns, *angles_rad in self._readings
+                  if first_ns <= stamp_ns <= last_ns]
+        return np.array(inside).reshape(-1, 2)
+
+    def mean_between(self, first_ns: int, last_ns: int) -> tuple[float, float]:
+        """Average the angles between two stamps, rad; without any, take the newest ones."""
+        inside = self.between(first_ns, last_ns)
+        alpha_rad, beta_rad = np.mean(
+            inside if len(inside) else np.array([self.angles_rad]), axis=0)
+        return float(alpha_rad), float(beta_rad)
 
 
 class NextPose(NamedTuple):
@@ -137,123 +281,23 @@ class NextPose(NamedTuple):
     newest_ns: int = 0  # Stamp of the newest sample, ns: a command is given after it
 
 
-class Guide(Protocol):
-    """Leads through the poses of one calibration: samples go in, accepted poses come out."""
-
-    accepted: dict[int, PoseRecord]  # Accepted poses by number
-    surroundings: Surroundings  # Temperature and supply over time
-    newest_ns: int | None  # Stamp of the newest sample, ns; None before the first
-
-    @property
-    def moves_itself(self) -> bool:
-        """Return whether a stage turns itself, so that nobody captures."""
-
-    @property
-    def is_over(self) -> bool:
-        """Return whether no pose is open; a hand-held calibration ends by `finish` only."""
-
-    @property
-    def open_poses(self) -> int:
-        """Return the number of open poses; 0 where the number of poses is not fixed."""
-
-    @property
-    def poses_to_verify(self) -> int:
-        """Return how many poses are still to be taken again for the check of the mounting."""
-
-    @property
-    def pose_number(self) -> int:
-        """Return the number of the next pose, from 1."""
-
-    @property
-    def previous(self) -> int | None:
-        """Return the number of the previous pose, from 0; None where there is none."""
-
-    def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
-        """
-        Take samples.
-
-        stamps_ns: their stamps, ns, (n,); volts: the samples, V, (n, m).
-        """
-
-    def read_encoder(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
-        """Take the angles of the stage."""
-
-    def read_command(self, alpha_rad: float, beta_rad: float) -> None:
-        """Take a command that somebody gave the stage."""
-
-    def accept(self) -> PoseRecord | None:
-        """Return the next pose for the journal, if one is complete."""
-
-    def take(self, record: PoseRecord) -> None:
-        """Count a pose that is on disk, and go on to the next one."""
-
-    def retry(self) -> None:
-        """Take the same pose again, since its record is not on disk."""
-
-    def capture(self) -> str:
-        """Take the pose in which the operator has put the sensor; return an obstacle or ''."""
-
-    def verify(self) -> None:
-        """Take earlier poses again, to check that the mounting is as it was."""
-
-    def skip_entry(self) -> JournalEntry | None:
-        """Return the entry that the journal needs before `skip`; None for none."""
-
-    def skip(self) -> str:
-        """Leave out the open pose; return a line for people."""
-
-    def redo(self) -> str:
-        """Forget the previous pose; return a line for people, or '' where there is none."""
-
-    def poses_to_fit(self) -> list[PoseRecord]:
-        """Return the poses for the fit."""
-
-    def new_refusal(self) -> str:
-        """Return why a pose was refused since the last call, or ''."""
-
-    def status(self) -> Status:
-        """Return what the guide waits for."""
-
-    def destination(self) -> str:
-        """Name the pose to reach, for people."""
-
-    def next_pose(self) -> NextPose | None:
-        """Return the pose to announce; None where no pose is open."""
-
-    def values(self) -> dict[str, str | float]:
-        """Return further values for programs, by key."""
-
-    def tilt_error_rad(self) -> float:
-        """Return the expected rms error of alpha and beta by the poses so far, rad."""
-
-    def stillness(self, newest: NewestSamples) -> Stillness | None:
-        """Return whether the newest samples are at rest; None while they are too few."""
-
-    def progress(self) -> Progress:
-        """Return the progress of the calibration, for the screen."""
-
-    def estimate_contents(self) -> Estimate:
-        """Return what the poses determine so far, for the screen; this costs some time."""
-
-
-class StagelessGuide:
+class Guide:
     """
-    The part of a `Guide` that is the same for all sensors without a stage.
+    What all guides share: the accepted poses, and what was refused.
 
-    No pose is known before it is taken, so that none is open, and none can be taken again to
-    check the mounting.
+    By itself it is the guide of a sensor that no stage carries. No pose is known before it is
+    taken, so that none is open, and none can be taken again to check the mounting.
     """
 
-    moves_itself = False
-    open_poses = 0
-    poses_to_verify = 0
+    moves_itself = False  # Whether a stage turns itself, so that nobody captures
 
     def __init__(self, sensor: Sensor, accepted: Sequence[PoseRecord]) -> None:
         self.sensor = sensor
-        self.accepted = {record.pose: record for record in accepted}
-        self.surroundings = Surroundings()
-        self.newest_ns: int | None = None
-        self._new_refusal = ''
+        self.accepted = {record.pose: record for record in accepted}  # By number
+        self.to_verify: list[PoseRecord] = []  # Poses to take again, to check the mounting
+        self.readings = {'temperature': Readings(), 'supply': Readings()}  # °C and V
+        self.newest_ns: int | None = None  # Stamp of the newest sample, ns
+        self.refusal = self._new_refusal = ''  # Why the newest pose was refused; '' if not
 
     @property
     def pose_number(self) -> int:
@@ -261,38 +305,71 @@ class StagelessGuide:
         return len(self.accepted) + 1
 
     @property
-    def previous(self) -> int | None:
-        """Return the number of the newest pose, from 0; None where there is none."""
-        return max(self.accepted, default=None)
+    def open_poses(self) -> int:
+        """Return the number of open poses; 0 where the number of poses is not fixed."""
+        return 0
 
     @property
-    def next_number(self) -> int:
-        """Return the number that the journal gives the next pose, from 0."""
-        return max(self.accepted, default=-1) + 1
+    def previous(self) -> int | None:
+        """Return the number of the previous pose, from 0; None where there is none."""
+        return max(self.accepted, default=None)
 
-    def verify(self) -> None:
-        """Do nothing: no pose can be taken again."""
+    def retry(self) -> None:
+        """Take the same pose again, since its record is not on disk; here it is still there."""
 
-    def read_encoder(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
-        """Do nothing: no stage carries the sensor."""
+    def redo(self, append: Callable[[JournalEntry], None]) -> str:
+        """Forget the previous pose, in the journal first; return a line for people, or ''."""
+        number = self.previous
+        if number is None:
+            return ''
+        # The fit must not use the pose, even if it is not taken again.
+        append(PoseDropped(number))
+        return self.forget(number)
 
-    def read_command(self, alpha_rad: float, beta_rad: float) -> None:
-        """Do nothing: no stage carries the sensor."""
+    def forget(self, number: int) -> str:
+        """Forget a pose; return a line for people."""
+        raise NotImplementedError
 
-    def skip_entry(self) -> JournalEntry | None:
-        """Return None: what is left out has no entry in the journal."""
-        return None
+    def poses_to_fit(self) -> list[PoseRecord]:
+        """Return the poses for the fit: the accepted ones, by number."""
+        return [self.accepted[number] for number in sorted(self.accepted)]
+
+    def values(self) -> dict[str, str | float]:
+        """Return further values for programs, by key."""
+        return {}
+
+    def stillness(self, newest: NewestSamples) -> Stillness | None:
+        """Return whether the newest samples are at rest; None while they are too few."""
+        return newest.stillness()
+
+    def refuse(self, reason: str) -> None:
+        """Refuse a pose; a new reason is kept for `new_refusal`."""
+        if reason != self.refusal:
+            self._new_refusal = reason
+        self.refusal = reason
 
     def new_refusal(self) -> str:
         """Return why a pose was refused since the last call, or ''."""
         text, self._new_refusal = self._new_refusal, ''
         return text
 
-    def _accepted_records(self) -> list[PoseRecord]:
-        """Return the accepted poses, by number."""
-        return [self.accepted[number] for number in sorted(self.accepted)]
+    def with_ambient(self, record: PoseRecord) -> PoseRecord:
+        """Add temperature and supply to a record."""
+        temperature_c, supply_v = (readings.mean(record.start_ns, record.stop_ns)
+                                   for readings in self.readings.values())
+        return replace(record, temperature_c=temperature_c, supply_v=supply_v)
 
-    def _saturated(self, part: str) -> str:
+    def temperature_fault(self, now_c: float, span_c: float) -> str:
+        """Refuse a pose whose temperature differs from that of the first pose."""
+        first_c = next((record.temperature_c for _, record in sorted(self.accepted.items())
+                        if math.isfinite(record.temperature_c)), math.nan)
+        if not abs(now_c - first_c) > span_c:
+            return ''
+        return (f'temperature moved {abs(now_c - first_c):.1f} °C since the first pose '
+                f'({first_c:.1f} to {now_c:.1f} °C), must stay within {span_c:g} °C; wait until '
+                'it is back, or finish with the poses so far')
+
+    def saturated_text(self, part: str) -> str:
         """Return that a part of the stream, 'rest' or 'block', is refused as saturated."""
         return (f'saturated: samples of the {part} are beyond the range of '
                 f'±{self.sensor.range_g:g} g or at a rail of the ADC; check supply and wiring')

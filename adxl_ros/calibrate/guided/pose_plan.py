@@ -4,17 +4,21 @@
 The pose plan: which poses a sweep visits, in which order.
 
 - How many poses of each group are taken: by plane, by direction of travel, by orientation.
+- Checks of one pose: one line with the value that is wrong and what to do, or '' if all is well.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 from adxl_ros.calibrate.fits import gravity_model
 from adxl_ros.calibrate.guided.screen_contents import Coverage
 from adxl_ros.errors import UserError
+from adxl_ros.files.sweep_journal import PoseRecord
+from adxl_ros.model.kinematics import specific_force
+from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 ORDER = 3
@@ -90,6 +94,30 @@ def with_checks(targets: list[Target], check_poses: int) -> list[Target]:
     checks = [Target(_whole_degrees(target.alpha_rad), _whole_degrees(target.beta_rad), True)
               for target in spread(check_poses)]
     return targets + nearest(targets[-1], checks)
+
+
+class Course:
+    """The poses of a plan: which are taken or left out, and which is to be taken next."""
+
+    def __init__(self, targets: Sequence[Target], accepted: Collection[int],
+                 skipped: Iterable[int]) -> None:
+        self.targets, self.accepted = targets, accepted  # Poses, and numbers of the taken ones
+        self.skipped = set(skipped) - set(accepted)  # Numbers of those that are left out
+        self.index = self.next_open()  # Number of the pose to go to, from 0
+
+    @property
+    def target(self) -> Target | None:
+        """Return the pose to go to; None at the end."""
+        return self.targets[self.index] if self.index < len(self.targets) else None
+
+    @property
+    def closed(self) -> set[int]:
+        """Return the numbers of the poses that are taken or left out."""
+        return self.skipped.union(self.accepted)
+
+    def next_open(self) -> int:
+        """Return the number of the first open pose; the number of poses if none is."""
+        return min({*range(len(self.targets))} - self.closed, default=len(self.targets))
 
 
 def travel_rad(targets: Sequence[Target]) -> float:
@@ -177,3 +205,99 @@ def _groups(target: Target, previous: Target | None) -> list[str]:
     if previous is None or target.beta_rad == previous.beta_rad:
         return [plane]
     return [plane, _FORTH if target.beta_rad > previous.beta_rad else _BACK]
+
+
+_RATE_ERROR = 0.05
+"""Largest relative error of the sample rate; chosen: above the error of any oscillator."""
+_CHANGE_G = 0.003
+"""Largest change of a repeated pose beyond noise and stage error, g; chosen: a turn of 0.17°."""
+_NOISE_STDS = 3.0
+"""Standard deviations of the noise in the limit of a change; chosen: exceeded once in 400."""
+_ACROSS_COSINE = 0.94
+"""Cosine of 20°: two poses whose verticals are closer do not show each turn of the mounting."""
+
+
+def angle_fault(target: Target, alpha_rad: float, beta_rad: float, tolerance_rad: float) -> str:
+    """Refuse a stage that is not at the pose."""
+    return ', '.join(
+        f'{name} is {_degrees(now - wanted)} from the target {np.degrees(wanted):.4g}°'
+        for name, now, wanted in (('alpha', alpha_rad, target.alpha_rad),
+                                  ('beta', beta_rad, target.beta_rad))
+        if abs(now - wanted) > tolerance_rad)
+
+
+def motion_fault(readings_rad: np.ndarray, tolerance_rad: float) -> str:
+    """Refuse a stage whose encoder, (n, 2), turned while the pose was averaged."""
+    for name, angles_rad in zip(('alpha', 'beta'), readings_rad.T):
+        range_rad = float(np.ptp(angles_rad)) if len(angles_rad) else 0.0
+        if range_rad > tolerance_rad:
+            return (f'{name} moved {_degrees(range_rad)} while the pose was averaged; hold the '
+                    'stage still')
+    return ''
+
+
+def saturation_fault(sensor: Sensor, volts: np.ndarray) -> str:
+    """Refuse samples, V, (n, m), at a rail of the ADC or beyond the range of the sensor."""
+    rows, columns = np.nonzero(sensor.saturated(volts))
+    if not len(rows):
+        return ''
+    axis = int(columns[0])
+    reading_v = volts[rows[0], axis]
+    reading_g = (reading_v - sensor.nominal_zero_g_v[axis]) / sensor.nominal_scale_v_per_g[axis]
+    return (f'saturated: {sensor.axes[axis]} reads {signed_text(reading_g)} g '
+            f'({reading_v:.3f} V), beyond its range of ±{sensor.range_g:g} g or at a rail of the '
+            'ADC; check supply and wiring')
+
+
+def rate_fault(measured_hz: float, unit: Sensor) -> str:
+    """Refuse samples whose rate is not that of the unit."""
+    if not abs(measured_hz / unit.rate_hz - 1) > _RATE_ERROR:
+        return ''
+    expected = f'were {unit.rate_hz:.4g} at the start; keep the rate of the sensor' \
+        if 'rate_hz' in unit.measured else \
+        f'sensor_info states rate_hz {unit.rate_hz:.4g}; correct the rate of the driver'
+    return f'samples are {measured_hz:.4g} a second by their stamps, but {expected}'
+
+
+def _degrees(angle_rad: float) -> str:
+    """Return the size of an angle as text."""
+    size = abs(float(np.degrees(angle_rad)))
+    return f'{size:.2f}°' if size < 1 else f'{size:.1f}°'
+
+
+def signed_text(value: float) -> str:
+    """Return a value as text, with its sign."""
+    return f'{value:+.2f}'.replace('-', '−')
+
+
+def to_take_again(records: Sequence[PoseRecord]) -> list[PoseRecord]:
+    """
+    Choose the poses of a journal that show the mounting when they are taken again.
+
+    A turn about the vertical of the newest pose does not show there. The pose whose vertical is
+    nearest to 90° from it comes second, if there is one.
+    """
+    def alignment(record: PoseRecord) -> float:
+        verticals = [np.array(specific_force(pose.alpha_rad, pose.beta_rad, 1.0))
+                     for pose in (record, newest)]
+        return abs(float(verticals[0] @ verticals[1]))
+
+    newest = max(records, key=lambda record: record.stop_ns)
+    across = min(records, key=alignment)
+    return [newest, across] if alignment(across) < _ACROSS_COSINE else [newest]
+
+
+def changed(sensor: Sensor, before: PoseRecord, now: PoseRecord, tolerance_rad: float) -> str:
+    """Compare two readings of the same pose, before and after an interruption."""
+    before_v, now_v = np.array(before.mean_v), np.array(now.mean_v)
+    change_g = np.abs(now_v - before_v) / sensor.nominal_scale_v_per_g
+    noise_g = np.hypot(before.std_v, now.std_v) / sensor.nominal_scale_v_per_g
+    # The stage may be off by its tolerance both times.
+    limit_g = _CHANGE_G + _NOISE_STDS * noise_g + 2 * tolerance_rad
+    axis = int((change_g - limit_g).argmax())
+    if change_g[axis] <= limit_g[axis]:
+        return ''
+    return (f'mounting changed: in pose {before.pose + 1} {sensor.axes[axis]} reads '
+            f'{now_v[axis]:.4f} V, but read {before_v[axis]:.4f} V before the interruption '
+            f'({change_g[axis] * 1e3:.1f} mg apart, {limit_g[axis] * 1e3:.1f} mg are allowed); '
+            'put the sensor back as it was, or begin again with resume:=anew')

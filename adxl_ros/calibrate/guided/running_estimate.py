@@ -3,6 +3,7 @@
 """
 The estimate of a unit after each pose: coefficients and expected tilt error.
 
+- The check of a reading against it.
 - The quick plan: the fewest poses that reach a stated tilt error.
 """
 
@@ -10,16 +11,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations, product
 import math
-from math import ceil
 
-from adxl_ros.calibrate import pose_response
 from adxl_ros.calibrate.fits import full_model, linearisation
-from adxl_ros.calibrate.fits.linearisation import linearised
-from adxl_ros.calibrate.guided.pose_plan import nearest, spread, Target, with_checks
+from adxl_ros.calibrate.fits.linearisation import linearised, StageError
+from adxl_ros.calibrate.guided import pose_plan
+from adxl_ros.calibrate.guided.pose_plan import angle_fault, signed_text, Target
 from adxl_ros.calibrate.guided.screen_contents import CoefficientRow
-from adxl_ros.calibrate.pose_response import StageError
-from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.poses import angle_jacobian, coefficient_jacobian, Poses, predicted_volts
+from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
 from adxl_ros.model.constants import Z_90
@@ -38,13 +39,21 @@ _VISIBLE_RAD = np.radians(1.0)
 _LEAST_STD_V = 1e-7
 """Lower bound of the noise of a mean, V; chosen: below any ADC, so that no weight is infinite."""
 _SEARCH_STD_RAD = np.radians(60.0)
-"""Prior standard deviation of the angles in `angles_of`, rad; chosen: a wrong pose is likely."""
+"""Prior standard deviation of the angles in `_angles_of`, rad; chosen: a wrong pose is likely."""
 _LONGEST_STEP_RAD = 0.3
-"""Longest step of the search of `angles_of`, rad; chosen: the response is nearly linear in it."""
+"""Longest step of the search of `_angles_of`, rad; chosen: the response is nearly linear in it."""
 _SEARCH_STEPS = 25
-"""Steps of the search of `angles_of`; chosen: several turns at the longest step."""
+"""Steps of the search of `_angles_of`; chosen: several turns at the longest step."""
 _MOST_DECIMALS = 6
 """Most decimals of a coefficient on the screen; chosen: 1 µV."""
+_OUTLIER_STDS = 3.5
+"""Residual from which a pose is refused, standard deviations; chosen: one of 2000 by chance."""
+_MODEL_STD_G = 5e-3
+"""Standard deviation of further model errors, g; chosen: it accepts twice the datasheet limits."""
+_SAME_READING_G = 0.2
+"""Largest difference of readings that count as equal when a mistake is named, g; chosen."""
+_WIRING_POSES = 4
+"""Poses after which the wiring of the axes counts as right; chosen: all axes have moved."""
 _EXPLAINED_STDS = 3.0
 """Largest residual of angles that explain volts, standard deviations; chosen: the usual 3."""
 
@@ -68,50 +77,66 @@ class RunningEstimate:
         """Return the standard deviation of each coefficient, (p,)."""
         return np.sqrt(np.diag(self.covariance))
 
-    def predicted(self, alpha_rad: float, beta_rad: float) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Predict the volts of a pose.
+    def reading_fault(self, target: Target, volts: np.ndarray, tolerance_rad: float) -> str:
+        """Refuse a pose whose mean, V, (m,), is an outlier to the prediction by earlier poses."""
+        sensor, pose = self.unit, self._pose(target.alpha_rad, target.beta_rad)
+        slope = coefficient_jacobian(sensor, pose, self.names)[0]
+        variance = np.diag(slope @ self.covariance @ slope.T + linearisation.volts_covariance(
+            sensor, pose, self.stage).blocks[0])
+        expected_v = predicted_volts(sensor, pose)[0]
+        slack_v = sensor.nominal_scale_v_per_g * np.hypot(_MODEL_STD_G, tolerance_rad)
+        residual_stds = np.abs(volts - expected_v) / np.hypot(np.sqrt(variance), slack_v)
+        if residual_stds.max() <= _OUTLIER_STDS:
+            return ''
+        axis = int(residual_stds.argmax())
+        measured_g, expected_g = ((v - sensor.zero_g_v) / sensor.scale_v_per_g
+                                  for v in (volts, expected_v))
+        finding = (f'{sensor.axes[axis]} reads {signed_text(measured_g[axis])} g where '
+                   f'{signed_text(expected_g[axis])} g was expected')
+        # After some good poses the wiring is right, but the operator may still be wrong.
+        is_wiring_unproven = self.poses < _WIRING_POSES
+        if is_wiring_unproven and _is_crossed(measured_g, expected_g):
+            return f'{finding}: axis inverted or swapped; check wiring, mounting and pose'
+        advice = ', or take the pose before again' if self.poses and is_wiring_unproven else ''
+        angles_rad = self._angles_of(target, volts, slack_v)
+        distance = '' if angles_rad is None else angle_fault(target, *angles_rad, tolerance_rad)
+        if distance:
+            return f'{finding}: by the sensor, {distance}; check the pose and the mounting{advice}'
+        return f'{finding}; check the pose, the mounting and the wiring{advice}'
 
-        returns: the volts and their standard deviations, V, (m,) each.
-        """
-        pose = Poses.without_volts(np.array([alpha_rad]), np.array([beta_rad]), self.pose_std_v)
-        slope = pose_response.coefficient_jacobian(self.unit, pose, self.names)[0]
-        covariance = slope @ self.covariance @ slope.T + pose_response.volts_covariance(
-            self.unit, pose, self.stage).blocks[0]
-        return pose_response.predicted_volts(self.unit, pose)[0], np.sqrt(np.diag(covariance))
-
-    def angles_of(self, alpha_rad: float, beta_rad: float, volts: np.ndarray, slack_v: np.ndarray
-                  ) -> tuple[float, float] | None:
+    def _angles_of(self, target: Target, volts: np.ndarray, slack_v: np.ndarray
+                   ) -> tuple[float, float] | None:
         """
         Find the angles near a pose that explain volts, by damped Gauss-Newton steps.
 
-        An angle that the volts do not show stays as it is.
-
-        volts: the volts that are read, V, (m,); slack_v: their standard deviation about the model,
-        V, (m,); returns: angles alpha and beta, rad; None if no angles explain the volts.
+        volts, slack_v: the volts that are read, and their standard deviations about the model, V,
+        (m,); returns: alpha and beta, rad; None if no angles explain the volts. An angle
+        that the volts do not show stays as it is.
         """
+        start_rad = np.array([target.alpha_rad, target.beta_rad])
         change_rad, damping = np.zeros(2), 1 / _SEARCH_STD_RAD ** 2
         for _ in range(_SEARCH_STEPS):
-            pose = Poses.without_volts(np.array([alpha_rad + change_rad[0]]),
-                                       np.array([beta_rad + change_rad[1]]), self.pose_std_v)
-            residual = (volts - pose_response.predicted_volts(self.unit, pose)[0]) / slack_v
-            slope = pose_response.angle_jacobian(self.unit, pose)[0] / slack_v[:, None]
+            pose = self._pose(*(start_rad + change_rad))
+            residual = (volts - predicted_volts(self.unit, pose)[0]) / slack_v
+            slope = angle_jacobian(self.unit, pose)[0] / slack_v[:, None]
             step_rad = np.linalg.solve(slope.T @ slope + damping * np.eye(2),
                                        slope.T @ residual - damping * change_rad)
             change_rad = change_rad + np.clip(step_rad, -_LONGEST_STEP_RAD, _LONGEST_STEP_RAD)
         if np.abs(residual).max() > _EXPLAINED_STDS:
             return None
-        return alpha_rad + float(change_rad[0]), beta_rad + float(change_rad[1])
+        alpha_rad, beta_rad = (start_rad + change_rad).tolist()
+        return alpha_rad, beta_rad
+
+    def _pose(self, alpha_rad: float, beta_rad: float) -> Poses:
+        return Poses.without_volts(np.array([alpha_rad]), np.array([beta_rad]), self.pose_std_v)
 
     def with_poses(self, targets: Sequence[Target]) -> RunningEstimate:
         """Predict the covariance of the estimate after further poses."""
         if not targets:
             return self
-        alpha_rad = np.array([target.alpha_rad for target in targets])
-        beta_rad = np.array([target.beta_rad for target in targets])
-        poses = Poses.without_volts(alpha_rad, beta_rad, self.pose_std_v)
-        no_prior = np.zeros(len(self.names))
-        model = linearised(self.unit, poses, self.names, no_prior)
+        angles_rad = np.array([(target.alpha_rad, target.beta_rad) for target in targets])
+        poses = Poses.without_volts(angles_rad[:, 0], angles_rad[:, 1], self.pose_std_v)
+        model = linearised(self.unit, poses, self.names, np.zeros(len(self.names)))
         information = model.information(model.covariance(self.stage))
         return replace(self, covariance=np.linalg.inv(
             np.linalg.inv(self.covariance) + information))
@@ -130,6 +155,25 @@ class RunningEstimate:
     def rows(self) -> tuple[CoefficientRow, ...]:
         """Return the coefficients for the screen."""
         return coefficient_rows(self.names, get(self.unit, self.names), self.std, self.prior)
+
+
+def _is_crossed(measured_g: np.ndarray, expected_g: np.ndarray) -> bool:
+    """Return whether axes with other signs, or in another order, read the expected values."""
+    def is_expected(values_g: np.ndarray) -> bool:
+        return bool(np.abs(values_g - expected_g).max() < _SAME_READING_G)
+
+    return not is_expected(measured_g) and any(
+        is_expected(np.array(signs) * order) for signs, order in product(
+            product((1, -1), repeat=len(measured_g)), permutations(measured_g)))
+
+
+def from_records(sensor: Sensor, records: Sequence[PoseRecord], dwell_s: float,
+                 previous: RunningEstimate | None = None) -> RunningEstimate:
+    """Estimate a unit from the poses of a journal, check poses left out; see `from_poses`."""
+    fitted = [record for record in records if not record.check]
+    poses = Poses.from_records(fitted) if fitted else \
+        Poses.without_volts(np.zeros(0), np.zeros(0), np.zeros(len(sensor.axes)))
+    return from_poses(sensor, poses, dwell_s, sensor.stage_std_rad, previous)
 
 
 def from_poses(sensor: Sensor, poses: Poses, dwell_s: float, stage_rad: float,
@@ -155,11 +199,6 @@ def from_poses(sensor: Sensor, poses: Poses, dwell_s: float, stage_rad: float,
                            len(poses))
 
 
-def no_poses(axes: int) -> Poses:
-    """Return the poses of a unit before its first pose, for a number of axes."""
-    return Poses.without_volts(np.zeros(0), np.zeros(0), np.zeros(axes))
-
-
 def tilt_error_rad(sensor: Sensor, pose_std_v: np.ndarray) -> float:
     """
     Predict the rms error of alpha and beta over the sphere.
@@ -167,7 +206,7 @@ def tilt_error_rad(sensor: Sensor, pose_std_v: np.ndarray) -> float:
     pose_std_v: standard deviation of the readings, V, (m,).
     """
     alpha_rad, beta_rad = np.array([(target.alpha_rad, target.beta_rad)
-                                    for target in spread(_EVALUATION_POSES)]).T
+                                    for target in pose_plan.spread(_EVALUATION_POSES)]).T
     force_mps2 = specific_force(alpha_rad, beta_rad, sensor.local_gravity_mps2)
 
     def tilt_stds_rad(unit: Sensor) -> np.ndarray:
@@ -185,37 +224,26 @@ def degrees_or_none(angle_rad: float) -> float | None:
     return float(np.degrees(angle_rad)) if np.isfinite(angle_rad) else None
 
 
-def in_g(sensor: Sensor, volts: np.ndarray) -> np.ndarray:
-    """
-    Convert volts by zero-g and scale factor of a unit.
-
-    volts: the volts, (m,); returns: specific force, g, (m,).
-    """
-    return (volts - sensor.zero_g_v) / sensor.scale_v_per_g
-
-
 def coefficient_rows(names: Sequence[Coefficient], values: np.ndarray, std: np.ndarray,
                      prior: np.ndarray) -> tuple[CoefficientRow, ...]:
     """
     Lay out coefficients for the screen, one row for each parameter of the unit.
 
-    names: names of the coefficients, (p,); values, std, prior: their values, their standard
-    deviations, and those by the datasheet alone, (p,).
+    values, std, prior: their values, standard deviations, and those by the datasheet alone, (p,).
     """
-    indices: dict[Coefficient, list[int]] = {}
+    places: dict[Coefficient, list[int]] = {}
     for i, name in enumerate(names):
         if not full_model.belongs_to_stage(name):
-            indices.setdefault(name.without_axis, []).append(i)
-    return tuple(_row(name, names, values, std, prior, rows) for name, rows in indices.items())
-
-
-def _row(name: Coefficient, names: Sequence[Coefficient], values: np.ndarray, std: np.ndarray,
-         prior: np.ndarray, rows: list[int]) -> CoefficientRow:
-    unit = parameter_of(names[rows[0]]).unit
-    intervals = tuple(f'{names[i].axis or names[i].parameter} '
-                      f'{_interval(values[i], Z_90 * std[i])}' for i in rows)
-    determined = float(np.min(1 - np.clip(std[rows] / prior[rows], 0, 1)))
-    return CoefficientRow(f'{name}, {unit}' if unit else str(name), intervals, determined)
+            places.setdefault(name.without_axis, []).append(i)
+    rows = []
+    for name, place in places.items():
+        unit = parameter_of(names[place[0]]).unit
+        rows.append(CoefficientRow(
+            f'{name}, {unit}' if unit else str(name),
+            tuple(f'{names[i].axis or names[i].parameter} {_interval(values[i], Z_90 * std[i])}'
+                  for i in place),
+            float(np.min(1 - np.clip(std[place] / prior[place], 0, 1)))))
+    return tuple(rows)
 
 
 def _interval(value: float, half_width: float) -> str:
@@ -236,35 +264,27 @@ def quick(sensor: Sensor, dwell_s: float, tilt_error_rad: float, check_poses: in
           ) -> list[Target]:
     """Choose the fewest poses that reach a tilt error, and never more than 90."""
     start = datasheet_estimate(sensor, dwell_s)
-    fewest = ceil((len(start.names) + _SPARE_READINGS) / len(sensor.axes))
+    fewest = math.ceil((len(start.names) + _SPARE_READINGS) / len(sensor.axes))
     grid = linearisation.candidate_poses(start.pose_std_v)
     rows = linearisation.whitened_jacobian(start.unit, grid, start.names, start.stage)
     chosen = [Target(float(grid.alpha_rad[i]), float(grid.beta_rad[i])) for i in
               linearisation.choose_poses(rows, np.diag(1 / start.prior ** 2),
                                          max(_MOST_POSES, fewest))]
     for count in range(fewest, len(chosen) + 1):
-        targets = _short_path(chosen[:count])
+        # Each pose is the nearest to the one before, from the lowest angles on.
+        first = min(chosen[:count], key=lambda target: (target.alpha_rad, target.beta_rad))
+        targets = [first, *pose_plan.nearest(first, [t for t in chosen[:count] if t is not first])]
         if start.with_poses(targets).tilt_error_rad() <= tilt_error_rad:
             break
-    return with_checks(targets, check_poses)
+    return pose_plan.with_checks(targets, check_poses)
 
 
 def datasheet_estimate(sensor: Sensor, dwell_s: float) -> RunningEstimate:
     """Return the estimate of a unit before its first pose, by the datasheet alone."""
-    return from_poses(
-        sensor, no_poses(len(sensor.axes)), dwell_s,
-        sensor.stage_std_rad)
+    return from_records(sensor, [], dwell_s)
 
 
 def expected_tilt_error_rad(sensor: Sensor, dwell_s: float, targets: Sequence[Target]) -> float:
     """Predict the rms error of alpha and beta after a pose plan."""
     fitted = [target for target in targets if not target.check]
     return datasheet_estimate(sensor, dwell_s).with_poses(fitted).tilt_error_rad()
-
-
-def _short_path(targets: list[Target]) -> list[Target]:
-    """Order poses so that each one is the nearest to the pose before, from the lowest angles."""
-    first = min(targets, key=lambda target: (target.alpha_rad, target.beta_rad))
-    others = list(targets)
-    others.remove(first)
-    return [first, *nearest(first, others)]

@@ -1,53 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-A guided calibration from its first pose to its parameter file, free of ROS.
-
-- What a guided calibration is to do, whatever the unit.
-- From a session to the contents of the calibration screen.
-"""
+"""A guided calibration from its first pose to its parameter file, free of ROS."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-import math
 import os
 from pathlib import Path
 from typing import Any
 
-from adxl_ros.calibrate import calibration, thermal_calibration
-from adxl_ros.calibrate.guided import pose_checks, pose_plan, running_estimate
-from adxl_ros.calibrate.guided.guide import Guide, NewestSamples
+from adxl_ros.calibrate import calibration
+from adxl_ros.calibrate.guided import pose_plan, running_estimate
+from adxl_ros.calibrate.guided.guide import NewestSamples
 from adxl_ros.calibrate.guided.hand_guide import HandGuide
-from adxl_ros.calibrate.guided.screen_contents import (
-    AxisReading,
-    CaptureSettings,
-    Estimate,
-    LiveReading,
-    Progress,
-    RestReading,
-    StageMode,
-)
+from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, Estimate, StageMode
 from adxl_ros.calibrate.guided.stage_guide import StageGuide
 from adxl_ros.calibrate.guided.thermal_guide import ThermalGuide, ThermalSettings
 from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.report import page
 from adxl_ros.errors import UserError
-from adxl_ros.files import calibration_store
+from adxl_ros.files import calibration_store, sweep_journal
 from adxl_ros.files.atomic_write import remove_unfinished
-from adxl_ros.files.sweep_journal import (
-    accepted_poses,
-    Fitted,
-    Journal,
-    MountingUnchecked,
-    PoseDropped,
-    PoseRecord,
-    skipped_poses,
-    unfinished,
-)
-from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.files.sweep_journal import JournalEntry, MountingUnchecked, PoseRecord
+from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor, with_axes
-from adxl_ros.signals.rest_detection import Stillness
 import numpy as np
 
 _UNIT_FIELDS = (
@@ -133,7 +110,7 @@ class SessionSettings:
 
     def question(self, unit: Sensor) -> str:
         """Return the question what to do with an interrupted calibration; '' without one."""
-        interrupted = unfinished(self.journal, self.head(unit))
+        interrupted = sweep_journal.unfinished(self.journal, self.head(unit))
         if interrupted is None:
             return ''
         if interrupted.obstacle:
@@ -160,46 +137,59 @@ class Session:
             raise UserError(f'mode: gravity needs the axes x, y and z, but the sensor has '
                             f'{unit.axes}; use mode:=stage')
         targets = settings.targets(unit)
-        self._base = _calibrated(base, unit) if settings.mode == 'thermal' else unit
+        self._base = unit
+        if settings.mode == 'thermal' and base is not None and base.effects:
+            # The calibrated unit, with the nominal values of its stream.
+            self._base = replace(with_axes(base, unit.axes), serial=unit.serial,
+                                 rate_hz=unit.rate_hz)
         self.unit, self.settings = unit, settings
         self.newest = NewestSamples(unit)  # The newest samples
+        self.fault = ''  # What is wrong with the samples, or ''
         # The accepted poses on disk
-        self.journal = Journal(settings.journal, settings.head(unit), start_over)
+        self.journal = sweep_journal.Journal(settings.journal, settings.head(unit), start_over)
         self._remove_unfinished()
         self._fitted: list[PoseRecord] = []
-        self._is_mounting_unchecked = any(isinstance(entry, MountingUnchecked)
-                                          for entry in self.journal.entries)
-        accepted = accepted_poses(self.journal.entries)
+        self._estimate: tuple[tuple[int, int], Estimate] | None = None
+        entries = self.journal.entries
+        self._is_mounting_unchecked = any(isinstance(e, MountingUnchecked) for e in entries)
+        accepted = sweep_journal.accepted_poses(entries)
         self.resumed = len(accepted)  # Number of the poses of an interrupted calibration
-        self.guide: Guide  # Leads through the poses
+        # stage, guide: Lead through the poses; `stage` is None without a stage
+        self.stage: StageGuide | None = None
+        self.guide: StageGuide | HandGuide | ThermalGuide
         if settings.mode == 'gravity':
             self.guide = HandGuide(unit, settings.capture.temperature_span_c, accepted)
         elif settings.mode == 'thermal':
             self.guide = ThermalGuide(unit, self._base, settings.thermal, accepted)
         else:
-            self.guide = StageGuide(unit, targets, settings.capture, accepted,
-                                    skipped_poses(self.journal.entries))
+            self.guide = self.stage = StageGuide(unit, targets, settings.capture, accepted,
+                                                 sweep_journal.skipped_poses(entries))
 
     @property
     def accepted_count(self) -> int:
         """Return the number of accepted poses."""
         return len(self.guide.accepted)
 
-    def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> str:
-        """
-        Take samples.
+    def append(self, entry: JournalEntry) -> None:
+        """Write an entry into the journal."""
+        self.journal.append(entry)
+        self._is_mounting_unchecked |= isinstance(entry, MountingUnchecked)
 
-        stamps_ns: their stamps, ns, (n,); volts: the samples, V, (n, m).
-        """
-        self.newest.feed(stamps_ns, volts)
-        fault = pose_checks.rate_fault(self.newest.rate_hz(), self.unit)
+    def feed(self, stamps_ns: np.ndarray, volts: np.ndarray, fault: str = '') -> str:
+        """Take samples, (n,) and (n, m), and what is wrong with them; return a new fault."""
+        if not len(stamps_ns) and not fault:
+            return ''
+        if not fault:
+            self.newest.feed(stamps_ns, volts)
+            fault = pose_plan.rate_fault(self.newest.rate_hz(), self.unit)
         if not fault:
             self.guide.feed(stamps_ns, volts)
-        return fault
+        before, self.fault = self.fault, fault
+        return '' if before else fault
 
     def take_poses(self) -> Iterator[str]:
         """Take the poses that are complete."""
-        unverified = self.guide.poses_to_verify
+        unverified = len(self.guide.to_verify)
         while (record := self.guide.accept()) is not None:
             try:
                 self.journal.append(record)
@@ -208,28 +198,18 @@ class Session:
                 raise
             self.guide.take(record)
             yield f'pose {record.pose + 1} is on disk'
-        if unverified > self.guide.poses_to_verify:
+        if unverified > len(self.guide.to_verify):
             yield 'this pose reads the same as before; one more pose checks the mounting' \
-                if self.guide.poses_to_verify else 'the sensor is mounted as it was'
+                if self.guide.to_verify else 'the sensor is mounted as it was'
 
-    def skip(self) -> str:
-        """Leave out the open pose; return a line for people, or '' where none is open."""
-        if self.guide.is_over:
-            return ''
-        entry = self.guide.skip_entry()
-        if entry is not None:
-            self.journal.append(entry)
-        if isinstance(entry, MountingUnchecked):
-            self._is_mounting_unchecked = True
-        return self.guide.skip()
-
-    def redo(self) -> str:
-        """Take the previous pose again; return a line for people, or '' where there is none."""
-        number = self.guide.previous
-        if number is not None:
-            # The fit must not use the pose, even if it is not taken again.
-            self.journal.append(PoseDropped(number))
-        return self.guide.redo()
+    def estimate(self) -> Estimate:
+        """Return what the poses determine so far; it is computed once for each pose."""
+        accepted = self.guide.accepted
+        # A pose that is taken again changes the stamp only.
+        key = len(accepted), max((record.stop_ns for record in accepted.values()), default=0)
+        if self._estimate is None or key != self._estimate[0]:
+            self._estimate = key, self.guide.estimate_contents()
+        return self._estimate[1]
 
     def finish(self) -> calibration.CalibrationResult:
         """
@@ -237,17 +217,17 @@ class Session:
 
         Call `end` once the report and the copy in the store are written, too.
         """
-        records = self.guide.poses_to_fit()
+        records, source = self.guide.poses_to_fit(), self.journal.path.name
         if not records:
             raise UserError('no pose is taken yet')
         if all(record.check for record in records):
             raise UserError('only check poses are taken, which the fit does not use; take other '
                             'poses, too')
         poses = Poses.from_records(records)
-        result = thermal_calibration.calibrate(
-            self._base, poses, self.journal.path.name, range_c=self.settings.thermal.range_c) \
+        result = calibration.calibrate_thermal(
+            self._base, poses, source, range_c=self.settings.thermal.range_c) \
             if self.settings.mode == 'thermal' else calibration.calibrate(
-                self.unit, [calibration.RecordedPoses(self.journal.path.name, poses)])
+                self.unit, [calibration.RecordedPoses(source, poses)])
         if self._is_mounting_unchecked:
             provenance = {**result.fitted.provenance,
                           'mounting': 'not checked after an interruption'}
@@ -256,6 +236,16 @@ class Session:
         self._fitted = records
         return result
 
+    def write_report(self, result: calibration.CalibrationResult) -> str:
+        """Write the report; return why there is none: without it the calibration is valid."""
+        if self.settings.report:
+            try:
+                Path(self.settings.report).mkdir(parents=True, exist_ok=True)
+                page.write(self.settings.report, result, self.settings.store)
+            except (UserError, OSError) as error:
+                return f'{error}'
+        return ''
+
     def end(self) -> None:
         """
         Note in the journal that the fit is written; a sweep with open poses can be resumed.
@@ -263,75 +253,18 @@ class Session:
         Without this note the next start fits and writes the files again.
         """
         try:
-            self.journal.append(Fitted(tuple(self._fitted), not self.guide.open_poses))
+            done = not self.guide.open_poses
+            self.journal.append(sweep_journal.Fitted(tuple(self._fitted), done))
         except UserError as error:
             raise UserError(f'{self.settings.output} is written, but {error}') from None
-
-    def close(self) -> None:
-        """Close the journal."""
-        self.journal.close()
 
     def _remove_unfinished(self) -> None:
         """Remove the unfinished files of a process that was killed while it wrote."""
         settings = self.settings
         places = [(path.parent, path.name) for path in (settings.output, settings.journal)]
         if settings.report:
-            places += [(Path(settings.report), 'report.html'),
-                       (Path(settings.report), 'calibration.png')]
+            places += [(Path(settings.report), name) for name in page.FILES]
         if settings.store:
             places.append((calibration_store.unit_folder(settings.store, self.unit.serial), ''))
         for folder, name in places:
             remove_unfinished(folder, name)
-
-
-def _calibrated(base: Sensor | None, unit: Sensor) -> Sensor:
-    """Return the calibrated unit with the nominal values of its stream."""
-    if base is None or not base.effects:
-        return unit
-    return replace(with_axes(base, unit.axes), serial=unit.serial, rate_hz=unit.rate_hz)
-
-
-class SessionDisplay:
-    """The displayed values of one session; the slow estimate is computed once for each pose."""
-
-    def __init__(self, session: Session) -> None:
-        self._session = session
-        self._estimate: Estimate | None = None
-        self._estimate_key = (0, 0)
-
-    def live(self) -> LiveReading | None:
-        """Return what the sensor reads at present; None without samples."""
-        newest = self._session.newest
-        return live_reading(newest, self._session.unit, self._session.guide.stillness(newest))
-
-    def progress(self) -> Progress:
-        """Return the progress of the calibration."""
-        return self._session.guide.progress()
-
-    def estimate(self) -> Estimate:
-        """Return what the poses determine so far."""
-        guide = self._session.guide
-        newest_ns = max((record.stop_ns for record in guide.accepted.values()), default=0)
-        # A pose that is taken again changes the stamp only.
-        key = len(guide.accepted), newest_ns
-        if self._estimate is None or key != self._estimate_key:
-            self._estimate, self._estimate_key = guide.estimate_contents(), key
-        return self._estimate
-
-
-def live_reading(newest: NewestSamples, unit: Sensor, stillness: Stillness | None
-                 ) -> LiveReading | None:
-    """Return what the sensor reads at present."""
-    if not len(newest.volts):
-        return None
-    axes = tuple(AxisReading(axis, mean_mps2, rms_mps2) for axis, mean_mps2, rms_mps2 in zip(
-        unit.axes, newest.mean_mps2(), newest.rms_mps2()))
-    rest = None if stillness is None else _rest(stillness, unit)
-    rate_hz = newest.rate_hz()
-    return LiveReading(axes, rate_hz if math.isfinite(rate_hz) else None, rest)
-
-
-def _rest(stillness: Stillness, unit: Sensor) -> RestReading:
-    mps2_per_v = G0_MPS2 / float(unit.nominal_scale_v_per_g[stillness.axis])
-    return RestReading(bool(stillness.at_rest), unit.axes[stillness.axis], stillness.statistic,
-                       float(stillness.value) * mps2_per_v, float(stillness.limit) * mps2_per_v)

@@ -1,29 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Acceptance of a calibration: PASS or FAIL against the datasheet and against the noise."""
+"""
+Acceptance of a calibration: PASS or FAIL against the datasheet and against the noise.
+
+- Errors and outcomes as lines of a terminal.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from adxl_ros.calibrate.report.cross_validation import (
-    ErrorStatistic,
-    HeldOutErrors,
-    rms_interval,
-)
-from adxl_ros.calibrate.report.error_budget import (
-    ErrorBudget,
-    ErrorBudgets,
-    rms_mg,
-    sample_noise_mps2,
-)
+from adxl_ros.calibrate.fits.gravity_fit import GravityFit
+from adxl_ros.calibrate.report import held_out
+from adxl_ros.calibrate.report.held_out import ErrorBudget, ErrorBudgets, HeldOutErrors, rms_mg
 from adxl_ros.model.coefficients import get, parameter_of
 from adxl_ros.model.constants import G0_MPS2, Z_90
+from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.report.quantities import with_half_width
+from adxl_ros.report.quantities import duration, with_half_width
 import numpy as np
+import scipy
 
 PASS = 'PASS'
 """Outcome: the whole 90 % interval of the error is within the limit."""
@@ -33,6 +31,8 @@ NOT_SHOWN = 'NOT SHOWN'
 """Outcome: the error is within the limit, but its 90 % interval is not."""
 _CHANCE_SHARE = 0.2
 """Largest relative difference of expected and measured mean square without a comment; chosen."""
+_UPPER_QUANTILE = 0.95
+"""Probability of the upper end of a 90 % interval."""
 _NONLINEARITY = Coefficient('nonlinearity', 'cubic_per_g2')
 """Parameter whose typical datasheet value limits the error of acceleration."""
 
@@ -90,7 +90,7 @@ def assess(model: str, budgets: ErrorBudgets, sensor: Sensor) -> Assessment:
     manufacturer's own calibration leaves. The limit by the noise is the noise of one sample, rms
     over the axes. The limits of tilt are the tilt errors that such errors of each axis cause.
     """
-    datasheet, noise = nonlinearity_mps2(sensor) ** 2, sample_noise_mps2(sensor) ** 2
+    datasheet, noise = nonlinearity_mps2(sensor) ** 2, held_out.sample_noise_mps2(sensor) ** 2
     accel, tilt = budgets
     return Assessment(model, accel, tilt, _outcome(accel, datasheet), _outcome(accel, noise),
                       _outcome(tilt, datasheet * tilt.tilt_per_axis),
@@ -108,24 +108,38 @@ def _outcome(budget: ErrorBudget, limit: float) -> str:
     return PASS if budget.calibration_high <= limit else NOT_SHOWN
 
 
+def gravity_error_budgets(fit: GravityFit, fitted: Sensor, force: np.ndarray, kept: np.ndarray
+                          ) -> ErrorBudgets:
+    """
+    Split the held-out errors of the magnitude of gravity; there is no stage part.
+
+    The part of the coefficients is that of the force by their covariance. It includes directions
+    that a magnitude does not show.
+
+    force: specific force in all rests by the fit, m/s², (k, 3).
+    """
+    errors = fit.held_out_mps2[kept]
+    excess = fit.excess_mps2 ** 2
+    by_noise = float(np.mean(fit.expected_mps2[kept] ** 2)) - excess
+    covariance = force_covariance(fitted, list(force[kept].T), np.zeros(len(fitted.axes)))
+    gravity, used = fitted.local_gravity_mps2, np.ones(len(kept), bool)
+    measured, nu = float(np.mean(errors ** 2)), held_out.degrees_of_freedom(errors)
+    quantile = float(scipy.special.chdtri(nu, _UPPER_QUANTILE))
+    upper = max(measured * nu / quantile - by_noise, excess)
+    accel = held_out.axis_variance(covariance, [0, 1, 2], used)
+    tilt = held_out.tilt_variance(covariance, force[kept], gravity, used)
+    # Each of three axes has the error of a magnitude; two of the three turn the vertical.
+    return ErrorBudgets(
+        ErrorBudget(measured, by_noise, 0.0, accel, excess, accel + upper),
+        ErrorBudget(3 * measured / gravity ** 2, 2 * by_noise / gravity ** 2, 0.0, tilt,
+                    2 * excess / gravity ** 2, tilt + 2 * upper / gravity ** 2,
+                    tilt_per_axis=2 / gravity ** 2))
+
+
 def nonlinearity_mps2(sensor: Sensor) -> float:
     """Return the typical nonlinearity at full scale by the datasheet, m/s²; 0 if not stated."""
     typical, _ = sensor.datasheet.get(_NONLINEARITY, (0.0, 0.0))
     return typical * sensor.range_g ** 3 * G0_MPS2
-
-
-def beyond_datasheet(sensor: Sensor) -> list[str]:
-    """Name the coefficients whose whole 90 % interval exceeds the datasheet's maximum."""
-    lines = []
-    stds = np.sqrt(np.diag(sensor.covariance))
-    values = get(sensor, sensor.covariance_names)
-    for name, value, std in zip(sensor.covariance_names, values, stds):
-        _, maximum = sensor.datasheet.get(name.without_axis, (0.0, 0.0))
-        half_width = Z_90 * std
-        if maximum and abs(value) - half_width > maximum:
-            lines.append(f'{name} is {with_half_width(float(value), half_width)} '
-                         f'{parameter_of(name).unit}, beyond {maximum:g}')
-    return lines
 
 
 def table(assessments: Sequence[Assessment], models: Sequence[HeldOutErrors]) -> list[str]:
@@ -145,7 +159,7 @@ def table(assessments: Sequence[Assessment], models: Sequence[HeldOutErrors]) ->
 def explanation(assessment: Assessment, sensor: Sensor) -> list[str]:
     """State the limits, and the parts of the error of the saved model."""
     accel = assessment.accel
-    limit_mps2, noise_mps2 = nonlinearity_mps2(sensor), sample_noise_mps2(sensor)
+    limit_mps2, noise_mps2 = nonlinearity_mps2(sensor), held_out.sample_noise_mps2(sensor)
     tilt = '' if np.isnan(assessment.error_deg) else f' and {assessment.error_deg:.3f} deg'
     datasheet = f'limit by the datasheet {1e3 * limit_mps2 / G0_MPS2:.2g} mg (typical ' \
         'nonlinearity at full scale)' if limit_mps2 else 'no limit by a datasheet'
@@ -164,11 +178,11 @@ def explanation(assessment: Assessment, sensor: Sensor) -> list[str]:
         lines.append(f'expected {rms_mg(accel.expected):.3f} mg = {", ".join(part.values())} '
                      f'(squares add); measured {rms_mg(accel.measured):.3f} mg'
                      + (', which differs by chance' if by_chance else ''))
-    limits = [
-        f'{_tilt_deg(assessment, limit):.2g} deg by the {name}: {outcome}'
-        for name, limit, outcome in (('datasheet', limit_mps2, assessment.tilt_datasheet),
-                                     ('noise', noise_mps2, assessment.tilt_noise)) if outcome]
     if assessment.tilt_noise:
+        outcomes = (('datasheet', limit_mps2, assessment.tilt_datasheet),
+                    ('noise', noise_mps2, assessment.tilt_noise))
+        limits = [f'{_tilt_deg(assessment, limit):.2g} deg by the {name}: {outcome}'
+                  for name, limit, outcome in outcomes if outcome]
         lines.append(f'limits of tilt: {", ".join(limits)}')
     if not accel.separable:
         lines.append('no pose was visited twice: stage and model are inseparable')
@@ -182,7 +196,7 @@ def limit_table(assessment: Assessment, sensor: Sensor) -> list[str]:
     for name, limit_mps2, accel, tilt in (
             ('limit by the datasheet', nonlinearity_mps2(sensor), assessment.accel_datasheet,
              assessment.tilt_datasheet),
-            ('noise of one sample', sample_noise_mps2(sensor), assessment.accel_noise,
+            ('noise of one sample', held_out.sample_noise_mps2(sensor), assessment.accel_noise,
              assessment.tilt_noise)):
         if accel:
             rows.append((name, 1e3 * limit_mps2 / G0_MPS2, _tilt_deg(assessment, limit_mps2),
@@ -203,10 +217,20 @@ def _tilt_deg(assessment: Assessment, accel_mps2: float) -> float:
 
 
 def unit_line(sensor: Sensor) -> list[str]:
-    """Return a line that compares the unit with its datasheet; none without a datasheet."""
+    """
+    Return a line that compares the unit with its datasheet; none without a datasheet.
+
+    It names the coefficients whose whole 90 % interval exceeds the datasheet's maximum.
+    """
     if not sensor.datasheet:
         return []
-    beyond = beyond_datasheet(sensor)
+    names, beyond = sensor.covariance_names, []
+    for name, value, half_width in zip(names, get(sensor, names),
+                                       Z_90 * np.sqrt(np.diag(sensor.covariance))):
+        _, maximum = sensor.datasheet.get(name.without_axis, (0.0, 0.0))
+        if maximum and abs(value) - half_width > maximum:
+            beyond.append(f'{name} is {with_half_width(float(value), half_width)} '
+                          f'{parameter_of(name).unit}, beyond {maximum:g}')
     return [f'unit within {sensor.datasheet_name or "its datasheet"}: '
             + (f'{FAIL}: {"; ".join(beyond)}' if beyond else PASS)]
 
@@ -247,7 +271,7 @@ def narrow_table(assessments: Sequence[Assessment], models: Sequence[HeldOutErro
     return lines
 
 
-def _cell(statistic: ErrorStatistic, datasheet: str, noise: str) -> str:
+def _cell(statistic: held_out.ErrorStatistic, datasheet: str, noise: str) -> str:
     cell = '-' if np.isnan(statistic.rms) else f'{statistic.rms:.3f}/{statistic.largest:.3f}'
     return f'{cell:>14} {datasheet:9} {noise:9}'
 
@@ -260,7 +284,7 @@ def gravity_line(assessment: Assessment, held_out_mps2: np.ndarray) -> str:
     of time, m/s², (k,).
     """
     mg = held_out_mps2 / G0_MPS2 * 1e3
-    low, high = rms_interval(mg)
+    low, high = held_out.rms_interval(mg)
     return (f'held-out stretches of time: {np.sqrt(np.mean(mg ** 2)):.3f} ({low:.3f} to '
             f'{high:.3f}) mg rms, '
             f'{np.abs(mg).max():.3f} max; datasheet {assessment.accel_datasheet or "-"}, noise '
@@ -290,8 +314,84 @@ def provenance_entries(assessment: Assessment | None, models: Sequence[HeldOutEr
             'limited_by': assessment.limited_by}
 
 
-def _with_interval(statistic: ErrorStatistic) -> str:
+def _with_interval(statistic: held_out.ErrorStatistic) -> str:
     if np.isnan(statistic.rms):
         return f'{"-":>23}'
     low, high = statistic.interval
     return f'{f"{statistic.rms:.3f} ({low:.3f} to {high:.3f})":>23}'
+
+
+_MODELS = {'nominal': 'datasheet values', 'linear': 'linear calibration',
+           'physical': 'physical calibration', 'full': 'full calibration'}
+"""Models in words."""
+
+
+def error_table(models: Sequence[HeldOutErrors]) -> list[str]:
+    """Lay out the errors of the models on held-out poses; the file holds the last model."""
+    lines = [f' {"":24}tilt error     acceleration error     (rms)']
+    lines += [f' {_MODELS[errors.model]:22} {_three_digits(errors.tilt_deg.rms):>9} ° '
+              f'{_three_digits(errors.accel_mg.rms):>18} mg' for errors in models]
+    lines[-1] += '           <- saved'
+    return lines
+
+
+def _three_digits(value: float) -> str:
+    """Write a value so that the decimal points of a right-aligned column stand in one line."""
+    if np.isnan(value):
+        return '-   '
+    decimals = 1 if value >= 10 else 2 if value >= 1 else 3
+    return f'{value:.{decimals}f}'.ljust(len(f'{value:.3f}'))
+
+
+def acceptance_lines(fitted: Sensor) -> list[str]:
+    """
+    Return whether the calibration error is within its limit, as lines.
+
+    The limit is that of the datasheet, or the noise of one sample where no datasheet states one.
+    """
+    provenance = fitted.provenance
+    span = [f'       By rests within {duration(float(provenance["span_s"]))}; a longer drift is '
+            'not in this figure.'] if 'span_s' in provenance else []
+    if 'own_accel_mg' not in provenance:
+        return [f' {NOT_SHOWN}  no pose was kept out of the fit to assess it']
+    error_mg = float(provenance['own_accel_mg'])
+    limit_mps2, kind, allows = nonlinearity_mps2(fitted), 'datasheet', \
+        'the datasheet allows'
+    if not limit_mps2:
+        limit_mps2, kind = held_out.sample_noise_mps2(fitted), 'noise'
+        allows = 'the noise of one sample is'
+    limit = f'{two_digits(1e3 * limit_mps2 / G0_MPS2)} mg'
+    accel = provenance.get(f'verdict_{kind}', '')
+    tilt = provenance.get(f'verdict_tilt_{kind}', '')
+    result = f'calibration error {two_digits(error_mg)} mg; {allows} {limit}'
+    if FAIL in (accel, tilt):
+        if accel != FAIL:
+            tilt_deg = float(provenance['own_tilt_deg'])
+            result = f'tilt error {tilt_deg:.2g}°, more than {limit} causes'
+        advice = 'More poses, or longer ones, reduce it.'
+        if len(fitted.axes) == 1:
+            advice = 'One axis does not see the force across it: align it, or accept this error.'
+        elif kind == 'datasheet':
+            advice = 'The sensor is worse than its datasheet states: do not use this file.'
+        return [f' {FAIL}  {result}', f'       {advice}', *span]
+    if NOT_SHOWN in (accel, tilt):
+        return [f' {NOT_SHOWN}  {result}',
+                '            The check poses are too few to show that the error is within it.',
+                *span]
+    return [f' {PASS}  {result}', *span]
+
+
+def gravity_lines(fit: GravityFit) -> list[str]:
+    """Lay out the errors of a calibration against gravity, before and after."""
+    used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
+    before, after, held_out = (
+        _three_digits(1e3 * float(np.sqrt(np.mean(values[used] ** 2))) / G0_MPS2)
+        for values in (fit.before_mps2, fit.residual_mps2, fit.held_out_mps2))
+    lines = [f' error of the magnitude of gravity, rms over {len(used)} rests',
+             f' {"datasheet values":22} {before:>9} mg',
+             f' {"gravity calibration":22} {after:>9} mg    <- saved',
+             f' {"a fifth of time held out":22}{held_out:>8} mg']
+    if fit.outliers:
+        count = len(fit.outliers)
+        lines.append(f' {count} {"outlier was" if count == 1 else "outliers were"} left out')
+    return lines

@@ -5,14 +5,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 import os
 from typing import Any
 
 from adxl_ros.calibrate.fits import linear
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
-from adxl_ros.calibrate.poses import Poses, reference_force
-from adxl_ros.calibrate.report.cross_validation import HeldOutErrors
+from adxl_ros.calibrate.poses import planes, Poses, reference_force
+from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.files.atomic_write import write_bytes
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2, Z_90
@@ -28,31 +27,6 @@ _MARKERS = 'os^D'
 """Markers of models, in order."""
 
 
-@dataclass(frozen=True)
-class _AxisData:
-    """What the panels of one axis show; k poses."""
-
-    d: int  # Index of the axis: 0 for x, 1 for y
-    model: str  # Name of the model
-    force_g: np.ndarray  # Reference along the measured axes, g, (k, m)
-    poses: Poses  # The poses of the sweep
-    # deviation_mv, model_mv: Measured and modelled output minus the linear model, mV, (k,)
-    deviation_mv: np.ndarray
-    model_mv: np.ndarray
-    regression: linear.AxisRegression  # Coefficients of the sequential regression
-    vertical: np.ndarray  # Whether the pose is in the plane alpha = 90°, (k,)
-
-    @property
-    def name(self) -> str:
-        """Return the name of the axis."""
-        return 'xy'[self.d]
-
-    @property
-    def other(self) -> str:
-        """Return the name of the other axis."""
-        return 'yx'[self.d]
-
-
 def draw_sweep(path: str | os.PathLike, sensor: Sensor, fitted: Sensor, poses: Poses) -> None:
     """Write the plot of `sweep` as PNG."""
     write_bytes(path, png(sweep(sensor, fitted, poses)))
@@ -66,20 +40,73 @@ def sweep(sensor: Sensor, fitted: Sensor, poses: Poses, panels: Sequence[int] = 
     force_g = np.column_stack(reference) / G0_MPS2
     predicted = np.column_stack(signal_chain.static_response(fitted)(
         reference, swept.environment))
-    vertical = np.abs(np.sin(swept.alpha_rad)) > _VERTICAL
     figure, grid = pyplot().subplots(2, len(panels), figsize=(4.4 * len(panels), 9),
                                      layout='constrained', squeeze=False)
     for d, row in enumerate(grid):
         linear_v = line.zero_g_v[d] + line.scale_v_per_g[d] * force_g[:, d]
-        data = _AxisData(d, fitted.model, force_g, swept,
-                         1e3 * (swept.volts[:, d] - linear_v),
-                         1e3 * (predicted[:, d] - linear_v), regressions[d], vertical)
+        deviation_mv, model_mv = (1e3 * (volts[:, d] - linear_v)
+                                  for volts in (swept.volts, predicted))
         for axis, panel in zip(row, panels):
-            _PANELS[panel](axis, data)
+            _draw_panel(axis, panel, d, fitted.model, swept, force_g, deviation_mv, model_mv,
+                        regressions[d])
     if len(panels) > 4:
         figure.suptitle(f'{fitted.serial}: deviation from the linear model, measured and by the '
                         f'{fitted.model} model (Ang et al. 2007, figures 2 to 8)')
     return figure
+
+
+def _draw_panel(axis: Any, panel: int, d: int, model: str, poses: Poses, force_g: np.ndarray,
+                deviation_mv: np.ndarray, model_mv: np.ndarray, regression: linear.AxisRegression
+                ) -> None:
+    """
+    Draw one panel for the axis x or y, given by d: figures 2, 3, 4, 5 with 7, 6, or 8.
+
+    force_g, deviation_mv, model_mv: reference of k poses, g, (k, 3), and measured and modelled
+    output minus the linear model, mV, (k,).
+    """
+    vertical = np.abs(np.sin(poses.alpha_rad)) > _VERTICAL
+    name, other = ('x', 'y') if d == 0 else ('y', 'x')
+    along_g, x_label = force_g[:, d], f'{name} reference, g'
+    if panel in (0, 1, 3):
+        everything = np.ones(len(poses), bool)
+        y_label = f'{name} output minus linear, mV'
+        title = f'figs. 5, 7: measured ● and {model} model ─' if panel == 3 else \
+            f'fig. {panel + 2}: paths, forth ● and back ◁'
+        backward = np.gradient(poses.beta_rad) < 0
+        chosen = np.flatnonzero(everything if panel else vertical)
+        for plane in planes(poses.alpha_rad[chosen]):
+            index = chosen[np.sort(plane)]
+            label = f'{np.degrees(poses.alpha_rad[index]).mean():.0f}°'
+            if panel == 3:
+                line, = axis.plot(along_g[index], deviation_mv[index], 'o', ms=3, label=label)
+                axis.plot(along_g[index], model_mv[index], lw=1, color=line.get_color())
+                continue
+            line, = axis.plot(along_g[index], deviation_mv[index], lw=1, label=label)
+            for part, marker, fill in ((index[~backward[index]], 'o', None),
+                                       (index[backward[index]], '<', 'none')):
+                axis.plot(along_g[part], deviation_mv[part], marker, ms=4,
+                          color=line.get_color(), mfc=fill)
+        axis.legend(title='alpha', fontsize=7)
+    elif panel == 2:
+        axis.plot(force_g[vertical, 1 - d], deviation_mv[vertical], 'o', ms=4,
+                  label='measured (10)')
+        axis.plot(_FINE_G, 1e3 * np.polynomial.polynomial.polyval(_FINE_G, regression.p),
+                  label='quadratic (11)')
+        axis.legend(fontsize=7)
+        x_label, y_label = f'{other} reference, g', f'{name} residual, mV'
+        title = f'fig. 4: residual against {other}, alpha = 90°'
+    else:
+        values, polynomial = (1e3 * regression.plane_bias_v, 1e3 * regression.q) \
+            if panel == 4 else (regression.plane_scale_v_per_g, regression.r)
+        az_g = regression.plane_az_g
+        fine_g = np.linspace(az_g.min(), az_g.max(), 101)
+        axis.plot(az_g, values, 'o', ms=4)
+        axis.plot(fine_g, np.polynomial.polynomial.polyval(fine_g, polynomial))
+        x_label = 'z reference, g'
+        y_label, title = (f'{name} zero-g minus that at 90°, mV',
+                          'fig. 6: zero-g against z (12, 13)') if panel == 4 else \
+            (f'{name} scale factor, V/g', 'fig. 8: scale factor against z (15, 17)')
+    axis.set(xlabel=x_label, ylabel=y_label, title=title)
 
 
 def gravity_rests(name: str, fit: GravityFit) -> Any:
@@ -117,79 +144,3 @@ def held_out(models: Sequence[HeldOutErrors], poses: Poses) -> Any:
         axis.grid(alpha=0.3)
     axes[0].legend(fontsize=8)
     return figure
-
-
-def _vertical_paths(axis: Any, data: _AxisData) -> None:
-    _paths(axis, data, data.vertical, paper_figure=2)
-
-
-def _all_paths(axis: Any, data: _AxisData) -> None:
-    _paths(axis, data, np.ones(len(data.poses), bool), paper_figure=3)
-
-
-def _paths(axis: Any, data: _AxisData, chosen: np.ndarray, paper_figure: int) -> None:
-    """Draw the deviation against the reference, plane by plane, beta forth and back."""
-    alpha_deg = np.degrees(data.poses.alpha_rad)
-    backward = np.gradient(data.poses.beta_rad) < 0
-    force_g, deviation_mv = data.force_g[:, data.d], data.deviation_mv
-    for plane in linear.planes(data.poses.alpha_rad[chosen]):
-        index = np.flatnonzero(chosen)[np.sort(plane)]
-        line, = axis.plot(force_g[index], deviation_mv[index], lw=1,
-                          label=f'{alpha_deg[index].mean():.0f}°')
-        forth, back = index[~backward[index]], index[backward[index]]
-        axis.plot(force_g[forth], deviation_mv[forth], 'o', ms=4, color=line.get_color())
-        axis.plot(force_g[back], deviation_mv[back], '<', ms=4, color=line.get_color(),
-                  mfc='none')
-    axis.legend(title='alpha', fontsize=7)
-    axis.set(xlabel=f'{data.name} reference, g', ylabel=f'{data.name} output minus linear, mV',
-             title=f'fig. {paper_figure}: paths, forth ● and back ◁')
-
-
-def _across(axis: Any, data: _AxisData) -> None:
-    """Draw the deviation against the other axis in the plane alpha = 90°, with its quadratic."""
-    vertical = data.vertical
-    axis.plot(data.force_g[vertical, 1 - data.d], data.deviation_mv[vertical], 'o', ms=4,
-              label='measured (10)')
-    axis.plot(_FINE_G, 1e3 * np.polynomial.polynomial.polyval(_FINE_G, data.regression.p),
-              label='quadratic (11)')
-    axis.legend(fontsize=7)
-    axis.set(xlabel=f'{data.other} reference, g', ylabel=f'{data.name} residual, mV',
-             title=f'fig. 4: residual against {data.other}, alpha = 90°')
-
-
-def _modelled(axis: Any, data: _AxisData) -> None:
-    """Draw the measured and the modelled deviation against the reference, plane by plane."""
-    alpha_rad, force_g = data.poses.alpha_rad, data.force_g[:, data.d]
-    for plane in linear.planes(alpha_rad):
-        index = np.sort(plane)
-        line, = axis.plot(force_g[index], data.deviation_mv[index], 'o', ms=3,
-                          label=f'{np.degrees(alpha_rad[index]).mean():.0f}°')
-        axis.plot(force_g[index], data.model_mv[index], lw=1, color=line.get_color())
-    axis.legend(title='alpha', fontsize=7)
-    axis.set(xlabel=f'{data.name} reference, g', ylabel=f'{data.name} output minus linear, mV',
-             title=f'figs. 5, 7: measured ● and {data.model} model ─')
-
-
-def _bias_along_z(axis: Any, data: _AxisData) -> None:
-    regression = data.regression
-    _along_z(axis, regression.plane_az_g, 1e3 * regression.plane_bias_v, 1e3 * regression.q)
-    axis.set(xlabel='z reference, g', ylabel=f'{data.name} zero-g minus that at 90°, mV',
-             title='fig. 6: zero-g against z (12, 13)')
-
-
-def _scale_along_z(axis: Any, data: _AxisData) -> None:
-    regression = data.regression
-    _along_z(axis, regression.plane_az_g, regression.plane_scale_v_per_g, regression.r)
-    axis.set(xlabel='z reference, g', ylabel=f'{data.name} scale factor, V/g',
-             title='fig. 8: scale factor against z (15, 17)')
-
-
-def _along_z(axis: Any, az_g: np.ndarray, values: np.ndarray, polynomial: np.ndarray) -> None:
-    """Draw values of the planes against their force along z, with a polynomial."""
-    fine_g = np.linspace(az_g.min(), az_g.max(), 101)
-    axis.plot(az_g, values, 'o', ms=4)
-    axis.plot(fine_g, np.polynomial.polynomial.polyval(fine_g, polynomial))
-
-
-_PANELS = (_vertical_paths, _all_paths, _across, _modelled, _bias_along_z, _scale_along_z)
-"""The panels of `sweep`, in order."""

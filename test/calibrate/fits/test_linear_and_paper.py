@@ -7,7 +7,7 @@ from dataclasses import replace
 from adxl_ros.calibrate import calibration
 from adxl_ros.calibrate.fits import linear
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.calibrate.report import cross_validation
+from adxl_ros.calibrate.report import held_out
 from adxl_ros.errors import UserError
 import numpy as np
 from pace import within
@@ -52,8 +52,8 @@ def test_physical_recovers_the_unit(axes):
             error = (fitted.values[name.effect][name.parameter][index]
                      - truth.values[name.effect][name.parameter][index])
             inside.append(abs(error) < 1.645 * sigma)
-        errors = cross_validation.summarise(
-            'physical', cross_validation.pose_errors(fitted, poses.subset(poses.check)))
+        errors = held_out.summarise(
+            'physical', held_out.pose_errors(fitted, poses.subset(poses.check)))
         alpha_deg.append(errors.alpha_deg.rms)
         assert errors.accel_mg.rms < 0.6
     assert np.mean(alpha_deg) < 0.1
@@ -67,7 +67,7 @@ def test_physical_reduces_the_tilt_error_as_the_paper_does():
     ratios = []
     for _ in range(5):
         poses = swept(rng, drawn(rng, sensor))
-        linear_errors, physical_errors = cross_validation.cross_validate(
+        linear_errors, physical_errors = held_out.cross_validate(
             {'linear': linear.fit, 'physical': linear.fit_physical}, sensor, poses)
         ratios.append(physical_errors.alpha_deg.rms / linear_errors.alpha_deg.rms)
     assert np.mean(ratios) < 1 - 0.889

@@ -82,13 +82,23 @@ class Rig:
         info = {**sensor_info(UNIT), **changes}
         self.controller.read_sensor_info(StreamInfo(info, 'sensor_info'))
 
+    def read_encoder(self):
+        """Give the guide the angles of the stage, as the node does."""
+        if self.controller.session is not None:
+            self.controller.session.stage.read_encoder(self.now_ns, *self.angles_rad)
+
+    def close(self):
+        """Close the journal, as the node does at its end."""
+        if self.controller.session is not None:
+            self.controller.session.journal.close()
+
     def turn(self, seconds=0.05, encoder=True):
         """Advance the time; a commanded stage reaches its pose at once."""
         for _ in range(round(seconds / 0.05)):
             if self.pose is not None and self.pose.command_rad is not None:
                 self.angles_rad = self.pose.command_rad
             if encoder:
-                self.controller.read_stage(self.now_ns, *self.angles_rad)
+                self.read_encoder()
             alpha_rad, beta_rad = (np.full(10, angle) for angle in self.angles_rad)
             stamps_ns = self.now_ns + np.arange(10) * 5_000_000
             self._waiting.append((stamps_ns, self.fed(specific_force(alpha_rad, beta_rad,
@@ -116,11 +126,11 @@ def rig(tmp_path):
 
     def make(*args, **changes):
         if made:
-            made[-1].controller.close()
+            made[-1].close()
         made.append(Rig(tmp_path, *args, **changes))
         return made[-1]
     yield make
-    made[-1].controller.close()
+    made[-1].close()
 
 
 def test_a_sweep_goes_from_the_wait_for_its_sensor_to_its_file(rig, tmp_path):
@@ -208,7 +218,7 @@ def test_a_fit_that_fails_at_the_end_waits_for_a_decision(rig, tmp_path, monkeyp
     assert status.text == 'cannot finish: unit.yaml: the disk is full; finish again, redo or abort'
     bench.turn(0.5)
     assert bench.lines(Severity.ERROR) == [status.text], 'one attempt has one report'
-    assert bench.controller.redo() == (True, 'pose 10 will be taken again')
+    assert bench.controller.change_pose('redo') == (True, 'pose 10 will be taken again')
     assert bench.controller.state is ControllerState.RUNNING
     bench.turn_until(lambda: bench.controller.state is ControllerState.FIT_FAILED)
     monkeypatch.undo()
@@ -233,7 +243,7 @@ def test_a_capture_has_its_answer_when_its_pose_is_on_disk_or_refused(rig):
     bench.turn_until(lambda: bench.answers)
     assert bench.answers == [(True, 'pose 1 is on disk')]
     bench.controller.capture()
-    assert bench.controller.skip() == (True, 'pose 2 is left out')
+    assert bench.controller.change_pose('skip') == (True, 'pose 2 is left out')
     assert bench.answers[-1] == (False, 'pose 2 is left out')
     bench.fault = 'this stream is already compensated'
     bench.turn()
@@ -250,15 +260,15 @@ def test_another_sensor_ends_the_session_and_a_restarted_driver_checks_the_mount
     bench.controller.start()
     bench.turn_until(lambda: bench.controller.session.accepted_count == 2)
     bench.say_info()
-    assert bench.controller.session.guide.poses_to_verify == 2
+    assert len(bench.controller.session.guide.to_verify) == 2
     assert bench.answers[-1] == (False, 'the driver started again; capture again')
-    bench.turn_until(lambda: not bench.controller.session.guide.poses_to_verify)
+    bench.turn_until(lambda: not bench.controller.session.guide.to_verify)
     assert 'the sensor is mounted as it was' in bench.lines()
     bench.say_info(rate_hz='100.0')
     assert bench.controller.state is ControllerState.IDLE
     assert 'rate_hz was 200.0, is 100.0: changed during the calibration' in bench.lines()[-1]
     bench.say_info(serial='C2')
-    assert bench.controller.unit is None and bench.lines(Severity.ERROR)[-1].startswith(
+    assert bench.controller.stream.unit is None and bench.lines(Severity.ERROR)[-1].startswith(
         'sensor_info: is of the sensor C2')
     bench.controller.start()
     assert bench.controller.status().phase is Phase.REFUSED

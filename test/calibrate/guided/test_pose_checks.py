@@ -4,7 +4,7 @@
 
 from dataclasses import replace
 
-from adxl_ros.calibrate.guided import pose_checks, running_estimate
+from adxl_ros.calibrate.guided import running_estimate
 from adxl_ros.calibrate.guided.hand_guide import HandGuide
 from adxl_ros.calibrate.guided.pose_plan import guided, Target
 from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, Phase, StageMode
@@ -90,8 +90,8 @@ def test_a_wrong_pose_is_refused_once_the_unit_is_estimated():
                             mean_v=tuple(poses.volts[i]), std_v=tuple(poses.std_v[i]))
                 for i in range(8)]
     hand = bench('manual', targets, sensor, accepted)
-    hand.sweep.skip()  # the check of the mounting
-    target = hand.sweep.target
+    hand.sweep.skip([].append)  # the check of the mounting
+    target = hand.sweep.course.target
     hand.run(0.2, target.alpha_rad, target.beta_rad + np.radians(3), encoder=False)
     hand.sweep.capture()
     assert hand.run(4, target.alpha_rad, target.beta_rad + np.radians(3), encoder=False) is None
@@ -117,8 +117,7 @@ def test_units_at_the_edge_of_the_datasheet_are_never_refused():
                 nominal('xyz'), poses.subset(order[:count]), 5.0, 4.2e-4, estimate)
             i = order[count]
             target = Target(poses.alpha_rad[i], poses.beta_rad[i])
-            assert not pose_checks.reading_fault(
-                estimate, target, poses.volts[i], np.radians(0.2))
+            assert not estimate.reading_fault(target, poses.volts[i], np.radians(0.2))
 
 
 def _edge(name, value):
@@ -129,14 +128,14 @@ def _edge(name, value):
 def test_a_change_of_temperature_is_refused():
     """4 °C above the first pose is refused, and accepted after the temperature is back."""
     warm = bench()
-    warm.sweep.surroundings.temperature_c.add(warm.now_ns, 23.0)
+    warm.sweep.readings['temperature'].add(warm.now_ns, 23.0)
     first = warm.run(5, np.pi / 2, 0.0)
     assert first.temperature_c == 23.0
     warm.sweep.take(first)
-    warm.sweep.surroundings.temperature_c.add(warm.now_ns, 27.0)
+    warm.sweep.readings['temperature'].add(warm.now_ns, 27.0)
     assert warm.run(4, np.pi / 2, np.pi / 6) is None
     assert refusal(warm).startswith('temperature moved 4.0 °C since the first pose (23.0 to 27.0')
-    warm.sweep.surroundings.temperature_c.add(warm.now_ns, 24.0)
+    warm.sweep.readings['temperature'].add(warm.now_ns, 24.0)
     assert warm.run(5, np.pi / 2, np.pi / 6).temperature_c == 24.0
 
 
@@ -159,12 +158,12 @@ def test_the_mounting_is_verified_after_an_interruption(by_rad, words):
     before = bench()
     entry = before.run(5, np.pi / 2, 0.0)
     after = bench(accepted=[entry])
-    assert after.sweep.poses_to_verify
+    assert after.sweep.to_verify
     assert 'once more, to see that the mounting' in after.sweep.destination()
-    assert after.sweep.target == UP
+    assert after.sweep.course.target == UP
     if not words:
         assert after.run(4, np.pi / 2, 0.0) is None
-        assert not after.sweep.poses_to_verify and after.sweep.target == NEXT
+        assert not after.sweep.to_verify and after.sweep.course.target == NEXT
         return
     after.fed = Fed(replace(nominal(), effects=('misalignment',), values={'misalignment': {
         'alpha_rad': np.zeros(2), 'beta_rad': np.full(2, by_rad)}}))
@@ -196,9 +195,9 @@ def test_by_hand_directions_are_requested_until_all_are_covered():
     assert edges and all(' point up equally' in words for words in edges)
     assert len(set(requests)) == 16, 'a direction was requested twice'
     assert errors[-1] < errors[0] / 20
-    assert guide.redo() == 'rest 16 is forgotten; hold the sensor in that direction again'
+    assert guide.redo([].append) == 'rest 16 is forgotten; hold the sensor in that direction again'
     assert len(guide.poses_to_fit()) == 15
-    assert 'is left out' in guide.skip()
+    assert 'is left out' in guide.skip([].append)
 
 
 def _direction(guide):

@@ -25,7 +25,7 @@ def begin(tmp_path):
 
     def begin(start_over=False, **changes):
         if begun:
-            begun[-1].close()
+            begun[-1].journal.close()
         capture = CaptureSettings(1.0, 0.0035, 20.0, StageMode.MANUAL)
         settings = replace(SessionSettings(
             'stage', 'full', (np.pi / 4, np.pi / 2), np.pi / 2, float(np.radians(0.1)), 2,
@@ -33,19 +33,19 @@ def begin(tmp_path):
         begun.append(Session(UNIT, settings, start_over))
         return begun[-1]
     yield begin
-    begun[-1].close()
+    begun[-1].journal.close()
 
 
 def take(session, count, off_v=0.0):
     """Take poses as `Session.take_poses` does."""
     for _ in range(count):
         guide = session.guide
-        target = guide.target
+        target, index = guide.course.target, guide.course.index
         volts = np.column_stack(signal_chain.static_response(TRUTH)(specific_force(
             np.array([target.alpha_rad]), np.array([target.beta_rad]), 9.80665)))[0] + off_v
         entry = pose_record(
-            guide.index, alpha_rad=target.alpha_rad, beta_rad=target.beta_rad, check=target.check,
-            start_ns=2 * guide.index, stop_ns=2 * guide.index + 1, mean_v=tuple(volts.tolist()),
+            index, alpha_rad=target.alpha_rad, beta_rad=target.beta_rad, check=target.check,
+            start_ns=2 * index, stop_ns=2 * index + 1, mean_v=tuple(volts.tolist()),
             std_v=(5e-5, 5e-5))
         session.journal.append(entry)
         guide.take(entry)
@@ -62,7 +62,7 @@ def test_a_pose_to_be_repeated_is_neither_fitted_nor_resumed(begin):
     session = begin()
     take(session, 2)
     take(session, 1, 0.3)
-    assert session.redo() == 'pose 3 will be taken again'
+    assert session.guide.redo(session.append) == 'pose 3 will be taken again'
     assert poses_on_disk(session) == [0, 1]
     assert [e.pose for e in session.guide.poses_to_fit()] == [0, 1]
     session = begin()
@@ -115,7 +115,7 @@ def test_few_poses_are_fitted_or_refused(begin, count):
     """An early finish never causes a traceback."""
     session = begin()
     take(session, count)
-    session.guide.skipped.update(range(count, 20))
+    session.guide.course.skipped.update(range(count, 20))
     session.guide.retry()
     try:
         assert session.finish().fitted.provenance['poses'] == f'{count}'

@@ -52,7 +52,7 @@ def begin(tmp_path):
 
     def begin(high_c=40.0):
         if begun:
-            begun[-1].close()
+            begun[-1].journal.close()
         settings = SessionSettings(
             'thermal', 'full', (), 0.1, 0.01, 0, CaptureSettings(1.0, 0.0035, 20.0,
                                                                  StageMode.MANUAL),
@@ -61,7 +61,7 @@ def begin(tmp_path):
         begun.append(Session(UNIT, settings, False, base()))
         return begun[-1]
     yield begin
-    begun[-1].close()
+    begun[-1].journal.close()
 
 
 def recorded(*effects, seconds=940.0):
@@ -76,12 +76,12 @@ def play(session, stamps_ns, volts, temperatures_c):
     """Feed a session as its node does, until it is over."""
     for first in range(0, len(stamps_ns), 20):
         part = slice(first, first + 20)
-        readings = session.guide.surroundings.temperature_c
+        readings = session.guide.readings['temperature']
         for stamp_ns, value in zip(stamps_ns[part], temperatures_c[part]):
             readings.add(int(stamp_ns), float(value))
         session.feed(stamps_ns[part], volts[part])
         list(session.take_poses())
-        if session.guide.is_over:
+        if session.guide.next_pose() is None:
             return
 
 
@@ -91,7 +91,7 @@ def test_the_range_is_covered_in_both_directions_and_the_file_has_the_slopes(beg
     assert session.guide.destination() == 'warm it to 40 °C'
     assert session.guide.estimate_contents().range_error == 'not known yet over 10 to 40 °C'
     play(session, *recorded('temperature_bias:per_k=4e-4'))
-    assert session.guide.is_over
+    assert session.guide.next_pose() is None
     values = session.guide.values()
     assert (values['warming'], values['cooling']) == ('100%', '100%')
     assert 0 < values['expected_error_mg'] < 0.5

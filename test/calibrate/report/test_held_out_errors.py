@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from adxl_ros.calibrate import calibration
 from adxl_ros.calibrate.fits.full_model import TERMS
-from adxl_ros.calibrate.report import acceptance, cross_validation
-from adxl_ros.calibrate.report.error_budget import ErrorBudget, ErrorBudgets
+from adxl_ros.calibrate.report import acceptance, held_out
+from adxl_ros.calibrate.report.held_out import ErrorBudget, ErrorBudgets
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects.base import Coefficient
@@ -32,20 +32,20 @@ def calibrated(seed, model=None, axes='xy', check=16, stage_rad=None, effects=TE
 
 def true_errors(truth, result):
     """Return the errors of the fitted units without noise and stage error, mg and deg rms."""
-    held_out = result.held_out[-1]
-    poses = result.poses.subset(result.inliers).subset(held_out.pose_index)
+    unseen = result.held_out[-1]
+    poses = result.poses.subset(result.inliers).subset(unseen.pose_index)
     force = np.column_stack(specific_force(poses.alpha_rad, poses.beta_rad,
                                            truth.local_gravity_mps2))
     volts = np.column_stack(signal_chain.static_response(truth)(list(force.T)))
     got = np.empty_like(force)
-    for number, unit in enumerate(held_out.fitted):
-        in_fold = held_out.fold == number
+    for number, unit in enumerate(unseen.fitted):
+        in_fold = unseen.fold == number
         up = np.where(force[in_fold, 2] < 0, -1, 1)
         got[in_fold] = np.column_stack(signal_chain.inverse(unit, up)(list(volts[in_fold].T)))
-    finite = np.isfinite(held_out.errors.tilt_rad)
+    finite = np.isfinite(unseen.errors.tilt_rad)
     mg = (got - force)[finite, :len(truth.axes)] / G0_MPS2 * 1e3
     return (np.sqrt(np.mean(mg ** 2)),
-            np.degrees(np.sqrt(np.mean(cross_validation.angle_between(got, force)[finite] ** 2))))
+            np.degrees(np.sqrt(np.mean(held_out.angle_between(got, force)[finite] ** 2))))
 
 
 @pytest.mark.parametrize(('check', 'units', 'within'), [(16, 4, 0.35), (0, 2, 0.5)],
@@ -138,7 +138,7 @@ def test_intervals_have_their_coverage_for_correlated_errors(correlation, min_co
         for k in range(1, 230):
             errors[k] = correlation * errors[k - 1] + np.sqrt(1 - correlation ** 2) * noise[k]
         errors = errors[100:]
-        low, high = cross_validation.rms_interval(errors)
+        low, high = held_out.rms_interval(errors)
         covered += low < 1 < high
         naive += 1 / 1.11 < np.sqrt(np.mean(errors ** 2)) < 1.11
     assert min_coverage < covered / 400 < 0.97

@@ -6,13 +6,9 @@ from dataclasses import replace
 import re
 
 from adxl_ros.calibrate.fits.full_model import TERMS
-from adxl_ros.calibrate.report import acceptance, cross_validation
-from adxl_ros.calibrate.report.text_tables import (
-    acceptance_lines,
-    compare,
-    error_table,
-    truth_table,
-)
+from adxl_ros.calibrate.report import acceptance, held_out
+from adxl_ros.calibrate.report.acceptance import acceptance_lines, error_table
+from adxl_ros.calibrate.report.coefficients import compare, truth_table
 from adxl_ros.model.coefficients import get, names_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient
@@ -90,11 +86,11 @@ def test_table_of_the_truth() -> None:
 
 
 def test_table_of_errors() -> None:
-    errors = cross_validation.PoseErrors(*np.zeros((2, 3)), np.full((3, 2), 0.45),
-                                         np.radians(np.full(3, 7.2)), np.zeros((3, 3)))
+    errors = held_out.PoseErrors(*np.zeros((2, 3)), np.full((3, 2), 0.45),
+                                 np.radians(np.full(3, 7.2)), np.zeros((3, 3)))
     fitted = replace(errors, accel_mps2=errors.accel_mps2 / 100, tilt_rad=np.full(3, np.nan))
-    models = [cross_validation.summarise('nominal', errors),
-              cross_validation.summarise('full', fitted)]
+    models = [held_out.summarise('nominal', errors),
+              held_out.summarise('full', fitted)]
     lines = error_table(models)
     assert lines[1].split() == ['datasheet', 'values', '7.20', '°', '45.9', 'mg']
     assert lines[2].split() == ['full', 'calibration', '-', '°', '0.459', 'mg', '<-', 'saved']

@@ -1,0 +1,473 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Errors on poses that a fit has not seen, and their budget: the mean square, split by cause.
+
+The mean runs over axes and over the poses that determine alpha. Squares add:
+
+    measured = noise + stage + coefficients + model
+
+- noise: the noise of the pose's mean, propagated through the linearised inverse.
+- stage: the random error of each joint. It is at most the stated σ = step/√12, or the scatter
+  between visits of the same pose if that is larger. The level of the base and the eccentricity
+  that the full model fits are corrected in the reference.
+- coefficients: the covariance of the calibration, which noise and stage error cause.
+- model: the remainder. It counts if chance explains it less than once in a hundred, by the degrees
+  of freedom of correlated poses. The scatter between visits of the same pose is no part of it.
+  Where no pose was visited twice, a sensor with z separates stage and model by |f|, which no
+  stage can change.
+
+The error of the calibration itself is √(coefficients + model).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from math import sqrt
+from typing import NamedTuple
+
+from adxl_ros.calibrate.poses import Poses, reference_force, stage_force
+from adxl_ros.errors import UserError
+from adxl_ros.model import noise, signal_chain
+from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.covariance import force_covariance
+from adxl_ros.model.kinematics import tilt
+from adxl_ros.model.sensor import Sensor
+import numpy as np
+import scipy
+
+Fit = Callable[[Sensor, Poses], Sensor]
+"""A function that fits a nominal sensor to poses and returns the fitted unit."""
+
+_FOLDS = 5
+"""Number of folds where no pose is marked as a check pose; chosen: the usual number."""
+_MAX_ANGLE_STD_RAD = np.radians(1.0)
+"""Largest standard deviation of an angle, rad, at which its error counts.
+
+Chosen: it leaves out poses near ±90°, which determine alpha poorly without z.
+"""
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """Errors of a calibrated sensor, measured minus reference, pose by pose."""
+
+    # alpha_rad, beta_rad: Errors of the angles, rad, (k,). NaN where the pose does not determine
+    # the angle.
+    alpha_rad: np.ndarray
+    beta_rad: np.ndarray
+    accel_mps2: np.ndarray  # Errors along the measured axes, m/s², (k, m)
+    # Angle between the measured and the reference vertical, rad, (k,). NaN where the pose does not
+    # determine alpha.
+    tilt_rad: np.ndarray
+    force_mps2: np.ndarray  # The measured specific force, m/s², (k, 3)
+
+
+@dataclass(frozen=True)
+class ErrorStatistic:
+    """Size of one kind of error over all poses; NaN where no pose shows it."""
+
+    rms: float  # Root mean square
+    largest: float  # Largest magnitude
+    interval: tuple[float, float]  # 90 % interval of the rms
+
+
+@dataclass(frozen=True)
+class HeldOutErrors:
+    """Errors of one model over held-out poses."""
+
+    model: str  # Name of the model
+    # tilt_deg, alpha_deg, beta_deg: Errors of the angles, degrees
+    tilt_deg: ErrorStatistic
+    alpha_deg: ErrorStatistic
+    beta_deg: ErrorStatistic
+    accel_mg: ErrorStatistic  # Error of acceleration over the measured axes, mg
+    errors: PoseErrors  # The errors of all held-out poses
+    pose_index: np.ndarray  # Index of each held-out pose among all poses, (k,)
+    fitted: tuple[Sensor, ...]  # The fitted sensor of each fold
+    fold: np.ndarray  # Index in `fitted` of the sensor that measured each pose, (k,)
+
+    @property
+    def pose_count(self) -> int:
+        """Return the number of held-out poses."""
+        return len(self.errors.accel_mps2)
+
+    @property
+    def poses_without_alpha(self) -> int:
+        """Return the number of held-out poses that do not determine alpha."""
+        return int(np.isnan(self.errors.alpha_rad).sum())
+
+
+def pose_errors(sensor: Sensor, poses: Poses, stage: Sensor | None = None) -> PoseErrors:
+    """
+    Compare a calibrated sensor with the stage, pose by pose.
+
+    As f(−α, β + π) = f(α, β), the angles of the reference are those with 0 ≤ α ≤ π. A sensor
+    without z cannot distinguish α from π − α: its alpha is at most π/2, and the reference gives
+    the sign of its z.
+    """
+    reference = reference_force(poses, sensor.local_gravity_mps2) if stage is None else \
+        stage_force(stage, poses.alpha_rad, poses.beta_rad)
+    z_sign = np.where(reference[2] < 0, -1, 1)
+    force = signal_chain.inverse(sensor, z_sign)(list(poses.volts.T), poses.environment)
+    covariance = force_covariance(sensor, force, np.mean(poses.std_v, axis=0) ** 2,
+                                  poses.environment)
+    measures_z = 'z' in sensor.axes
+    angles = tilt(force, covariance, measures_z)
+    alpha = np.arctan2(np.hypot(*reference[:2]), reference[2])
+    if not measures_z:
+        alpha = np.minimum(alpha, np.pi - alpha)
+    beta = np.arctan2(-reference[1], reference[0])
+    measured = [AXES.index(axis) for axis in sensor.axes]
+    alpha_determined = angles.alpha_std < _MAX_ANGLE_STD_RAD
+    beta_determined = angles.beta_std < _MAX_ANGLE_STD_RAD
+    beta_error = (angles.beta - beta + np.pi) % (2 * np.pi) - np.pi
+    tilt_error = angle_between(np.column_stack(force), np.column_stack(reference))
+    return PoseErrors(
+        np.where(alpha_determined, angles.alpha - alpha, np.nan),
+        np.where(beta_determined, beta_error, np.nan),
+        np.column_stack([force[d] - reference[d] for d in measured]),
+        np.where(alpha_determined, tilt_error, np.nan),
+        np.column_stack(force))
+
+
+def angle_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """
+    Return the angles between pairs of vectors.
+
+    first, second: the vectors, of any length, (k, 3); returns: angles from 0 to π, rad, (k,).
+    """
+    across = np.linalg.norm(np.cross(first, second), axis=1)
+    return np.arctan2(across, np.sum(first * second, axis=1))
+
+
+def summarise(model: str, errors: PoseErrors, pose_index: np.ndarray | None = None,
+              fitted: Sequence[Sensor] = (), fold: np.ndarray | None = None) -> HeldOutErrors:
+    """
+    Summarise the errors of one model over held-out poses.
+
+    pose_index: index of each pose among all poses, (k,); None is 0 to k − 1; fold: index in
+    `fitted` of the sensor of each pose, (k,); None is 0 for all.
+    """
+    count = len(errors.accel_mps2)
+    accel_mg = errors.accel_mps2[determining_alpha(errors)] / G0_MPS2 * 1e3
+    return HeldOutErrors(
+        model, _statistic(np.degrees(errors.tilt_rad)), _statistic(np.degrees(errors.alpha_rad)),
+        _statistic(np.degrees(errors.beta_rad)), _statistic(accel_mg),
+        errors, np.arange(count) if pose_index is None else pose_index, tuple(fitted),
+        np.zeros(count, int) if fold is None else fold)
+
+
+def determining_alpha(errors: PoseErrors) -> np.ndarray:
+    """
+    Mark the poses whose errors of acceleration count, (k,) bool: those that determine alpha.
+
+    Without z, a wrong root of equation (5) shifts x and y of the others.
+    """
+    has_tilt = np.isfinite(errors.tilt_rad)
+    return has_tilt if has_tilt.any() else np.isfinite(errors.accel_mps2).all(axis=1)
+
+
+def _statistic(values: np.ndarray) -> ErrorStatistic:
+    sizes = np.abs(values[np.isfinite(values)])
+    return ErrorStatistic(_rms(values), float(sizes.max()) if sizes.size else float('nan'),
+                          rms_interval(values))
+
+
+def _rms(values: np.ndarray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(finite ** 2))) if finite.size else float('nan')
+
+
+def degrees_of_freedom(values: np.ndarray) -> float:
+    """
+    Return the effective degrees of freedom ν of a mean square of correlated errors.
+
+    Errors of neighbouring poses are correlated: the poses share a plane, a temperature, a fit.
+    Let s be the mean of each pose's squares, γ₀ its variance and ρ_k its correlation over k poses.
+    Then var(s̄) = γ₀/n·(1 + 2·Σ(1 − k/n)·ρ_k), summed up to the first ρ_k that is not positive
+    (Geyer 1992), and ν = 2·s̄²/var(s̄) (Satterthwaite 1946), at most the number of errors.
+
+    values: errors in the order of the visit, (k,) or (k, m). Rows with NaN do not count.
+    """
+    table = values.reshape(len(values), -1)
+    table = table[np.isfinite(table).all(axis=1)]
+    squares = np.mean(table ** 2, axis=1)
+    count, mean = len(squares), float(np.sum(squares)) / max(len(squares), 1)
+    if count < 3 or mean <= 0:
+        return float(max(count, 1))
+    deviation = squares - mean
+    variance = float(np.mean(deviation ** 2))
+    if variance <= 0:
+        return float(count)
+    inflation = 1.0
+    for k in range(1, count // 2):
+        correlation = float(np.sum(deviation[k:] * deviation[:-k])) / count / variance
+        if correlation <= 0:
+            break
+        inflation += 2 * (1 - k / count) * correlation
+    freedom = 2 * mean ** 2 / (variance / (count - 1) * inflation)
+    return float(np.clip(freedom, 1.0, table.size))
+
+
+def rms_interval(values: np.ndarray) -> tuple[float, float]:
+    """Return the 90 % interval of the rms of correlated errors; see `degrees_of_freedom`."""
+    with np.errstate(invalid='ignore'):
+        rms, nu = _rms(values), degrees_of_freedom(values)
+    low, high = (rms * float(np.sqrt(nu / scipy.special.chdtri(nu, p))) for p in (0.05, 0.95))
+    return low, high
+
+
+def cross_validate(fits: dict[str, Fit], sensor: Sensor, poses: Poses,
+                   stage: Sensor | None = None) -> list[HeldOutErrors]:
+    """
+    Return the errors of models on poses that are held out of their fit.
+
+    Poses marked `check` are held out of a fit to all others. Without check poses, every pose
+    belongs to one of five folds, and each fold is held out of a fit to the others. A fold is
+    skipped for a model whose fit fails.
+    """
+    number = np.arange(len(poses))
+    folds = [poses.check] if poses.check.any() else \
+        [number % _FOLDS == fold for fold in range(min(_FOLDS, len(poses)))]
+    models = []
+    for model, fit in fits.items():
+        parts, units, index = [], [], []
+        for held_out in folds:
+            try:
+                units.append(fit(sensor, poses.subset(~held_out)))
+            except UserError:
+                continue
+            parts.append(pose_errors(units[-1], poses.subset(held_out), stage))
+            index.append(number[held_out])
+        if parts:
+            # The poses in the order of the visit.
+            order = np.argsort(np.concatenate(index))
+            joined = [np.concatenate([getattr(part, field.name) for part in parts])[order]
+                      for field in fields(PoseErrors)]
+            fold = np.repeat(np.arange(len(index)), [len(part) for part in index])
+            models.append(summarise(model, PoseErrors(*joined), np.concatenate(index)[order],
+                                    units, fold[order]))
+    return models
+
+
+def table(models: Sequence[HeldOutErrors]) -> list[str]:
+    """Return the errors of all models as lines for a terminal."""
+    lines = [f'{"held out":9} {"poses":>5}  {"tilt rms/max deg":>16}  {"alpha rms/max deg":>17}  '
+             f'{"beta rms/max deg":>16}  {"accel rms/max mg":>16}']
+    for errors in models:
+        lines.append(f'{errors.model:9} {errors.pose_count:5d}  {_cell(errors.tilt_deg)}  '
+                     f' {_cell(errors.alpha_deg)}  {_cell(errors.beta_deg)}  '
+                     f'{_cell(errors.accel_mg)}')
+    if models and models[-1].poses_without_alpha:
+        lines.append(f'alpha does not count in {models[-1].poses_without_alpha} poses: its '
+                     'standard deviation is over 1 deg there (near +-90 deg without a z axis)')
+    return lines
+
+
+def _cell(statistic: ErrorStatistic) -> str:
+    if np.isnan(statistic.rms):
+        return f'{"-":>16}'
+    return f'{statistic.rms:7.3f} /{statistic.largest:7.3f}'
+
+
+_SAME_POSE_RAD = np.radians(0.5)
+"""Largest distance of the joint angles of two visits of the same pose, rad; chosen."""
+_MIN_PAIRS = 6
+"""Smallest number of pairs of visits that show the scatter between visits; chosen."""
+_PROBE_MPS2 = 1e-3 * G0_MPS2
+"""Error of each axis, m/s², for which the resulting tilt error is computed: 1 mg."""
+_CHANCE = 0.01
+"""Probability of a model part by chance, if the errors have none; chosen."""
+_UPPER_QUANTILE = 0.95
+"""Probability of the upper end of a 90 % interval."""
+
+
+@dataclass(frozen=True)
+class ErrorBudget:
+    """Parts of a mean square of errors: (m/s²)² per axis for acceleration, rad² for tilt."""
+
+    # Mean square of the held-out errors. By chance it differs from the sum of the parts.
+    measured: float
+    # noise, stage, coefficients, model: The parts, as the module describes them
+    noise: float
+    stage: float
+    coefficients: float
+    model: float
+    calibration_high: float  # Upper end of the 90 % interval of `coefficients + model`
+    separable: bool = True  # Whether the poses separate stage and model
+    # Mean square of tilt that a mean square of 1 (m/s²)² on each measured axis causes; NaN for
+    # acceleration
+    tilt_per_axis: float = float('nan')
+
+    @property
+    def calibration(self) -> float:
+        """Return the mean square of the error of the calibration itself."""
+        return self.coefficients + self.model
+
+    @property
+    def expected(self) -> float:
+        """Return the sum of all parts."""
+        return self.noise + self.stage + self.coefficients + self.model
+
+    @property
+    def limited_by(self) -> str:
+        """Return the cause of the largest part: noise, stage, model, or 'stage or model'."""
+        if not self.separable and \
+                max(self.model, self.coefficients) > max(self.noise, self.stage):
+            return 'stage or model'
+        # Noise and stage cause the error of the coefficients, which is no limit of its own.
+        parts = ('noise', 'stage', 'model')
+        return parts[int(np.argmax([getattr(self, part) for part in parts]))]
+
+
+_NAN = float('nan')
+_NO_BUDGET = ErrorBudget(_NAN, _NAN, _NAN, _NAN, _NAN, _NAN)
+"""Budget of a quantity that no pose shows."""
+
+
+class ErrorBudgets(NamedTuple):
+    """The error budgets of one model."""
+
+    accel: ErrorBudget  # Budget of acceleration, (m/s²)² per axis
+    tilt: ErrorBudget  # Budget of tilt, rad²
+
+
+def error_budgets(errors: HeldOutErrors, poses: Poses, stage: Sensor | None = None
+                  ) -> ErrorBudgets:
+    """Split the held-out errors of one model by cause."""
+    held, sensor, measured = poses.subset(errors.pose_index), errors.fitted[0], errors.errors
+    gravity = sensor.local_gravity_mps2
+    reference = np.column_stack(reference_force(held, gravity))
+    corrected = reference if stage is None else np.column_stack(
+        stage_force(stage, held.alpha_rad, held.beta_rad))
+    has_tilt, used = np.isfinite(measured.tilt_rad), determining_alpha(measured)
+    axes = [AXES.index(axis) for axis in sensor.axes]
+    *by_cause, probe = _covariances(errors, held, reference)
+    accel_scatter, tilt_scatter, has_noise = _scatter(sensor, poses.subset(~poses.check))
+    accel = tilt = _NO_BUDGET
+    if used.any():
+        parts = [axis_variance(covariance, axes, used) for covariance in by_cause]
+        accel = _budget((measured.force_mps2 - corrected)[used][:, axes],
+                        float(np.mean(measured.accel_mps2[used] ** 2)), parts,
+                        accel_scatter - parts[0] * has_noise)
+    if has_tilt.any():
+        parts = [tilt_variance(covariance, reference, gravity, has_tilt)
+                 for covariance in by_cause]
+        tilt = _budget(angle_between(measured.force_mps2, corrected)[has_tilt],
+                       float(np.mean(measured.tilt_rad[has_tilt] ** 2)), parts,
+                       tilt_scatter - parts[0] * has_noise)
+        tilt = replace(tilt, tilt_per_axis=tilt_variance(
+            probe, reference, gravity, has_tilt) / _PROBE_MPS2 ** 2)
+    return ErrorBudgets(accel, tilt)
+
+
+def _budget(errors: np.ndarray, measured: float, predicted: Sequence[float], unexplainable: float
+            ) -> ErrorBudget:
+    """
+    Split a mean square of errors against the corrected reference.
+
+    errors: the errors, (k,) or (k, m), in the order of the visit; predicted: the parts by noise,
+    coefficients and stated stage error; unexplainable: mean square that no model explains, without
+    noise; NaN where it is unknown.
+    """
+    by_noise, by_coefficients, by_stated_stage = predicted
+    mean_square, nu = float(np.mean(errors ** 2)), degrees_of_freedom(errors)
+    lower = mean_square * nu / float(scipy.special.chdtri(nu, _CHANCE))
+    upper = mean_square * nu / float(scipy.special.chdtri(nu, _UPPER_QUANTILE))
+    largest_stage = float(np.fmax(by_stated_stage, unexplainable))
+    explained = by_noise + by_coefficients + largest_stage
+    model = mean_square - explained if lower > explained else 0.0
+    stage = min(max(mean_square - by_noise - by_coefficients, 0.0), largest_stage)
+    return ErrorBudget(
+        measured, by_noise, max(measured - mean_square, 0.0) + stage, by_coefficients, model,
+        by_coefficients + max(upper - explained, 0.0), bool(np.isfinite(unexplainable)))
+
+
+def _covariances(errors: HeldOutErrors, held: Poses, reference: np.ndarray) -> list[np.ndarray]:
+    """
+    Return covariances of the specific force in the held-out poses, (m/s²)², each (3, 3, k).
+
+    They are those by the noise of the mean, by the coefficients, by the stated stage error, and by
+    an independent error `_PROBE_MPS2` on each measured axis.
+    """
+    shape = (3, 3, len(held))
+    by_noise, by_coefficients, by_probe = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    for number, sensor in enumerate(errors.fitted):
+        fold = errors.fold == number
+        force, environment = list(reference[fold].T), held.subset(fold).environment
+        variance_v2 = np.mean(held.std_v[fold], axis=0) ** 2
+        total = force_covariance(sensor, force, variance_v2, environment)
+        without_noise = force_covariance(sensor, force, 0 * variance_v2, environment)
+        by_noise[:, :, fold] = total - without_noise
+        by_coefficients[:, :, fold] = without_noise
+        exact = sensor.without_covariance()
+        by_probe[:, :, fold] = force_covariance(
+            exact, force, (sensor.scale_v_per_g / G0_MPS2 * _PROBE_MPS2) ** 2, environment)
+    return [by_noise, by_coefficients, _stage_covariance(errors.fitted[0], held), by_probe]
+
+
+def _stage_covariance(sensor: Sensor, held: Poses) -> np.ndarray:
+    """Return the covariance of the reference by the stated stage error, (m/s²)², (3, 3, k)."""
+    variance = (sensor.stage_std_rad * sensor.local_gravity_mps2) ** 2
+    a, b, zero = held.alpha_rad, held.beta_rad, np.zeros(len(held))
+    by_alpha = np.array([np.cos(a) * np.cos(b), -np.cos(a) * np.sin(b), -np.sin(a)])
+    by_beta = np.array([-np.sin(a) * np.sin(b), -np.sin(a) * np.cos(b), zero])
+    return variance * (np.einsum('ik,jk->ijk', by_alpha, by_alpha)
+                       + np.einsum('ik,jk->ijk', by_beta, by_beta))
+
+
+def axis_variance(covariance: np.ndarray, axes: list[int], used: np.ndarray) -> float:
+    """Return the mean variance of the measured axes over the poses used, (m/s²)²."""
+    return float(np.mean([covariance[d, d][used] for d in axes]))
+
+
+def tilt_variance(covariance: np.ndarray, force: np.ndarray, gravity: float, used: np.ndarray
+                  ) -> float:
+    """Return the mean square of tilt over the poses used, rad², by the part across the force."""
+    up = force / np.linalg.norm(force, axis=1, keepdims=True)
+    trace = np.einsum('iik->k', covariance)
+    radial = np.einsum('ki,ijk,kj->k', up, covariance, up)
+    return float(np.mean((trace - radial)[used])) / gravity ** 2
+
+
+def _scatter(sensor: Sensor, poses: Poses) -> tuple[float, float, bool]:
+    """
+    Return the mean squares of acceleration and tilt that no model can explain.
+
+    returns: both, in the units of `ErrorBudgets`, NaN where the poses do not show them; and
+    whether they include the noise of the means.
+    """
+    joints = np.column_stack([np.cos(poses.alpha_rad), np.sin(poses.alpha_rad),
+                              np.cos(poses.beta_rad), np.sin(poses.beta_rad)])
+    near = scipy.spatial.cKDTree(joints).query_pairs(_SAME_POSE_RAD)
+    pairs = np.array(sorted(near), int).reshape(-1, 2)
+    gravity = sensor.local_gravity_mps2
+    errors = pose_errors(sensor, poses)
+    reference = np.column_stack(reference_force(poses, gravity))
+    if len(pairs) >= _MIN_PAIRS:
+        # The difference of two visits has twice the mean square of one visit.
+        accel = np.diff(errors.accel_mps2[pairs], axis=1)[:, 0]
+        force = np.diff((errors.force_mps2 - reference)[pairs], axis=1)[:, 0]
+        has_tilt = np.isfinite(errors.tilt_rad[pairs]).all(axis=1)
+        across = np.cross(force, reference[pairs[:, 0]])[has_tilt] / gravity ** 2
+        tilt = np.sum(across ** 2) / max(len(across), 1) / 2
+        return float(np.mean(accel ** 2) / 2), float(tilt), True
+    if sensor.axes != AXES:
+        return np.nan, np.nan, False
+    # No stage error changes |f|. A model error is as large in |f| as in any other direction.
+    magnitude = np.linalg.norm(errors.force_mps2, axis=1) - gravity
+    excess = max(float(np.mean(errors.accel_mps2 ** 2) - np.mean(magnitude ** 2)), 0.0)
+    return excess, 3 * excess / gravity ** 2, False
+
+
+def sample_noise_mps2(sensor: Sensor) -> float:
+    """Return the noise of one sample, rms over the axes, m/s²."""
+    noise_g = noise.sample_std_v(sensor) / sensor.scale_v_per_g
+    return float(np.sqrt(np.mean(noise_g ** 2))) * G0_MPS2
+
+
+def rms_mg(mean_square: float) -> float:
+    """Return the rms in mg of a mean square in (m/s²)²; 0 for a negative one."""
+    return sqrt(max(mean_square, 0.0)) / G0_MPS2 * 1e3

@@ -1,0 +1,374 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""The page of a calibration: one file that opens offline, with figures that plotly.js draws."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+import os
+from pathlib import Path
+import re
+from typing import Any
+
+from adxl_ros.calibrate.fits import linear
+from adxl_ros.calibrate.fits.gravity_fit import GravityFit
+from adxl_ros.calibrate.poses import Poses, reference_force
+from adxl_ros.calibrate.report import acceptance, coefficients, held_out, plots
+from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
+from adxl_ros.calibrate.report.coefficients import DriftHistory
+from adxl_ros.calibrate.result import CalibrationResult
+from adxl_ros.errors import UserError
+from adxl_ros.files import calibration_store, parameter_file
+from adxl_ros.files.atomic_write import write_bytes, write_text
+from adxl_ros.model import signal_chain
+from adxl_ros.model.coefficients import get
+from adxl_ros.model.constants import G0_MPS2, Z_90
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.report import figures, page as html_page
+from adxl_ros.report.figures import AXIS_COLOURS, axis_number, Figure, QUIET_COLOUR
+import numpy as np
+
+FILES = ('report.html', 'calibration.png')
+"""Files of a report."""
+_PANELS = ((0, 1), (2, 3), (4, 5))
+"""Panels of `plots.sweep` that stand side by side on the page."""
+_COLOURS = {PASS: 'green', NOT_SHOWN: 'amber', FAIL: 'red'}
+"""Colour of the badge by outcome."""
+_PART_COLOURS = {'noise': '#7b8794', 'stage': '#d9930d', 'coefficients': '#1f5fbf',
+                 'model': '#c0392b'}
+"""Colours of the parts of the error budget."""
+_ADVICE = {
+    'noise': 'Noise limits it most: longer rests at each pose reduce the error.',
+    'stage': 'The stage limits it most: a finer encoder, or more poses, reduce the error.',
+    'model': 'The model limits it most: a model with more terms reduces the error.',
+    'stage or model': 'Stage or model limits it most: visit some poses twice to see which.',
+}
+"""How to get better, by the largest cause of error."""
+_BEYOND = 'beyond the maximum'
+"""Outcome of a coefficient whose whole interval exceeds the maximum of the datasheet."""
+_BEYOND_WHISKER = 1.08
+"""Half of a whisker's range divided by the largest value in it. Chosen: no dot is cut."""
+
+
+def write(folder: str | os.PathLike, result: CalibrationResult,
+          store: str | os.PathLike = '') -> None:
+    """Write `report.html`, and the plots of the unit as `calibration.png`."""
+    html_page.check_libraries()
+    past = calibration_store.history(store, result.fitted.serial).calibrations \
+        if str(store) else []
+    page_path, plot_path = (Path(folder) / name for name in FILES)
+    write_text(page_path, page(result, [sensor for _, sensor in past]))
+    # If the poses do not suffice for the figures of the paper, the page states the reason.
+    with suppress(UserError):
+        draw(plot_path, result)
+
+
+def draw(path: str | os.PathLike, result: CalibrationResult) -> None:
+    """Write the plots of a calibrated unit as PNG."""
+    if result.gravity_fit is not None:
+        write_bytes(path, figures.png(plots.gravity_rests(result.name, result.gravity_fit)))
+    else:
+        plots.draw_sweep(path, result.nominal, _paper_sensor(result), result.poses)
+
+
+def _paper_sensor(result: CalibrationResult) -> Sensor:
+    """Return the unit by a model that the paper's figures can show."""
+    return result.fitted if result.fitted.model in ('physical', 'full') else \
+        linear.fit_physical(result.nominal, result.poses.subset(~result.poses.check))
+
+
+def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
+    """Lay out the page."""
+    fitted = result.fitted
+    assessment = next((row for row in result.assessments if row.model == fitted.model), None)
+    errors = next((row for row in result.held_out if row.model == fitted.model), None)
+    history, rows = DriftHistory.from_store(fitted, past), _coefficients(fitted)
+    drawn: dict[str, Figure] = {}
+    if result.gravity_fit is not None:
+        drawn['errors'] = _gravity_errors(result.gravity_fit)
+    elif assessment is not None and errors is not None:
+        drawn['errors'] = _pose_errors(
+            errors, assessment, result.poses.subset(result.inliers), fitted.axes)
+    if history.sensors:
+        drawn['drift'] = _drift(history)
+    pictures, fault, paper_model = _paper_figures(result)
+    temperature_c = fitted.envelope.temperature_c
+    return html_page.render('adxl_ros.calibrate.report', 'calibration.html', {
+        'title': f'Calibration of {fitted.serial}, {fitted.provenance["date"][:10]}',
+        'about': [f'{fitted.model} model', f'{len(result.poses)} poses', f'axes {fitted.axes}'],
+        'badge': _badge(fitted),
+        'tiles': _tiles(result, assessment),
+        'advice': _ADVICE.get(assessment.limited_by, '') if assessment else
+        'Take more poses: too few were held out to assess this calibration.',
+        'file_name': re.sub(r'[^\w.-]+', '_', fitted.serial) + '.yaml',
+        'download': html_page.download_url(parameter_file.as_text(fitted, result.comments())),
+        'figures': drawn,
+        'open_circles': errors.poses_without_alpha if errors else 0,
+        'sphere': _sphere(result),
+        'coefficients': rows,
+        'beyond': [row for row in rows if row['outcome'] == _BEYOND],
+        'datasheet': fitted.datasheet_name,
+        'limit_head': _limit_head(fitted),
+        'limits': _limits(result),
+        'budget': _budget(assessment.accel) if assessment and errors else None,
+        'history': history.table() if history.sensors else None,
+        'changes': history.changes() if history.sensors else [],
+        'paper_model': paper_model,
+        'pictures': pictures, 'pictures_fault': fault,
+        'report_lines': result.report_lines,
+        'provenance': [
+            ['serial', fitted.serial], ['model', fitted.model],
+            ['effects', ', '.join(fitted.effects)],
+            *([key.replace('_', ' '), value] for key, value in fitted.provenance.items()),
+            ['valid for temperatures', f'{temperature_c[0]:.1f} to {temperature_c[1]:.1f} °C'
+             if temperature_c else 'not measured']]})
+
+
+def _badge(fitted: Sensor) -> dict[str, str]:
+    """Return the acceptance as the terminal shows it, and its colour."""
+    first, *others = (line.strip() for line in acceptance.acceptance_lines(fitted))
+    outcome = next(outcome for outcome in (NOT_SHOWN, PASS, FAIL) if first.startswith(outcome))
+    sentence = '. '.join([first.removeprefix(outcome).strip(), *others])
+    return {'colour': _COLOURS[outcome], 'word': outcome,
+            'sentence': f'{sentence[:1].upper()}{sentence[1:].rstrip(".")}.'}
+
+
+def _tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dict[str, str]]:
+    """Return tilt and acceleration error before and after, and what limits them."""
+    tiles = []
+    if (fit := result.gravity_fit) is not None:
+        used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
+        before, after = (_digits(held_out.rms_mg(float(np.mean(v[used] ** 2))))
+                         for v in (fit.before_mps2, fit.held_out_mps2))
+        tiles = [{'label': 'error of the magnitude of gravity', 'text': f'{before} → {after} mg',
+                  'note': f'rms over {len(used)} rests, held out'}]
+    for label, unit, name in (('tilt error', '°', 'tilt_deg'),
+                              ('acceleration error', 'mg', 'accel_mg')):
+        statistics = [getattr(errors, name) for errors in result.held_out]
+        if statistics and not np.isnan(statistics[-1].rms):
+            before, after = (_digits(statistics[i].rms) for i in (0, -1))
+            low, high = map(_digits, statistics[-1].interval)
+            tiles.append({'label': label, 'text': f'{before} → {after} {unit}',
+                          'note': f'rms on held-out poses, 90 %: {low} to {high} {unit}'})
+    if assessment is not None:
+        tiles.append({'label': 'limited by', 'text': assessment.limited_by,
+                      'note': f'calibration error {_digits(assessment.error_mg)} mg, without '
+                              'noise and stage error of the check'})
+    return tiles
+
+
+def _digits(value: float) -> str:
+    """Write a positive value with three digits at most, without an exponent."""
+    decimals = 1 if value >= 10 else 2 if value >= 1 else 3
+    return f'{value:.{decimals}f}' if value >= 5e-4 else '< 0.001'
+
+
+def _limit_head(fitted: Sensor) -> list[str]:
+    """Return the head of the table of limits."""
+    datasheet_mps2 = acceptance.nonlinearity_mps2(fitted)
+    datasheet = f'datasheet ({1e3 * datasheet_mps2 / G0_MPS2:.2g} mg)' if datasheet_mps2 \
+        else 'datasheet'
+    noise = f'noise ({1e3 * held_out.sample_noise_mps2(fitted) / G0_MPS2:.2g} mg)'
+    return ['model', 'poses', 'tilt error, °', 'alpha, °', 'beta, °', 'acceleration error, mg',
+            'calibration error, mg', f'acceleration, {datasheet}', f'acceleration, {noise}',
+            'tilt, datasheet', 'tilt, noise', 'limited by']
+
+
+def _limits(result: CalibrationResult) -> list[list[str]]:
+    """Return the errors of each model, and one outcome for each limit."""
+    errors_of = {errors.model: errors for errors in result.held_out}
+    row_of, rows = {row.model: row for row in result.assessments}, []
+    for model in errors_of or row_of:
+        errors, row = errors_of.get(model), row_of.get(model)
+        statistics = [getattr(errors, name, None) for name in (
+            'tilt_deg', 'alpha_deg', 'beta_deg', 'accel_mg')]
+        rows.append([
+            model, str(errors.pose_count if errors else len(result.poses)),
+            *('-' if s is None or np.isnan(s.rms) else
+              f'{_digits(s.rms)} (max {_digits(s.largest)})' for s in statistics),
+            *(['-'] * 6 if row is None else [
+                _digits(row.error_mg), row.accel_datasheet or '-', row.accel_noise or '-',
+                row.tilt_datasheet or '-', row.tilt_noise or '-', row.limited_by])])
+    return rows
+
+
+def _budget(budget: held_out.ErrorBudget) -> dict[str, Any]:
+    """Return the parts of the acceleration error as parts of a bar, and in words."""
+    squares = {name: float(getattr(budget, name)) for name in _PART_COLOURS}
+    total = max(sum(squares.values()), 1e-30)
+    return {'expected': f'{_digits(held_out.rms_mg(budget.expected))} mg',
+            'measured': f'{_digits(held_out.rms_mg(budget.measured))} mg',
+            'separable': budget.separable,
+            'parts': [{'name': name, 'text': f'{_digits(held_out.rms_mg(square))} mg',
+                       'percent': round(100 * square / total, 2), 'colour': _PART_COLOURS[name]}
+                      for name, square in squares.items()]}
+
+
+def _sphere(result: CalibrationResult) -> dict[str, Any]:
+    """Return the data of the sphere's script: errors of each model by pose and quantity."""
+    fitted, poses, fit = result.fitted, result.poses, result.gravity_fit
+    if fit is not None:
+        force = np.column_stack(signal_chain.inverse(fitted)(
+            list(poses.volts.T), poses.environment))
+        errors = {'nominal': 1e3 * fit.before_mps2[:, None] / G0_MPS2,
+                  'gravity': 1e3 * fit.residual_mps2[:, None] / G0_MPS2}
+        quantities = [['magnitude minus gravity', 'mg']]
+        labels = [f'rest {i + 1}' for i in range(len(poses))]
+    else:
+        force = np.column_stack(reference_force(poses, fitted.local_gravity_mps2))
+        units = {row.model: row.fitted[0] for row in result.held_out} | {fitted.model: fitted}
+        errors = {}
+        for model, unit in units.items():
+            of_unit = held_out.pose_errors(unit, poses)
+            errors[model] = np.column_stack([np.degrees(of_unit.tilt_rad),
+                                             1e3 * of_unit.accel_mps2 / G0_MPS2])
+        quantities = [['error of tilt', '°'], *([f'error of {a}', 'mg'] for a in fitted.axes)]
+        labels = [f'pose {i}, alpha {alpha:.1f}°, beta {beta:.1f}°' for i, (alpha, beta) in
+                  enumerate(np.degrees([poses.alpha_rad, poses.beta_rad]).T, 1)]
+    up = force / np.linalg.norm(force, axis=1, keepdims=True)
+    return {'models': list(errors), 'quantities': quantities, 'poses': [
+        {'u': [round(float(c), 5) for c in up[i]], 'label': label,
+         'held_out': bool(poses.check[i]),
+         'values': [list(map(_number, values[i])) for values in errors.values()]}
+        for i, label in enumerate(labels)]}
+
+
+def _number(value: float) -> float | None:
+    return float(f'{value:.4g}') if np.isfinite(value) else None
+
+
+def _coefficients(fitted: Sensor) -> list[dict[str, Any]]:
+    """Return the coefficients with their intervals within the range of the datasheet."""
+    half_widths = Z_90 * np.sqrt(np.diag(fitted.covariance))
+    departures = get(fitted, fitted.covariance_names)
+    rows = []
+    for row, name, value, half_width in zip(
+            coefficients.compare(fitted, fitted), fitted.covariance_names, departures,
+            half_widths):
+        typical, maximum = fitted.datasheet.get(name.without_axis, (0.0, 0.0))
+        largest = max(typical, maximum, abs(value) + half_width, 1e-12) * _BEYOND_WHISKER
+        unit = '' if row.unit == '1' else f' {row.unit}'
+        text = f'{coefficients.rounded(row, row.fitted)} ± ' \
+            f'{coefficients.rounded(row, row.half_width)}{unit}'
+        # The lower end of the interval decides.
+        lower = abs(value) - half_width
+        beyond = '' if not (typical or maximum) else _BEYOND if 0 < maximum < lower else \
+            'beyond typical' if 0 < typical < lower else 'within'
+        factor = float(np.degrees(1.0)) if row.unit == '°' else 1.0
+        ranges = [f'{word} ±{factor * figure:.2g}' for word, figure in (
+            ('typical', typical), ('maximum', maximum)) if figure]
+        rows.append({
+            'label': f'{row.label} {row.axis}', 'name': str(name), 'text': text,
+            'datasheet': ', '.join(ranges) or '-', 'outcome': beyond,
+            'mark': figures.whisker(
+                value, value - half_width, value + half_width, (-largest, largest), text,
+                typical or maximum, beyond.startswith('beyond'))})
+    return rows
+
+
+def _paper_figures(result: CalibrationResult) -> tuple[list[str], str, str]:
+    """Return the figures of the paper as URLs, else why there are none, and their model."""
+    if result.gravity_fit is not None:
+        drawn = plots.gravity_rests(result.name, result.gravity_fit)
+        return [html_page.picture_url(drawn)], '', ''
+    pictures = [plots.held_out(result.held_out, result.poses.subset(result.inliers))] \
+        if result.held_out else []
+    fault, model = '', 'physical'
+    try:
+        unit = _paper_sensor(result)
+        model = unit.model
+        pictures += [plots.sweep(result.nominal, unit, result.poses, pair) for pair in _PANELS]
+    except UserError as error:
+        fault = str(error)
+    return [html_page.picture_url(drawn) for drawn in pictures], fault, model
+
+
+_BAND_COLOUR = 'rgba(31,95,191,0.12)'
+_ROOM = {'l': 8, 'r': 12, 't': 36, 'b': 8}
+"""Margins with room for a legend, pixels."""
+_DATES = 4
+"""Largest number of dates at an axis. Chosen: they fit beside each other on a phone."""
+
+
+def _pose_errors(errors: held_out.HeldOutErrors, assessment: Assessment, poses: Poses, axes: str
+                 ) -> Figure:
+    """Draw the errors at the held-out poses with the band that 90 % of them should be in."""
+    number = np.arange(1, errors.pose_count + 1)
+    held = poses.subset(errors.pose_index)
+    angles_deg = np.degrees([held.alpha_rad, held.beta_rad])
+    labels = [f'pose {i}, alpha {alpha:.1f}°, beta {beta:.1f}°'
+              for i, (alpha, beta) in enumerate(angles_deg.T, 1)]
+    accel_mg = errors.errors.accel_mps2 / G0_MPS2 * 1e3
+    half_mg = Z_90 * 1e3 * float(np.sqrt(assessment.accel.expected)) / G0_MPS2
+    traces = [_band(len(number), -half_mg, half_mg, 1)]
+    symbols = np.where(held_out.determining_alpha(errors.errors), 'circle', 'circle-open').tolist()
+    traces += [_dots(number, accel_mg[:, d], f'{axis}', AXIS_COLOURS[axis], labels, 'mg', 1)
+               for d, axis in enumerate(axes)]
+    for trace in traces[1:]:
+        trace['marker']['symbol'] = symbols
+    tilt_deg = np.degrees(errors.errors.tilt_rad)
+    if not np.isfinite(tilt_deg).any():
+        return figures.figure(traces, 320, margin=_ROOM,
+                              xaxis={'title': {'text': 'held-out pose'}},
+                              yaxis={'title': {'text': 'acceleration, mg'}})
+    # The error of tilt has two components: 90 % of its lengths are within √(ln 10) of the rms.
+    high_deg = float(np.degrees(np.sqrt(assessment.tilt.expected * np.log(10))))
+    traces += [_band(len(number), 0.0, high_deg, 2),
+               _dots(number, tilt_deg, 'tilt', '#6b46a8', labels, '°', 2)]
+    return figures.figure(
+        traces, 440, margin=_ROOM, xaxis={'title': {'text': 'held-out pose'}, 'anchor': 'y2'},
+        yaxis={'title': {'text': 'acceleration, mg'}, 'domain': [0.54, 1]},
+        yaxis2={'title': {'text': 'tilt, °'}, 'domain': [0, 0.46], 'rangemode': 'tozero'})
+
+
+def _gravity_errors(fit: GravityFit) -> Figure:
+    """Draw the error of the magnitude of gravity at each rest, and its expected 90 % bars."""
+    used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
+    scale = 1e3 / G0_MPS2
+    traces = [figures.points(
+        used + 1, scale * fit.held_out_mps2[used], Z_90 * scale * fit.expected_mps2[used],
+        'held out', AXIS_COLOURS['x'])]
+    return figures.figure(traces, 320, margin=_ROOM, xaxis={'title': {'text': 'rest'}},
+                          yaxis={'title': {'text': 'magnitude minus gravity, mg'}})
+
+
+def _drift(history: DriftHistory) -> Figure:
+    """Draw zero-g and scale factor of a unit over its calibrations, relative to the newest."""
+    traces, layout, dates = [], {}, history.dates
+    number_of = np.arange(len(dates))
+    labelled = np.unique(np.linspace(0, len(dates) - 1, _DATES).astype(int))
+    for number, label in enumerate(('zero-g, mg', 'scale factor, ‰'), 1):
+        values, std = history.series(number - 1)
+        for d, axis in enumerate(history.sensors[-1].axes):
+            trace = figures.points(number_of, values[:, d], Z_90 * std[:, d], axis,
+                                   AXIS_COLOURS[axis])
+            traces.append(trace | {'mode': 'lines+markers', 'text': dates,
+                                   'hovertemplate': '%{text}: %{y:.3~g}',
+                                   'showlegend': number == 1, 'legendgroup': axis,
+                                   'yaxis': axis_number('y', number)})
+        layout[axis_number('yaxis', number)] = {
+            'title': {'text': label}, 'domain': [0.54, 1] if number == 1 else [0, 0.46]}
+    return figures.figure(
+        traces, 340, margin=_ROOM, **layout,
+        xaxis={'anchor': 'y2', 'tickvals': labelled.tolist(),
+               'ticktext': [dates[i][:10] for i in labelled]})
+
+
+def _band(count: int, low: float, high: float, panel: int) -> Figure:
+    """Draw the band of the expected errors in a panel."""
+    edges = [0.5, count + 0.5]
+    return figures.line(
+        [*edges, *edges[::-1]], [low, low, high, high], 'expected 90 %', QUIET_COLOUR,
+        fill='toself', fillcolor=_BAND_COLOUR, hoverinfo='skip', xaxis='x',
+        yaxis=axis_number('y', panel), showlegend=panel == 1,
+        line={'color': QUIET_COLOUR, 'width': 0.5})
+
+
+def _dots(number: np.ndarray, values: np.ndarray, name: str, colour: str, labels: list[str],
+          unit: str, panel: int) -> Figure:
+    """Draw one error of each pose in a panel."""
+    return {'type': 'scatter', 'mode': 'markers', 'x': number.tolist(),
+            'y': figures.rounded(values), 'name': name, 'text': labels, 'xaxis': 'x',
+            'yaxis': axis_number('y', panel), 'marker': {'color': colour, 'size': 7},
+            'hovertemplate': '%{text}: %{y:.3~g} ' + unit + '<extra>' + name + '</extra>'}
