@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The gap in the unit of the user: tilt, velocity after an integration, or a function of theirs."""
+"""The gap in the unit of the user: tilt, velocity, or a function of theirs."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from adxl_ros.calibrate.fits import gravity_fit, linear
 from adxl_ros.calibrate.guided import pose_plan
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import acceptance, held_out as unseen
-from adxl_ros.calibrate.report.acceptance import acceptance_lines, error_table, gravity_lines
+from adxl_ros.calibrate.report.acceptance import acceptance_lines, error_table
 from adxl_ros.calibrate.report.coefficients import added_effect_lines, compare, truth_table
 from adxl_ros.closed_output import ended_by_closed_output
 from adxl_ros.errors import UserError
@@ -286,7 +286,7 @@ def _run_recording(folder: Path, path: Path, length_s: float) -> None:
         poses = _show_replay(graph, output, path)
     fitted = parameter_file.load(output)
     nominal = replace(fitted.without_covariance(), effects=(), values={})
-    _print('', *text_tables.gravity_lines(
+    _print('', *gravity_lines(
         gravity_fit.fit_gravity(poses.volts, poses.std_v, nominal)), '',
            *file_lines({'Page': report / 'report.html', 'Calibration': output}))
 

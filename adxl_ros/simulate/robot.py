@@ -205,8 +205,8 @@ class RobotPath(ForcePath):
 
     def _paths(self, tracks: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
         """Return derivatives 0 to 2 of the tracks on the grid, (3, n, k)."""
-        paths = [SmoothedPath(times, values, step, is_seen=True) if np.ptp(values) else Held(float(values[0]))
-                 for (times, values), step in zip(tracks, self._steps)]
+        paths = [SmoothedPath(times, values, step, is_seen=True) if np.ptp(values)
+                 else Held(float(values[0])) for (times, values), step in zip(tracks, self._steps)]
         return np.array([[path(self._grid_s, order) for path in paths]
                          for order in range(3)]).transpose(0, 2, 1)
 
@@ -297,8 +297,9 @@ def _tracks(robot: Robot, readings: Readings) -> list[tuple[np.ndarray, np.ndarr
         times, pose = readings.base
         signs = np.cumprod(np.append(1.0, np.where(np.sum(
             pose[1:, 3:] * pose[:-1, 3:], axis=1) < 0, -1.0, 1.0)))
+        pose = np.hstack([pose[:, :3], pose[:, 3:] * signs[:, None]])
         tracks += [(f'base {axis}', times, values) for axis, values in zip(
-            'x y z qx qy qz qw'.split(), np.hstack([pose[:, :3], pose[:, 3:] * signs[:, None]]).T)]
+            ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), pose.T)]
     if not tracks:
         raise UserError(f'{robot.urdf}: no joint moves {robot.frame}, and {readings.path} has no '
                         'pose of a moving base; record odom, or tf')

@@ -295,7 +295,7 @@ def _on_host(array: Any) -> np.ndarray:
 
 def _like(values: np.ndarray, like: Any) -> Any:
     """Return values as an array of the same library, type and device as another one."""
-    if isinstance(like, np.ndarray) or np.ndim(like) == 1 and isinstance(like, (list, tuple)):
+    if isinstance(like, np.ndarray) or (np.ndim(like) == 1 and isinstance(like, (list, tuple))):
         return values
     try:
         from array_api_compat import array_namespace, device
@@ -311,7 +311,7 @@ def _put_rows(whole: Any, part: Any, rows: np.ndarray) -> None:
         old, new = whole.get(key) if isinstance(whole, dict) else whole[key], part[key]
         if isinstance(new, dict | deque) and old is not None:
             _put_rows(old, new, rows)
-        elif isinstance(new, np.ndarray) and np.shape(old) != new.shape:
+        elif isinstance(new, np.ndarray) and old is not None and old.shape != new.shape:
             axis = next(i for i, (m, n) in enumerate(zip(old.shape, new.shape)) if m != n)
             whole[key] = np.array(old)
             np.moveaxis(whole[key], axis, 0)[rows] = np.moveaxis(new, axis, 0)

@@ -64,6 +64,7 @@ def unit_draws(sensor: Sensor, units: str | PathLike | Population) -> UnitDraws:
         The parameter file states no tolerance or covariance, or the population cannot be read.
 
     """
+    limit: float | np.ndarray
     if units == 'datasheet':
         names, std, limit = _datasheet(sensor)
         mean = np.array([parameter_of(name).neutral for name in names])

@@ -15,7 +15,7 @@ from adxl_ros.diagnose.diagnosis import diagnose as diagnose_recordings, Diagnos
 from adxl_ros.diagnose.report import as_json, screen_lines
 from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.errors import UserError
-from adxl_ros.files import parameter_file, population_file
+from adxl_ros.files import parameter_file, population_file, recording
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import NO_UNIT

@@ -93,7 +93,8 @@ def test_a_moving_base(tmp_path):
     yaw, x = 0.9 * np.sin(1.3 * inner), -0.05 * 16 * np.sin(4 * inner)
     expected = np.column_stack([-ARM_M * rate ** 2 + x * np.cos(yaw),
                                 ARM_M * acceleration - x * np.sin(yaw), G0_MPS2 + 0 * x])
-    assert np.array(path(inner)).T == pytest.approx(expected, abs=5e-3)
+    force = np.array(path(inner)).T
+    assert force == pytest.approx(expected, abs=5e-3)
 
 
 @pytest.mark.parametrize(('frame', 'joints', 'words'), [
