@@ -30,11 +30,12 @@ from math import sqrt
 from adxl_ros.diagnose.comparison import BaselineComparison, CachedPath, gravity_slopes
 from adxl_ros.diagnose.evidence import Whitener
 from adxl_ros.model import noise
-from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.diagnosis_hints import DriftSpectrum
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import true_runs
+from adxl_ros.simulate.smoothed_paths import ForcePath
 import numpy as np
 import scipy
 
@@ -279,6 +280,11 @@ def _held_errors(comparison: BaselineComparison, axis: int, held_v2: float
             memory[1:] *= np.minimum(errors.std[:-1] / errors.std[1:], 1.0)
             v_per_rad = slope * sensor.scale_v_per_g[axis] * sensor.local_gravity_mps2 / G0_MPS2
             yield (v_per_rad * errors.std) ** 2, memory
+    force = comparison.motion.force
+    if isinstance(force, ForcePath) and force.is_robot:
+        errors = force.errors(time_s, AXES.index(sensor.axes[axis]))
+        v_per_mps2 = sensor.scale_v_per_g[axis] / G0_MPS2
+        yield (v_per_mps2 * errors.std) ** 2, np.exp(-errors.forgetting_per_s * comparison.dt_s)
     if held_v2 > _SMALLEST_HELD_SHARE * sensor.lsb_v ** 2 / 12:
         simulated_v = comparison.simulated_v(sensor)[:, axis]
         steps = np.abs(np.diff(simulated_v, prepend=simulated_v[:1])) / sensor.lsb_v

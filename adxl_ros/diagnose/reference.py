@@ -371,6 +371,24 @@ def seen_step_rad(recording: Recording, stated_rad: float) -> float:
     return largest_rad
 
 
+_JERK_S = 0.1
+"""Time around a jerk of a robot that is left out, s. Chosen: that of the splines' knots."""
+
+
+def _too_abrupt(comparison: BaselineComparison, force: Any, noise_g: float
+                ) -> list[LeftOut]:
+    """Find samples at which a robot jerks, so that its encoders do not show its acceleration."""
+    error_g = np.abs(force.smoothing_mps2[:, :len(comparison.sensor.axes)]).max(axis=1) / G0_MPS2
+    time_s = comparison.time_s
+    rows = np.interp(time_s, force.time_s, error_g) > noise_g
+    rows |= (time_s < force.time_s[0] + _JERK_S) | (time_s > force.time_s[-1] - _JERK_S)
+    margin = round(_JERK_S * comparison.sensor.rate_hz)
+    rows = np.convolve(rows, np.ones(2 * margin + 1), 'same') > 0.5
+    return [LeftOut(rows, f'the robot jerks, which its encoders do not show (error up to '
+                    f'{1e3 * error_g.max():.2g} mg); move more smoothly, or record the joints at '
+                    'a higher rate')] if rows.any() else []
+
+
 def too_coarse(comparison: BaselineComparison, columns: dict[str, np.ndarray]) -> list[LeftOut]:
     """Find samples at which the reference moves faster than its readings show."""
     sensor, time_s, force = comparison.sensor, comparison.time_s, comparison.motion.force
@@ -379,6 +397,8 @@ def too_coarse(comparison: BaselineComparison, columns: dict[str, np.ndarray]) -
     # Name, times and readings of each reference, degree, derivative and knots of its spline, the
     # largest error, and what to do
     references: list[tuple] = []
+    if isinstance(force, ForcePath) and force.is_robot:
+        return _too_abrupt(comparison, force, noise_g)
     if isinstance(force, ForcePath):
         references = [('--sim', force.time_s, np.array(force(force.time_s)) / G0_MPS2, 3, 0, 0.0,
                        limit_g, '; write it at a higher rate, and switch off noise that the '

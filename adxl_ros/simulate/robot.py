@@ -10,6 +10,8 @@ are known; what the steps of the encoders leave open is simulated, and is the er
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
+from dataclasses import replace
 from difflib import get_close_matches
 from functools import cached_property
 import os
@@ -17,10 +19,17 @@ from typing import Any
 
 from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files import robot_readings
+from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.robot_readings import Readings
 from adxl_ros.model.constants import G0_MPS2
-from adxl_ros.simulate.motion import Held
-from adxl_ros.simulate.smoothed_paths import ForcePath, noise_step, PathErrors, SmoothedPath
+from adxl_ros.simulate.motion import Held, INTERNAL_RATE_HZ, Motion
+from adxl_ros.simulate.smoothed_paths import (
+    ForcePath,
+    KNOT_S,
+    noise_step,
+    PathErrors,
+    SmoothedPath,
+)
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
@@ -29,8 +38,14 @@ _HIGHEST_RATE_HZ = 1000.0
 """Highest rate at which the kinematics are evaluated, Hz. Chosen: the rate of the simulator."""
 _PER_READING = 2
 """Evaluations of the kinematics for each reading of a joint. Chosen: splines join them."""
+_KNOT_READINGS = 4
+"""Largest distance of the knots of a joint's spline, in readings. Chosen: jerks of a move then
+show, and the penalty still averages over the steps of an encoder."""
 _SMALLEST_STEP = 1e-9
 """Step of an encoder, rad or m, that is exact. Chosen: rounding of floats in a log."""
+_LONGEST_GAP_S, _USUAL_GAPS = 0.1, 5.0
+"""Longest time without a reading of a joint, s, and in usual gaps. Chosen: a robot moves within
+it, and a message may be late."""
 _AROUND_S = 0.3
 """Time around which the error of the force is taken, s. Chosen: a part of a move."""
 _OFFSET_RAD = 1e-4
@@ -196,7 +211,13 @@ class RobotPath(ForcePath):
         end_s = min(times[-1] for times, _ in self._tracks)
         readings_hz = max(1 / float(np.median(np.diff(times))) for times, _ in self._tracks)
         rate_hz = min(_PER_READING * readings_hz, _HIGHEST_RATE_HZ)
-        self._grid_s = np.linspace(begin_s, end_s, max(int((end_s - begin_s) * rate_hz), 8))
+        grid_s = np.linspace(begin_s, end_s, max(int((end_s - begin_s) * rate_hz), 8))
+        for times, _ in self._tracks:
+            # Nothing is known in a gap, however smoothly the spline bridges it.
+            gaps_s = np.append(np.diff(times), 0.0)
+            longest_s = max(_LONGEST_GAP_S, _USUAL_GAPS * float(np.median(gaps_s)))
+            grid_s = grid_s[gaps_s[np.searchsorted(times, grid_s, 'right') - 1] <= longest_s]
+        self._grid_s = grid_s
         self._smoothed = self._paths(self._tracks)
         self.motion = self._moved(self._smoothed)
         super().__init__(self._grid_s, self.motion[0])
@@ -205,8 +226,9 @@ class RobotPath(ForcePath):
 
     def _paths(self, tracks: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
         """Return derivatives 0 to 2 of the tracks on the grid, (3, n, k)."""
-        paths = [SmoothedPath(times, values, step, is_seen=True) if np.ptp(values)
-                 else Held(float(values[0])) for (times, values), step in zip(tracks, self._steps)]
+        paths = [SmoothedPath(times, values, step, is_seen=True, knot_s=min(
+            KNOT_S, _KNOT_READINGS * float(np.median(np.diff(times))))) if np.ptp(values)
+            else Held(float(values[0])) for (times, values), step in zip(tracks, self._steps)]
         return np.array([[path(self._grid_s, order) for path in paths]
                          for order in range(3)]).transpose(0, 2, 1)
 
@@ -221,6 +243,25 @@ class RobotPath(ForcePath):
         both = self._rotation(inside_s).T
         return list(both[:3]), list(both[3:])
 
+    def as_motion(self) -> Motion:
+        """Return the motion that a sensor in the frame follows."""
+        rate_hz = 1 / float(np.median(np.diff(self.time_s)))
+        return Motion(float(np.ptp(self.time_s)), force=self,
+                      internal_rate_hz=max(rate_hz, INTERNAL_RATE_HZ))
+
+    @property
+    def step_rad(self) -> float:
+        """Step of one encoder whose error is that of all joints together, rad."""
+        return float(np.sqrt(np.sum(np.square(self._steps[:len(self.joints)]))))
+
+    def with_angles(self, read: Recording) -> Recording:
+        """Add the angles of a stage that turns the sensor as the robot does; see `angles`."""
+        alpha_rad, beta_rad = self.angles(read.time_s)
+        known = (read.time_s >= self.time_s[0]) & (read.time_s <= self.time_s[-1])
+        return replace(read, columns={**read.columns, **{
+            name: np.where(known, angle, np.nan) for name, angle in (
+                ('alpha_rad', alpha_rad), ('beta_rad', beta_rad))}})
+
     def angles(self, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
         Return alpha and beta of a stage that turns the frame as the robot does, rad, (n,) each.
@@ -230,6 +271,14 @@ class RobotPath(ForcePath):
         inside_s = np.clip(time_s, self._grid_s[0], self._grid_s[-1])
         x, y, z = CubicSpline(self._grid_s, self.motion[3])(inside_s).T
         return np.arctan2(np.hypot(x, y), z), np.unwrap(np.arctan2(-y, x))
+
+    def shifted(self, later_s: float) -> RobotPath:
+        """Return the same motion at later times, s."""
+        later = copy(self)
+        later._grid_s = self._grid_s + later_s
+        ForcePath.__init__(later, later._grid_s, self.motion[0])
+        later._rotation = CubicSpline(later._grid_s, np.hstack(list(self.motion[1:3])))
+        return later
 
     @cached_property
     def modes(self) -> dict[str, np.ndarray]:  # type: ignore[override]
@@ -256,9 +305,9 @@ class RobotPath(ForcePath):
         """
         Return what is to be expected of the error of one component, m/s², at times, s, (n,).
 
-        Standard deviation and memory are those of `error_mps2` around each time.
+        Standard deviation and memory are those of rounding and smoothing around each time.
         """
-        error = self.error_mps2[:, component]
+        error = self.rounding_mps2[:, component] + 2 * self.smoothing_mps2[:, component]
         step_s = self._grid_s[1] - self._grid_s[0]
         around = max(round(_AROUND_S / step_s), 3)
         square, product = (uniform_filter1d(v, around) for v in (
@@ -268,20 +317,31 @@ class RobotPath(ForcePath):
                           np.interp(time_s, self._grid_s, -np.log(memory) / step_s))
 
     @cached_property
-    def error_mps2(self) -> np.ndarray:
+    def smoothing_mps2(self) -> np.ndarray:
+        """What smoothing once more would change, m/s², at `time_s`, (n, 3): moves too abrupt."""
+        return self._moved(self._paths(self._read_again(False)))[0] - self.motion[0]
+
+    @cached_property
+    def rounding_mps2(self) -> np.ndarray:
         """
         A draw of the error that the steps of the encoders leave, m/s², at `time_s`, (n, 3).
 
         The smoothed motion is read by encoders whose steps lie elsewhere, and smoothed again.
         """
-        rng = np.random.default_rng(0)
-        tracks = []
+        return self._moved(self._paths(self._read_again(True)))[0] - self.motion[0] \
+            - self.smoothing_mps2
+
+    def _read_again(self, is_rounded: bool) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return readings of the smoothed motion, exact or by encoders of the same steps."""
+        rng, tracks = np.random.default_rng(0), []
         for (times, values), step, smooth in zip(self._tracks, self._steps, self._smoothed[0].T):
-            read = np.interp(times, self._grid_s, smooth)
+            read = CubicSpline(self._grid_s, smooth)(np.clip(
+                times, self._grid_s[0], self._grid_s[-1]))
             offset = step * rng.random()
-            tracks.append((times, np.rint((read + offset) / step) * step - offset if step
-                           and np.ptp(values) else read))
-        return self._moved(self._paths(tracks))[0] - self.motion[0]
+            if is_rounded and step and np.ptp(values):
+                read = np.rint((read + offset) / step) * step - offset
+            tracks.append((times, read))
+        return tracks
 
 
 def _tracks(robot: Robot, readings: Readings) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -63,13 +63,14 @@ class SensorModel:
         """
         # The unit
         self.sensor = params if isinstance(params, Sensor) else parameter_file.load(params)
-        check_needs(self.sensor, Motion(0.0))
         self.draws = unit_draws(self.sensor, units) if units is not None else None
         self._delay_s = float(self.sensor.values.get('time_offset', {}).get('offset_s', 0.0))
         reasons = {name: _reason_to_leave_out(effect_named(name), self._delay_s)
                    for name in self.sensor.effects}
         # Reason by name of an effect of the unit that is not simulated
         self.left_out = {name: reason for name, reason in reasons.items() if reason}
+        check_needs(replace(self.sensor, effects=tuple(
+            name for name in self.sensor.effects if name not in self.left_out)), Motion(0.0))
         # Drawn coefficients of the sensors, (n, k); None before the first step, or without draws
         self.coefficients: np.ndarray | None = None
         self._units_rng, self._white = (np.random.default_rng([seed, n]) for n in (1, 0))

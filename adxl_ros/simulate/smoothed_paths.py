@@ -125,12 +125,13 @@ class SmoothedPath:
     """
 
     def __init__(self, time_s: np.ndarray, reading: np.ndarray, step: float,
-                 degree: int = _DEGREE, is_seen: bool = False) -> None:
+                 degree: int = _DEGREE, is_seen: bool = False, knot_s: float = KNOT_S) -> None:
         """
         Prepare for the readings of an encoder.
 
         time_s: ascending times, s, (n,); reading: readings, rad or m, (n,); NaN where there is
-        none; is_seen: whether the step is that of the readings, and not stated.
+        none; is_seen: whether the step is that of the readings, and not stated; knot_s: distance
+        of the knots, s.
         """
         sampled = np.isfinite(reading)
         self._time_s, self._reading = time_s[sampled], reading[sampled]
@@ -139,6 +140,7 @@ class SmoothedPath:
         if not is_seen and self._step == step and _is_interpolated(self._reading, step):
             kept = _places_of_readings(self._reading, _SMALLEST_CHANGE * step)
             self._time_s, self._reading = self._time_s[kept], self._reading[kept]
+        self._knot_s = knot_s
         self._strength = self._matched_strength(self._step)
         self._degree = degree
 
@@ -170,7 +172,7 @@ class SmoothedPath:
             return None
         inside_s = np.clip(time_s, self._time_s[0], self._time_s[-1])
         rate_hz = 1 / float(np.median(np.diff(self._time_s)))
-        knot_s = max(KNOT_S, 2 / rate_hz)
+        knot_s = max(self._knot_s, 2 / rate_hz)
         corner_hz = min(self._strength ** (-1 / 6) / (2 * np.pi * knot_s), 1 / (2 * knot_s))
         place = np.clip(np.searchsorted(self._time_s, inside_s), 0, len(self._time_s) - 1)
         # The reading changes at most once in a sample.
@@ -191,7 +193,7 @@ class SmoothedPath:
             while len(self._windows) >= _MAX_WINDOWS:
                 del self._windows[min(self._windows)]
             spline = smoothing_spline(
-                *self._part(window), self._strength, self._step, self._degree)
+                *self._part(window), self._strength, self._step, self._degree, self._knot_s)
             self._windows[window] = _polynomials(spline) \
                 if spline.k and len(spline.t) <= _MAX_PIECES else spline
         return self._windows[window]
@@ -205,14 +207,14 @@ class SmoothedPath:
     def _matched_strength(self, step: float) -> float:
         """Return the median strength that windows all over the recording need."""
         last = int((self._time_s[-1] - self._time_s[0]) // _WINDOW_S)
-        strengths = [matched_strength(*self._part(int(window)), step)
+        strengths = [matched_strength(*self._part(int(window)), step, self._knot_s)
                      for window in np.unique(np.linspace(0, last, _PROBES).round())]
         positive = [strength for strength in strengths if strength]
         return float(np.median(positive)) if positive else _USUAL_STRENGTH
 
 
 def smoothing_spline(time_s: np.ndarray, reading: np.ndarray, strength: float, step: float,
-                     degree: int = _DEGREE) -> scipy.interpolate.BSpline:
+                     degree: int = _DEGREE, knot_s: float = KNOT_S) -> scipy.interpolate.BSpline:
     """
     Fit the smoothing spline of one window; see `SmoothedPath`.
 
@@ -225,7 +227,7 @@ def smoothing_spline(time_s: np.ndarray, reading: np.ndarray, strength: float, s
         interval_s = np.diff(time_s)
         even = interval_s.max() < _MAX_UNEVENNESS * np.median(interval_s)
         return scipy.interpolate.make_interp_spline(time_s, reading, k=degree if even else _DEGREE)
-    window = _Window(time_s, reading)
+    window = _Window(time_s, reading, knot_s)
     return scipy.interpolate.BSpline(window.knots, window.bounded_coefficients(
         strength, np.where(_moving(reading), 0.0, _REST_WEIGHT), step / 2) + window.mean, _DEGREE)
 
@@ -295,7 +297,8 @@ def _samples_per_reading(reading: np.ndarray, smallest: float) -> int:
     return int(np.quantile(np.diff(bends), _READING_QUANTILE)) if len(bends) > 1 else 1
 
 
-def matched_strength(time_s: np.ndarray, reading: np.ndarray, step: float) -> float:
+def matched_strength(time_s: np.ndarray, reading: np.ndarray, step: float,
+                     knot_s: float = KNOT_S) -> float:
     """
     Find the largest strength whose deviation is at most that of an encoder.
 
@@ -304,7 +307,7 @@ def matched_strength(time_s: np.ndarray, reading: np.ndarray, step: float) -> fl
     moving = _moving(reading)
     if not step or moving.sum() < _MIN_MOVING:
         return 0.0
-    window = _Window(time_s, reading)
+    window = _Window(time_s, reading, knot_s)
 
     def too_strong(strength: float) -> bool:
         deviation = reading - window.mean - window.design @ window.coefficients(strength)
@@ -317,10 +320,10 @@ def matched_strength(time_s: np.ndarray, reading: np.ndarray, step: float) -> fl
 class _Window:
     """Normal equations of the spline of one window."""
 
-    def __init__(self, time_s: np.ndarray, reading: np.ndarray) -> None:
+    def __init__(self, time_s: np.ndarray, reading: np.ndarray, knot_s: float) -> None:
         duration_s = time_s[-1] - time_s[0]
         inner = np.linspace(time_s[0], time_s[-1],
-                            max(int(min(duration_s / KNOT_S, len(time_s) / 2)), 1) + 1)
+                            max(int(min(duration_s / knot_s, len(time_s) / 2)), 1) + 1)
         outer = (inner[1] - inner[0]) * np.arange(1, _DEGREE + 1)
         # Knots of the spline, s
         self.knots = np.concatenate([inner[0] - outer[::-1], inner, inner[-1] + outer])
@@ -425,6 +428,10 @@ class ForcePath:
     def __call__(self, time_s: np.ndarray) -> Components:
         """Return the three components at times, s, (n,), m/s²; constant outside."""
         return list(self._spline(np.clip(time_s, self.time_s[0], self.time_s[-1])).T)
+
+    def errors(self, time_s: np.ndarray, component: int) -> PathErrors:
+        """Return the errors of a component at times, s, (n,), m/s²: none are known."""
+        return PathErrors(np.zeros(len(time_s)), np.zeros(len(time_s)))
 
     def shifted(self, later_s: float) -> ForcePath:
         """Return the same force at later times, s."""

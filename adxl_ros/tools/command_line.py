@@ -18,7 +18,7 @@ import signal
 import sys
 import textwrap
 from types import FrameType
-from typing import Any, Protocol
+from typing import Any, Protocol, TYPE_CHECKING
 
 from adxl_ros.closed_output import ended_by_closed_output
 from adxl_ros.errors import UserError
@@ -36,6 +36,9 @@ from adxl_ros.model.effects.base import Coefficient, Effect, Parameter
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report.screen import COLUMNS, end_lines, entry_list, NextStep
 import numpy as np
+
+if TYPE_CHECKING:
+    from adxl_ros.simulate.robot import RobotPath
 
 _UNITS = {'rad': 'rad', 'm': 'm', 'c': 'degC', 'v': 'V'}
 """Units of references by the end of their columns' names."""
@@ -126,6 +129,25 @@ def add_recording_options(parse: argparse.ArgumentParser) -> None:
                        help='leave out samples whose stamp does not increase, and count them')
     group.add_argument('--axes', metavar='x=-y,y=x,z=z',
                        help='axes of the sensor by those of the file, for a documented mounting')
+
+
+def add_robot_options(parse: argparse.ArgumentParser) -> None:
+    """Add the options of a robot that carries the sensor, in place of a stage."""
+    group = parse.add_argument_group(
+        'a robot as the stage', 'The recording also has sensor_msgs/JointState, and odom or tf '
+        'where the base moves.')
+    group.add_argument('--urdf', metavar='FILE', help='the robot; needs pinocchio')
+    group.add_argument('--frame', metavar='NAME', default='imu_link',
+                       help='its frame that carries the sensor (default: imu_link)')
+    group.add_argument('--joints', metavar='TOPIC', default='',
+                       help='topic of its joints (default: joint_states, or the only one)')
+
+
+def robot_path(options: argparse.Namespace, read: Recording, sensor: Sensor) -> RobotPath:
+    """Return the motion of the robot of a recording; the options name a URDF."""
+    from adxl_ros.simulate import robot
+    return robot.robot_path(options.urdf, options.frame, read.path, read.epoch_ns,
+                            sensor.local_gravity_mps2, options.joints)
 
 
 def reading_options(options: argparse.Namespace) -> ReadingOptions:

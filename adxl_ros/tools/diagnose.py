@@ -13,6 +13,7 @@ from typing import Any
 from adxl_ros.diagnose import page
 from adxl_ros.diagnose.diagnosis import diagnose as diagnose_recordings, Diagnosis, self_check
 from adxl_ros.diagnose.report import as_json, screen_lines
+from adxl_ros.diagnose.user_unit import gap_in, GapInUnit, quantity
 from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, population_file, recording
@@ -53,6 +54,9 @@ def parser() -> argparse.ArgumentParser:
                        help='the population.yaml of a fleet, as prior of zero-g and scale factor')
     parse.add_argument('--sim', metavar='RECORDING',
                        help='ideal specific force of the same manoeuvre by another simulator')
+    parse.add_argument('--in', dest='quantity', metavar='QUANTITY',
+                       help='state the gap in your unit, too: tilt (deg), velocity (m/s after '
+                            '10 s), or MODULE:FUNCTION')
     parse.add_argument('--align', action='store_true',
                        help='shift --sim in time where its motion is late or early')
     parse.add_argument('--material', type=float, default=MATERIAL_MG, metavar='MG',
@@ -64,6 +68,7 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--json', action='store_true', help='print the report as JSON')
     parse.add_argument('-o', dest='output', metavar='DIR', required=True,
                        help='report.json, report.html and params.yaml')
+    cli.add_robot_options(parse)
     cli.add_recording_options(parse)
     return parse
 
@@ -86,17 +91,23 @@ def diagnose(options: argparse.Namespace) -> int:
             (options.self_check < 0, f'--self-check {options.self_check}: must not be negative'),
             (options.sim and count > 1,
              f'--sim {options.sim}: goes with one recording, but {count} are given'),
-            (options.align and not options.sim, '--align: shifts --sim, which is not given')):
+            (options.urdf and (options.sim or count > 1),
+             f'--urdf {options.urdf}: goes with one recording, and without --sim'),
+            (options.align and not (options.sim or options.urdf),
+             '--align: shifts --sim or a robot, and neither is given')):
         if is_wrong:
             raise UserError(message)
     reading = cli.reading_options(options)
     population = population_file.read(options.prior) if options.prior else None
+    unit = quantity(options.quantity) if options.quantity else None
     html_page.check_libraries()
     with cli.progress('reading') as show:
         recordings = [cli.read('diagnose', path, reading) for path in options.recording]
+        sensor, _ = measure_unstated(load_sensor(options.params, recordings[0]), recordings[0])
         sim = motion_from_force(recording.read_ideal(options.sim, recordings[0].epoch_ns), False
                                 )[0] if options.sim else None
-        sensor, _ = measure_unstated(load_sensor(options.params, recordings[0]), recordings[0])
+        if options.urdf:
+            sim = cli.robot_path(options, recordings[0], sensor).as_motion()
         prior_lines: list[str] = []
         if population is not None:
             sensor, line, _ = posterior(sensor, population)
@@ -104,13 +115,17 @@ def diagnose(options: argparse.Namespace) -> int:
         diagnosis = diagnose_recordings(recordings, sensor, sim, options.seed,
                                         lambda stage, done: show(done, stage), options.align,
                                         options.material)
-        subject = _subject(recordings, sensor, options.sim)
+        subject = _subject(recordings, sensor, options.sim or options.urdf)
         lines = [*screen_lines(diagnosis, subject), *prior_lines]
         if options.self_check and diagnosis.report is not None:
             lines += ['', ' ' + self_check(diagnosis, recordings, sim, options.self_check,
                                            options.seed,
                                            lambda done: show(done, 'self-check'))]
-        report = _write(options, diagnosis, subject, lines)
+        gap = gap_in(unit, diagnosis.full_rate, diagnosis.report.baseline,
+                     diagnosis.report.sensor, options.seed) \
+            if unit is not None and diagnosis.report is not None else None
+        lines += ['', f' in      {gap.text}'] if gap else []
+        report = _write(options, diagnosis, subject, lines, gap)
     if options.json:
         print(json.dumps(report, indent=1, allow_nan=False))
     else:
@@ -124,12 +139,12 @@ def diagnose(options: argparse.Namespace) -> int:
     return 1
 
 
-def _write(options: argparse.Namespace, diagnosis: Diagnosis, subject: str, lines: list[str]
-           ) -> dict[str, Any]:
+def _write(options: argparse.Namespace, diagnosis: Diagnosis, subject: str, lines: list[str],
+           gap: GapInUnit | None) -> dict[str, Any]:
     """Write the files of a diagnosis; return its report."""
     folder = Path(options.output)
     cli.make_folder(folder)
-    report = as_json(diagnosis)
+    report = as_json(diagnosis) | ({'gap_in': gap._asdict()} if gap else {})
     write_text(folder / 'report.json', json.dumps(report, indent=1, allow_nan=False) + '\n')
     parameters = '' if diagnosis.report is None else \
         parameter_file.as_text(diagnosis.report.sensor, lines)
@@ -180,7 +195,7 @@ def _next_steps(options: argparse.Namespace, diagnosis: Diagnosis) -> str | list
                   NextStep('simulate with the effects', simulate)]
     else:
         given = options.params and cli.quoted(options.params)
-        together = '' if options.sim else ' together with this one'
+        together = '' if options.sim or options.urdf else ' together with this one'
         steps.append(NextStep(f'{then}diagnose it{together}',
                               _diagnose_command(options, given, options.recording)))
     return steps
@@ -189,9 +204,11 @@ def _next_steps(options: argparse.Namespace, diagnosis: Diagnosis) -> str | list
 def _diagnose_command(options: argparse.Namespace, params: str | None, recordings: list[str]
                       ) -> str:
     """Return the command that diagnoses the next recording, alone or with others."""
-    words = [cli.quoted(*([] if options.sim else recordings), 'next.csv')]
+    words = [cli.quoted(*([] if options.sim or options.urdf else recordings), 'next.csv')]
     words += [f'--params {params}'] if params else []
     words += ['--sim next_simulated.csv'] if options.sim else []
+    words += [f'--urdf {cli.quoted(options.urdf)} --frame {cli.quoted(options.frame)}'] \
+        if options.urdf else []
     output = f'{options.output}{"_2" if options.output[-1].isdigit() else "2"}'
     return cli.command('diagnose', ' '.join([*words, f'-o {cli.quoted(output)}']))
 

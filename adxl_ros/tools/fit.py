@@ -72,6 +72,7 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--store', metavar='DIR', default=str(calibration_store.default_folder()),
                        help='the calibration store, which gets a copy (default: %(default)s); '
                             'empty for none')
+    cli.add_robot_options(parse)
     cli.add_recording_options(parse)
     return parse
 
@@ -106,6 +107,11 @@ def fit(options: argparse.Namespace) -> int:
                 unit, lines = measure_unstated(load_sensor(options.params, read), read)
                 base, measured = unit, listed(lines)
             unit = recorded_unit(unit, read)
+            if options.urdf:
+                robot = cli.robot_path(options, read, unit)
+                read = robot.with_angles(read)
+                unit = replace(unit, stage_resolution_rad=max(
+                    unit.stage_resolution_rad, robot.step_rad))
             _report_range(read, unit)
             show('reading', (number + 0.5) / len(options.recording))
             thermal = _thermal_blocks(options, read, unit)

@@ -37,7 +37,20 @@ MOTION = Motion(12.0, Knots([0, 1, 3, 5, 7, 12], [0.5, 0.5, 1.2, 0.9, 2.0, 2.0])
 
 
 _TIME_S = np.arange(0.0, 12.0, 0.01)
-FOLLOWED = Motion(12.0, force=ForcePath(_TIME_S, G * np.column_stack([
+
+
+class RobotForce(ForcePath):
+    """A recorded force with errors of a robot, which are none in particular."""
+
+    is_robot = True
+
+    def __init__(self, time_s, force_mps2):
+        super().__init__(time_s, force_mps2)
+        self.modes = {name: np.roll(force_mps2, k + 1, axis=1) for k, name in enumerate(
+            (*(f'joint{n}' for n in range(1, 9)), 'flexible'))}
+
+
+FOLLOWED = Motion(12.0, force=RobotForce(_TIME_S, G * np.column_stack([
     0.3 * np.sin(9 * _TIME_S), 0.4 * np.cos(5 * _TIME_S), 1 + 0.2 * np.sin(23 * _TIME_S)])),
     temperature_c=MOTION.temperature_c, supply_v=MOTION.supply_v)
 

@@ -23,7 +23,8 @@ import pytest
 from units import nominal
 
 RATE_HZ = 200.0
-STAGE = {'backlash', 'base_tilt', 'gravity', 'lever_arm', 'stage_eccentricity', 'stage_offset'}
+STAGE = {'backlash', 'base_tilt', 'gravity', 'lever_arm', 'stage_eccentricity', 'stage_offset',
+         'joint_offset', 'flexible_link'}
 CLOCK = {'clock_skew', 'time_offset'}
 NOISE = {'bias_walk', 'flicker', 'noise_excess', 'spikes', 'stuck'}
 MEAN = ['bias', 'scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z', 'nonlinearity',

@@ -292,7 +292,7 @@ def joint_offset(signals: Signals, p: Parameters) -> None:
 
 
 @effect(Place.REFERENCE,
-        Parameter('compliance_s2', 's^2', -0.01, 0.01, 1e-4,
+        Parameter('compliance_s2', 's^2', 0.0, 0.01, 1e-4,
                   'physics: a first resonance of 16 Hz, 1/(2*pi*f)^2',
                   'angle by which a joint lags, divided by its angular acceleration', ''),
         needs=(Need.ROBOT,),
