@@ -166,12 +166,11 @@ def _mujoco(export: Export) -> str:
     # The comment names it, too, and may not hold two dashes.
     name = re.sub('-+', '-', sensor.serial)
     comment = head(export, 'MuJoCo',
-                    'noise is the largest of the axes. Include this file, or copy site and '
-                    'sensor.',
-                    'The whole chain, in Python after each mj_step:',
-                    f'  from {_MODEL} import SensorModel',
-                    f'  sensor = SensorModel({export.source!r})',
-                    f'  reading = sensor(data.sensor({name!r}).data, model.opt.timestep)')
+                   'noise is the largest of the axes. Include this file, or copy site and sensor.',
+                   'The whole chain, in Python after each mj_step:',
+                   f'  from {_MODEL} import SensorModel',
+                   f'  sensor = SensorModel({export.source!r})',
+                   f'  reading = sensor(data.sensor({name!r}).data, model.opt.timestep)')
     return '\n'.join([
         *_xml_comment(comment),
         '<mujoco>', '  <worldbody>', '    <body name="imu_link">',
@@ -191,8 +190,8 @@ def _sdf(export: Export) -> str:
     """
     sensor = export.sensor
     comment = head(export, 'SDFormat',
-                    'The zero-g is in mean, because gz-sensors draws the sign of bias_mean.',
-                    *flat_noise_lines(sensor))
+                   'The zero-g is in mean, because gz-sensors draws the sign of bias_mean.',
+                   *flat_noise_lines(sensor))
     lines = ['<?xml version="1.0"?>', *_xml_comment(comment),
              '<sdf version="1.9">', '  <model name="imu">', '    <link name="imu_link">',
              f'      <sensor name={quoteattr(sensor.serial)} type="imu">',
@@ -223,7 +222,7 @@ _STD = {WHITE_NOISE: 'std', 'noise_excess': 'std', 'bias': 'mean'}
 
 SIMULATORS = {
     'genesis': Format(
-        'Python module with options of an IMU of Genesis',
+        'Python module with options of an IMU of Genesis 0.4',
         {WHITE_NOISE: 'acc_noise', 'noise_excess': 'acc_noise', 'bias': 'acc_bias',
          'bias_walk': 'acc_random_walk', 'scale_factor': 'CROSS_AXIS_COUPLING',
          'misalignment': 'CROSS_AXIS_COUPLING', 'lever_arm': 'pos_offset',
@@ -234,7 +233,7 @@ SIMULATORS = {
         {**_STD, 'lever_arm': 'pos'},
         _isaaclab),
     'mjlab': Format(
-        'Python module with configurations of mjlab',
+        'Python module with configurations of mjlab 1.x',
         {**_STD, 'lever_arm': 'POS'},
         _mjlab),
     'mujoco': Format(

@@ -6,7 +6,7 @@ A sensor in the formats of other software: each file is read by its reader and c
 Software that is too large to install is replaced by what its source says, of a stated version.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, make_dataclass, replace
 import json
 import sys
 from types import ModuleType, SimpleNamespace
@@ -145,21 +145,8 @@ class NoiseModel:
         raise AssertionError('it replaces the chain')
 
 
-@dataclass
-class Gaussian:
-    """GaussianNoiseCfg of Isaac Lab 2.0 to 3.0 and of mjlab 1.6."""
-
-    mean: object = 0.0
-    std: object = 1.0
-    operation: str = 'add'
-
-
-@dataclass
-class IsaacNoiseModelCfg:
-    """NoiseModelCfg of Isaac Lab 2.0 to 3.0, which refuses a missing noise_cfg."""
-
-    noise_cfg: Gaussian
-    class_type: type = NoiseModel
+Gaussian = make_dataclass('GaussianNoiseCfg', ['mean', 'std', 'operation'])
+"""Of Isaac Lab 2.0 to 3.0 and of mjlab 1.6."""
 
 
 @dataclass(kw_only=True)
@@ -208,43 +195,29 @@ def check_noise(values):
 @pytest.mark.parametrize('version', ['2.3', '3.0'])
 def test_isaaclab(exported, monkeypatch, version):
     """Data is a tensor in 2.x, and a ProxyArray since 3.0 (isaac-sim/IsaacLab#5421)."""
-    @dataclass
-    class Offset:
-        pos: tuple
-        rot: tuple = (1.0, 0.0, 0.0, 0.0) if version == '2.3' else (0.0, 0.0, 0.0, 1.0)
-
+    offset = make_dataclass('OffsetCfg', ['pos'])  # Its default of rot is no turn in both
     values = run_module(exported, 'isaaclab', monkeypatch, {
         'isaaclab': {}, 'isaaclab.utils': {}, 'torch': {'tensor': np.array},
-        'isaaclab.sensors': {'ImuCfg': SimpleNamespace(OffsetCfg=Offset)},
-        'isaaclab.utils.noise': {'GaussianNoiseCfg': Gaussian, 'NoiseModel': NoiseModel,
-                                 'NoiseModelCfg': IsaacNoiseModelCfg}})
-    assert values['OFFSET'] == Offset(ARM_M)
+        'isaaclab.sensors': {'ImuCfg': SimpleNamespace(OffsetCfg=offset)},
+        'isaaclab.utils.noise': {
+            'GaussianNoiseCfg': Gaussian, 'NoiseModel': NoiseModel,
+            'NoiseModelCfg': make_dataclass('NoiseModelCfg', ['class_type', 'noise_cfg'])}})
+    assert values['OFFSET'] == offset(ARM_M)
     assert values['UPDATE_PERIOD_S'] == pytest.approx(1 / unit().rate_hz)
     tensor = np.zeros((2, 3))
-    data = SimpleNamespace(lin_acc_b=tensor if version == '2.3' else
-                           SimpleNamespace(torch=tensor))
-    env = SimpleNamespace(scene={'imu': SimpleNamespace(data=data)})
+    data = tensor if version == '2.3' else SimpleNamespace(torch=tensor)
+    env = SimpleNamespace(scene={'imu': SimpleNamespace(data=SimpleNamespace(lin_acc_b=data))})
     assert values['acceleration'](env) is tensor
     check_noise(values)
 
 
 def test_mjlab(exported, monkeypatch):
     """A name is that of the entity and its own (mjlab 1.6, builtin_sensor.py)."""
-    @dataclass
-    class ObjRef:
-        type: str
-        name: str
-        entity: str | None = None
-
-    @dataclass
-    class BuiltinSensorCfg:
-        name: str
-        sensor_type: str
-        obj: ObjRef
-
     values = run_module(exported, 'mjlab', monkeypatch, {
         'mjlab': {}, 'mjlab.utils': {},
-        'mjlab.sensor': {'BuiltinSensorCfg': BuiltinSensorCfg, 'ObjRef': ObjRef},
+        'mjlab.sensor': {
+            'BuiltinSensorCfg': make_dataclass('BuiltinSensorCfg', ['name', 'sensor_type', 'obj']),
+            'ObjRef': make_dataclass('ObjRef', ['type', 'name', 'entity'])},
         'mjlab.utils.noise': {'GaussianNoiseCfg': Gaussian, 'NoiseModel': NoiseModel,
                               'NoiseModelCfg': MjlabNoiseModelCfg}})
     sensor = values['ACCELEROMETER']
