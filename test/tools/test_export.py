@@ -194,13 +194,15 @@ def check_noise(values):
 
 @pytest.mark.parametrize('version', ['2.3', '3.0'])
 def test_isaaclab(exported, monkeypatch, version):
-    """Data is a tensor in 2.x, and a ProxyArray since 3.0 (isaac-sim/IsaacLab#5421)."""
+    """Data is a tensor in 2.x, and a ProxyArray since 3.0 (concepts/sensors/imu.rst)."""
     offset = make_dataclass('OffsetCfg', ['pos'])  # Its default of rot is no turn in both
     values = run_module(exported, 'isaaclab', monkeypatch, {
         'isaaclab': {}, 'isaaclab.utils': {}, 'torch': {'tensor': np.array},
         'isaaclab.sensors': {'ImuCfg': SimpleNamespace(OffsetCfg=offset)},
-        'isaaclab.utils.noise': {
-            'GaussianNoiseCfg': Gaussian, 'NoiseModel': NoiseModel,
+        'isaaclab.utils.noise': {},
+        'isaaclab.utils.noise.noise_model': {'NoiseModel': NoiseModel},
+        'isaaclab.utils.noise.noise_cfg': {
+            'GaussianNoiseCfg': Gaussian,
             'NoiseModelCfg': make_dataclass('NoiseModelCfg', ['class_type', 'noise_cfg'])}})
     assert values['OFFSET'] == offset(ARM_M)
     assert values['UPDATE_PERIOD_S'] == pytest.approx(1 / unit().rate_hz)
