@@ -1,21 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A sensor in the formats of other software: a table of formats, each with a function.
+A sensor in the formats of estimators; `simulator_exports` has those of simulators.
 
 A format states which parts of the sensor it holds, with their places in the file; the head of each
-file lists them beside what it cannot hold.
+file lists them next to what it cannot hold.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 import json
-import re
 from textwrap import wrap
 from typing import Any, NamedTuple
-from xml.sax.saxutils import quoteattr
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
@@ -40,14 +38,12 @@ _NO_AXIS_VARIANCE = 1e6
 """Variance of an axis that the sensor does not have, (m/s²)², as the driver publishes it."""
 _COLUMNS = 75
 """Columns of the head without the signs of a comment; chosen: 79 with them."""
+_NOT_HELD = 'not held'
+"""In place of the place of a part that a file lacks."""
 _SMALLEST_MG = 5e-4
 """Size below which a part counts as 0, mg; chosen: half of the last digit."""
-_WALK_S = 1e9
-"""Correlation time of a walk without bounds, s; chosen: far longer than any simulation."""
 _ABSENT = np.diag([-1.0, 0.0, 0.0])
 """Covariance of a quantity that the sensor does not measure (sensor_msgs/Imu)."""
-_MODEL = 'adxl_ros.simulate.sensor_model'
-"""Module of the whole chain, which files name."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +52,8 @@ class Export:
 
     sensor: Sensor  # The unit
     source: str  # Name of its parameter file
+    # Place in the file by name of the part that it holds
+    holds: Mapping[str, str]
     # Rms of what each part of the sensor changes, mg, by its name: effects but those of the stage,
     # and the constants above
     sizes_mg: Mapping[str, float]
@@ -104,22 +102,45 @@ def axes(sensor: Sensor) -> list[Axis]:
         for d, name in enumerate(sensor.axes)]
 
 
-def _arm_m(sensor: Sensor) -> list[float]:
+def by_axis(sensor: Sensor, field: str) -> tuple[float, ...]:
+    """Return a field of `Axis` for x, y and z; 0 for an axis that the sensor does not have."""
+    of_axis = {axis.name: getattr(axis, field) for axis in axes(sensor)}
+    return tuple(of_axis.get(name, 0.0) for name in AXES)
+
+
+def gain(sensor: Sensor) -> np.ndarray:
+    """Return the linear response at 0 g, 25 °C and the nominal supply, (m, 3)."""
+    by_force = signal_chain.jacobian(signal_chain.analog_response(sensor), [0.0, 0.0, 0.0])
+    return by_force * G0_MPS2 / sensor.nominal_scale_v_per_g[:, None]
+
+
+def arm_m(sensor: Sensor) -> tuple[float, ...]:
     """Return the position of the sensor on its link, m: the lever arm, or zero without one."""
     values = sensor.values.get('lever_arm', {})
-    return [float(values.get(f'{axis}_m', 0.0)) for axis in AXES]
+    return tuple(float(values.get(f'{axis}_m', 0.0)) for axis in AXES)
 
 
-def _head(export: Export, software: str, name: str, *further: str) -> list[str]:
+def delay_s(sensor: Sensor) -> float:
+    """Return how late the samples are, s; negative if they are early."""
+    return float(sensor.values.get('time_offset', {}).get('offset_s', 0.0))
+
+
+def places(form: Format, sensor: Sensor) -> dict[str, str]:
+    """Return the places of what a format holds of a sensor; none holds samples before time."""
+    return {part: place for part, place in form.holds.items()
+            if part != 'time_offset' or delay_s(sensor) >= 0}
+
+
+def head(export: Export, software: str, *further: str) -> list[str]:
     """Return the head of a file: what it holds of the sensor, and what it cannot hold."""
-    sensor, holds = export.sensor, FORMATS[name].holds
+    sensor = export.sensor
     width = max(map(len, export.sizes_mg)) + 2
     lines = [f'Sensor {sensor.serial}, axes {" ".join(sensor.axes)}, {sensor.rate_hz:.5g} Hz.',
              f'Written by adxl_ros {package_version()} for {software}, from {export.source}.',
              '',
              f'{"part":{width}}{"size, mg rms":14}in this file']
     for part, size_mg in sorted(export.sizes_mg.items(), key=lambda part: -part[1]):
-        lines.append(f'{part:{width}}{size_text(size_mg):14}{place_text(part, holds)}')
+        lines.append(f'{part:{width}}{size_text(size_mg):14}{export.holds.get(part, _NOT_HELD)}')
     missing = [axis for axis in AXES if axis not in sensor.axes]
     if missing:
         lines += ['', f'The sensor has no {" and no ".join(missing)}: do not use that output.']
@@ -133,14 +154,9 @@ def _head(export: Export, software: str, name: str, *further: str) -> list[str]:
             f'{size_text(export.remaining_mg)} mg rms.', '', *further]
 
 
-def _commented(lines: list[str]) -> list[str]:
+def commented(lines: list[str]) -> list[str]:
     """Return lines as comments behind a hash."""
     return [f'# {line}'.rstrip() for line in lines]
-
-
-def _xml_comment(lines: list[str]) -> list[str]:
-    """Return lines as a comment of XML, which may not hold two dashes."""
-    return ['<!--', *(f'  {line}'.rstrip().replace('--', '- -') for line in lines), '-->']
 
 
 def origin_text(sensor: Sensor) -> str:
@@ -153,7 +169,7 @@ def origin_text(sensor: Sensor) -> str:
             'Rate: as the parameter file states it.')
 
 
-def _flat_noise_lines(sensor: Sensor) -> list[str]:
+def flat_noise_lines(sensor: Sensor) -> list[str]:
     """
     Return how much quieter white noise is than filtered noise of the same rms at low frequency.
 
@@ -180,51 +196,21 @@ def size_text(size_mg: float) -> str:
     return f'{size_mg:.3g}' if size_mg >= _SMALLEST_MG else '< 0.0005'
 
 
-def place_text(name: str, holds: Mapping[str, str]) -> str:
-    """Return where a file holds a part of the sensor."""
-    return holds.get(name, 'not held')
-
-
 def _broadcaster(export: Export) -> str:
     """ros2_controllers: parameters of `imu_sensor_broadcaster` with its static covariances."""
-    variance = {axis.name: axis.sample_variance for axis in axes(export.sensor)}
-    by_axis = np.diag([variance.get(name, _NO_AXIS_VARIANCE) for name in AXES])
+    variance = by_axis(export.sensor, 'sample_variance')
+    acceleration = np.diag([v if axis in export.sensor.axes else _NO_AXIS_VARIANCE
+                            for axis, v in zip(AXES, variance)])
     return '\n'.join([
-        *_commented(_head(
-            export, 'imu_sensor_broadcaster', 'broadcaster',
+        *commented(head(
+            export, 'imu_sensor_broadcaster',
             'The covariance is that of one sample. Set sensor_name to that of the URDF.')),
         'imu_sensor_broadcaster:', '  ros__parameters:', '    sensor_name: imu',
         '    frame_id: imu_link',
         *(f'    static_covariance_{quantity}: '
           f'[{", ".join(float_text(value) for value in matrix.ravel().tolist())}]'
           for quantity, matrix in (('orientation', _ABSENT), ('angular_velocity', _ABSENT),
-                                   ('linear_acceleration', by_axis))), ''])
-
-
-def _isaaclab(export: Export) -> str:
-    """Isaac Lab: a Python module with `ImuCfg` and the noise of its observation."""
-    sensor = export.sensor
-    by_name = {axis.name: axis for axis in axes(sensor)}
-    mean, std = ([getattr(by_name[name], field) if name in by_name else 0.0 for name in AXES]
-                 for field in ('zero_g_mps2', 'noise_std_mps2'))
-    comment = _head(export, 'Isaac Lab', 'isaaclab', *_flat_noise_lines(sensor),
-                    'The whole chain for all environments, in each step:',
-                    f'  from {_MODEL} import SensorModel',
-                    f'  sensor = SensorModel({export.source!r})',
-                    '  readings = sensor(imu.data.lin_acc_b.cpu().numpy(), dt)')
-    return '\n'.join([
-        *_commented(comment), '',
-        'from isaaclab.sensors import ImuCfg',
-        'from isaaclab.utils.noise import GaussianNoiseCfg',
-        'import torch', '',
-        '# ImuCfg(prim_path=..., offset=OFFSET, update_period=UPDATE_PERIOD_S)',
-        f'OFFSET = ImuCfg.OffsetCfg(pos={tuple(_arm_m(sensor))!r})',
-        f'UPDATE_PERIOD_S = {1 / sensor.rate_hz!r}', '',
-        '# ObsTerm(func=mdp.imu_lin_acc, noise=ACCELERATION_NOISE), m/s^2',
-        'ACCELERATION_NOISE = GaussianNoiseCfg(',
-        f'    mean=torch.tensor({mean!r}),',
-        f'    std=torch.tensor({std!r}),',
-        "    operation='add')", ''])
+                                   ('linear_acceleration', acceleration))), ''])
 
 
 def _json(export: Export) -> str:
@@ -235,9 +221,6 @@ def _json(export: Export) -> str:
     steps. The parameters of all effects are in it, but not their functions.
     """
     sensor = export.sensor
-    by_force = signal_chain.jacobian(signal_chain.analog_response(sensor), [0.0, 0.0, 0.0])
-    gain = by_force * G0_MPS2 / sensor.nominal_scale_v_per_g[:, None]
-    holds = FORMATS['json'].holds
     effects: dict[str, dict[str, Any]] = {}
     for effect in sensor.effects:
         units = {parameter.name: parameter.unit for parameter in effect_named(effect).parameters}
@@ -254,11 +237,12 @@ def _json(export: Export) -> str:
                   'sample_variance': '(m/s^2)^2', 'noise_density': 'm/s^2/sqrt(Hz), one-sided',
                   'walk_density': 'm/s^2/sqrt(s)', 'walk_return_per_s': '1/s',
                   'step_mps2': 'm/s^2'},
-        'gain': gain.tolist(),
+        'gain': gain(sensor).tolist(),
         'filter_s': noise.electronics(sensor).rc_s.tolist(),
-        'position_m': _arm_m(sensor),
+        'position_m': arm_m(sensor),
         'effects': effects,
-        'parts': [{'name': name, 'size_mg': round(size, 6), 'place': place_text(name, holds)}
+        'parts': [{'name': name, 'size_mg': round(size, 6),
+                   'place': export.holds.get(name, _NOT_HELD)}
                   for name, size in export.sizes_mg.items()],
         'not_held_mg': round(export.remaining_mg, 6),
         'parameter_file': parameter_file.to_flat(sensor),
@@ -271,99 +255,124 @@ def kalibr_settings(white: float, walk: float, rate_hz: float) -> list[tuple[str
             ('accelerometer_random_walk', walk, 'm/s^3/sqrt(Hz)'), ('update_rate', rate_hz, 'Hz')]
 
 
-def _kalibr(export: Export) -> str:
-    """Kalibr: the accelerometer's part of `imu.yaml`, the largest value of all axes."""
-    values = axes(export.sensor)
-    white = max(axis.noise_density for axis in values) / ONE_SIDED
+def _densities(export: Export, software: str) -> tuple[float, float, list[str]]:
+    """Return white noise and random walk of the noisiest axis over both signs, and remarks."""
+    white = max(by_axis(export.sensor, 'noise_density')) / ONE_SIDED
     if not white:
-        raise UserError(f'{export.source}: sensor.noise_density_g_per_rthz is 0, which Kalibr '
-                        'refuses; measure it: ros2 run adxl_ros noise RECORDING -o FILE.yaml')
-    walk = max(axis.walk_density for axis in values)
-    comment = _head(export, 'Kalibr', 'kalibr', 'Densities are the largest of the axes.')
+        raise UserError(f'{export.source}: sensor.noise_density_g_per_rthz is 0, and {software} '
+                        'needs noise; measure it: ros2 run adxl_ros noise RECORDING -o FILE.yaml')
+    walk = max(by_axis(export.sensor, 'walk_density'))
+    remarks = ['Values are those of the noisiest axis.']
     if not walk:
         walk = effect_named('bias_walk').diagnosis.healthy_density * G0_MPS2
-        comment += ['The random walk is that of a healthy unit: the file states none.']
-    comment += ['This sensor has no gyroscope. Kalibr needs these lines of yours, too:',
-                'gyroscope_noise_density, gyroscope_random_walk']
+        remarks += ['The random walk is that of a healthy unit: the file states none.']
+    return white, walk, remarks
+
+
+def _largest_mps2(sensor: Sensor) -> float:
+    """Return the reading at which the first axis may clip, m/s²: by range, rails or saturation."""
+    zero_g_v, scale = sensor.nominal_zero_g_v, sensor.nominal_scale_v_per_g
+    limits_g = [sensor.range_g, *np.ravel(sensor.values.get('saturation', {}).get('limit_g', ()))]
+    if sensor.adc_bits:
+        limits_g += [*(zero_g_v / scale), *((sensor.adc_vref_v - sensor.lsb_v - zero_g_v) / scale)]
+    return float(min(limits_g)) * G0_MPS2
+
+
+def _settings(indent: str, values: Sequence[tuple[str, float | tuple[float, ...], str]]
+              ) -> list[str]:
+    """Return lines of YAML: name, number or numbers, and unit."""
+    texts = {name: float_text(value) if isinstance(value, float)
+             else f'[{", ".join(map(float_text, value))}]' for name, value, _ in values}
+    return [f'{indent}{name}: {texts[name]}  # {unit}' for name, _, unit in values]
+
+
+def _kalibr(export: Export) -> str:
+    """Kalibr: the accelerometer's part of `imu.yaml`."""
+    white, walk, remarks = _densities(export, 'Kalibr')
     return '\n'.join([
-        *_commented(comment), 'rostopic: /imu/data_raw',
-        *(f'{name}: {float_text(value)}  # {unit}'
-          for name, value, unit in kalibr_settings(white, walk, export.sensor.rate_hz)), ''])
+        *commented(head(export, 'Kalibr', *remarks,
+                        'This sensor has no gyroscope. Kalibr needs these lines of yours, too:',
+                        'gyroscope_noise_density, gyroscope_random_walk')),
+        'rostopic: /imu/data_raw',
+        *_settings('', kalibr_settings(white, walk, export.sensor.rate_hz)), ''])
 
 
-def _mujoco(export: Export) -> str:
+def _okvis2(export: Export) -> str:
+    """OKVIS2: the accelerometer's part of `imu_parameters`, with the densities of Kalibr."""
+    sensor = export.sensor
+    white, walk, remarks = _densities(export, 'OKVIS2')
+    return '\n'.join([
+        *commented(head(export, 'OKVIS2', *remarks,
+                        'OKVIS2 stops without these lines, which are yours: use, T_BS, g_max,',
+                        'sigma_g_c, sigma_gw_c, sigma_bg, sigma_ba, g0')),
+        'imu_parameters:',
+        *_settings('    ', [
+            ('a_max', _largest_mps2(sensor), 'm/s^2'),
+            ('sigma_a_c', white, 'm/s^2/sqrt(Hz)'),
+            ('sigma_aw_c', walk, 'm/s^3/sqrt(Hz)'),
+            ('a0', by_axis(sensor, 'zero_g_mps2'), 'm/s^2'),
+            ('g', sensor.local_gravity_mps2, 'm/s^2')]), ''])
+
+
+def _fusioncore(export: Export) -> str:
     """
-    MuJoCo: a body with a site and an accelerometer, as MJCF.
+    FusionCore: parameters of its node.
 
-    MuJoCo stores `noise` since 3.1.4 without adding it, and has one value for all axes: the
-    largest.
+    It adds the variance of the walk once a step, whatever its length: here a sample.
     """
     sensor = export.sensor
-    noise_mps2 = max(axis.noise_std_mps2 for axis in axes(sensor))
-    # The comment names it, too, and may not hold two dashes.
-    name = re.sub('-+', '-', sensor.serial)
-    comment = _head(export, 'MuJoCo', 'mujoco',
-                    'noise is the largest of the axes. Include this file, or copy site and '
-                    'sensor.',
-                    'The whole chain, in Python after each mj_step:',
-                    f'  from {_MODEL} import SensorModel',
-                    f'  sensor = SensorModel({export.source!r})',
-                    f'  reading = sensor(data.sensor({name!r}).data, model.opt.timestep)')
+    _, walk, remarks = _densities(export, 'FusionCore')
     return '\n'.join([
-        *_xml_comment(comment),
-        '<mujoco>', '  <worldbody>', '    <body name="imu_link">',
-        f'      <site name={quoteattr(name)} pos="{" ".join(map(repr, _arm_m(sensor)))}"/>',
-        '    </body>', '  </worldbody>', '  <sensor>',
-        f'    <accelerometer name={quoteattr(name)} site={quoteattr(name)} '
-        f'noise="{noise_mps2!r}"/>',
-        '  </sensor>', '</mujoco>', ''])
+        *commented(head(export, 'FusionCore', *remarks, *flat_noise_lines(sensor),
+                        'FusionCore adapts accel_noise, unless adaptive.imu is false. An arm of 0',
+                        'makes it take that of TF. imu.gyro_noise is yours.')),
+        'fusioncore:', '  ros__parameters:',
+        *_settings('    ', [
+            ('imu.accel_noise', max(by_axis(sensor, 'sample_variance')) ** 0.5, 'm/s^2'),
+            ('ukf.q_accel_bias', walk ** 2 / sensor.rate_hz, '(m/s^2)^2 a sample'),
+            *((f'imu.lever_arm_{axis}', value, 'm, from base_link')
+              for axis, value in zip(AXES, arm_m(sensor)))]), ''])
 
 
-def _sdf(export: Export) -> str:
+def _point_lio(export: Export) -> str:
     """
-    SDFormat: an `<imu>` of gz-sensors (Gazebo), in a link of a model.
+    Point-LIO: the accelerometer's part of `mapping`.
 
-    The zero-g is the mean of the noise. gz-sensors changes the sign of `<bias_mean>` at random
-    (GaussianNoiseModel.cc), but not that of `<mean>`.
+    It multiplies its process noise by dt² (esekfom.hpp), so that a walk has the value k²·rate. It
+    scales readings by the length of `gravity` over `acc_norm`: both are the same here.
     """
     sensor = export.sensor
-    comment = _head(export, 'SDFormat', 'sdf',
-                    'The zero-g is in mean, because gz-sensors draws the sign of bias_mean.',
-                    *_flat_noise_lines(sensor))
-    lines = ['<?xml version="1.0"?>', *_xml_comment(comment),
-             '<sdf version="1.9">', '  <model name="imu">', '    <link name="imu_link">',
-             f'      <sensor name={quoteattr(sensor.serial)} type="imu">',
-             f'        <pose>{" ".join(map(repr, _arm_m(sensor)))} 0 0 0</pose>',
-             '        <always_on>true</always_on>',
-             f'        <update_rate>{sensor.rate_hz!r}</update_rate>',
-             '        <imu>', '          <linear_acceleration>']
-    for axis in axes(sensor):
-        values = {'mean': axis.zero_g_mps2, 'stddev': axis.noise_std_mps2, 'bias_mean': 0.0,
-                  'bias_stddev': 0.0}
-        if axis.walk_density:
-            values |= {'dynamic_bias_stddev': axis.walk_density,
-                       'dynamic_bias_correlation_time':
-                           1 / (axis.walk_return_per_s or 1 / _WALK_S)}
-        if axis.step_mps2:
-            values['precision'] = axis.step_mps2
-        kind = 'gaussian_quantized' if axis.step_mps2 else 'gaussian'
-        lines += [f'            <{axis.name}>', f'              <noise type="{kind}">',
-                  *(f'                <{name}>{value!r}</{name}>'
-                    for name, value in values.items()),
-                  '              </noise>', f'            </{axis.name}>']
-    return '\n'.join([*lines, '          </linear_acceleration>', '        </imu>',
-                      '      </sensor>', '    </link>', '  </model>', '</sdf>', ''])
+    _, walk, remarks = _densities(export, 'Point-LIO')
+    gravity, variance = sensor.local_gravity_mps2, max(by_axis(sensor, 'sample_variance'))
+    return '\n'.join([
+        *commented(head(export, 'Point-LIO', *remarks, *flat_noise_lines(sensor),
+                        'Variances are those of the sensor alone; files of Point-LIO have 0.01 to',
+                        '0.1, for vibration, too. In ROS 2 this is below ros__parameters.',
+                        'Yours: satu_gyro, imu_meas_omg_cov, b_gyr_cov, gyr_cov_input.')),
+        'mapping:',
+        *_settings('    ', [
+            ('imu_time_inte', 1 / sensor.rate_hz, 's'),
+            ('satu_acc', _largest_mps2(sensor), 'm/s^2'),
+            ('acc_norm', gravity, 'm/s^2'),
+            ('gravity', (0.0, 0.0, -gravity), 'm/s^2, down'),
+            ('imu_meas_acc_cov', variance, '(m/s^2)^2'),
+            ('acc_cov_input', variance, '(m/s^2)^2'),
+            ('b_acc_cov', walk ** 2 * sensor.rate_hz, '(m/s^2)^2/s^2')]), ''])
 
 
-FORMATS = {
+_SAMPLE = (WHITE_NOISE, 'noise_excess', STEPS, 'quantisation')
+"""Parts in the variance of one sample."""
+
+ESTIMATORS = {
     'broadcaster': Format(
         'parameters of imu_sensor_broadcaster (ros2_controllers)',
-        dict.fromkeys((WHITE_NOISE, 'noise_excess', STEPS, 'quantisation'), 'covariance'),
+        dict.fromkeys(_SAMPLE, 'covariance'),
         _broadcaster),
-    'isaaclab': Format(
-        'Python module with configurations of Isaac Lab',
-        {WHITE_NOISE: 'std', 'noise_excess': 'std', 'bias': 'mean', 'lever_arm': 'pos'},
-        _isaaclab),
+    'fusioncore': Format(
+        'parameters of FusionCore 0.3',
+        {**dict.fromkeys(_SAMPLE, 'imu.accel_noise'), 'bias_walk': 'ukf.q_accel_bias',
+         'lever_arm': 'imu.lever_arm_x, _y, _z'},
+        _fusioncore),
     'json': Format(
         'all values with units, for any program',
         {WHITE_NOISE: 'axes.noise_std_mps2', 'noise_excess': 'axes.noise_std_mps2',
@@ -376,16 +385,15 @@ FORMATS = {
         {WHITE_NOISE: 'accelerometer_noise_density',
          'noise_excess': 'accelerometer_noise_density', 'bias_walk': 'accelerometer_random_walk'},
         _kalibr),
-    'mujoco': Format(
-        'site and accelerometer of MuJoCo (MJCF)',
-        {'lever_arm': 'pos of the site', WHITE_NOISE: 'noise (MuJoCo does not add it)',
-         'noise_excess': 'noise (MuJoCo does not add it)'},
-        _mujoco),
-    'sdf': Format(
-        'imu of gz-sensors, Gazebo (SDFormat)',
-        {WHITE_NOISE: '<stddev>', 'noise_excess': '<stddev>', 'bias': '<mean>',
-         'bias_walk': '<dynamic_bias_stddev>', 'lever_arm': '<pose>', STEPS: '<precision>',
-         'quantisation': '<precision>'},
-        _sdf),
+    'okvis2': Format(
+        'the part of the accelerometer in the configuration of OKVIS2',
+        {WHITE_NOISE: 'sigma_a_c', 'noise_excess': 'sigma_a_c', 'bias': 'a0',
+         'bias_walk': 'sigma_aw_c', 'saturation': 'a_max'},
+        _okvis2),
+    'point_lio': Format(
+        'the part of the accelerometer in the configuration of Point-LIO',
+        {**dict.fromkeys(_SAMPLE, 'imu_meas_acc_cov'), 'bias_walk': 'b_acc_cov',
+         'saturation': 'satu_acc'},
+        _point_lio),
 }
 """Formats by name."""

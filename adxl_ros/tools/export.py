@@ -5,10 +5,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from adxl_ros.files import exports, parameter_file
+from adxl_ros.files import exports, parameter_file, simulator_exports
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
@@ -25,6 +25,9 @@ _EXAMPLES = {
 }
 """Examples of arguments, by their purpose."""
 
+FORMATS = dict(sorted({**exports.ESTIMATORS, **simulator_exports.SIMULATORS}.items()))
+"""All formats by name."""
+
 _NAMED_PARTS = 3
 """Number of parts that the screen names; chosen: the file lists all."""
 
@@ -32,10 +35,10 @@ _NAMED_PARTS = 3
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
     parse = cli.argument_parser('export', __doc__, _EXAMPLES, lambda: entry_list(
-        'formats', {name: each.meaning for name, each in exports.FORMATS.items()}))
+        'formats', {name: each.meaning for name, each in FORMATS.items()}))
     parse.add_argument('params', metavar='PARAMS', help='parameter file of the sensor')
-    parse.add_argument('--to', dest='format', required=True, choices=list(exports.FORMATS),
-                       metavar='FORMAT', help=f'{", ".join(exports.FORMATS)}')
+    parse.add_argument('--to', dest='format', required=True, choices=list(FORMATS),
+                       metavar='FORMAT', help=f'{", ".join(FORMATS)}')
     parse.add_argument('-o', dest='output', required=True, metavar='FILE', help='the new file')
     return parse
 
@@ -44,17 +47,17 @@ def export(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     cli.refuse_same_file(options.output, options.params)
     sensor = parameter_file.load(options.params)
-    exporter = exports.FORMATS[options.format]
+    exporter = FORMATS[options.format]
     with cli.progress('sizes of the effects') as show:
-        exported = _sized(sensor, options, set(exporter.holds), show)
+        exported = _sized(sensor, options, exports.places(exporter, sensor), show)
     write_text(options.output, exporter.text(exported))
-    held = [name for name in exported.sizes_mg if name in exporter.holds]
+    held = [name for name in exported.sizes_mg if name in exported.holds]
     cli.print_end(_result_lines(exported, options.format, held), [options.output], cli.command(
         'simulate', f'rich --params {cli.quoted(options.params)} -o rich.csv'))
     return 0
 
 
-def _sized(sensor: Sensor, options: argparse.Namespace, held: set[str],
+def _sized(sensor: Sensor, options: argparse.Namespace, holds: Mapping[str, str],
            show: Callable[[float], None]) -> exports.Export:
     """Simulate the sizes of all parts of a sensor."""
     parts = PartSizes(sensor, TRAJECTORIES['rich'](np.random.default_rng(0)))
@@ -66,8 +69,8 @@ def _sized(sensor: Sensor, options: argparse.Namespace, held: set[str],
         sizes_mg[exports.STEPS] = _rms_mg([axis.step_mps2 / np.sqrt(12) for axis in axes])
     if sensor.rc_s:
         sizes_mg[exports.FILTER] = parts.filter_mg()
-    return exports.Export(sensor, Path(options.params).name, sizes_mg,
-                          parts.remaining_mg({*held, *stage}, exports.FILTER in held))
+    return exports.Export(sensor, Path(options.params).name, holds, sizes_mg,
+                          parts.remaining_mg({*holds, *stage}, exports.FILTER in holds))
 
 
 def _rms_mg(values_mps2: list[float]) -> float:

@@ -1,18 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""A sensor in the formats of other software: each file is read by its reader and compared."""
+"""
+A sensor in the formats of other software: each file is read by its reader and compared.
 
-from dataclasses import replace
+Software that is too large to install is replaced by what its source says, of a stated version.
+"""
+
+from dataclasses import dataclass, make_dataclass, replace
 import json
+import sys
 from types import ModuleType, SimpleNamespace
+from typing import Annotated, ClassVar
 from xml.etree import ElementTree
 
 from adxl_ros.files import parameter_file
-from adxl_ros.files.exports import FORMATS
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.simulate.sensor_model import SensorModel
+from adxl_ros.tools.export import FORMATS
 import numpy as np
 from processes import run_in_process
+from pydantic import BaseModel, ConfigDict, Field
 import pytest
 from units import nominal
 import yaml
@@ -55,10 +63,11 @@ def zero_g_mps2(sensor):
 
 
 def test_the_formats_are_there():
-    assert set(FORMATS) == {'broadcaster', 'isaaclab', 'json', 'kalibr', 'mujoco', 'sdf'}
+    assert list(FORMATS) == ['broadcaster', 'fusioncore', 'genesis', 'isaaclab', 'json', 'kalibr',
+                             'mjlab', 'mujoco', 'okvis2', 'point_lio', 'sdf']
 
 
-@pytest.mark.parametrize('name', ['broadcaster', 'isaaclab', 'kalibr', 'mujoco', 'sdf'])
+@pytest.mark.parametrize('name', sorted({*FORMATS} - {'json', 'genesis'}))
 def test_the_head_says_what_the_format_cannot_hold(exported, name):
     """The size is that of the effect: an angle in mg, times the in-plane force across it."""
     lines = exported[name].text.splitlines()
@@ -69,12 +78,14 @@ def test_the_head_says_what_the_format_cannot_hold(exported, name):
     assert 0.2e3 * MISALIGNED_RAD < float(sizes['misalignment']) < 1e3 * MISALIGNED_RAD
     bias_mg = 1e3 * np.sqrt(np.mean((OFFSET_V / unit().nominal_scale_v_per_g) ** 2))
     assert float(sizes['bias']) == pytest.approx(bias_mg, rel=0.01)
-    assert (places['bias'] == 'not held') == (name not in ('sdf', 'isaaclab'))
+    assert (places['bias'] == 'not held') == (
+        name not in ('sdf', 'isaaclab', 'mjlab', 'okvis2'))
     assert 'no z' in exported[name].text
+    assert all(len(line) <= COLUMNS for line in lines if line.startswith('#'))
     assert max(map(len, exported[name].screen.splitlines())) <= COLUMNS
 
 
-@pytest.mark.parametrize('name', ['isaaclab', 'sdf'])
+@pytest.mark.parametrize('name', ['fusioncore', 'isaaclab', 'sdf'])
 def test_the_head_says_how_much_too_quiet_flat_noise_is(exported, name):
     frequency_hz = np.linspace(0, unit().rate_hz / 2, 20001)
     density = noise.density_v2_per_hz(replace(unit(), adc_bits=0), frequency_hz)[:, 0]
@@ -127,34 +138,212 @@ def test_the_head_for_mujoco_runs(exported, monkeypatch):
     assert names['reading'][:2] == pytest.approx(zero_g_mps2(unit()), abs=0.3)
 
 
-def test_isaaclab(exported, monkeypatch):
-    """The module runs on configurations that have the fields of Isaac Lab."""
-    class Offset(SimpleNamespace):
+class NoiseModel:
+    """Base class of Isaac Lab 2.0 to 3.0 and mjlab 1.6: both refuse a class that is no child."""
 
-        def __init__(self, pos, rot=(1.0, 0.0, 0.0, 0.0)):
-            super().__init__(pos=pos, rot=rot)
+    def __init__(self, noise_model_cfg, num_envs, device):
+        raise AssertionError('it replaces the chain')
 
-    class Noise(SimpleNamespace):
 
-        def __init__(self, mean=0.0, std=1.0, operation='add'):
-            super().__init__(mean=mean, std=std, operation=operation)
+Gaussian = make_dataclass('GaussianNoiseCfg', ['mean', 'std', 'operation'])
+"""Of Isaac Lab 2.0 to 3.0 and of mjlab 1.6."""
 
-    contents = {'isaaclab': {}, 'isaaclab.utils': {}, 'torch': {'tensor': np.array},
-                'isaaclab.sensors': {'ImuCfg': SimpleNamespace(OffsetCfg=Offset)},
-                'isaaclab.utils.noise': {'GaussianNoiseCfg': Noise}}
-    for name, members in contents.items():
-        module = ModuleType(name)
+
+@dataclass(kw_only=True)
+class MjlabNoiseModelCfg:
+    """NoiseModelCfg of mjlab 1.6: children name their class."""
+
+    noise_cfg: Gaussian
+    class_type: ClassVar[type] = NoiseModel
+
+    def __init_subclass__(cls, class_type):
+        cls.class_type = class_type
+
+
+def run_module(exported, name, monkeypatch, contents):
+    """Run an exported module of Python on modules with those contents; return its names."""
+    for package, members in contents.items():
+        module = ModuleType(package)
         vars(module).update(members)
-        monkeypatch.setitem(__import__('sys').modules, name, module)
-    values = {}
-    exec(compile(exported['isaaclab'].text, 'isaaclab.py', 'exec'), values)
-    assert values['OFFSET'].pos == ARM_M
-    assert values['UPDATE_PERIOD_S'] == pytest.approx(1 / unit().rate_hz)
+        monkeypatch.setitem(sys.modules, package, module)
+    monkeypatch.chdir(exported[name].path.parent)
+    values = {'__name__': name}
+    exec(compile(exported[name].text, name, 'exec'), values)
+    return values
+
+
+def check_noise(values):
+    """Compare the noise of a module, and its whole chain, with the unit."""
     acceleration = values['ACCELERATION_NOISE']
     assert acceleration.operation == 'add'
     assert acceleration.mean == pytest.approx([*zero_g_mps2(unit()), 0.0])
     std_mps2 = noise.analog_std_v(unit()) / unit().nominal_scale_v_per_g * G0_MPS2
     assert acceleration.std == pytest.approx([*std_mps2, 0.0])
+    chain = values['WHOLE_CHAIN']
+    assert chain.noise_cfg is acceleration
+    assert issubclass(chain.class_type, NoiseModel)
+    model = chain.class_type(chain, num_envs=2, device='cpu')
+    model.reset()
+    force = np.tile([0.0, 0.0, G0_MPS2], (2, 1))
+    expected = SensorModel('unit.yaml')
+    for _ in range(3):
+        assert model(force) == pytest.approx(expected(force, 1 / unit().rate_hz))
+        model.reset(np.array([1]))
+        expected.reset([1])
+
+
+@pytest.mark.parametrize('version', ['2.3', '3.0'])
+def test_isaaclab(exported, monkeypatch, version):
+    """Data is a tensor in 2.x, and a ProxyArray since 3.0 (concepts/sensors/imu.rst)."""
+    offset = make_dataclass('OffsetCfg', ['pos'])  # Its default of rot is no turn in both
+    values = run_module(exported, 'isaaclab', monkeypatch, {
+        'isaaclab': {}, 'isaaclab.utils': {}, 'torch': {'tensor': np.array},
+        'isaaclab.sensors': {'ImuCfg': SimpleNamespace(OffsetCfg=offset)},
+        'isaaclab.utils.noise': {},
+        'isaaclab.utils.noise.noise_model': {'NoiseModel': NoiseModel},
+        'isaaclab.utils.noise.noise_cfg': {
+            'GaussianNoiseCfg': Gaussian,
+            'NoiseModelCfg': make_dataclass('NoiseModelCfg', ['class_type', 'noise_cfg'])}})
+    assert values['OFFSET'] == offset(ARM_M)
+    assert values['UPDATE_PERIOD_S'] == pytest.approx(1 / unit().rate_hz)
+    tensor = np.zeros((2, 3))
+    data = tensor if version == '2.3' else SimpleNamespace(torch=tensor)
+    env = SimpleNamespace(scene={'imu': SimpleNamespace(data=SimpleNamespace(lin_acc_b=data))})
+    assert values['acceleration'](env) is tensor
+    check_noise(values)
+
+
+def test_mjlab(exported, monkeypatch):
+    """A name is that of the entity and its own (mjlab 1.6, builtin_sensor.py)."""
+    values = run_module(exported, 'mjlab', monkeypatch, {
+        'mjlab': {}, 'mjlab.utils': {},
+        'mjlab.sensor': {
+            'BuiltinSensorCfg': make_dataclass('BuiltinSensorCfg', ['name', 'sensor_type', 'obj']),
+            'ObjRef': make_dataclass('ObjRef', ['type', 'name', 'entity'])},
+        'mjlab.utils.noise': {'GaussianNoiseCfg': Gaussian, 'NoiseModel': NoiseModel,
+                              'NoiseModelCfg': MjlabNoiseModelCfg}})
+    sensor = values['ACCELEROMETER']
+    assert (sensor.sensor_type, sensor.obj.type, sensor.obj.name) == (
+        'accelerometer', 'site', values['NAME'])
+    assert values['POS'] == ARM_M
+    # Tensors are made of tuples of floats.
+    assert isinstance(values['ACCELERATION_NOISE'].std, tuple)
+    name = f'{sensor.obj.entity}/{sensor.name}'
+    env = SimpleNamespace(scene={name: SimpleNamespace(data='data')})
+    assert values['acceleration'](env) == 'data'
+    check_noise(values)
+
+
+NotNegative = Annotated[float, Field(ge=0)]
+Three = Annotated[tuple[float, float, float], Field(strict=False)]
+
+
+class GenesisImu(BaseModel):
+    """Options of gs.sensors.IMU in Genesis 0.4.5, options/sensors/options.py, by its rules."""
+
+    model_config = ConfigDict(strict=True, extra='forbid')
+    pos_offset: Three
+    acc_bias: Three
+    acc_noise: Three
+    acc_random_walk: Three
+    acc_resolution: Three
+    delay: NotNegative
+    jitter: NotNegative
+    interpolate: bool = False
+
+
+def test_genesis(exported, monkeypatch, tmp_path):
+    """The sensor multiplies, adds walk, noise and bias, and rounds (Genesis 0.4.5, imu.py)."""
+    values = run_module(exported, 'genesis', monkeypatch, {})
+    options = GenesisImu(**values['ACCELEROMETER'])
+    assert options.jitter <= options.delay
+    assert options.pos_offset == ARM_M
+    force = np.array([1.0, -2.0, G0_MPS2])
+    step = options.acc_resolution[0]
+    biased = np.array(values['CROSS_AXIS_COUPLING']) @ force + options.acc_bias
+    quiet = replace(unit(), noise_density_g_per_rthz=np.zeros(2), effects=('bias', 'misalignment'))
+    reading = SensorModel(quiet)(force, values['DT_S'])
+    assert reading[:2] == pytest.approx(np.round(biased[:2] / step) * step, abs=1.01 * step)
+    std_mps2 = noise.analog_std_v(unit()) / unit().nominal_scale_v_per_g * G0_MPS2
+    assert options.acc_noise == pytest.approx([*std_mps2, 0.0])
+    # It adds one draw a step: after 1 s the walk has the density of the unit.
+    assert np.array(options.acc_random_walk)[:2] * np.sqrt(unit().rate_hz) == pytest.approx(
+        unit().values['bias_walk']['density_g_per_rts'] * G0_MPS2)
+    rows = [line.split() for line in exported['genesis'].text.splitlines()]
+    assert [row[1] for row in rows if row[-2:] == ['not', 'held']] == ['RC']
+
+
+@pytest.mark.parametrize('offset_s', [0.02, -0.02])
+def test_genesis_holds_a_delay_but_no_lead(tmp_path, offset_s):
+    parameter_file.save(tmp_path / 'unit.yaml', replace(
+        nominal('x'), effects=('time_offset',), values={'time_offset': {
+            'offset_s': np.array(offset_s)}}))
+    done = run_in_process('export', 'unit.yaml', '--to', 'genesis', '-o', 'out.py', cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    row = next(line for line in (tmp_path / 'out.py').read_text().splitlines()
+               if line.startswith('# time_offset'))
+    values = {}
+    exec((tmp_path / 'out.py').read_text(), values)
+    assert values['ACCELEROMETER']['delay'] == max(offset_s, 0.0)
+    assert row.endswith('delay' if offset_s > 0 else 'not held')
+
+
+def sample_variance():
+    return ((noise.sample_std_v(unit()) / unit().nominal_scale_v_per_g * G0_MPS2) ** 2).max()
+
+
+def test_okvis2(exported):
+    """
+    OKVIS2 wants real numbers and sequences (ViParametersReader.cpp, commit 464180a).
+
+    Its covariance grows by sigma² dt (ImuError.cpp), so that its densities are those of Kalibr.
+    """
+    own = yaml.safe_load(exported['okvis2'].text)['imu_parameters']
+    kalibr = yaml.safe_load(exported['kalibr'].text)
+    assert own['sigma_a_c'] == kalibr['accelerometer_noise_density']
+    assert own['sigma_aw_c'] == kalibr['accelerometer_random_walk']
+    assert own['a0'] == pytest.approx([*zero_g_mps2(unit()), 0.0])
+    assert own['a_max'] == pytest.approx(unit().range_g * G0_MPS2)
+    assert own['g'] == unit().local_gravity_mps2
+    assert all(isinstance(value, float) for value in [*own.pop('a0'), *own.values()])
+    named = exported['okvis2'].text.partition('are yours: ')[2].partition('imu_parameters')[0]
+    assert {*own, 'a0', *named.replace('#', '').replace(',', ' ').split()} == {
+        'use', 'T_BS', 'a_max', 'g_max', 'sigma_g_c', 'sigma_bg', 'sigma_a_c', 'sigma_ba',
+        'sigma_gw_c', 'sigma_aw_c', 'a0', 'g0', 'g'}
+
+
+def test_fusioncore(exported):
+    """R is accel_noise², and Q is added once a step (FusionCore 0.3.7, imu.hpp and ukf.cpp)."""
+    parameters = yaml.safe_load(exported['fusioncore'].text)['fusioncore']['ros__parameters']
+    assert all(isinstance(value, float) for value in parameters.values())
+    assert parameters == {
+        'imu.accel_noise': pytest.approx(np.sqrt(sample_variance())),
+        'ukf.q_accel_bias': pytest.approx((3e-5 * G0_MPS2) ** 2 / unit().rate_hz),
+        **{f'imu.lever_arm_{axis}': m for axis, m in zip('xyz', ARM_M)}}
+
+
+def test_point_lio(exported):
+    """
+    Point-LIO, commit ef96597: it adds b_acc_cov·dt² a step (esekfom.hpp).
+
+    A reading counts as acc·|gravity|/acc_norm, and as clipped from 0.99 satu_acc (Estimator.cpp).
+    """
+    own = yaml.safe_load(exported['point_lio'].text)['mapping']
+    assert np.linalg.norm(own['gravity']) / own['acc_norm'] == 1
+    assert own['satu_acc'] == pytest.approx(unit().range_g * G0_MPS2)
+    assert own['imu_meas_acc_cov'] == own['acc_cov_input'] == pytest.approx(sample_variance())
+    dt_s = own['imu_time_inte']
+    assert own['b_acc_cov'] * dt_s ** 2 == pytest.approx((3e-5 * G0_MPS2) ** 2 * dt_s)
+
+
+@pytest.mark.parametrize(('effects', 'values', 'limit_g'), [
+    ((), {}, 1.7), (('saturation',), {'saturation': {'limit_g': np.array([1.2, 1.5])}}, 1.2)])
+def test_an_estimator_learns_the_first_limit(tmp_path, effects, values, limit_g):
+    parameter_file.save(tmp_path / 'unit.yaml', nominal('xy', effects=effects, values=values))
+    done = run_in_process('export', 'unit.yaml', '--to', 'okvis2', '-o', 'o.yaml', cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    own = yaml.safe_load((tmp_path / 'o.yaml').read_text())['imu_parameters']
+    assert own['a_max'] == pytest.approx(limit_g * G0_MPS2)
 
 
 def test_kalibr(exported):
