@@ -82,6 +82,33 @@ SUPPLY = replace(REST, duration_s=60.0, supply_v=Steps(5.0, ((15, 4.8), (30, 5.2
 TILTING = Scene(Motion(18.0, turning(0.0).beta, Held(np.radians(30))), 'alpha_rad',
                 'alpha at beta = 30°, deg', 180 / np.pi)
 CARRIED_S = np.arange(0.0, 4.0, 0.01)
+
+class Arm(ForcePath):
+    """The end of an arm of 0.5 m that swings about its y, with the errors of a robot."""
+
+    is_robot = True
+
+    def __init__(self) -> None:
+        """Take the swing of a joint."""
+        super().__init__(CARRIED_S, self.force(self.turn(0.0)))
+        self.modes = {'joint1': (self.force(self.turn(0.0) + 1e-4) - self.force(self.turn(0.0)))
+                      / 1e-4,
+                      'flexible': (self.force(self.turn(1e-5)) - self.force(self.turn(0.0))) / 1e-5}
+
+    def turn(self, compliance_s2: float) -> np.ndarray:
+        """Return the angle of the joint, rad, with links that yield."""
+        q = 0.8 * np.sin(6 * CARRIED_S) + 0.1 * np.sin(25 * CARRIED_S)
+        return q - compliance_s2 * np.gradient(np.gradient(q, CARRIED_S), CARRIED_S)
+
+    def force(self, q: np.ndarray) -> np.ndarray:
+        """Return the specific force, m/s², (n, 3)."""
+        rate = np.gradient(q, CARRIED_S)
+        return np.column_stack([
+            -0.5 * rate ** 2 - 9.80665 * np.sin(q), 0 * q,
+            -0.5 * np.gradient(rate, CARRIED_S) + 9.80665 * np.cos(q)])
+
+
+SWUNG = Motion(4.0, force=Arm())
 CARRIED = Motion(4.0, force=ForcePath(CARRIED_S, 9.80665 * np.column_stack([
     0.2 * np.sin(2 * CARRIED_S) + 0.05 * np.sin(25 * CARRIED_S),
     0.3 * np.sin(3 * CARRIED_S) + 0.02 * np.sin(50 * CARRIED_S), np.ones(len(CARRIED_S))])))
@@ -97,6 +124,7 @@ SCENES = {
     'temperature_scale': Scene(WARM), 'warm_up': Scene(WARM), 'thermal_lag': Scene(WARM),
     'thermal_hysteresis': Scene(CYCLE, 'temperature_c', 'temperature, °C'),
     'supply': Scene(SUPPLY), 'reference_filter': Scene(CARRIED),
+    'joint_offset': Scene(SWUNG), 'flexible_link': Scene(SWUNG),
     'reference_delay': Scene(CARRIED), 'reference_frame': Scene(CARRIED),
     'bias_walk': Scene(replace(REST, duration_s=1200.0)), 'spikes': replace(
         OVER_TIME, motion=replace(REST, duration_s=20.0)),
