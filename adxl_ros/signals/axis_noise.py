@@ -46,8 +46,6 @@ class AxisNoise:
     # lowest_s, lowest: Time, s, and value, m/s², of the lowest point of the Allan deviation
     lowest_s: float
     lowest: float
-    # Time that would show half of a term's upper limit, s, by name of the terms that are not seen
-    needed_s: dict[str, float]
 
     @property
     def estimates(self) -> tuple[Estimate, Estimate, Estimate]:
@@ -83,15 +81,13 @@ def recording_noise(path: str, rest: StillStretch, axes: str, show: Callable[[fl
         means = rest.means[:, i]
         fit = noise_parameters.fit_noise(means, rest.step_s, variances)
         drift = noise_parameters.find_drift(means, rest.step_s, variances, fit, rest.temperature_c)
-        needed_s = {name: noise_parameters.needed_time_s(fit, term, rest.span_s)
-                    for term, name in enumerate(TERMS) if not getattr(fit, name).is_seen}
         deviation = rest.allan.deviation[:, i]
         lowest = int(np.argmin(deviation))
         std, resolution = float(rest.sample_std[i]), float(rest.resolution[i])
         rounding = resolution / float(np.sqrt(12 * rest.rate_hz))
         noises.append(AxisNoise(axis, without_rounding(fit, std, resolution, rounding), drift, std,
                                 resolution, rounding, float(rest.allan.tau_s[lowest]),
-                                float(deviation[lowest]), needed_s))
+                                float(deviation[lowest])))
         show((i + 1) / len(axes))
     return RecordingNoise(path, rest, noises)
 

@@ -26,7 +26,7 @@ from adxl_ros.report.screen import row
 from adxl_ros.signals import axis_noise
 from adxl_ros.signals.allan_deviation import longest_rest, StillStretch
 from adxl_ros.signals.axis_noise import AxisNoise, RecordingNoise, settings, TERMS
-from adxl_ros.signals.noise_parameters import Drift, DriftKind, Estimate
+from adxl_ros.signals.noise_parameters import Drift, Estimate
 from adxl_ros.signals.recorded_sensor import load_sensor
 from adxl_ros.tools import command_line as cli
 import numpy as np
@@ -37,9 +37,6 @@ MICRO_G = 1e6 / G0_MPS2
 _LARGEST_STD_MPS2 = 0.3
 """Noise of a sample from which a sensor vibrates, m/s². Chosen: three times that of a low-cost
 IMU at 1 kHz."""
-
-_LARGEST_RATIO = 1.25
-"""Ratio of measured and fitted power from which it is reported. Chosen: less changes N by 10 %."""
 
 _LARGEST_FILLED = 0.01
 """Share of missing samples from which white noise changes visibly. Chosen."""
@@ -121,9 +118,7 @@ def _warnings(result: RecordingNoise) -> list[str]:
     texts += _too_short(result)
     for noise in result.axes:
         if noise.drift is not None:
-            texts.append(_drift_text(rest, noise, noise.drift))
-        else:
-            texts += _unexplained(noise)
+            texts.append(_drift_text(rest, noise.axis, noise.drift))
         if noise.is_coarse:
             texts.append(f'{noise.axis}: samples change in steps of '
                          f'{noise.resolution * MICRO_G:.3g} µg, which hide the noise. N, B and K '
@@ -147,58 +142,33 @@ def _motion(rest: StillStretch) -> str:
 
 
 def _too_short(result: RecordingNoise) -> list[str]:
-    """Return which terms the time does not show, and how long it must be."""
+    """Return which terms the time does not show."""
     texts = []
     for name in TERMS:
-        needed_s = {noise.axis: noise.needed_s[name] for noise in result.axes
-                    if name in noise.needed_s}
-        if needed_s:
-            longest_s = max(needed_s.values())
-            further = 'To see half of the limit above, record about ' \
-                f'{duration(longest_s, 2)}.' if np.isfinite(longest_s) else \
-                'The other terms hide it, in longer recordings, too.'
+        axes = [noise.axis for noise in result.axes if not getattr(noise.fit, name).is_seen]
+        if axes:
             texts.append(f'{duration(result.rest.span_s)} is too short to see the {NAMES[name]} '
-                         f'of {", ".join(needed_s)}. {further}')
+                         f'of {", ".join(axes)}. Record for longer.')
     return texts
 
 
-def _unexplained(noise: AxisNoise) -> list[str]:
-    """Return at which frequencies N, B and K do not describe the noise."""
-    texts = []
-    octaves = [octave for octave in noise.fit.octaves
-               if abs(np.log(octave.ratio)) > np.log(_LARGEST_RATIO)]
-    for is_excess, advice in ((True, 'Look for a fan, mains or a person nearby.'),
-                              (False, 'The noise is none of these three there.')):
-        part = [octave for octave in octaves if (octave.ratio > 1) == is_excess]
-        if part:
-            ratio = max(part, key=lambda octave: abs(np.log(octave.ratio))).ratio
-            texts.append(f'{noise.axis}: from {part[0].low_hz:.3g} to {part[-1].high_hz:.3g} Hz '
-                         f'the power is {"up" if is_excess else "down"} to {ratio:.2g} times that '
-                         f'of N, B and K. {advice}')
-    return texts
-
-
-def _micro_or_milli_g(size_mps2: float, unit: str) -> str:
+def _micro_or_milli_g(size_mps2: float) -> str:
     """Return a drift with its sign in µg or mg."""
     size = size_mps2 * MICRO_G
-    return f'{size:+.3g} µg{unit}' if abs(size) < 1000 else f'{size / 1000:+.3g} mg{unit}'
+    return f'{size:+.3g} µg' if abs(size) < 1000 else f'{size / 1000:+.3g} mg'
 
 
-def _drift_text(rest: StillStretch, noise: AxisNoise, drift: Drift) -> str:
-    """Return what the axis follows, and the random walk without it."""
-    if drift.kind is DriftKind.TEMPERATURE:
-        assert rest.temperature_c is not None
-        text = (f'follows the temperature by {_micro_or_milli_g(drift.size, "/K")} '
+def _drift_text(rest: StillStretch, axis: str, drift: Drift) -> str:
+    """Return what an axis follows, and its noise without this drift."""
+    if rest.temperature_c is not None and drift.follows == 'temperature':
+        text = (f'follows the temperature by {_micro_or_milli_g(drift.size)}/K '
                 f'({np.ptp(rest.temperature_c):.2g} K in all)')
-    elif drift.kind is DriftKind.TREND:
-        text = f'drifts by {_micro_or_milli_g(3600 * drift.size, "/h")} throughout'
     else:
-        at_s = rest.start_s + drift.cell * rest.step_s
-        text = f'has a step of {_micro_or_milli_g(drift.size, "")} at {at_s:.6g} s'
+        text = f'drifts by {_micro_or_milli_g(3600 * drift.size)}/h'
     without = [_interval(estimate.scaled(MICRO_G))
                for estimate in (drift.without.instability, drift.without.walk)]
-    return (f'{noise.axis}: {text}. B and K contain this drift. Without it B is {without[0]} µg, '
-            f'and K is {without[1]} µg/√s.')
+    return (f'{axis}: {text}. B and K contain this drift. Without it B is {without[0]} µg, and K '
+            f'is {without[1]} µg/√s.')
 
 
 def _as_json(result: RecordingNoise) -> dict[str, Any]:
