@@ -15,6 +15,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.atomic_write import write_bytes, write_text
 from adxl_ros.files.csv_file import csv_writer
+from adxl_ros.files.parameter_file import float_text
 from adxl_ros.files.recording_columns import Recording, unit_of
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import ONE_SIDED
@@ -101,9 +102,19 @@ def _interval(estimate: Estimate) -> str:
 
 
 def _paste_lines(result: RecordingNoise) -> list[str]:
-    """Return the settings of other programs, ready to paste."""
-    return [line for program, entries in settings(result.axes, result.rest.rate_hz).items()
-            for line in (f'# {program}', *(line for entry in entries for line in entry.lines()))]
+    """Return the settings of other programs in YAML, ready to paste."""
+    lines = []
+    for program, entries in settings(result.axes, result.rest.rate_hz).items():
+        lines.append(f'# {program}')
+        for name, values, unit in entries:
+            texts = [float_text(float(f'{value:.{6 if value >= 1 else 3}g}')) for value in values]
+            if len(texts) == 1:
+                lines.append(f'{name}: {texts[0]}  # {unit}')
+            else:
+                rows = [', '.join(texts[i:i + 3]) for i in range(0, len(texts), 3)]
+                lines += [f'{name}:  # {unit}',
+                          *('  [' + ',\n   '.join(rows) + ']').split('\n')]
+    return lines
 
 
 def _warnings(result: RecordingNoise) -> list[str]:
@@ -186,8 +197,8 @@ def _as_json(result: RecordingNoise) -> dict[str, Any]:
             'tau_s': result.rest.allan.tau_s.tolist(),
             **{noise.axis: result.rest.allan.deviation[:, i].tolist()
                for i, noise in enumerate(result.axes)}},
-        'settings': {program: {setting.name: setting.values[0] if len(setting.values) == 1
-                               else list(setting.values) for setting in entries}
+        'settings': {program: {name: values[0] if len(values) == 1 else values
+                               for name, values, _ in entries}
                      for program, entries in settings(result.axes, result.rest.rate_hz).items()},
         'warnings': _warnings(result),
     }
