@@ -62,8 +62,6 @@ _IIOD_PORT = '30431'
 """TCP port of iiod without another one in the URI."""
 _PROBE_S = 0.5
 """Longest wait for the answer of an iiod, s; libiio itself waits for five seconds."""
-_POLL_S = 1.0
-"""Period in which attributes are read that have no place in the buffer, s."""
 _CLOCK_ATTRIBUTE = 'current_timestamp_clock'
 """Attribute of the kernel that selects the clock of the time stamps."""
 _MAX_STAMP_NS = 2 ** 62
@@ -280,9 +278,7 @@ class _Stream:
                         ceil(_ROUND_TRIPS * _answer_s(axis.channel) * rate_hz)),
                     _MAX_BUFFER)
         self.buffer_s = count / rate_hz
-        self._columns = [column for column in columns if column.channel.scan_element]
-        self._polled = [column for column in columns if not column.channel.scan_element]
-        self._polled_s = 0.0
+        self._columns = [*columns]
         for channel in [self._timestamp, *(column.channel for column in self._columns)]:
             channel.enabled = True
         # Some kernels cannot set this number; a network server cannot once its buffer runs.
@@ -299,7 +295,6 @@ class _Stream:
             device_ns = np.frombuffer(self._timestamp.read(self._buffer), np.int64)
             values = {column.role: column.convert(np.frombuffer(
                 column.channel.read(self._buffer), column.dtype)) for column in self._columns}
-            values |= self._poll(len(device_ns))
         except OSError as error:
             raise _ReadError(f'{self.name}: lost: {base.reason(error)}') from None
         lengths = {len(device_ns), *map(len, values.values())}
@@ -313,17 +308,8 @@ class _Stream:
         self._buffer = None
         self._timestamp = None
         self._columns.clear()
-        self._polled.clear()
         self._device = None
         self._context = None
-
-    def _poll(self, count: int) -> dict[str, np.ndarray]:
-        """Read the channels without a place in the buffer once a second; NaN in between."""
-        is_due = bool(self._polled) and time.monotonic() - self._polled_s >= _POLL_S
-        if is_due:
-            self._polled_s = time.monotonic()
-        return {column.role: np.full(count, column.convert(_number(column.channel, 'raw'))
-                                     if is_due else np.nan) for column in self._polled}
 
 
 def _open_stream(settings: Settings, entries: Sequence[str], sensor: Sensor) -> _Stream:
@@ -380,8 +366,7 @@ def _find_device(context: Any, name: str) -> Any:
     device = context.find_device(name) if name and name.isascii() else None
     if device is not None:
         return device
-    buffered = [device for device in context.devices
-                if any(channel.scan_element for channel in _inputs(device))]
+    buffered = [device for device in context.devices if _inputs(device)]
     if not name and len(buffered) == 1:
         return buffered[0]
     raise UserError(f'link.device: {name!r} is not there; with buffered channels there are: '
@@ -389,9 +374,9 @@ def _find_device(context: Any, name: str) -> Any:
 
 
 def _inputs(device: Any) -> list[Any]:
-    """Return the input channels of a device without its time stamps."""
-    return [channel for channel in device.channels
-            if not channel.output and channel.id != 'timestamp']
+    """Return the input channels of a device that have a place in its buffer."""
+    return [channel for channel in device.channels if channel.scan_element
+            and not channel.output and channel.id != 'timestamp']
 
 
 def _assign_roles(device: Any, entries: Sequence[str], axes: str) -> dict[str, Any]:
@@ -402,8 +387,8 @@ def _assign_roles(device: Any, entries: Sequence[str], axes: str) -> dict[str, A
         by_label = {labels[channel.id]: channel for channel in inputs}
         if all(axis in by_label for axis in axes):
             return {role: by_label[role] for role in order if role in by_label}
-        measured = [channel for channel in inputs if channel.scan_element
-                    and channel.type.name in ('IIO_VOLTAGE', 'IIO_ACCEL')]
+        measured = [channel for channel in inputs
+                    if channel.type.name in ('IIO_VOLTAGE', 'IIO_ACCEL')]
         entries = [channel.id for channel
                    in sorted(measured, key=lambda channel: channel.index)[:len(axes)]]
     roles: list[str] = []
@@ -416,14 +401,12 @@ def _assign_roles(device: Any, entries: Sequence[str], axes: str) -> dict[str, A
             available = ', '.join(f'{key} ({label})' if label else key
                                   for key, label in labels.items())
             raise UserError(f'link.channels: {_name(device)} has no channel {name!r}; it has '
-                            f'{available}')
+                            f'{available} in its buffer')
         if not equals:
             free = [candidate for candidate in order if candidate not in roles]
             role = name if name in free or not free else free[0]
         roles.append(role)
         assigned.append(named[0])
-        if role in axes and not named[0].scan_element:
-            raise UserError(f'link.channels: {named[0].id} has no place in the buffer')
     base.check_roles(roles, axes)
     return dict(zip(roles, assigned))
 
@@ -438,7 +421,7 @@ def _label(channel: Any) -> str:
 def _column(role: str, channel: Any, sensor: Sensor, supply_scale: float) -> _Column:
     """Read how the codes of a channel become V or degC."""
     form = channel.data_format
-    if channel.scan_element and (form.repeat > 1 or form.length not in (8, 16, 32, 64)):
+    if form.repeat > 1 or form.length not in (8, 16, 32, 64):
         raise UserError(f'{channel.id}: a format of {form.length} bits, {form.repeat} times, '
                         'cannot be read')
     dtype = f'{"i" if form.is_signed else "u"}{form.length // 8}'
