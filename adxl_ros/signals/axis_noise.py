@@ -4,17 +4,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
+from adxl_ros.errors import UserError
 from adxl_ros.files.exports import kalibr_settings
+from adxl_ros.files.recording_columns import Recording, unit_of
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals import noise_parameters
-from adxl_ros.signals.allan_deviation import StillStretch
+from adxl_ros.signals.allan_deviation import longest_rest, StillStretch
 from adxl_ros.signals.noise_parameters import Drift, Estimate, NoiseFit
+from adxl_ros.signals.recorded_sensor import load_sensor
 import numpy as np
 
 TERMS = ('white', 'instability', 'walk')
@@ -68,16 +71,24 @@ class RecordingNoise:
     """The noise of a recording."""
 
     path: str  # The recording
+    sensor: Sensor  # Its parameter file
+    unit: Sensor  # The nominal sensor that it comes from
     rest: StillStretch  # Its samples at rest
     axes: list[AxisNoise]  # The noise by axis
 
 
-def recording_noise(path: str, rest: StillStretch, axes: str, show: Callable[[float], None]
-                    ) -> RecordingNoise:
-    """Fit the noise of all axes."""
+def recording_noise(read: Callable[[], Iterable[Recording]], params: str | None,
+                    show: Callable[[float], None] = lambda done: None) -> RecordingNoise:
+    """Fit the noise of all axes in the longest rest; `read` yields the blocks of a recording."""
+    first = next(iter(read()), None)
+    if first is None:
+        raise UserError('the recording holds no samples')
+    sensor = load_sensor(params, first)
+    unit = unit_of(sensor, first.stream_info, first.axes)
+    rest = longest_rest(read, unit)
     variances = noise_parameters.coefficient_variances(len(rest.means), rest.step_s)
     noises = []
-    for i, axis in enumerate(axes):
+    for i, axis in enumerate(unit.axes):
         means = rest.means[:, i]
         fit = noise_parameters.fit_noise(means, rest.step_s, variances)
         drift = noise_parameters.find_drift(means, rest.step_s, variances, fit, rest.temperature_c)
@@ -88,8 +99,8 @@ def recording_noise(path: str, rest: StillStretch, axes: str, show: Callable[[fl
         noises.append(AxisNoise(axis, without_rounding(fit, std, resolution, rounding), drift, std,
                                 resolution, rounding, float(rest.allan.tau_s[lowest]),
                                 float(deviation[lowest])))
-        show((i + 1) / len(axes))
-    return RecordingNoise(path, rest, noises)
+        show((i + 1) / len(unit.axes))
+    return RecordingNoise(first.path, sensor, unit, rest, noises)
 
 
 def without_rounding(fit: NoiseFit, std: float, resolution: float, rounding: float) -> NoiseFit:

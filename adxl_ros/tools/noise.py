@@ -16,7 +16,7 @@ from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.atomic_write import write_bytes, write_text
 from adxl_ros.files.csv_file import csv_writer
 from adxl_ros.files.parameter_file import float_text
-from adxl_ros.files.recording_columns import Recording, unit_of
+from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor
@@ -25,10 +25,9 @@ from adxl_ros.report.figures import png, pyplot
 from adxl_ros.report.quantities import duration
 from adxl_ros.report.screen import row
 from adxl_ros.signals import axis_noise
-from adxl_ros.signals.allan_deviation import longest_rest, StillStretch
+from adxl_ros.signals.allan_deviation import StillStretch
 from adxl_ros.signals.axis_noise import AxisNoise, RecordingNoise, settings, TERMS
 from adxl_ros.signals.noise_parameters import Drift, Estimate
-from adxl_ros.signals.recorded_sensor import load_sensor
 from adxl_ros.tools import command_line as cli
 import numpy as np
 
@@ -305,19 +304,25 @@ def noise(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     if options.report:
         html_page.check_libraries()
-    source = _Source(options)
+    reading, newest = cli.reading_options(options), []
     with cli.progress('noise') as show:
-        rest = longest_rest(lambda: source.blocks(show), source.unit)
-        result = axis_noise.recording_noise(options.recording, rest, source.axes,
+        def blocks() -> Iterator[Recording]:
+            for block in recording.blocks(options.recording, _BLOCK_ROWS, reading):
+                newest[:] = [block]
+                yield block
+                show(block.done, 'read')
+
+        result = axis_noise.recording_noise(blocks, options.params,
                                             lambda done: show(done, 'fit'))
-    cli.report_reading('noise', source.last)
+    rest = result.rest
+    cli.report_reading('noise', *newest)
     files: list[Path] = []
     if options.report:
         cli.make_folder(Path(options.report))
         files += _write_page(Path(options.report), result)
     if options.output:
         name = Path(options.recording).name
-        fresh = axis_noise.with_noise(source.sensor(rest.rate_hz), result.axes)
+        fresh = axis_noise.with_noise(_sensor(result), result.axes)
         parameter_file.save(options.output, replace(fresh, provenance={
             **fresh.provenance, 'noise_from': name, 'rate_from': name}), [
                 f'Noise measured in {duration(rest.span_s)} at rest of {result.path}.',
@@ -335,41 +340,15 @@ def noise(options: argparse.Namespace) -> int:
     return 0
 
 
-class _Source:
-    """The recording and its unit."""
-
-    axes: str  # Measured axes, known after the first block
-    last: Recording  # The newest block
-
-    def __init__(self, options: argparse.Namespace) -> None:
-        self._path, self._params = options.recording, options.params
-        self._reading = cli.reading_options(options)
-        self._unit: Sensor | None = None
-
-    def blocks(self, show: cli.ShowDone) -> Iterator[Recording]:
-        """Yield the blocks of the recording, and show how much has been read."""
-        for block in recording.blocks(self._path, _BLOCK_ROWS, self._reading):
-            self.last = block
-            yield block
-            show(block.done, 'read')
-
-    def unit(self, block: Recording) -> Sensor:
-        """Return the nominal sensor of the recording by its first block."""
-        if self._unit is None:
-            self.axes = block.axes
-            self._sensor = load_sensor(self._params, block)
-            self._unit = unit_of(self._sensor, block.stream_info, block.axes)
-        return self._unit
-
-    def sensor(self, rate_hz: float) -> Sensor:
-        """Return the sensor of the parameter file, with the axes and rate of the recording."""
-        assert self._unit is not None
-        if self._sensor.effects and self._sensor.axes != self.axes:
-            raise UserError(f'{self._path}: has the axes {self.axes}, but the parameters of '
-                            f'{self._sensor.serial} are for {self._sensor.axes}; name the '
-                            'parameter file of this sensor')
-        base = self._sensor if self._sensor.effects else self._unit
-        return replace(base, serial=self._unit.serial, rate_hz=round(rate_hz, 6))
+def _sensor(result: RecordingNoise) -> Sensor:
+    """Return the sensor of the parameter file, with the axes and rate of the recording."""
+    sensor, unit = result.sensor, result.unit
+    if sensor.effects and sensor.axes != unit.axes:
+        raise UserError(f'{result.path}: has the axes {unit.axes}, but the parameters of '
+                        f'{sensor.serial} are for {sensor.axes}; name the parameter file of this '
+                        'sensor')
+    return replace(sensor if sensor.effects else unit, serial=unit.serial,
+                   rate_hz=round(result.rest.rate_hz, 6))
 
 
 def main() -> int:
