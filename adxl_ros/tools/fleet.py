@@ -19,7 +19,7 @@ from adxl_ros.fleet.inputs import find_sources, stated_by
 from adxl_ros.fleet.recipe import make_recipe, Recipe, task_names, TASKS
 from adxl_ros.fleet.row import reason_kind, Row
 from adxl_ros.fleet.run import only_client, Plan, plan, Results, Selection, since_text, work
-from adxl_ros.report.addresses import as_utf_8, without_secrets
+from adxl_ros.report.page import as_utf_8, without_secrets
 from adxl_ros.report.quantities import counted, duration, file_size
 from adxl_ros.report.screen import wrapped
 from adxl_ros.tools import command_line as cli
