@@ -163,39 +163,34 @@ class CompensationPolicy:
         return calibration_store.newer(self._store, sensor)
 
     def status(self, interval: Interval, newer: Path | None, calibration: str) -> Status:
-        """Return the state of the stream."""
-        counts = interval.counts
-        if self.refusal:
-            return Status(State.REFUSED, f'publishing nothing: {self.refusal}')
-        if not counts.get('received') and interval.duration_s > _SHORTEST_SILENCE_S:
-            return Status(State.SILENT, f'no samples on {self._topics.data_raw}')
-        if interval.obstacle:
-            return Status(State.UNKNOWN, (
-                f'publishing nothing yet: nothing on {self._topics.sensor_info}, and '
-                f'{self._topics.data_raw} does not show its sensor: {interval.obstacle}'))
-        if counts.get('dropped'):
-            return Status(State.DROPPING,
-                          f'{counts["dropped"]} samples dropped that no force explains')
-        if counts.get('saturated'):
-            return Status(State.SATURATED,
-                          f'{counts["saturated"]} samples with the ADC at its rail')
-        if self.info is None:
-            return Status(State.NOT_CONFIRMED,
-                          f'unit not confirmed: nothing on {self._topics.sensor_info}')
+        """Return the state of the stream: the first one that holds."""
+        counts, topics = interval.counts, self._topics
+        is_silent = not counts.get('received') and interval.duration_s > _SHORTEST_SILENCE_S
+        is_newer = newer is not None and not self.is_named(calibration)
         unknown = self._unknown_surroundings(interval)
-        if unknown:
-            return Status(State.SURROUNDINGS_UNKNOWN, unknown)
-        if not self.sensor.effects:
-            return Status(State.NOT_CALIBRATED, 'not calibrated: the datasheet values apply')
-        if counts.get('outside'):
-            return Status(State.OUTSIDE, (
-                f'{counts["outside"]} samples outside of what was calibrated, their covariance '
-                f'raised: {"; ".join(interval.outside)}'))
-        if newer is not None and not self.is_named(calibration):
-            return Status(State.NEWER_CALIBRATION, (
-                f'a newer calibration is in the store: {newer}; set calibration to it, or start '
-                'again'))
-        return Status(State.COMPENSATING, 'compensating')
+        states = (
+            (self.refusal, State.REFUSED, f'publishing nothing: {self.refusal}'),
+            (is_silent, State.SILENT, f'no samples on {topics.data_raw}'),
+            (interval.obstacle, State.UNKNOWN,
+             f'publishing nothing yet: nothing on {topics.sensor_info}, and {topics.data_raw} '
+             f'does not show its sensor: {interval.obstacle}'),
+            (counts.get('dropped'), State.DROPPING,
+             f'{counts.get("dropped")} samples dropped that no force explains'),
+            (counts.get('saturated'), State.SATURATED,
+             f'{counts.get("saturated")} samples with the ADC at its rail'),
+            (self.info is None, State.NOT_CONFIRMED,
+             f'unit not confirmed: nothing on {topics.sensor_info}'),
+            (unknown, State.SURROUNDINGS_UNKNOWN, unknown),
+            (not self.sensor.effects, State.NOT_CALIBRATED,
+             'not calibrated: the datasheet values apply'),
+            (counts.get('outside'), State.OUTSIDE,
+             f'{counts.get("outside")} samples outside of what was calibrated, their covariance '
+             f'raised: {"; ".join(interval.outside)}'),
+            (is_newer, State.NEWER_CALIBRATION,
+             f'a newer calibration is in the store: {newer}; set calibration to it, or start '
+             'again'),
+            (True, State.COMPENSATING, 'compensating'))
+        return next(Status(state, text) for holds, state, text in states if holds)
 
     def _unknown_surroundings(self, interval: Interval) -> str:
         """Name an effect whose temperature or supply nobody publishes, or return ''."""

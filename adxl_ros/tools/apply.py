@@ -11,7 +11,8 @@ from contextlib import contextmanager
 import itertools
 from pathlib import Path
 
-from adxl_ros.compensate.recordings import effects_left, Estimates, ImuFields, RecordingEstimator
+from adxl_ros.compensate.estimators import effects_left, Estimates, RecordingEstimator
+from adxl_ros.compensate.live_stream import ImuFields
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.bag_writer import TiltBag
 from adxl_ros.files.csv_file import csv_writer
