@@ -220,7 +220,6 @@ class CompensationPolicy:
             **{f'provenance.{key}': value for key, value in sensor.provenance.items()}}
 
     def _unit(self) -> str:
-        """State whether the stream is of the unit of the calibration."""
         if self.refusal:
             return 'several' if self.refusal == self.mixture else 'other'
         if self.info is None:
@@ -230,7 +229,6 @@ class CompensationPolicy:
             else 'confirmed'
 
     def _validity(self, interval: Interval, age_days: float | None) -> str:
-        """Describe whether the calibration is valid for the samples of the interval."""
         sensor = self.sensor
         if not sensor.effects:
             return 'not calibrated'
@@ -251,7 +249,6 @@ class CompensationPolicy:
 
 
 def _age_days(sensor: Sensor) -> float | None:
-    """Return the age of a calibration, days; None where its file states no date."""
     date = calibration_store.date_of(sensor)
     if date is None:
         return None

@@ -343,7 +343,6 @@ class LiveEstimator:
         return xx + unknown, xy, xz, yy + unknown, yz, zz + self._noise_variance[0] + motion
 
     def _cell(self, force: Components) -> _Cell:
-        """Return the cell of a force."""
         key = (round(force[0] / _CELL_MPS2), round(force[1] / _CELL_MPS2),
                round(force[2] / _CELL_MPS2))
         cell = self._cells.get(key)

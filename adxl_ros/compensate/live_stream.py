@@ -224,7 +224,6 @@ class ImuFields:
     """
 
     def __init__(self) -> None:
-        """Begin with angles of 0."""
         self._last_rad = np.zeros(3)
 
     def __call__(self, estimates: Estimates) -> tuple[dict[str, np.ndarray], np.ndarray]:

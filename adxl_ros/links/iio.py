@@ -105,7 +105,6 @@ class IioLink(base.DeviceLink):
     references = tuple(base.COLUMNS.values())
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
-        """Prepare the link without opening the device."""
         self._declared, self._settings = sensor, settings
         self._entries = base.parse_channels(settings.channels)
         self._stream: _Stream | None = None
@@ -149,7 +148,6 @@ class IioLink(base.DeviceLink):
             self._stream = None
 
     def _condition(self) -> tuple[base.Level, str]:
-        """Return level and text of the status."""
         # The URI of this machine is only a kind and a colon.
         uri, stream = self._settings.uri.removesuffix(':'), self._stream
         if self._error:
@@ -263,7 +261,6 @@ class _Stream:
 
     def __init__(self, context: Any, device: Any, columns: Sequence[_Column], settings: Settings,
                  sensor: Sensor) -> None:
-        """Start the buffer."""
         self.name = _name(device)
         self._context, self._device = context, device
         self._timestamp = device.find_channel('timestamp')
@@ -313,7 +310,6 @@ class _Stream:
 
 
 def _open_stream(settings: Settings, entries: Sequence[str], sensor: Sensor) -> _Stream:
-    """Open a device and start its buffer."""
     iio = import_libiio()
     try:
         _probe(settings.uri)
@@ -374,7 +370,6 @@ def _find_device(context: Any, name: str) -> Any:
 
 
 def _inputs(device: Any) -> list[Any]:
-    """Return the input channels of a device that have a place in its buffer."""
     return [channel for channel in device.channels if channel.scan_element
             and not channel.output and channel.id != 'timestamp']
 
@@ -443,7 +438,6 @@ def _column(role: str, channel: Any, sensor: Sensor, supply_scale: float) -> _Co
 
 
 def _number(channel: Any, name: str) -> float:
-    """Read an attribute; raises `UserError` where it is not a finite number."""
     try:
         text = channel.attrs[name].value
     except KeyError:

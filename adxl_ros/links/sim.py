@@ -77,7 +77,6 @@ class SimulatedSensor:
     joint_state_topic = 'stage/true_joint_states'
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
-        """Rest in the pose of the settings."""
         self.sensor = sensor
         self._seed = settings.seed
         self._knots = [_resting((settings.alpha_rad, settings.beta_rad, 0.0))]
@@ -142,12 +141,10 @@ class SimulatedSensor:
         """Do nothing: the link holds nothing open."""
 
     def _skipped(self, now_ns: int) -> int:
-        """Return how many samples a jump of time to `now_ns` skips."""
         gap_s = (now_ns - self._until_ns) * 1e-9
         return round(gap_s * self.sensor.rate_hz) if self._until_ns and gap_s > 0 else 0
 
     def _stamp(self, index: float | np.ndarray) -> np.ndarray:
-        """Return the times of samples by their numbers, ns."""
         return self._origin_ns + np.rint(index * (1e9 / self.sensor.rate_hz)).astype(np.int64)
 
     def _motion_until_ns(self) -> int:
@@ -213,5 +210,4 @@ class SimulatedSensor:
 
 
 def _resting(position: tuple[float, ...]) -> _Knot:
-    """Return a knot at rest before all stamps."""
     return _Knot(0, position, (0.0,) * len(JOINTS))

@@ -90,7 +90,6 @@ class CellMeans:
         return (squares + between) / max(width * self.size - 1, 1)
 
     def _join(self) -> None:
-        """Join each cell with its neighbour."""
         half = self.count // 2
         pairs = self.means.reshape(half, 2, -1)
         differences = pairs[:, 1] - pairs[:, 0]
@@ -298,7 +297,6 @@ class _Samples:
         self._cells.feed(rows)
 
     def _evenly(self, time_s: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Return the rows with gaps filled."""
         steps_s = np.diff(time_s)
         gaps = steps_s > gap_s(self.nominal_hz)
         if not gaps.any():

@@ -134,7 +134,6 @@ def density_g_per_rthz(noise: AxisNoise) -> float | None:
 
 
 def _likely(estimate: Estimate) -> float:
-    """Return an estimate, or its upper limit where it is not seen."""
     return estimate.value if estimate.is_seen else estimate.high
 
 

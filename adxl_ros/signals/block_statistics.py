@@ -54,11 +54,9 @@ class Blocks:
     angle: np.ndarray
 
     def __len__(self) -> int:
-        """Return the number of blocks."""
         return len(self.start)
 
     def __getitem__(self, part: slice | np.ndarray) -> Blocks:
-        """Return the blocks that a slice or an index array selects."""
         return Blocks(*(getattr(self, f.name)[part] for f in fields(self)))
 
     @staticmethod
@@ -125,7 +123,6 @@ class BlockCutter:
         return blocks
 
     def _summed(self, columns: np.ndarray, start: np.ndarray, run: np.ndarray) -> Blocks:
-        """Compute the statistics of the blocks that begin at the columns `start`."""
         block = columns[:, start[:, None] + np.arange(self.size)]
         samples, angles = block[1:1 + self._axes], block[1 + self._axes:]
         finite = np.isfinite(samples).all(axis=0)

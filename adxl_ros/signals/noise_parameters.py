@@ -245,7 +245,6 @@ def _best(models: list[_Groups], fixed: int | None = None, value: float = 0.0
 
 
 def _grouped(power: np.ndarray, variances: np.ndarray) -> _Groups:
-    """Group coefficients of power (n,) whose frequencies are nearly equal."""
     edges = [*range(min(_SINGLE, len(power)))]
     position = float(_SINGLE)
     while position < len(power):

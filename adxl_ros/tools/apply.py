@@ -155,7 +155,6 @@ def _report_effects(block: Recording, sensor: Sensor, undo_filter: bool) -> None
 
 
 def _columns(estimates: Estimates) -> dict[str, np.ndarray]:
-    """Return the columns of the output, (n,) each, in its order."""
     columns = {f'a{axis}_mps2': values for axis, values in zip(AXES, estimates.force_mps2)}
     columns |= {f'a{axis}_std_mps2': values
                 for axis, values in zip(AXES, estimates.force_std_mps2)}

@@ -152,7 +152,6 @@ def reading_text(options: argparse.Namespace) -> str:
 
 
 def _counts(option: str, text: str, is_positive: bool) -> tuple[float, ...]:
-    """Return the numbers of a list."""
     try:
         values = tuple(float(word) for word in text.split(',')) if text else ()
     except ValueError:

@@ -49,7 +49,6 @@ _UNITS = {'white': 'm/s^2/sqrt(Hz)', 'instability': 'm/s^2', 'walk': 'm/s^2/sqrt
 
 
 def _head(result: RecordingNoise) -> list[str]:
-    """Return which samples are used."""
     rest, axes = result.rest, ' '.join(noise.axis for noise in result.axes)
     return [result.path, f'{duration(rest.span_s)} at rest, {rest.rate_hz:.5g} Hz, axes {axes}']
 
@@ -74,7 +73,6 @@ def _tables(result: RecordingNoise) -> list[str]:
 
 
 def _micro_g_intervals(noise: AxisNoise) -> list[str]:
-    """Return N, B and K in µg with their intervals."""
     return [_interval(estimate.scaled(MICRO_G)) for estimate in noise.estimates]
 
 
@@ -117,7 +115,6 @@ def _paste_lines(result: RecordingNoise) -> list[str]:
 
 
 def _warnings(result: RecordingNoise) -> list[str]:
-    """Return what limits the result, and what to do about it."""
     rest, texts = result.rest, []
     if rest.motion_s:
         texts.append(f'{_motion(rest)} Used is the longest rest, {duration(rest.span_s)} of '
@@ -144,7 +141,6 @@ def _warnings(result: RecordingNoise) -> list[str]:
 
 
 def _motion(rest: StillStretch) -> str:
-    """Return when the sensor moves."""
     first = rest.motion_s[0]
     others = len(rest.motion_s) - 1
     repeated = {0: '', 1: ' and once again'}.get(others, f' and at {others} further times')
@@ -152,7 +148,6 @@ def _motion(rest: StillStretch) -> str:
 
 
 def _too_short(result: RecordingNoise) -> list[str]:
-    """Return which terms the time does not show."""
     texts = []
     for name in TERMS:
         axes = [noise.axis for noise in result.axes if not getattr(noise.fit, name).is_seen]
@@ -182,7 +177,6 @@ def _drift_text(rest: StillStretch, axis: str, drift: Drift) -> str:
 
 
 def _as_json(result: RecordingNoise) -> dict[str, Any]:
-    """Return the result for programs, in SI units."""
     return {
         'schema': 1,
         'recording': result.path,
@@ -204,7 +198,6 @@ def _as_json(result: RecordingNoise) -> dict[str, Any]:
 
 
 def _axis_json(noise: AxisNoise) -> dict[str, Any]:
-    """Return the noise of an axis for programs."""
     terms = {name: {'value': estimate.value if estimate.is_seen else None,
                     'ci': [estimate.low, estimate.high], 'unit': _UNITS[name]}
              for name, estimate in zip(TERMS, noise.estimates)}
@@ -225,7 +218,6 @@ _COLUMNS = ('axis', 'white noise N, µg/√Hz', 'bias instability B, µg', 'rand
 
 
 def _write_page(folder: Path, result: RecordingNoise) -> list[Path]:
-    """Write the page, the plot and the curve."""
     page, plot, curve = (folder / name for name in ('report.html', 'allan.png', 'allan.csv'))
     figure = _plot(result)
     write_text(page, _page(result, figure))
@@ -238,7 +230,6 @@ def _write_page(folder: Path, result: RecordingNoise) -> list[Path]:
 
 
 def _page(result: RecordingNoise, figure: Any) -> str:
-    """Return the page."""
     rows = [[noise.axis, *_micro_g_intervals(noise),
              f'{noise.lowest * MICRO_G:.3g} at {noise.lowest_s:.3g} s',
              f'{noise.sample_std:.3g}', f'{noise.fit.highest_hz:.3g}'] for noise in result.axes]
@@ -250,7 +241,6 @@ def _page(result: RecordingNoise, figure: Any) -> str:
 
 
 def _plot(result: RecordingNoise) -> Any:
-    """Return the plot of the Allan deviation by axis."""
     figure, axes = pyplot().subplots(1, len(result.axes), squeeze=False, sharey=True,
                                      figsize=(_INCHES[0] * len(result.axes), _INCHES[1]),
                                      layout='constrained')

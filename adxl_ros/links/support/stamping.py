@@ -89,7 +89,6 @@ class ClockMap:
     """
 
     def __init__(self, delay_s: float, decision_s: float = _LATER_WAIT_S) -> None:
-        """Begin without arrivals."""
         self._decision_s = decision_s
         self.steps = 0  # How often the device's clock has stepped, by its arrivals
         self._delay_ns = round(delay_s * 1e9)
@@ -170,7 +169,6 @@ class ClockMap:
         return stamps
 
     def _line(self, device_ns: Any) -> Any:
-        """Map device times, ns, to host times, ns: an array or one number."""
         return self._line_host_ns + (device_ns - self._line_device_ns) * self._slope
 
     def _update_window(self, device_ns: int, lag_ns: int) -> None:
@@ -298,7 +296,6 @@ class SystemClockMap:
     """Map from the host's monotonic clock, which is never set, to ROS time, the system clock."""
 
     def __init__(self) -> None:
-        """Read both clocks."""
         self.steps = 0  # How often the system clock was set since the map began
         self._offset_ns = float(_system_offset()[1])
 
@@ -354,7 +351,6 @@ class PeriodMeans:
     """Replaces slow references by their means over 0.1 s, each at the next sample that comes."""
 
     def __init__(self, columns: Sequence[str]) -> None:
-        """Begin without values."""
         self._held: dict[str, list[np.ndarray]] = {column: [] for column in columns}
         self._period = 0
 
@@ -393,7 +389,6 @@ class Stamper:
     """Holds samples until the device's clock is known, stamps them and counts lost ones."""
 
     def __init__(self, clock: ClockMap | IdentityMap, references: Sequence[str]) -> None:
-        """Begin without samples; `references` are the columns that all samples have."""
         self.clock = clock  # Map of the device's clock
         self.period_ns = 0.0  # Sample period, ns; 0 before the first `restart`
         self._system_clock = SystemClockMap()
