@@ -94,6 +94,11 @@ def listed(names: Sequence[str], word: str) -> str:
     return f' {word} '.join(filter(None, [', '.join(names[:-1]), *names[-1:]]))
 
 
+def column_unit(name: str) -> str:
+    """Return the unit of a reference, which its column's name ends with."""
+    return {'rad': 'rad', 'm': 'm', 'c': '°C', 'v': 'V'}[name.rsplit('_', 1)[1]]
+
+
 def mg(value_mps2: Any) -> Any:
     """Convert m/s² to mg."""
     return 1e3 * value_mps2 / G0_MPS2

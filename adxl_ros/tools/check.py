@@ -20,7 +20,7 @@ from adxl_ros.files import recording
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.report import page as html_page
-from adxl_ros.report.quantities import duration, short_time
+from adxl_ros.report.quantities import column_unit, duration, short_time
 from adxl_ros.report.screen import COLUMNS, row
 from adxl_ros.signals.findings import check_recording, Findings
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
@@ -39,8 +39,6 @@ _MOST_DETAILED = 3
 """Recordings up to which the details of sound ones are printed, too. Chosen: a screen."""
 _LABEL_COLUMNS = 12
 """Columns of the label of a line below a recording."""
-_UNITS = {'rad': 'rad', 'm': 'm', 'c': '°C', 'v': 'V'}
-"""Units of references by the end of their names."""
 
 
 def _lines(results: list[Findings]) -> list[str]:
@@ -106,7 +104,7 @@ def _value_lines(contents: RecordingContents) -> list[str]:
     texts = [f'{contents.samples} samples, jitter {short_time(contents.jitter_s)} rms',
              ', '.join(f'{axis.name} {axis.lowest_mps2:.3g} to {axis.highest_mps2:.3g} m/s²'
                        for axis in contents.axes),
-             *(f'{name} {low:.4g} to {high:.4g} {_UNITS[name.rsplit("_", 1)[1]]}'
+             *(f'{name} {low:.4g} to {high:.4g} {column_unit(name)}'
                for name, (low, high) in contents.reference_ranges.items())]
     if contents.delay is not None:
         texts.append(f'log time minus header time {short_time(contents.delay.median_s)}, '
