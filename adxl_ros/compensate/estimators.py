@@ -8,33 +8,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from adxl_ros.compensate.inversions import (
-    noise_variance_v2,
-    paper_inverse,
-    undo_filter_blocks,
-)
+from adxl_ros.compensate.inversions import noise_variance_v2, paper_inverse, undo_filter_blocks
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
-from adxl_ros.model import noise, signal_chain
+from adxl_ros.model import covariance as force_errors, noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
-from adxl_ros.model.covariance import (
-    derived_z_covariance,
-    measured_covariance,
-    prepared_covariance,
-    UNMEASURED_VARIANCE,
-)
-from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import (
-    ActsOn,
-    Components,
-    Concern,
-    Effect,
-    Environment,
-    FLOATS,
-    Need,
-    NOMINAL_ENVIRONMENT,
-    Place,
-)
+from adxl_ros.model.covariance import UNMEASURED_VARIANCE
+from adxl_ros.model.effects.base import Components, Environment, FLOATS, NOMINAL_ENVIRONMENT
 from adxl_ros.model.kinematics import angles, Mounting, roll_pitch_covariance, Tilt, tilt
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -77,7 +57,7 @@ class RecordingEstimator:
         self._sensor, self._undo_filter = sensor, undo_filter
         self._begin_s = float(first.time_s[0])
         self._inverse = (paper_inverse if paper else signal_chain.inverse)(sensor)
-        self._covariance = prepared_covariance(
+        self._covariance = force_errors.prepared_covariance(
             sensor, noise_variance_v2(sensor) if undo_filter else None)
 
     def blocks(self, recording: Iterable[Recording]) -> Iterator[tuple[Recording, Estimates]]:
@@ -115,15 +95,6 @@ class RecordingEstimator:
             force_mps2[1:] = np.nan
         force_std_mps2[np.isnan(force_mps2)] = np.inf
         return Estimates(force_mps2, force_std_mps2, covariance, angles, at_rail, outside, volts)
-
-
-def effects_left(sensor: Sensor, undo_filter: bool) -> list[Effect]:
-    """Return the effects of a unit that act on single samples and that no inverse undoes."""
-    effects = [effect_named(name) for name in sensor.effects]
-    return [effect for effect in effects
-            if effect.acts_on is ActsOn.MEAN and not effect.invertible
-            and effect.place < Place.CLOCK and effect.concern is not Concern.STAGE
-            and not (undo_filter and Need.FILTER in effect.needs)]
 
 
 _CELL_MPS2 = 0.5
@@ -273,7 +244,7 @@ class LiveEstimator:
 
     def _use(self, sensor: Sensor) -> None:
         """Take covariance and validity range from the unit, with or without temperature range."""
-        self._measured_covariance = measured_covariance(sensor, self._variance_v2)
+        self._measured_covariance = force_errors.measured_covariance(sensor, self._variance_v2)
         self._envelope = sensor.envelope
         self._knows_temperature = sensor is self.sensor
 
@@ -338,8 +309,8 @@ class LiveEstimator:
             xx, xy, xz, yy, yz, zz = cell.covariance
             return xx + unknown, xy, xz, yy + unknown, yz, zz + unknown
         xx, xy, _, yy, _, _ = cell.covariance
-        xx, xy, xz, yy, yz, zz = derived_z_covariance(force, (xx, xy, yy), cell.tangent.slope,
-                                                      FLOATS)
+        xx, xy, xz, yy, yz, zz = force_errors.derived_z_covariance(
+            force, (xx, xy, yy), cell.tangent.slope, FLOATS)
         return xx + unknown, xy, xz, yy + unknown, yz, zz + self._noise_variance[0] + motion
 
     def _cell(self, force: Components) -> _Cell:

@@ -18,7 +18,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 import itertools
 from math import factorial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from adxl_ros.model import noise
 from adxl_ros.model.constants import AXES, G0_MPS2
@@ -86,7 +86,7 @@ def undo_filter_blocks(blocks: Iterable[tuple[Token, np.ndarray, np.ndarray]],
     time constants of the filter by axis, s, (m,); yields: for each block: its token, and volts
     before the filter, V, (n, m).
     """
-    none = None, np.empty(0), np.empty((0, len(rc_s)))
+    none: tuple[Any, ...] = None, np.empty(0), np.empty((0, len(rc_s)))
     _, before_s, before_v = none
     for (token, time_s, volts), (_, after_s, after_v) in itertools.pairwise(
             itertools.chain(blocks, [none])):

@@ -294,7 +294,8 @@ def noise(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     if options.report:
         html_page.check_libraries()
-    reading, newest = cli.reading_options(options), []
+    reading = cli.reading_options(options)
+    newest: list[Recording] = []
     with cli.progress('noise') as show:
         def blocks() -> Iterator[Recording]:
             for block in recording.blocks(options.recording, _BLOCK_ROWS, reading):
