@@ -210,7 +210,9 @@ class CompensationPolicy:
     def values(self, interval: Interval, newer: Path | None) -> dict[str, Any]:
         """Return what diagnostics report of the calibration in use."""
         sensor = self.sensor
-        age_days = _age_days(sensor) if sensor.effects else None
+        date = calibration_store.date_of(sensor) if sensor.effects else None
+        age_days = None if date is None else \
+            (datetime.now(timezone.utc) - date).total_seconds() / 86400
         return {
             'unit': self._unit(), 'calibration': self.source, 'serial': sensor.serial,
             'axes': sensor.axes, 'model': sensor.model, 'effects': ', '.join(sensor.effects),
@@ -246,10 +248,3 @@ class CompensationPolicy:
                 or interval.ages_s['temperature_c'] > _STALE_S:
             return 'valid, temperature not known'
         return 'valid'
-
-
-def _age_days(sensor: Sensor) -> float | None:
-    date = calibration_store.date_of(sensor)
-    if date is None:
-        return None
-    return (datetime.now(timezone.utc) - date).total_seconds() / 86400

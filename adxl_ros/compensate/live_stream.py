@@ -237,7 +237,9 @@ class ImuFields:
         solved = ~unsolved if unsolved.any() else slice(None)  # a slice copies nothing
         force = estimates.force_mps2[:, solved]
         force = np.where(np.isnan(force), 0.0, force)
-        covariance = _known(estimates.covariance[:, :, solved])
+        covariance = estimates.covariance[:, :, solved]
+        unknown = np.diag(np.full(3, UNMEASURED_VARIANCE))[:, :, None]
+        covariance = np.where(np.isfinite(covariance).all(axis=(0, 1)), covariance, unknown)
         tilt = estimates.tilt
         shown_rad = np.stack([tilt.roll, tilt.pitch, tilt.inclination])[:, solved]
         std_rad = np.stack([tilt.roll_std, tilt.pitch_std])[:, solved]
@@ -259,12 +261,6 @@ class ImuFields:
         held = np.take_along_axis(angles_rad, np.maximum.accumulate(rows, axis=1), axis=1)
         self._last_rad = held[:, -1]
         return held[:, 1:]
-
-
-def _known(covariance: np.ndarray) -> np.ndarray:
-    """Return covariances, (m/s²)², (3, 3, n), with a very large one in place of infinite ones."""
-    unknown = np.diag(np.full(3, UNMEASURED_VARIANCE))[:, :, None]
-    return np.where(np.isfinite(covariance).all(axis=(0, 1)), covariance, unknown)
 
 
 def _orientation_covariance(force: np.ndarray, covariance: np.ndarray, roll_rad2: np.ndarray,
