@@ -11,7 +11,7 @@ from math import ceil, isfinite
 import os
 import socket
 import time
-from typing import Any, NamedTuple
+from typing import Any
 
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.links.support import base, stamping
@@ -111,7 +111,7 @@ class IioLink(base.DeviceLink):
         self._stamper = Stamper(ClockMap(settings.delay, _DECISION_S), self.references)
         self._backoff = base.Backoff()
         self._error = ''
-        self._adc: _Adc | None = None
+        self._adc: dict[str, float] = {}
         self._connections = self._repeated = 0
         self._newest_ns = -1
         self._is_behind = False
@@ -157,7 +157,7 @@ class IioLink(base.DeviceLink):
         silent_s = time.monotonic() - self._last_buffer_s
         if silent_s > max(_SILENT_S, _SILENT_BUFFERS * stream.buffer_s):
             return base.Level.WARN, f'{uri}: silent, {stream.name} gives no samples'
-        rate_hz, wanted_hz = stream.adc.rate_hz, self._declared.rate_hz
+        rate_hz, wanted_hz = stream.rate_hz, self._declared.rate_hz
         difference = '' if abs(rate_hz / wanted_hz - 1) < _RATE_TOLERANCE else \
             f' ({wanted_hz:g} Hz were asked for)'
         return base.Level.OK, f'streaming at {rate_hz:g} Hz{difference}'
@@ -178,12 +178,10 @@ class IioLink(base.DeviceLink):
         adc = stream.adc
         if adc != self._adc:
             self._adc = adc
-            self.sensor = replace(
-                self._declared, rate_hz=adc.rate_hz, adc_bits=adc.bits,
-                adc_vref_v=self._declared.adc_vref_v if adc.vref_v is None else adc.vref_v)
+            self.sensor = replace(self._declared, **adc)  # type: ignore[arg-type]
             if stream.by_host_clock:
                 self._stamper.clock = IdentityMap()
-            self._stamper.restart(1e9 / adc.rate_hz)
+            self._stamper.restart(1e9 / stream.rate_hz)
             self._newest_ns = -1
 
     def _receive(self, stream: _Stream) -> None:
@@ -219,14 +217,6 @@ class _ReadError(Exception):
     """The device is absent or lost; another attempt may find it."""
 
 
-class _Adc(NamedTuple):
-    """What a device states about its ADC."""
-
-    rate_hz: float  # Sample rate, Hz
-    bits: int  # Resolution, bit; 0 where the codes do not begin at 0 V
-    vref_v: float | None = None  # Full scale, V; None where it is not known
-
-
 @dataclass(frozen=True)
 class _Column:
     """A channel, with the conversion of its codes to V or degC: (code + offset) * scale + zero."""
@@ -242,21 +232,21 @@ class _Column:
         """Return V or degC for a code or an array of codes."""
         return (codes + self.offset) * self.scale + self.zero
 
-    def adc(self, rate_hz: float) -> _Adc:
-        """Return the ADC of this channel, as far as the format determines it."""
+    def adc(self) -> dict[str, float]:
+        """Return the ADC as fields of a sensor; 0 bits where the codes do not begin at 0 V."""
         if self.zero or self.offset:
-            return _Adc(rate_hz, 0)
+            return {'adc_bits': 0}
         form = self.channel.data_format
         bits = int(form.bits - form.is_signed)
-        return _Adc(rate_hz, bits, self.scale * 2.0 ** bits)
+        return {'adc_bits': bits, 'adc_vref_v': self.scale * 2.0 ** bits}
 
 
 class _Stream:
     """
     A device whose buffer is running.
 
-    adc: its ADC; by_host_clock: whether its time stamps are those of this machine's monotonic
-    clock; buffer_s: duration of a buffer, s.
+    adc: its sample rate and ADC, as fields of a sensor; by_host_clock: whether its time stamps are
+    those of this machine's monotonic clock; buffer_s: duration of a buffer, s.
     """
 
     def __init__(self, context: Any, device: Any, columns: Sequence[_Column], settings: Settings,
@@ -269,8 +259,8 @@ class _Stream:
                             'cannot be counted')
         self.by_host_clock = _select_monotonic_clock(device) and settings.uri.startswith('local:')
         axis = next(column for column in columns if column.role in sensor.axes)
-        self.adc = axis.adc(_set_rate(context, device, columns, sensor.rate_hz))
-        rate_hz = self.adc.rate_hz
+        self.rate_hz = rate_hz = _set_rate(context, device, columns, sensor.rate_hz)
+        self.adc = {'rate_hz': rate_hz, **axis.adc()}
         count = min(max(settings.samples_together(rate_hz),
                         ceil(_ROUND_TRIPS * _answer_s(axis.channel) * rate_hz)),
                     _MAX_BUFFER)

@@ -114,7 +114,8 @@ class SimulatedSensor:
 
     def begin(self, now_ns: int) -> int:
         """Make the next sample due now; return the number of samples that are skipped."""
-        skipped = self._skipped(now_ns)
+        gap_s = (now_ns - self._until_ns) * 1e-9
+        skipped = round(gap_s * self.sensor.rate_hz) if self._until_ns and gap_s > 0 else 0
         self._origin_ns = -(-now_ns // _BEAT_NS) * _BEAT_NS
         self._made, self._until_ns, self._next_ns = 0, now_ns, self._origin_ns
         self._stamps, self._volts = self._stamps[:0], self._volts[:0]
@@ -139,10 +140,6 @@ class SimulatedSensor:
 
     def close(self) -> None:
         """Do nothing: the link holds nothing open."""
-
-    def _skipped(self, now_ns: int) -> int:
-        gap_s = (now_ns - self._until_ns) * 1e-9
-        return round(gap_s * self.sensor.rate_hz) if self._until_ns and gap_s > 0 else 0
 
     def _stamp(self, index: float | np.ndarray) -> np.ndarray:
         return self._origin_ns + np.rint(index * (1e9 / self.sensor.rate_hz)).astype(np.int64)

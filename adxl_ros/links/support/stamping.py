@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 import time
 from typing import Any, NamedTuple
 
@@ -325,16 +324,6 @@ def _system_offset() -> tuple[int, int]:
 
 _PERIOD_NS = 100_000_000
 """Period of the means of supply and temperature, ns. Chosen: both change slowly."""
-_KEPT_COUNTS = 8
-"""Numbers of samples for which absent values are kept. Chosen: a device has one or two."""
-
-
-@lru_cache(_KEPT_COUNTS)
-def absent(count: int) -> np.ndarray:
-    """Return values that are not there: NaN, (count,), not to be written."""
-    values = np.full(count, np.nan)
-    values.flags.writeable = False
-    return values
 
 
 @dataclass(frozen=True)
@@ -363,11 +352,11 @@ class PeriodMeans:
         column, (n,) each.
         """
         period = int(host_ns[-1]) // _PERIOD_NS
-        means = dict.fromkeys(self._held, absent(len(host_ns)))
+        means = dict.fromkeys(self._held, np.full(len(host_ns), np.nan))
         if period != self._period:
             self._period = period
             for column, parts in self._held.items():
-                values = np.concatenate([*parts, absent(1)])
+                values = np.concatenate([*parts, np.empty(0)])
                 values = values[np.isfinite(values)]
                 parts.clear()
                 if len(values):
