@@ -50,12 +50,9 @@ def counted(number: int, noun: str) -> str:
     return f'{number} {noun}{"" if number == 1 else "s"}'
 
 
-def duration(seconds: float, digits: int = 0) -> str:
-    """Return a time with two units at most, for people, with so many digits of its unit if any."""
+def duration(seconds: float) -> str:
+    """Return a time with two units at most, for people."""
     seconds = round(seconds, 3)
-    if digits:
-        unit_s = next((unit_s for unit_s in (86400.0, 3600.0, 60.0) if seconds >= 2 * unit_s), 1.0)
-        seconds = float(f'{seconds / unit_s:.{digits}g}') * unit_s
     for unit_s, unit, smaller_s, smaller in ((86400, 'd', 3600, 'h'), (3600, 'h', 60, 'min')):
         if round(seconds) >= unit_s:
             count, rest = divmod(round(seconds / smaller_s), round(unit_s / smaller_s))
