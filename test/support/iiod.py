@@ -75,7 +75,7 @@ class Adc:
         self.rate = float(options.get('rate', 1000.0))
         self.channels = [*options.get('channels', CHANNELS)]
         # libiio numbers the channels of the buffer first, with the time stamps as the last one.
-        self.stamp_index = len(self.channels)
+        self.stamp_index = sum(not channel.get('unbuffered') for channel in self.channels)
         self.attributes = {'sampling_frequency': str(self.rate),
                            'current_timestamp_clock': 'realtime', **options.get('attributes', {})}
         self.offset_ns = options.get('offset_ns', 7_000_000_000)
@@ -149,7 +149,7 @@ class Adc:
                  if name in channel or name in DEFAULTS]
         attributes = ''.join(
             f'<attribute name="{name}" filename="in_{channel["id"]}_{name}" />' for name in names)
-        scan = scan_xml(i, channel.get('format', FORMAT))
+        scan = '' if channel.get('unbuffered') else scan_xml(i, channel.get('format', FORMAT))
         return f'<channel id="{channel["id"]}" type="input">{scan}{attributes}</channel>'
 
     def xml(self):
