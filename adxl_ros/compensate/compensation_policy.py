@@ -163,39 +163,34 @@ class CompensationPolicy:
         return calibration_store.newer(self._store, sensor)
 
     def status(self, interval: Interval, newer: Path | None, calibration: str) -> Status:
-        """Return the state of the stream."""
-        counts = interval.counts
-        if self.refusal:
-            return Status(State.REFUSED, f'publishing nothing: {self.refusal}')
-        if not counts.get('received') and interval.duration_s > _SHORTEST_SILENCE_S:
-            return Status(State.SILENT, f'no samples on {self._topics.data_raw}')
-        if interval.obstacle:
-            return Status(State.UNKNOWN, (
-                f'publishing nothing yet: nothing on {self._topics.sensor_info}, and '
-                f'{self._topics.data_raw} does not show its sensor: {interval.obstacle}'))
-        if counts.get('dropped'):
-            return Status(State.DROPPING,
-                          f'{counts["dropped"]} samples dropped that no force explains')
-        if counts.get('saturated'):
-            return Status(State.SATURATED,
-                          f'{counts["saturated"]} samples with the ADC at its rail')
-        if self.info is None:
-            return Status(State.NOT_CONFIRMED,
-                          f'unit not confirmed: nothing on {self._topics.sensor_info}')
+        """Return the state of the stream: the first one that holds."""
+        counts, topics = interval.counts, self._topics
+        is_silent = not counts.get('received') and interval.duration_s > _SHORTEST_SILENCE_S
+        is_newer = newer is not None and not self.is_named(calibration)
         unknown = self._unknown_surroundings(interval)
-        if unknown:
-            return Status(State.SURROUNDINGS_UNKNOWN, unknown)
-        if not self.sensor.effects:
-            return Status(State.NOT_CALIBRATED, 'not calibrated: the datasheet values apply')
-        if counts.get('outside'):
-            return Status(State.OUTSIDE, (
-                f'{counts["outside"]} samples outside of what was calibrated, their covariance '
-                f'raised: {"; ".join(interval.outside)}'))
-        if newer is not None and not self.is_named(calibration):
-            return Status(State.NEWER_CALIBRATION, (
-                f'a newer calibration is in the store: {newer}; set calibration to it, or start '
-                'again'))
-        return Status(State.COMPENSATING, 'compensating')
+        states = (
+            (self.refusal, State.REFUSED, f'publishing nothing: {self.refusal}'),
+            (is_silent, State.SILENT, f'no samples on {topics.data_raw}'),
+            (interval.obstacle, State.UNKNOWN,
+             f'publishing nothing yet: nothing on {topics.sensor_info}, and {topics.data_raw} '
+             f'does not show its sensor: {interval.obstacle}'),
+            (counts.get('dropped'), State.DROPPING,
+             f'{counts.get("dropped")} samples dropped that no force explains'),
+            (counts.get('saturated'), State.SATURATED,
+             f'{counts.get("saturated")} samples with the ADC at its rail'),
+            (self.info is None, State.NOT_CONFIRMED,
+             f'unit not confirmed: nothing on {topics.sensor_info}'),
+            (unknown, State.SURROUNDINGS_UNKNOWN, unknown),
+            (not self.sensor.effects, State.NOT_CALIBRATED,
+             'not calibrated: the datasheet values apply'),
+            (counts.get('outside'), State.OUTSIDE,
+             f'{counts.get("outside")} samples outside of what was calibrated, their covariance '
+             f'raised: {"; ".join(interval.outside)}'),
+            (is_newer, State.NEWER_CALIBRATION,
+             f'a newer calibration is in the store: {newer}; set calibration to it, or start '
+             'again'),
+            (True, State.COMPENSATING, 'compensating'))
+        return next(Status(state, text) for holds, state, text in states if holds)
 
     def _unknown_surroundings(self, interval: Interval) -> str:
         """Name an effect whose temperature or supply nobody publishes, or return ''."""
@@ -215,7 +210,9 @@ class CompensationPolicy:
     def values(self, interval: Interval, newer: Path | None) -> dict[str, Any]:
         """Return what diagnostics report of the calibration in use."""
         sensor = self.sensor
-        age_days = _age_days(sensor) if sensor.effects else None
+        date = calibration_store.date_of(sensor) if sensor.effects else None
+        age_days = None if date is None else \
+            (datetime.now(timezone.utc) - date).total_seconds() / 86400
         return {
             'unit': self._unit(), 'calibration': self.source, 'serial': sensor.serial,
             'axes': sensor.axes, 'model': sensor.model, 'effects': ', '.join(sensor.effects),
@@ -225,7 +222,6 @@ class CompensationPolicy:
             **{f'provenance.{key}': value for key, value in sensor.provenance.items()}}
 
     def _unit(self) -> str:
-        """State whether the stream is of the unit of the calibration."""
         if self.refusal:
             return 'several' if self.refusal == self.mixture else 'other'
         if self.info is None:
@@ -235,7 +231,6 @@ class CompensationPolicy:
             else 'confirmed'
 
     def _validity(self, interval: Interval, age_days: float | None) -> str:
-        """Describe whether the calibration is valid for the samples of the interval."""
         sensor = self.sensor
         if not sensor.effects:
             return 'not calibrated'
@@ -253,11 +248,3 @@ class CompensationPolicy:
                 or interval.ages_s['temperature_c'] > _STALE_S:
             return 'valid, temperature not known'
         return 'valid'
-
-
-def _age_days(sensor: Sensor) -> float | None:
-    """Return the age of a calibration, days; None where its file states no date."""
-    date = calibration_store.date_of(sensor)
-    if date is None:
-        return None
-    return (datetime.now(timezone.utc) - date).total_seconds() / 86400

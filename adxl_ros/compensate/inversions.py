@@ -18,7 +18,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 import itertools
 from math import factorial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from adxl_ros.model import noise
 from adxl_ros.model.constants import AXES, G0_MPS2
@@ -86,21 +86,15 @@ def undo_filter_blocks(blocks: Iterable[tuple[Token, np.ndarray, np.ndarray]],
     time constants of the filter by axis, s, (m,); yields: for each block: its token, and volts
     before the filter, V, (n, m).
     """
-    previous_s, previous_v = np.empty(0), np.empty((0, len(rc_s)))
-    current = None
-    for following in itertools.chain(blocks, [None]):
-        if current is not None:
-            token, time_s, volts = current
-            following_s, following_v = np.empty(0), np.empty((0, len(rc_s)))
-            if following is not None:
-                following_s, following_v = following[1][:HALF], following[2][:HALF]
-            undone_v = undo_filter(
-                np.concatenate([previous_v, volts, following_v]),
-                np.concatenate([previous_s, time_s, following_s]), rc_s, rate_hz)
-            yield token, undone_v[len(previous_s):len(previous_s) + len(time_s)]
-            previous_s = np.concatenate([previous_s, time_s])[-HALF:]
-            previous_v = np.concatenate([previous_v, volts])[-HALF:]
-        current = following
+    none: tuple[Any, ...] = None, np.empty(0), np.empty((0, len(rc_s)))
+    _, before_s, before_v = none
+    for (token, time_s, volts), (_, after_s, after_v) in itertools.pairwise(
+            itertools.chain(blocks, [none])):
+        near_s = np.concatenate([before_s, time_s, after_s[:HALF]])
+        near_v = np.concatenate([before_v, volts, after_v[:HALF]])
+        begin, end = len(before_s), len(before_s) + len(time_s)
+        yield token, undo_filter(near_v, near_s, rc_s, rate_hz)[begin:end]
+        before_s, before_v = near_s[:end][-HALF:], near_v[:end][-HALF:]
 
 
 def noise_variance_v2(sensor: Sensor) -> np.ndarray:

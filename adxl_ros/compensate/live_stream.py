@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""A live stream: serialized samples come in, corrected samples and tilt go out, one by one."""
+"""What is published of corrected samples: of a live stream one by one, and of recordings."""
 
 from __future__ import annotations
 
@@ -8,19 +8,14 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from adxl_ros.compensate.inversions import DelayedInversion, noise_variance_v2, paper_inverse
+from adxl_ros.compensate.estimators import Estimate, Estimates, LiveEstimator
+from adxl_ros.compensate.inversions import DelayedInversion
 from adxl_ros.files import imu_message
 from adxl_ros.files.cdr import CdrError
-from adxl_ros.model import noise, signal_chain
-from adxl_ros.model.constants import AXES, G0_MPS2
-from adxl_ros.model.covariance import (
-    derived_z_covariance,
-    measured_covariance,
-    UNMEASURED_VARIANCE,
-)
-from adxl_ros.model.effects.base import Components, Environment, FLOATS, NOMINAL_ENVIRONMENT
+from adxl_ros.model import noise
+from adxl_ros.model.covariance import UNMEASURED_VARIANCE
+from adxl_ros.model.effects.base import ARRAYS, Components, FLOATS
 from adxl_ros.model.kinematics import (
-    angles,
     Mounting,
     quaternion,
     roll_pitch_covariance,
@@ -29,257 +24,6 @@ from adxl_ros.model.kinematics import (
 )
 from adxl_ros.model.sensor import Sensor
 import numpy as np
-
-_CELL_MPS2 = 0.5
-"""Width of a cell of the grid of forces, m/s²; chosen: tangent and covariance hardly vary within
-it, so that its samples share them."""
-
-_MAX_CELLS = 4096
-"""Largest number of cells in memory; chosen: the forces of all poses fill about as many."""
-
-_CELL_ENVIRONMENT = Environment(time_s=0.0, temperature_c=0.5, supply_v=0.01)
-"""Change of the surroundings, °C and V, from which the cells are computed again; chosen: the
-tangent hardly varies within it. Time has no limit."""
-
-_MAX_ACCEL_MPS2 = 1e6
-"""Acceleration that no sensor outputs, m/s²; chosen: far beyond any range."""
-
-_TOLERANCE_MPS2 = 1e-8
-"""Largest next step of a converged inverse, m/s²; chosen: far below any noise."""
-
-_MAX_STEPS = 8
-"""Newton steps after which the inverse starts from zero; chosen: one or two suffice usually."""
-
-_MOTION_S = 0.5
-"""Interval of the variance that separates motion from noise, s; chosen: the RC filter leaves some
-24 independent samples in it."""
-
-_PAUSE_S = 1.0
-"""Time without a sample after which the variance begins again, s; chosen: two intervals."""
-
-_NOISE_FACTOR = 2
-"""Multiple of the noise variance that does not count as motion; chosen: the variance of some 24
-samples hardly exceeds it by chance."""
-
-
-class Estimate(NamedTuple):
-    """Estimate from one sample."""
-
-    # Specific force in the frame of the case, or of the robot where there is a mounting, m/s²,
-    # three floats
-    force: Components
-    covariance: tuple[float, ...]  # Covariance of the force: xx, xy, xz, yy, yz, zz, (m/s²)²
-    # roll, pitch, inclination: Angle, rad, and its variance, rad². The variance of an angle that
-    # is not shown exceeds `tilt.UNOBSERVABLE_RAD2`.
-    roll: tuple[float, float]
-    pitch: tuple[float, float]
-    inclination: tuple[float, float]
-    roll_pitch: float  # Covariance of roll and pitch, rad²
-    # Whether the ADC is at a rail; the variances are then those of an unmeasured axis
-    saturated: bool
-    # Texts on how the sample lies outside of the validity range; the variances include it
-    outside: tuple[str, ...]
-
-
-class _Cell(NamedTuple):
-    """What the forces of one cell of the grid share."""
-
-    tangent: signal_chain.Tangent  # Tangent of the inverse at the middle of the cell
-    # Covariance by noise and coefficients: xx, xy, xz, yy, yz, zz, (m/s²)²
-    covariance: tuple[float, ...]
-    outside: tuple[str, ...]  # Texts on how the cell lies outside of the validity range
-
-
-class LiveEstimator:
-    """
-    Estimates specific force, its covariance and tilt of a live stream, sample by sample.
-
-    All calculations are in floats, which are ten times faster than arrays of one sample. The
-    force is that of `signal_chain.inverse` to 1e-8 m/s². Near alpha = ±90°, where |f| = g may
-    have no solution, it differs by a few hundredths of its standard deviation.
-
-    Angles, and the z of equation 5, hold at rest only. Motion adds to their variances: the
-    variance of the in-plane force over half a second, as far as it exceeds twice that of the
-    noise. The larger of the last two half seconds counts. A derived z also gets the noise
-    variance of a measured axis.
-    """
-
-    def __init__(self, sensor: Sensor, paper: bool = False, undo_filter: bool = False,
-                 mounting: Mounting | None = None) -> None:
-        """Prepare for a unit."""
-        self.sensor, self.mounting = sensor, mounting
-        self._paper_inverse = paper_inverse(sensor, FLOATS) if paper else None
-        self._variance_v2 = noise_variance_v2(sensor) if undo_filter \
-            else noise.sample_std_v(sensor) ** 2
-        self._zero_g_v = sensor.nominal_zero_g_v.tolist()
-        self._v_per_mps2 = (sensor.nominal_scale_v_per_g / G0_MPS2).tolist()
-        self._rails = (0.0, sensor.adc_vref_v - sensor.lsb_v, sensor.lsb_v / 2)
-        self._respond = signal_chain.analog_response(sensor)
-        self._undo_adc = signal_chain.adc_inverse(sensor)
-        self._newton_step = signal_chain.newton_step(
-            sensor.axes, signal_chain.gravity_mps2(sensor), FLOATS)
-        self._invert = signal_chain.inverse(sensor)
-        self._use(sensor.without_temperature_range())
-        self._cells: dict[tuple[int, int, int], _Cell] = {}
-        noise_mps2 = np.sqrt(self._variance_v2) / sensor.scale_v_per_g * G0_MPS2
-        self._noise_variance = (noise_mps2[:2] ** 2).tolist()
-        self._derives_z = sensor.axes == 'xy'
-        # The last force, and the volts at the ADC's input that respond to it.
-        self._force: Components = [0.0, 0.0, 0.0]
-        self._environment = self._cells_environment = NOMINAL_ENVIRONMENT
-        self._last_volts = self._respond(self._force)
-        self._time_s = float('-inf')
-
-    def __call__(self, accel_mps2: Components, time_s: float) -> Estimate | None:
-        """Estimate from one sample."""
-        volts = self.volts(accel_mps2)
-        return self.from_volts(volts, time_s) if volts else None
-
-    def volts(self, accel_mps2: Sequence[float]) -> Components:
-        """Undo the nominal conversion; an empty list if a value exceeds that of any sensor."""
-        volts = [zero + a * scale for zero, a, scale in
-                 zip(self._zero_g_v, accel_mps2, self._v_per_mps2) if abs(a) < _MAX_ACCEL_MPS2]
-        return volts if len(volts) == len(self._v_per_mps2) else []
-
-    def from_volts(self, volts: Components, time_s: float) -> Estimate | None:
-        """
-        Estimate from the volts of one sample.
-
-        volts: volts of each measured axis, V.
-        """
-        force = self._inverse(volts)
-        if force is None:
-            return None
-        saturated = self._at_a_rail(volts)
-        unknown = UNMEASURED_VARIANCE if saturated else 0.0
-        motion = self._motion_variance(force, time_s) + unknown
-        cell = self._cell(force)
-        covariance = self._covariance(force, cell, unknown, motion)
-        # The angles are those of gravity, so that motion adds to the variance of each axis.
-        moved: tuple[float, ...] = (
-            covariance[0] + motion, covariance[1], covariance[2], covariance[3] + motion,
-            covariance[4], covariance[5] if self._derives_z else covariance[5] + motion)
-        if self.mounting is not None:
-            force, covariance, moved = (
-                self.mounting.rotate(force), self.mounting.rotate_covariance(covariance),
-                self.mounting.rotate_covariance(moved))
-        roll, pitch, inclination, _ = angles(force, moved, FLOATS)
-        return Estimate(force, covariance, roll, pitch, inclination,
-                        roll_pitch_covariance(force, moved, FLOATS), saturated, cell.outside)
-
-    def set_environment(self, temperature_c: float | None = None, supply_v: float | None = None
-                        ) -> None:
-        """Set the surroundings of the samples that follow."""
-        if temperature_c is not None:
-            if not self._knows_temperature:
-                self._use(self.sensor)
-                self._cells.clear()
-            self._environment = self._environment._replace(temperature_c=temperature_c)
-        if supply_v is not None:
-            self._environment = self._environment._replace(supply_v=supply_v)
-        if any(abs(now - then) > limit for now, then, limit in zip(
-                self._environment[1:], self._cells_environment[1:], _CELL_ENVIRONMENT[1:])):
-            self._cells.clear()
-            self._cells_environment = self._environment
-        self._last_volts = self._respond(self._force, self._environment)
-
-    def _use(self, sensor: Sensor) -> None:
-        """Take covariance and validity range from the unit, with or without temperature range."""
-        self._measured_covariance = measured_covariance(sensor, self._variance_v2)
-        self._envelope = sensor.envelope
-        self._knows_temperature = sensor is self.sensor
-
-    def _inverse(self, volts: Components) -> Components | None:
-        """Invert the chain, beginning at the force of the last sample; None without a solution."""
-        if self._paper_inverse:
-            self._force = self._paper_inverse(volts, self._environment)
-            return self._force if abs(sum(self._force)) < float('inf') else None
-        tangent = self._cell(self._force).tangent
-        force, change = self._force, 0.0
-        response, input_v = self._last_volts, self._undo_adc(volts)
-        for _ in range(_MAX_STEPS):
-            previous, previous_change = force, change
-            force = self._newton_step([v - r for v, r in zip(input_v, response)], previous,
-                                      tangent, self.sensor.z_sign)
-            change = max(abs(f - p) for f, p in zip(force, previous))
-            # Steps shrink by the same factor or faster, which bounds the next one.
-            if change * change <= _TOLERANCE_MPS2 * previous_change:
-                break
-            response = self._respond(force, self._environment)
-        else:
-            force = self._invert(volts, self._environment)
-        if not abs(force[0]) + abs(force[1]) + abs(force[2]) < float('inf'):
-            return None
-        self._force, self._last_volts = force, input_v
-        return force
-
-    def _at_a_rail(self, volts: Components) -> bool:
-        low, high, half_lsb = self._rails
-        return any((v < low + half_lsb and v > low - half_lsb)
-                   or (v > high - half_lsb and v < high + half_lsb) for v in volts)
-
-    def _motion_variance(self, force: Components, time_s: float) -> float:
-        """Return the variance of the recent in-plane force beyond its noise, (m/s²)²."""
-        if not 0 <= time_s - self._time_s < _PAUSE_S:
-            self._previous_excess = 0.0
-            self._begin_interval(time_s)
-        elif time_s - self._begin_s > _MOTION_S:
-            self._previous_excess = self._excess()
-            self._begin_interval(time_s)
-        self._time_s = time_s
-        self._count += 1
-        # Welford's recurrence of mean and sum of squares.
-        for d, value in enumerate(force[:len(self._noise_variance)]):
-            deviation = value - self._mean[d]
-            self._mean[d] += deviation / self._count
-            self._squares[d] += deviation * (value - self._mean[d])
-        return max(self._excess(), self._previous_excess)
-
-    def _begin_interval(self, time_s: float) -> None:
-        self._begin_s, self._count = time_s, 0
-        self._mean, self._squares = [0.0, 0.0], [0.0, 0.0]
-
-    def _excess(self) -> float:
-        """Return the variance of this interval beyond a multiple of that of the noise, (m/s²)²."""
-        return max(0.0, *(squares / self._count - _NOISE_FACTOR * variance
-                          for squares, variance in zip(self._squares, self._noise_variance)))
-
-    def _covariance(self, force: Components, cell: _Cell, unknown: float, motion: float
-                    ) -> tuple[float, ...]:
-        """
-        Return the covariance of a force: xx, xy, xz, yy, yz, zz, (m/s²)².
-
-        Each axis gets the variance `unknown`; a derived z also gets that of noise and motion.
-        """
-        if not self._derives_z:
-            xx, xy, xz, yy, yz, zz = cell.covariance
-            return xx + unknown, xy, xz, yy + unknown, yz, zz + unknown
-        xx, xy, _, yy, _, _ = cell.covariance
-        xx, xy, xz, yy, yz, zz = derived_z_covariance(force, (xx, xy, yy), cell.tangent.slope,
-                                                      FLOATS)
-        return xx + unknown, xy, xz, yy + unknown, yz, zz + self._noise_variance[0] + motion
-
-    def _cell(self, force: Components) -> _Cell:
-        """Return the cell of a force."""
-        key = (round(force[0] / _CELL_MPS2), round(force[1] / _CELL_MPS2),
-               round(force[2] / _CELL_MPS2))
-        cell = self._cells.get(key)
-        if cell is None:
-            if len(self._cells) >= _MAX_CELLS:
-                self._cells.clear()
-            cell = self._cells[key] = self._new_cell([float(k * _CELL_MPS2) for k in key])
-        return cell
-
-    def _new_cell(self, middle: Components) -> _Cell:
-        """Compute the cell around a force, m/s², three floats."""
-        measured, tangent, leverage = self._measured_covariance(middle, self._environment)
-        outside = self._envelope.describe_outside(self._environment.temperature_c, middle,
-                                                  float(leverage[0]))
-        covariance = np.diag([0.0, UNMEASURED_VARIANCE, UNMEASURED_VARIANCE])
-        axes = [AXES.index(axis) for axis in self.sensor.axes]
-        covariance[np.ix_(axes, axes)] = measured[:, :, 0]
-        return _Cell(tangent, tuple(covariance[np.triu_indices(3)].tolist()), outside)
-
 
 COUNTS = ('received', 'published', 'dropped', 'saturated', 'outside')
 """What a stream counts: samples, and those to which something happened."""
@@ -350,7 +94,9 @@ class LiveStream:
         live = LiveEstimator(sensor, self._paper, self._undo_filter,
                              self._mounting if self._mounting.turns else None)
         live.set_environment(**self.surroundings)
-        self._chain = _Chain(live, _delayed(sensor, rate_hz), self._stride(rate_hz))
+        stride = max(1, round(rate_hz / self._output_rate_hz)) if self._output_rate_hz else 1
+        self._chain = _Chain(
+            live, DelayedInversion(noise.electronics(sensor).rc_s, rate_hz), stride)
 
     @property
     def sensor(self) -> Sensor:
@@ -374,15 +120,6 @@ class LiveStream:
     def stop_collecting(self) -> None:
         """Forget the kept forces."""
         self._forces = None
-
-    def restart_filter(self, rate_hz: float) -> None:
-        """Forget the samples that wait for their neighbours; the stream has a rate, Hz."""
-        self._chain = self._chain._replace(delayed=_delayed(self._chain.live.sensor, rate_hz),
-                                           stride=self._stride(rate_hz))
-
-    def _stride(self, rate_hz: float) -> int:
-        """Return which part of the samples is published: one of so many."""
-        return max(1, round(rate_hz / self._output_rate_hz)) if self._output_rate_hz else 1
 
     def surround(self, name: str, value: float) -> None:
         """Take a temperature or supply into account, from the next sample on."""
@@ -422,7 +159,7 @@ class LiveStream:
 
     def _correct(self, chain: _Chain, time_s: float, volts: list[float], raw: Any) -> None:
         live = chain.live
-        estimate = live.from_volts(volts, time_s)
+        estimate = live(volts, time_s)
         if estimate is None:
             self.counts['dropped'] += 1
             return
@@ -478,5 +215,66 @@ def free_acceleration(force_mps2: Components, quaternion: Sequence[float], gravi
     return [f - gravity_mps2 * v for f, v in zip(force_mps2, vertical)]
 
 
-def _delayed(sensor: Sensor, rate_hz: float) -> DelayedInversion:
-    return DelayedInversion(noise.electronics(sensor).rc_s, rate_hz)
+class ImuFields:
+    """
+    Makes the fields of `imu/data` and `tilt`, block by block.
+
+    An angle that a sample does not show keeps its last value, 0 before the first, with a very
+    large variance. So has a force that the sample does not determine.
+    """
+
+    def __init__(self) -> None:
+        self._last_rad = np.zeros(3)
+
+    def __call__(self, estimates: Estimates) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """
+        Return the fields of sensor_msgs/Imu and the tilt of the samples that have a solution.
+
+        returns: fields by name, (n, k) each. The yaw of the orientation is 0 and unknown. Roll,
+        pitch and inclination, rad, (n, 3).
+        """
+        unsolved = estimates.unsolved
+        solved = ~unsolved if unsolved.any() else slice(None)  # a slice copies nothing
+        force = estimates.force_mps2[:, solved]
+        force = np.where(np.isnan(force), 0.0, force)
+        covariance = estimates.covariance[:, :, solved]
+        unknown = np.diag(np.full(3, UNMEASURED_VARIANCE))[:, :, None]
+        covariance = np.where(np.isfinite(covariance).all(axis=(0, 1)), covariance, unknown)
+        tilt = estimates.tilt
+        shown_rad = np.stack([tilt.roll, tilt.pitch, tilt.inclination])[:, solved]
+        std_rad = np.stack([tilt.roll_std, tilt.pitch_std])[:, solved]
+        angles_rad = self._held(shown_rad)
+        variance = np.where(np.isfinite(std_rad), std_rad ** 2, UNKNOWN_ANGLE_RAD2)
+        return {'linear_acceleration': force.T,
+                'linear_acceleration_covariance': covariance.reshape(9, -1).T,
+                'orientation': np.stack(quaternion(angles_rad[0], angles_rad[1], ARRAYS)).T,
+                'orientation_covariance': _orientation_covariance(force, covariance, *variance).T
+                }, angles_rad.T
+
+    def _held(self, angles_rad: np.ndarray) -> np.ndarray:
+        """Return angles, rad, (3, n), with the last known value in place of NaN."""
+        if angles_rad.size and not np.isnan(angles_rad).any():
+            self._last_rad = angles_rad[:, -1]
+            return angles_rad
+        angles_rad = np.concatenate([self._last_rad[:, None], angles_rad], axis=1)
+        rows = np.where(np.isnan(angles_rad), 0, np.arange(angles_rad.shape[1]))
+        held = np.take_along_axis(angles_rad, np.maximum.accumulate(rows, axis=1), axis=1)
+        self._last_rad = held[:, -1]
+        return held[:, 1:]
+
+
+def _orientation_covariance(force: np.ndarray, covariance: np.ndarray, roll_rad2: np.ndarray,
+                            pitch_rad2: np.ndarray) -> np.ndarray:
+    """
+    Return the elements of the covariance of roll, pitch and yaw, row after row.
+
+    force: specific force, m/s², (3, n); covariance: its covariance, (m/s²)², (3, 3, n); roll_rad2,
+    pitch_rad2: variances, rad², (n,); returns: the covariance, rad², (9, n).
+    """
+    components = tuple(covariance[i, j] for i in range(3) for j in range(i, 3))
+    both = roll_pitch_covariance(list(force), components, ARRAYS)
+    is_known = np.maximum(roll_rad2, pitch_rad2) < UNKNOWN_ANGLE_RAD2
+    elements = np.zeros((9, len(roll_rad2)))
+    elements[0], elements[4], elements[8] = roll_rad2, pitch_rad2, UNKNOWN_ANGLE_RAD2
+    elements[1] = elements[3] = np.where(is_known, both, 0.0)
+    return elements

@@ -27,9 +27,15 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import ActsOn
 from adxl_ros.model.filters import low_pass
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.report import figures as plots, page as html_page, units
+from adxl_ros.report import figures as plots, page as html_page
 from adxl_ros.report.figures import Figure, figure, line, rounded
-from adxl_ros.report.units import mg, mg_text, percent
+from adxl_ros.report.quantities import (
+    mg,
+    mg_text,
+    parameter_label,
+    parameter_text,
+    percent,
+)
 import numpy as np
 import scipy
 
@@ -146,7 +152,7 @@ def _effect(candidate: dict[str, Any], report: Report) -> dict[str, Any]:
     docs, sizes = {p.name: p.doc for p in effect.parameters}, []
     is_single = len({key.partition('.')[0] for key in parameters}) == 1
     for key, parameter in parameters.items():
-        text, mark = units.parameter_text(parameter, words.axis_scale(report, key)), None
+        text, mark = parameter_text(parameter, words.axis_scale(report, key)), None
         if parameter.get('ci'):
             ends = [v for p in parameters.values() if p.get('ci')
                     and p['unit'] == parameter['unit'] for v in p['ci']]
@@ -154,7 +160,7 @@ def _effect(candidate: dict[str, Any], report: Report) -> dict[str, Any]:
             margin = _MARGIN * (high - low)
             mark = plots.whisker(parameter['value'], parameter['ci'][0], parameter['ci'][1],
                                  (low - margin, high + margin), text)
-        sizes.append({'label': units.parameter_label(key, is_single) or 'size', 'text': text,
+        sizes.append({'label': parameter_label(key, is_single) or 'size', 'text': text,
                       'doc': docs[key.partition('.')[0]], 'mark': mark})
     return {'name': effect.name, 'sure': percent(candidate['probability']),
             'share': '' if candidate['share'] is None else

@@ -19,9 +19,9 @@ from adxl_ros.model.coefficients import fitted_of, get, parameter_of
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import ActsOn, Coefficient, Concern
-from adxl_ros.report.quantities import Interval
-from adxl_ros.report.units import (
+from adxl_ros.report.quantities import (
     amplitude_text,
+    Interval,
     listed,
     mg_text,
     parameter_label,

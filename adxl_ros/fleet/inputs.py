@@ -27,7 +27,7 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.files.tables import TABLE_ENDINGS
 from adxl_ros.fleet.row import PAGE, POPULATION, TABLE, UNITS
-from adxl_ros.report.addresses import as_utf_8, without_secrets
+from adxl_ros.report.page import as_utf_8, without_secrets
 
 _ENDINGS = ('.csv', '.mcap', '.db3')
 """Ends of the names of recordings in a folder, beside those of other tables."""

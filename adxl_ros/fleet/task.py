@@ -9,7 +9,6 @@ other. A task that refuses leaves its reason. What a recording does not hold is 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 import json
@@ -22,7 +21,7 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.recording_columns import recorded_unit, Recording, unit_of
+from adxl_ros.files.recording_columns import recorded_unit, Recording
 from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.files.tables import NoNumbers
 from adxl_ros.fleet.inputs import begin_of, is_manifest, Source
@@ -33,7 +32,6 @@ from adxl_ros.model.coefficients import get, parameter_of
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.package_version import package_version
-from adxl_ros.signals.allan_deviation import longest_rest
 from adxl_ros.signals.axis_noise import recording_noise
 from adxl_ros.signals.findings import BLOCK_ROWS, check_recording, Findings
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
@@ -248,20 +246,9 @@ class _Job:
 
     def _noise(self) -> None:
         """Find the noise of the longest rest."""
-        path = self.staged.path
-        units: list[Sensor] = []
-
-        def blocks() -> Iterator[Recording]:
-            return recording.blocks(path, BLOCK_ROWS, self.recipe.reading)
-
-        def sensor_of(block: Recording) -> Sensor:
-            if not units:
-                units.append(unit_of(load_sensor(self.params, block), block.stream_info,
-                                     block.axes))
-            return units[0]
-
-        rest = longest_rest(blocks, sensor_of)
-        result = recording_noise(str(path), rest, units[0].axes, lambda done: None)
+        result = recording_noise(
+            lambda: recording.blocks(self.staged.path, BLOCK_ROWS, self.recipe.reading),
+            self.params)
         for noise in result.axes:
             for letter, unit, estimate in zip('nbk', ('mps2_per_rthz', 'mps2', 'mps2_per_rts'),
                                               noise.estimates):

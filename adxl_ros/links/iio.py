@@ -11,7 +11,7 @@ from math import ceil, isfinite
 import os
 import socket
 import time
-from typing import Any, NamedTuple
+from typing import Any
 
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.links.support import base, stamping
@@ -62,8 +62,6 @@ _IIOD_PORT = '30431'
 """TCP port of iiod without another one in the URI."""
 _PROBE_S = 0.5
 """Longest wait for the answer of an iiod, s; libiio itself waits for five seconds."""
-_POLL_S = 1.0
-"""Period in which attributes are read that have no place in the buffer, s."""
 _CLOCK_ATTRIBUTE = 'current_timestamp_clock'
 """Attribute of the kernel that selects the clock of the time stamps."""
 _MAX_STAMP_NS = 2 ** 62
@@ -107,14 +105,13 @@ class IioLink(base.DeviceLink):
     references = tuple(base.COLUMNS.values())
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
-        """Prepare the link without opening the device."""
         self._declared, self._settings = sensor, settings
         self._entries = base.parse_channels(settings.channels)
         self._stream: _Stream | None = None
         self._stamper = Stamper(ClockMap(settings.delay, _DECISION_S), self.references)
         self._backoff = base.Backoff()
         self._error = ''
-        self._adc: _Adc | None = None
+        self._adc: dict[str, float] = {}
         self._connections = self._repeated = 0
         self._newest_ns = -1
         self._is_behind = False
@@ -151,7 +148,6 @@ class IioLink(base.DeviceLink):
             self._stream = None
 
     def _condition(self) -> tuple[base.Level, str]:
-        """Return level and text of the status."""
         # The URI of this machine is only a kind and a colon.
         uri, stream = self._settings.uri.removesuffix(':'), self._stream
         if self._error:
@@ -161,7 +157,7 @@ class IioLink(base.DeviceLink):
         silent_s = time.monotonic() - self._last_buffer_s
         if silent_s > max(_SILENT_S, _SILENT_BUFFERS * stream.buffer_s):
             return base.Level.WARN, f'{uri}: silent, {stream.name} gives no samples'
-        rate_hz, wanted_hz = stream.adc.rate_hz, self._declared.rate_hz
+        rate_hz, wanted_hz = stream.rate_hz, self._declared.rate_hz
         difference = '' if abs(rate_hz / wanted_hz - 1) < _RATE_TOLERANCE else \
             f' ({wanted_hz:g} Hz were asked for)'
         return base.Level.OK, f'streaming at {rate_hz:g} Hz{difference}'
@@ -182,12 +178,10 @@ class IioLink(base.DeviceLink):
         adc = stream.adc
         if adc != self._adc:
             self._adc = adc
-            self.sensor = replace(
-                self._declared, rate_hz=adc.rate_hz, adc_bits=adc.bits,
-                adc_vref_v=self._declared.adc_vref_v if adc.vref_v is None else adc.vref_v)
+            self.sensor = replace(self._declared, **adc)  # type: ignore[arg-type]
             if stream.by_host_clock:
                 self._stamper.clock = IdentityMap()
-            self._stamper.restart(1e9 / adc.rate_hz)
+            self._stamper.restart(1e9 / stream.rate_hz)
             self._newest_ns = -1
 
     def _receive(self, stream: _Stream) -> None:
@@ -223,14 +217,6 @@ class _ReadError(Exception):
     """The device is absent or lost; another attempt may find it."""
 
 
-class _Adc(NamedTuple):
-    """What a device states about its ADC."""
-
-    rate_hz: float  # Sample rate, Hz
-    bits: int  # Resolution, bit; 0 where the codes do not begin at 0 V
-    vref_v: float | None = None  # Full scale, V; None where it is not known
-
-
 @dataclass(frozen=True)
 class _Column:
     """A channel, with the conversion of its codes to V or degC: (code + offset) * scale + zero."""
@@ -246,26 +232,25 @@ class _Column:
         """Return V or degC for a code or an array of codes."""
         return (codes + self.offset) * self.scale + self.zero
 
-    def adc(self, rate_hz: float) -> _Adc:
-        """Return the ADC of this channel, as far as the format determines it."""
+    def adc(self) -> dict[str, float]:
+        """Return the ADC as fields of a sensor; 0 bits where the codes do not begin at 0 V."""
         if self.zero or self.offset:
-            return _Adc(rate_hz, 0)
+            return {'adc_bits': 0}
         form = self.channel.data_format
         bits = int(form.bits - form.is_signed)
-        return _Adc(rate_hz, bits, self.scale * 2.0 ** bits)
+        return {'adc_bits': bits, 'adc_vref_v': self.scale * 2.0 ** bits}
 
 
 class _Stream:
     """
     A device whose buffer is running.
 
-    adc: its ADC; by_host_clock: whether its time stamps are those of this machine's monotonic
-    clock; buffer_s: duration of a buffer, s.
+    adc: its sample rate and ADC, as fields of a sensor; by_host_clock: whether its time stamps are
+    those of this machine's monotonic clock; buffer_s: duration of a buffer, s.
     """
 
     def __init__(self, context: Any, device: Any, columns: Sequence[_Column], settings: Settings,
                  sensor: Sensor) -> None:
-        """Start the buffer."""
         self.name = _name(device)
         self._context, self._device = context, device
         self._timestamp = device.find_channel('timestamp')
@@ -274,15 +259,13 @@ class _Stream:
                             'cannot be counted')
         self.by_host_clock = _select_monotonic_clock(device) and settings.uri.startswith('local:')
         axis = next(column for column in columns if column.role in sensor.axes)
-        self.adc = axis.adc(_set_rate(context, device, columns, sensor.rate_hz))
-        rate_hz = self.adc.rate_hz
+        self.rate_hz = rate_hz = _set_rate(context, device, columns, sensor.rate_hz)
+        self.adc = {'rate_hz': rate_hz, **axis.adc()}
         count = min(max(settings.samples_together(rate_hz),
                         ceil(_ROUND_TRIPS * _answer_s(axis.channel) * rate_hz)),
                     _MAX_BUFFER)
         self.buffer_s = count / rate_hz
-        self._columns = [column for column in columns if column.channel.scan_element]
-        self._polled = [column for column in columns if not column.channel.scan_element]
-        self._polled_s = 0.0
+        self._columns = [*columns]
         for channel in [self._timestamp, *(column.channel for column in self._columns)]:
             channel.enabled = True
         # Some kernels cannot set this number; a network server cannot once its buffer runs.
@@ -299,7 +282,6 @@ class _Stream:
             device_ns = np.frombuffer(self._timestamp.read(self._buffer), np.int64)
             values = {column.role: column.convert(np.frombuffer(
                 column.channel.read(self._buffer), column.dtype)) for column in self._columns}
-            values |= self._poll(len(device_ns))
         except OSError as error:
             raise _ReadError(f'{self.name}: lost: {base.reason(error)}') from None
         lengths = {len(device_ns), *map(len, values.values())}
@@ -313,21 +295,11 @@ class _Stream:
         self._buffer = None
         self._timestamp = None
         self._columns.clear()
-        self._polled.clear()
         self._device = None
         self._context = None
 
-    def _poll(self, count: int) -> dict[str, np.ndarray]:
-        """Read the channels without a place in the buffer once a second; NaN in between."""
-        is_due = bool(self._polled) and time.monotonic() - self._polled_s >= _POLL_S
-        if is_due:
-            self._polled_s = time.monotonic()
-        return {column.role: np.full(count, column.convert(_number(column.channel, 'raw'))
-                                     if is_due else np.nan) for column in self._polled}
-
 
 def _open_stream(settings: Settings, entries: Sequence[str], sensor: Sensor) -> _Stream:
-    """Open a device and start its buffer."""
     iio = import_libiio()
     try:
         _probe(settings.uri)
@@ -380,8 +352,7 @@ def _find_device(context: Any, name: str) -> Any:
     device = context.find_device(name) if name and name.isascii() else None
     if device is not None:
         return device
-    buffered = [device for device in context.devices
-                if any(channel.scan_element for channel in _inputs(device))]
+    buffered = [device for device in context.devices if _inputs(device)]
     if not name and len(buffered) == 1:
         return buffered[0]
     raise UserError(f'link.device: {name!r} is not there; with buffered channels there are: '
@@ -389,9 +360,8 @@ def _find_device(context: Any, name: str) -> Any:
 
 
 def _inputs(device: Any) -> list[Any]:
-    """Return the input channels of a device without its time stamps."""
-    return [channel for channel in device.channels
-            if not channel.output and channel.id != 'timestamp']
+    return [channel for channel in device.channels if channel.scan_element
+            and not channel.output and channel.id != 'timestamp']
 
 
 def _assign_roles(device: Any, entries: Sequence[str], axes: str) -> dict[str, Any]:
@@ -402,8 +372,8 @@ def _assign_roles(device: Any, entries: Sequence[str], axes: str) -> dict[str, A
         by_label = {labels[channel.id]: channel for channel in inputs}
         if all(axis in by_label for axis in axes):
             return {role: by_label[role] for role in order if role in by_label}
-        measured = [channel for channel in inputs if channel.scan_element
-                    and channel.type.name in ('IIO_VOLTAGE', 'IIO_ACCEL')]
+        measured = [channel for channel in inputs
+                    if channel.type.name in ('IIO_VOLTAGE', 'IIO_ACCEL')]
         entries = [channel.id for channel
                    in sorted(measured, key=lambda channel: channel.index)[:len(axes)]]
     roles: list[str] = []
@@ -416,14 +386,12 @@ def _assign_roles(device: Any, entries: Sequence[str], axes: str) -> dict[str, A
             available = ', '.join(f'{key} ({label})' if label else key
                                   for key, label in labels.items())
             raise UserError(f'link.channels: {_name(device)} has no channel {name!r}; it has '
-                            f'{available}')
+                            f'{available} in its buffer')
         if not equals:
             free = [candidate for candidate in order if candidate not in roles]
             role = name if name in free or not free else free[0]
         roles.append(role)
         assigned.append(named[0])
-        if role in axes and not named[0].scan_element:
-            raise UserError(f'link.channels: {named[0].id} has no place in the buffer')
     base.check_roles(roles, axes)
     return dict(zip(roles, assigned))
 
@@ -438,7 +406,7 @@ def _label(channel: Any) -> str:
 def _column(role: str, channel: Any, sensor: Sensor, supply_scale: float) -> _Column:
     """Read how the codes of a channel become V or degC."""
     form = channel.data_format
-    if channel.scan_element and (form.repeat > 1 or form.length not in (8, 16, 32, 64)):
+    if form.repeat > 1 or form.length not in (8, 16, 32, 64):
         raise UserError(f'{channel.id}: a format of {form.length} bits, {form.repeat} times, '
                         'cannot be read')
     dtype = f'{"i" if form.is_signed else "u"}{form.length // 8}'
@@ -460,7 +428,6 @@ def _column(role: str, channel: Any, sensor: Sensor, supply_scale: float) -> _Co
 
 
 def _number(channel: Any, name: str) -> float:
-    """Read an attribute; raises `UserError` where it is not a finite number."""
     try:
         text = channel.attrs[name].value
     except KeyError:

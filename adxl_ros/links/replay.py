@@ -51,7 +51,6 @@ class Replay:
     _volts: np.ndarray
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
-        """Read the first rows."""
         self._path, self._loop = settings.recording, settings.loop
         self._blocks = self._all_blocks()
         first = next(self._blocks)

@@ -204,7 +204,6 @@ class _FrameSize:
         return ''
 
     def _possible(self, info: BoardInfo) -> int:
-        """Return how many samples a frame shall have."""
         return wire_format.samples_that_fit(self._settings.samples_together(info.rate_hz), info,
                                             self._port.uart_bytes_per_s)
 
@@ -218,7 +217,6 @@ class SerialLink(base.DeviceLink):
     """
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
-        """Prepare the link without opening the port."""
         self._declared, self._settings = sensor, settings
         self._stated_roles = base.parse_channels(settings.channels)
         if self._stated_roles:
@@ -326,7 +324,6 @@ class SerialLink(base.DeviceLink):
         self._unpaid_s = len(chunk) / _MAX_BYTES_PER_S + samples / (_MAX_RATE_RATIO * rate_hz)
 
     def _decoded(self, raw: bytes) -> BoardInfo | SampleFrame | None:
-        """Decode and count a frame; None for one that cannot be read."""
         try:
             frame = wire_format.decode(raw)
         except wire_format.VersionError as error:
@@ -403,7 +400,6 @@ class _Port:
     """
 
     def __init__(self, name: str, baud: int) -> None:
-        """Prepare the port; the first `read` opens it."""
         self.connections = self.received_bytes = 0
         self.last_byte_s = self.opened_s = 0.0
         # Bytes that the open port carries per second; infinite where the baud rate has no meaning
@@ -458,7 +454,6 @@ class _Port:
                 port.close()
 
     def _open(self) -> None:
-        """Try to open the port; `error` has the reason of a failure."""
         try:
             self._port = self._pyserial.serial_for_url(self._name, self._baud, timeout=0,
                                                        exclusive=True)

@@ -77,7 +77,6 @@ class SimulatedSensor:
     joint_state_topic = 'stage/true_joint_states'
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
-        """Rest in the pose of the settings."""
         self.sensor = sensor
         self._seed = settings.seed
         self._knots = [_resting((settings.alpha_rad, settings.beta_rad, 0.0))]
@@ -115,7 +114,8 @@ class SimulatedSensor:
 
     def begin(self, now_ns: int) -> int:
         """Make the next sample due now; return the number of samples that are skipped."""
-        skipped = self._skipped(now_ns)
+        gap_s = (now_ns - self._until_ns) * 1e-9
+        skipped = round(gap_s * self.sensor.rate_hz) if self._until_ns and gap_s > 0 else 0
         self._origin_ns = -(-now_ns // _BEAT_NS) * _BEAT_NS
         self._made, self._until_ns, self._next_ns = 0, now_ns, self._origin_ns
         self._stamps, self._volts = self._stamps[:0], self._volts[:0]
@@ -141,13 +141,7 @@ class SimulatedSensor:
     def close(self) -> None:
         """Do nothing: the link holds nothing open."""
 
-    def _skipped(self, now_ns: int) -> int:
-        """Return how many samples a jump of time to `now_ns` skips."""
-        gap_s = (now_ns - self._until_ns) * 1e-9
-        return round(gap_s * self.sensor.rate_hz) if self._until_ns and gap_s > 0 else 0
-
     def _stamp(self, index: float | np.ndarray) -> np.ndarray:
-        """Return the times of samples by their numbers, ns."""
         return self._origin_ns + np.rint(index * (1e9 / self.sensor.rate_hz)).astype(np.int64)
 
     def _motion_until_ns(self) -> int:
@@ -213,5 +207,4 @@ class SimulatedSensor:
 
 
 def _resting(position: tuple[float, ...]) -> _Knot:
-    """Return a knot at rest before all stamps."""
     return _Knot(0, position, (0.0,) * len(JOINTS))

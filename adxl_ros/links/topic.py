@@ -118,7 +118,6 @@ class _Chain:
         return volts
 
     def _force_at(self, time_s: np.ndarray) -> list[np.ndarray]:
-        """Return the force at times, s, (n,); between samples by a polynomial."""
         place = time_s * self._rate_hz - self._first
         nearest = np.rint(place).astype(int)
         if np.abs(place - nearest).max() < _ON_SAMPLE:
@@ -129,7 +128,6 @@ class _Chain:
                               self._force[first[:, None] + np.arange(POINTS)]))
 
     def _temperature_at(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
-        """Return the temperature at times, s, (n,), °C."""
         return np.full(len(time_s), 0.0 if order else self._temperature_c)
 
 
@@ -148,7 +146,6 @@ class EmulatedSensor(base.DeviceLink):
     """
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
-        """Wait for the first sample."""
         self.imu_topic, self.temperature_topic = settings.topic, settings.temperature_topic
         self._seed = settings.seed
         # Fixed axes (REP-103), as in a URDF joint.
@@ -221,7 +218,6 @@ class EmulatedSensor(base.DeviceLink):
         return base.LinkStatus(*self._condition(), counts, events)
 
     def _condition(self) -> tuple[base.Level, str]:
-        """Return level and text of the status."""
         topic, sensor = self.imu_topic, self.sensor
         if self._mixture:
             return base.Level.ERROR, self._mixture

@@ -260,7 +260,7 @@ class Compensation(Node):
         if self._stream.may_be_foreign or self._policy.sensor is not self._named[0]:
             self._use(*self._named)
         self._take_from_store()
-        self._stream.restart_filter(self._policy.rate_hz)
+        self._stream.use(self._policy.sensor, self._policy.rate_hz)
         self._assess()
 
     def _take_from_store(self) -> None:

@@ -1,14 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Values with their intervals, and as text with the digits that these allow."""
+"""Numbers as text: the digits that intervals allow, units that people use, and lists."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+from adxl_ros.model.constants import G0_MPS2
 import numpy as np
 
 _MOST_DECIMALS = 7
 """Largest number of decimals (chosen: a table of 79 columns has room for ten digits)."""
 _UNKNOWN_DECIMALS = 4
 """Number of decimals of a coefficient without an interval."""
+_NEARLY_ALL = 0.995
+"""Share from which a percentage would be rounded to 100."""
+_SMALLEST_MG = 0.005
+"""Acceleration, mg, that rounds to 0.00 below this."""
+_UNIT_SUFFIXES = ('m', 's', 'rad', 'v', 'hz', 'f', 'g')
+"""Ends of parameter names that repeat the unit of the value."""
 
 
 @dataclass(frozen=True)
@@ -39,12 +50,9 @@ def counted(number: int, noun: str) -> str:
     return f'{number} {noun}{"" if number == 1 else "s"}'
 
 
-def duration(seconds: float, digits: int = 0) -> str:
-    """Return a time with two units at most, for people, with so many digits of its unit if any."""
+def duration(seconds: float) -> str:
+    """Return a time with two units at most, for people."""
     seconds = round(seconds, 3)
-    if digits:
-        unit_s = next((unit_s for unit_s in (86400.0, 3600.0, 60.0) if seconds >= 2 * unit_s), 1.0)
-        seconds = float(f'{seconds / unit_s:.{digits}g}') * unit_s
     for unit_s, unit, smaller_s, smaller in ((86400, 'd', 3600, 'h'), (3600, 'h', 60, 'min')):
         if round(seconds) >= unit_s:
             count, rest = divmod(round(seconds / smaller_s), round(unit_s / smaller_s))
@@ -76,3 +84,89 @@ def file_size(count: int) -> str:
         if count >= factor:
             return f'{count / factor:.3g} {unit}'
     return f'{count} B'
+
+
+def listed(names: Sequence[str], word: str) -> str:
+    """Return names separated by commas, with a word before the last one."""
+    return f' {word} '.join(filter(None, [', '.join(names[:-1]), *names[-1:]]))
+
+
+def column_unit(name: str) -> str:
+    """Return the unit of a reference, which its column's name ends with."""
+    return {'rad': 'rad', 'm': 'm', 'c': '°C', 'v': 'V'}[name.rsplit('_', 1)[1]]
+
+
+def mg(value_mps2: Any) -> Any:
+    """Convert m/s² to mg."""
+    return 1e3 * value_mps2 / G0_MPS2
+
+
+def mg_text(value_mps2: float) -> str:
+    """Return an acceleration, m/s², in mg with three digits at most."""
+    value = float(mg(value_mps2))
+    if abs(value) < _SMALLEST_MG:
+        return '< 0.01 mg'
+    return f'{value:.{2 if abs(value) < 10 else 1 if abs(value) < 100 else 0}f} mg'
+
+
+def amplitude_text(power: float) -> str:
+    """Return the root of a power, (m/s²)², in mg; a negative power counts as 0."""
+    return mg_text(float(np.sqrt(max(power, 0.0))))
+
+
+def power_text(power: Interval) -> str:
+    """Return the root of a power with its 90 % interval in mg."""
+    value, low, high = map(amplitude_text, (power.value, power.low, power.high))
+    return value if value == high else f'{value[:-3]} ({low[:-3]} to {high[:-3]}) mg'
+
+
+def percent(share: float) -> str:
+    """Return a share in per cent; only certainty by definition would be 0 or 100 %."""
+    if share >= _NEARLY_ALL:
+        return '> 99 %'
+    return '< 1 %' if 0 < share < 1 - _NEARLY_ALL else f'{100 * share:.0f} %'
+
+
+def parameter_label(key: str, is_single: bool) -> str:
+    """Return the name of a parameter without its unit, or its axis where that is enough."""
+    name, _, axis = key.partition('.')
+    stem, _, suffix = name.rpartition('_')
+    short = stem if stem and suffix in _UNIT_SUFFIXES else name
+    return axis if axis and is_single else f'{short} {axis}'.rstrip()
+
+
+def parameter_text(parameter: Mapping[str, Any], scale_v_per_g: float = 1.0, digits: int = 3
+                   ) -> str:
+    """Return a parameter of a report with its interval, in a unit that people use."""
+    if not parameter.get('determined', True):
+        return 'not determined'
+    ci = parameter.get('ci')
+    plain = np.array([*np.atleast_1d(parameter['value']), *(ci or ())], float)
+    values, unit = _for_people(plain, parameter['unit'], scale_v_per_g)
+    if ci:
+        width = max((values[2] - values[1]) / 4, 1e-12)
+        places = int(np.clip(np.ceil(-np.log10(width)), 0, 6))
+        value, low, high = (f'{round(v, places) + 0.0:.{places}f}' for v in values)
+        return f'{value} ({low} to {high}) {unit}'.rstrip()
+    texts = dict.fromkeys(np.format_float_positional(v, digits, fractional=False, trim='-')
+                          if abs(v) < 100 else f'{v:.0f}' for v in values)
+    return f'{", ".join(texts)} {unit}'.rstrip()
+
+
+def _for_people(values: np.ndarray, unit: str, scale_v_per_g: float) -> tuple[np.ndarray, str]:
+    """Return values in a unit with prefix; volts of the output as the acceleration they feign."""
+    if unit == 'rad':
+        return np.degrees(values), 'deg'
+    if unit in ('V', 'V/g') and np.abs(values).max() < scale_v_per_g:
+        values, unit = values / scale_v_per_g, 'g' if unit == 'V' else '1'
+    if unit == 'm/s^2':
+        values, unit = values / G0_MPS2, 'g'
+    base, slash, per = unit.replace('s/s', '1').partition('/')
+    per = per.replace('^2', '²').replace('sqrt(', '√').replace(')', '')
+    largest = float(np.abs(values).max())
+    if base in ('g', 'm', 's', 'V', '1') and 0 < largest < 0.1:
+        factor = 1e6 if largest < 1e-4 else 1e2 if base == '1' else 1e3
+        values = factor * values
+        base = {1e6: 'ppm', 1e2: '%'}[factor] if base == '1' else {1e6: 'µ', 1e3: 'm'}[
+            factor] + base
+    return values, (base + slash + per).removeprefix('1' if not per else '')

@@ -90,7 +90,6 @@ class CellMeans:
         return (squares + between) / max(width * self.size - 1, 1)
 
     def _join(self) -> None:
-        """Join each cell with its neighbour."""
         half = self.count // 2
         pairs = self.means.reshape(half, 2, -1)
         differences = pairs[:, 1] - pairs[:, 0]
@@ -233,15 +232,14 @@ def shortest_rest_s(rate_hz: float) -> float:
     return max(SHORTEST_S, _FEWEST_SAMPLES / rate_hz) - 1 / rate_hz
 
 
-def longest_rest(read: Callable[[], Iterable[Recording]], unit_of: Callable[[Recording], Sensor]
-                 ) -> StillStretch:
+def longest_rest(read: Callable[[], Iterable[Recording]], unit: Sensor) -> StillStretch:
     """
     Find the longest rest of a recording.
 
     A recording at rest throughout is read once. Any other is read twice, and the memory is
     bounded in both cases.
     """
-    survey = _read(read, unit_of, None)
+    survey = _read(read, unit, None)
     rests = [rest for rest, _ in survey.rests.detected]
     rest = max(rests, key=lambda rest: rest.span_s, default=Rest(0, 0, 0.0, 0.0))
     shortest_s = shortest_rest_s(survey.nominal_hz)
@@ -254,7 +252,7 @@ def longest_rest(read: Callable[[], Iterable[Recording]], unit_of: Callable[[Rec
                 if stop_s - start_s > _LARGEST_END_S]
     still, span = survey, ''
     if motion_s or rest.disturbed_s:
-        still = _read(read, unit_of, rest)
+        still = _read(read, unit, rest)
         span = f' from {rest.time_start_s:.4g} s to {rest.time_stop_s:.4g} s'
     return still.stretch(span, survey.last_s - survey.first_s, motion_s)
 
@@ -299,7 +297,6 @@ class _Samples:
         self._cells.feed(rows)
 
     def _evenly(self, time_s: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Return the rows with gaps filled."""
         steps_s = np.diff(time_s)
         gaps = steps_s > gap_s(self.nominal_hz)
         if not gaps.any():
@@ -329,13 +326,12 @@ class _Samples:
             motion_s)
 
 
-def _read(read: Callable[[], Iterable[Recording]], unit_of: Callable[[Recording], Sensor],
-          rest: Rest | None) -> _Samples:
+def _read(read: Callable[[], Iterable[Recording]], unit: Sensor, rest: Rest | None) -> _Samples:
     """Read the undisturbed samples of a rest; those of the whole recording where it is None."""
     samples: _Samples | None = None
     held = np.nan
     for block in read():
-        unit, time_s = unit_of(block), block.time_s
+        time_s = block.time_s
         temperature, held = _held(block, held)
         rows = np.column_stack([block.accel_mps2(unit), temperature])
         if rest is not None:

@@ -4,17 +4,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
+from adxl_ros.errors import UserError
 from adxl_ros.files.exports import kalibr_settings
+from adxl_ros.files.recording_columns import Recording, unit_of
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals import noise_parameters
-from adxl_ros.signals.allan_deviation import StillStretch
+from adxl_ros.signals.allan_deviation import longest_rest, StillStretch
 from adxl_ros.signals.noise_parameters import Drift, Estimate, NoiseFit
+from adxl_ros.signals.recorded_sensor import load_sensor
 import numpy as np
 
 TERMS = ('white', 'instability', 'walk')
@@ -46,8 +49,6 @@ class AxisNoise:
     # lowest_s, lowest: Time, s, and value, m/s², of the lowest point of the Allan deviation
     lowest_s: float
     lowest: float
-    # Time that would show half of a term's upper limit, s, by name of the terms that are not seen
-    needed_s: dict[str, float]
 
     @property
     def estimates(self) -> tuple[Estimate, Estimate, Estimate]:
@@ -70,30 +71,36 @@ class RecordingNoise:
     """The noise of a recording."""
 
     path: str  # The recording
+    sensor: Sensor  # Its parameter file
+    unit: Sensor  # The nominal sensor that it comes from
     rest: StillStretch  # Its samples at rest
     axes: list[AxisNoise]  # The noise by axis
 
 
-def recording_noise(path: str, rest: StillStretch, axes: str, show: Callable[[float], None]
-                    ) -> RecordingNoise:
-    """Fit the noise of all axes."""
+def recording_noise(read: Callable[[], Iterable[Recording]], params: str | None,
+                    show: Callable[[float], None] = lambda done: None) -> RecordingNoise:
+    """Fit the noise of all axes in the longest rest; `read` yields the blocks of a recording."""
+    first = next(iter(read()), None)
+    if first is None:
+        raise UserError('the recording holds no samples')
+    sensor = load_sensor(params, first)
+    unit = unit_of(sensor, first.stream_info, first.axes)
+    rest = longest_rest(read, unit)
     variances = noise_parameters.coefficient_variances(len(rest.means), rest.step_s)
     noises = []
-    for i, axis in enumerate(axes):
+    for i, axis in enumerate(unit.axes):
         means = rest.means[:, i]
         fit = noise_parameters.fit_noise(means, rest.step_s, variances)
         drift = noise_parameters.find_drift(means, rest.step_s, variances, fit, rest.temperature_c)
-        needed_s = {name: noise_parameters.needed_time_s(fit, term, rest.span_s)
-                    for term, name in enumerate(TERMS) if not getattr(fit, name).is_seen}
         deviation = rest.allan.deviation[:, i]
         lowest = int(np.argmin(deviation))
         std, resolution = float(rest.sample_std[i]), float(rest.resolution[i])
         rounding = resolution / float(np.sqrt(12 * rest.rate_hz))
         noises.append(AxisNoise(axis, without_rounding(fit, std, resolution, rounding), drift, std,
                                 resolution, rounding, float(rest.allan.tau_s[lowest]),
-                                float(deviation[lowest]), needed_s))
-        show((i + 1) / len(axes))
-    return RecordingNoise(path, rest, noises)
+                                float(deviation[lowest])))
+        show((i + 1) / len(unit.axes))
+    return RecordingNoise(first.path, sensor, unit, rest, noises)
 
 
 def without_rounding(fit: NoiseFit, std: float, resolution: float, rounding: float) -> NoiseFit:
@@ -127,7 +134,6 @@ def density_g_per_rthz(noise: AxisNoise) -> float | None:
 
 
 def _likely(estimate: Estimate) -> float:
-    """Return an estimate, or its upper limit where it is not seen."""
     return estimate.value if estimate.is_seen else estimate.high
 
 
@@ -194,30 +200,8 @@ _PX4_HZ = 100.0
 """Rate of the filter of PX4, Hz: EKF2_PREDICT_US is 10 000."""
 
 
-@dataclass(frozen=True)
-class Setting:
-    """A line of another program's settings."""
-
-    name: str
-    values: tuple[float, ...]  # One, or nine of a matrix
-    unit: str  # Their unit, and what they are
-
-    def lines(self) -> list[str]:
-        """Return the setting in YAML, with its unit as a comment."""
-        texts = [_yaml_number(value) for value in self.values]
-        if len(texts) == 1:
-            return [f'{self.name}: {texts[0]}  # {self.unit}']
-        rows = [', '.join(texts[i:i + 3]) for i in range(0, len(texts), 3)]
-        return [f'{self.name}:  # {self.unit}',
-                *('  [' + ',\n   '.join(rows) + ']').split('\n')]
-
-
-def _yaml_number(value: float) -> str:
-    """Return a value as YAML reads a floating-point number: 4.0e-05, not 4e-05."""
-    if value >= 1:
-        return repr(float(f'{value:.6g}'))
-    mantissa, e, exponent = f'{value:.3g}'.partition('e')
-    return f'{mantissa if "." in mantissa else f"{mantissa}.0"}{e}{exponent}'
+Setting = tuple[str, list[float], str]
+"""A line of another program's settings: name, one value or nine of a matrix, and their unit."""
 
 
 def settings(noises: list[AxisNoise], rate_hz: float) -> dict[str, list[Setting]]:
@@ -230,24 +214,26 @@ def settings(noises: list[AxisNoise], rate_hz: float) -> dict[str, list[Setting]
     value for all axes get the largest one. A term that is not seen is its upper limit.
     """
     loudest = max(noises, key=lambda noise: noise.sample_white)
-    white, walks = loudest.sample_white, [noise.fit.walk for noise in noises]
-    white_limit = '' if loudest.fit.white.is_seen else ', an upper limit'
-    walk = max(walks, key=lambda walk: walk.value)
-    limit = '' if walk.is_seen else ', an upper limit'
-    k = walk.value if walk.is_seen else max(walk.high for walk in walks)
+    walk = max((noise.fit.walk for noise in noises), key=lambda walk: walk.value)
+    white, k = loudest.sample_white, walk.value
+    if not walk.is_seen:
+        k = max(noise.fit.walk.high for noise in noises)
+    white_note, note = ('' if term.is_seen else ', an upper limit'
+                        for term in (loudest.fit.white, walk))
     variances = [noise.sample_std ** 2 for noise in noises]
     matrix = np.diag((variances + [1e6] * 3)[:3]).ravel()
+
+    def both(names: tuple[str, str], filter_hz: float, remark: str = '') -> list[Setting]:
+        root = float(np.sqrt(filter_hz))
+        return [(names[0], [white * root], f'm/s^2{remark}{white_note}'),
+                (names[1], [k * root], f'm/s^3{note}')]
+
     return {
         'kalibr, imu.yaml': [
-            Setting(name, (value,), unit + note) for (name, value, unit), note
-            in zip(kalibr_settings(white, k, rate_hz), (white_limit, limit, ''))],
-        f'VINS-Fusion, at {rate_hz:.4g} Hz': [
-            Setting('acc_n', (white * np.sqrt(rate_hz),), f'm/s^2{white_limit}'),
-            Setting('acc_w', (k * np.sqrt(rate_hz),), f'm/s^3{limit}')],
+            (name, [value], unit + remark) for (name, value, unit), remark
+            in zip(kalibr_settings(white, k, rate_hz), (white_note, note, ''))],
+        f'VINS-Fusion, at {rate_hz:.4g} Hz': both(('acc_n', 'acc_w'), rate_hz),
         'robot_localization, in sensor_msgs/Imu of the driver': [
-            Setting('linear_acceleration_covariance', tuple(matrix.tolist()), '(m/s^2)^2')],
-        'PX4, its filter at 100 Hz; vibration in flight needs more': [
-            Setting('EKF2_ACC_NOISE', (white * np.sqrt(_PX4_HZ),),
-                    f'm/s^2, at least 0.01{white_limit}'),
-            Setting('EKF2_ACC_B_NOISE', (k * np.sqrt(_PX4_HZ),), f'm/s^3{limit}')],
-    }
+            ('linear_acceleration_covariance', matrix.tolist(), '(m/s^2)^2')],
+        'PX4, its filter at 100 Hz; vibration in flight needs more': both(
+            ('EKF2_ACC_NOISE', 'EKF2_ACC_B_NOISE'), _PX4_HZ, ', at least 0.01')}

@@ -31,11 +31,6 @@ def gap_s(rate_hz: float) -> float:
     return max(_GAP_S, _GAP_PERIODS / rate_hz)
 
 
-def block_samples(rate_hz: float) -> int:
-    """Return the number of samples in a block at a sample rate, Hz."""
-    return max(1, round(BLOCK_S * rate_hz))
-
-
 @dataclass(frozen=True)
 class Blocks:
     """Sums over k blocks of equally many rows."""
@@ -54,11 +49,9 @@ class Blocks:
     angle: np.ndarray
 
     def __len__(self) -> int:
-        """Return the number of blocks."""
         return len(self.start)
 
     def __getitem__(self, part: slice | np.ndarray) -> Blocks:
-        """Return the blocks that a slice or an index array selects."""
         return Blocks(*(getattr(self, f.name)[part] for f in fields(self)))
 
     @staticmethod
@@ -77,7 +70,7 @@ class BlockCutter:
     """
 
     def __init__(self, rate_hz: float, axes: int, angles: int = 0):
-        self.size = block_samples(rate_hz)
+        self.size = Spans(rate_hz).size
         self._axes = axes
         self._gap_s = gap_s(rate_hz)
         self._leftover = np.empty((1 + axes + angles, 0))
@@ -125,7 +118,6 @@ class BlockCutter:
         return blocks
 
     def _summed(self, columns: np.ndarray, start: np.ndarray, run: np.ndarray) -> Blocks:
-        """Compute the statistics of the blocks that begin at the columns `start`."""
         block = columns[:, start[:, None] + np.arange(self.size)]
         samples, angles = block[1:1 + self._axes], block[1 + self._axes:]
         finite = np.isfinite(samples).all(axis=0)
@@ -213,7 +205,7 @@ class Spans:
     @property
     def size(self) -> int:
         """Return the number of samples in a block."""
-        return block_samples(self.rate_hz)
+        return max(1, round(BLOCK_S * self.rate_hz))
 
     @property
     def block_s(self) -> float:

@@ -87,20 +87,17 @@ def assess(contents: RecordingContents) -> Findings:
 
 
 def _missing(contents: RecordingContents) -> str:
-    """Return how many samples are missing."""
     expected = contents.samples + contents.missing
     return (f'{contents.missing} samples are missing ({100 * contents.missing / expected:.2g} %) '
             f'in {counted(contents.gaps, "gap")}, the longest of {contents.longest_gap_s:.3g} s')
 
 
 def _has_wide_gaps(contents: RecordingContents) -> bool:
-    """Return whether so many samples are missing that a recording is not sound."""
     share = contents.missing / (contents.samples + contents.missing)
     return share > _LARGEST_MISSING or contents.longest_gap_s > _LONGEST_GAP_S
 
 
 def _stamp_faults(contents: RecordingContents) -> list[str]:
-    """Return what is wrong with the stamps."""
     faults = []
     duplicates, backward = contents.bad_stamps
     if duplicates:
@@ -127,7 +124,6 @@ def _stamp_faults(contents: RecordingContents) -> list[str]:
 
 
 def _sample_faults(contents: RecordingContents) -> list[str]:
-    """Return what is wrong with the samples."""
     faults = [f'{axis.name} never changes; the axis is stuck, or not connected'
               for axis in contents.axes if axis.is_stuck]
     faults += [f'{axis.name} does not change for {axis.held_s:.3g} s while other axes do; the '
@@ -154,7 +150,6 @@ def _unit_hint(length_g: float) -> str:
 
 
 def _remarks(contents: RecordingContents) -> list[str]:
-    """Return what is noteworthy, but no fault."""
     remarks = list(contents.remarks)
     if contents.missing and not _has_wide_gaps(contents):
         remarks.append(_missing(contents))
@@ -182,7 +177,6 @@ def _range_rad(contents: RecordingContents) -> float | None:
 
 
 def _fit(contents: RecordingContents) -> Ability:
-    """Return whether `fit` can calibrate from a recording."""
     held = f'{counted(contents.poses, "orientation")} in {counted(contents.rests, "rest")}'
     if _range_rad(contents) is not None:
         is_able = contents.poses >= _FEWEST_STAGE_POSES
@@ -196,7 +190,6 @@ def _fit(contents: RecordingContents) -> Ability:
 
 
 def _diagnose(contents: RecordingContents) -> Ability:
-    """Return whether `diagnose` can name effects."""
     range_rad = _range_rad(contents)
     if contents.poses <= 1 and not (range_rad and range_rad > _MOVED_RAD):
         follows = [text for name, (text, smallest) in _FOLLOWED.items()
@@ -215,7 +208,6 @@ def _diagnose(contents: RecordingContents) -> Ability:
 
 
 def _noise(contents: RecordingContents) -> Ability:
-    """Return whether `noise` can measure the noise."""
     longest_s, shortest_s = contents.longest_rest_s, shortest_rest_s(contents.rate_hz)
     return Ability('noise', longest_s >= shortest_s,
                    f'longest rest {duration(longest_s)}' if longest_s >= shortest_s else
@@ -247,7 +239,6 @@ def check_recording(path: str, params: str | None, reading: ReadingOptions,
 
 
 def _shown(blocks: Iterator[Recording], show: Callable[[float], None]) -> Iterator[Recording]:
-    """Yield blocks, and show how much has been read."""
     for block in blocks:
         yield block
         show(block.done)

@@ -14,7 +14,6 @@ process (IEEE Std 952, annex B).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
@@ -38,7 +37,7 @@ _SMALLEST = 1e-4
 """Square of a term, by the square at which it would dominate, from which an upper limit is
 searched. Chosen: it changes the likelihood of no recording."""
 _OCTAVE_PROBABILITY = 1e-3
-"""Probability by chance, below which an octave contradicts the three terms, or a group exceeds its
+"""Probability by chance, below which an octave shows a filter, or a group exceeds its
 neighbours. Chosen: with ten octaves one healthy recording in a hundred."""
 _BOUND_PROBABILITY = 1e-2
 """Probability by chance, below which a walk has bounds. Chosen: one healthy recording in a
@@ -54,12 +53,6 @@ _MARGIN_OCTAVES = 2
 """Octaves below a filter's effect that are left out. Chosen: the effect falls by 16 in power."""
 _FEWEST = 32
 """Fewest coefficients of a fit. Chosen: white noise is then known within 20 %."""
-
-_SEEN = 2.0
-"""Value of a term, in its standard deviations, from which an interval excludes 0. Chosen: the
-interval by the likelihood is a little wider than 1.64 of them."""
-_LONGEST_FACTOR = 1024
-"""Largest ratio of a needed time to the time of a recording. Chosen: minutes become days."""
 
 FLOOR = float(np.sqrt(2 * np.log(2) / np.pi))
 """Allan deviation of bias instability divided by B: 0.664 (IEEE Std 952, equation C.15)."""
@@ -82,14 +75,6 @@ class Estimate(NamedTuple):
         return Estimate(self.value * factor, self.low * factor, self.high * factor)
 
 
-class Octave(NamedTuple):
-    """An octave of frequency whose power contradicts the fitted terms."""
-
-    low_hz: float
-    high_hz: float
-    ratio: float  # Measured power divided by the fitted power
-
-
 @dataclass(frozen=True)
 class NoiseFit:
     """The noise of one axis; u is the unit of the signal."""
@@ -105,8 +90,6 @@ class NoiseFit:
     highest: int  # Number of cosine coefficients of the fit, from the lowest
     highest_hz: float  # Frequency of the last one, Hz
     kept: np.ndarray  # Groups of coefficients without lines, bool
-    # Octaves that contradict the fit. Above `highest_hz` only those with too much power.
-    octaves: tuple[Octave, ...]
     log_likelihood: float  # Largest log likelihood, up to a constant
 
     @property
@@ -231,10 +214,8 @@ def fit_noise(means: np.ndarray, step_s: float, variances: np.ndarray | None = N
     models, correlation = _walks(used, span_s, highest)
     theta, likelihood = _best(models)
     white, instability, walk = (_interval(models, theta, likelihood, term) for term in range(3))
-    if correlation is not None:
-        everything = everything.bounded(correlation.value, span_s)
     return NoiseFit(white, instability, walk, correlation, highest, highest / (2 * span_s), kept,
-                    _contradictions(everything, theta, highest, 2 * span_s), likelihood)
+                    likelihood)
 
 
 def _walks(groups: _Groups, span_s: float, highest: int
@@ -263,35 +244,7 @@ def _best(models: list[_Groups], fixed: int | None = None, value: float = 0.0
     return max((_fit(model, fixed, value) for model in models), key=lambda fit: fit[1])
 
 
-def needed_time_s(fit: NoiseFit, term: int, span_s: float) -> float:
-    """
-    Return how long a recording must be to show half of a term's upper limit, s.
-
-    The Fisher information of the cosine coefficients tells when the interval excludes 0. It is
-    `inf` beyond a thousand times the time of the recording.
-    """
-    squares = fit.squares
-    squares[term] = ((fit.white, fit.instability, fit.walk)[term].high / 2) ** 2
-    factor = 1.0
-    while factor <= _LONGEST_FACTOR:
-        time_s = span_s * factor
-        stop = max(int(2 * time_s * fit.highest_hz), _FEWEST)
-        k = np.unique(np.geomspace(1, stop, 400).astype(int))
-        count = np.gradient(k.astype(float))
-        omega = np.pi * k / time_s
-        shapes = np.column_stack([np.ones(len(k)), 1 / omega, 1 / omega ** 2])
-        design = shapes * squares * (np.sqrt(count / 2) / (shapes @ squares))[:, None]
-        design = design[:, squares > 0]
-        place = int((squares[:term] > 0).sum())
-        std = np.sqrt(np.linalg.inv(design.T @ design)[place, place])
-        if std * _SEEN < 1:
-            return time_s
-        factor *= 2 ** 0.25
-    return float('inf')
-
-
 def _grouped(power: np.ndarray, variances: np.ndarray) -> _Groups:
-    """Group coefficients of power (n,) whose frequencies are nearly equal."""
     edges = [*range(min(_SINGLE, len(power)))]
     position = float(_SINGLE)
     while position < len(power):
@@ -392,56 +345,18 @@ def _is_expected(octave: _Groups, lower: _Groups, theta: np.ndarray) -> bool:
     return bool(scipy.stats.chi2.sf(excess ** 2 / variance, 1) > _OCTAVE_PROBABILITY)
 
 
-def _contradictions(groups: _Groups, theta: np.ndarray, highest: int, span_s: float
-                    ) -> tuple[Octave, ...]:
-    """
-    Return the octaves whose power contradicts the fit; `span_s` is twice the time.
-
-    Above the fitted coefficients, less power is that of a filter.
-    """
-    octaves: list[Octave] = []
-    stop = int(groups.first[-1] + groups.count[-1])
-    while stop > _FEWEST:
-        begin = stop // 2
-        octave = groups.below(stop)
-        octave = octave.where(octave.first >= begin)
-        freedom = int(octave.count.sum())
-        if freedom:
-            total = float(octave.count @ (octave.power / (octave.shapes @ theta)))
-            chance = 2 * min(scipy.stats.chi2.cdf(total, freedom),
-                             scipy.stats.chi2.sf(total, freedom))
-            if chance < _OCTAVE_PROBABILITY and (total > freedom or stop <= highest):
-                octaves.append(Octave(begin / span_s, stop / span_s, total / freedom))
-        stop = begin
-    return tuple(octaves[::-1])
-
-
-_TREND_GAIN = 12.0
-"""Gain in twice the log likelihood from which a trend is named. Chosen: one chance in 2000."""
-_STEP_GAIN = 30.0
-"""The same of a step, whose time is searched. Chosen: also after a search over 10⁵ times rare."""
+_DRIFT_GAIN = 12.0
+"""Gain in twice the log likelihood from which a drift is named. Chosen: one chance in 2000."""
 _FIT_ROUNDS = 3
 """Rounds that fit the size of a drift and the noise in turn. Chosen: sizes then stay."""
-_TEMPERATURE_SHARE = 0.8
-"""Share of the largest gain from which temperature is named first. Chosen: it is the cause, where
-a trend or a step only describes."""
-
-
-class DriftKind(Enum):
-    """What a drift follows."""
-
-    TEMPERATURE = 'temperature'
-    TREND = 'trend'
-    STEP = 'step'
 
 
 @dataclass(frozen=True)
 class Drift:
     """A drift of one axis; u is its unit."""
 
-    kind: DriftKind  # What it follows
-    size: float  # Its size: u/K, u/s, or u
-    cell: int  # Number of the cell at which a step is; 0 for the others
+    follows: str  # What it follows: temperature or time
+    size: float  # Its size: u/K or u/s
     without: NoiseFit  # The noise without the drift
 
 
@@ -453,51 +368,18 @@ def find_drift(means: np.ndarray, step_s: float, variances: np.ndarray, fit: Noi
     means: means of cells, u, (n,); variances: those of `coefficient_variances`; fit: the noise of
     the same cells; temperature_c: temperature of the cells, (n,), None where it is not measured.
     """
-    number = np.arange(len(means), dtype=float)
-    cell = _likely_step(coefficients(means), variances, fit)
-    shapes = {DriftKind.TREND: number * step_s, DriftKind.STEP: (number >= cell).astype(float)}
+    shapes = {'time': np.arange(len(means)) * step_s}
     if temperature_c is not None and np.ptp(temperature_c) > 0:
-        shapes[DriftKind.TEMPERATURE] = temperature_c
-    gains, drifts = {}, {}
-    for kind, shape in shapes.items():
-        size, without = _without(means, shape, step_s, variances, fit)
-        gain = 2 * (without.log_likelihood - fit.log_likelihood)
-        if gain > (_STEP_GAIN if kind is DriftKind.STEP else _TREND_GAIN):
-            gains[kind] = gain
-            drifts[kind] = Drift(kind, size, cell if kind is DriftKind.STEP else 0, without)
-    if not drifts:
-        return None
-    best = max(gains, key=lambda kind: gains[kind])
-    if gains.get(DriftKind.TEMPERATURE, 0.0) > _TEMPERATURE_SHARE * gains[best]:
-        best = DriftKind.TEMPERATURE
-    return drifts[best]
-
-
-def _without(means: np.ndarray, shape: np.ndarray, step_s: float, variances: np.ndarray,
-             fit: NoiseFit) -> tuple[float, NoiseFit]:
-    """Return the size of a drift of a shape, (n,), and the noise without it."""
-    measured, expected = (coefficients(values)[:fit.highest] for values in (means, shape))
-    size = 0.0
-    for _ in range(_FIT_ROUNDS):
-        weight = expected / (variances[:fit.highest] @ fit.squares)
-        size = float(weight @ measured / (weight @ expected))
-        fit = fit_noise(means - size * shape, step_s, variances, fit)
-    return size, fit
-
-
-def _likely_step(measured: np.ndarray, variances: np.ndarray, fit: NoiseFit) -> int:
-    """
-    Return the cell at which a step is most likely, by the matched filter for the fitted noise.
-
-    Coefficient k of a unit step at cell p of n is −sin(k·π·p/n)/(√(2·n)·sin(k·π/(2·n))).
-    """
-    count = len(measured) + 1
-    k = np.arange(1, count)
-    variance = variances @ fit.squares
-    factor = np.where(k < fit.highest, 1 / np.sin(k * np.pi / (2 * count)), 0.0)
-    score = scipy.fft.dst(measured * factor / variance, type=1)
-    weight = np.zeros(count)
-    weight[1:] = factor ** 2 / variance
-    # The sum of sin² by place: (1 − cos)/2 of the double angle.
-    norm = weight.sum() - np.fft.fft(weight).real[1:]
-    return 1 + int(np.argmax(score ** 2 / np.maximum(norm, 1e-6 * norm.max())))
+        shapes['temperature'] = temperature_c
+    drifts = []
+    for name, shape in shapes.items():
+        measured, expected = (coefficients(values)[:fit.highest] for values in (means, shape))
+        size, without = 0.0, fit
+        for _ in range(_FIT_ROUNDS):
+            weight = expected / (variances[:fit.highest] @ without.squares)
+            size = float(weight @ measured / (weight @ expected))
+            without = fit_noise(means - size * shape, step_s, variances, without)
+        drifts.append(Drift(name, size, without))
+    best = max(drifts, key=lambda drift: drift.without.log_likelihood)
+    gain = 2 * (best.without.log_likelihood - fit.log_likelihood)
+    return best if gain > _DRIFT_GAIN else None

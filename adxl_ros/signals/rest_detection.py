@@ -105,7 +105,6 @@ class NoiseLimits:
 
 
 def _largest(limits: list[NoiseLimits]) -> NoiseLimits | None:
-    """Return the largest of each limit; None without any."""
     return NoiseLimits(*(np.maximum.reduce([getattr(each, f.name) for each in limits])
                          for f in fields(NoiseLimits))) if limits else None
 

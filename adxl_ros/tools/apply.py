@@ -11,15 +11,15 @@ from contextlib import contextmanager
 import itertools
 from pathlib import Path
 
-from adxl_ros.compensate.recordings import effects_left, Estimates, ImuFields, RecordingEstimator
+from adxl_ros.compensate.estimators import Estimates, RecordingEstimator
+from adxl_ros.compensate.live_stream import ImuFields
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.bag_writer import TiltBag
 from adxl_ros.files.csv_file import csv_writer
 from adxl_ros.files.recording_columns import check_unit, Recording
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.covariance import UNMEASURED_VARIANCE
-from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import NOMINAL_ENVIRONMENT
+from adxl_ros.model.effects import base, effect_named
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.signals.recorded_sensor import BeyondRange, listed, load_sensor, measure_unstated
 from adxl_ros.tools import command_line as cli
@@ -142,19 +142,20 @@ def _estimated(options: argparse.Namespace, sensor: Sensor, first: Recording | N
 
 def _report_effects(block: Recording, sensor: Sensor, undo_filter: bool) -> None:
     """Name the effects that are not undone, or undone for nominal surroundings."""
-    not_undone = effects_left(sensor, undo_filter)
     for effect in map(effect_named, sensor.effects):
-        if effect in not_undone:
+        acts_on_samples = effect.acts_on is base.ActsOn.MEAN and effect.place < base.Place.CLOCK \
+            and effect.concern is not base.Concern.STAGE
+        is_undone = effect.invertible or (undo_filter and base.Need.FILTER in effect.needs)
+        if acts_on_samples and not is_undone:
             cli.note(f'apply: {effect.name} is not undone: a single sample does not determine '
                      'it')
         for name in effect.follows:
             if name != 'time_s' and not np.isfinite(block.columns.get(name, np.nan)).all():
                 cli.note(f'apply: {block.path}: {name} is missing or has gaps: {effect.name} is '
-                         f'taken at {getattr(NOMINAL_ENVIRONMENT, name):g} there')
+                         f'taken at {getattr(base.NOMINAL_ENVIRONMENT, name):g} there')
 
 
 def _columns(estimates: Estimates) -> dict[str, np.ndarray]:
-    """Return the columns of the output, (n,) each, in its order."""
     columns = {f'a{axis}_mps2': values for axis, values in zip(AXES, estimates.force_mps2)}
     columns |= {f'a{axis}_std_mps2': values
                 for axis, values in zip(AXES, estimates.force_std_mps2)}

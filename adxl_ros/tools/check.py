@@ -20,7 +20,7 @@ from adxl_ros.files import recording
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.report import page as html_page
-from adxl_ros.report.quantities import duration, short_time
+from adxl_ros.report.quantities import column_unit, duration, short_time
 from adxl_ros.report.screen import COLUMNS, row
 from adxl_ros.signals.findings import check_recording, Findings
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
@@ -39,8 +39,6 @@ _MOST_DETAILED = 3
 """Recordings up to which the details of sound ones are printed, too. Chosen: a screen."""
 _LABEL_COLUMNS = 12
 """Columns of the label of a line below a recording."""
-_UNITS = {'rad': 'rad', 'm': 'm', 'c': '°C', 'v': 'V'}
-"""Units of references by the end of their names."""
 
 
 def _lines(results: list[Findings]) -> list[str]:
@@ -64,7 +62,6 @@ def _lines(results: list[Findings]) -> list[str]:
 
 
 def _sentence(results: list[Findings]) -> str:
-    """Return how many recordings are sound."""
     if len(results) == 1:
         return f'The recording is {"" if results[0].is_sound else "not "}sound.'
     count = sum(result.is_sound for result in results)
@@ -72,7 +69,6 @@ def _sentence(results: list[Findings]) -> str:
 
 
 def _cells(result: Findings) -> list[str]:
-    """Return name, length, rate, missing samples, share at rest, axes and verdict."""
     name, contents = Path(result.path).name, result.contents
     if contents is None:
         return [name, *['–'] * 5, 'unreadable']
@@ -105,11 +101,10 @@ def _details(result: Findings) -> list[str]:
 
 
 def _value_lines(contents: RecordingContents) -> list[str]:
-    """Return stamps, ranges and references of a recording, for people."""
     texts = [f'{contents.samples} samples, jitter {short_time(contents.jitter_s)} rms',
              ', '.join(f'{axis.name} {axis.lowest_mps2:.3g} to {axis.highest_mps2:.3g} m/s²'
                        for axis in contents.axes),
-             *(f'{name} {low:.4g} to {high:.4g} {_UNITS[name.rsplit("_", 1)[1]]}'
+             *(f'{name} {low:.4g} to {high:.4g} {column_unit(name)}'
                for name, (low, high) in contents.reference_ranges.items())]
     if contents.delay is not None:
         texts.append(f'log time minus header time {short_time(contents.delay.median_s)}, '
@@ -118,7 +113,6 @@ def _value_lines(contents: RecordingContents) -> list[str]:
 
 
 def _page(results: list[Findings]) -> str:
-    """Return the page."""
     is_sound = all(result.is_sound for result in results)
     badge = {'colour': 'green' if is_sound else 'red', 'sentence': _sentence(results),
              'word': 'Sound.' if is_sound else 'Not sound.'}
@@ -200,7 +194,6 @@ def _with_what_shows(result: Findings, params: str | None, reading: ReadingOptio
 
 
 def _next_command(results: list[Findings], options: argparse.Namespace) -> str:
-    """Return the command that a sound recording allows; empty for none."""
     for result in results:
         able = {ability.tool for ability in result.abilities if ability.is_able}
         for tool, output in (('fit', 'unit.yaml --report report'),
@@ -212,7 +205,6 @@ def _next_command(results: list[Findings], options: argparse.Namespace) -> str:
 
 
 def _as_json(result: Findings) -> dict[str, Any]:
-    """Return the findings for programs, in SI units."""
     values: dict[str, Any] = {}
     if result.contents is not None:
         values = asdict(result.contents)

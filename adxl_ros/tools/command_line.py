@@ -32,16 +32,15 @@ from adxl_ros.files.column_mapping import (
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model import coefficients
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Coefficient, Effect, Parameter
+from adxl_ros.model.effects.base import Coefficient, Effect
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.report.quantities import column_unit
 from adxl_ros.report.screen import COLUMNS, end_lines, entry_list, NextStep
 import numpy as np
 
 if TYPE_CHECKING:
     from adxl_ros.simulate.robot import RobotPath
 
-_UNITS = {'rad': 'rad', 'm': 'm', 'c': 'degC', 'v': 'V'}
-"""Units of references by the end of their columns' names."""
 _BAR_COLUMNS = 24
 """Columns of a progress bar: names of stages and times stand beside it in 80 columns."""
 
@@ -174,7 +173,6 @@ def reading_text(options: argparse.Namespace) -> str:
 
 
 def _counts(option: str, text: str, is_positive: bool) -> tuple[float, ...]:
-    """Return the numbers of a list."""
     try:
         values = tuple(float(word) for word in text.split(',')) if text else ()
     except ValueError:
@@ -220,43 +218,30 @@ def _value(effect: Effect, values: Mapping[str, np.ndarray], axes: str, key: str
            text: str) -> np.ndarray:
     """Return one parameter with a new value for all its axes or one; `text` is the option."""
     name, _, axis = key.partition('.')
-    parameter = _parameter(effect, name, text)
-    value = _number(parameter, number, text)
-    if not parameter.axes:
-        if axis:
-            raise UserError(f'--effect {text}: {name} is one number without axes; write '
-                            f'{name}={number}')
-        return np.array(value)
-    chosen = [i for i, a in enumerate(axes) if a in parameter.axes and axis in ('', a)]
-    if not chosen:
-        raise UserError(f'--effect {text}: no axis {axis!r} to act on; the sensor has {axes}, '
-                        f'{name} acts on {parameter.axes}')
-    changed = np.array(values[name], float)
-    changed[chosen] = value
-    return changed
-
-
-def _parameter(effect: Effect, name: str, text: str) -> Parameter:
-    by_name = {p.name: p for p in effect.parameters}
-    if name not in by_name:
-        near = get_close_matches(name, by_name, 1, _SIMILARITY) or list(by_name)
+    parameters = {parameter.name: parameter for parameter in effect.parameters}
+    if name not in parameters:
+        near = get_close_matches(name, parameters, 1, _SIMILARITY) or [*parameters]
         raise UserError(f'--effect {text}: {effect.name} has no parameter {name!r}; did you mean '
                         f'{near[0]}?')
-    return by_name[name]
-
-
-def _number(parameter: Parameter, number: str, text: str) -> float:
-    """Read the value of a parameter, within its bounds; `text` is the option, for messages."""
+    parameter = parameters[name]
     try:
         value = float(number)
     except ValueError:
-        raise UserError(f'--effect {text}: {number!r} is not a number; {parameter.name} is in '
+        raise UserError(f'--effect {text}: {number!r} is not a number; {name} is in '
                         f'{parameter.unit}, written without the unit') from None
     if not parameter.lower <= value <= parameter.upper:
         raise UserError(f'--effect {text}: {value:g} {parameter.unit} is outside '
                         f'{parameter.lower:g} to {parameter.upper:g} {parameter.unit}; a typical '
-                        f'{parameter.name} is {parameter.scale:g}')
-    return value
+                        f'{name} is {parameter.scale:g}')
+    if not (parameter.axes or axis):
+        return np.array(value)
+    chosen = [i for i, a in enumerate(axes) if a in parameter.axes and axis in ('', a)]
+    if not chosen:
+        raise UserError(f'--effect {text}: no axis {axis!r} to act on; the sensor has {axes}, '
+                        f'{name} acts on {parameter.axes or "none, it is one number"}')
+    changed = np.array(values[name], float)
+    changed[chosen] = value
+    return changed
 
 
 def print_end(result: Sequence[str], files: Iterable[str | os.PathLike],
@@ -320,7 +305,7 @@ def report_reading(tool: str, recording: Recording) -> None:
     for name, alignment in recording.alignments.items():
         # References with the stamps of the samples need no alignment.
         if alignment.gap_s:
-            unit = _UNITS[name.rsplit('_', 1)[1]]
+            unit = column_unit(name)
             note(f'{tool}: {recording.path}: {name} aligned by its stamps: residual '
                  f'{alignment.residual:.3g} {unit} rms, nearest message at most '
                  f'{alignment.gap_s:.3g} s away')

@@ -19,7 +19,7 @@ from adxl_ros.fleet.inputs import find_sources, stated_by
 from adxl_ros.fleet.recipe import make_recipe, Recipe, task_names, TASKS
 from adxl_ros.fleet.row import reason_kind, Row
 from adxl_ros.fleet.run import only_client, Plan, plan, Results, Selection, since_text, work
-from adxl_ros.report.addresses import as_utf_8, without_secrets
+from adxl_ros.report.page import as_utf_8, without_secrets
 from adxl_ros.report.quantities import counted, duration, file_size
 from adxl_ros.report.screen import wrapped
 from adxl_ros.tools import command_line as cli
@@ -104,7 +104,6 @@ def fleet(options: argparse.Namespace) -> int:
 
 def _worked(options: argparse.Namespace, recipe: Recipe, results: Results, to_do: Plan,
             begin_s: float) -> int:
-    """Work on all that there is to do, and write table and page."""
     rows: list[Row] = []
     is_interrupted = False
     try:
@@ -128,7 +127,6 @@ def _worked(options: argparse.Namespace, recipe: Recipe, results: Results, to_do
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Refuse numbers that make no sense, and missing libraries."""
     for name, lowest in (('jobs', 1), ('retries', 0), ('limit', 1)):
         value = getattr(options, name)
         if value is not None and value < lowest:
@@ -165,7 +163,6 @@ def _written(folder: Path, results: Results) -> list[Path]:
 
 
 def _plan_lines(to_do: Plan, count: int) -> list[str]:
-    """Return what there is to do."""
     stated = iter(stated_by([source for source, serial in zip(to_do.todo, to_do.serials)
                              if not serial]))
     by_unit = Counter(serial or next(stated).serial for serial in to_do.serials)
@@ -184,12 +181,10 @@ def _plan_lines(to_do: Plan, count: int) -> list[str]:
 
 
 def _left_out(to_do: Plan) -> str:
-    """Return how many recordings a run leaves out; empty for none."""
     return f'{to_do.outside} by --since, --limit or --only-failed' if to_do.outside else ''
 
 
 def _result_lines(rows: Sequence[Row], to_do: Plan, took_s: float) -> list[str]:
-    """Return the answer, the figures, and why recordings have no result."""
     outcomes = Counter(row['outcome'] for row in rows)
     parts = [f'{outcomes[name]} {name}' for name in ('done', 'refused', 'crashed')
              if outcomes[name] or name == 'done']

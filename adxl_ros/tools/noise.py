@@ -15,7 +15,8 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.atomic_write import write_bytes, write_text
 from adxl_ros.files.csv_file import csv_writer
-from adxl_ros.files.recording_columns import Recording, unit_of
+from adxl_ros.files.parameter_file import float_text
+from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor
@@ -24,10 +25,9 @@ from adxl_ros.report.figures import png, pyplot
 from adxl_ros.report.quantities import duration
 from adxl_ros.report.screen import row
 from adxl_ros.signals import axis_noise
-from adxl_ros.signals.allan_deviation import longest_rest, StillStretch
+from adxl_ros.signals.allan_deviation import StillStretch
 from adxl_ros.signals.axis_noise import AxisNoise, RecordingNoise, settings, TERMS
-from adxl_ros.signals.noise_parameters import Drift, DriftKind, Estimate
-from adxl_ros.signals.recorded_sensor import load_sensor
+from adxl_ros.signals.noise_parameters import Drift, Estimate
 from adxl_ros.tools import command_line as cli
 import numpy as np
 
@@ -37,9 +37,6 @@ MICRO_G = 1e6 / G0_MPS2
 _LARGEST_STD_MPS2 = 0.3
 """Noise of a sample from which a sensor vibrates, m/s². Chosen: three times that of a low-cost
 IMU at 1 kHz."""
-
-_LARGEST_RATIO = 1.25
-"""Ratio of measured and fitted power from which it is reported. Chosen: less changes N by 10 %."""
 
 _LARGEST_FILLED = 0.01
 """Share of missing samples from which white noise changes visibly. Chosen."""
@@ -52,7 +49,6 @@ _UNITS = {'white': 'm/s^2/sqrt(Hz)', 'instability': 'm/s^2', 'walk': 'm/s^2/sqrt
 
 
 def _head(result: RecordingNoise) -> list[str]:
-    """Return which samples are used."""
     rest, axes = result.rest, ' '.join(noise.axis for noise in result.axes)
     return [result.path, f'{duration(rest.span_s)} at rest, {rest.rate_hz:.5g} Hz, axes {axes}']
 
@@ -77,7 +73,6 @@ def _tables(result: RecordingNoise) -> list[str]:
 
 
 def _micro_g_intervals(noise: AxisNoise) -> list[str]:
-    """Return N, B and K in µg with their intervals."""
     return [_interval(estimate.scaled(MICRO_G)) for estimate in noise.estimates]
 
 
@@ -104,13 +99,22 @@ def _interval(estimate: Estimate) -> str:
 
 
 def _paste_lines(result: RecordingNoise) -> list[str]:
-    """Return the settings of other programs, ready to paste."""
-    return [line for program, entries in settings(result.axes, result.rest.rate_hz).items()
-            for line in (f'# {program}', *(line for entry in entries for line in entry.lines()))]
+    """Return the settings of other programs in YAML, ready to paste."""
+    lines = []
+    for program, entries in settings(result.axes, result.rest.rate_hz).items():
+        lines.append(f'# {program}')
+        for name, values, unit in entries:
+            texts = [float_text(float(f'{value:.{6 if value >= 1 else 3}g}')) for value in values]
+            if len(texts) == 1:
+                lines.append(f'{name}: {texts[0]}  # {unit}')
+            else:
+                rows = [', '.join(texts[i:i + 3]) for i in range(0, len(texts), 3)]
+                lines += [f'{name}:  # {unit}',
+                          *('  [' + ',\n   '.join(rows) + ']').split('\n')]
+    return lines
 
 
 def _warnings(result: RecordingNoise) -> list[str]:
-    """Return what limits the result, and what to do about it."""
     rest, texts = result.rest, []
     if rest.motion_s:
         texts.append(f'{_motion(rest)} Used is the longest rest, {duration(rest.span_s)} of '
@@ -121,9 +125,7 @@ def _warnings(result: RecordingNoise) -> list[str]:
     texts += _too_short(result)
     for noise in result.axes:
         if noise.drift is not None:
-            texts.append(_drift_text(rest, noise, noise.drift))
-        else:
-            texts += _unexplained(noise)
+            texts.append(_drift_text(rest, noise.axis, noise.drift))
         if noise.is_coarse:
             texts.append(f'{noise.axis}: samples change in steps of '
                          f'{noise.resolution * MICRO_G:.3g} µg, which hide the noise. N, B and K '
@@ -139,7 +141,6 @@ def _warnings(result: RecordingNoise) -> list[str]:
 
 
 def _motion(rest: StillStretch) -> str:
-    """Return when the sensor moves."""
     first = rest.motion_s[0]
     others = len(rest.motion_s) - 1
     repeated = {0: '', 1: ' and once again'}.get(others, f' and at {others} further times')
@@ -147,62 +148,35 @@ def _motion(rest: StillStretch) -> str:
 
 
 def _too_short(result: RecordingNoise) -> list[str]:
-    """Return which terms the time does not show, and how long it must be."""
     texts = []
     for name in TERMS:
-        needed_s = {noise.axis: noise.needed_s[name] for noise in result.axes
-                    if name in noise.needed_s}
-        if needed_s:
-            longest_s = max(needed_s.values())
-            further = 'To see half of the limit above, record about ' \
-                f'{duration(longest_s, 2)}.' if np.isfinite(longest_s) else \
-                'The other terms hide it, in longer recordings, too.'
+        axes = [noise.axis for noise in result.axes if not getattr(noise.fit, name).is_seen]
+        if axes:
             texts.append(f'{duration(result.rest.span_s)} is too short to see the {NAMES[name]} '
-                         f'of {", ".join(needed_s)}. {further}')
+                         f'of {", ".join(axes)}. Record for longer.')
     return texts
 
 
-def _unexplained(noise: AxisNoise) -> list[str]:
-    """Return at which frequencies N, B and K do not describe the noise."""
-    texts = []
-    octaves = [octave for octave in noise.fit.octaves
-               if abs(np.log(octave.ratio)) > np.log(_LARGEST_RATIO)]
-    for is_excess, advice in ((True, 'Look for a fan, mains or a person nearby.'),
-                              (False, 'The noise is none of these three there.')):
-        part = [octave for octave in octaves if (octave.ratio > 1) == is_excess]
-        if part:
-            ratio = max(part, key=lambda octave: abs(np.log(octave.ratio))).ratio
-            texts.append(f'{noise.axis}: from {part[0].low_hz:.3g} to {part[-1].high_hz:.3g} Hz '
-                         f'the power is {"up" if is_excess else "down"} to {ratio:.2g} times that '
-                         f'of N, B and K. {advice}')
-    return texts
-
-
-def _micro_or_milli_g(size_mps2: float, unit: str) -> str:
+def _micro_or_milli_g(size_mps2: float) -> str:
     """Return a drift with its sign in µg or mg."""
     size = size_mps2 * MICRO_G
-    return f'{size:+.3g} µg{unit}' if abs(size) < 1000 else f'{size / 1000:+.3g} mg{unit}'
+    return f'{size:+.3g} µg' if abs(size) < 1000 else f'{size / 1000:+.3g} mg'
 
 
-def _drift_text(rest: StillStretch, noise: AxisNoise, drift: Drift) -> str:
-    """Return what the axis follows, and the random walk without it."""
-    if drift.kind is DriftKind.TEMPERATURE:
-        assert rest.temperature_c is not None
-        text = (f'follows the temperature by {_micro_or_milli_g(drift.size, "/K")} '
+def _drift_text(rest: StillStretch, axis: str, drift: Drift) -> str:
+    """Return what an axis follows, and its noise without this drift."""
+    if rest.temperature_c is not None and drift.follows == 'temperature':
+        text = (f'follows the temperature by {_micro_or_milli_g(drift.size)}/K '
                 f'({np.ptp(rest.temperature_c):.2g} K in all)')
-    elif drift.kind is DriftKind.TREND:
-        text = f'drifts by {_micro_or_milli_g(3600 * drift.size, "/h")} throughout'
     else:
-        at_s = rest.start_s + drift.cell * rest.step_s
-        text = f'has a step of {_micro_or_milli_g(drift.size, "")} at {at_s:.6g} s'
+        text = f'drifts by {_micro_or_milli_g(3600 * drift.size)}/h'
     without = [_interval(estimate.scaled(MICRO_G))
                for estimate in (drift.without.instability, drift.without.walk)]
-    return (f'{noise.axis}: {text}. B and K contain this drift. Without it B is {without[0]} µg, '
-            f'and K is {without[1]} µg/√s.')
+    return (f'{axis}: {text}. B and K contain this drift. Without it B is {without[0]} µg, and K '
+            f'is {without[1]} µg/√s.')
 
 
 def _as_json(result: RecordingNoise) -> dict[str, Any]:
-    """Return the result for programs, in SI units."""
     return {
         'schema': 1,
         'recording': result.path,
@@ -216,15 +190,14 @@ def _as_json(result: RecordingNoise) -> dict[str, Any]:
             'tau_s': result.rest.allan.tau_s.tolist(),
             **{noise.axis: result.rest.allan.deviation[:, i].tolist()
                for i, noise in enumerate(result.axes)}},
-        'settings': {program: {setting.name: setting.values[0] if len(setting.values) == 1
-                               else list(setting.values) for setting in entries}
+        'settings': {program: {name: values[0] if len(values) == 1 else values
+                               for name, values, _ in entries}
                      for program, entries in settings(result.axes, result.rest.rate_hz).items()},
         'warnings': _warnings(result),
     }
 
 
 def _axis_json(noise: AxisNoise) -> dict[str, Any]:
-    """Return the noise of an axis for programs."""
     terms = {name: {'value': estimate.value if estimate.is_seen else None,
                     'ci': [estimate.low, estimate.high], 'unit': _UNITS[name]}
              for name, estimate in zip(TERMS, noise.estimates)}
@@ -245,7 +218,6 @@ _COLUMNS = ('axis', 'white noise N, µg/√Hz', 'bias instability B, µg', 'rand
 
 
 def _write_page(folder: Path, result: RecordingNoise) -> list[Path]:
-    """Write the page, the plot and the curve."""
     page, plot, curve = (folder / name for name in ('report.html', 'allan.png', 'allan.csv'))
     figure = _plot(result)
     write_text(page, _page(result, figure))
@@ -258,7 +230,6 @@ def _write_page(folder: Path, result: RecordingNoise) -> list[Path]:
 
 
 def _page(result: RecordingNoise, figure: Any) -> str:
-    """Return the page."""
     rows = [[noise.axis, *_micro_g_intervals(noise),
              f'{noise.lowest * MICRO_G:.3g} at {noise.lowest_s:.3g} s',
              f'{noise.sample_std:.3g}', f'{noise.fit.highest_hz:.3g}'] for noise in result.axes]
@@ -270,7 +241,6 @@ def _page(result: RecordingNoise, figure: Any) -> str:
 
 
 def _plot(result: RecordingNoise) -> Any:
-    """Return the plot of the Allan deviation by axis."""
     figure, axes = pyplot().subplots(1, len(result.axes), squeeze=False, sharey=True,
                                      figsize=(_INCHES[0] * len(result.axes), _INCHES[1]),
                                      layout='constrained')
@@ -324,19 +294,26 @@ def noise(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     if options.report:
         html_page.check_libraries()
-    source = _Source(options)
+    reading = cli.reading_options(options)
+    newest: list[Recording] = []
     with cli.progress('noise') as show:
-        rest = longest_rest(lambda: source.blocks(show), source.unit)
-        result = axis_noise.recording_noise(options.recording, rest, source.axes,
+        def blocks() -> Iterator[Recording]:
+            for block in recording.blocks(options.recording, _BLOCK_ROWS, reading):
+                newest[:] = [block]
+                yield block
+                show(block.done, 'read')
+
+        result = axis_noise.recording_noise(blocks, options.params,
                                             lambda done: show(done, 'fit'))
-    cli.report_reading('noise', source.last)
+    rest = result.rest
+    cli.report_reading('noise', *newest)
     files: list[Path] = []
     if options.report:
         cli.make_folder(Path(options.report))
         files += _write_page(Path(options.report), result)
     if options.output:
         name = Path(options.recording).name
-        fresh = axis_noise.with_noise(source.sensor(rest.rate_hz), result.axes)
+        fresh = axis_noise.with_noise(_sensor(result), result.axes)
         parameter_file.save(options.output, replace(fresh, provenance={
             **fresh.provenance, 'noise_from': name, 'rate_from': name}), [
                 f'Noise measured in {duration(rest.span_s)} at rest of {result.path}.',
@@ -354,41 +331,15 @@ def noise(options: argparse.Namespace) -> int:
     return 0
 
 
-class _Source:
-    """The recording and its unit."""
-
-    axes: str  # Measured axes, known after the first block
-    last: Recording  # The newest block
-
-    def __init__(self, options: argparse.Namespace) -> None:
-        self._path, self._params = options.recording, options.params
-        self._reading = cli.reading_options(options)
-        self._unit: Sensor | None = None
-
-    def blocks(self, show: cli.ShowDone) -> Iterator[Recording]:
-        """Yield the blocks of the recording, and show how much has been read."""
-        for block in recording.blocks(self._path, _BLOCK_ROWS, self._reading):
-            self.last = block
-            yield block
-            show(block.done, 'read')
-
-    def unit(self, block: Recording) -> Sensor:
-        """Return the nominal sensor of the recording by its first block."""
-        if self._unit is None:
-            self.axes = block.axes
-            self._sensor = load_sensor(self._params, block)
-            self._unit = unit_of(self._sensor, block.stream_info, block.axes)
-        return self._unit
-
-    def sensor(self, rate_hz: float) -> Sensor:
-        """Return the sensor of the parameter file, with the axes and rate of the recording."""
-        assert self._unit is not None
-        if self._sensor.effects and self._sensor.axes != self.axes:
-            raise UserError(f'{self._path}: has the axes {self.axes}, but the parameters of '
-                            f'{self._sensor.serial} are for {self._sensor.axes}; name the '
-                            'parameter file of this sensor')
-        base = self._sensor if self._sensor.effects else self._unit
-        return replace(base, serial=self._unit.serial, rate_hz=round(rate_hz, 6))
+def _sensor(result: RecordingNoise) -> Sensor:
+    """Return the sensor of the parameter file, with the axes and rate of the recording."""
+    sensor, unit = result.sensor, result.unit
+    if sensor.effects and sensor.axes != unit.axes:
+        raise UserError(f'{result.path}: has the axes {unit.axes}, but the parameters of '
+                        f'{sensor.serial} are for {sensor.axes}; name the parameter file of this '
+                        'sensor')
+    return replace(sensor if sensor.effects else unit, serial=unit.serial,
+                   rate_hz=round(result.rest.rate_hz, 6))
 
 
 def main() -> int:

@@ -105,7 +105,6 @@ def simulate(options: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Refuse wrong usage."""
     names = (*TRAJECTORIES, 'imu')
     if options.trajectory not in names and not Path(options.trajectory).exists():
         near = get_close_matches(options.trajectory, names, 1)
@@ -167,14 +166,12 @@ def _samples(sensor: Sensor, options: argparse.Namespace
 
 
 def _file_output(stack: ExitStack, sensor: Sensor, path: str) -> Output:
-    """Return what writes samples to a recording."""
     write, info = stack.enter_context(recording.writer(path, sensor)), sensor_info(sensor)
     return lambda columns: write(Recording(path, columns['time_s'], {
         name: values for name, values in columns.items() if name != 'time_s'}, info))
 
 
 def _board_output(stack: ExitStack, sensor: Sensor, port: str) -> Output:
-    """Return what sends samples as an emulated board does."""
     emulated_board.check_sensor(sensor)
     descriptor = stack.enter_context(emulated_board.open_terminal(port))
     boards: list[emulated_board.Board] = []
@@ -191,7 +188,6 @@ def _board_output(stack: ExitStack, sensor: Sensor, port: str) -> Output:
 
 
 def _print_end(options: argparse.Namespace, sensor: Sensor, duration_s: float) -> None:
-    """Print what was simulated, the file, and the command that reads it."""
     effects = f' with {", ".join(sensor.effects)}' if sensor.effects else ', no effects'
     result = (f'Simulated {options.trajectory}: {duration_s:.4g} s at {sensor.rate_hz:.4g} Hz, '
               f'axes {sensor.axes}. Sensor {sensor.serial}{effects}.')

@@ -119,7 +119,7 @@ def test_inversion_of_the_filter_delays_samples() -> None:
     for _ in range(20):
         stream.send(sensor, 0.7, 0.4)
     assert len(stream.data) == 20 - inversions.HALF
-    stream.restart_filter(500.0)
+    stream.use(stream.sensor, 500.0)
     for _ in range(inversions.HALF):
         stream.send(sensor, 0.7, 0.4)
     assert len(stream.data) == 20 - inversions.HALF, 'the waiting samples are dropped'

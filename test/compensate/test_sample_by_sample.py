@@ -2,9 +2,10 @@
 
 """Compensation sample by sample equals that of blocks, and its messages are right."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
-from adxl_ros.compensate.live_stream import LiveEstimator
+from adxl_ros.compensate.estimators import Estimate, LiveEstimator
 from adxl_ros.files import imu_message
 from adxl_ros.model import signal_chain
 from adxl_ros.model.covariance import force_covariance
@@ -46,11 +47,22 @@ def at_rest(alpha: float, beta: float, count: int) -> list[np.ndarray]:
     return [np.full(count, f) for f in specific_force(alpha, beta, G)]
 
 
+def follower(sensor: Sensor) -> Callable[[list[float], float], Estimate | None]:
+    """Return an estimator of nominally converted samples, m/s²."""
+    live = LiveEstimator(sensor)
+
+    def follow(accel_mps2: list[float], time_s: float) -> Estimate | None:
+        volts = live.volts(accel_mps2)
+        return live(volts, time_s) if volts else None
+
+    return follow
+
+
 @pytest.mark.parametrize('axes', ['x', 'xy', 'xyz'])
 def test_agrees_with_blocks(axes: str) -> None:
     sensor = unit(axes)
     accel = samples(sensor, turning(2.0))
-    follow = LiveEstimator(sensor)
+    follow = follower(sensor)
     outputs = [follow(a, i / 1000) for i, a in enumerate(accel)]
     volts = sensor.nominal_zero_g_v + np.array(accel)[:, :len(axes)] / G * \
         sensor.nominal_scale_v_per_g
@@ -76,7 +88,7 @@ def test_motion_raises_the_variance_of_z_and_angles_while_it_lasts() -> None:
     force = at_rest(0.6, 1.0, 9000)
     shaken = slice(2000, 5000)
     force[0][shaken] += 2 * 2 ** 0.5 * np.sin(2 * np.pi * 3 * np.arange(3000) / 1000)
-    follow = LiveEstimator(sensor)
+    follow = follower(sensor)
     outputs = [follow(a, i / 1000) for i, a in enumerate(samples(sensor, force))]
     std = np.sqrt([f.covariance[5] for f in outputs])
     assert 1.5 < np.median(std[3500:5000]) < 3
@@ -84,7 +96,7 @@ def test_motion_raises_the_variance_of_z_and_angles_while_it_lasts() -> None:
     # The x axis is measured also in motion.
     assert max(f.covariance[0] for f in outputs) < 1.1 * outputs[0].covariance[0]
     assert std[-1] < 1.1 * std[1900]
-    three_axes = LiveEstimator(unit('xyz'))
+    three_axes = follower(unit('xyz'))
     for i, a in enumerate(samples(unit('xyz'), force)[:4000]):
         last = three_axes(a, i / 1000)
     assert last.covariance[5] < 1e-3
@@ -96,7 +108,7 @@ def test_motion_raises_the_variance_of_z_and_angles_while_it_lasts() -> None:
 def test_a_sample_without_a_solution_is_none_and_changes_no_other(axes: str, bad: float) -> None:
     sensor = unit(axes)
     accel = samples(sensor, at_rest(0.6, 1.0, 40))
-    follow, again = LiveEstimator(sensor), LiveEstimator(sensor)
+    follow, again = follower(sensor), follower(sensor)
     for i, a in enumerate(accel):
         if i % 10 == 5:
             assert again([bad, *a[1:]], i / 1000) is None

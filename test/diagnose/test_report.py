@@ -10,7 +10,7 @@ from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model.constants import G0_MPS2
-from adxl_ros.report.units import parameter_text
+from adxl_ros.report.quantities import parameter_text
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import simulate

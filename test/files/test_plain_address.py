@@ -2,7 +2,7 @@
 
 """What of an address stays out of tables, pages and messages."""
 
-from adxl_ros.report.addresses import without_secrets
+from adxl_ros.report.page import without_secrets
 import pytest
 
 

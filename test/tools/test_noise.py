@@ -84,14 +84,14 @@ def test_the_lines_to_paste_are_yaml(tmp_path: Path) -> None:
     assert {'acc_n', 'acc_w', 'EKF2_ACC_NOISE', 'EKF2_ACC_B_NOISE'} <= set(values)
 
 
-def test_a_short_recording_says_how_long_it_must_be(tmp_path: Path) -> None:
+def test_a_short_recording_is_named(tmp_path: Path) -> None:
     write_csv(tmp_path / 'still.csv', *samples(60.0, terms=(N, 0.0, 0.0)))
     result = as_json(tmp_path, 'still.csv')
     assert result['axes']['x']['walk']['value'] is None
     assert result['axes']['x']['walk']['ci'][1] > 0
     warning = next(text for text in result['warnings'] if 'random walk K' in text)
     assert 'too short' in warning
-    assert 'record about' in warning
+    assert 'Record for longer' in warning
 
 
 def test_noise_that_rounding_hides_is_not_written(tmp_path: Path) -> None:

@@ -289,7 +289,6 @@ class Backoff:
     """An exponential back-off that a success resets."""
 
     def __init__(self) -> None:
-        """Make the first attempt due at once."""
         self._wait_s = _FIRST_S
         self._due_s = 0.0
 

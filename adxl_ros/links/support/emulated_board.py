@@ -44,7 +44,6 @@ class Board:
     """
 
     def __init__(self, sensor: Sensor, roles: list[str], fd: int) -> None:
-        """Begin as after a reset."""
         self._sensor, self._roles, self._fd = sensor, roles, fd
         self._encoder = wire_format.Encoder(wire_format.BoardInfo(
             sensor.rate_hz, sensor.adc_bits, len(roles), sensor.adc_vref_v, sensor.serial))
@@ -81,7 +80,6 @@ class Board:
             self._index += len(block)
 
     def _obey(self) -> None:
-        """Take the commands that have come from the host."""
         try:
             received = os.read(self._fd, _READ_BYTES)
         except OSError:
@@ -109,7 +107,6 @@ class Board:
 
 
 def _volts(role: str, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the voltage of a channel, V, (n,)."""
     if role == base.SUPPLY:
         return columns[base.COLUMNS[role]] / _SUPPLY_SCALE
     if role == base.TEMPERATURE:

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 import time
 from typing import Any, NamedTuple
 
@@ -89,7 +88,6 @@ class ClockMap:
     """
 
     def __init__(self, delay_s: float, decision_s: float = _LATER_WAIT_S) -> None:
-        """Begin without arrivals."""
         self._decision_s = decision_s
         self.steps = 0  # How often the device's clock has stepped, by its arrivals
         self._delay_ns = round(delay_s * 1e9)
@@ -170,7 +168,6 @@ class ClockMap:
         return stamps
 
     def _line(self, device_ns: Any) -> Any:
-        """Map device times, ns, to host times, ns: an array or one number."""
         return self._line_host_ns + (device_ns - self._line_device_ns) * self._slope
 
     def _update_window(self, device_ns: int, lag_ns: int) -> None:
@@ -298,7 +295,6 @@ class SystemClockMap:
     """Map from the host's monotonic clock, which is never set, to ROS time, the system clock."""
 
     def __init__(self) -> None:
-        """Read both clocks."""
         self.steps = 0  # How often the system clock was set since the map began
         self._offset_ns = float(_system_offset()[1])
 
@@ -328,16 +324,6 @@ def _system_offset() -> tuple[int, int]:
 
 _PERIOD_NS = 100_000_000
 """Period of the means of supply and temperature, ns. Chosen: both change slowly."""
-_KEPT_COUNTS = 8
-"""Numbers of samples for which absent values are kept. Chosen: a device has one or two."""
-
-
-@lru_cache(_KEPT_COUNTS)
-def absent(count: int) -> np.ndarray:
-    """Return values that are not there: NaN, (count,), not to be written."""
-    values = np.full(count, np.nan)
-    values.flags.writeable = False
-    return values
 
 
 @dataclass(frozen=True)
@@ -354,7 +340,6 @@ class PeriodMeans:
     """Replaces slow references by their means over 0.1 s, each at the next sample that comes."""
 
     def __init__(self, columns: Sequence[str]) -> None:
-        """Begin without values."""
         self._held: dict[str, list[np.ndarray]] = {column: [] for column in columns}
         self._period = 0
 
@@ -367,11 +352,11 @@ class PeriodMeans:
         column, (n,) each.
         """
         period = int(host_ns[-1]) // _PERIOD_NS
-        means = dict.fromkeys(self._held, absent(len(host_ns)))
+        means = dict.fromkeys(self._held, np.full(len(host_ns), np.nan))
         if period != self._period:
             self._period = period
             for column, parts in self._held.items():
-                values = np.concatenate([*parts, absent(1)])
+                values = np.concatenate([*parts, np.empty(0)])
                 values = values[np.isfinite(values)]
                 parts.clear()
                 if len(values):
@@ -393,7 +378,6 @@ class Stamper:
     """Holds samples until the device's clock is known, stamps them and counts lost ones."""
 
     def __init__(self, clock: ClockMap | IdentityMap, references: Sequence[str]) -> None:
-        """Begin without samples; `references` are the columns that all samples have."""
         self.clock = clock  # Map of the device's clock
         self.period_ns = 0.0  # Sample period, ns; 0 before the first `restart`
         self._system_clock = SystemClockMap()

@@ -100,7 +100,6 @@ class Encoder:
     """Encodes and numbers frames, as the firmware does."""
 
     def __init__(self, info: BoardInfo) -> None:
-        """Begin as after a reset."""
         self.info = info
         self._sequence = 0
         self._flags = AFTER_RESET
@@ -123,7 +122,6 @@ class Encoder:
         return encode_payload(head + codes.astype('<u2').tobytes())
 
     def _next_sequence(self) -> int:
-        """Return the number of the next frame."""
         self._sequence += 1
         return (self._sequence - 1) % 2 ** 32
 
@@ -186,7 +184,6 @@ def _stuff(raw: bytes) -> bytes:
 
 
 def _unstuff(raw: bytes) -> bytes:
-    """Decode what `_stuff` encodes; raise `WireError` for other bytes."""
     if 0 in raw:
         raise WireError('zero byte found in input')
     parts, at = [], 0
@@ -242,7 +239,6 @@ class Splitter:
     """Splits a stream of bytes at each 0x00 and holds at most one frame."""
 
     def __init__(self) -> None:
-        """Begin anywhere in the stream."""
         self.skipped = 0  # Bytes of runs that are too long for a frame
         self._incomplete = b''
         self._skipping = False
@@ -297,7 +293,6 @@ class FrameCounter:
     """
 
     def __init__(self) -> None:
-        """Begin without a count."""
         self.repeated = self.overruns = 0
         self._period_us = 0.0
         self._first: SampleFrame | None = None  # First frame of the count
@@ -357,7 +352,6 @@ class FrameCounter:
         return AcceptedFrame(frame, ahead if ahead > 0 and in_step else None)
 
     def _is_first(self, frame: SampleFrame) -> bool:
-        """Return whether a frame is the first one of the count, again."""
         first = self._first
         return first is not None and (frame.sequence, frame.time_us, frame.index) == (
             first.sequence, first.time_us, first.index)

@@ -1,0 +1,332 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Specific force and tilt with their errors: of recordings block by block, and of live samples."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from adxl_ros.compensate.inversions import noise_variance_v2, paper_inverse, undo_filter_blocks
+from adxl_ros.errors import UserError
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.model import covariance as force_errors, noise, signal_chain
+from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.covariance import UNMEASURED_VARIANCE
+from adxl_ros.model.effects.base import Components, Environment, FLOATS, NOMINAL_ENVIRONMENT
+from adxl_ros.model.kinematics import angles, Mounting, roll_pitch_covariance, Tilt, tilt
+from adxl_ros.model.sensor import Sensor
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """
+    Estimates of the samples of one block.
+
+    A quantity that a sample does not determine is NaN and has an infinite standard deviation.
+    """
+
+    force_mps2: np.ndarray  # Specific force in the case frame, m/s², (3, n)
+    force_std_mps2: np.ndarray  # Standard deviations of the force, m/s², (3, n)
+    # Covariance of the force, (m/s²)², (3, 3, n); very large for an axis that is not measured
+    covariance: np.ndarray
+    tilt: Tilt  # Angles of the samples with their standard deviations, rad, (n,) each
+    at_rail: np.ndarray  # Whether the ADC was at a rail, (n,)
+    outside: np.ndarray  # Whether temperature or force lie outside of the validity range, (n,)
+    volts: np.ndarray  # Volts of the ADC, V, (n, m)
+
+    @property
+    def unsolved(self) -> np.ndarray:
+        """Whether no force explains the sample, (n,)."""
+        return np.isnan(self.force_mps2[0])
+
+
+class RecordingEstimator:
+    """Estimates force and tilt of the samples of one recording."""
+
+    def __init__(self, sensor: Sensor, first: Recording, paper: bool = False,
+                 undo_filter: bool = False) -> None:
+        """Prepare for a recording."""
+        if paper and sensor.axes == 'x':
+            raise UserError('--inverse paper: needs the axes x and y, the sensor has x; leave it '
+                            'out')
+        if 'temperature_c' not in first.columns:
+            sensor = sensor.without_temperature_range()
+        self._sensor, self._undo_filter = sensor, undo_filter
+        self._begin_s = float(first.time_s[0])
+        self._inverse = (paper_inverse if paper else signal_chain.inverse)(sensor)
+        self._covariance = force_errors.prepared_covariance(
+            sensor, noise_variance_v2(sensor) if undo_filter else None)
+
+    def blocks(self, recording: Iterable[Recording]) -> Iterator[tuple[Recording, Estimates]]:
+        """Yield each block of the recording with its estimates."""
+        measured = ((block, block.volts(self._sensor)) for block in recording)
+        before_filter = ((pair, pair[1]) for pair in measured) if not self._undo_filter else \
+            undo_filter_blocks(((pair, pair[0].time_s, pair[1]) for pair in measured),
+                               noise.electronics(self._sensor).rc_s, self._sensor.rate_hz)
+        for (block, volts), input_v in before_filter:
+            yield block, self._estimate(volts, input_v, self._environment(block))
+
+    def _environment(self, block: Recording) -> Environment:
+        """Return the surroundings of the samples; nominal where they are not measured."""
+        measured = {name: block.columns[name] for name in ('temperature_c', 'supply_v')
+                    if name in block.columns}
+        return NOMINAL_ENVIRONMENT._replace(time_s=block.time_s - self._begin_s, **{
+            name: np.where(np.isfinite(values), values, getattr(NOMINAL_ENVIRONMENT, name))
+            for name, values in measured.items()})
+
+    def _estimate(self, volts: np.ndarray, input_v: np.ndarray, environment: Environment
+                  ) -> Estimates:
+        """Estimate from volts of the ADC and before the filter; rails determine no quantity."""
+        sensor = self._sensor
+        at_rail = signal_chain.at_a_rail(volts, sensor)
+        with np.errstate(all='ignore'):  # some volts have no solution
+            force = self._inverse(list(input_v.T), environment)
+            covariance, leverage = self._covariance(force, environment)
+            outside = np.isfinite(force[0]) & sensor.envelope.is_outside(
+                environment.temperature_c, force, leverage)
+            covariance[:, :, at_rail] = np.inf
+            angles = tilt(force, covariance, 'z' in sensor.axes)
+        force_mps2 = np.array(force)
+        force_std_mps2 = np.sqrt([covariance[d, d] for d in range(3)])
+        if sensor.axes == 'x':
+            force_mps2[1:] = np.nan
+        force_std_mps2[np.isnan(force_mps2)] = np.inf
+        return Estimates(force_mps2, force_std_mps2, covariance, angles, at_rail, outside, volts)
+
+
+_CELL_MPS2 = 0.5
+"""Width of a cell of the grid of forces, m/s²; chosen: tangent and covariance hardly vary within
+it, so that its samples share them."""
+
+_MAX_CELLS = 4096
+"""Largest number of cells in memory; chosen: the forces of all poses fill about as many."""
+
+_CELL_ENVIRONMENT = Environment(time_s=0.0, temperature_c=0.5, supply_v=0.01)
+"""Change of the surroundings, °C and V, from which the cells are computed again; chosen: the
+tangent hardly varies within it. Time has no limit."""
+
+_MAX_ACCEL_MPS2 = 1e6
+"""Acceleration that no sensor outputs, m/s²; chosen: far beyond any range."""
+
+_TOLERANCE_MPS2 = 1e-8
+"""Largest next step of a converged inverse, m/s²; chosen: far below any noise."""
+
+_MAX_STEPS = 8
+"""Newton steps after which the inverse starts from zero; chosen: one or two suffice usually."""
+
+_MOTION_S = 0.5
+"""Interval of the variance that separates motion from noise, s; chosen: the RC filter leaves some
+24 independent samples in it."""
+
+_PAUSE_S = 1.0
+"""Time without a sample after which the variance begins again, s; chosen: two intervals."""
+
+_NOISE_FACTOR = 2
+"""Multiple of the noise variance that does not count as motion; chosen: the variance of some 24
+samples hardly exceeds it by chance."""
+
+
+class Estimate(NamedTuple):
+    """Estimate from one sample."""
+
+    # Specific force in the frame of the case, or of the robot where there is a mounting, m/s²,
+    # three floats
+    force: Components
+    covariance: tuple[float, ...]  # Covariance of the force: xx, xy, xz, yy, yz, zz, (m/s²)²
+    # roll, pitch, inclination: Angle, rad, and its variance, rad². The variance of an angle that
+    # is not shown exceeds `tilt.UNOBSERVABLE_RAD2`.
+    roll: tuple[float, float]
+    pitch: tuple[float, float]
+    inclination: tuple[float, float]
+    roll_pitch: float  # Covariance of roll and pitch, rad²
+    # Whether the ADC is at a rail; the variances are then those of an unmeasured axis
+    saturated: bool
+    # Texts on how the sample lies outside of the validity range; the variances include it
+    outside: tuple[str, ...]
+
+
+class _Cell(NamedTuple):
+    """What the forces of one cell of the grid share."""
+
+    tangent: signal_chain.Tangent  # Tangent of the inverse at the middle of the cell
+    # Covariance by noise and coefficients: xx, xy, xz, yy, yz, zz, (m/s²)²
+    covariance: tuple[float, ...]
+    outside: tuple[str, ...]  # Texts on how the cell lies outside of the validity range
+
+
+class LiveEstimator:
+    """
+    Estimates specific force, its covariance and tilt of a live stream, sample by sample.
+
+    All calculations are in floats, which are ten times faster than arrays of one sample. The
+    force is that of `signal_chain.inverse` to 1e-8 m/s². Near alpha = ±90°, where |f| = g may
+    have no solution, it differs by a few hundredths of its standard deviation.
+
+    Angles, and the z of equation 5, hold at rest only. Motion adds to their variances: the
+    variance of the in-plane force over half a second, as far as it exceeds twice that of the
+    noise. The larger of the last two half seconds counts. A derived z also gets the noise
+    variance of a measured axis.
+    """
+
+    def __init__(self, sensor: Sensor, paper: bool = False, undo_filter: bool = False,
+                 mounting: Mounting | None = None) -> None:
+        """Prepare for a unit."""
+        self.sensor, self.mounting = sensor, mounting
+        self._paper_inverse = paper_inverse(sensor, FLOATS) if paper else None
+        self._variance_v2 = noise_variance_v2(sensor) if undo_filter \
+            else noise.sample_std_v(sensor) ** 2
+        self._zero_g_v = sensor.nominal_zero_g_v.tolist()
+        self._v_per_mps2 = (sensor.nominal_scale_v_per_g / G0_MPS2).tolist()
+        self._rails_v = 0.0, sensor.adc_vref_v - sensor.lsb_v
+        self._half_lsb_v = sensor.lsb_v / 2
+        self._respond = signal_chain.analog_response(sensor)
+        self._undo_adc = signal_chain.adc_inverse(sensor)
+        self._newton_step = signal_chain.newton_step(
+            sensor.axes, signal_chain.gravity_mps2(sensor), FLOATS)
+        self._invert = signal_chain.inverse(sensor)
+        self._use(sensor.without_temperature_range())
+        self._cells: dict[tuple[int, int, int], _Cell] = {}
+        noise_mps2 = np.sqrt(self._variance_v2) / sensor.scale_v_per_g * G0_MPS2
+        self._noise_variance = (noise_mps2[:2] ** 2).tolist()
+        self._derives_z = sensor.axes == 'xy'
+        # The last force, and the volts at the ADC's input that respond to it.
+        self._force: Components = [0.0, 0.0, 0.0]
+        self._environment = self._cells_environment = NOMINAL_ENVIRONMENT
+        self._last_volts = self._respond(self._force)
+        self._time_s = float('-inf')
+
+    def volts(self, accel_mps2: Sequence[float]) -> Components:
+        """Undo the nominal conversion; an empty list if a value exceeds that of any sensor."""
+        volts = [zero + a * scale for zero, a, scale in
+                 zip(self._zero_g_v, accel_mps2, self._v_per_mps2) if abs(a) < _MAX_ACCEL_MPS2]
+        return volts if len(volts) == len(self._v_per_mps2) else []
+
+    def __call__(self, volts: Components, time_s: float) -> Estimate | None:
+        """Estimate from the volts of one sample, V; None where no force explains it."""
+        force = self._inverse(volts)
+        if force is None:
+            return None
+        saturated = any(abs(v - rail) < self._half_lsb_v for v in volts for rail in self._rails_v)
+        unknown = UNMEASURED_VARIANCE if saturated else 0.0
+        motion = self._motion_variance(force, time_s) + unknown
+        cell = self._cell(force)
+        covariance = self._covariance(force, cell, unknown, motion)
+        # The angles are those of gravity, so that motion adds to the variance of each axis.
+        moved: tuple[float, ...] = (
+            covariance[0] + motion, covariance[1], covariance[2], covariance[3] + motion,
+            covariance[4], covariance[5] if self._derives_z else covariance[5] + motion)
+        if self.mounting is not None:
+            force, covariance, moved = (
+                self.mounting.rotate(force), self.mounting.rotate_covariance(covariance),
+                self.mounting.rotate_covariance(moved))
+        roll, pitch, inclination, _ = angles(force, moved, FLOATS)
+        return Estimate(force, covariance, roll, pitch, inclination,
+                        roll_pitch_covariance(force, moved, FLOATS), saturated, cell.outside)
+
+    def set_environment(self, temperature_c: float | None = None, supply_v: float | None = None
+                        ) -> None:
+        """Set the surroundings of the samples that follow."""
+        if temperature_c is not None:
+            if not self._knows_temperature:
+                self._use(self.sensor)
+                self._cells.clear()
+            self._environment = self._environment._replace(temperature_c=temperature_c)
+        if supply_v is not None:
+            self._environment = self._environment._replace(supply_v=supply_v)
+        if any(abs(now - then) > limit for now, then, limit in zip(
+                self._environment[1:], self._cells_environment[1:], _CELL_ENVIRONMENT[1:])):
+            self._cells.clear()
+            self._cells_environment = self._environment
+        self._last_volts = self._respond(self._force, self._environment)
+
+    def _use(self, sensor: Sensor) -> None:
+        """Take covariance and validity range from the unit, with or without temperature range."""
+        self._measured_covariance = force_errors.measured_covariance(sensor, self._variance_v2)
+        self._envelope = sensor.envelope
+        self._knows_temperature = sensor is self.sensor
+
+    def _inverse(self, volts: Components) -> Components | None:
+        """Invert the chain, beginning at the force of the last sample; None without a solution."""
+        if self._paper_inverse:
+            self._force = self._paper_inverse(volts, self._environment)
+            return self._force if abs(sum(self._force)) < float('inf') else None
+        tangent = self._cell(self._force).tangent
+        force, change = self._force, 0.0
+        response, input_v = self._last_volts, self._undo_adc(volts)
+        for _ in range(_MAX_STEPS):
+            previous, previous_change = force, change
+            force = self._newton_step([v - r for v, r in zip(input_v, response)], previous,
+                                      tangent, self.sensor.z_sign)
+            change = max(abs(f - p) for f, p in zip(force, previous))
+            # Steps shrink by the same factor or faster, which bounds the next one.
+            if change * change <= _TOLERANCE_MPS2 * previous_change:
+                break
+            response = self._respond(force, self._environment)
+        else:
+            force = self._invert(volts, self._environment)
+        if not abs(force[0]) + abs(force[1]) + abs(force[2]) < float('inf'):
+            return None
+        self._force, self._last_volts = force, input_v
+        return force
+
+    def _motion_variance(self, force: Components, time_s: float) -> float:
+        """Return the variance of the recent in-plane force beyond its noise, (m/s²)²."""
+        if not 0 <= time_s - self._time_s < _PAUSE_S:
+            self._previous_excess = 0.0
+            self._begin_interval(time_s)
+        elif time_s - self._begin_s > _MOTION_S:
+            self._previous_excess = self._excess()
+            self._begin_interval(time_s)
+        self._time_s = time_s
+        self._count += 1
+        # Welford's recurrence of mean and sum of squares.
+        for d, value in enumerate(force[:len(self._noise_variance)]):
+            deviation = value - self._mean[d]
+            self._mean[d] += deviation / self._count
+            self._squares[d] += deviation * (value - self._mean[d])
+        return max(self._excess(), self._previous_excess)
+
+    def _begin_interval(self, time_s: float) -> None:
+        self._begin_s, self._count = time_s, 0
+        self._mean, self._squares = [0.0, 0.0], [0.0, 0.0]
+
+    def _excess(self) -> float:
+        """Return the variance of this interval beyond a multiple of that of the noise, (m/s²)²."""
+        return max(0.0, *(squares / self._count - _NOISE_FACTOR * variance
+                          for squares, variance in zip(self._squares, self._noise_variance)))
+
+    def _covariance(self, force: Components, cell: _Cell, unknown: float, motion: float
+                    ) -> tuple[float, ...]:
+        """
+        Return the covariance of a force: xx, xy, xz, yy, yz, zz, (m/s²)².
+
+        Each axis gets the variance `unknown`; a derived z also gets that of noise and motion.
+        """
+        if not self._derives_z:
+            xx, xy, xz, yy, yz, zz = cell.covariance
+            return xx + unknown, xy, xz, yy + unknown, yz, zz + unknown
+        xx, xy, _, yy, _, _ = cell.covariance
+        xx, xy, xz, yy, yz, zz = force_errors.derived_z_covariance(
+            force, (xx, xy, yy), cell.tangent.slope, FLOATS)
+        return xx + unknown, xy, xz, yy + unknown, yz, zz + self._noise_variance[0] + motion
+
+    def _cell(self, force: Components) -> _Cell:
+        key = (round(force[0] / _CELL_MPS2), round(force[1] / _CELL_MPS2),
+               round(force[2] / _CELL_MPS2))
+        cell = self._cells.get(key)
+        if cell is None:
+            if len(self._cells) >= _MAX_CELLS:
+                self._cells.clear()
+            middle = [float(k * _CELL_MPS2) for k in key]
+            measured, tangent, leverage = self._measured_covariance(middle, self._environment)
+            outside = self._envelope.describe_outside(self._environment.temperature_c, middle,
+                                                      float(leverage[0]))
+            covariance = np.diag([0.0, UNMEASURED_VARIANCE, UNMEASURED_VARIANCE])
+            axes = [AXES.index(axis) for axis in self.sensor.axes]
+            covariance[np.ix_(axes, axes)] = measured[:, :, 0]
+            cell = self._cells[key] = _Cell(
+                tangent, tuple(covariance[np.triu_indices(3)].tolist()), outside)
+        return cell
