@@ -151,16 +151,12 @@ def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: s
         **({'converged': _yes_or_no(full.converged)} if full else {}),
         **acceptance.provenance_entries(assessment, errors)})
     explanation = acceptance.explanation(assessment, fitted) if assessment else []
-    unit_lines = acceptance.unit_line(fitted)
     return CalibrationResult(
         nominal=sensor, fitted=fitted, poses=poses, assessments=assessments,
         held_out=errors, outliers=outliers, warnings=(*fit.warnings, *refusals),
-        report_lines=[*refusals, *held_out.table(errors),
-                      *acceptance.table(assessments, errors), *explanation, *unit_lines,
-                      *fit_lines],
-        summary_lines=[*acceptance.headline(assessment, errors), *unit_lines,
-                       *acceptance.narrow_table(assessments, errors), *explanation,
-                       *fit_lines, *refusals])
+        report_lines=[*acceptance.headline(assessment, errors), *acceptance.unit_line(fitted),
+                      *acceptance.error_table(errors, assessments), *explanation, *fit_lines,
+                      *refusals])
 
 
 def _with_population(fit: _StageFit, population: Population) -> _StageFit:
@@ -319,15 +315,16 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, d
                      population: Population | None) -> CalibrationResult:
     fit = gravity_fit.fit_gravity(poses.volts, poses.std_v, sensor)
     kept = np.setdiff1d(np.arange(len(poses)), fit.outliers)
-    before, after, unseen = (rms_mg(np.mean(values[kept] ** 2)) for values in (
-        fit.before_mps2, fit.residual_mps2, fit.held_out_mps2))
+    after, unseen = (rms_mg(np.mean(values[kept] ** 2))
+                     for values in (fit.residual_mps2, fit.held_out_mps2))
     fitted = replace(
         sensor, model='gravity', effects=('bias', 'scale_factor', 'misalignment'),
         values=fit.values, covariance=fit.covariance, covariance_names=gravity_fit.NAMES)
-    prior_lines: list[str] = []
+    warnings = [] if fit.converged else [term_selection.NOT_CONVERGED]
     if population is not None:
         combined = posterior(fitted, population)
-        fitted, prior_lines = combined.sensor, [f'prior: {combined.line}']
+        fitted = combined.sensor
+        warnings.append(f'prior: {combined.line}')
     force = np.column_stack(signal_chain.inverse(fitted)(list(poses.volts.T), poses.environment))
     budgets = acceptance.gravity_error_budgets(fit, fitted, force, kept)
     assessment = acceptance.assess('gravity', budgets, fitted)
@@ -337,19 +334,13 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, d
         'reference': 'gravity', **({'prior': population.name} if population else {}),
         'residual_mg': f'{after:.4f}', 'held_out_mg': f'{unseen:.4f}', 'span_s': f'{span_s:.1f}',
         'converged': _yes_or_no(fit.converged), **acceptance.provenance_entries(assessment, ())})
-    fit_lines = [] if fit.converged else [term_selection.NOT_CONVERGED]
-    if fit.outliers:
-        rests = ', '.join(f'{i + 1} (from {poses.time_s[i, 0]:.1f} s)' for i in fit.outliers)
-        fit_lines.append(f'outliers, left out: rest {rests}')
-    lines = [f'magnitude of gravity over {len(kept)} rests, rms in mg: nominal {before:.2f}, '
-             f'nine parameters {after:.3f}, held out {unseen:.3f}',
-             *fit_lines, acceptance.gravity_line(assessment, fit.held_out_mps2[kept]),
+    lines = [*acceptance.headline(assessment, ()),
+             *acceptance.gravity_lines(fit, poses.time_s[:, 0]),
              *acceptance.explanation(assessment, fitted), *acceptance.unit_line(fitted),
-             *prior_lines]
+             *warnings]
     return CalibrationResult(
         nominal=sensor, fitted=fitted, poses=poses, assessments=(assessment,), gravity_fit=fit,
-        warnings=(*fit_lines, *prior_lines), report_lines=lines,
-        summary_lines=[*acceptance.headline(assessment, ()), *lines])
+        warnings=warnings, report_lines=lines)
 
 
 def _yes_or_no(condition: bool) -> str:
@@ -423,8 +414,7 @@ def calibrate_thermal(base: Sensor, poses: Poses, source: str, data_sha256: str 
         f'zero-g stays as calibrated at {calibrated_c:.1f} °C']
     if not has_scale:
         lines.append('scale factor over temperature: not fitted, it needs a second orientation')
-    return CalibrationResult(nominal=base, fitted=fitted, poses=poses, report_lines=lines,
-                             summary_lines=lines)
+    return CalibrationResult(nominal=base, fitted=fitted, poses=poses, report_lines=lines)
 
 
 def _slope_lines(fitted: Sensor, fit: thermal_fit.ThermalFit) -> list[str]:

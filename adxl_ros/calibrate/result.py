@@ -8,7 +8,7 @@ The result of a calibration: the fitted unit with its provenance, validity range
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from datetime import datetime, timezone
 import hashlib
@@ -46,9 +46,8 @@ class CalibrationResult:
     # nominal, fitted: The unit before and after the fit
     nominal: Sensor
     fitted: Sensor
-    report_lines: list[str]  # Errors, acceptance and fit as text: the head of the parameter file
-    # The same for a terminal of 80 columns, the most important lines first
-    summary_lines: list[str]
+    # Errors, acceptance and fit as text, the most important lines first
+    report_lines: Sequence[str]
     poses: Poses  # k poses, check poses among them
     # Acceptance of each model; the last one is that of `fitted`
     assessments: tuple[Assessment, ...] = ()
@@ -57,7 +56,7 @@ class CalibrationResult:
     gravity_fit: GravityFit | None = None  # The fit of a calibration against gravity
     outliers: tuple[int, ...] = ()  # Indices of the outliers, which the fit leaves out
     # What is wrong with the poses or the fit, and why no richer model was fitted
-    warnings: tuple[str, ...] = ()
+    warnings: Sequence[str] = ()
 
     def comments(self) -> list[str]:
         """Return coefficients and assessment as text: the head of the parameter file."""

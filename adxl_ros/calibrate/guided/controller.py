@@ -451,7 +451,7 @@ class Controller:
             return False
         for line in result.comments():
             self._outputs.log(Severity.INFO, line)
-        self.outcome = tuple(result.summary_lines)
+        self.outcome = tuple(result.report_lines)
         self._outputs.log(Severity.INFO, self.outcome[0])
         open_poses = session.guide.open_poses
         advice = f'; {open_poses} poses are open: start again to go on' if open_poses else ''

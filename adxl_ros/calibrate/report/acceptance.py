@@ -142,20 +142,6 @@ def nonlinearity_mps2(sensor: Sensor) -> float:
     return typical * sensor.range_g ** 3 * G0_MPS2
 
 
-def table(assessments: Sequence[Assessment], models: Sequence[HeldOutErrors]) -> list[str]:
-    """Return errors and outcomes of all models as lines for a terminal."""
-    lines = [f'{"model":9} {"tilt rms (90 %) deg":>23} {"accel rms (90 %) mg":>23}  '
-             f'{"error mg":>8}  {"datasheet":9} {"noise":9} limited by']
-    errors_of = {errors.model: errors for errors in models}
-    for row in assessments:
-        errors = errors_of[row.model]
-        lines.append(
-            f'{row.model:9} {_with_interval(errors.tilt_deg)} {_with_interval(errors.accel_mg)}  '
-            f'{row.error_mg:8.3f}  {row.accel_datasheet or "-":9} {row.accel_noise:9} '
-            f'{row.limited_by}')
-    return lines
-
-
 def explanation(assessment: Assessment, sensor: Sensor) -> list[str]:
     """State the limits, and the parts of the error of the saved model."""
     accel = assessment.accel
@@ -189,24 +175,7 @@ def explanation(assessment: Assessment, sensor: Sensor) -> list[str]:
     return lines
 
 
-def limit_table(assessment: Assessment, sensor: Sensor) -> list[str]:
-    """Lay out the error of the calibration below its limits, with one outcome for each figure."""
-    rows = [('calibration error', 1e3 * assessment.accel.calibration ** 0.5 / G0_MPS2,
-             assessment.error_deg, '', '')]
-    for name, limit_mps2, accel, tilt in (
-            ('limit by the datasheet', nonlinearity_mps2(sensor), assessment.accel_datasheet,
-             assessment.tilt_datasheet),
-            ('noise of one sample', held_out.sample_noise_mps2(sensor), assessment.accel_noise,
-             assessment.tilt_noise)):
-        if accel:
-            rows.append((name, 1e3 * limit_mps2 / G0_MPS2, _tilt_deg(assessment, limit_mps2),
-                         accel, tilt))
-    return [f' {name:24} {"-" if np.isnan(value_deg) else two_digits(value_deg):>7} ° {tilt:9} '
-            f'{two_digits(value_mg):>8} mg {accel}'.rstrip()
-            for name, value_mg, value_deg, accel, tilt in rows]
-
-
-def two_digits(value: float) -> str:
+def _two_digits(value: float) -> str:
     """Write a value with two digits, the last zero too."""
     return f'{value:.0f}' if value >= 10 else f'{value:#.2g}'
 
@@ -254,9 +223,9 @@ def headline(assessment: Assessment | None, models: Sequence[HeldOutErrors]) -> 
     return lines
 
 
-def narrow_table(assessments: Sequence[Assessment], models: Sequence[HeldOutErrors]
-                 ) -> list[str]:
-    """Return errors and outcomes of all models in at most 79 columns, the simplest model first."""
+def error_table(models: Sequence[HeldOutErrors], assessments: Sequence[Assessment] = ()
+                ) -> list[str]:
+    """Return errors and outcomes by model in at most 79 columns; the last model is in the file."""
     if not models:
         return []
     row_of, limits = {row.model: row for row in assessments}, f'{"datasheet":9} {"noise":9}'
@@ -276,19 +245,24 @@ def _cell(statistic: held_out.ErrorStatistic, datasheet: str, noise: str) -> str
     return f'{cell:>14} {datasheet:9} {noise:9}'
 
 
-def gravity_line(assessment: Assessment, held_out_mps2: np.ndarray) -> str:
+def gravity_lines(fit: GravityFit, time_s: np.ndarray) -> list[str]:
     """
-    State errors and outcomes of a calibration against gravity in one line.
+    State the errors of a calibration against gravity, before and after, and its outliers.
 
-    held_out_mps2: error of the magnitude of gravity at each rest by the fit to the other stretches
-    of time, m/s², (k,).
+    time_s: beginning of each rest, s, (k,).
     """
-    mg = held_out_mps2 / G0_MPS2 * 1e3
-    low, high = held_out.rms_interval(mg)
-    return (f'held-out stretches of time: {np.sqrt(np.mean(mg ** 2)):.3f} ({low:.3f} to '
-            f'{high:.3f}) mg rms, '
-            f'{np.abs(mg).max():.3f} max; datasheet {assessment.accel_datasheet or "-"}, noise '
-            f'{assessment.accel_noise}; limited by the {assessment.limited_by}')
+    kept = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
+    before, after, unseen = (rms_mg(np.mean(values[kept] ** 2)) for values in (
+        fit.before_mps2, fit.residual_mps2, fit.held_out_mps2))
+    held_out_mg = fit.held_out_mps2[kept] / G0_MPS2 * 1e3
+    low, high = held_out.rms_interval(held_out_mg)
+    lines = [f'magnitude of gravity over {len(kept)} rests, rms in mg: nominal {before:.2f}, '
+             f'nine parameters {after:.3f}, held-out stretches of time {unseen:.3f} ({low:.3f} '
+             f'to {high:.3f}), {np.abs(held_out_mg).max():.3f} max']
+    if fit.outliers:
+        rests = ', '.join(f'{i + 1} (from {time_s[i]:.1f} s)' for i in fit.outliers)
+        lines.append(f'outliers, left out: rest {rests}')
+    return lines
 
 
 def provenance_entries(assessment: Assessment | None, models: Sequence[HeldOutErrors]
@@ -314,35 +288,6 @@ def provenance_entries(assessment: Assessment | None, models: Sequence[HeldOutEr
             'limited_by': assessment.limited_by}
 
 
-def _with_interval(statistic: held_out.ErrorStatistic) -> str:
-    if np.isnan(statistic.rms):
-        return f'{"-":>23}'
-    low, high = statistic.interval
-    return f'{f"{statistic.rms:.3f} ({low:.3f} to {high:.3f})":>23}'
-
-
-_MODELS = {'nominal': 'datasheet values', 'linear': 'linear calibration',
-           'physical': 'physical calibration', 'full': 'full calibration'}
-"""Models in words."""
-
-
-def error_table(models: Sequence[HeldOutErrors]) -> list[str]:
-    """Lay out the errors of the models on held-out poses; the file holds the last model."""
-    lines = [f' {"":24}tilt error     acceleration error     (rms)']
-    lines += [f' {_MODELS[errors.model]:22} {_three_digits(errors.tilt_deg.rms):>9} ° '
-              f'{_three_digits(errors.accel_mg.rms):>18} mg' for errors in models]
-    lines[-1] += '           <- saved'
-    return lines
-
-
-def _three_digits(value: float) -> str:
-    """Write a value so that the decimal points of a right-aligned column stand in one line."""
-    if np.isnan(value):
-        return '-   '
-    decimals = 1 if value >= 10 else 2 if value >= 1 else 3
-    return f'{value:.{decimals}f}'.ljust(len(f'{value:.3f}'))
-
-
 def acceptance_lines(fitted: Sensor) -> list[str]:
     """
     Return whether the calibration error is within its limit, as lines.
@@ -360,10 +305,10 @@ def acceptance_lines(fitted: Sensor) -> list[str]:
     if not limit_mps2:
         limit_mps2, kind = held_out.sample_noise_mps2(fitted), 'noise'
         allows = 'the noise of one sample is'
-    limit = f'{two_digits(1e3 * limit_mps2 / G0_MPS2)} mg'
+    limit = f'{_two_digits(1e3 * limit_mps2 / G0_MPS2)} mg'
     accel = provenance.get(f'verdict_{kind}', '')
     tilt = provenance.get(f'verdict_tilt_{kind}', '')
-    result = f'calibration error {two_digits(error_mg)} mg; {allows} {limit}'
+    result = f'calibration error {_two_digits(error_mg)} mg; {allows} {limit}'
     if FAIL in (accel, tilt):
         if accel != FAIL:
             tilt_deg = float(provenance['own_tilt_deg'])
@@ -379,19 +324,3 @@ def acceptance_lines(fitted: Sensor) -> list[str]:
                 '            The check poses are too few to show that the error is within it.',
                 *span]
     return [f' {PASS}  {result}', *span]
-
-
-def gravity_lines(fit: GravityFit) -> list[str]:
-    """Lay out the errors of a calibration against gravity, before and after."""
-    used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
-    before, after, held_out = (
-        _three_digits(1e3 * float(np.sqrt(np.mean(values[used] ** 2))) / G0_MPS2)
-        for values in (fit.before_mps2, fit.residual_mps2, fit.held_out_mps2))
-    lines = [f' error of the magnitude of gravity, rms over {len(used)} rests',
-             f' {"datasheet values":22} {before:>9} mg',
-             f' {"gravity calibration":22} {after:>9} mg    <- saved',
-             f' {"a fifth of time held out":22}{held_out:>8} mg']
-    if fit.outliers:
-        count = len(fit.outliers)
-        lines.append(f' {count} {"outlier was" if count == 1 else "outliers were"} left out')
-    return lines
