@@ -221,7 +221,6 @@ class Controller:
         self._samples, self._outputs, self._log = samples, outputs, _Log(outputs)
         self._starts_over: bool | None = None
         self._fit_fault = ''
-        self._misdated: set[str] = set()
         self._accepted = 0
 
     def start(self, start_over: bool | None = None) -> Answer:
@@ -314,19 +313,10 @@ class Controller:
 
     def read_quantity(self, quantity: str, stamp_ns: int, value: float) -> None:
         """Take a temperature or a supply; a stamp of another clock gives way to the newest one."""
-        if self.session is None:
-            return
-        newest_ns = self.session.guide.newest_ns or 0
-        ahead_ns = stamp_ns - newest_ns
-        if stamp_ns and newest_ns and abs(ahead_ns) > STALE_NS:
-            if quantity not in self._misdated:
-                self._misdated.add(quantity)
-                side = 'ahead of' if ahead_ns > 0 else 'behind'
-                self._outputs.log(
-                    Severity.WARNING, f'{quantity} is stamped {abs(ahead_ns) * 1e-9:.0f} s {side} '
-                    'imu/data_raw: its time of arrival counts; put both on one clock')
-            stamp_ns = 0
-        self.session.guide.readings[quantity].add(stamp_ns or newest_ns, value)
+        if self.session is not None:
+            newest_ns = self.session.guide.newest_ns or stamp_ns
+            is_near = abs(stamp_ns - newest_ns) <= STALE_NS
+            self.session.guide.readings[quantity].add(stamp_ns if is_near else newest_ns, value)
 
     def poll(self) -> None:
         """Take the samples and poses since the last call; announce the next pose or fit."""
