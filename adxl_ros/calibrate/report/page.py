@@ -81,8 +81,9 @@ def _paper_sensor(result: CalibrationResult) -> Sensor:
 def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
     """Lay out the page."""
     fitted = result.fitted
-    assessment = next((row for row in result.assessments if row.model == fitted.model), None)
-    errors = next((row for row in result.held_out if row.model == fitted.model), None)
+    errors_of = {errors.model: errors for errors in result.held_out}
+    row_of = {row.model: row for row in result.assessments}
+    errors, assessment = errors_of.get(fitted.model), row_of.get(fitted.model)
     history, rows = DriftHistory.from_store(fitted, past), _coefficients(fitted)
     drawn: dict[str, Figure] = {}
     if result.gravity_fit is not None:
@@ -109,9 +110,12 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
         'coefficients': rows,
         'beyond': [row for row in rows if row['outcome'] == _BEYOND],
         'datasheet': fitted.datasheet_name,
-        'limit_head': _limit_head(fitted),
-        'limits': _limits(result),
-        'budget': _budget(assessment.accel) if assessment and errors else None,
+        'models': list(errors_of or row_of), 'errors_of': errors_of, 'row_of': row_of,
+        'poses': len(result.poses), 'digits': _digits, 'mg': held_out.rms_mg,
+        'datasheet_mg': 1e3 * acceptance.nonlinearity_mps2(fitted) / G0_MPS2,
+        'noise_mg': 1e3 * held_out.sample_noise_mps2(fitted) / G0_MPS2,
+        'budget': assessment.accel if assessment and errors else None,
+        'part_colours': _PART_COLOURS,
         'history': history.table() if history.sensors else None,
         'changes': history.changes() if history.sensors else [],
         'paper_model': paper_model,
@@ -162,47 +166,6 @@ def _digits(value: float) -> str:
     """Write a positive value with three digits at most, without an exponent."""
     decimals = 1 if value >= 10 else 2 if value >= 1 else 3
     return f'{value:.{decimals}f}' if value >= 5e-4 else '< 0.001'
-
-
-def _limit_head(fitted: Sensor) -> list[str]:
-    """Return the head of the table of limits."""
-    datasheet_mps2 = acceptance.nonlinearity_mps2(fitted)
-    datasheet = f'datasheet ({1e3 * datasheet_mps2 / G0_MPS2:.2g} mg)' if datasheet_mps2 \
-        else 'datasheet'
-    noise = f'noise ({1e3 * held_out.sample_noise_mps2(fitted) / G0_MPS2:.2g} mg)'
-    return ['model', 'poses', 'tilt error, °', 'alpha, °', 'beta, °', 'acceleration error, mg',
-            'calibration error, mg', f'acceleration, {datasheet}', f'acceleration, {noise}',
-            'tilt, datasheet', 'tilt, noise', 'limited by']
-
-
-def _limits(result: CalibrationResult) -> list[list[str]]:
-    """Return the errors of each model, and one outcome for each limit."""
-    errors_of = {errors.model: errors for errors in result.held_out}
-    row_of, rows = {row.model: row for row in result.assessments}, []
-    for model in errors_of or row_of:
-        errors, row = errors_of.get(model), row_of.get(model)
-        statistics = [getattr(errors, name, None) for name in (
-            'tilt_deg', 'alpha_deg', 'beta_deg', 'accel_mg')]
-        rows.append([
-            model, str(errors.pose_count if errors else len(result.poses)),
-            *('-' if s is None or np.isnan(s.rms) else
-              f'{_digits(s.rms)} (max {_digits(s.largest)})' for s in statistics),
-            *(['-'] * 6 if row is None else [
-                _digits(row.error_mg), row.accel_datasheet or '-', row.accel_noise or '-',
-                row.tilt_datasheet or '-', row.tilt_noise or '-', row.limited_by])])
-    return rows
-
-
-def _budget(budget: held_out.ErrorBudget) -> dict[str, Any]:
-    """Return the parts of the acceleration error as parts of a bar, and in words."""
-    squares = {name: float(getattr(budget, name)) for name in _PART_COLOURS}
-    total = max(sum(squares.values()), 1e-30)
-    return {'expected': f'{_digits(held_out.rms_mg(budget.expected))} mg',
-            'measured': f'{_digits(held_out.rms_mg(budget.measured))} mg',
-            'separable': budget.separable,
-            'parts': [{'name': name, 'text': f'{_digits(held_out.rms_mg(square))} mg',
-                       'percent': round(100 * square / total, 2), 'colour': _PART_COLOURS[name]}
-                      for name, square in squares.items()]}
 
 
 def _sphere(result: CalibrationResult) -> dict[str, Any]:
@@ -270,8 +233,7 @@ def _coefficients(fitted: Sensor) -> list[dict[str, Any]]:
 def _paper_figures(result: CalibrationResult) -> tuple[list[str], str, str]:
     """Return the figures of the paper as URLs, else why there are none, and their model."""
     if result.gravity_fit is not None:
-        drawn = plots.gravity_rests(result.name, result.gravity_fit)
-        return [html_page.picture_url(drawn)], '', ''
+        return [], '', ''
     pictures = [plots.held_out(result.held_out, result.poses.subset(result.inliers))] \
         if result.held_out else []
     fault, model = '', 'physical'
