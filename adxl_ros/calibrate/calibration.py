@@ -29,11 +29,6 @@ STAGE_FITS = {'linear': linear.fit, 'physical': linear.fit_physical, 'full': ter
 """Models that are fitted against the stage, simplest first."""
 _LISTED_RESTS = 5
 """Largest number of rests that a line lists (chosen: fits into a line)."""
-_RIDGE = 1e-3
-"""Weight of a change of 0, relative to a rest, for a direction that no rest of a recording has.
-Chosen: small beside one rest."""
-_NEGLIGIBLE_MG = 0.01
-"""Scatter below which only this limit is shown, mg. Chosen: no sensor repeats that well."""
 
 
 @dataclass(frozen=True)
@@ -136,9 +131,8 @@ def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: s
         sensor, poses.subset(~np.isin(np.arange(len(poses)), outliers)), fit)
     assessment = next((row for row in assessments if row.model == fitted.model), None)
     force = np.column_stack(reference_force(poses, fitted.local_gravity_mps2))
-    predicted = np.column_stack(signal_chain.static_response(fitted)(
-        list(force.T), poses.environment))
-    residual_mg = ((poses.volts - predicted) / fitted.scale_v_per_g * 1e3)[fitting]
+    residual_mg = ((poses.volts - predicted_volts(fitted, poses)) / fitted.scale_v_per_g
+                   * 1e3)[fitting]
     if fitted.model == 'full':
         fitted, filter_lines = with_filter(
             fitted, [recording.filters for recording in recordings if recording.filters])
@@ -348,33 +342,16 @@ def _yes_or_no(condition: bool) -> str:
 
 
 def _turn_on_lines(fitted: Sensor, recordings: Sequence[Poses]) -> list[str]:
-    """Report the scatter of the zero-g over recordings of one unit."""
-    if len(recordings) < 2:
+    """Report the scatter of the zero-g over recordings of one unit on the stage."""
+    on_stage = [poses.subset(poses.has_angles) for poses in recordings if poses.has_angles.any()]
+    if len(on_stage) < 2:
         return []
-    changes_mg = np.array([_zero_g_change_mg(fitted, poses) for poses in recordings])
-    texts = [f'{value:.2g}' if value > _NEGLIGIBLE_MG else f'< {_NEGLIGIBLE_MG:g}'
-             for value in np.std(changes_mg, axis=0, ddof=1)]
-    by_axis = ', '.join(f'{axis} {text}' for axis, text in zip(fitted.axes, texts))
+    changes_mg = [1e3 * np.mean((poses.volts - predicted_volts(fitted, poses))
+                                / fitted.scale_v_per_g, axis=0) for poses in on_stage]
+    by_axis = ', '.join(f'{axis} {value:.2g}' for axis, value in zip(
+        fitted.axes, np.std(changes_mg, axis=0, ddof=1)))
     return [f'turn-on to turn-on: the zero-g scatters by {by_axis} mg (standard deviation over '
-            f'{len(recordings)} recordings)']
-
-
-def _zero_g_change_mg(fitted: Sensor, poses: Poses) -> np.ndarray:
-    """Return the zero-g of a recording minus that of the fit by axis, mg, (m,)."""
-    if poses.has_angles.any():
-        poses = poses.subset(poses.has_angles)
-        force = list(reference_force(poses, fitted.local_gravity_mps2))
-        predicted = signal_chain.static_response(fitted)(force, poses.environment)
-        residual_v = poses.volts - np.column_stack(predicted)
-        return np.asarray(1e3 * np.mean(residual_v / fitted.scale_v_per_g, axis=0))
-    # Against gravity a change shows along the direction of each rest only.
-    force_mps2 = np.column_stack(signal_chain.inverse(fitted)(
-        list(poses.volts.T), poses.environment))
-    magnitude_mps2 = np.linalg.norm(force_mps2, axis=1)
-    direction = force_mps2 / magnitude_mps2[:, None]
-    excess_mg = 1e3 * (magnitude_mps2 / fitted.local_gravity_mps2 - 1)
-    normal = direction.T @ direction + _RIDGE * np.eye(direction.shape[1])
-    return np.asarray(np.linalg.solve(normal, direction.T @ excess_mg))
+            f'{len(on_stage)} recordings)']
 
 
 _RIVAL_SHARE = 0.5

@@ -231,16 +231,14 @@ class HandGuide(HandRests):
                 int(np.argmax(gravity_model.UP @ up)))) + ' now'
         return Progress(
             number=self.pose_number, destination=self.destination(), position=position,
-            accepted=len(self.accepted), total=ENOUGH_RESTS, skipped=0,
-            open_poses=self.open_poses, remaining_s=None, dwelt_s=None, dwell_s=None)
+            accepted=len(self.accepted), total=ENOUGH_RESTS)
 
     def estimate_contents(self) -> Estimate:
         """Return what the rests determine so far, for the screen."""
         return Estimate(
             coverage=pose_plan.by_orientation(self.covered),
             covered_faces=pose_plan.faces(self.covered), coefficients=self.rows,
-            tilt_error_deg=running_estimate.degrees_or_none(self.tilt_error_rad()),
-            final_tilt_error_deg=None)
+            tilt_error_deg=running_estimate.degrees_or_none(self.tilt_error_rad()))
 
     def tilt_error_rad(self) -> float:
         """Return the expected rms error of alpha and beta by the rests so far, rad."""

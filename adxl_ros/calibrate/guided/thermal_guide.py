@@ -141,8 +141,7 @@ class ThermalGuide(Guide):
         done = int(self._passed.warming.sum() + self._passed.cooling.sum())
         return screen_contents.Progress(
             number=self.pose_number, destination=self.destination(), position=position,
-            accepted=done, total=2 * PARTS, skipped=0, open_poses=self.open_poses,
-            remaining_s=None, dwelt_s=None, dwell_s=None)
+            accepted=done, total=2 * PARTS)
 
     def estimate_contents(self) -> screen_contents.Estimate:
         """Return what the blocks determine so far, for the screen."""
@@ -158,8 +157,7 @@ class ThermalGuide(Guide):
         return screen_contents.Estimate(
             coverage=(Coverage('warming', int(self._passed.warming.sum()), PARTS),
                       Coverage('cooling', int(self._passed.cooling.sum()), PARTS)),
-            covered_faces='', coefficients=rows, tilt_error_deg=None, final_tilt_error_deg=None,
-            range_error=error)
+            coefficients=rows, range_error=error)
 
     def tilt_error_rad(self) -> float:
         """Return NaN: blocks in one orientation do not determine the tilt."""

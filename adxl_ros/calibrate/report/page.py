@@ -117,7 +117,7 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
         'budget': assessment.accel if assessment and errors else None,
         'part_colours': _PART_COLOURS,
         'history': history.table() if history.sensors else None,
-        'changes': history.changes() if history.sensors else [],
+        'changes': history.changes() if history.sensors else '',
         'paper_model': paper_model,
         'pictures': pictures, 'pictures_fault': fault,
         'report_lines': result.report_lines,
