@@ -27,8 +27,6 @@ import numpy as np
 
 STAGE_FITS = {'linear': linear.fit, 'physical': linear.fit_physical, 'full': term_selection.fit}
 """Models that are fitted against the stage, simplest first."""
-_LISTED_RESTS = 5
-"""Largest number of rests that a line lists (chosen: fits into a line)."""
 
 
 @dataclass(frozen=True)
@@ -87,9 +85,8 @@ def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | 
                                 effects, source, data_sha256, population)
         starts_s = poses.time_s[~poses.has_angles, 0]
         if len(starts_s):
-            listed = ', '.join(f'{start_s:.1f}' for start_s in starts_s[:_LISTED_RESTS])
-            further = ' ...' * (len(starts_s) > _LISTED_RESTS)
-            lines = [f'rests without angles, left out: {len(starts_s)} (from {listed}{further} s)']
+            lines = [f'rests without angles, left out: {len(starts_s)} (the first one from '
+                     f'{starts_s[0]:.1f} s)']
     elif model not in (None, 'full'):
         raise UserError(f'{source}: the {model} model is fitted against stage angles (alpha_rad '
                         'and beta_rad), which are missing; leave --model out to calibrate a '
@@ -142,7 +139,7 @@ def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: s
     fitted = with_provenance(fitted, source, poses, data_sha256, {
         'reference': 'stage', **({'prior': population.name} if population else {}),
         'residual_mg': f'{np.sqrt(np.mean(residual_mg ** 2)):.4f}',
-        **({'converged': _yes_or_no(full.converged)} if full else {}),
+        **({'converged': 'yes' if full.converged else 'no'} if full else {}),
         **acceptance.provenance_entries(assessment, errors)})
     explanation = acceptance.explanation(assessment, fitted) if assessment else []
     return CalibrationResult(
@@ -327,7 +324,7 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, d
     fitted = with_provenance(fitted, source, poses, data_sha256, {
         'reference': 'gravity', **({'prior': population.name} if population else {}),
         'residual_mg': f'{after:.4f}', 'held_out_mg': f'{unseen:.4f}', 'span_s': f'{span_s:.1f}',
-        'converged': _yes_or_no(fit.converged), **acceptance.provenance_entries(assessment, ())})
+        'converged': 'yes' if fit.converged else 'no', **acceptance.provenance_entries(assessment, ())})
     lines = [*acceptance.headline(assessment, ()),
              *acceptance.gravity_lines(fit, poses.time_s[:, 0]),
              *acceptance.explanation(assessment, fitted), *acceptance.unit_line(fitted),
@@ -335,10 +332,6 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, d
     return CalibrationResult(
         nominal=sensor, fitted=fitted, poses=poses, assessments=(assessment,), gravity_fit=fit,
         warnings=warnings, report_lines=lines)
-
-
-def _yes_or_no(condition: bool) -> str:
-    return 'yes' if condition else 'no'
 
 
 def _turn_on_lines(fitted: Sensor, recordings: Sequence[Poses]) -> list[str]:

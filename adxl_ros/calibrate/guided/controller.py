@@ -27,8 +27,6 @@ import numpy as np
 
 IDLE_TEXT = 'idle; call ~/start'
 """Status of a controller that has not been started."""
-_POLLS_PER_MEASUREMENT = 50
-"""Calls of `poll` from one attempt to measure an unknown sensor to the next: one a second."""
 
 
 class ControllerState(Enum):
@@ -152,7 +150,7 @@ class StreamSensor:
     def __init__(self, settings: SessionSettings, sensor: Sensor, anonymous: Sensor,
                  samples: SampleSource) -> None:
         self._settings, self._sensor, self._anonymous = settings, sensor, anonymous
-        self._samples, self._polls = samples, 0
+        self._samples = samples
         self.unit: Sensor | None = None  # The nominal sensor; None while it is unknown
         self.newest: NewestSamples | None = None  # Its newest samples
         self.fault = ''  # Why the stated sensor is not the one of the parameters, or ''
@@ -180,8 +178,7 @@ class StreamSensor:
         if self.unit is None and (waits or shows):
             # A driver that has just begun states its sensor on another topic.
             self._samples.keep_newest()
-            self._polls += 1
-            if self._polls % _POLLS_PER_MEASUREMENT == 0 and not self.fault:
+            if not self.fault:
                 self._measure(log, outputs)
         elif self.unit is not None and self.newest is not None and shows:
             self.newest.feed(*self._samples.take(self.unit))
@@ -197,6 +194,7 @@ class StreamSensor:
             unit, lines = recorded_sensor.unit_of_stream(self._anonymous, stamps_ns, accel_mps2)
         except UserError as error:
             log.line(Severity.WARNING, f'imu/data_raw: {error}')
+            self._samples.clear()
             return
         outputs.log(Severity.INFO, f'no sensor_info: measured from the stream: {"; ".join(lines)}')
         self.take(unit)

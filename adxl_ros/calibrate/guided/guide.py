@@ -306,9 +306,6 @@ class Guide:
         """Return the number of the previous pose, from 0; None where there is none."""
         return max(self.accepted, default=None)
 
-    def retry(self) -> None:
-        """Take the same pose again, since its record is not on disk; here it is still there."""
-
     def redo(self, append: Callable[[JournalEntry], None]) -> str:
         """Forget the previous pose, in the journal first; return a line for people, or ''."""
         number = self.previous

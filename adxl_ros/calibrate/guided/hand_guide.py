@@ -201,8 +201,7 @@ class HandGuide(HandRests):
         """Name the direction to turn to, for people."""
         if self.next_up is None:
             return 'turn it to any direction not yet covered, and hold it still'
-        direction = gravity_model.points_up(gravity_model.name_up(self.next_up))
-        return f'turn it so that {direction}, and hold it still'
+        return f'turn it so that {gravity_model.points_up(self.next_up)}, and hold it still'
 
     def next_pose(self) -> NextPose:
         """Return the direction to announce."""
@@ -227,8 +226,7 @@ class HandGuide(HandRests):
         """Return the progress of the calibration, for the screen."""
         up = self.up()
         position = '' if up is None else \
-            gravity_model.points_up(gravity_model.name_up(
-                int(np.argmax(gravity_model.UP @ up)))) + ' now'
+            f'{gravity_model.points_up(int(np.argmax(gravity_model.UP @ up)))} now'
         return Progress(
             number=self.pose_number, destination=self.destination(), position=position,
             accepted=len(self.accepted), total=ENOUGH_RESTS)

@@ -194,7 +194,8 @@ class Session:
             try:
                 self.journal.append(record)
             except UserError:
-                self.guide.retry()
+                if self.stage is not None:
+                    self.stage.go(self.stage.course.index)
                 raise
             self.guide.take(record)
             yield f'pose {record.pose + 1} is on disk'

@@ -206,10 +206,6 @@ class StageSweep(Guide):
             self.sensor, self.poses_to_fit(), self.settings.dwell_s, self.estimate)
         self.go(self.course.next_open())
 
-    def retry(self) -> None:
-        """Take the same pose again, since its record is not on disk."""
-        self.go(self.course.index)
-
     def refuse(self, reason: str) -> None:
         """Report a refusal once. A commanded stage averages again, an operator captures again."""
         super().refuse(reason)
