@@ -324,7 +324,8 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, d
     fitted = with_provenance(fitted, source, poses, data_sha256, {
         'reference': 'gravity', **({'prior': population.name} if population else {}),
         'residual_mg': f'{after:.4f}', 'held_out_mg': f'{unseen:.4f}', 'span_s': f'{span_s:.1f}',
-        'converged': 'yes' if fit.converged else 'no', **acceptance.provenance_entries(assessment, ())})
+        'converged': 'yes' if fit.converged else 'no',
+        **acceptance.provenance_entries(assessment, ())})
     lines = [*acceptance.headline(assessment, ()),
              *acceptance.gravity_lines(fit, poses.time_s[:, 0]),
              *acceptance.explanation(assessment, fitted), *acceptance.unit_line(fitted),

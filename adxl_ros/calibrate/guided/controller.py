@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol
 
 from adxl_ros.calibrate.fits.gravity_fit import MIN_RESTS
 from adxl_ros.calibrate.guided.guide import NewestSamples, NextPose, STALE_NS
-from adxl_ros.calibrate.guided.hand_guide import ENOUGH_RESTS
+from adxl_ros.calibrate.guided.rest_guides import ENOUGH_RESTS
 from adxl_ros.calibrate.guided.screen_contents import Phase, Status
 from adxl_ros.calibrate.guided.session import Session, SessionSettings
 from adxl_ros.calibrate.guided.stage_guide import MountingError
