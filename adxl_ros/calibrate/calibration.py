@@ -108,9 +108,9 @@ class _StageFit:
 
     fitted: Sensor  # The fitted unit
     refit: held_out.Fit  # The same fit to other poses, for cross-validation
-    report_lines: Sequence[str] = ()  # Report of a full fit
-    warnings: Sequence[str] = ()  # What is wrong with the poses or a full fit
     full: full_model.FullFit | None = None  # The full fit; None for other models
+    terms: Sequence[term_selection.Term] = ()  # Evidence for the terms of a full fit
+    notes: Sequence[str] = ()  # What to know about the choice of the model
 
 
 def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None,
@@ -118,11 +118,13 @@ def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: s
                    population: Population | None) -> CalibrationResult:
     poses = _joined(recordings)
     check_polarity(sensor, poses)
-    fit, refusals = _richest_fit(sensor, recordings, model, effects, population)
+    fit = _richest_fit(sensor, recordings, model, effects, population)
     if population is not None:
         fit = _with_population(fit, population)
-    full, fitted, fit_lines = fit.full, fit.fitted, list(fit.report_lines)
-    fitting = np.flatnonzero(~poses.check)
+    full, fitted, fitting = fit.full, fit.fitted, np.flatnonzero(~poses.check)
+    fit_lines, warnings = ([], []) if full is None else (
+        term_selection.report_lines(full, poses.subset(fitting), fit.terms),
+        term_selection.warnings(full, poses.subset(fitting)))
     outliers = tuple(fitting[list(full.outliers)].tolist()) if full else ()
     errors, assessments = _assessed(
         sensor, poses.subset(~np.isin(np.arange(len(poses)), outliers)), fit)
@@ -144,10 +146,10 @@ def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: s
     explanation = acceptance.explanation(assessment, fitted) if assessment else []
     return CalibrationResult(
         nominal=sensor, fitted=fitted, poses=poses, assessments=assessments,
-        held_out=errors, outliers=outliers, warnings=(*fit.warnings, *refusals),
+        held_out=errors, outliers=outliers, warnings=[*warnings, *fit.notes],
         report_lines=[*acceptance.headline(assessment, errors), *acceptance.unit_line(fitted),
                       *acceptance.error_table(errors, assessments), *explanation, *fit_lines,
-                      *refusals])
+                      *fit.notes])
 
 
 def _with_population(fit: _StageFit, population: Population) -> _StageFit:
@@ -158,9 +160,8 @@ def _with_population(fit: _StageFit, population: Population) -> _StageFit:
         fitted = fit.refit(sensor, poses)
         return fitted if combined.is_stranger else posterior(fitted, population).sensor
 
-    line = f'prior: {combined.line}'
-    return replace(fit, fitted=combined.sensor, refit=refit, warnings=[*fit.warnings, line],
-                   report_lines=[*fit.report_lines, line])
+    return replace(fit, fitted=combined.sensor, refit=refit,
+                   notes=[f'prior: {combined.line}', *fit.notes])
 
 
 def _assessed(sensor: Sensor, inliers: Poses, fit: _StageFit
@@ -179,9 +180,8 @@ def _assessed(sensor: Sensor, inliers: Poses, fit: _StageFit
 
 
 def _richest_fit(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None,
-                 effects: Sequence[str], population: Population | None
-                 ) -> tuple[_StageFit, list[str]]:
-    """Fit a model, or the richest one that the poses determine; also say why no richer one."""
+                 effects: Sequence[str], population: Population | None) -> _StageFit:
+    """Fit a model, or the richest one that the poses determine; also note why no richer one."""
     poses = _joined(recordings)
     poses = poses.subset(~poses.check)
     fits: dict[str, Callable[[], _StageFit]] = {
@@ -190,17 +190,20 @@ def _richest_fit(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str
         'affine': lambda: _fit_affine(sensor, poses),
         'linear': lambda: _fit_linear(sensor, poses, population)}
     if model:
-        return fits[model](), []
+        return fits[model]()
+    if sensor.axes != AXES or effects:
+        del fits['affine']
     refusals: list[str] = []
-    for name in ('full', 'physical', 'affine'):
-        if name == 'affine' and (sensor.axes != AXES or effects):
-            continue
+    *richer, simplest = fits
+    for name in richer:
         try:
-            return fits[name](), refusals if name == 'physical' else []
+            fit = fits[name]()
+            # The fit of the twelve coefficients states for itself what is open.
+            return fit if name == 'affine' else replace(fit, notes=refusals)
         except UserError as error:
             if name != 'affine':
                 refusals.append(f'not {name}: {error}')
-    return fits['linear'](), refusals
+    return replace(fits[simplest](), notes=refusals)
 
 
 def _fit_full(sensor: Sensor, poses: Poses, recordings: Sequence[RecordedPoses],
@@ -209,10 +212,7 @@ def _fit_full(sensor: Sensor, poses: Poses, recordings: Sequence[RecordedPoses],
     full, terms = term_selection.fit_selected(sensor, poses, effects)
     if len(recordings) > 1:
         _require_one_mounting(full, recordings)
-    return _StageFit(
-        full.fitted, partial(term_selection.fit, effects=effects),
-        term_selection.report_lines(full, poses, terms), term_selection.warnings(full, poses),
-        full)
+    return _StageFit(full.fitted, partial(term_selection.fit, effects=effects), full, terms)
 
 
 def _fit_affine(sensor: Sensor, poses: Poses) -> _StageFit:
@@ -221,15 +221,14 @@ def _fit_affine(sensor: Sensor, poses: Poses) -> _StageFit:
     std = np.sqrt(np.diag(np.linalg.inv(full.information)))
     still_open = [name for name, value in zip(full.names, std)
                   if not full_model.belongs_to_stage(name) and value > parameter_of(name).scale]
-    lines = [f'{len(poses)} poses determine zero-g, scale factor and misalignment, no further '
+    notes = [f'{len(poses)} poses determine zero-g, scale factor and misalignment, no further '
              'terms; more poses show those']
     if still_open:
-        lines.append(f'open, by its prior alone: {", ".join(map(str, still_open))}; add poses '
+        notes.append(f'open, by its prior alone: {", ".join(map(str, still_open))}; add poses '
                      'with this axis up and down')
     return _StageFit(
-        full.fitted, lambda sensor, poses: term_selection.fit_affine(sensor, poses).fitted,
-        [*lines, *term_selection.report_lines(full, poses, [])],
-        [*lines, *term_selection.warnings(full, poses)], full)
+        full.fitted, lambda sensor, poses: term_selection.fit_affine(sensor, poses).fitted, full,
+        notes=notes)
 
 
 def _fit_linear(sensor: Sensor, poses: Poses, population: Population | None) -> _StageFit:

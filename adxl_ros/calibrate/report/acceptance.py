@@ -288,39 +288,42 @@ def provenance_entries(assessment: Assessment | None, models: Sequence[HeldOutEr
             'limited_by': assessment.limited_by}
 
 
-def acceptance_lines(fitted: Sensor) -> list[str]:
+def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
     """
-    Return whether the calibration error is within its limit, as lines.
+    Return whether the calibration error is within its limit, and sentences on it.
 
     The limit is that of the datasheet, or the noise of one sample where no datasheet states one.
     """
     provenance = fitted.provenance
-    span = [f'       By rests within {duration(float(provenance["span_s"]))}; a longer drift is '
-            'not in this figure.'] if 'span_s' in provenance else []
     if 'own_accel_mg' not in provenance:
-        return [f' {NOT_SHOWN}  no pose was kept out of the fit to assess it']
-    error_mg = float(provenance['own_accel_mg'])
-    limit_mps2, kind, allows = nonlinearity_mps2(fitted), 'datasheet', \
-        'the datasheet allows'
+        return NOT_SHOWN, ['no pose was kept out of the fit to assess it']
+    limit_mps2, kind, allows = nonlinearity_mps2(fitted), 'datasheet', 'the datasheet allows'
     if not limit_mps2:
         limit_mps2, kind = held_out.sample_noise_mps2(fitted), 'noise'
         allows = 'the noise of one sample is'
     limit = f'{_two_digits(1e3 * limit_mps2 / G0_MPS2)} mg'
     accel = provenance.get(f'verdict_{kind}', '')
-    tilt = provenance.get(f'verdict_tilt_{kind}', '')
-    result = f'calibration error {_two_digits(error_mg)} mg; {allows} {limit}'
-    if FAIL in (accel, tilt):
+    outcome = _worse(accel, provenance.get(f'verdict_tilt_{kind}', '')) or PASS
+    lines = [f'calibration error {_two_digits(float(provenance["own_accel_mg"]))} mg; {allows} '
+             f'{limit}']
+    if outcome == FAIL:
         if accel != FAIL:
             tilt_deg = float(provenance['own_tilt_deg'])
-            result = f'tilt error {tilt_deg:.2g}°, more than {limit} causes'
-        advice = 'More poses, or longer ones, reduce it.'
-        if len(fitted.axes) == 1:
-            advice = 'One axis does not see the force across it: align it, or accept this error.'
-        elif kind == 'datasheet':
-            advice = 'The sensor is worse than its datasheet states: do not use this file.'
-        return [f' {FAIL}  {result}', f'       {advice}', *span]
-    if NOT_SHOWN in (accel, tilt):
-        return [f' {NOT_SHOWN}  {result}',
-                '            The check poses are too few to show that the error is within it.',
-                *span]
-    return [f' {PASS}  {result}', *span]
+            lines = [f'tilt error {tilt_deg:.2g}°, more than {limit} causes']
+        lines.append(
+            'One axis does not see the force across it: align it, or accept this error.'
+            if len(fitted.axes) == 1 else
+            'The sensor is worse than its datasheet states: do not use this file.'
+            if kind == 'datasheet' else 'More poses, or longer ones, reduce it.')
+    elif outcome == NOT_SHOWN:
+        lines.append('The check poses are too few to show that the error is within it.')
+    if 'span_s' in provenance:
+        lines.append(f'By rests within {duration(float(provenance["span_s"]))}; a longer drift is '
+                     'not in this figure.')
+    return outcome, lines
+
+
+def acceptance_lines(fitted: Sensor) -> list[str]:
+    """Return the acceptance as lines of a terminal."""
+    outcome, (first, *others) = acceptance(fitted)
+    return [f' {outcome}  {first}', *(f'       {line}' for line in others)]

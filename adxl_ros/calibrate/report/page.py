@@ -134,12 +134,11 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
 
 
 def _badge(fitted: Sensor) -> dict[str, str]:
-    """Return the acceptance as the terminal shows it, and its colour."""
-    first, *others = (line.strip() for line in acceptance.acceptance_lines(fitted))
-    outcome = next(outcome for outcome in (NOT_SHOWN, PASS, FAIL) if first.startswith(outcome))
-    sentence = '. '.join([first.removeprefix(outcome).strip(), *others])
+    """Return the acceptance and its colour."""
+    outcome, lines = acceptance.acceptance(fitted)
+    sentence = '. '.join(line.rstrip('.') for line in lines)
     return {'colour': _COLOURS[outcome], 'word': outcome,
-            'sentence': f'{sentence[:1].upper()}{sentence[1:].rstrip(".")}.'}
+            'sentence': f'{sentence[0].upper()}{sentence[1:]}.'}
 
 
 def _tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dict[str, str]]:
