@@ -357,8 +357,3 @@ class Guide:
         return (f'temperature moved {abs(now_c - first_c):.1f} °C since the first pose '
                 f'({first_c:.1f} to {now_c:.1f} °C), must stay within {span_c:g} °C; wait until '
                 'it is back, or finish with the poses so far')
-
-    def saturated_text(self, part: str) -> str:
-        """Return that a part of the stream, 'rest' or 'block', is refused as saturated."""
-        return (f'saturated: samples of the {part} are beyond the range of '
-                f'±{self.sensor.range_g:g} g or at a rail of the ADC; check supply and wiring')

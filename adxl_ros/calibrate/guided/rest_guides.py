@@ -195,7 +195,8 @@ class HandRests(Guide):
         saturated = (bisect_right(self._saturated_ns, record.stop_ns)
                      - bisect_left(self._saturated_ns, record.start_ns))
         if saturated > _MOST_SATURATED * record.samples:
-            return self.saturated_text('rest')
+            return ('saturated: samples of the rest are beyond the range of '
+                    f'±{self.sensor.range_g:g} g or at a rail of the ADC; check supply and wiring')
         return self.temperature_fault(record.temperature_c, self._span_c)
 
     def _records(self, number: int) -> Iterator[PoseRecord]:
@@ -309,8 +310,7 @@ class ThermalGuide(Guide):
             dwell.record(max(self.accepted, default=-1) + 1, rest, samples))
         self.refuse('no temperature: nothing on the topic temperature; publish the reading of a '
                     'thermometer at the sensor' if not math.isfinite(record.temperature_c) else
-                    self.saturated_text('block') if self.sensor.saturated(
-                        dwell.volts(rest)[:samples]).any() else '')
+                    pose_plan.saturation_fault(self.sensor, dwell.volts(rest)[:samples]))
         if self.refusal:
             self._dwell = dwell.after(record.stop_ns)
             return None

@@ -144,14 +144,16 @@ def nonlinearity_mps2(sensor: Sensor) -> float:
 
 def explanation(assessment: Assessment, sensor: Sensor) -> list[str]:
     """State the limits, and the parts of the error of the saved model."""
-    accel = assessment.accel
-    limit_mps2, noise_mps2 = nonlinearity_mps2(sensor), held_out.sample_noise_mps2(sensor)
+    accel, to_tilt = assessment.accel, np.degrees(np.sqrt(assessment.tilt.tilt_per_axis))
     tilt = '' if np.isnan(assessment.error_deg) else f' and {assessment.error_deg:.3f} deg'
-    datasheet = f'limit by the datasheet {1e3 * limit_mps2 / G0_MPS2:.2g} mg (typical ' \
-        'nonlinearity at full scale)' if limit_mps2 else 'no limit by a datasheet'
+    # The limit of tilt is the tilt that an acceleration error of each axis causes.
+    limits = [f'limit by the {name} {1e3 * limit_mps2 / G0_MPS2:.2g} mg'
+              + ('' if np.isnan(to_tilt) else f' and {limit_mps2 * to_tilt:.2g} deg')
+              for name, limit_mps2 in (
+                  ('datasheet', nonlinearity_mps2(sensor)),
+                  ('noise of one sample', held_out.sample_noise_mps2(sensor))) if limit_mps2]
     lines = [f'calibration error {assessment.error_mg:.3f} mg{tilt} rms, without noise and stage '
-             'error of the check',
-             f'{datasheet}; limit by the noise of one sample {1e3 * noise_mps2 / G0_MPS2:.2g} mg']
+             'error of the check', '; '.join(limits)]
     part = {name: f'{name} {rms_mg(getattr(accel, name)):.3f}'
             for name in ('noise', 'stage', 'coefficients', 'model')}
     if assessment.model == 'gravity':
@@ -164,12 +166,6 @@ def explanation(assessment: Assessment, sensor: Sensor) -> list[str]:
         lines.append(f'expected {rms_mg(accel.expected):.3f} mg = {", ".join(part.values())} '
                      f'(squares add); measured {rms_mg(accel.measured):.3f} mg'
                      + (', which differs by chance' if by_chance else ''))
-    if assessment.tilt_noise:
-        outcomes = (('datasheet', limit_mps2, assessment.tilt_datasheet),
-                    ('noise', noise_mps2, assessment.tilt_noise))
-        limits = [f'{_tilt_deg(assessment, limit):.2g} deg by the {name}: {outcome}'
-                  for name, limit, outcome in outcomes if outcome]
-        lines.append(f'limits of tilt: {", ".join(limits)}')
     if not accel.separable:
         lines.append('no pose was visited twice: stage and model are inseparable')
     return lines
@@ -180,11 +176,6 @@ def _two_digits(value: float) -> str:
     return f'{value:.0f}' if value >= 10 else f'{value:#.2g}'
 
 
-def _tilt_deg(assessment: Assessment, accel_mps2: float) -> float:
-    """Return the tilt that an acceleration error of each axis causes, deg rms."""
-    return float(np.degrees(accel_mps2 * np.sqrt(assessment.tilt.tilt_per_axis)))
-
-
 def unit_line(sensor: Sensor) -> list[str]:
     """
     Return a line that compares the unit with its datasheet; none without a datasheet.
@@ -193,13 +184,14 @@ def unit_line(sensor: Sensor) -> list[str]:
     """
     if not sensor.datasheet:
         return []
-    names, beyond = sensor.covariance_names, []
-    for name, value, half_width in zip(names, get(sensor, names),
-                                       Z_90 * np.sqrt(np.diag(sensor.covariance))):
-        _, maximum = sensor.datasheet.get(name.without_axis, (0.0, 0.0))
-        if maximum and abs(value) - half_width > maximum:
-            beyond.append(f'{name} is {with_half_width(float(value), half_width)} '
-                          f'{parameter_of(name).unit}, beyond {maximum:g}')
+    names = sensor.covariance_names
+    half_widths = Z_90 * np.sqrt(np.diag(sensor.covariance))
+    maxima = [sensor.datasheet.get(name.without_axis, (0.0, 0.0))[1] for name in names]
+    beyond = [f'{name} is {with_half_width(float(value), half_width)} {parameter_of(name).unit}, '
+              f'beyond {maximum:g}'
+              for name, value, half_width, maximum in zip(names, get(sensor, names), half_widths,
+                                                          maxima)
+              if 0 < maximum < abs(value) - half_width]
     return [f'unit within {sensor.datasheet_name or "its datasheet"}: '
             + (f'{FAIL}: {"; ".join(beyond)}' if beyond else PASS)]
 
