@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from adxl_ros.calibrate import calibration, pose_extraction
-from adxl_ros.calibrate.report import acceptance, page as unit_page, plots as sweep_figures
+from adxl_ros.calibrate.report import acceptance, page as unit_page
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.atomic_write import write_text
@@ -115,8 +115,8 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path
                              np.random.default_rng([first, 0]))
     unit = experiments.calibrated(truth, first)
     pictures = folder / FIGURES
-    sweep_figures.draw_sweep(pictures / 'sweep.png', experiments.bare(truth),
-                             unit.fitted['physical'], unit.poses)
+    unit_page.draw_sweep(pictures / 'sweep.png', experiments.bare(truth),
+                         unit.fitted['physical'], unit.poses)
     report.draw_misalignment(pictures / 'misalignment.png', results['paper'][0].directions)
     report.draw_tilt(pictures / 'tilt.png', results['paper'][0])
     report.draw_motion(pictures / 'motion.png', unit.fitted, experiments.shaken(truth, first))

@@ -27,13 +27,6 @@ import numpy as np
 
 STAGE_FITS = {'linear': linear.fit, 'physical': linear.fit_physical, 'full': term_selection.fit}
 """Models that are fitted against the stage, simplest first."""
-_LISTED_RESTS = 5
-"""Largest number of rests that a line lists (chosen: fits into a line)."""
-_RIDGE = 1e-3
-"""Weight of a change of 0, relative to a rest, for a direction that no rest of a recording has.
-Chosen: small beside one rest."""
-_NEGLIGIBLE_MG = 0.01
-"""Scatter below which only this limit is shown, mg. Chosen: no sensor repeats that well."""
 
 
 @dataclass(frozen=True)
@@ -92,9 +85,8 @@ def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | 
                                 effects, source, data_sha256, population)
         starts_s = poses.time_s[~poses.has_angles, 0]
         if len(starts_s):
-            listed = ', '.join(f'{start_s:.1f}' for start_s in starts_s[:_LISTED_RESTS])
-            further = ' ...' * (len(starts_s) > _LISTED_RESTS)
-            lines = [f'rests without angles, left out: {len(starts_s)} (from {listed}{further} s)']
+            lines = [f'rests without angles, left out: {len(starts_s)} (the first one from '
+                     f'{starts_s[0]:.1f} s)']
     elif model not in (None, 'full'):
         raise UserError(f'{source}: the {model} model is fitted against stage angles (alpha_rad '
                         'and beta_rad), which are missing; leave --model out to calibrate a '
@@ -116,9 +108,9 @@ class _StageFit:
 
     fitted: Sensor  # The fitted unit
     refit: held_out.Fit  # The same fit to other poses, for cross-validation
-    report_lines: Sequence[str] = ()  # Report of a full fit
-    warnings: Sequence[str] = ()  # What is wrong with the poses or a full fit
     full: full_model.FullFit | None = None  # The full fit; None for other models
+    terms: Sequence[term_selection.Term] = ()  # Evidence for the terms of a full fit
+    notes: Sequence[str] = ()  # What to know about the choice of the model
 
 
 def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None,
@@ -126,19 +118,20 @@ def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: s
                    population: Population | None) -> CalibrationResult:
     poses = _joined(recordings)
     check_polarity(sensor, poses)
-    fit, refusals = _richest_fit(sensor, recordings, model, effects, population)
+    fit = _richest_fit(sensor, recordings, model, effects, population)
     if population is not None:
         fit = _with_population(fit, population)
-    full, fitted, fit_lines = fit.full, fit.fitted, list(fit.report_lines)
-    fitting = np.flatnonzero(~poses.check)
+    full, fitted, fitting = fit.full, fit.fitted, np.flatnonzero(~poses.check)
+    fit_lines, warnings = ([], []) if full is None else (
+        term_selection.report_lines(full, poses.subset(fitting), fit.terms),
+        term_selection.warnings(full, poses.subset(fitting)))
     outliers = tuple(fitting[list(full.outliers)].tolist()) if full else ()
     errors, assessments = _assessed(
         sensor, poses.subset(~np.isin(np.arange(len(poses)), outliers)), fit)
     assessment = next((row for row in assessments if row.model == fitted.model), None)
     force = np.column_stack(reference_force(poses, fitted.local_gravity_mps2))
-    predicted = np.column_stack(signal_chain.static_response(fitted)(
-        list(force.T), poses.environment))
-    residual_mg = ((poses.volts - predicted) / fitted.scale_v_per_g * 1e3)[fitting]
+    residual_mg = ((poses.volts - predicted_volts(fitted, poses)) / fitted.scale_v_per_g
+                   * 1e3)[fitting]
     if fitted.model == 'full':
         fitted, filter_lines = with_filter(
             fitted, [recording.filters for recording in recordings if recording.filters])
@@ -148,19 +141,15 @@ def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: s
     fitted = with_provenance(fitted, source, poses, data_sha256, {
         'reference': 'stage', **({'prior': population.name} if population else {}),
         'residual_mg': f'{np.sqrt(np.mean(residual_mg ** 2)):.4f}',
-        **({'converged': _yes_or_no(full.converged)} if full else {}),
+        **({'converged': 'yes' if full.converged else 'no'} if full else {}),
         **acceptance.provenance_entries(assessment, errors)})
     explanation = acceptance.explanation(assessment, fitted) if assessment else []
-    unit_lines = acceptance.unit_line(fitted)
     return CalibrationResult(
         nominal=sensor, fitted=fitted, poses=poses, assessments=assessments,
-        held_out=errors, outliers=outliers, warnings=(*fit.warnings, *refusals),
-        report_lines=[*refusals, *held_out.table(errors),
-                      *acceptance.table(assessments, errors), *explanation, *unit_lines,
-                      *fit_lines],
-        summary_lines=[*acceptance.headline(assessment, errors), *unit_lines,
-                       *acceptance.narrow_table(assessments, errors), *explanation,
-                       *fit_lines, *refusals])
+        held_out=errors, outliers=outliers, warnings=[*warnings, *fit.notes],
+        report_lines=[*acceptance.headline(assessment, errors), *acceptance.unit_line(fitted),
+                      *acceptance.error_table(errors, assessments), *explanation, *fit_lines,
+                      *fit.notes])
 
 
 def _with_population(fit: _StageFit, population: Population) -> _StageFit:
@@ -171,9 +160,8 @@ def _with_population(fit: _StageFit, population: Population) -> _StageFit:
         fitted = fit.refit(sensor, poses)
         return fitted if combined.is_stranger else posterior(fitted, population).sensor
 
-    line = f'prior: {combined.line}'
-    return replace(fit, fitted=combined.sensor, refit=refit, warnings=[*fit.warnings, line],
-                   report_lines=[*fit.report_lines, line])
+    return replace(fit, fitted=combined.sensor, refit=refit,
+                   notes=[f'prior: {combined.line}', *fit.notes])
 
 
 def _assessed(sensor: Sensor, inliers: Poses, fit: _StageFit
@@ -192,9 +180,8 @@ def _assessed(sensor: Sensor, inliers: Poses, fit: _StageFit
 
 
 def _richest_fit(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None,
-                 effects: Sequence[str], population: Population | None
-                 ) -> tuple[_StageFit, list[str]]:
-    """Fit a model, or the richest one that the poses determine; also say why no richer one."""
+                 effects: Sequence[str], population: Population | None) -> _StageFit:
+    """Fit a model, or the richest one that the poses determine; also note why no richer one."""
     poses = _joined(recordings)
     poses = poses.subset(~poses.check)
     fits: dict[str, Callable[[], _StageFit]] = {
@@ -203,17 +190,20 @@ def _richest_fit(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str
         'affine': lambda: _fit_affine(sensor, poses),
         'linear': lambda: _fit_linear(sensor, poses, population)}
     if model:
-        return fits[model](), []
+        return fits[model]()
+    if sensor.axes != AXES or effects:
+        del fits['affine']
     refusals: list[str] = []
-    for name in ('full', 'physical', 'affine'):
-        if name == 'affine' and (sensor.axes != AXES or effects):
-            continue
+    *richer, simplest = fits
+    for name in richer:
         try:
-            return fits[name](), refusals if name == 'physical' else []
+            fit = fits[name]()
+            # The fit of the twelve coefficients states for itself what is open.
+            return fit if name == 'affine' else replace(fit, notes=refusals)
         except UserError as error:
             if name != 'affine':
                 refusals.append(f'not {name}: {error}')
-    return fits['linear'](), refusals
+    return replace(fits[simplest](), notes=refusals)
 
 
 def _fit_full(sensor: Sensor, poses: Poses, recordings: Sequence[RecordedPoses],
@@ -222,10 +212,7 @@ def _fit_full(sensor: Sensor, poses: Poses, recordings: Sequence[RecordedPoses],
     full, terms = term_selection.fit_selected(sensor, poses, effects)
     if len(recordings) > 1:
         _require_one_mounting(full, recordings)
-    return _StageFit(
-        full.fitted, partial(term_selection.fit, effects=effects),
-        term_selection.report_lines(full, poses, terms), term_selection.warnings(full, poses),
-        full)
+    return _StageFit(full.fitted, partial(term_selection.fit, effects=effects), full, terms)
 
 
 def _fit_affine(sensor: Sensor, poses: Poses) -> _StageFit:
@@ -234,15 +221,14 @@ def _fit_affine(sensor: Sensor, poses: Poses) -> _StageFit:
     std = np.sqrt(np.diag(np.linalg.inv(full.information)))
     still_open = [name for name, value in zip(full.names, std)
                   if not full_model.belongs_to_stage(name) and value > parameter_of(name).scale]
-    lines = [f'{len(poses)} poses determine zero-g, scale factor and misalignment, no further '
+    notes = [f'{len(poses)} poses determine zero-g, scale factor and misalignment, no further '
              'terms; more poses show those']
     if still_open:
-        lines.append(f'open, by its prior alone: {", ".join(map(str, still_open))}; add poses '
+        notes.append(f'open, by its prior alone: {", ".join(map(str, still_open))}; add poses '
                      'with this axis up and down')
     return _StageFit(
-        full.fitted, lambda sensor, poses: term_selection.fit_affine(sensor, poses).fitted,
-        [*lines, *term_selection.report_lines(full, poses, [])],
-        [*lines, *term_selection.warnings(full, poses)], full)
+        full.fitted, lambda sensor, poses: term_selection.fit_affine(sensor, poses).fitted, full,
+        notes=notes)
 
 
 def _fit_linear(sensor: Sensor, poses: Poses, population: Population | None) -> _StageFit:
@@ -319,15 +305,16 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, d
                      population: Population | None) -> CalibrationResult:
     fit = gravity_fit.fit_gravity(poses.volts, poses.std_v, sensor)
     kept = np.setdiff1d(np.arange(len(poses)), fit.outliers)
-    before, after, unseen = (rms_mg(np.mean(values[kept] ** 2)) for values in (
-        fit.before_mps2, fit.residual_mps2, fit.held_out_mps2))
+    after, unseen = (rms_mg(np.mean(values[kept] ** 2))
+                     for values in (fit.residual_mps2, fit.held_out_mps2))
     fitted = replace(
         sensor, model='gravity', effects=('bias', 'scale_factor', 'misalignment'),
         values=fit.values, covariance=fit.covariance, covariance_names=gravity_fit.NAMES)
-    prior_lines: list[str] = []
+    warnings = [] if fit.converged else [term_selection.NOT_CONVERGED]
     if population is not None:
         combined = posterior(fitted, population)
-        fitted, prior_lines = combined.sensor, [f'prior: {combined.line}']
+        fitted = combined.sensor
+        warnings.append(f'prior: {combined.line}')
     force = np.column_stack(signal_chain.inverse(fitted)(list(poses.volts.T), poses.environment))
     budgets = acceptance.gravity_error_budgets(fit, fitted, force, kept)
     assessment = acceptance.assess('gravity', budgets, fitted)
@@ -336,54 +323,28 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, d
     fitted = with_provenance(fitted, source, poses, data_sha256, {
         'reference': 'gravity', **({'prior': population.name} if population else {}),
         'residual_mg': f'{after:.4f}', 'held_out_mg': f'{unseen:.4f}', 'span_s': f'{span_s:.1f}',
-        'converged': _yes_or_no(fit.converged), **acceptance.provenance_entries(assessment, ())})
-    fit_lines = [] if fit.converged else [term_selection.NOT_CONVERGED]
-    if fit.outliers:
-        rests = ', '.join(f'{i + 1} (from {poses.time_s[i, 0]:.1f} s)' for i in fit.outliers)
-        fit_lines.append(f'outliers, left out: rest {rests}')
-    lines = [f'magnitude of gravity over {len(kept)} rests, rms in mg: nominal {before:.2f}, '
-             f'nine parameters {after:.3f}, held out {unseen:.3f}',
-             *fit_lines, acceptance.gravity_line(assessment, fit.held_out_mps2[kept]),
+        'converged': 'yes' if fit.converged else 'no',
+        **acceptance.provenance_entries(assessment, ())})
+    lines = [*acceptance.headline(assessment, ()),
+             *acceptance.gravity_lines(fit, poses.time_s[:, 0]),
              *acceptance.explanation(assessment, fitted), *acceptance.unit_line(fitted),
-             *prior_lines]
+             *warnings]
     return CalibrationResult(
         nominal=sensor, fitted=fitted, poses=poses, assessments=(assessment,), gravity_fit=fit,
-        warnings=(*fit_lines, *prior_lines), report_lines=lines,
-        summary_lines=[*acceptance.headline(assessment, ()), *lines])
-
-
-def _yes_or_no(condition: bool) -> str:
-    return 'yes' if condition else 'no'
+        warnings=warnings, report_lines=lines)
 
 
 def _turn_on_lines(fitted: Sensor, recordings: Sequence[Poses]) -> list[str]:
-    """Report the scatter of the zero-g over recordings of one unit."""
-    if len(recordings) < 2:
+    """Report the scatter of the zero-g over recordings of one unit on the stage."""
+    on_stage = [poses.subset(poses.has_angles) for poses in recordings if poses.has_angles.any()]
+    if len(on_stage) < 2:
         return []
-    changes_mg = np.array([_zero_g_change_mg(fitted, poses) for poses in recordings])
-    texts = [f'{value:.2g}' if value > _NEGLIGIBLE_MG else f'< {_NEGLIGIBLE_MG:g}'
-             for value in np.std(changes_mg, axis=0, ddof=1)]
-    by_axis = ', '.join(f'{axis} {text}' for axis, text in zip(fitted.axes, texts))
+    changes_mg = [1e3 * np.mean((poses.volts - predicted_volts(fitted, poses))
+                                / fitted.scale_v_per_g, axis=0) for poses in on_stage]
+    by_axis = ', '.join(f'{axis} {value:.2g}' for axis, value in zip(
+        fitted.axes, np.std(changes_mg, axis=0, ddof=1)))
     return [f'turn-on to turn-on: the zero-g scatters by {by_axis} mg (standard deviation over '
-            f'{len(recordings)} recordings)']
-
-
-def _zero_g_change_mg(fitted: Sensor, poses: Poses) -> np.ndarray:
-    """Return the zero-g of a recording minus that of the fit by axis, mg, (m,)."""
-    if poses.has_angles.any():
-        poses = poses.subset(poses.has_angles)
-        force = list(reference_force(poses, fitted.local_gravity_mps2))
-        predicted = signal_chain.static_response(fitted)(force, poses.environment)
-        residual_v = poses.volts - np.column_stack(predicted)
-        return np.asarray(1e3 * np.mean(residual_v / fitted.scale_v_per_g, axis=0))
-    # Against gravity a change shows along the direction of each rest only.
-    force_mps2 = np.column_stack(signal_chain.inverse(fitted)(
-        list(poses.volts.T), poses.environment))
-    magnitude_mps2 = np.linalg.norm(force_mps2, axis=1)
-    direction = force_mps2 / magnitude_mps2[:, None]
-    excess_mg = 1e3 * (magnitude_mps2 / fitted.local_gravity_mps2 - 1)
-    normal = direction.T @ direction + _RIDGE * np.eye(direction.shape[1])
-    return np.asarray(np.linalg.solve(normal, direction.T @ excess_mg))
+            f'{len(on_stage)} recordings)']
 
 
 _RIVAL_SHARE = 0.5
@@ -423,8 +384,7 @@ def calibrate_thermal(base: Sensor, poses: Poses, source: str, data_sha256: str 
         f'zero-g stays as calibrated at {calibrated_c:.1f} °C']
     if not has_scale:
         lines.append('scale factor over temperature: not fitted, it needs a second orientation')
-    return CalibrationResult(nominal=base, fitted=fitted, poses=poses, report_lines=lines,
-                             summary_lines=lines)
+    return CalibrationResult(nominal=base, fitted=fitted, poses=poses, report_lines=lines)
 
 
 def _slope_lines(fitted: Sensor, fit: thermal_fit.ThermalFit) -> list[str]:

@@ -9,8 +9,8 @@ Poses from recordings: rests, their means, angles and settings.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
-from itertools import islice, pairwise, takewhile
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
 
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
@@ -31,9 +31,8 @@ ENCODER_STEPS = 1.5
 """Largest change of an encoder at rest, in its steps. Chosen: it may flicker by one step."""
 COMMAND_RAD = 1e-9
 """Commands that differ by less are equal, rad. Chosen: above the rounding of a message."""
-_MAX_READINGS = 20_000
-"""Largest number of readings in memory; older readings are reduced to their extremes. Chosen:
-200 s at 100 Hz."""
+_MAX_READINGS = 100_000
+"""Largest number of readings in memory; older ones are forgotten. Chosen: 1000 s at 100 Hz."""
 
 
 def angle_tolerance_rad(sensor: Sensor) -> float:
@@ -100,12 +99,7 @@ def _mean_of_finite(values: np.ndarray) -> float:
 
 
 class SettingTracker:
-    """
-    Numbers the settings of alpha and beta while a sweep runs, after those of its earlier poses.
-
-    Memory is bounded: since the last pose, readings older than the newest 20 000 are reduced to
-    their extremes.
-    """
+    """Numbers the settings of alpha and beta while a sweep runs, after those of its poses."""
 
     def __init__(self, tolerance_rad: float, taken: Sequence[PoseRecord] = ()) -> None:
         self._tolerance_rad = tolerance_rad
@@ -113,19 +107,20 @@ class SettingTracker:
             record.alpha_setting, record.beta_setting)] for record in taken]
         self._settings = np.max([[-1, -1], *numbers], axis=0)
         self._mean_rad = np.full(2, np.nan)
-        self._readings, self._commands = _Window(), _Window()
-        self._unseen = True
+        self._readings, self._commands = (deque[_Stamped](maxlen=_MAX_READINGS) for _ in range(2))
+        # First and last stamp of the newest pose, ns; None if the stage may have moved unseen
+        self._newest_ns: tuple[int, int] | None = None
 
     def read(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
         """Add an encoder reading."""
-        self._readings.add(stamp_ns, (alpha_rad, beta_rad))
+        self._readings.append((stamp_ns, (alpha_rad, beta_rad)))
 
     def command(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
         """Add a command, which is in force from its stamp on."""
-        before = self._commands.newest
+        before = self._commands[-1][1] if self._commands else (np.nan, np.nan)
         new = tuple(a if np.isfinite(a) else b for a, b in zip((alpha_rad, beta_rad), before))
         if new != before:
-            self._commands.add(stamp_ns, new)
+            self._commands.append((stamp_ns, new))
 
     def lose_track(self) -> None:
         """
@@ -133,20 +128,26 @@ class SettingTracker:
 
         Later stamps may be smaller than the former ones, since a clock may have been set.
         """
-        self._unseen = True
-        for window in (self._readings, self._commands):
-            window.begin(None)
+        self._newest_ns = None
+        self._readings.clear()
+        held = [(-np.inf, angles) for _, angles in self._commands][-1:]
+        self._commands.clear()
+        self._commands.extend(held)
 
     def settings(self, start_ns: int, stop_ns: int, alpha_rad: float, beta_rad: float
                  ) -> tuple[int, int]:
         """Return the numbers of the settings of alpha and beta in the next pose."""
-        middle_ns, mean = (start_ns + stop_ns) // 2, np.array([alpha_rad, beta_rad])
-        low, high = self._readings.extremes(middle_ns)
-        moved = _encoder_moved(np.fmin(low, mean), np.fmax(high, mean), self._mean_rad,
-                               self._tolerance_rad)
-        moved |= _command_moved(*self._commands.extremes(start_ns),
-                                np.array(self._commands.before))
-        alpha, beta = self._settings + (moved | self._unseen)
+        moved = np.ones(2, bool)
+        if self._newest_ns is not None:
+            first_ns = self._newest_ns[0]
+            seen = _between(self._readings, sum(self._newest_ns) // 2, (start_ns + stop_ns) // 2)
+            seen = np.vstack([seen, (alpha_rad, beta_rad)])
+            held = np.vstack([(np.nan, np.nan), _between(self._commands, -np.inf, first_ns)])[-1]
+            given = np.vstack([held, _between(self._commands, first_ns, start_ns)])
+            moved = _encoder_moved(np.fmin.reduce(seen), np.fmax.reduce(seen), self._mean_rad,
+                                   self._tolerance_rad)
+            moved |= _command_moved(np.fmin.reduce(given), np.fmax.reduce(given), held)
+        alpha, beta = self._settings + moved
         return int(alpha), int(beta)
 
     def take(self, start_ns: int, stop_ns: int, alpha_rad: float, beta_rad: float) -> None:
@@ -154,46 +155,17 @@ class SettingTracker:
         self._settings = np.array(self.settings(start_ns, stop_ns, alpha_rad, beta_rad))
         mean = np.array([alpha_rad, beta_rad])
         self._mean_rad = np.where(np.isfinite(mean), mean, self._mean_rad)
-        self._unseen = False
-        self._readings.begin((start_ns + stop_ns) // 2)
-        self._commands.begin(start_ns)
+        self._newest_ns = start_ns, stop_ns
 
 
-class _Window:
-    """Angles of two joints since the last pose."""
+_Stamped = tuple[float, tuple[float, ...]]
+"""A stamp, ns, and the angles of both joints from then on, rad."""
 
-    def __init__(self) -> None:
-        # The last angles up to that pose, rad; NaN without any
-        self.before: tuple[float, ...] = (float('nan'), float('nan'))
-        self.newest: tuple[float, ...] = self.before  # The newest angles, rad
-        self._recent: deque[tuple[int, tuple[float, ...]]] = deque()
-        self._older = np.full((2, 2), np.nan)
 
-    def add(self, stamp_ns: int, angles_rad: tuple[float, ...]) -> None:
-        """Append the angles of both joints, rad, (2,)."""
-        self.newest = angles_rad
-        self._recent.append((stamp_ns, angles_rad))
-        if len(self._recent) > _MAX_READINGS:
-            _, oldest = self._recent.popleft()
-            self._older = np.array([np.fmin(self._older[0], oldest),
-                                    np.fmax(self._older[1], oldest)])
-
-    def extremes(self, stamp_ns: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the least and the greatest angles up to a stamp, rad, (2,) each."""
-        recent = [angles for _, angles in islice(self._recent, self._count(stamp_ns))]
-        angles_rad = np.vstack([self._older, *recent])
-        return np.fmin.reduce(angles_rad), np.fmax.reduce(angles_rad)
-
-    def begin(self, stamp_ns: int | None) -> None:
-        """Forget the angles up to a stamp, or all of them."""
-        for _ in range(len(self._recent) if stamp_ns is None else self._count(stamp_ns)):
-            _, self.before = self._recent.popleft()
-        self._older = np.full((2, 2), np.nan)
-
-    def _count(self, stamp_ns: int) -> int:
-        """Count the stored angles up to the last one whose stamp is not later."""
-        later = takewhile(lambda kept: kept[0] > stamp_ns, reversed(self._recent))
-        return len(self._recent) - sum(1 for _ in later)
+def _between(kept: Iterable[_Stamped], after_ns: float, last_ns: float) -> np.ndarray:
+    """Return the angles after a stamp, up to another one, rad, (n, 2)."""
+    return np.array([angles for stamp_ns, angles in kept
+                     if after_ns < stamp_ns <= last_ns]).reshape(-1, 2)
 
 
 _MAX_PERIODS = 1.5

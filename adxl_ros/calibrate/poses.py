@@ -95,14 +95,8 @@ class Poses:
                       stamps_ns * 1e-9, column('check').astype(bool), column('temperature_c'),
                       column('supply_v'))
         # Poses of earlier versions have no numbers of settings: they get those by the angles.
-        numbers = {}
-        for name in ('alpha_setting', 'beta_setting'):
-            by_angle = getattr(poses, name)
-            given = np.array([-1 if number is None else number for number in column(name)], int)
-            missing = given < 0
-            first = by_angle.max() + 1 if missing.any() else 0
-            numbers[name] = np.where(missing, by_angle, given + first)
-        return replace(poses, **numbers)
+        return replace(poses, **{name: column(name).astype(int) for name in (
+            'alpha_setting', 'beta_setting') if None not in column(name)})
 
     @staticmethod
     def joined(parts: Sequence[Poses]) -> Poses:

@@ -8,22 +8,23 @@ The result of a calibration: the fitted unit with its provenance, validity range
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from datetime import datetime, timezone
 import hashlib
+from itertools import groupby
 import os
 
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
 from adxl_ros.calibrate.poses import planes, Poses
 from adxl_ros.calibrate.report.acceptance import Assessment
+from adxl_ros.calibrate.report.coefficients import compare
 from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.atomic_write import keep_previous
 from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.model.coefficients import get
-from adxl_ros.model.constants import Z_90
 from adxl_ros.model.covariance import leverage
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient
@@ -46,9 +47,8 @@ class CalibrationResult:
     # nominal, fitted: The unit before and after the fit
     nominal: Sensor
     fitted: Sensor
-    report_lines: list[str]  # Errors, acceptance and fit as text: the head of the parameter file
-    # The same for a terminal of 80 columns, the most important lines first
-    summary_lines: list[str]
+    # Errors, acceptance and fit as text, the most important lines first
+    report_lines: Sequence[str]
     poses: Poses  # k poses, check poses among them
     # Acceptance of each model; the last one is that of `fitted`
     assessments: tuple[Assessment, ...] = ()
@@ -57,7 +57,7 @@ class CalibrationResult:
     gravity_fit: GravityFit | None = None  # The fit of a calibration against gravity
     outliers: tuple[int, ...] = ()  # Indices of the outliers, which the fit leaves out
     # What is wrong with the poses or the fit, and why no richer model was fitted
-    warnings: tuple[str, ...] = ()
+    warnings: Sequence[str] = ()
 
     def comments(self) -> list[str]:
         """Return coefficients and assessment as text: the head of the parameter file."""
@@ -111,28 +111,13 @@ class CalibrationResult:
         return ~np.isin(np.arange(len(self.poses)), self.outliers)
 
 
-_ABSOLUTE = {('bias', 'offset_v'): ('zero-g', 'zero_g_v'),
-             ('scale_factor', 'offset_v_per_g'): ('scale factor', 'scale_v_per_g')}
-"""Label and field of what is stated as a whole, not as a departure from the datasheet."""
-
-
 def coefficient_lines(sensor: Sensor) -> list[str]:
     """Return the fitted coefficients with their 90 % intervals as text."""
-    std = dict(zip(sensor.covariance_names, np.sqrt(np.diag(sensor.covariance))))
     lines = [f'{sensor.serial}: {sensor.model} model, coefficient +- half of its 90 % interval']
-    for effect, fitted in sensor.values.items():
-        for parameter in effect_named(effect).parameters:
-            if parameter.name not in fitted:
-                continue
-            label, field = _ABSOLUTE.get((effect, parameter.name),
-                                         (f'{effect}.{parameter.name}', ''))
-            values = getattr(sensor, field) if field else fitted[parameter.name]
-            axes = list(sensor.axes) if np.ndim(values) else ['']
-            names = [Coefficient(effect, parameter.name, axis) for axis in axes]
-            entries = [f'{name.axis} {value:.6g} +- {Z_90 * std[name]:.2g}'.lstrip()
-                       for name, value in zip(names, np.ravel(values)) if name in std]
-            if entries:
-                lines.append(f'  {label:34} {"   ".join(entries)} {parameter.unit}')
+    for name, rows in groupby(compare(sensor, sensor), lambda row: row.name):
+        by_axis = [f'{row.axis} {row.fitted:.6g} +- {row.half_width:.2g} {row.unit}'.strip()
+                   for row in rows]
+        lines.append(f'  {name:34} {"   ".join(by_axis)}')
     return lines
 
 

@@ -13,9 +13,9 @@ from pathlib import Path
 
 from adxl_ros.calibrate.guided import controller, pose_plan
 from adxl_ros.calibrate.guided.controller import Answer, ControllerState
+from adxl_ros.calibrate.guided.rest_guides import ThermalSettings
 from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, StageMode
 from adxl_ros.calibrate.guided.session import SessionSettings
-from adxl_ros.calibrate.guided.thermal_guide import ThermalSettings
 from adxl_ros.compensate.live_stream import UNKNOWN_ANGLE_RAD2
 from adxl_ros.files import cdr
 from adxl_ros.model.sensor import Sensor, to_volts

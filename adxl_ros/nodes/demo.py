@@ -287,7 +287,7 @@ def _run_recording(folder: Path, path: Path, length_s: float) -> None:
     fitted = parameter_file.load(output)
     nominal = replace(fitted.without_covariance(), effects=(), values={})
     _print('', *gravity_lines(
-        gravity_fit.fit_gravity(poses.volts, poses.std_v, nominal)), '',
+        gravity_fit.fit_gravity(poses.volts, poses.std_v, nominal), poses.time_s[:, 0]), '',
            *file_lines({'Page': report / 'report.html', 'Calibration': output}))
 
 

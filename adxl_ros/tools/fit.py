@@ -141,7 +141,7 @@ def fit(options: argparse.Namespace) -> int:
     cli.note(f'fit: {result.keep(options.store)}')
     report = [Path(options.report) / name for name in page.FILES] if options.report else []
     lines = [errors_in_words(result.fitted), '', *_result_lines(result)] if thermal is None else \
-        [*result.summary_lines, '']
+        [*result.report_lines, '']
     cli.print_end([*lines, *measured, ''], [options.output, *report], cli.command(
         'apply', f'{cli.quoted(options.recording[0])}{cli.reading_text(options)} --params '
         f'{cli.quoted(options.output)} -o tilt.csv'))
@@ -178,15 +178,15 @@ def _result_lines(result: calibration.CalibrationResult) -> list[str]:
     if result.held_out:
         count = result.held_out[-1].pose_count
         folds = ': a fifth is left out at a time' if count >= len(result.inliers) else ''
-        lines += ['', f' on {count} poses that the fit has not seen{folds}',
-                  *acceptance.error_table(result.held_out)]
+        lines += ['', f'on {count} poses that the fit has not seen{folds}',
+                  *acceptance.error_table(result.held_out, result.assessments)]
     elif result.gravity_fit is not None:
-        lines += ['', *acceptance.gravity_lines(result.gravity_fit)]
+        lines += ['', *acceptance.gravity_lines(result.gravity_fit, result.poses.time_s[:, 0])]
     if result.assessments:
         assessment = result.assessments[-1]
-        lines += ['', *acceptance.limit_table(assessment, fitted),
-                  f' {"limited by":24} {_LIMITS[assessment.limited_by]}']
-    return lines + [f' {line}' for line in (*acceptance.unit_line(fitted), *result.warnings)]
+        lines += ['', *acceptance.explanation(assessment, fitted),
+                  f'limited by {_LIMITS[assessment.limited_by]}']
+    return lines + [*acceptance.unit_line(fitted), *result.warnings]
 
 
 def main() -> int:

@@ -63,6 +63,8 @@ _STAGE_PRIOR_SIZES = 3.0
 stage that is in order."""
 _GAUGE_PRIOR_SIZES = 1.0
 """Prior standard deviation of a term of `GAUGE`, in typical sizes: the datasheet's 1.5 %."""
+_NAMED_POSES = 4
+"""Number of further poses that a message names."""
 _REGULARISATION = 1e-6
 """Term added to the information in typical sizes, so that it can be inverted."""
 
@@ -466,14 +468,12 @@ def require_determined(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
         f'they have {poses.volts.size} values for {len(names)} coefficients'
     raise UserError(
         f'the full model is not determined by {len(poses)} poses: {reason}; add poses (alpha, '
-        f'beta) = {format_poses(next_poses(unit, poses, names, stage))} deg, or fit --model '
-        'physical or linear')
+        f'beta) = {next_poses(unit, poses, names, stage)} deg, or fit --model physical or linear')
 
 
-def next_poses(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError,
-               count: int = 4) -> list[tuple[float, float]]:
+def next_poses(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError) -> str:
     """
-    Choose the poses that would help most, one by one: alpha and beta of each, rad.
+    Name the poses that would help most, one by one, as `(alpha, beta)` in degrees.
 
     Each pose is the one of a 15° grid that shrinks the joint confidence region of all
     coefficients the most, in units of their typical size (D-optimality; Fedorov 1972). Each is a
@@ -484,11 +484,6 @@ def next_poses(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: 
     rows = linearisation.whitened_jacobian(unit, grid, tuple(names), stage) * scale
     information = fisher_information(unit, poses, names, stage) * np.outer(scale, scale)
     chosen = linearisation.choose_poses(rows, information + _REGULARISATION * np.eye(len(names)),
-                                        count)
-    return [(float(grid.alpha_rad[i]), float(grid.beta_rad[i])) for i in chosen]
-
-
-def format_poses(angles_rad: Sequence[tuple[float, float]]) -> str:
-    """Format poses as `(alpha, beta)` in degrees."""
-    return ', '.join(f'({np.degrees(alpha):.0f}, {np.degrees(beta):.0f})'
-                     for alpha, beta in angles_rad)
+                                        _NAMED_POSES)
+    return ', '.join(f'({np.degrees(grid.alpha_rad[i]):.0f}, {np.degrees(grid.beta_rad[i]):.0f})'
+                     for i in chosen)

@@ -160,10 +160,7 @@ def magnitude_jacobian(mean: np.ndarray, parameters: np.ndarray) -> np.ndarray:
 
 def magnitude_variance(rests: NominalRests, parameters: np.ndarray) -> np.ndarray:
     """Return the variance of each magnitude by the noise of the means, g², (k,)."""
-    sines = _sines(parameters)
-    force = _components(rests.mean, parameters, sines)
-    by_sensed = _sensed_gradient(force / _length(force), sines)
-    return _variance(rests, by_sensed.T / (1 + parameters[3:6]))
+    return _variance(rests, linearised(rests.mean, parameters).by_output)
 
 
 def _variance(rests: NominalRests, by_output: np.ndarray) -> np.ndarray:
@@ -298,8 +295,8 @@ def name_up(candidate: int) -> str:
     return axes[0] if len(axes) == 1 else f'{" and ".join(axes)} equally'
 
 
-def points_up(name: str) -> str:
-    """Return a sentence for a name: '+x points up', '+x and −y point up equally'."""
-    if ' and ' not in name:
-        return f'{name} points up'
-    return f'{name.removesuffix(" equally")} point up equally'
+def points_up(candidate: int) -> str:
+    """Return a sentence: '+x points up', '+x and −y point up equally'."""
+    name = name_up(candidate)
+    return f'{name.removesuffix(" equally")} point up equally' if ' and ' in name else \
+        f'{name} points up'

@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol
 
 from adxl_ros.calibrate.fits.gravity_fit import MIN_RESTS
 from adxl_ros.calibrate.guided.guide import NewestSamples, NextPose, STALE_NS
-from adxl_ros.calibrate.guided.hand_guide import ENOUGH_RESTS
+from adxl_ros.calibrate.guided.rest_guides import ENOUGH_RESTS
 from adxl_ros.calibrate.guided.screen_contents import Phase, Status
 from adxl_ros.calibrate.guided.session import Session, SessionSettings
 from adxl_ros.calibrate.guided.stage_guide import MountingError
@@ -27,8 +27,6 @@ import numpy as np
 
 IDLE_TEXT = 'idle; call ~/start'
 """Status of a controller that has not been started."""
-_POLLS_PER_MEASUREMENT = 50
-"""Calls of `poll` from one attempt to measure an unknown sensor to the next: one a second."""
 
 
 class ControllerState(Enum):
@@ -152,7 +150,7 @@ class StreamSensor:
     def __init__(self, settings: SessionSettings, sensor: Sensor, anonymous: Sensor,
                  samples: SampleSource) -> None:
         self._settings, self._sensor, self._anonymous = settings, sensor, anonymous
-        self._samples, self._polls = samples, 0
+        self._samples = samples
         self.unit: Sensor | None = None  # The nominal sensor; None while it is unknown
         self.newest: NewestSamples | None = None  # Its newest samples
         self.fault = ''  # Why the stated sensor is not the one of the parameters, or ''
@@ -180,8 +178,7 @@ class StreamSensor:
         if self.unit is None and (waits or shows):
             # A driver that has just begun states its sensor on another topic.
             self._samples.keep_newest()
-            self._polls += 1
-            if self._polls % _POLLS_PER_MEASUREMENT == 0 and not self.fault:
+            if not self.fault:
                 self._measure(log, outputs)
         elif self.unit is not None and self.newest is not None and shows:
             self.newest.feed(*self._samples.take(self.unit))
@@ -197,6 +194,7 @@ class StreamSensor:
             unit, lines = recorded_sensor.unit_of_stream(self._anonymous, stamps_ns, accel_mps2)
         except UserError as error:
             log.line(Severity.WARNING, f'imu/data_raw: {error}')
+            self._samples.clear()
             return
         outputs.log(Severity.INFO, f'no sensor_info: measured from the stream: {"; ".join(lines)}')
         self.take(unit)
@@ -221,7 +219,6 @@ class Controller:
         self._samples, self._outputs, self._log = samples, outputs, _Log(outputs)
         self._starts_over: bool | None = None
         self._fit_fault = ''
-        self._misdated: set[str] = set()
         self._accepted = 0
 
     def start(self, start_over: bool | None = None) -> Answer:
@@ -314,19 +311,10 @@ class Controller:
 
     def read_quantity(self, quantity: str, stamp_ns: int, value: float) -> None:
         """Take a temperature or a supply; a stamp of another clock gives way to the newest one."""
-        if self.session is None:
-            return
-        newest_ns = self.session.guide.newest_ns or 0
-        ahead_ns = stamp_ns - newest_ns
-        if stamp_ns and newest_ns and abs(ahead_ns) > STALE_NS:
-            if quantity not in self._misdated:
-                self._misdated.add(quantity)
-                side = 'ahead of' if ahead_ns > 0 else 'behind'
-                self._outputs.log(
-                    Severity.WARNING, f'{quantity} is stamped {abs(ahead_ns) * 1e-9:.0f} s {side} '
-                    'imu/data_raw: its time of arrival counts; put both on one clock')
-            stamp_ns = 0
-        self.session.guide.readings[quantity].add(stamp_ns or newest_ns, value)
+        if self.session is not None:
+            newest_ns = self.session.guide.newest_ns or stamp_ns
+            is_near = abs(stamp_ns - newest_ns) <= STALE_NS
+            self.session.guide.readings[quantity].add(stamp_ns if is_near else newest_ns, value)
 
     def poll(self) -> None:
         """Take the samples and poses since the last call; announce the next pose or fit."""
@@ -451,7 +439,7 @@ class Controller:
             return False
         for line in result.comments():
             self._outputs.log(Severity.INFO, line)
-        self.outcome = tuple(result.summary_lines)
+        self.outcome = tuple(result.report_lines)
         self._outputs.log(Severity.INFO, self.outcome[0])
         open_poses = session.guide.open_poses
         advice = f'; {open_poses} poses are open: start again to go on' if open_poses else ''

@@ -214,34 +214,26 @@ class EncoderTrack:
         self.newest_ns: int | None = None  # Stamp of the newest reading, ns
         self.angles_rad: tuple[float, float] | None = None  # Newest alpha and beta, rad
         self._readings: deque[tuple[int, float, float]] = deque(maxlen=_KEPT_READINGS)
-        self._offsets_s: deque[float] = deque(maxlen=_KEPT_OFFSETS)
-        self._is_compared = True
+        # Stamps of the readings minus those of the newest samples, s
+        self.offsets_s: deque[float] = deque(maxlen=_KEPT_OFFSETS)
 
-    def read(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> bool:
-        """Take a reading; return whether its clock went back."""
+    def read(self, stamp_ns: int, alpha_rad: float, beta_rad: float, sample_ns: int | None
+             ) -> bool:
+        """Take a reading, and the newest stamp of the samples; return whether time went back."""
+        if sample_ns is not None:
+            self.offsets_s.append((stamp_ns - sample_ns) * 1e-9)
         restarted = went_back(self.newest_ns, stamp_ns)
         if restarted:
             self._readings.clear()
         self._readings.append((stamp_ns, alpha_rad, beta_rad))
         self.newest_ns, self.angles_rad = stamp_ns, (alpha_rad, beta_rad)
-        self._is_compared = False
         return restarted
-
-    def compare_clock(self, sample_ns: int) -> None:
-        """Compare the clock of a new reading with the newest stamp of the samples, ns."""
-        if not self._is_compared and self.newest_ns is not None:
-            self._offsets_s.append((self.newest_ns - sample_ns) * 1e-9)
-        self._is_compared = True
-
-    def forget_clock(self) -> None:
-        """Forget the comparisons, since the clock of the samples has changed."""
-        self._offsets_s.clear()
 
     def clock_fault(self) -> str:
         """Return what is wrong with the clock of the encoder, or ''."""
         # The smallest offset is that of the message with the least delay.
-        ahead_s = min(self._offsets_s, key=abs) \
-            if len(self._offsets_s) >= _FEWEST_OFFSETS else 0.0
+        ahead_s = min(self.offsets_s, key=abs) \
+            if len(self.offsets_s) >= _FEWEST_OFFSETS else 0.0
         size_s = abs(ahead_s)
         if size_s <= _CLOCK_OFFSET_S:
             return ''
@@ -314,9 +306,6 @@ class Guide:
         """Return the number of the previous pose, from 0; None where there is none."""
         return max(self.accepted, default=None)
 
-    def retry(self) -> None:
-        """Take the same pose again, since its record is not on disk; here it is still there."""
-
     def redo(self, append: Callable[[JournalEntry], None]) -> str:
         """Forget the previous pose, in the journal first; return a line for people, or ''."""
         number = self.previous
@@ -368,8 +357,3 @@ class Guide:
         return (f'temperature moved {abs(now_c - first_c):.1f} °C since the first pose '
                 f'({first_c:.1f} to {now_c:.1f} °C), must stay within {span_c:g} °C; wait until '
                 'it is back, or finish with the poses so far')
-
-    def saturated_text(self, part: str) -> str:
-        """Return that a part of the stream, 'rest' or 'block', is refused as saturated."""
-        return (f'saturated: samples of the {part} are beyond the range of '
-                f'±{self.sensor.range_g:g} g or at a rail of the ADC; check supply and wiring')

@@ -19,7 +19,8 @@ from adxl_ros.calibrate.fits.linearisation import linearised, StageError
 from adxl_ros.calibrate.guided import pose_plan
 from adxl_ros.calibrate.guided.pose_plan import angle_fault, signed_text, Target
 from adxl_ros.calibrate.guided.screen_contents import CoefficientRow
-from adxl_ros.calibrate.poses import angle_jacobian, coefficient_jacobian, Poses, predicted_volts
+from adxl_ros.calibrate.poses import coefficient_jacobian, Poses, predicted_volts
+from adxl_ros.calibrate.report import held_out
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
@@ -38,12 +39,6 @@ _VISIBLE_RAD = np.radians(1.0)
 """Largest standard deviation of an angle by noise alone, rad, at which a pose counts."""
 _LEAST_STD_V = 1e-7
 """Lower bound of the noise of a mean, V; chosen: below any ADC, so that no weight is infinite."""
-_SEARCH_STD_RAD = np.radians(60.0)
-"""Prior standard deviation of the angles in `_angles_of`, rad; chosen: a wrong pose is likely."""
-_LONGEST_STEP_RAD = 0.3
-"""Longest step of the search of `_angles_of`, rad; chosen: the response is nearly linear in it."""
-_SEARCH_STEPS = 25
-"""Steps of the search of `_angles_of`; chosen: several turns at the longest step."""
 _MOST_DECIMALS = 6
 """Most decimals of a coefficient on the screen; chosen: 1 µV."""
 _OUTLIER_STDS = 3.5
@@ -98,34 +93,22 @@ class RunningEstimate:
         if is_wiring_unproven and _is_crossed(measured_g, expected_g):
             return f'{finding}: axis inverted or swapped; check wiring, mounting and pose'
         advice = ', or take the pose before again' if self.poses and is_wiring_unproven else ''
-        angles_rad = self._angles_of(target, volts, slack_v)
-        distance = '' if angles_rad is None else angle_fault(target, *angles_rad, tolerance_rad)
-        if distance:
+        if distance := self._distance(target, pose, volts, slack_v, tolerance_rad):
             return f'{finding}: by the sensor, {distance}; check the pose and the mounting{advice}'
         return f'{finding}; check the pose, the mounting and the wiring{advice}'
 
-    def _angles_of(self, target: Target, volts: np.ndarray, slack_v: np.ndarray
-                   ) -> tuple[float, float] | None:
-        """
-        Find the angles near a pose that explain volts, by damped Gauss-Newton steps.
-
-        volts, slack_v: the volts that are read, and their standard deviations about the model, V,
-        (m,); returns: alpha and beta, rad; None if no angles explain the volts. An angle
-        that the volts do not show stays as it is.
-        """
-        start_rad = np.array([target.alpha_rad, target.beta_rad])
-        change_rad, damping = np.zeros(2), 1 / _SEARCH_STD_RAD ** 2
-        for _ in range(_SEARCH_STEPS):
-            pose = self._pose(*(start_rad + change_rad))
-            residual = (volts - predicted_volts(self.unit, pose)[0]) / slack_v
-            slope = angle_jacobian(self.unit, pose)[0] / slack_v[:, None]
-            step_rad = np.linalg.solve(slope.T @ slope + damping * np.eye(2),
-                                       slope.T @ residual - damping * change_rad)
-            change_rad = change_rad + np.clip(step_rad, -_LONGEST_STEP_RAD, _LONGEST_STEP_RAD)
-        if np.abs(residual).max() > _EXPLAINED_STDS:
-            return None
-        alpha_rad, beta_rad = (start_rad + change_rad).tolist()
-        return alpha_rad, beta_rad
+    def _distance(self, target: Target, pose: Poses, volts: np.ndarray, slack_v: np.ndarray,
+                  tolerance_rad: float) -> str:
+        """Return how far from a target the volts show the stage; '' if no angles explain them."""
+        errors = held_out.pose_errors(self.unit, replace(
+            pose, volts=volts[None], std_v=slack_v[None]))
+        excess_g = np.linalg.norm(errors.force_mps2) / self.unit.local_gravity_mps2 - 1
+        if abs(excess_g) > _EXPLAINED_STDS * np.max(slack_v / self.unit.nominal_scale_v_per_g):
+            return ''
+        # An angle that the volts do not show counts as the target's.
+        alpha_rad, beta_rad = np.nan_to_num([errors.alpha_rad[0], errors.beta_rad[0]])
+        return angle_fault(target, target.alpha_rad + alpha_rad, target.beta_rad + beta_rad,
+                           tolerance_rad)
 
     def _pose(self, alpha_rad: float, beta_rad: float) -> Poses:
         return Poses.without_volts(np.array([alpha_rad]), np.array([beta_rad]), self.pose_std_v)

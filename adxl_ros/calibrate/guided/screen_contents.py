@@ -120,15 +120,15 @@ class Progress:
     # out
     accepted: int
     total: int
-    skipped: int
+    skipped: int = 0
     # Number of poses that a fit would miss now; 0 where the number of poses is not fixed
-    open_poses: int
+    open_poses: int = 0
     # Time that the open poses take, s; None where the number of poses is not fixed
-    remaining_s: float | None
+    remaining_s: float | None = None
     # dwelt_s, dwell_s: Time at rest in the pose so far, and the required time, s; None without a
     # fixed dwell
-    dwelt_s: float | None
-    dwell_s: float | None
+    dwelt_s: float | None = None
+    dwell_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -157,12 +157,12 @@ class Estimate:
     """What the poses determine so far."""
 
     coverage: tuple[Coverage, ...]  # Poses by group
-    covered_faces: str  # Faces of the sensor that have pointed up, for people; '' with a stage
     coefficients: tuple[CoefficientRow, ...]  # The parameters of the unit
     # Expected rms error of alpha and beta, degrees; None where no pose shows both
-    tilt_error_deg: float | None
+    tilt_error_deg: float | None = None
     # The same after all poses; None where the number of poses is not fixed
-    final_tilt_error_deg: float | None
+    final_tilt_error_deg: float | None = None
+    covered_faces: str = ''  # Faces of the sensor that have pointed up, for people
     # Expected error over a range of temperature, for people; '' for other calibrations
     range_error: str = ''
 

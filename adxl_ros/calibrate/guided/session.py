@@ -13,10 +13,9 @@ from typing import Any
 from adxl_ros.calibrate import calibration
 from adxl_ros.calibrate.guided import pose_plan, running_estimate
 from adxl_ros.calibrate.guided.guide import NewestSamples
-from adxl_ros.calibrate.guided.hand_guide import HandGuide
+from adxl_ros.calibrate.guided.rest_guides import HandGuide, ThermalGuide, ThermalSettings
 from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, Estimate, StageMode
 from adxl_ros.calibrate.guided.stage_guide import StageGuide
-from adxl_ros.calibrate.guided.thermal_guide import ThermalGuide, ThermalSettings
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import page
 from adxl_ros.errors import UserError
@@ -194,7 +193,8 @@ class Session:
             try:
                 self.journal.append(record)
             except UserError:
-                self.guide.retry()
+                if self.stage is not None:
+                    self.stage.go(self.stage.course.index)
                 raise
             self.guide.take(record)
             yield f'pose {record.pose + 1} is on disk'

@@ -125,7 +125,7 @@ class StageSweep(Guide):
 
     def read_encoder(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
         """Take the angles of the stage."""
-        if self.encoder.read(stamp_ns, alpha_rad, beta_rad):
+        if self.encoder.read(stamp_ns, alpha_rad, beta_rad, self.newest_ns):
             # A stage that has restarted may have moved in between.
             self._tracker.lose_track()
         if self.uses_encoder:
@@ -154,10 +154,9 @@ class StageSweep(Guide):
                 'begins again'
             self.verify()
             self._tracker.lose_track()
-            self.encoder.forget_clock()
+            self.encoder.offsets_s.clear()
             self.since_ns, self.dwell, self.has_arrived = None, Dwell(self.sensor, 0), False
         self.newest_ns = int(stamps_ns[-1])
-        self.encoder.compare_clock(self.newest_ns)
         if self.since_ns is None:
             self.since_ns = int(stamps_ns[0])
         if self.has_arrived:
@@ -207,40 +206,22 @@ class StageSweep(Guide):
             self.sensor, self.poses_to_fit(), self.settings.dwell_s, self.estimate)
         self.go(self.course.next_open())
 
-    def retry(self) -> None:
-        """Take the same pose again, since its record is not on disk."""
-        self.go(self.course.index)
-
     def refuse(self, reason: str) -> None:
         """Report a refusal once. A commanded stage averages again, an operator captures again."""
         super().refuse(reason)
         self.restart_dwell(self.moves_itself)
 
 
-def _moved_away(sweep: StageSweep, record: PoseRecord) -> str:
-    """Refuse a rest in another pose than that in which the operator captured."""
-    settings, sensor, dwell = sweep.settings, sweep.sensor, sweep.dwell
-    if settings.stage_mode is StageMode.COMMANDED:
-        return ''
+def _fault(sweep: StageSweep, record: PoseRecord, rest: Rest) -> str:
+    """Return why a pose is refused, or ''."""
+    settings, fault = sweep.settings, ''
     if settings.stage_mode is StageMode.ENCODER:
         now_rad = sweep.encoder.angles_rad or (record.alpha_rad, record.beta_rad)
-        return pose_plan.angle_fault(
+        fault = pose_plan.angle_fault(
             sweep.course.targets[record.pose], *now_rad, settings.near_rad) or \
             pose_plan.motion_fault(sweep.encoder.between(record.start_ns, record.stop_ns),
                                    settings.tolerance_rad)
-    captured_v = dwell.volts(dwell.rests()[0]).mean(axis=0)
-    change_g = np.abs(np.array(record.mean_v) - captured_v) / sensor.nominal_scale_v_per_g
-    axis = int(change_g.argmax())
-    if change_g[axis] < np.sin(settings.near_rad):
-        return ''
-    return (f'the pose changed after the capture: {sensor.axes[axis]} moved by '
-            f'{change_g[axis]:.2f} g; hold the stage still until the pose is taken')
-
-
-def _fault(sweep: StageSweep, record: PoseRecord, rest: Rest) -> str:
-    """Return why a pose is refused, or ''."""
-    settings = sweep.settings
-    fault = _moved_away(sweep, record) or pose_plan.saturation_fault(
+    fault = fault or pose_plan.saturation_fault(
         sweep.sensor, sweep.dwell.volts(rest)) or sweep.temperature_fault(
             record.temperature_c, settings.temperature_span_c)
     if fault or sweep.to_verify:
@@ -375,7 +356,7 @@ class StageGuide(StageSweep):
         final = self.estimate.with_poses([target for number, target in enumerate(targets)
                                           if number not in closed and not target.check])
         return screen_contents.Estimate(
-            coverage=pose_plan.by_plane(targets, self.accepted), covered_faces='',
+            coverage=pose_plan.by_plane(targets, self.accepted),
             coefficients=self.estimate.rows(),
             tilt_error_deg=running_estimate.degrees_or_none(self.tilt_error_rad()),
             final_tilt_error_deg=running_estimate.degrees_or_none(final.tilt_error_rad()))

@@ -142,30 +142,18 @@ def nonlinearity_mps2(sensor: Sensor) -> float:
     return typical * sensor.range_g ** 3 * G0_MPS2
 
 
-def table(assessments: Sequence[Assessment], models: Sequence[HeldOutErrors]) -> list[str]:
-    """Return errors and outcomes of all models as lines for a terminal."""
-    lines = [f'{"model":9} {"tilt rms (90 %) deg":>23} {"accel rms (90 %) mg":>23}  '
-             f'{"error mg":>8}  {"datasheet":9} {"noise":9} limited by']
-    errors_of = {errors.model: errors for errors in models}
-    for row in assessments:
-        errors = errors_of[row.model]
-        lines.append(
-            f'{row.model:9} {_with_interval(errors.tilt_deg)} {_with_interval(errors.accel_mg)}  '
-            f'{row.error_mg:8.3f}  {row.accel_datasheet or "-":9} {row.accel_noise:9} '
-            f'{row.limited_by}')
-    return lines
-
-
 def explanation(assessment: Assessment, sensor: Sensor) -> list[str]:
     """State the limits, and the parts of the error of the saved model."""
-    accel = assessment.accel
-    limit_mps2, noise_mps2 = nonlinearity_mps2(sensor), held_out.sample_noise_mps2(sensor)
+    accel, to_tilt = assessment.accel, np.degrees(np.sqrt(assessment.tilt.tilt_per_axis))
     tilt = '' if np.isnan(assessment.error_deg) else f' and {assessment.error_deg:.3f} deg'
-    datasheet = f'limit by the datasheet {1e3 * limit_mps2 / G0_MPS2:.2g} mg (typical ' \
-        'nonlinearity at full scale)' if limit_mps2 else 'no limit by a datasheet'
+    # The limit of tilt is the tilt that an acceleration error of each axis causes.
+    limits = [f'limit by the {name} {1e3 * limit_mps2 / G0_MPS2:.2g} mg'
+              + ('' if np.isnan(to_tilt) else f' and {limit_mps2 * to_tilt:.2g} deg')
+              for name, limit_mps2 in (
+                  ('datasheet', nonlinearity_mps2(sensor)),
+                  ('noise of one sample', held_out.sample_noise_mps2(sensor))) if limit_mps2]
     lines = [f'calibration error {assessment.error_mg:.3f} mg{tilt} rms, without noise and stage '
-             'error of the check',
-             f'{datasheet}; limit by the noise of one sample {1e3 * noise_mps2 / G0_MPS2:.2g} mg']
+             'error of the check', '; '.join(limits)]
     part = {name: f'{name} {rms_mg(getattr(accel, name)):.3f}'
             for name in ('noise', 'stage', 'coefficients', 'model')}
     if assessment.model == 'gravity':
@@ -178,42 +166,14 @@ def explanation(assessment: Assessment, sensor: Sensor) -> list[str]:
         lines.append(f'expected {rms_mg(accel.expected):.3f} mg = {", ".join(part.values())} '
                      f'(squares add); measured {rms_mg(accel.measured):.3f} mg'
                      + (', which differs by chance' if by_chance else ''))
-    if assessment.tilt_noise:
-        outcomes = (('datasheet', limit_mps2, assessment.tilt_datasheet),
-                    ('noise', noise_mps2, assessment.tilt_noise))
-        limits = [f'{_tilt_deg(assessment, limit):.2g} deg by the {name}: {outcome}'
-                  for name, limit, outcome in outcomes if outcome]
-        lines.append(f'limits of tilt: {", ".join(limits)}')
     if not accel.separable:
         lines.append('no pose was visited twice: stage and model are inseparable')
     return lines
 
 
-def limit_table(assessment: Assessment, sensor: Sensor) -> list[str]:
-    """Lay out the error of the calibration below its limits, with one outcome for each figure."""
-    rows = [('calibration error', 1e3 * assessment.accel.calibration ** 0.5 / G0_MPS2,
-             assessment.error_deg, '', '')]
-    for name, limit_mps2, accel, tilt in (
-            ('limit by the datasheet', nonlinearity_mps2(sensor), assessment.accel_datasheet,
-             assessment.tilt_datasheet),
-            ('noise of one sample', held_out.sample_noise_mps2(sensor), assessment.accel_noise,
-             assessment.tilt_noise)):
-        if accel:
-            rows.append((name, 1e3 * limit_mps2 / G0_MPS2, _tilt_deg(assessment, limit_mps2),
-                         accel, tilt))
-    return [f' {name:24} {"-" if np.isnan(value_deg) else two_digits(value_deg):>7} ° {tilt:9} '
-            f'{two_digits(value_mg):>8} mg {accel}'.rstrip()
-            for name, value_mg, value_deg, accel, tilt in rows]
-
-
-def two_digits(value: float) -> str:
+def _two_digits(value: float) -> str:
     """Write a value with two digits, the last zero too."""
     return f'{value:.0f}' if value >= 10 else f'{value:#.2g}'
-
-
-def _tilt_deg(assessment: Assessment, accel_mps2: float) -> float:
-    """Return the tilt that an acceleration error of each axis causes, deg rms."""
-    return float(np.degrees(accel_mps2 * np.sqrt(assessment.tilt.tilt_per_axis)))
 
 
 def unit_line(sensor: Sensor) -> list[str]:
@@ -224,13 +184,14 @@ def unit_line(sensor: Sensor) -> list[str]:
     """
     if not sensor.datasheet:
         return []
-    names, beyond = sensor.covariance_names, []
-    for name, value, half_width in zip(names, get(sensor, names),
-                                       Z_90 * np.sqrt(np.diag(sensor.covariance))):
-        _, maximum = sensor.datasheet.get(name.without_axis, (0.0, 0.0))
-        if maximum and abs(value) - half_width > maximum:
-            beyond.append(f'{name} is {with_half_width(float(value), half_width)} '
-                          f'{parameter_of(name).unit}, beyond {maximum:g}')
+    names = sensor.covariance_names
+    half_widths = Z_90 * np.sqrt(np.diag(sensor.covariance))
+    maxima = [sensor.datasheet.get(name.without_axis, (0.0, 0.0))[1] for name in names]
+    beyond = [f'{name} is {with_half_width(float(value), half_width)} {parameter_of(name).unit}, '
+              f'beyond {maximum:g}'
+              for name, value, half_width, maximum in zip(names, get(sensor, names), half_widths,
+                                                          maxima)
+              if 0 < maximum < abs(value) - half_width]
     return [f'unit within {sensor.datasheet_name or "its datasheet"}: '
             + (f'{FAIL}: {"; ".join(beyond)}' if beyond else PASS)]
 
@@ -254,9 +215,9 @@ def headline(assessment: Assessment | None, models: Sequence[HeldOutErrors]) -> 
     return lines
 
 
-def narrow_table(assessments: Sequence[Assessment], models: Sequence[HeldOutErrors]
-                 ) -> list[str]:
-    """Return errors and outcomes of all models in at most 79 columns, the simplest model first."""
+def error_table(models: Sequence[HeldOutErrors], assessments: Sequence[Assessment] = ()
+                ) -> list[str]:
+    """Return errors and outcomes by model in at most 79 columns; the last model is in the file."""
     if not models:
         return []
     row_of, limits = {row.model: row for row in assessments}, f'{"datasheet":9} {"noise":9}'
@@ -276,19 +237,24 @@ def _cell(statistic: held_out.ErrorStatistic, datasheet: str, noise: str) -> str
     return f'{cell:>14} {datasheet:9} {noise:9}'
 
 
-def gravity_line(assessment: Assessment, held_out_mps2: np.ndarray) -> str:
+def gravity_lines(fit: GravityFit, time_s: np.ndarray) -> list[str]:
     """
-    State errors and outcomes of a calibration against gravity in one line.
+    State the errors of a calibration against gravity, before and after, and its outliers.
 
-    held_out_mps2: error of the magnitude of gravity at each rest by the fit to the other stretches
-    of time, m/s², (k,).
+    time_s: beginning of each rest, s, (k,).
     """
-    mg = held_out_mps2 / G0_MPS2 * 1e3
-    low, high = held_out.rms_interval(mg)
-    return (f'held-out stretches of time: {np.sqrt(np.mean(mg ** 2)):.3f} ({low:.3f} to '
-            f'{high:.3f}) mg rms, '
-            f'{np.abs(mg).max():.3f} max; datasheet {assessment.accel_datasheet or "-"}, noise '
-            f'{assessment.accel_noise}; limited by the {assessment.limited_by}')
+    kept = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
+    before, after, unseen = (rms_mg(np.mean(values[kept] ** 2)) for values in (
+        fit.before_mps2, fit.residual_mps2, fit.held_out_mps2))
+    held_out_mg = fit.held_out_mps2[kept] / G0_MPS2 * 1e3
+    low, high = held_out.rms_interval(held_out_mg)
+    lines = [f'magnitude of gravity over {len(kept)} rests, rms in mg: nominal {before:.2f}, '
+             f'nine parameters {after:.3f}, held-out stretches of time {unseen:.3f} ({low:.3f} '
+             f'to {high:.3f}), {np.abs(held_out_mg).max():.3f} max']
+    if fit.outliers:
+        rests = ', '.join(f'{i + 1} (from {time_s[i]:.1f} s)' for i in fit.outliers)
+        lines.append(f'outliers, left out: rest {rests}')
+    return lines
 
 
 def provenance_entries(assessment: Assessment | None, models: Sequence[HeldOutErrors]
@@ -314,84 +280,42 @@ def provenance_entries(assessment: Assessment | None, models: Sequence[HeldOutEr
             'limited_by': assessment.limited_by}
 
 
-def _with_interval(statistic: held_out.ErrorStatistic) -> str:
-    if np.isnan(statistic.rms):
-        return f'{"-":>23}'
-    low, high = statistic.interval
-    return f'{f"{statistic.rms:.3f} ({low:.3f} to {high:.3f})":>23}'
-
-
-_MODELS = {'nominal': 'datasheet values', 'linear': 'linear calibration',
-           'physical': 'physical calibration', 'full': 'full calibration'}
-"""Models in words."""
-
-
-def error_table(models: Sequence[HeldOutErrors]) -> list[str]:
-    """Lay out the errors of the models on held-out poses; the file holds the last model."""
-    lines = [f' {"":24}tilt error     acceleration error     (rms)']
-    lines += [f' {_MODELS[errors.model]:22} {_three_digits(errors.tilt_deg.rms):>9} ° '
-              f'{_three_digits(errors.accel_mg.rms):>18} mg' for errors in models]
-    lines[-1] += '           <- saved'
-    return lines
-
-
-def _three_digits(value: float) -> str:
-    """Write a value so that the decimal points of a right-aligned column stand in one line."""
-    if np.isnan(value):
-        return '-   '
-    decimals = 1 if value >= 10 else 2 if value >= 1 else 3
-    return f'{value:.{decimals}f}'.ljust(len(f'{value:.3f}'))
-
-
-def acceptance_lines(fitted: Sensor) -> list[str]:
+def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
     """
-    Return whether the calibration error is within its limit, as lines.
+    Return whether the calibration error is within its limit, and sentences on it.
 
     The limit is that of the datasheet, or the noise of one sample where no datasheet states one.
     """
     provenance = fitted.provenance
-    span = [f'       By rests within {duration(float(provenance["span_s"]))}; a longer drift is '
-            'not in this figure.'] if 'span_s' in provenance else []
     if 'own_accel_mg' not in provenance:
-        return [f' {NOT_SHOWN}  no pose was kept out of the fit to assess it']
-    error_mg = float(provenance['own_accel_mg'])
-    limit_mps2, kind, allows = nonlinearity_mps2(fitted), 'datasheet', \
-        'the datasheet allows'
+        return NOT_SHOWN, ['no pose was kept out of the fit to assess it']
+    limit_mps2, kind, allows = nonlinearity_mps2(fitted), 'datasheet', 'the datasheet allows'
     if not limit_mps2:
         limit_mps2, kind = held_out.sample_noise_mps2(fitted), 'noise'
         allows = 'the noise of one sample is'
-    limit = f'{two_digits(1e3 * limit_mps2 / G0_MPS2)} mg'
+    limit = f'{_two_digits(1e3 * limit_mps2 / G0_MPS2)} mg'
     accel = provenance.get(f'verdict_{kind}', '')
-    tilt = provenance.get(f'verdict_tilt_{kind}', '')
-    result = f'calibration error {two_digits(error_mg)} mg; {allows} {limit}'
-    if FAIL in (accel, tilt):
+    outcome = _worse(accel, provenance.get(f'verdict_tilt_{kind}', '')) or PASS
+    lines = [f'calibration error {_two_digits(float(provenance["own_accel_mg"]))} mg; {allows} '
+             f'{limit}']
+    if outcome == FAIL:
         if accel != FAIL:
             tilt_deg = float(provenance['own_tilt_deg'])
-            result = f'tilt error {tilt_deg:.2g}°, more than {limit} causes'
-        advice = 'More poses, or longer ones, reduce it.'
-        if len(fitted.axes) == 1:
-            advice = 'One axis does not see the force across it: align it, or accept this error.'
-        elif kind == 'datasheet':
-            advice = 'The sensor is worse than its datasheet states: do not use this file.'
-        return [f' {FAIL}  {result}', f'       {advice}', *span]
-    if NOT_SHOWN in (accel, tilt):
-        return [f' {NOT_SHOWN}  {result}',
-                '            The check poses are too few to show that the error is within it.',
-                *span]
-    return [f' {PASS}  {result}', *span]
+            lines = [f'tilt error {tilt_deg:.2g}°, more than {limit} causes']
+        lines.append(
+            'One axis does not see the force across it: align it, or accept this error.'
+            if len(fitted.axes) == 1 else
+            'The sensor is worse than its datasheet states: do not use this file.'
+            if kind == 'datasheet' else 'More poses, or longer ones, reduce it.')
+    elif outcome == NOT_SHOWN:
+        lines.append('The check poses are too few to show that the error is within it.')
+    if 'span_s' in provenance:
+        lines.append(f'By rests within {duration(float(provenance["span_s"]))}; a longer drift is '
+                     'not in this figure.')
+    return outcome, lines
 
 
-def gravity_lines(fit: GravityFit) -> list[str]:
-    """Lay out the errors of a calibration against gravity, before and after."""
-    used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
-    before, after, held_out = (
-        _three_digits(1e3 * float(np.sqrt(np.mean(values[used] ** 2))) / G0_MPS2)
-        for values in (fit.before_mps2, fit.residual_mps2, fit.held_out_mps2))
-    lines = [f' error of the magnitude of gravity, rms over {len(used)} rests',
-             f' {"datasheet values":22} {before:>9} mg',
-             f' {"gravity calibration":22} {after:>9} mg    <- saved',
-             f' {"a fifth of time held out":22}{held_out:>8} mg']
-    if fit.outliers:
-        count = len(fit.outliers)
-        lines.append(f' {count} {"outlier was" if count == 1 else "outliers were"} left out')
-    return lines
+def acceptance_lines(fitted: Sensor) -> list[str]:
+    """Return the acceptance as lines of a terminal."""
+    outcome, (first, *others) = acceptance(fitted)
+    return [f' {outcome}  {first}', *(f'       {line}' for line in others)]

@@ -144,14 +144,6 @@ def added_effect_lines(fitted: Sensor, truth: Sensor) -> list[str]:
             for effect in fitted.effects if effect not in expected]
 
 
-_TEMPERATURE_SLOPE = Coefficient('temperature_bias', 'per_k')
-"""Parameter whose typical datasheet value predicts the drift by temperature."""
-_MIN_WARMING_C = 1.0
-"""Smallest difference of temperature that is reported, °C; chosen."""
-_TYPICAL_SLOPE_PER_K = 1e-4
-"""Typical slope of zero-g where the datasheet states none, g/K; ADXL203 datasheet: 0.1 mg/K."""
-
-
 class _Quantity(NamedTuple):
     """A quantity that is compared between calibrations."""
 
@@ -177,51 +169,54 @@ class DriftHistory:
     @staticmethod
     def from_store(newest: Sensor, stored: Sequence[Sensor]) -> DriftHistory:
         """Append the newest calibration to the stored ones of other data and the same axes."""
-        data = newest.provenance.get('data_sha256')
         by_data: dict[str, Sensor] = {}
-        for sensor in stored:
+        for sensor in (*stored, newest):
             # Two fits of the same data show no drift: only the last one counts.
-            if sensor.axes == newest.axes and (
-                    data is None or sensor.provenance.get('data_sha256') != data):
-                by_data[sensor.provenance.get('data_sha256')
-                        or calibration_store.calibration_id(sensor)] = sensor
-        return DriftHistory((*by_data.values(), newest) if by_data else ())
+            if sensor.axes == newest.axes:
+                data = sensor.provenance.get('data_sha256') or \
+                    calibration_store.calibration_id(sensor)
+                by_data.pop(data, None)
+                by_data[data] = sensor
+        return DriftHistory(tuple(by_data.values()) if len(by_data) > 1 else ())
 
     def table(self) -> tuple[list[str], list[list[str]]]:
         """Return head and rows: each calibration, and its change from the one before."""
-        axes = self.sensors[-1].axes
-        head = ['date', 'id', 'model', 'temperature, °C', *(
-            f'{quantity.label} {axis}' for quantity in _QUANTITIES for axis in axes)]
-        return head, [_row(*pair) for pair in zip((None, *self.sensors), self.sensors)]
+        head, rows = ['date', 'id', 'model', 'temperature, °C'], [
+            [date, calibration_store.calibration_id(sensor), sensor.model,
+             sensor.provenance.get('temperature_c', '-')]
+            for date, sensor in zip(self.dates, self.sensors)]
+        for number, quantity in enumerate(_QUANTITIES):
+            drift, _ = self.series(number)
+            for d, axis in enumerate(self.sensors[-1].axes):
+                head.append(f'{quantity.label} {axis}')
+                changes = ['', *(f' ({change:+.2f} {quantity.unit})'
+                                 for change in np.diff(drift[:, d]))]
+                for row, sensor, change in zip(rows, self.sensors, changes):
+                    row.append(f'{getattr(sensor, quantity.field)[d]:.5f}{change}')
+        return head, rows
 
-    def changes(self) -> list[str]:
-        """Return lines on the changes since the calibration before that exceed their intervals."""
+    def changes(self) -> str:
+        """State the changes since the calibration before that exceed their intervals."""
         before, now = self.sensors[-2:]
         changes = []
-        for quantity in _QUANTITIES:
-            change, std = _change(before, now, quantity)
-            for axis, difference, half_width in zip(now.axes, change, Z_90 * std):
-                if abs(difference) > half_width:
-                    changes.append(f'{quantity.label} of {axis} changed by {difference:+.2f} +- '
-                                   f'{half_width:.2f} {quantity.unit}')
+        for number, quantity in enumerate(_QUANTITIES):
+            drift, std = self.series(number)
+            half_widths = Z_90 * np.hypot(*std[-2:])
+            changes += [f'{quantity.label} of {axis} changed by {change:+.2f} +- '
+                        f'{half_width:.2f} {quantity.unit}' for axis, change, half_width
+                        in zip(now.axes, -drift[-2], half_widths) if abs(change) > half_width]
         identity = calibration_store.calibration_id(before)
         earlier, later = map(calibration_store.date_of, (before, now))
         since = f'Since {identity}' if earlier is None or later is None else \
             f'In {(later - earlier).total_seconds() / 86400:.1f} days since {identity}'
-        lines = [f'{since}: {"; ".join(changes)}.' if changes else
-                 f'{since} nothing has changed beyond the 90 % intervals.']
-        warming = _temperature_c(now) - _temperature_c(before)
-        if abs(warming) > _MIN_WARMING_C and changes:
-            slope, _ = now.datasheet.get(_TEMPERATURE_SLOPE, (_TYPICAL_SLOPE_PER_K, 0.0))
-            lines.append(f"The temperature differs by {warming:+.1f} °C. With the datasheet's "
-                         'typical slope, zero-g changes by '
-                         f'{1e3 * slope * abs(warming):.2f} mg from that.')
-        return lines
+        return f'{since}: {"; ".join(changes)}.' if changes else \
+            f'{since} nothing has changed beyond the 90 % intervals.'
 
     @property
     def dates(self) -> list[str]:
         """Return the dates of the calibrations, as text."""
-        return [_date(sensor, f'no. {i}') for i, sensor in enumerate(self.sensors, 1)]
+        return [sensor.provenance.get('date', f'no. {i}')[:16].replace('T', ' ')
+                for i, sensor in enumerate(self.sensors, 1)]
 
     def series(self, quantity: int) -> tuple[np.ndarray, np.ndarray]:
         """
@@ -231,41 +226,11 @@ class DriftHistory:
         standard deviations of the values, (k, m) each.
         """
         chosen, newest = _QUANTITIES[quantity], self.sensors[-1]
-        return (np.array([_change(newest, sensor, chosen)[0] for sensor in self.sensors]),
-                np.array([_std(sensor, chosen) for sensor in self.sensors]))
-
-
-def _row(before: Sensor | None, now: Sensor) -> list[str]:
-    """Return one calibration as cells of a table, with its change from the one before."""
-    cells = []
-    for quantity in _QUANTITIES:
-        for d in range(len(now.axes)):
-            change = '' if before is None else \
-                f' ({_change(before, now, quantity)[0][d]:+.2f} {quantity.unit})'
-            cells.append(f'{getattr(now, quantity.field)[d]:.5f}{change}')
-    return [_date(now), calibration_store.calibration_id(now), now.model,
-            now.provenance.get('temperature_c', '-'), *cells]
-
-
-def _change(before: Sensor, now: Sensor, quantity: _Quantity) -> tuple[np.ndarray, np.ndarray]:
-    """Return the change of a quantity and its standard deviation, mg or permille, (m,)."""
-    change = getattr(now, quantity.field) - getattr(before, quantity.field)
-    return change / now.scale_v_per_g * 1e3, np.hypot(_std(before, quantity), _std(now, quantity))
-
-
-def _std(sensor: Sensor, quantity: _Quantity) -> np.ndarray:
-    """Return the standard deviation of a quantity, mg or permille, (m,)."""
-    std = dict(zip(sensor.covariance_names, np.sqrt(np.diag(sensor.covariance))))
-    return np.array([std.get(replace(quantity.parameter, axis=axis), 0.0)
-                     for axis in sensor.axes]) / sensor.scale_v_per_g * 1e3
-
-
-def _date(sensor: Sensor, unknown: str = '') -> str:
-    return sensor.provenance.get('date', unknown)[:16].replace('T', ' ')
-
-
-def _temperature_c(sensor: Sensor) -> float:
-    try:
-        return float(sensor.provenance.get('temperature_c', 'nan'))
-    except ValueError:
-        return float('nan')
+        drift, std = [], []
+        for sensor in self.sensors:
+            change = getattr(sensor, chosen.field) - getattr(newest, chosen.field)
+            drift.append(change / newest.scale_v_per_g * 1e3)
+            by_name = dict(zip(sensor.covariance_names, np.sqrt(np.diag(sensor.covariance))))
+            std.append([by_name.get(replace(chosen.parameter, axis=axis), 0.0)
+                        for axis in sensor.axes] / sensor.scale_v_per_g * 1e3)
+        return np.array(drift), np.array(std)

@@ -252,26 +252,6 @@ def cross_validate(fits: dict[str, Fit], sensor: Sensor, poses: Poses,
     return models
 
 
-def table(models: Sequence[HeldOutErrors]) -> list[str]:
-    """Return the errors of all models as lines for a terminal."""
-    lines = [f'{"held out":9} {"poses":>5}  {"tilt rms/max deg":>16}  {"alpha rms/max deg":>17}  '
-             f'{"beta rms/max deg":>16}  {"accel rms/max mg":>16}']
-    for errors in models:
-        lines.append(f'{errors.model:9} {errors.pose_count:5d}  {_cell(errors.tilt_deg)}  '
-                     f' {_cell(errors.alpha_deg)}  {_cell(errors.beta_deg)}  '
-                     f'{_cell(errors.accel_mg)}')
-    if models and models[-1].poses_without_alpha:
-        lines.append(f'alpha does not count in {models[-1].poses_without_alpha} poses: its '
-                     'standard deviation is over 1 deg there (near +-90 deg without a z axis)')
-    return lines
-
-
-def _cell(statistic: ErrorStatistic) -> str:
-    if np.isnan(statistic.rms):
-        return f'{"-":>16}'
-    return f'{statistic.rms:7.3f} /{statistic.largest:7.3f}'
-
-
 _SAME_POSE_RAD = np.radians(0.5)
 """Largest distance of the joint angles of two visits of the same pose, rad; chosen."""
 _MIN_PAIRS = 6

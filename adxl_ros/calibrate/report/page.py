@@ -1,6 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The page of a calibration: one file that opens offline, with figures that plotly.js draws."""
+"""
+The page of a calibration: one file that opens offline, with figures that plotly.js draws.
+
+- Its pictures: figures 2 to 8 of the paper for one unit, and errors of fits.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +17,8 @@ from typing import Any
 
 from adxl_ros.calibrate.fits import linear
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
-from adxl_ros.calibrate.poses import Poses, reference_force
-from adxl_ros.calibrate.report import acceptance, coefficients, held_out, plots
+from adxl_ros.calibrate.poses import planes, Poses, reference_force
+from adxl_ros.calibrate.report import acceptance, coefficients, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
 from adxl_ros.calibrate.report.coefficients import DriftHistory
 from adxl_ros.calibrate.result import CalibrationResult
@@ -32,7 +36,7 @@ import numpy as np
 FILES = ('report.html', 'calibration.png')
 """Files of a report."""
 _PANELS = ((0, 1), (2, 3), (4, 5))
-"""Panels of `plots.sweep` that stand side by side on the page."""
+"""Panels of `_sweep` that stand side by side on the page."""
 _COLOURS = {PASS: 'green', NOT_SHOWN: 'amber', FAIL: 'red'}
 """Colour of the badge by outcome."""
 _PART_COLOURS = {'noise': '#7b8794', 'stage': '#d9930d', 'coefficients': '#1f5fbf',
@@ -67,9 +71,9 @@ def write(folder: str | os.PathLike, result: CalibrationResult,
 def draw(path: str | os.PathLike, result: CalibrationResult) -> None:
     """Write the plots of a calibrated unit as PNG."""
     if result.gravity_fit is not None:
-        write_bytes(path, figures.png(plots.gravity_rests(result.name, result.gravity_fit)))
+        write_bytes(path, figures.png(_gravity_rests(result.name, result.gravity_fit)))
     else:
-        plots.draw_sweep(path, result.nominal, _paper_sensor(result), result.poses)
+        draw_sweep(path, result.nominal, _paper_sensor(result), result.poses)
 
 
 def _paper_sensor(result: CalibrationResult) -> Sensor:
@@ -81,8 +85,9 @@ def _paper_sensor(result: CalibrationResult) -> Sensor:
 def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
     """Lay out the page."""
     fitted = result.fitted
-    assessment = next((row for row in result.assessments if row.model == fitted.model), None)
-    errors = next((row for row in result.held_out if row.model == fitted.model), None)
+    errors_of = {errors.model: errors for errors in result.held_out}
+    row_of = {row.model: row for row in result.assessments}
+    errors, assessment = errors_of.get(fitted.model), row_of.get(fitted.model)
     history, rows = DriftHistory.from_store(fitted, past), _coefficients(fitted)
     drawn: dict[str, Figure] = {}
     if result.gravity_fit is not None:
@@ -109,11 +114,14 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
         'coefficients': rows,
         'beyond': [row for row in rows if row['outcome'] == _BEYOND],
         'datasheet': fitted.datasheet_name,
-        'limit_head': _limit_head(fitted),
-        'limits': _limits(result),
-        'budget': _budget(assessment.accel) if assessment and errors else None,
+        'models': list(errors_of or row_of), 'errors_of': errors_of, 'row_of': row_of,
+        'poses': len(result.poses), 'digits': _digits, 'mg': held_out.rms_mg,
+        'datasheet_mg': 1e3 * acceptance.nonlinearity_mps2(fitted) / G0_MPS2,
+        'noise_mg': 1e3 * held_out.sample_noise_mps2(fitted) / G0_MPS2,
+        'budget': assessment.accel if assessment and errors else None,
+        'part_colours': _PART_COLOURS,
         'history': history.table() if history.sensors else None,
-        'changes': history.changes() if history.sensors else [],
+        'changes': history.changes() if history.sensors else '',
         'paper_model': paper_model,
         'pictures': pictures, 'pictures_fault': fault,
         'report_lines': result.report_lines,
@@ -126,12 +134,11 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
 
 
 def _badge(fitted: Sensor) -> dict[str, str]:
-    """Return the acceptance as the terminal shows it, and its colour."""
-    first, *others = (line.strip() for line in acceptance.acceptance_lines(fitted))
-    outcome = next(outcome for outcome in (NOT_SHOWN, PASS, FAIL) if first.startswith(outcome))
-    sentence = '. '.join([first.removeprefix(outcome).strip(), *others])
+    """Return the acceptance and its colour."""
+    outcome, lines = acceptance.acceptance(fitted)
+    sentence = '. '.join(line.rstrip('.') for line in lines)
     return {'colour': _COLOURS[outcome], 'word': outcome,
-            'sentence': f'{sentence[:1].upper()}{sentence[1:].rstrip(".")}.'}
+            'sentence': f'{sentence[0].upper()}{sentence[1:]}.'}
 
 
 def _tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dict[str, str]]:
@@ -162,47 +169,6 @@ def _digits(value: float) -> str:
     """Write a positive value with three digits at most, without an exponent."""
     decimals = 1 if value >= 10 else 2 if value >= 1 else 3
     return f'{value:.{decimals}f}' if value >= 5e-4 else '< 0.001'
-
-
-def _limit_head(fitted: Sensor) -> list[str]:
-    """Return the head of the table of limits."""
-    datasheet_mps2 = acceptance.nonlinearity_mps2(fitted)
-    datasheet = f'datasheet ({1e3 * datasheet_mps2 / G0_MPS2:.2g} mg)' if datasheet_mps2 \
-        else 'datasheet'
-    noise = f'noise ({1e3 * held_out.sample_noise_mps2(fitted) / G0_MPS2:.2g} mg)'
-    return ['model', 'poses', 'tilt error, °', 'alpha, °', 'beta, °', 'acceleration error, mg',
-            'calibration error, mg', f'acceleration, {datasheet}', f'acceleration, {noise}',
-            'tilt, datasheet', 'tilt, noise', 'limited by']
-
-
-def _limits(result: CalibrationResult) -> list[list[str]]:
-    """Return the errors of each model, and one outcome for each limit."""
-    errors_of = {errors.model: errors for errors in result.held_out}
-    row_of, rows = {row.model: row for row in result.assessments}, []
-    for model in errors_of or row_of:
-        errors, row = errors_of.get(model), row_of.get(model)
-        statistics = [getattr(errors, name, None) for name in (
-            'tilt_deg', 'alpha_deg', 'beta_deg', 'accel_mg')]
-        rows.append([
-            model, str(errors.pose_count if errors else len(result.poses)),
-            *('-' if s is None or np.isnan(s.rms) else
-              f'{_digits(s.rms)} (max {_digits(s.largest)})' for s in statistics),
-            *(['-'] * 6 if row is None else [
-                _digits(row.error_mg), row.accel_datasheet or '-', row.accel_noise or '-',
-                row.tilt_datasheet or '-', row.tilt_noise or '-', row.limited_by])])
-    return rows
-
-
-def _budget(budget: held_out.ErrorBudget) -> dict[str, Any]:
-    """Return the parts of the acceleration error as parts of a bar, and in words."""
-    squares = {name: float(getattr(budget, name)) for name in _PART_COLOURS}
-    total = max(sum(squares.values()), 1e-30)
-    return {'expected': f'{_digits(held_out.rms_mg(budget.expected))} mg',
-            'measured': f'{_digits(held_out.rms_mg(budget.measured))} mg',
-            'separable': budget.separable,
-            'parts': [{'name': name, 'text': f'{_digits(held_out.rms_mg(square))} mg',
-                       'percent': round(100 * square / total, 2), 'colour': _PART_COLOURS[name]}
-                      for name, square in squares.items()]}
 
 
 def _sphere(result: CalibrationResult) -> dict[str, Any]:
@@ -270,15 +236,14 @@ def _coefficients(fitted: Sensor) -> list[dict[str, Any]]:
 def _paper_figures(result: CalibrationResult) -> tuple[list[str], str, str]:
     """Return the figures of the paper as URLs, else why there are none, and their model."""
     if result.gravity_fit is not None:
-        drawn = plots.gravity_rests(result.name, result.gravity_fit)
-        return [html_page.picture_url(drawn)], '', ''
-    pictures = [plots.held_out(result.held_out, result.poses.subset(result.inliers))] \
+        return [], '', ''
+    pictures = [_held_out_plot(result.held_out, result.poses.subset(result.inliers))] \
         if result.held_out else []
     fault, model = '', 'physical'
     try:
         unit = _paper_sensor(result)
         model = unit.model
-        pictures += [plots.sweep(result.nominal, unit, result.poses, pair) for pair in _PANELS]
+        pictures += [_sweep(result.nominal, unit, result.poses, pair) for pair in _PANELS]
     except UserError as error:
         fault = str(error)
     return [html_page.picture_url(drawn) for drawn in pictures], fault, model
@@ -372,3 +337,130 @@ def _dots(number: np.ndarray, values: np.ndarray, name: str, colour: str, labels
             'y': figures.rounded(values), 'name': name, 'text': labels, 'xaxis': 'x',
             'yaxis': axis_number('y', panel), 'marker': {'color': colour, 'size': 7},
             'hovertemplate': '%{text}: %{y:.3~g} ' + unit + '<extra>' + name + '</extra>'}
+
+
+_FINE_G = np.linspace(-1, 1, 201)
+"""Specific force at which curves are drawn, g."""
+_VERTICAL = np.sin(np.radians(89))
+"""Smallest sine of alpha in the plane alpha = 90°; chosen: stages are better than 1°."""
+_MARKERS = 'os^D'
+"""Markers of models, in order."""
+
+
+def draw_sweep(path: str | os.PathLike, sensor: Sensor, fitted: Sensor, poses: Poses) -> None:
+    """Write figures 2 to 8 of the paper as PNG."""
+    write_bytes(path, figures.png(_sweep(sensor, fitted, poses)))
+
+
+def _sweep(sensor: Sensor, fitted: Sensor, poses: Poses, panels: Sequence[int] = range(6)) -> Any:
+    """Draw figures 2 to 8 of the paper for the x and y axes, one row per axis."""
+    swept = poses.subset(~poses.check)
+    line, regressions = linear.fit(sensor, swept), linear.regress_axes(sensor, swept)
+    reference = reference_force(swept, sensor.local_gravity_mps2)
+    force_g = np.column_stack(reference) / G0_MPS2
+    predicted = np.column_stack(signal_chain.static_response(fitted)(
+        reference, swept.environment))
+    figure, grid = figures.pyplot().subplots(2, len(panels), figsize=(4.4 * len(panels), 9),
+                                     layout='constrained', squeeze=False)
+    for d, row in enumerate(grid):
+        linear_v = line.zero_g_v[d] + line.scale_v_per_g[d] * force_g[:, d]
+        deviation_mv, model_mv = (1e3 * (volts[:, d] - linear_v)
+                                  for volts in (swept.volts, predicted))
+        for axis, panel in zip(row, panels):
+            _draw_panel(axis, panel, d, fitted.model, swept, force_g, deviation_mv, model_mv,
+                        regressions[d])
+    if len(panels) > 4:
+        figure.suptitle(f'{fitted.serial}: deviation from the linear model, measured and by the '
+                        f'{fitted.model} model (Ang et al. 2007, figures 2 to 8)')
+    return figure
+
+
+def _draw_panel(axis: Any, panel: int, d: int, model: str, poses: Poses, force_g: np.ndarray,
+                deviation_mv: np.ndarray, model_mv: np.ndarray, regression: linear.AxisRegression
+                ) -> None:
+    """
+    Draw one panel for the axis x or y, given by d: figures 2, 3, 4, 5 with 7, 6, or 8.
+
+    force_g, deviation_mv, model_mv: reference of k poses, g, (k, 3), and measured and modelled
+    output minus the linear model, mV, (k,).
+    """
+    vertical = np.abs(np.sin(poses.alpha_rad)) > _VERTICAL
+    name, other = ('x', 'y') if d == 0 else ('y', 'x')
+    along_g, x_label = force_g[:, d], f'{name} reference, g'
+    if panel in (0, 1, 3):
+        everything = np.ones(len(poses), bool)
+        y_label = f'{name} output minus linear, mV'
+        title = f'figs. 5, 7: measured ● and {model} model ─' if panel == 3 else \
+            f'fig. {panel + 2}: paths, forth ● and back ◁'
+        backward = np.gradient(poses.beta_rad) < 0
+        chosen = np.flatnonzero(everything if panel else vertical)
+        for plane in planes(poses.alpha_rad[chosen]):
+            index = chosen[np.sort(plane)]
+            label = f'{np.degrees(poses.alpha_rad[index]).mean():.0f}°'
+            if panel == 3:
+                line, = axis.plot(along_g[index], deviation_mv[index], 'o', ms=3, label=label)
+                axis.plot(along_g[index], model_mv[index], lw=1, color=line.get_color())
+                continue
+            line, = axis.plot(along_g[index], deviation_mv[index], lw=1, label=label)
+            for part, marker, fill in ((index[~backward[index]], 'o', None),
+                                       (index[backward[index]], '<', 'none')):
+                axis.plot(along_g[part], deviation_mv[part], marker, ms=4,
+                          color=line.get_color(), mfc=fill)
+        axis.legend(title='alpha', fontsize=7)
+    elif panel == 2:
+        axis.plot(force_g[vertical, 1 - d], deviation_mv[vertical], 'o', ms=4,
+                  label='measured (10)')
+        axis.plot(_FINE_G, 1e3 * np.polynomial.polynomial.polyval(_FINE_G, regression.p),
+                  label='quadratic (11)')
+        axis.legend(fontsize=7)
+        x_label, y_label = f'{other} reference, g', f'{name} residual, mV'
+        title = f'fig. 4: residual against {other}, alpha = 90°'
+    else:
+        values, polynomial = (1e3 * regression.plane_bias_v, 1e3 * regression.q) \
+            if panel == 4 else (regression.plane_scale_v_per_g, regression.r)
+        az_g = regression.plane_az_g
+        fine_g = np.linspace(az_g.min(), az_g.max(), 101)
+        axis.plot(az_g, values, 'o', ms=4)
+        axis.plot(fine_g, np.polynomial.polynomial.polyval(fine_g, polynomial))
+        x_label = 'z reference, g'
+        y_label, title = (f'{name} zero-g minus that at 90°, mV',
+                          'fig. 6: zero-g against z (12, 13)') if panel == 4 else \
+            (f'{name} scale factor, V/g', 'fig. 8: scale factor against z (15, 17)')
+    axis.set(xlabel=x_label, ylabel=y_label, title=title)
+
+
+def _gravity_rests(name: str, fit: GravityFit) -> Any:
+    """Draw the error of the magnitude of gravity in each rest, before and after the fit."""
+    figure, axes = figures.pyplot().subplots(1, 2, figsize=(12, 4.5), layout='constrained')
+    rests = np.arange(1, len(fit.residual_mps2) + 1)
+    for axis, values, title in ((axes[0], fit.before_mps2, 'nominal'),
+                                (axes[1], fit.residual_mps2, 'calibrated')):
+        mg = values / G0_MPS2 * 1e3
+        axis.axhline(0, color='0.7', lw=0.8)
+        axis.errorbar(rests, mg, yerr=Z_90 * fit.expected_mps2 / G0_MPS2 * 1e3, fmt='o', ms=4,
+                      lw=1)
+        axis.set(title=f'{title}: rms {np.sqrt(np.mean(mg ** 2)):.2f} mg', xlabel='rest',
+                 ylabel='magnitude minus gravity, mg')
+    figure.suptitle(f'{name}: {len(rests)} rests (bars: 90 %, expected)')
+    return figure
+
+
+def _held_out_plot(models: Sequence[held_out.HeldOutErrors], poses: Poses) -> Any:
+    """Draw the errors on held-out poses, model by model, as in figure 10 of the paper."""
+    figure, axes = figures.pyplot().subplots(1, 3, figsize=(13, 4), layout='constrained')
+    for i, model in enumerate(models):
+        errors = model.errors
+        alpha_deg = np.degrees(poses.alpha_rad[model.pose_index])
+        accel_mg = np.sqrt(np.mean(errors.accel_mps2 ** 2, axis=1)) / G0_MPS2 * 1e3
+        for axis, values in zip(axes, (np.degrees(errors.alpha_rad), np.degrees(errors.beta_rad),
+                                       accel_mg)):
+            axis.plot(alpha_deg, np.abs(values), _MARKERS[i % 4], ms=4, mfc='none', color=f'C{i}',
+                      label=model.model)
+    for axis, label in zip(axes, ('|error of alpha|, deg', '|error of beta|, deg',
+                                  'error of acceleration, mg')):
+        axis.set(xlabel='alpha of the pose, deg', ylabel=label, yscale='log')
+        # A tiny error by chance must not compress the scale.
+        axis.set_ylim(bottom=1e-6 * axis.get_ylim()[1])
+        axis.grid(alpha=0.3)
+    axes[0].legend(fontsize=8)
+    return figure

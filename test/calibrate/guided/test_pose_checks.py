@@ -5,8 +5,8 @@
 from dataclasses import replace
 
 from adxl_ros.calibrate.guided import running_estimate
-from adxl_ros.calibrate.guided.hand_guide import HandGuide
 from adxl_ros.calibrate.guided.pose_plan import guided, Target
+from adxl_ros.calibrate.guided.rest_guides import HandGuide
 from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, Phase, StageMode
 from adxl_ros.calibrate.guided.stage_guide import MountingError, StageGuide
 from adxl_ros.model.coefficients import parameter_of

@@ -98,11 +98,11 @@ def test_a_linear_model_fails_because_of_its_model():
     assert 'limit by the datasheet 3.4 mg' in lines
     assert 'unit within ADXL203' in lines
     # A screen has the acceptance first, then one line for each model, within 80 columns.
-    assert result.summary_lines[0] == f'full: datasheet PASS, noise PASS; limited by the {limit}'
-    assert result.summary_lines[1].startswith('held out: tilt 0.')
-    models = [line for line in result.summary_lines if line.split()[0] in outcomes]
+    assert result.report_lines[0] == f'full: datasheet PASS, noise PASS; limited by the {limit}'
+    assert result.report_lines[1].startswith('held out: tilt 0.')
+    models = [line for line in result.report_lines if line.split()[0] in outcomes]
     assert [line.split()[2] for line in models] == ['FAIL', 'PASS', 'PASS']
-    assert max(map(len, [*result.summary_lines[:2], *models])) < 80
+    assert max(map(len, [*result.report_lines[:2], *models])) < 80
 
 
 @pytest.mark.parametrize(('parts', 'outcome'), [
