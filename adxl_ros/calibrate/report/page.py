@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 import os
 from pathlib import Path
@@ -14,7 +14,7 @@ from typing import Any
 from adxl_ros.calibrate.fits import linear
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
 from adxl_ros.calibrate.poses import Poses, reference_force
-from adxl_ros.calibrate.report import acceptance, coefficients, held_out, plots
+from adxl_ros.calibrate.report import acceptance, coefficients, gum, held_out, plots
 from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
 from adxl_ros.calibrate.report.coefficients import DriftHistory
 from adxl_ros.calibrate.result import CalibrationResult
@@ -52,13 +52,17 @@ _BEYOND_WHISKER = 1.08
 
 
 def write(folder: str | os.PathLike, result: CalibrationResult,
-          store: str | os.PathLike = '') -> None:
-    """Write `report.html`, and the plots of the unit as `calibration.png`."""
+          store: str | os.PathLike = '', stated: Mapping[str, float] | None = None) -> None:
+    """
+    Write `report.html`, and the plots of the unit as `calibration.png`.
+
+    stated: standard uncertainties of the laboratory; see `gum.uncertainty`.
+    """
     html_page.check_libraries()
     past = calibration_store.history(store, result.fitted.serial).calibrations \
         if str(store) else []
     page_path, plot_path = (Path(folder) / name for name in FILES)
-    write_text(page_path, page(result, [sensor for _, sensor in past]))
+    write_text(page_path, page(result, [sensor for _, sensor in past], stated))
     # If the poses do not suffice for the figures of the paper, the page states the reason.
     with suppress(UserError):
         draw(plot_path, result)
@@ -78,7 +82,8 @@ def _paper_sensor(result: CalibrationResult) -> Sensor:
         linear.fit_physical(result.nominal, result.poses.subset(~result.poses.check))
 
 
-def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
+def page(result: CalibrationResult, past: Sequence[Sensor],
+         stated: Mapping[str, float] | None = None) -> str:
     """Lay out the page."""
     fitted = result.fitted
     assessment = next((row for row in result.assessments if row.model == fitted.model), None)
@@ -112,6 +117,7 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
         'limit_head': _limit_head(fitted),
         'limits': _limits(result),
         'budget': _budget(assessment.accel) if assessment and errors else None,
+        'gum': gum.section(gum.uncertainty(result, stated)),
         'history': history.table() if history.sensors else None,
         'changes': history.changes() if history.sensors else [],
         'paper_model': paper_model,

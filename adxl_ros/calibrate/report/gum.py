@@ -1,0 +1,281 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The uncertainty of the acceleration at a stated pose, as the GUM asks for it (JCGM 100).
+
+Squares of contributions add. Those of noise, coefficients, stage and model are the parts of
+`held_out.ErrorBudget`, here pose by pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from adxl_ros.calibrate.poses import Poses, reference_force
+from adxl_ros.calibrate.report import acceptance, held_out
+from adxl_ros.calibrate.report.acceptance import FAIL, NOT_SHOWN, PASS
+from adxl_ros.calibrate.result import CalibrationResult
+from adxl_ros.model import signal_chain
+from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.sensor import MARGIN_K, Sensor
+import numpy as np
+import scipy
+
+K = 2
+"""Coverage factor of an expanded uncertainty; about 95 % for a normal distribution."""
+_EARTH_HALF_RANGE_MPS2 = 0.027
+"""Half of the range of gravity at sea level, 9.780 to 9.832 m/s², about the standard gravity."""
+_LOCAL_STD_MPS2 = 5e-4
+"""Uncertainty of a stated local gravity, m/s². Chosen: 50 mGal, the size of gravity anomalies."""
+_UNIFORM = np.sqrt(3)
+"""Half-width of a uniform distribution divided by its standard deviation."""
+_SURROUNDINGS = {'temperature': ('temperature_c', 'temperature_k', 'K', MARGIN_K, 0.1),
+                 'supply': ('supply_v', 'supply_v', 'V', 0.0, 1e-3)}
+"""Field of a pose, key of `STATED`, unit, margin of the range, and step of central differences."""
+STATED = ('gravity_mps2', 'temperature_k', 'supply_v')
+"""Inputs whose standard uncertainty a laboratory may state."""
+_MANY = 1000
+"""Degrees of freedom from which they count as infinite; chosen."""
+_HEAVIEST_TAIL = 1.5365
+"""Square of a ratio from which no sum of squares of normal errors exceeds its mean more often than
+the square of one normal error does (Székely and Bakirov 2003)."""
+MODEL = (
+    'a = F(V, theta, T, U) (1 + dg/g) - g (du/d alpha d alpha + du/d beta d beta) + d model. '
+    'The measurand a is the acceleration along an axis of the case at the stated pose alpha, beta. '
+    'F inverts the calibrated sensor; V is the mean output at rest, theta the coefficients, T the '
+    'temperature, U the supply, g the local gravity, u the direction of the vertical. The '
+    'corrections d are 0 and have an uncertainty.')
+"""The measurement model."""
+MEANING = (
+    f'The expanded uncertainty is the standard uncertainty times k = {K}: about 95 % for a normal '
+    'distribution, more where a uniform one has the largest part. It is that of one rest as long as '
+    'those of the calibration, by a supply that the model follows or that is constant. Ageing after '
+    'the calibration is not in it.')
+"""What an expanded uncertainty means."""
+RULE = (
+    f'{PASS} if error + guard band is at most the limit, where the guard band reaches to the upper '
+    f'end of the 90 % interval of the error; without one, this is simple acceptance. {FAIL} if the '
+    f'error exceeds the limit; {NOT_SHOWN} in between, and where stage and model are inseparable. '
+    'Risk: a unit with such an error exceeds the limit at most so often; at the limit, in half of '
+    'the cases. The error is that of coefficients and model: noise, stage, gravity, temperature '
+    'and supply belong to each use, and are not in it.')
+"""The decision rule (ISO/IEC 17025, 7.8.6)."""
+
+
+@dataclass(frozen=True)
+class Input:
+    """An input quantity, and what it contributes to the acceleration at k poses of m axes."""
+
+    name: str  # The quantity
+    kind: str  # Evaluation, A or B, and distribution or source
+    std: Any  # Standard uncertainty, (k, m) or one for all
+    unit: str  # Unit of `std`
+    freedom: float  # Degrees of freedom
+    contribution_mps2: np.ndarray  # Standard uncertainty of the acceleration, (k, m)
+
+
+class Decision(NamedTuple):
+    """A comparison of the calibration error with its limit, in one unit."""
+
+    quantity: str  # acceleration or tilt
+    unit: str  # mg or °
+    error: float  # Error of the calibration, rms over the poses
+    guard_band: float  # From there to the upper end of its 90 % interval
+    limit: float
+    outcome: str  # PASS, FAIL or NOT SHOWN
+
+    @property
+    def risk(self) -> float:
+        """Return the largest probability that the error of such a unit exceeds the limit."""
+        square = (self.limit / (self.error + self.guard_band)) ** 2
+        if square < 1:
+            return 1.0
+        return float(scipy.special.chdtrc(1, square)) if square >= _HEAVIEST_TAIL else 0.5
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """The uncertainty at k held-out poses of a calibration of m axes."""
+
+    axes: str
+    # alpha_rad, beta_rad: The stated poses, (k,)
+    alpha_rad: np.ndarray
+    beta_rad: np.ndarray
+    # reference_mps2, error_mps2: Acceleration by stage and gravity, and the measured one minus
+    # that, (k, m)
+    reference_mps2: np.ndarray
+    error_mps2: np.ndarray
+    inputs: tuple[Input, ...]
+    limit_name: str  # Where the limits of the decisions come from
+    decisions: tuple[Decision, ...]
+
+    @property
+    def combined_mps2(self) -> np.ndarray:
+        """Return the combined standard uncertainty, m/s², (k, m)."""
+        return np.asarray(np.sqrt(sum(row.contribution_mps2 ** 2 for row in self.inputs)))
+
+    @property
+    def worst(self) -> tuple[int, int]:
+        """Return pose and axis of the largest combined uncertainty."""
+        return divmod(int(np.argmax(self.combined_mps2)), self.error_mps2.shape[1])
+
+    @property
+    def freedom(self) -> float:
+        """Return the effective degrees of freedom there, by Welch and Satterthwaite."""
+        total = sum(row.contribution_mps2[self.worst] ** 4 / row.freedom for row in self.inputs)
+        return float(self.combined_mps2[self.worst] ** 4 / total) if total else float('inf')
+
+    @property
+    def coverage(self) -> float:
+        """Return the probability of ±`K` standard uncertainties by Student's t."""
+        return float(2 * scipy.special.stdtr(min(self.freedom, 1e9), K) - 1)
+
+    @property
+    def outcome(self) -> str:
+        """Return the worst outcome."""
+        outcomes = [row.outcome for row in self.decisions]
+        return next((word for word in (FAIL, NOT_SHOWN, PASS) if word in outcomes), NOT_SHOWN)
+
+
+def uncertainty(result: CalibrationResult, stated: Mapping[str, float] | None = None
+                ) -> Uncertainty | None:
+    """
+    Return the uncertainty at the held-out poses that determine alpha; None without such poses.
+
+    stated: standard uncertainties that the laboratory states, by the names of `STATED`.
+    """
+    fitted, stated = result.fitted, stated or {}
+    errors = next((row for row in result.held_out if row.model == fitted.model), None)
+    assessment = next((row for row in result.assessments if row.model == fitted.model), None)
+    if errors is None or assessment is None or not np.isfinite(assessment.accel.measured):
+        return None
+    gravity, axes = fitted.local_gravity_mps2, [AXES.index(axis) for axis in fitted.axes]
+    poses = result.poses.subset(result.inliers)
+    held, used = poses.subset(errors.pose_index), held_out.determining_alpha(errors.errors)
+    force = np.column_stack(reference_force(held, gravity))
+    by_noise, by_coefficients, by_stage, _ = (
+        np.sqrt([covariance[d, d][used] for d in axes]).T
+        for covariance in held_out.covariances(errors, held, force))
+    held, reference = held.subset(used), force[used][:, axes]
+    error, budget = errors.errors.accel_mps2[used], assessment.accel
+    nu = held_out.degrees_of_freedom(error)
+    model = np.full(error.shape, np.sqrt(budget.model))
+    # The poses may scatter more than the step of the encoder permits.
+    stage_mps2, stage_kind = by_stage, 'B, uniform within a step'
+    stage_rad, excess = fitted.stage_std_rad, budget.stage / max(np.mean(by_stage ** 2), 1e-30)
+    if excess > 1:
+        stage_mps2 = by_stage * excess ** 0.5 if stage_rad else model * 0 + budget.stage ** 0.5
+        stage_kind = 'A, scatter of the poses'
+        stage_rad = stage_rad * excess ** 0.5 or budget.stage ** 0.5 / gravity
+    gravity_std, gravity_kind = _LOCAL_STD_MPS2, 'B, anomalies of gravity'
+    if 'gravity_mps2' in stated:
+        gravity_std, gravity_kind = stated['gravity_mps2'], 'B, stated'
+    elif gravity == G0_MPS2:  # The standard value is that of no place in particular.
+        gravity_std, gravity_kind = _EARTH_HALF_RANGE_MPS2 / _UNIFORM, 'B, anywhere on earth'
+    fit_freedom = error.shape[1] * int((~poses.check).sum()) - len(fitted.covariance_names)
+    inputs = (
+        Input('noise of the mean', 'A, normal', 1e3 * np.mean(held.std_v, axis=0), 'mV',
+              np.inf, by_noise),
+        Input('coefficients', 'A, covariance of the fit', 1e3 * by_coefficients / G0_MPS2, 'mg',
+              max(fit_freedom, 1), by_coefficients),
+        Input('stage angles', stage_kind, np.degrees(stage_rad), '°',
+              np.inf if stage_mps2 is by_stage else nu, stage_mps2),
+        Input('model', 'A, held-out errors', 1e3 * model / G0_MPS2, 'mg', nu, model),
+        Input('local gravity', gravity_kind, gravity_std, 'm/s²', np.inf,
+              np.abs(reference) / gravity * gravity_std),
+        *(_surroundings(name, fitted, held, reference, stated) for name in _SURROUNDINGS))
+    limit_name = 'nonlinearity of the datasheet'
+    limit_mps2 = acceptance.nonlinearity_mps2(fitted)
+    outcomes = assessment.accel_datasheet, assessment.tilt_datasheet
+    if not limit_mps2:
+        limit_name, limit_mps2 = 'noise of one sample', held_out.sample_noise_mps2(fitted)
+        outcomes = assessment.accel_noise, assessment.tilt_noise
+    limits = (
+        ('acceleration', 'mg', budget, 1e3 / G0_MPS2, 1.0),
+        ('tilt', '°', assessment.tilt, float(np.degrees(1.0)), assessment.tilt.tilt_per_axis ** .5))
+    decisions = []
+    for (quantity, unit, part, scale, per_axis), outcome in zip(limits, outcomes):
+        if outcome:
+            size, high = (scale * part.calibration ** 0.5, scale * part.calibration_high ** 0.5)
+            decisions.append(Decision(quantity, unit, size, high - size,
+                                      scale * limit_mps2 * per_axis, outcome))
+    return Uncertainty(fitted.axes, held.alpha_rad, held.beta_rad, reference, error, inputs,
+                       limit_name, tuple(decisions))
+
+
+def _surroundings(name: str, fitted: Sensor, held: Poses, reference: np.ndarray,
+                  stated: Mapping[str, float]) -> Input:
+    """Return the contribution of temperature or supply, uniform over those of the poses."""
+    field, key, unit, margin, step = _SURROUNDINGS[name]
+    values, environment = getattr(held, field), held.environment
+    seen = values[np.isfinite(values)]
+    half_range = margin + (np.ptp(seen) / 2 if seen.size else 0.0)
+    kind = 'B, range of the poses' if seen.size else \
+        f'B, ±{margin:g} {unit}, not measured' if margin else 'not measured, taken as constant'
+    std = stated.get(key, half_range / _UNIFORM)
+    inverse = signal_chain.inverse(fitted, np.where(np.cos(held.alpha_rad) < 0, -1, 1))
+    shifted = [np.column_stack(inverse(list(held.volts.T), environment._replace(
+        **{field: getattr(environment, field) + sign * step}))) for sign in (1, -1)]
+    axes = [AXES.index(axis) for axis in fitted.axes]
+    slope = (shifted[0] - shifted[1])[:, axes] / (2 * step)
+    if name == 'temperature':
+        # What the model does not follow drifts as the datasheet states.
+        slope = np.sqrt(slope ** 2 + (G0_MPS2 * fitted.envelope.zero_g_per_k) ** 2
+                        + (reference * fitted.envelope.scale_per_k) ** 2)
+    return Input(name, 'B, stated' if key in stated else kind, std, unit, np.inf,
+                 np.abs(np.nan_to_num(slope)) * std)
+
+
+def budget_rows(found: Uncertainty) -> list[list[str]]:
+    """Lay out the inputs at the pose of the largest uncertainty: the table of the GUM."""
+    rows, at = [], found.worst
+    for row in found.inputs:
+        std = float(np.broadcast_to(row.std, found.error_mps2.shape)[at])
+        part_mg = 1e3 * float(row.contribution_mps2[at]) / G0_MPS2
+        sensitivity = f'{part_mg / std if std else 0:.3g} mg per {row.unit}'
+        rows.append([row.name, f'{std:.2g} {row.unit} ({row.kind})',
+                     '1' if row.unit == 'mg' else sensitivity, f'{part_mg:.3f}',
+                     f'{row.freedom:.0f}' if row.freedom < _MANY else '∞'])
+    return rows
+
+
+BUDGET_HEAD = ['input', 'standard uncertainty (type)', 'sensitivity', 'contribution, mg',
+               'degrees of freedom']
+"""Head of `budget_rows`."""
+DECISION_HEAD = ['error of', 'error + guard band', 'limit', 'outcome', 'risk']
+"""Head of `decision_rows`."""
+
+
+def decision_rows(found: Uncertainty) -> list[list[str]]:
+    """Lay out the decisions with the figures that they follow from."""
+    rows = []
+    for row in found.decisions:
+        risk = f'{100 * row.risk:.1f} %' if row.risk >= 1e-3 else '< 0.1 %'
+        rows.append([
+            row.quantity, f'{row.error:.3f} + {row.guard_band:.3f} = '
+            f'{row.error + row.guard_band:.3f} {row.unit}', f'{row.limit:.3g} {row.unit}',
+            row.outcome, risk])
+    return rows
+
+
+def section(found: Uncertainty | None) -> dict[str, Any] | None:
+    """Return the uncertainty as the page shows it."""
+    if found is None:
+        return None
+    combined_mg, (pose, axis) = 1e3 * found.combined_mps2 / G0_MPS2, found.worst
+    alpha, beta = np.degrees([found.alpha_rad[pose], found.beta_rad[pose]])
+    inside = np.abs(found.error_mps2) <= K * found.combined_mps2
+    freedom = f'{found.freedom:.0f}' if found.freedom < _MANY else 'infinite'
+    return {
+        'model': MODEL, 'meaning': MEANING, 'rule': RULE, 'limit_name': found.limit_name,
+        'pose': f'alpha {alpha:.1f}°, beta {beta:.1f}°, axis {found.axes[axis]}',
+        'budget': (BUDGET_HEAD, budget_rows(found)),
+        'decisions': (DECISION_HEAD, decision_rows(found)),
+        'combined': f'{combined_mg[pose, axis]:.3f} mg',
+        'expanded': f'{K * combined_mg[pose, axis]:.2f} mg',
+        'freedom': f'{freedom} effective degrees of freedom: {100 * found.coverage:.1f} % by '
+                   "Student's t",
+        'range': f'{K * combined_mg.min():.2f} to {K * combined_mg.max():.2f} mg',
+        'inside': f'{int(inside.sum())} of {inside.size}'}
