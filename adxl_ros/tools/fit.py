@@ -73,8 +73,8 @@ def parser() -> argparse.ArgumentParser:
                        help='write a Digital Calibration Certificate of a calibration on a stage, '
                             f'by the schema DCC {dcc.SCHEMA_VERSION} of PTB')
     parse.add_argument('--dcc-data', metavar='FILE',
-                       help='YAML file of the laboratory: laboratory, customer, responsible, '
-                            'place, uncertainty, ... (default: not stated)')
+                       help='YAML file with what a laboratory states for it, as laboratory_name, '
+                            'customer_name, responsible, gravity_std_mps2')
     parse.add_argument('--store', metavar='DIR', default=str(calibration_store.default_folder()),
                        help='the calibration store, which gets a copy (default: %(default)s); '
                             'empty for none')
@@ -134,14 +134,14 @@ def fit(options: argparse.Namespace) -> int:
             if thermal is None else calibration.calibrate_thermal(
                 with_axes(base, unit.axes), thermal, Path(options.recording[0]).name, sha)
         result = replace(result, report_lines=[*result.report_lines, *measured])
-        found = gum.uncertainty(result, laboratory['uncertainty']) if options.dcc else None
+        found = gum.uncertainty(result, laboratory) if options.dcc else None
         if options.dcc and found is None:
             raise UserError(f'--dcc {options.dcc}: a certificate states errors at stage angles, '
                             'and no pose with angles was kept out of the fit; leave it out')
         if options.report:
             show('report', 0.0)
             cli.make_folder(Path(options.report))
-            page.write(options.report, result, options.store, laboratory['uncertainty'])
+            page.write(options.report, result, options.store, laboratory)
         if found is not None:
             dcc.write(options.dcc, result, found, laboratory)
     result.save(options.output)

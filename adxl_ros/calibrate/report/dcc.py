@@ -36,50 +36,35 @@ NOT_STATED = 'not stated'
 """What stands where the laboratory states nothing."""
 PLACES = ('laboratory', 'customer', 'laboratoryBranch', 'customerBranch', 'other')
 """Places of a calibration that the schema knows."""
-_CONTACT = {'name': NOT_STATED, 'email': NOT_STATED, 'city': NOT_STATED, 'country': 'ZZ'}
-_LABORATORY: dict[str, Any] = {
-    'laboratory': _CONTACT, 'customer': _CONTACT, 'responsible': NOT_STATED, 'identifier': '',
-    'country': 'ZZ', 'place': 'other', 'manufacturer': NOT_STATED, 'stage': NOT_STATED,
-    'uncertainty': {}}
-"""Entries of a laboratory's file, with what stands for those that are missing; ZZ is no country."""
+_LABORATORY = {
+    **{f'{who}_{what}': NOT_STATED for who in ('laboratory', 'customer')
+       for what in ('name', 'email', 'city')},
+    'laboratory_country': 'ZZ', 'customer_country': 'ZZ', 'place': 'other',
+    'responsible': NOT_STATED, 'manufacturer': NOT_STATED, 'stage': NOT_STATED, 'identifier': ''}
+"""Texts of a laboratory's file, and what stands for those that are missing; ZZ is no country."""
 _UNITS = {'V': 'volt', 'rad': 'radian', '°': 'degree', 'K': 'kelvin', 's': 'second', 'm': 'metre'}
 """Units of D-SI; all others count as 1."""
 _ACCELERATION = r'\metre\second\tothe{-2}'
 
 
 def read_laboratory(path: str | os.PathLike | None) -> dict[str, Any]:
-    """Read and check what a laboratory states in a YAML file; None states nothing."""
-    if path is None:
-        return _LABORATORY
-    node = compose(path)
+    """Read the texts and the standard uncertainties of a laboratory's YAML file; None has none."""
+    node = compose(path) if path is not None else None
     given = yaml.constructor.SafeConstructor().construct_document(node) if node else {}
-    found = _merged(str(path), _LABORATORY, given)
-    for name, std in found['uncertainty'].items():
-        if name not in gum.STATED or not isinstance(std, (int, float)) or not 0 <= std < math.inf:
-            raise UserError(f'{path}: uncertainty.{name}: {std!r}; state standard uncertainties '
-                            f'of {", ".join(gum.STATED)}, as numbers')
-    for code in (found['country'], found['laboratory']['country'], found['customer']['country']):
-        if not re.fullmatch('[A-Z]{2}', code):
-            raise UserError(f'{path}: country {code!r} is no code of two capital letters, as DE')
-    if found['place'] not in PLACES:
-        raise UserError(f'{path}: place {found["place"]!r}: one of {", ".join(PLACES)}')
-    return found
-
-
-def _merged(place: str, known: dict[str, Any], given: Any) -> dict[str, Any]:
-    """Return entries over those that are known, and refuse others."""
-    if not isinstance(given, dict) or (known and not set(given) <= set(known)):
-        raise UserError(f'{place}: found {given!r}, expected a mapping with some of '
-                        f'{", ".join(known)}')
-    merged = known | given
-    for name, default in known.items():
-        if isinstance(default, dict):
-            merged[name] = _merged(f'{place}: {name}', default, merged[name])
-        elif not isinstance(merged[name], str) or default and not merged[name].strip():
-            raise UserError(f'{place}: {name}: {merged[name]!r} is no text')
-        else:
-            merged[name] = ' '.join(merged[name].split())
-    return merged
+    if not isinstance(given, dict) or not set(given) <= {*_LABORATORY, *gum.STATED}:
+        raise UserError(f'{path}: found {given!r}, expected a mapping with some of '
+                        f'{", ".join((*_LABORATORY, *gum.STATED))}')
+    for name, value in given.items():
+        if name in gum.STATED:
+            if not isinstance(value, (int, float)) or not 0 <= value < math.inf:
+                raise UserError(f'{path}: {name}: {value!r} is no number such as 1.0e-5')
+        elif not isinstance(value, str) or not value.strip():
+            raise UserError(f'{path}: {name}: {value!r} is no text')
+        elif name.endswith('country') and not re.fullmatch('[A-Z]{2}', value):
+            raise UserError(f'{path}: {name}: {value!r} is no code of two capitals such as DE')
+        elif name == 'place' and value not in PLACES:
+            raise UserError(f'{path}: place: {value!r} is none of {", ".join(PLACES)}')
+    return {**_LABORATORY, **given}
 
 
 def _element(name: str, *content: Any, **attributes: str) -> ElementTree.Element:
@@ -90,12 +75,12 @@ def _element(name: str, *content: Any, **attributes: str) -> ElementTree.Element
         if isinstance(child, ElementTree.Element):
             made.append(child)
         elif child is not None:
-            made.text = str(child)
+            made.text = ' '.join(str(child).split())
     return made
 
 
 def _text(name: str, text: str) -> ElementTree.Element:
-    return _element(name, _element('content', ' '.join(text.split()), lang='en'))
+    return _element(name, _element('content', text, lang='en'))
 
 
 def _numbers(values: Iterable[float]) -> str:
@@ -146,10 +131,12 @@ def write(path: str | os.PathLike, result: CalibrationResult, found: Uncertainty
     write_bytes(path, ElementTree.tostring(root, 'utf-8', xml_declaration=True))
 
 
-def _contact(name: str, stated: dict[str, str]) -> ElementTree.Element:
-    return _element(name, _text('name', stated['name']), _element('eMail', stated['email']),
-                    _element('location', _element('city', stated['city']),
-                             _element('countryCode', stated['country'])))
+def _contact(name: str, who: str, laboratory: dict[str, Any]) -> ElementTree.Element:
+    return _element(
+        name, _text('name', laboratory[f'{who}_name']),
+        _element('eMail', laboratory[f'{who}_email']),
+        _element('location', _element('city', laboratory[f'{who}_city']),
+                 _element('countryCode', laboratory[f'{who}_country'])))
 
 
 def _identified(issuer: str, value: str, name: str) -> ElementTree.Element:
@@ -169,8 +156,9 @@ def _administrative(result: CalibrationResult, found: Uncertainty, laboratory: d
         _identified('manufacturer', fitted.serial, 'serial number'))
     return _element(
         'administrativeData',
-        _element('dccSoftware', _software(result)),
-        _element('coreData', _element('countryCodeISO3166_1', laboratory['country']),
+        _element('dccSoftware', _element('software', _text('name', 'adxl_ros'),
+                                         _element('release', provenance['package_version']))),
+        _element('coreData', _element('countryCodeISO3166_1', laboratory['laboratory_country']),
                  _element('usedLangCodeISO639_1', 'en'),
                  _element('mandatoryLangCodeISO639_1', 'en'),
                  _element('uniqueIdentifier', laboratory['identifier']
@@ -179,17 +167,12 @@ def _administrative(result: CalibrationResult, found: Uncertainty, laboratory: d
                  _element('beginPerformanceDate', date), _element('endPerformanceDate', date),
                  _element('performanceLocation', laboratory['place'])),
         _element('items', item),
-        _element('calibrationLaboratory', _contact('contact', laboratory['laboratory'])),
+        _element('calibrationLaboratory', _contact('contact', 'laboratory', laboratory)),
         _element('respPersons', _element(
             'respPerson', _element('person', _text('name', laboratory['responsible'])),
             _element('mainSigner', 'true'))),
-        _contact('customer', laboratory['customer']),
+        _contact('customer', 'customer', laboratory),
         _element('statements', *(_conformity(found, row) for row in found.decisions)))
-
-
-def _software(result: CalibrationResult) -> ElementTree.Element:
-    return _element('software', _text('name', 'adxl_ros'),
-                    _element('release', result.fitted.provenance['package_version']))
 
 
 def _conformity(found: Uncertainty, row: gum.Decision) -> ElementTree.Element:
@@ -223,26 +206,21 @@ def _results(result: CalibrationResult, found: Uncertainty, laboratory: dict[str
             (f'error along {name}', found.error_mps2[:, d], _ACCELERATION,
              found.combined_mps2[:, d], '', 'basic_measurementError'))))
         for d, name in enumerate(fitted.axes)]
-    fit = []
-    for row in compare(fitted, fitted):
-        unit, factor = si_unit(row.unit)
-        fit.append(_quantity(f'{row.label} {row.axis}', factor * row.fitted, unit,
-                             factor * row.half_width / Z_90, row.name))
+    fit = [_quantity(f'{row.label} {row.axis}', factor * row.fitted, unit,
+                     factor * row.half_width / Z_90, row.name)
+           for row in compare(fitted, fitted) for unit, factor in [si_unit(row.unit)]]
     budget = [_quantity(cells[0], row.contribution_mps2[worst, axis], _ACCELERATION, None,
                         f'standard uncertainty {cells[1]}, sensitivity {cells[2]}, degrees of '
                         f'freedom {cells[4]}')
               for cells, row in zip(gum.budget_rows(found), found.inputs)]
     conditions = [_quantity('local gravity', fitted.local_gravity_mps2, _ACCELERATION)]
-    if fitted.envelope.temperature_c:
-        conditions += [_quantity(f'{name} temperature of the poses', value + 273.15, r'\kelvin')
-                       for name, value in zip(('lowest', 'highest'),
-                                              fitted.envelope.temperature_c)]
+    conditions += [_quantity(f'{name} temperature', value + 273.15, r'\kelvin') for name, value in
+                   zip(('lowest', 'highest'), fitted.envelope.temperature_c or ())]
     return _element(
         'measurementResult', _text('name', 'Calibration of an accelerometer in the gravity field'),
         _element('usedMethods',
-                 _method('Expanded uncertainty', gum.MEANING, 'JCGM 100:2008', 'basic_uncertainty'),
-                 _method('Measurement model', gum.MODEL, None, 'basic_calibrationMethod')),
-        _element('usedSoftware', _software(result)),
+                 _method('Expanded uncertainty', gum.MEANING, 'basic_uncertainty'),
+                 _method('Measurement model', gum.MODEL, 'basic_calibrationMethod')),
         _element('measuringEquipments', _element(
             'measuringEquipment', _text('name', 'rotary stage of two axes'),
             _text('description', f'step {np.degrees(fitted.stage_resolution_rad):.4f}°; '
@@ -257,6 +235,6 @@ def _results(result: CalibrationResult, found: Uncertainty, laboratory: dict[str
                 ('Uncertainty budget at the pose of the largest uncertainty', budget)))))
 
 
-def _method(name: str, about: str, norm: str | None, kind: str) -> ElementTree.Element:
+def _method(name: str, about: str, kind: str) -> ElementTree.Element:
     return _element('usedMethod', _text('name', name), _text('description', about),
-                    _element('norm', norm) if norm else None, refType=kind)
+                    _element('norm', 'JCGM 100:2008'), refType=kind)

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from adxl_ros.calibrate.poses import Poses, reference_force
 from adxl_ros.calibrate.report import acceptance, held_out
-from adxl_ros.calibrate.report.acceptance import FAIL, NOT_SHOWN, PASS
+from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
 from adxl_ros.calibrate.result import CalibrationResult
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
@@ -31,36 +31,35 @@ _LOCAL_STD_MPS2 = 5e-4
 """Uncertainty of a stated local gravity, m/s². Chosen: 50 mGal, the size of gravity anomalies."""
 _UNIFORM = np.sqrt(3)
 """Half-width of a uniform distribution divided by its standard deviation."""
-_SURROUNDINGS = {'temperature': ('temperature_c', 'temperature_k', 'K', MARGIN_K, 0.1),
-                 'supply': ('supply_v', 'supply_v', 'V', 0.0, 1e-3)}
+_SURROUNDINGS = {'temperature': ('temperature_c', 'temperature_std_k', 'K', MARGIN_K, 0.1),
+                 'supply': ('supply_v', 'supply_std_v', 'V', 0.0, 1e-3)}
 """Field of a pose, key of `STATED`, unit, margin of the range, and step of central differences."""
-STATED = ('gravity_mps2', 'temperature_k', 'supply_v')
+STATED = ('gravity_std_mps2', 'temperature_std_k', 'supply_std_v')
 """Inputs whose standard uncertainty a laboratory may state."""
+_ZERO = 1e-9
+"""Values below are rounding; chosen."""
 _MANY = 1000
 """Degrees of freedom from which they count as infinite; chosen."""
 _HEAVIEST_TAIL = 1.5365
 """Square of a ratio from which no sum of squares of normal errors exceeds its mean more often than
 the square of one normal error does (Székely and Bakirov 2003)."""
 MODEL = (
-    'a = F(V, theta, T, U) (1 + dg/g) - g (du/d alpha d alpha + du/d beta d beta) + d model. '
-    'The measurand a is the acceleration along an axis of the case at the stated pose alpha, beta. '
-    'F inverts the calibrated sensor; V is the mean output at rest, theta the coefficients, T the '
-    'temperature, U the supply, g the local gravity, u the direction of the vertical. The '
-    'corrections d are 0 and have an uncertainty.')
+    'a = F(V; θ, T, U)·(1 + δg/g) − g·(∂u/∂α·δα + ∂u/∂β·δβ) + δm. The measurand a is the '
+    'acceleration along an axis of the case at the stated pose α, β. F inverts the calibrated '
+    'sensor. V is the mean output of a rest, θ the coefficients, T the temperature, U the supply, '
+    'g the local gravity, u the component of the vertical. The corrections δ are 0 and uncertain.')
 """The measurement model."""
 MEANING = (
     f'The expanded uncertainty is the standard uncertainty times k = {K}: about 95 % for a normal '
-    'distribution, more where a uniform one has the largest part. It is that of one rest as long as '
-    'those of the calibration, by a supply that the model follows or that is constant. Ageing after '
-    'the calibration is not in it.')
+    'distribution, more where a uniform one has the largest part. It holds for rests as long as '
+    'those of the calibration and a supply that is constant or in the model, without ageing.')
 """What an expanded uncertainty means."""
 RULE = (
-    f'{PASS} if error + guard band is at most the limit, where the guard band reaches to the upper '
-    f'end of the 90 % interval of the error; without one, this is simple acceptance. {FAIL} if the '
-    f'error exceeds the limit; {NOT_SHOWN} in between, and where stage and model are inseparable. '
-    'Risk: a unit with such an error exceeds the limit at most so often; at the limit, in half of '
-    'the cases. The error is that of coefficients and model: noise, stage, gravity, temperature '
-    'and supply belong to each use, and are not in it.')
+    f'{PASS} if error + guard band is at most the limit; {FAIL} if the error exceeds it; '
+    f'{NOT_SHOWN} in between, and where stage and model are inseparable. The guard band reaches '
+    'to the upper end of the 90 % interval; without one, this is simple acceptance. The risk is '
+    'the largest probability that a unit with such an error exceeds the limit. The error is that '
+    'of coefficients and model; the other inputs belong to each use.')
 """The decision rule (ISO/IEC 17025, 7.8.6)."""
 
 
@@ -132,14 +131,8 @@ class Uncertainty:
         """Return the probability of ±`K` standard uncertainties by Student's t."""
         return float(2 * scipy.special.stdtr(min(self.freedom, 1e9), K) - 1)
 
-    @property
-    def outcome(self) -> str:
-        """Return the worst outcome."""
-        outcomes = [row.outcome for row in self.decisions]
-        return next((word for word in (FAIL, NOT_SHOWN, PASS) if word in outcomes), NOT_SHOWN)
 
-
-def uncertainty(result: CalibrationResult, stated: Mapping[str, float] | None = None
+def uncertainty(result: CalibrationResult, stated: Mapping[str, Any] | None = None
                 ) -> Uncertainty | None:
     """
     Return the uncertainty at the held-out poses that determine alpha; None without such poses.
@@ -156,7 +149,7 @@ def uncertainty(result: CalibrationResult, stated: Mapping[str, float] | None = 
     held, used = poses.subset(errors.pose_index), held_out.determining_alpha(errors.errors)
     force = np.column_stack(reference_force(held, gravity))
     by_noise, by_coefficients, by_stage, _ = (
-        np.sqrt([covariance[d, d][used] for d in axes]).T
+        np.sqrt(np.maximum([covariance[d, d][used] for d in axes], 0.0)).T
         for covariance in held_out.covariances(errors, held, force))
     held, reference = held.subset(used), force[used][:, axes]
     error, budget = errors.errors.accel_mps2[used], assessment.accel
@@ -170,8 +163,8 @@ def uncertainty(result: CalibrationResult, stated: Mapping[str, float] | None = 
         stage_kind = 'A, scatter of the poses'
         stage_rad = stage_rad * excess ** 0.5 or budget.stage ** 0.5 / gravity
     gravity_std, gravity_kind = _LOCAL_STD_MPS2, 'B, anomalies of gravity'
-    if 'gravity_mps2' in stated:
-        gravity_std, gravity_kind = stated['gravity_mps2'], 'B, stated'
+    if 'gravity_std_mps2' in stated:
+        gravity_std, gravity_kind = stated['gravity_std_mps2'], 'B, stated'
     elif gravity == G0_MPS2:  # The standard value is that of no place in particular.
         gravity_std, gravity_kind = _EARTH_HALF_RANGE_MPS2 / _UNIFORM, 'B, anywhere on earth'
     fit_freedom = error.shape[1] * int((~poses.check).sum()) - len(fitted.covariance_names)
@@ -186,27 +179,31 @@ def uncertainty(result: CalibrationResult, stated: Mapping[str, float] | None = 
         Input('local gravity', gravity_kind, gravity_std, 'm/s²', np.inf,
               np.abs(reference) / gravity * gravity_std),
         *(_surroundings(name, fitted, held, reference, stated) for name in _SURROUNDINGS))
-    limit_name = 'nonlinearity of the datasheet'
-    limit_mps2 = acceptance.nonlinearity_mps2(fitted)
+    limit_name, decisions = _decisions(assessment, fitted)
+    return Uncertainty(fitted.axes, held.alpha_rad, held.beta_rad, reference, error, inputs,
+                       limit_name, decisions)
+
+
+def _decisions(assessment: Assessment, fitted: Sensor) -> tuple[str, tuple[Decision, ...]]:
+    """Return where the limits come from, and the decisions that the verdict of a tool shows."""
+    limit_mps2, name = acceptance.nonlinearity_mps2(fitted), 'nonlinearity of the datasheet'
     outcomes = assessment.accel_datasheet, assessment.tilt_datasheet
     if not limit_mps2:
-        limit_name, limit_mps2 = 'noise of one sample', held_out.sample_noise_mps2(fitted)
+        limit_mps2, name = held_out.sample_noise_mps2(fitted), 'noise of one sample'
         outcomes = assessment.accel_noise, assessment.tilt_noise
-    limits = (
-        ('acceleration', 'mg', budget, 1e3 / G0_MPS2, 1.0),
-        ('tilt', '°', assessment.tilt, float(np.degrees(1.0)), assessment.tilt.tilt_per_axis ** .5))
+    accel, tilt = assessment.accel, assessment.tilt
+    figures = (('acceleration', 'mg', 1e3 / G0_MPS2, accel, limit_mps2),
+               ('tilt', '°', float(np.degrees(1.0)), tilt, limit_mps2 * tilt.tilt_per_axis ** 0.5))
     decisions = []
-    for (quantity, unit, part, scale, per_axis), outcome in zip(limits, outcomes):
+    for (quantity, unit, scale, part, limit), outcome in zip(figures, outcomes):
         if outcome:
-            size, high = (scale * part.calibration ** 0.5, scale * part.calibration_high ** 0.5)
-            decisions.append(Decision(quantity, unit, size, high - size,
-                                      scale * limit_mps2 * per_axis, outcome))
-    return Uncertainty(fitted.axes, held.alpha_rad, held.beta_rad, reference, error, inputs,
-                       limit_name, tuple(decisions))
+            error, high = scale * part.calibration ** 0.5, scale * part.calibration_high ** 0.5
+            decisions.append(Decision(quantity, unit, error, high - error, scale * limit, outcome))
+    return name, tuple(decisions)
 
 
 def _surroundings(name: str, fitted: Sensor, held: Poses, reference: np.ndarray,
-                  stated: Mapping[str, float]) -> Input:
+                  stated: Mapping[str, Any]) -> Input:
     """Return the contribution of temperature or supply, uniform over those of the poses."""
     field, key, unit, margin, step = _SURROUNDINGS[name]
     values, environment = getattr(held, field), held.environment
@@ -234,48 +231,40 @@ def budget_rows(found: Uncertainty) -> list[list[str]]:
     for row in found.inputs:
         std = float(np.broadcast_to(row.std, found.error_mps2.shape)[at])
         part_mg = 1e3 * float(row.contribution_mps2[at]) / G0_MPS2
-        sensitivity = f'{part_mg / std if std else 0:.3g} mg per {row.unit}'
-        rows.append([row.name, f'{std:.2g} {row.unit} ({row.kind})',
-                     '1' if row.unit == 'mg' else sensitivity, f'{part_mg:.3f}',
-                     f'{row.freedom:.0f}' if row.freedom < _MANY else '∞'])
+        sensitivity = '1' if row.unit == 'mg' else \
+            f'{_digits(part_mg / std if std else 0.0)} mg per {row.unit}'
+        rows.append([row.name, f'{_digits(std)} {row.unit} ({row.kind})', sensitivity,
+                     f'{part_mg:.3f}', _freedom(row.freedom)])
     return rows
 
 
-BUDGET_HEAD = ['input', 'standard uncertainty (type)', 'sensitivity', 'contribution, mg',
-               'degrees of freedom']
-"""Head of `budget_rows`."""
-DECISION_HEAD = ['error of', 'error + guard band', 'limit', 'outcome', 'risk']
-"""Head of `decision_rows`."""
+def _freedom(value: float) -> str:
+    return f'{value:.0f}' if value < _MANY else '∞'
 
 
-def decision_rows(found: Uncertainty) -> list[list[str]]:
-    """Lay out the decisions with the figures that they follow from."""
-    rows = []
-    for row in found.decisions:
-        risk = f'{100 * row.risk:.1f} %' if row.risk >= 1e-3 else '< 0.1 %'
-        rows.append([
-            row.quantity, f'{row.error:.3f} + {row.guard_band:.3f} = '
-            f'{row.error + row.guard_band:.3f} {row.unit}', f'{row.limit:.3g} {row.unit}',
-            row.outcome, risk])
-    return rows
+def _digits(value: float) -> str:
+    """Write a value with two digits, without an exponent."""
+    rounded = float(f'{value:.2g}') if value > _ZERO else 0.0
+    return str(np.format_float_positional(rounded, trim='-'))
 
 
 def section(found: Uncertainty | None) -> dict[str, Any] | None:
     """Return the uncertainty as the page shows it."""
     if found is None:
         return None
-    combined_mg, (pose, axis) = 1e3 * found.combined_mps2 / G0_MPS2, found.worst
+    expanded_mg, (pose, axis) = 1e3 * K * found.combined_mps2 / G0_MPS2, found.worst
     alpha, beta = np.degrees([found.alpha_rad[pose], found.beta_rad[pose]])
     inside = np.abs(found.error_mps2) <= K * found.combined_mps2
-    freedom = f'{found.freedom:.0f}' if found.freedom < _MANY else 'infinite'
+    decisions = [[
+        row.quantity, f'{row.error:.3f} + {row.guard_band:.3f} = '
+        f'{row.error + row.guard_band:.3f} {row.unit}', f'{_digits(row.limit)} {row.unit}',
+        row.outcome, f'{100 * row.risk:.1f} %' if row.risk >= 1e-3 else '< 0.1 %'] for row in found.decisions]
     return {
         'model': MODEL, 'meaning': MEANING, 'rule': RULE, 'limit_name': found.limit_name,
         'pose': f'alpha {alpha:.1f}°, beta {beta:.1f}°, axis {found.axes[axis]}',
-        'budget': (BUDGET_HEAD, budget_rows(found)),
-        'decisions': (DECISION_HEAD, decision_rows(found)),
-        'combined': f'{combined_mg[pose, axis]:.3f} mg',
-        'expanded': f'{K * combined_mg[pose, axis]:.2f} mg',
-        'freedom': f'{freedom} effective degrees of freedom: {100 * found.coverage:.1f} % by '
-                   "Student's t",
-        'range': f'{K * combined_mg.min():.2f} to {K * combined_mg.max():.2f} mg',
+        'budget': budget_rows(found), 'decisions': decisions,
+        'combined': f'{expanded_mg[pose, axis] / K:.3f} mg',
+        'expanded': f'{expanded_mg[pose, axis]:.2f} mg',
+        'freedom': _freedom(found.freedom), 'coverage': f'{100 * found.coverage:.1f} %',
+        'range': f'{expanded_mg.min():.2f} to {expanded_mg.max():.2f} mg',
         'inside': f'{int(inside.sum())} of {inside.size}'}

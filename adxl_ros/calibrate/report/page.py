@@ -52,7 +52,7 @@ _BEYOND_WHISKER = 1.08
 
 
 def write(folder: str | os.PathLike, result: CalibrationResult,
-          store: str | os.PathLike = '', stated: Mapping[str, float] | None = None) -> None:
+          store: str | os.PathLike = '', stated: Mapping[str, Any] | None = None) -> None:
     """
     Write `report.html`, and the plots of the unit as `calibration.png`.
 
@@ -83,7 +83,7 @@ def _paper_sensor(result: CalibrationResult) -> Sensor:
 
 
 def page(result: CalibrationResult, past: Sequence[Sensor],
-         stated: Mapping[str, float] | None = None) -> str:
+         stated: Mapping[str, Any] | None = None) -> str:
     """Lay out the page."""
     fitted = result.fitted
     assessment = next((row for row in result.assessments if row.model == fitted.model), None)
