@@ -11,7 +11,7 @@ from pathlib import Path
 from adxl_ros.calibrate import calibration, pose_extraction
 from adxl_ros.calibrate.fits import thermal_fit
 from adxl_ros.calibrate.poses import Poses, with_table_angles
-from adxl_ros.calibrate.report import acceptance, dcc, gum, page
+from adxl_ros.calibrate.report import acceptance, dcc, page
 from adxl_ros.calibrate.report.coefficients import errors_in_words
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, population_file, sweep_journal
@@ -134,16 +134,12 @@ def fit(options: argparse.Namespace) -> int:
             if thermal is None else calibration.calibrate_thermal(
                 with_axes(base, unit.axes), thermal, Path(options.recording[0]).name, sha)
         result = replace(result, report_lines=[*result.report_lines, *measured])
-        found = gum.uncertainty(result, laboratory) if options.dcc else None
-        if options.dcc and found is None:
-            raise UserError(f'--dcc {options.dcc}: a certificate states errors at stage angles, '
-                            'and no pose with angles was kept out of the fit; leave it out')
+        if options.dcc:
+            dcc.write(options.dcc, result, laboratory)
         if options.report:
             show('report', 0.0)
             cli.make_folder(Path(options.report))
             page.write(options.report, result, options.store, laboratory)
-        if found is not None:
-            dcc.write(options.dcc, result, found, laboratory)
     result.save(options.output)
     cli.note(f'fit: {result.keep(options.store)}')
     report = [Path(options.report) / name for name in page.FILES] if options.report else []

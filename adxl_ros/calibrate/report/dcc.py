@@ -9,7 +9,6 @@ What the tool cannot know comes from a file of the laboratory, or is marked as n
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
 import math
 import os
 import re
@@ -51,9 +50,12 @@ def read_laboratory(path: str | os.PathLike | None) -> dict[str, Any]:
     """Read the texts and the standard uncertainties of a laboratory's YAML file; None has none."""
     node = compose(path) if path is not None else None
     given = yaml.constructor.SafeConstructor().construct_document(node) if node else {}
-    if not isinstance(given, dict) or not set(given) <= {*_LABORATORY, *gum.STATED}:
-        raise UserError(f'{path}: found {given!r}, expected a mapping with some of '
-                        f'{", ".join((*_LABORATORY, *gum.STATED))}')
+    known = (*_LABORATORY, *gum.STATED)
+    unknown = [str(name) for name in given if name not in known] if isinstance(given, dict) else \
+        ['no mapping']
+    if unknown:
+        raise UserError(f'{path}: found {", ".join(unknown)}; expected a mapping with some of '
+                        f'{", ".join(known)}')
     for name, value in given.items():
         if name in gum.STATED:
             if not isinstance(value, (int, float)) or not 0 <= value < math.inf:
@@ -83,8 +85,8 @@ def _text(name: str, text: str) -> ElementTree.Element:
     return _element(name, _element('content', text, lang='en'))
 
 
-def _numbers(values: Iterable[float]) -> str:
-    return ' '.join(f'{value:.7g}' for value in values)
+def _numbers(values: Any) -> str:
+    return ' '.join(f'{value:.7g}' for value in np.ravel(values))
 
 
 def _quantity(name: str, values: Any, unit: str, std: Any = None, about: str = '',
@@ -93,14 +95,14 @@ def _quantity(name: str, values: Any, unit: str, std: Any = None, about: str = '
     end = 'XMLList' if np.ndim(values) else ''
     expanded = None if std is None else _element(
         f'si:expandedUnc{end}',
-        _element(f'si:uncertainty{end}', _numbers(np.ravel(gum.K * np.asarray(std)))),
+        _element(f'si:uncertainty{end}', _numbers(gum.K * np.asarray(std))),
         _element(f'si:coverageFactor{end}', gum.K),
         _element(f'si:coverageProbability{end}', 0.95),
         _element(f'si:distribution{end}', 'normal'))
     return _element(
         'quantity', _text('name', name), _text('description', about) if about else None,
         _element('si:realListXMLList' if end else 'si:real',
-                 _element(f'si:value{end}', _numbers(np.ravel(values))),
+                 _element(f'si:value{end}', _numbers(values)),
                  _element(f'si:unit{end}', unit), expanded), **({'refType': kind} if kind else {}))
 
 
@@ -118,9 +120,12 @@ def si_unit(unit: str) -> tuple[str, float]:
     return ''.join(parts) or r'\one', G0_MPS2 ** g
 
 
-def write(path: str | os.PathLike, result: CalibrationResult, found: Uncertainty,
-          laboratory: dict[str, Any]) -> None:
-    """Write the certificate."""
+def write(path: str | os.PathLike, result: CalibrationResult, laboratory: dict[str, Any]) -> None:
+    """Write the certificate of a calibration against a stage."""
+    found = gum.uncertainty(result, laboratory)
+    if found is None:
+        raise UserError(f'{path}: a certificate states errors at stage angles, and no pose with '
+                        'angles was kept out of the fit; leave --dcc out')
     root = _element('digitalCalibrationCertificate',
                     _administrative(result, found, laboratory),
                     _element('measurementResults', _results(result, found, laboratory)),

@@ -36,8 +36,6 @@ _SURROUNDINGS = {'temperature': ('temperature_c', 'temperature_std_k', 'K', MARG
 """Field of a pose, key of `STATED`, unit, margin of the range, and step of central differences."""
 STATED = ('gravity_std_mps2', 'temperature_std_k', 'supply_std_v')
 """Inputs whose standard uncertainty a laboratory may state."""
-_ZERO = 1e-9
-"""Values below are rounding; chosen."""
 _MANY = 1000
 """Degrees of freedom from which they count as infinite; chosen."""
 _HEAVIEST_TAIL = 1.5365
@@ -166,7 +164,7 @@ def uncertainty(result: CalibrationResult, stated: Mapping[str, Any] | None = No
     if 'gravity_std_mps2' in stated:
         gravity_std, gravity_kind = stated['gravity_std_mps2'], 'B, stated'
     elif gravity == G0_MPS2:  # The standard value is that of no place in particular.
-        gravity_std, gravity_kind = _EARTH_HALF_RANGE_MPS2 / _UNIFORM, 'B, anywhere on earth'
+        gravity_std, gravity_kind = _EARTH_HALF_RANGE_MPS2 / _UNIFORM, 'B, not local: anywhere'
     fit_freedom = error.shape[1] * int((~poses.check).sum()) - len(fitted.covariance_names)
     inputs = (
         Input('noise of the mean', 'A, normal', 1e3 * np.mean(held.std_v, axis=0), 'mV',
@@ -244,7 +242,7 @@ def _freedom(value: float) -> str:
 
 def _digits(value: float) -> str:
     """Write a value with two digits, without an exponent."""
-    rounded = float(f'{value:.2g}') if value > _ZERO else 0.0
+    rounded = float(f'{value:.2g}') if value > 1e-9 else 0.0
     return str(np.format_float_positional(rounded, trim='-'))
 
 
@@ -258,7 +256,8 @@ def section(found: Uncertainty | None) -> dict[str, Any] | None:
     decisions = [[
         row.quantity, f'{row.error:.3f} + {row.guard_band:.3f} = '
         f'{row.error + row.guard_band:.3f} {row.unit}', f'{_digits(row.limit)} {row.unit}',
-        row.outcome, f'{100 * row.risk:.1f} %' if row.risk >= 1e-3 else '< 0.1 %'] for row in found.decisions]
+        row.outcome, f'{100 * row.risk:.1f} %' if row.risk >= 1e-3 else '< 0.1 %']
+        for row in found.decisions]
     return {
         'model': MODEL, 'meaning': MEANING, 'rule': RULE, 'limit_name': found.limit_name,
         'pose': f'alpha {alpha:.1f}°, beta {beta:.1f}°, axis {found.axes[axis]}',

@@ -104,7 +104,7 @@ def test_standard_gravity_is_no_local_gravity_and_the_laboratory_may_state_it():
     kinds = [next(row.kind for row in gum.uncertainty(result, stated).inputs
                   if row.name == 'local gravity')
              for stated in ({}, {'gravity_std_mps2': 1e-5})]
-    assert kinds == ['B, anywhere on earth', 'B, stated']
+    assert kinds == ['B, not local: anywhere', 'B, stated']
     assert 'FAIL' in {row.outcome for row in gum.uncertainty(result).decisions}
 
 
@@ -114,12 +114,13 @@ def children(element):
 
 def test_a_certificate_has_the_elements_of_the_schema(found, tmp_path):
     """The elements and their order are compared by name; with DCC_SCHEMA, by the schema itself."""
-    result, table = found
+    result, _ = found
     (tmp_path / 'lab.yaml').write_text(
         'laboratory_name: A & B\nlaboratory_country: DE\nresponsible: C. D.\n'
         'gravity_std_mps2: 1.0e-5\n')
     for name in (None, tmp_path / 'lab.yaml'):
-        dcc.write(tmp_path / 'cert.xml', result, table, dcc.read_laboratory(name))
+        laboratory = dcc.read_laboratory(name)
+        dcc.write(tmp_path / 'cert.xml', result, laboratory)
         validate(tmp_path / 'cert.xml')
     root = ElementTree.parse(tmp_path / 'cert.xml').getroot()
     assert root.tag == '{https://ptb.de/dcc}digitalCalibrationCertificate'
@@ -136,7 +137,7 @@ def test_a_certificate_has_the_elements_of_the_schema(found, tmp_path):
         'name', 'usedMethods', 'measuringEquipments', 'influenceConditions', 'results']
     text = {element.text for element in root.iter()}
     assert {'A & B', 'C. D.', '<7 & 8>', 'pass', 'not stated'} <= text
-    named = dcc.NAMESPACES
+    named, table = dcc.NAMESPACES, gum.uncertainty(result, laboratory)
     errors = [part for part in root.iterfind('.//dcc:quantity', named)
               if part.get('refType') == 'basic_measurementError']
     for d, part in enumerate(errors):
