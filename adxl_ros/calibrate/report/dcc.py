@@ -223,9 +223,10 @@ def _results(result: CalibrationResult, found: Uncertainty, laboratory: dict[str
                    zip(('lowest', 'highest'), fitted.envelope.temperature_c or ())]
     return _element(
         'measurementResult', _text('name', 'Calibration of an accelerometer in the gravity field'),
-        _element('usedMethods',
-                 _method('Expanded uncertainty', gum.MEANING, 'basic_uncertainty'),
-                 _method('Measurement model', gum.MODEL, 'basic_calibrationMethod')),
+        _element('usedMethods', _element(
+            'usedMethod', _text('name', 'Expanded uncertainty'),
+            _text('description', f'{gum.MEANING} {gum.MODEL}'), _element('norm', 'JCGM 100:2008'),
+            refType='basic_uncertainty')),
         _element('measuringEquipments', _element(
             'measuringEquipment', _text('name', 'rotary stage of two axes'),
             _text('description', f'step {np.degrees(fitted.stage_resolution_rad):.4f}°; '
@@ -238,8 +239,3 @@ def _results(result: CalibrationResult, found: Uncertainty, laboratory: dict[str
                 ('Errors at poses that the fit has not seen', points),
                 ('Coefficients', fit),
                 ('Uncertainty budget at the pose of the largest uncertainty', budget)))))
-
-
-def _method(name: str, about: str, kind: str) -> ElementTree.Element:
-    return _element('usedMethod', _text('name', name), _text('description', about),
-                    _element('norm', 'JCGM 100:2008'), refType=kind)
