@@ -11,7 +11,7 @@ from pathlib import Path
 from adxl_ros.calibrate import calibration, pose_extraction
 from adxl_ros.calibrate.fits import thermal_fit
 from adxl_ros.calibrate.poses import Poses, with_table_angles
-from adxl_ros.calibrate.report import acceptance, page
+from adxl_ros.calibrate.report import acceptance, dcc, page
 from adxl_ros.calibrate.report.coefficients import errors_in_words
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, population_file, sweep_journal
@@ -69,6 +69,12 @@ def parser() -> argparse.ArgumentParser:
                        help='the parameter file of the calibrated sensor')
     parse.add_argument('--report', metavar='DIR',
                        help='write the page report.html and its plots there')
+    parse.add_argument('--dcc', metavar='FILE.xml',
+                       help='write a Digital Calibration Certificate of a calibration on a stage, '
+                            f'by the schema DCC {dcc.SCHEMA_VERSION} of PTB')
+    parse.add_argument('--dcc-data', metavar='FILE',
+                       help='YAML file with what a laboratory states for it, as laboratory_name, '
+                            'customer_name, responsible, gravity_std_mps2')
     parse.add_argument('--store', metavar='DIR', default=str(calibration_store.default_folder()),
                        help='the calibration store, which gets a copy (default: %(default)s); '
                             'empty for none')
@@ -92,6 +98,7 @@ def fit(options: argparse.Namespace) -> int:
         html_page.check_libraries()
     if options.poses and (options.journal or len(options.recording) != 1):
         raise UserError(f'--poses {options.poses}: goes with one recording, and without --journal')
+    laboratory = dcc.read_laboratory(options.dcc_data)
     population = population_file.read(options.prior) if options.prior else None
     records = sweep_journal.poses_to_fit(sweep_journal.read(options.journal).entries) \
         if options.journal else None
@@ -133,13 +140,16 @@ def fit(options: argparse.Namespace) -> int:
             if thermal is None else calibration.calibrate_thermal(
                 with_axes(base, unit.axes), thermal, Path(options.recording[0]).name, sha)
         result = replace(result, report_lines=[*result.report_lines, *measured])
+        if options.dcc:
+            dcc.write(options.dcc, result, laboratory)
         if options.report:
             show('report', 0.0)
             cli.make_folder(Path(options.report))
-            page.write(options.report, result, options.store)
+            page.write(options.report, result, options.store, laboratory)
     result.save(options.output)
     cli.note(f'fit: {result.keep(options.store)}')
     report = [Path(options.report) / name for name in page.FILES] if options.report else []
+    report += [Path(options.dcc)] if options.dcc else []
     lines = [errors_in_words(result.fitted), '', *_result_lines(result)] if thermal is None else \
         [*result.report_lines, '']
     cli.print_end([*lines, *measured, ''], [options.output, *report], cli.command(

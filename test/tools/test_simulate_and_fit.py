@@ -21,8 +21,9 @@ def test_simulate_fit_and_apply_make_one_path(run_tool, tmp_path):
                         '--seed', 5, '-o', f'{name}.csv')
         assert (done.returncode, done.stderr) == (0, '')
     done = run_tool('fit', 'sweep.csv', '--params', 'nominal.yaml', '-o', 'unit.yaml',
-                    '--report', 'figures')
+                    '--report', 'figures', '--dcc', 'certificate.xml')
     assert done.returncode == 0, done.stderr
+    assert '<si:uncertaintyXMLList>' in (tmp_path / 'certificate.xml').read_text()
     assert 'full model' in done.stdout and 'poses that the fit has not seen' in done.stdout
     assert (tmp_path / 'figures' / 'calibration.png').stat().st_size > 20000
     fitted = parameter_file.load(tmp_path / 'unit.yaml')
@@ -51,6 +52,10 @@ def test_a_resting_recording_is_fitted_over_temperature(run_tool, tmp_path):
     done = run_tool('fit', 'oven.csv', '--effect', 'temperature_bias', '-o', 'b.yaml',
                     '--report', 'page')
     assert done.returncode == 1 and '--report page: a fit over temperature' in done.stderr
+    done = run_tool('fit', 'oven.csv', '--effect', 'temperature_bias', '-o', 'b.yaml',
+                    '--dcc', 'certificate.xml')
+    assert done.returncode == 1 and 'a certificate states errors at stage' in done.stderr
+    assert not (tmp_path / 'b.yaml').exists()
 
 
 def test_several_recordings_of_one_unit_are_fitted_together(run_tool, tmp_path):

@@ -324,7 +324,7 @@ def error_budgets(errors: HeldOutErrors, poses: Poses, stage: Sensor | None = No
         stage_force(stage, held.alpha_rad, held.beta_rad))
     has_tilt, used = np.isfinite(measured.tilt_rad), determining_alpha(measured)
     axes = [AXES.index(axis) for axis in sensor.axes]
-    *by_cause, probe = _covariances(errors, held, reference)
+    *by_cause, probe = covariances(errors, held, reference)
     accel_scatter, tilt_scatter, has_noise = _scatter(sensor, poses.subset(~poses.check))
     accel = tilt = _NO_BUDGET
     if used.any():
@@ -365,7 +365,7 @@ def _budget(errors: np.ndarray, measured: float, predicted: Sequence[float], une
         by_coefficients + max(upper - explained, 0.0), bool(np.isfinite(unexplainable)))
 
 
-def _covariances(errors: HeldOutErrors, held: Poses, reference: np.ndarray) -> list[np.ndarray]:
+def covariances(errors: HeldOutErrors, held: Poses, reference: np.ndarray) -> list[np.ndarray]:
     """
     Return covariances of the specific force in the held-out poses, (m/s²)², each (3, 3, k).
 

@@ -8,7 +8,7 @@ The page of a calibration: one file that opens offline, with figures that plotly
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 import os
 from pathlib import Path
@@ -18,7 +18,7 @@ from typing import Any
 from adxl_ros.calibrate.fits import linear
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
 from adxl_ros.calibrate.poses import planes, Poses, reference_force
-from adxl_ros.calibrate.report import acceptance, coefficients, held_out
+from adxl_ros.calibrate.report import acceptance, coefficients, gum, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
 from adxl_ros.calibrate.report.coefficients import DriftHistory
 from adxl_ros.calibrate.result import CalibrationResult
@@ -56,13 +56,17 @@ _BEYOND_WHISKER = 1.08
 
 
 def write(folder: str | os.PathLike, result: CalibrationResult,
-          store: str | os.PathLike = '') -> None:
-    """Write `report.html`, and the plots of the unit as `calibration.png`."""
+          store: str | os.PathLike = '', stated: Mapping[str, Any] | None = None) -> None:
+    """
+    Write `report.html`, and the plots of the unit as `calibration.png`.
+
+    stated: standard uncertainties of the laboratory; see `gum.uncertainty`.
+    """
     html_page.check_libraries()
     past = calibration_store.history(store, result.fitted.serial).calibrations \
         if str(store) else []
     page_path, plot_path = (Path(folder) / name for name in FILES)
-    write_text(page_path, page(result, [sensor for _, sensor in past]))
+    write_text(page_path, page(result, [sensor for _, sensor in past], stated))
     # If the poses do not suffice for the figures of the paper, the page states the reason.
     with suppress(UserError):
         draw(plot_path, result)
@@ -82,7 +86,8 @@ def _paper_sensor(result: CalibrationResult) -> Sensor:
         linear.fit_physical(result.nominal, result.poses.subset(~result.poses.check))
 
 
-def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
+def page(result: CalibrationResult, past: Sequence[Sensor],
+         stated: Mapping[str, Any] | None = None) -> str:
     """Lay out the page."""
     fitted = result.fitted
     errors_of = {errors.model: errors for errors in result.held_out}
@@ -120,6 +125,7 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
         'noise_mg': 1e3 * held_out.sample_noise_mps2(fitted) / G0_MPS2,
         'budget': assessment.accel if assessment and errors else None,
         'part_colours': _PART_COLOURS,
+        'gum': gum.section(gum.uncertainty(result, stated)),
         'history': history.table() if history.sensors else None,
         'changes': history.changes() if history.sensors else '',
         'paper_model': paper_model,

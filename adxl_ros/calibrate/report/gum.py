@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The uncertainty of the acceleration at a stated pose, as the GUM asks for it (JCGM 100).
+
+Squares of contributions add. Those of noise, coefficients, stage and model are the parts of
+`held_out.ErrorBudget`, here pose by pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from adxl_ros.calibrate.poses import Poses, reference_force
+from adxl_ros.calibrate.report import acceptance, held_out
+from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
+from adxl_ros.calibrate.result import CalibrationResult
+from adxl_ros.model import signal_chain
+from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.sensor import MARGIN_K, Sensor
+import numpy as np
+import scipy
+
+K = 2
+"""Coverage factor of an expanded uncertainty; about 95 % for a normal distribution."""
+_EARTH_HALF_RANGE_MPS2 = 0.027
+"""Half of the range of gravity at sea level, 9.780 to 9.832 m/s², about the standard gravity."""
+_LOCAL_STD_MPS2 = 5e-4
+"""Uncertainty of a stated local gravity, m/s². Chosen: 50 mGal, the size of gravity anomalies."""
+_UNIFORM = np.sqrt(3)
+"""Half-width of a uniform distribution divided by its standard deviation."""
+_SURROUNDINGS = {'temperature': ('temperature_c', 'temperature_std_k', 'K', MARGIN_K, 0.1),
+                 'supply': ('supply_v', 'supply_std_v', 'V', 0.0, 1e-3)}
+"""Field of a pose, key of `STATED`, unit, margin of the range, and step of central differences."""
+STATED = ('gravity_std_mps2', 'temperature_std_k', 'supply_std_v')
+"""Inputs whose standard uncertainty a laboratory may state."""
+_MANY = 1000
+"""Degrees of freedom from which they count as infinite; chosen."""
+_HEAVIEST_TAIL = 1.5365
+"""Square of a ratio from which no sum of squares of normal errors exceeds its mean more often than
+the square of one normal error does (Székely and Bakirov 2003)."""
+MODEL = (
+    'a = F(V; θ, T, U)·(1 + δg/g) − g·(∂u/∂α·δα + ∂u/∂β·δβ) + δm. The measurand a is the '
+    'acceleration along an axis of the case at the stated pose α, β. F inverts the calibrated '
+    'sensor. V is the mean output of a rest, θ the coefficients, T the temperature, U the supply, '
+    'g the local gravity, u the component of the vertical. The corrections δ are 0 and uncertain.')
+"""The measurement model."""
+MEANING = (
+    f'The expanded uncertainty is the standard uncertainty times k = {K}: about 95 % for a normal '
+    'distribution, more where a uniform one has the largest part. It holds for rests as long as '
+    'those of the calibration and a supply that is constant or in the model, without ageing.')
+"""What an expanded uncertainty means."""
+RULE = (
+    f'{PASS} if error + guard band is at most the limit; {FAIL} if the error exceeds it; '
+    f'{NOT_SHOWN} in between, and where stage and model are inseparable. The guard band reaches '
+    'to the upper end of the 90 % interval; without one, this is simple acceptance. The risk is '
+    'the largest probability that a unit with such an error exceeds the limit. The error is that '
+    'of coefficients and model; the other inputs belong to each use.')
+"""The decision rule (ISO/IEC 17025, 7.8.6)."""
+
+
+@dataclass(frozen=True)
+class Input:
+    """An input quantity, and what it contributes to the acceleration at k poses of m axes."""
+
+    name: str  # The quantity
+    kind: str  # Evaluation, A or B, and distribution or source
+    std: Any  # Standard uncertainty, (k, m) or one for all
+    unit: str  # Unit of `std`
+    freedom: float  # Degrees of freedom
+    contribution_mps2: np.ndarray  # Standard uncertainty of the acceleration, (k, m)
+
+
+class Decision(NamedTuple):
+    """A comparison of the calibration error with its limit, in one unit."""
+
+    quantity: str  # acceleration or tilt
+    unit: str  # mg or °
+    error: float  # Error of the calibration, rms over the poses
+    guard_band: float  # From there to the upper end of its 90 % interval
+    limit: float
+    outcome: str  # PASS, FAIL or NOT SHOWN
+
+    @property
+    def risk(self) -> float:
+        """Return the largest probability that the error of such a unit exceeds the limit."""
+        square = (self.limit / (self.error + self.guard_band)) ** 2
+        if square < 1:
+            return 1.0
+        return float(scipy.special.chdtrc(1, square)) if square >= _HEAVIEST_TAIL else 0.5
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """The uncertainty at k held-out poses of a calibration of m axes."""
+
+    axes: str
+    # alpha_rad, beta_rad: The stated poses, (k,)
+    alpha_rad: np.ndarray
+    beta_rad: np.ndarray
+    # reference_mps2, error_mps2: Acceleration by stage and gravity, and the measured one minus
+    # that, (k, m)
+    reference_mps2: np.ndarray
+    error_mps2: np.ndarray
+    inputs: tuple[Input, ...]
+    limit_name: str  # Where the limits of the decisions come from
+    decisions: tuple[Decision, ...]
+
+    @property
+    def combined_mps2(self) -> np.ndarray:
+        """Return the combined standard uncertainty, m/s², (k, m)."""
+        return np.asarray(np.sqrt(sum(row.contribution_mps2 ** 2 for row in self.inputs)))
+
+    @property
+    def worst(self) -> tuple[int, int]:
+        """Return pose and axis of the largest combined uncertainty."""
+        return divmod(int(np.argmax(self.combined_mps2)), self.error_mps2.shape[1])
+
+    @property
+    def freedom(self) -> float:
+        """Return the effective degrees of freedom there, by Welch and Satterthwaite."""
+        total = sum(row.contribution_mps2[self.worst] ** 4 / row.freedom for row in self.inputs)
+        return float(self.combined_mps2[self.worst] ** 4 / total) if total else float('inf')
+
+    @property
+    def coverage(self) -> float:
+        """Return the probability of ±`K` standard uncertainties by Student's t."""
+        return float(2 * scipy.special.stdtr(min(self.freedom, 1e9), K) - 1)
+
+
+def uncertainty(result: CalibrationResult, stated: Mapping[str, Any] | None = None
+                ) -> Uncertainty | None:
+    """
+    Return the uncertainty at the held-out poses that determine alpha; None without such poses.
+
+    stated: standard uncertainties that the laboratory states, by the names of `STATED`.
+    """
+    fitted, stated = result.fitted, stated or {}
+    errors = next((row for row in result.held_out if row.model == fitted.model), None)
+    assessment = next((row for row in result.assessments if row.model == fitted.model), None)
+    if errors is None or assessment is None or not np.isfinite(assessment.accel.measured):
+        return None
+    gravity, axes = fitted.local_gravity_mps2, [AXES.index(axis) for axis in fitted.axes]
+    poses = result.poses.subset(result.inliers)
+    held, used = poses.subset(errors.pose_index), held_out.determining_alpha(errors.errors)
+    force = np.column_stack(reference_force(held, gravity))
+    by_noise, by_coefficients, by_stage, _ = (
+        np.sqrt(np.maximum([covariance[d, d][used] for d in axes], 0.0)).T
+        for covariance in held_out.covariances(errors, held, force))
+    held, reference = held.subset(used), force[used][:, axes]
+    error, budget = errors.errors.accel_mps2[used], assessment.accel
+    nu = held_out.degrees_of_freedom(error)
+    model = np.full(error.shape, np.sqrt(budget.model))
+    # The poses may scatter more than the step of the encoder permits.
+    stage_mps2, stage_kind = by_stage, 'B, uniform within a step'
+    stage_rad, excess = fitted.stage_std_rad, budget.stage / max(np.mean(by_stage ** 2), 1e-30)
+    if excess > 1:
+        stage_mps2 = by_stage * excess ** 0.5 if stage_rad else model * 0 + budget.stage ** 0.5
+        stage_kind = 'A, scatter of the poses'
+        stage_rad = stage_rad * excess ** 0.5 or budget.stage ** 0.5 / gravity
+    gravity_std, gravity_kind = _LOCAL_STD_MPS2, 'B, anomalies of gravity'
+    if 'gravity_std_mps2' in stated:
+        gravity_std, gravity_kind = stated['gravity_std_mps2'], 'B, stated'
+    elif gravity == G0_MPS2:  # The standard value is that of no place in particular.
+        gravity_std, gravity_kind = _EARTH_HALF_RANGE_MPS2 / _UNIFORM, 'B, not local: anywhere'
+    fit_freedom = error.shape[1] * int((~poses.check).sum()) - len(fitted.covariance_names)
+    inputs = (
+        Input('noise of the mean', 'A, normal', 1e3 * np.mean(held.std_v, axis=0), 'mV',
+              np.inf, by_noise),
+        Input('coefficients', 'A, covariance of the fit', 1e3 * by_coefficients / G0_MPS2, 'mg',
+              max(fit_freedom, 1), by_coefficients),
+        Input('stage angles', stage_kind, np.degrees(stage_rad), '°',
+              np.inf if stage_mps2 is by_stage else nu, stage_mps2),
+        Input('model', 'A, held-out errors', 1e3 * model / G0_MPS2, 'mg', nu, model),
+        Input('local gravity', gravity_kind, gravity_std, 'm/s²', np.inf,
+              np.abs(reference) / gravity * gravity_std),
+        *(_surroundings(name, fitted, held, reference, stated) for name in _SURROUNDINGS))
+    limit_name, decisions = _decisions(assessment, fitted)
+    return Uncertainty(fitted.axes, held.alpha_rad, held.beta_rad, reference, error, inputs,
+                       limit_name, decisions)
+
+
+def _decisions(assessment: Assessment, fitted: Sensor) -> tuple[str, tuple[Decision, ...]]:
+    """Return where the limits come from, and the decisions that the verdict of a tool shows."""
+    limit_mps2, name = acceptance.nonlinearity_mps2(fitted), 'nonlinearity of the datasheet'
+    outcomes = assessment.accel_datasheet, assessment.tilt_datasheet
+    if not limit_mps2:
+        limit_mps2, name = held_out.sample_noise_mps2(fitted), 'noise of one sample'
+        outcomes = assessment.accel_noise, assessment.tilt_noise
+    accel, tilt = assessment.accel, assessment.tilt
+    figures = (('acceleration', 'mg', 1e3 / G0_MPS2, accel, limit_mps2),
+               ('tilt', '°', float(np.degrees(1.0)), tilt, limit_mps2 * tilt.tilt_per_axis ** 0.5))
+    decisions = []
+    for (quantity, unit, scale, part, limit), outcome in zip(figures, outcomes):
+        if outcome:
+            error, high = scale * part.calibration ** 0.5, scale * part.calibration_high ** 0.5
+            decisions.append(Decision(quantity, unit, error, high - error, scale * limit, outcome))
+    return name, tuple(decisions)
+
+
+def _surroundings(name: str, fitted: Sensor, held: Poses, reference: np.ndarray,
+                  stated: Mapping[str, Any]) -> Input:
+    """Return the contribution of temperature or supply, uniform over those of the poses."""
+    field, key, unit, margin, step = _SURROUNDINGS[name]
+    values, environment = getattr(held, field), held.environment
+    seen = values[np.isfinite(values)]
+    half_range = margin + (np.ptp(seen) / 2 if seen.size else 0.0)
+    kind = 'B, range of the poses' if seen.size else \
+        f'B, ±{margin:g} {unit}, not measured' if margin else 'not measured, taken as constant'
+    std = stated.get(key, half_range / _UNIFORM)
+    inverse = signal_chain.inverse(fitted, np.where(np.cos(held.alpha_rad) < 0, -1, 1))
+    shifted = [np.column_stack(inverse(list(held.volts.T), environment._replace(
+        **{field: getattr(environment, field) + sign * step}))) for sign in (1, -1)]
+    axes = [AXES.index(axis) for axis in fitted.axes]
+    slope = (shifted[0] - shifted[1])[:, axes] / (2 * step)
+    if name == 'temperature':
+        # What the model does not follow drifts as the datasheet states.
+        slope = np.sqrt(slope ** 2 + (G0_MPS2 * fitted.envelope.zero_g_per_k) ** 2
+                        + (reference * fitted.envelope.scale_per_k) ** 2)
+    return Input(name, 'B, stated' if key in stated else kind, std, unit, np.inf,
+                 np.abs(np.nan_to_num(slope)) * std)
+
+
+def budget_rows(found: Uncertainty) -> list[list[str]]:
+    """Lay out the inputs at the pose of the largest uncertainty: the table of the GUM."""
+    rows, at = [], found.worst
+    for row in found.inputs:
+        std = float(np.broadcast_to(row.std, found.error_mps2.shape)[at])
+        part_mg = 1e3 * float(row.contribution_mps2[at]) / G0_MPS2
+        sensitivity = '1' if row.unit == 'mg' else \
+            f'{_digits(part_mg / std if std else 0.0)} mg per {row.unit}'
+        rows.append([row.name, f'{_digits(std)} {row.unit} ({row.kind})', sensitivity,
+                     f'{part_mg:.3f}', _freedom(row.freedom)])
+    return rows
+
+
+def _freedom(value: float) -> str:
+    return f'{value:.0f}' if value < _MANY else '∞'
+
+
+def _digits(value: float) -> str:
+    """Write a value with two digits, without an exponent."""
+    rounded = float(f'{value:.2g}') if value > 1e-9 else 0.0
+    return str(np.format_float_positional(rounded, trim='-'))
+
+
+def section(found: Uncertainty | None) -> dict[str, Any] | None:
+    """Return the uncertainty as the page shows it."""
+    if found is None:
+        return None
+    expanded_mg, (pose, axis) = 1e3 * K * found.combined_mps2 / G0_MPS2, found.worst
+    alpha, beta = np.degrees([found.alpha_rad[pose], found.beta_rad[pose]])
+    inside = np.abs(found.error_mps2) <= K * found.combined_mps2
+    decisions = [[
+        row.quantity, f'{row.error:.3f} + {row.guard_band:.3f} = '
+        f'{row.error + row.guard_band:.3f} {row.unit}', f'{_digits(row.limit)} {row.unit}',
+        row.outcome, f'{100 * row.risk:.1f} %' if row.risk >= 1e-3 else '< 0.1 %']
+        for row in found.decisions]
+    return {
+        'model': MODEL, 'meaning': MEANING, 'rule': RULE, 'limit_name': found.limit_name,
+        'pose': f'alpha {alpha:.1f}°, beta {beta:.1f}°, axis {found.axes[axis]}',
+        'budget': budget_rows(found), 'decisions': decisions,
+        'combined': f'{expanded_mg[pose, axis] / K:.3f} mg',
+        'expanded': f'{expanded_mg[pose, axis]:.2f} mg',
+        'freedom': _freedom(found.freedom), 'coverage': f'{100 * found.coverage:.1f} %',
+        'range': f'{expanded_mg.min():.2f} to {expanded_mg.max():.2f} mg',
+        'inside': f'{int(inside.sum())} of {inside.size}'}

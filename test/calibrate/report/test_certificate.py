@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Uncertainty by the GUM, checked on simulated units, and the certificate that states it."""
+
+from dataclasses import replace
+import os
+from pathlib import Path
+from xml.etree import ElementTree
+
+from adxl_ros.calibrate import calibration
+from adxl_ros.calibrate.fits.full_model import TERMS
+from adxl_ros.calibrate.report import dcc, gum
+from adxl_ros.errors import UserError
+from adxl_ros.model import noise, signal_chain
+from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.kinematics import specific_force
+import numpy as np
+import pytest
+from units import drawn, nominal, swept
+
+pytestmark = pytest.mark.long
+
+GRAVITY_MPS2, GRAVITY_STD_MPS2 = 9.80131, 0.002
+SCHEMA = Path(os.environ.get('DCC_SCHEMA', ''))
+"""Folder with dcc.xsd, and with the schemas of its imports as SI_Format.xsd and xmldsig.xsd."""
+IMPORTS = {'https://ptb.de/si/v2.1.0/SI_Format.xsd': 'SI_Format.xsd',
+           'https://www.w3.org/TR/xmldsig-core/xmldsig-core-schema.xsd': 'xmldsig.xsd'}
+
+
+def calibrated(seed, axes='xy', model=None, gravity_mps2=GRAVITY_MPS2):
+    """Calibrate a drawn unit whose true gravity differs from the stated one."""
+    rng = np.random.default_rng([seed, 17])
+    sensor = nominal(axes, serial='<7 & 8>', local_gravity_mps2=gravity_mps2)
+    truth = replace(drawn(rng, sensor, TERMS),
+                    local_gravity_mps2=gravity_mps2 + GRAVITY_STD_MPS2 * rng.normal())
+    poses = swept(rng, truth)
+    return truth, calibration.calibrate(
+        sensor, [calibration.RecordedPoses('made', poses)], model)
+
+
+@pytest.fixture(scope='module')
+def found():
+    """Return a calibration and its uncertainty."""
+    _, result = calibrated(1)
+    return result, gum.uncertainty(result, {'gravity_std_mps2': GRAVITY_STD_MPS2})
+
+
+@pytest.mark.parametrize(('axes', 'units'), [('xy', 5), ('xyz', 3)])
+def test_the_expanded_interval_holds_for_drawn_units(axes, units):
+    """
+    At stated poses, all inputs are drawn anew: stage, noise, temperature, gravity by unit.
+
+    The largest part is uniform, so that k = 2 holds in more than 95 %: the standard uncertainty is
+    checked, too.
+    """
+    ratios, columns = [], [AXES.index(axis) for axis in axes]
+    for seed in range(units):
+        truth, result = calibrated(seed, axes)
+        table = gum.uncertainty(result, {'gravity_std_mps2': GRAVITY_STD_MPS2})
+        rng, alpha, beta = np.random.default_rng([seed, 18]), table.alpha_rad, table.beta_rad
+        std_v = noise.sample_std_v(truth) / np.sqrt(
+            noise.effective_samples(5000, 1e-3, truth.rc_s))
+        z_sign = np.where(np.cos(alpha) < 0, -1, 1)
+        stated = np.column_stack(specific_force(alpha, beta, truth.local_gravity_mps2))
+        for _ in range(20):
+            slip = truth.stage_resolution_rad * rng.uniform(-0.5, 0.5, (2, len(alpha)))
+            force = specific_force(alpha + slip[0], beta + slip[1], truth.local_gravity_mps2)
+            volts = np.column_stack(signal_chain.static_response(truth)(list(force)))
+            drift_g = rng.uniform(-2, 2, (len(alpha), 1)) * 1e-4 * rng.normal(size=len(axes))
+            volts += drift_g * truth.scale_v_per_g + std_v * rng.normal(size=volts.shape)
+            got = np.column_stack(signal_chain.inverse(result.fitted, z_sign)(list(volts.T)))
+            ratios.append(((got - stated)[:, columns] / table.combined_mps2).ravel())
+    ratios = np.concatenate(ratios)
+    assert 0.9 < np.sqrt(np.mean(ratios ** 2)) < 1.1
+    assert 0.94 < np.mean(np.abs(ratios) < gum.K) < 0.99
+
+
+def test_the_table_adds_up_and_has_the_numbers_of_the_error_budget(found):
+    """Each contribution is uncertainty times sensitivity; PASS follows from the figures."""
+    result, table = found
+    assessment, at = result.assessments[-1], table.worst
+    for row, part in zip(table.inputs, ('noise', 'coefficients', None, 'model')):
+        if part:
+            assert np.mean(row.contribution_mps2 ** 2) == pytest.approx(
+                getattr(assessment.accel, part), rel=1e-9)
+    parts_mg = [1e3 * row.contribution_mps2[at] / G0_MPS2 for row in table.inputs]
+    section = gum.section(table)
+    assert section['combined'] == f'{np.sqrt(np.sum(np.square(parts_mg))):.3f} mg'
+    assert [row[3] for row in section['budget']] == [f'{part:.3f}' for part in parts_mg]
+    assert table.coverage == pytest.approx(0.95, abs=0.02)
+    accel, tilt = table.decisions
+    assert accel.error == pytest.approx(assessment.error_mg)
+    assert (accel.outcome, tilt.outcome) == (
+        assessment.accel_datasheet, assessment.tilt_datasheet) == ('PASS', 'PASS')
+    assert accel.error + accel.guard_band <= accel.limit and accel.risk < 1e-3
+    # A hundredth of a normal distribution is beyond 2.576 of its standard deviations.
+    assert accel._replace(limit=2.576, error=0.9, guard_band=0.1).risk == pytest.approx(
+        0.01, rel=1e-3)
+    assert accel._replace(limit=1.0, error=1.0, guard_band=0.0).risk == 0.5
+
+
+def test_standard_gravity_is_no_local_gravity_and_the_laboratory_may_state_it():
+    _, result = calibrated(2, model='linear', gravity_mps2=G0_MPS2)
+    kinds = [next(row.kind for row in gum.uncertainty(result, stated).inputs
+                  if row.name == 'local gravity')
+             for stated in ({}, {'gravity_std_mps2': 1e-5})]
+    assert kinds == ['B, not local: anywhere', 'B, stated']
+    assert 'FAIL' in {row.outcome for row in gum.uncertainty(result).decisions}
+
+
+def children(element):
+    return [child.tag.partition('}')[2] for child in element]
+
+
+def test_a_certificate_has_the_elements_of_the_schema(found, tmp_path):
+    """The elements and their order are compared by name; with DCC_SCHEMA, by the schema itself."""
+    result, _ = found
+    (tmp_path / 'lab.yaml').write_text(
+        'laboratory_name: A & B\nlaboratory_country: DE\nresponsible: C. D.\n'
+        'gravity_std_mps2: 1.0e-5\n')
+    for name in (None, tmp_path / 'lab.yaml'):
+        laboratory = dcc.read_laboratory(name)
+        dcc.write(tmp_path / 'cert.xml', result, laboratory)
+        validate(tmp_path / 'cert.xml')
+    root = ElementTree.parse(tmp_path / 'cert.xml').getroot()
+    assert root.tag == '{https://ptb.de/dcc}digitalCalibrationCertificate'
+    assert root.get('schemaVersion') == dcc.SCHEMA_VERSION
+    administrative, measured = root
+    assert children(administrative) == [
+        'dccSoftware', 'coreData', 'items', 'calibrationLaboratory', 'respPersons', 'customer',
+        'statements']
+    assert children(administrative[1]) == [
+        'countryCodeISO3166_1', 'usedLangCodeISO639_1', 'mandatoryLangCodeISO639_1',
+        'uniqueIdentifier', 'identifications', 'beginPerformanceDate', 'endPerformanceDate',
+        'performanceLocation']
+    assert children(measured[0]) == [
+        'name', 'usedMethods', 'measuringEquipments', 'influenceConditions', 'results']
+    text = {element.text for element in root.iter()}
+    assert {'A & B', 'C. D.', '<7 & 8>', 'pass', 'not stated'} <= text
+    named, table = dcc.NAMESPACES, gum.uncertainty(result, laboratory)
+    errors = [part for part in root.iterfind('.//dcc:quantity', named)
+              if part.get('refType') == 'basic_measurementError']
+    for d, part in enumerate(errors):
+        values, expanded = (np.array(part.find(f'.//si:{tag}', named).text.split(), float)
+                            for tag in ('valueXMLList', 'uncertaintyXMLList'))
+        np.testing.assert_allclose(values, table.error_mps2[:, d], rtol=1e-6)
+        np.testing.assert_allclose(expanded, 2 * table.combined_mps2[:, d], rtol=1e-6)
+    assert len(errors) == 2
+
+
+def validate(path):
+    """Validate against the schema of PTB, if the environment names a copy of it."""
+    if not (SCHEMA / 'dcc.xsd').is_file():
+        return
+    etree = pytest.importorskip('lxml.etree')
+    text = (SCHEMA / 'dcc.xsd').read_text()
+    for address, name in IMPORTS.items():
+        text = text.replace(address, str(SCHEMA / name))
+    etree.XMLSchema(etree.fromstring(text.encode())).assertValid(etree.parse(str(path)))
+
+
+@pytest.mark.parametrize(('unit', 'expected'), [
+    ('V/g', (r'\volt\metre\tothe{-1}\second\tothe{2}', 1 / G0_MPS2)),
+    ('1/g²', (r'\metre\tothe{-2}\second\tothe{4}', G0_MPS2 ** -2)), ('°', (r'\degree', 1.0)),
+    ('g/K', (r'\kelvin\tothe{-1}\metre\second\tothe{-2}', G0_MPS2)), ('1', (r'\one', 1.0))])
+def test_units_of_the_si(unit, expected):
+    assert dcc.si_unit(unit) == (expected[0], pytest.approx(expected[1]))
+
+
+@pytest.mark.parametrize(('text', 'words'), [
+    ('labor: x', 'labor'), ('- x', 'a mapping'),
+    ('customer_country: Germany', 'two capitals'),
+    ('place: here', 'none of laboratory'), ('responsible: 7', '7 is no text'),
+    ('gravity_std_mps2: high', 'no number')])
+def test_a_bad_file_of_a_laboratory_is_refused(tmp_path, text, words):
+    (tmp_path / 'lab.yaml').write_text(text)
+    with pytest.raises(UserError, match=words):
+        dcc.read_laboratory(tmp_path / 'lab.yaml')
