@@ -14,12 +14,12 @@ import tempfile
 import time
 from typing import NamedTuple
 
-from adxl_ros.closed_output import ended_by_closed_output
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.nodes.jobs import cpu_time_s, executable, running, use_own_graph
 from adxl_ros.nodes.run_node import program_parser
 from adxl_ros.nodes.topics import Inbox
+from adxl_ros.process import ended_by_closed_output
 from adxl_ros_validation.bench_jobs import offline_jobs, print_table
 import numpy as np
 import rclpy

@@ -34,6 +34,7 @@ from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Place
 from adxl_ros.report.quantities import number
 import numpy as np
+import pandas as pd
 import scipy
 
 _VERDICTS = ('no_gap', 'explained', 'partly', 'inseparable', 'unknown')
@@ -63,7 +64,6 @@ class EffectMatrix:
 
 def effect_matrix(table: FleetTable) -> EffectMatrix:
     """Count the named effects by unit, and look for what units with an effect have in common."""
-    import pandas as pd
     used = np.isin(table['status'].astype(str), _VERDICTS) & (table.unit >= 0) & table.first
     frame, unit = table.frame[used], table.unit[used]
     counts = Counter(name for names in frame['effects'] for name in names)

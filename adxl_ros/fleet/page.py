@@ -22,6 +22,7 @@ from adxl_ros.model.population import Population
 from adxl_ros.report import figures as plotly, page as html_page
 from adxl_ros.report.quantities import number
 import numpy as np
+import pandas as pd
 import scipy
 
 _TREND_HEIGHT = 190
@@ -193,7 +194,6 @@ def far_out(results: Sequence[QuantityResult], serials: Sequence[str]
 
 def _units_csv(results: Sequence[QuantityResult], serials: Sequence[str]) -> str:
     """Return the estimates of all units, with and without the population."""
-    import pandas as pd
     columns = ('serial', 'coefficient', 'unit', 'estimate', 'std', 'shrunken', 'shrunken_std',
                'distance', 'is_far_out')
     rows: list[tuple] = []

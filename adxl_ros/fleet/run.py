@@ -11,7 +11,6 @@ written. One client at a time works on a folder.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor
 from contextlib import contextmanager
 from datetime import datetime, timezone
 import fcntl
@@ -25,11 +24,10 @@ from typing import Any, NamedTuple
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files.atomic_write import atomic_path
 from adxl_ros.fleet.inputs import as_date, Source, stated_by
-from adxl_ros.fleet.recipe import Recipe
-from adxl_ros.fleet.row import arrow_schema, as_table, Row, TABLE
+from adxl_ros.fleet.row import arrow_schema, as_table, Recipe, Row, TABLE
 from adxl_ros.fleet.staging import StagingError
 from adxl_ros.fleet.task import make_row, refused, Result, TaskCrashed
-from adxl_ros.workers import Finished, finished_tasks, make_folder, write
+from adxl_ros.workers import Finished, finished_tasks, make_folder, Pool, write
 
 _ROWS = 'rows'
 """Folder of the rows."""
@@ -227,7 +225,7 @@ def _expected_s(count: int, size_bytes: int, recipe: Recipe, results: Results) -
                for name in recipe.tasks)
 
 
-def work(pool: Executor, sources: Sequence[Source], recipe: Recipe, results: Results,
+def work(pool: Pool, sources: Sequence[Source], recipe: Recipe, results: Results,
          retries: int, show: Callable[[float], None]) -> Iterator[Row]:
     """Work on recordings, and write each row as soon as it is there."""
     failed = {url for url, entry in results.newest.items() if entry.outcome != 'done'}
@@ -267,6 +265,6 @@ def _written(end: Finished, recipe: Recipe, results: Results) -> Row:
 def since_text(text: str) -> str:
     """Return the date of --since, ISO 8601 in UTC; raise `UserError` for another text."""
     date = as_date(text)
-    if date is None:
+    if not date:
         raise UserError(f'--since {text}: expected a date, for example 2026-11-01')
     return date

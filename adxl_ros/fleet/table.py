@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 import os
-from typing import TYPE_CHECKING
 
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.fleet.populations import (
@@ -24,9 +23,7 @@ from adxl_ros.fleet.trends import claims, fit_trends, interval_factor, outliers,
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.report.quantities import number
 import numpy as np
-
-if TYPE_CHECKING:
-    import pandas as pd
+import pandas as pd
 
 _TEXTS = ['url', 'hash', 'serial', 'outcome', 'refusal', 'refused_by', 'calibration_id', 'status',
           'report', 'version']

@@ -18,7 +18,7 @@ import sys
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.package_version import package_version
+from adxl_ros.process import package_version
 from adxl_ros.report.addresses import as_utf_8, without_secrets
 from adxl_ros.report.figures import png
 

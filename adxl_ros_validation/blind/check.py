@@ -4,14 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from datetime import date
 from pathlib import Path
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.package_version import package_version
-from adxl_ros.workers import make_folder
+from adxl_ros.process import package_version
+from adxl_ros.workers import make_folder, Pool
 from adxl_ros_validation.blind import diagnosis_runs, grading, scores, sealing
 from adxl_ros_validation.blind.diagnosis_runs import Show
 from adxl_ros_validation.blind.scores import Trial
@@ -20,7 +19,7 @@ import numpy as np
 import scipy
 
 
-def score(folder: Path, pool: Executor, show: Show) -> dict[str, Any]:
+def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
     """Diagnose all recordings that have no report yet, read the labels and score."""
     digest = sealing.published_hash(folder)
     if digest is None:

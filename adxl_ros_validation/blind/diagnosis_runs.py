@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
@@ -21,7 +20,7 @@ from typing import Any
 
 import adxl_ros
 from adxl_ros.errors import UserError
-from adxl_ros.workers import for_each, make_folder, write
+from adxl_ros.workers import for_each, make_folder, Pool, write
 from adxl_ros_validation.blind import trials
 from adxl_ros_validation.blind.trials import Label
 from adxl_ros_validation.blind.world import ideal_observer
@@ -94,7 +93,7 @@ def _children_cpu_s() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def diagnose_all(folder: Path, pool: Executor, show: Callable[[float], None]
+def diagnose_all(folder: Path, pool: Pool, show: Callable[[float], None]
                  ) -> dict[str, Result]:
     """Diagnose all recordings of a folder that have no report yet."""
     reports, recordings = make_folder(folder / 'reports'), folder / 'recordings'
@@ -121,7 +120,7 @@ def diagnose_all(folder: Path, pool: Executor, show: Callable[[float], None]
 
 
 def kept(folder: Path, names: Sequence[str], work: Callable[..., tuple[str, Any]],
-         job: Callable[[str], tuple], pool: Executor, show: Callable[[float], None]
+         job: Callable[[str], tuple], pool: Pool, show: Callable[[float], None]
          ) -> dict[str, Any]:
     """Do the work that has no result in a folder yet, and return all results by name."""
     def keep(name: str, result: Any) -> None:

@@ -10,7 +10,6 @@ rest (the baseline) is there already, and no error.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 import hashlib
@@ -21,7 +20,7 @@ import tempfile
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.workers import make_folder, write
+from adxl_ros.workers import make_folder, Pool, write
 from adxl_ros_validation.blind import (
     diagnosis_runs,
     grading,
@@ -363,7 +362,7 @@ def _strength(half: Half, change: np.ndarray, name: str) -> float:
     return ideal_observer.rms(rest)
 
 
-def seal(folder: Path, source: Path, seed: int | None, count: int, pool: Executor, show: Show
+def seal(folder: Path, source: Path, seed: int | None, count: int, pool: Pool, show: Show
          ) -> str:
     """Draw the trials of a folder or manifest into a folder; return the published hash."""
     base, digest = folder / 'baseline' / 'recordings', sealing.published_hash(folder)
@@ -408,7 +407,7 @@ def right(answer: Answer, base: Answer, label: Label) -> tuple[bool, bool]:
     return exact, found
 
 
-def score(folder: Path, pool: Executor, show: Show) -> dict[str, Any]:
+def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
     """Diagnose what has no report yet, compare labels with the hash, and score."""
     with show('untouched') as advance:
         untouched = diagnosis_runs.diagnose_all(folder / 'baseline', pool, advance)

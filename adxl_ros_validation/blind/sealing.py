@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Executor
 from dataclasses import asdict
 from datetime import date
 from functools import partial
@@ -17,7 +16,7 @@ import shutil
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
-from adxl_ros.workers import for_each, make_folder, write
+from adxl_ros.workers import for_each, make_folder, Pool, write
 from adxl_ros_validation.blind.trials import Drawn, Label, Plan
 
 
@@ -29,7 +28,7 @@ class Setup(NamedTuple):
 
 
 def seal(folder: Path, seed: int | None, count: int, plan: Callable[[int, int], list[Plan]],
-         make: Callable[[Plan], Drawn], pool: Executor, show: Callable[[float], None]) -> str:
+         make: Callable[[Plan], Drawn], pool: Pool, show: Callable[[float], None]) -> str:
     """
     Draw trials into a folder and publish the hash of their labels.
 
@@ -59,7 +58,7 @@ def seal(folder: Path, seed: int | None, count: int, plan: Callable[[int, int], 
 
 
 def _draw(folder: Path, drawn: Path, plans: list[Plan], make: Callable[[Plan], Drawn],
-          pool: Executor, show: Callable[[float], None]) -> None:
+          pool: Pool, show: Callable[[float], None]) -> None:
     """Draw the trials that are not there yet."""
     recordings = make_folder(folder / 'recordings')
 
