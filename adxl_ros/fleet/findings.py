@@ -29,7 +29,7 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from adxl_ros.fleet.populations import by_prefix, CHANCE, MIN_GROUP
-from adxl_ros.fleet.table import FleetTable, MG, QuantityResult, TOLERANCE_MG
+from adxl_ros.fleet.table import FarOut, FleetTable, MG, QuantityResult, TOLERANCE_MG
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Place
 from adxl_ros.report.quantities import number
@@ -196,23 +196,17 @@ class UnitState:
 
 
 def rank(table: FleetTable, results: Sequence[QuantityResult],
-         far_out: Sequence[dict[str, str | float]]) -> list[UnitState]:
+         distant: Sequence[FarOut]) -> list[UnitState]:
     """Return all units, the most urgent first."""
-    labels = {result.quantity.column: result.quantity.label for result in results}
-    distant: dict[str, tuple[float, str]] = {}
-    for item in far_out:
-        distance = abs(float(item['distance']))
-        distant.setdefault(str(item['serial']), (
-            distance, f'{labels[str(item["coefficient"])]} is {distance:.1f} standard deviations '
-            'from the mean of the fleet.'))
-    ranked = [_state_of(unit, table, results, distant.get(serial))
+    farthest = {item.serial: item for item in reversed(distant)}
+    ranked = [_state_of(unit, table, results, farthest.get(serial))
               for unit, serial in enumerate(table.serials)]
     return [state for _, state in sorted(ranked, key=lambda item: (
         item[1].state, item[0], item[1].serial))]
 
 
 def _state_of(unit: int, table: FleetTable, results: Sequence[QuantityResult],
-              distant: tuple[float, str] | None) -> tuple[float, UnitState]:
+              distant: FarOut | None) -> tuple[float, UnitState]:
     """Return a unit and its rank among those of its state, the most urgent least."""
     rows = table.rows_of(unit)
     gap_mg, floor_mg, over_mg = _gap_now(table, rows)
@@ -240,7 +234,9 @@ def _state_of(unit: int, table: FleetTable, results: Sequence[QuantityResult],
                   'The last recording is refused: '
                   ) + str(table['refusal'][rows[-1]] or table['outcome'][rows[-1]])
     elif distant is not None:
-        state, urgency, reason = State.FAR_OUT, -distant[0], distant[1]
+        state, urgency = State.FAR_OUT, -abs(distant.distance)
+        reason = f'{distant.quantity.label} is {-urgency:.1f} standard deviations from the mean ' \
+            'of the fleet.'
     elif not age_days <= MAX_AGE_DAYS:
         state, urgency = State.OLD_CALIBRATION, -age_days if age_days > 0 else -np.inf
         reason = f'Its calibration is {age_days:.0f} days old.' if age_days > 0 else \

@@ -141,7 +141,7 @@ def _check(options: argparse.Namespace) -> None:
 
 def _warn_of_replaced(to_do: Plan, results: Results, tasks: Sequence[str]) -> None:
     """Warn where rows of other tasks leave table and page, as a recording has one row there."""
-    before = [results.newest[source.url].tasks for source in to_do.todo
+    before = [results.newest[source.url].row['tasks'] for source in to_do.todo
               if source.url in results.newest]
     missing = [name for name in TASKS
                if name not in tasks and any(name in earlier for earlier in before)]
