@@ -44,7 +44,9 @@ def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
     graded = [Trial(label, grading.answer(results[label.name]), held_out[label.name])
               for label in labels]
     made = scores.scores(graded)
-    negative = controls(folder, graded)
+    negative = {'labels_permuted': permuted(graded),
+                'metadata_only': metadata(folder / 'recordings', labels),
+                'strength_zero': strength_zero(graded)}
     return {
         'schema': 1, 'hash': digest, **setup._asdict(), 'cases': len(labels),
         'date': str(date.today()), 'version': package_version(),
@@ -53,32 +55,20 @@ def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
                    if trial.answer.status == 'failed'},
         'bars': scores.bars(made), 'controls': negative,
         'leaks': any(control['leaks'] for control in negative.values()),
-        'scores': made, 'rows': [_row(trial) for trial in graded]}
-
-
-def _row(trial: Trial) -> dict[str, Any]:
-    """Return the data of one trial from which the scores follow."""
-    label, answer = trial.label, trial.answer
-    faults = {name: [fault[name] for fault in label.faults]
-              for name in ('strength_mps2', 'power', 'told', 'inseparable')}
-    return {'name': label.name, 'group': label.group, 'effects': list(label.effects), **faults,
+        'scores': made, 'rows': [{
+            **{name: [fault[name] for fault in label.faults]
+               for name in ('strength_mps2', 'power', 'told', 'inseparable')},
+            'name': label.name, 'group': label.group, 'effects': list(label.effects),
             'flexible': label.flexible, 'manoeuvre': label.manoeuvre, 'axes': label.axes,
             'status': answer.status, 'top': sorted(answer.top), 'named': sorted(answer.named),
             'probability': answer.probability, 'right': grading.verdict_right(answer, label),
-            'seconds': answer.seconds, 'held': trial.held_out}
+            'seconds': answer.seconds, 'held': held} for label, answer, held in graded]}
 
 
 _CHANCE = 0.002
 """Chance that one control reports a leak of a check that has none; chosen."""
 _SHUFFLES = 2000
 """Number of permutations of the labels; chosen."""
-
-
-def controls(folder: Path, trials: Sequence[Trial]) -> dict[str, dict[str, Any]]:
-    """Run all controls; `leaks` states whether a control is not at chance."""
-    return {'labels_permuted': permuted(trials),
-            'metadata_only': metadata(folder / 'recordings', [trial.label for trial in trials]),
-            'strength_zero': strength_zero(trials)}
 
 
 def permuted(trials: Sequence[Trial]) -> dict[str, Any]:
@@ -110,7 +100,19 @@ def metadata(recordings: Path, labels: Sequence[Label]) -> dict[str, Any]:
     and Wallis), for the quantity that they explain best. At chance is the same with permuted
     labels. Labels count in three ways: by group, by effect, and as some effect or none.
     """
-    facts = np.array([_facts(recordings, label.name) for label in labels], float)
+    def facts_of(name: str) -> tuple[float, ...]:
+        csv, yaml = (recordings / f'{name}.{suffix}' for suffix in ('csv', 'yaml'))
+        data, size, about = csv.read_bytes(), csv.stat().st_size, yaml.stat()
+        rows, last = data.count(b'\n'), data.rstrip().rsplit(b'\n', 1)[-1]
+        return (size, rows, size - rows * len(last), csv.stat().st_mtime, about.st_size,
+                about.st_mtime, float(last.split(b',')[0]))
+
+    def explained_by(members: np.ndarray) -> float:
+        sums = members.T @ ranks
+        between = np.sum(sums ** 2 / members.sum(axis=0)[:, None], axis=0)
+        return float(np.max(between / np.maximum(np.sum(ranks ** 2, axis=0), 1e-12)))
+
+    facts = np.array([facts_of(label.name) for label in labels], float)
     ranks = scipy.stats.rankdata(np.column_stack([facts, np.arange(len(labels))]), axis=0)
     ranks -= ranks.mean(axis=0)
     groupings = [[label.group for label in labels],
@@ -121,28 +123,12 @@ def metadata(recordings: Path, labels: Sequence[Label]) -> dict[str, Any]:
     for grouping in groupings:
         index = np.unique(grouping, return_inverse=True)[1]
         members = np.eye(index.max() + 1)[index]
-        explained.append(_explained(members, ranks))
-        chance.append([_explained(members[rng.permutation(count)], ranks)
-                       for _ in range(_SHUFFLES)])
+        explained.append(explained_by(members))
+        chance.append([explained_by(members[rng.permutation(count)]) for _ in range(_SHUFFLES)])
     above = np.sum(np.array(chance) >= np.array(explained)[:, None] - 1e-12, axis=1)
     p = float((1 + above.min()) / (1 + _SHUFFLES))
     return {'score': explained[0], 'chance': float(np.mean(chance[0])), 'p': p,
             'leaks': p < _CHANCE}
-
-
-def _explained(members: np.ndarray, ranks: np.ndarray) -> float:
-    """Return the largest share of a quantity's variance of ranks that is between groups."""
-    sums = members.T @ ranks
-    between = np.sum(sums ** 2 / members.sum(axis=0)[:, None], axis=0)
-    return float(np.max(between / np.maximum(np.sum(ranks ** 2, axis=0), 1e-12)))
-
-
-def _facts(recordings: Path, name: str) -> tuple[float, ...]:
-    csv, yaml = recordings / f'{name}.csv', recordings / f'{name}.yaml'
-    data, about = csv.read_bytes(), csv.stat()
-    rows, last = data.count(b'\n'), data.rstrip().rsplit(b'\n', 1)[-1]
-    return (about.st_size, rows, about.st_size - rows * len(last), about.st_mtime,
-            yaml.stat().st_size, yaml.stat().st_mtime, float(last.split(b',')[0]))
 
 
 def strength_zero(trials: Sequence[Trial]) -> dict[str, Any]:

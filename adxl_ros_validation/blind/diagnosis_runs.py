@@ -72,25 +72,20 @@ def diagnose(name: str, recording: bytes, parameters: bytes, sim: bytes | None =
             if data is not None:
                 (folder / f'{name}{suffix}').write_bytes(data)
                 os.utime(folder / f'{name}{suffix}', (0, 0))
-        start, cpu = time.monotonic(), _children_cpu_s()
+        start, used = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
         status, error = call(
             folder, 'diagnose', f'{name}.csv', '--params', f'{name}.yaml', '-o', 'out', '--json',
             '--seed', '0', *(['--sim', f'{name}_sim.csv'] if sim else []))
-        seconds, cpu = time.monotonic() - start, _children_cpu_s() - cpu
+        seconds, now = time.monotonic() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
         params = folder / 'out' / 'params.yaml'
         try:
             content = json.loads(params.with_name('report.json').read_bytes())
         except (OSError, ValueError) as problem:
             content, error = None, error or f'no report: {problem}'
-        return name, {'report': content, 'seconds': seconds, 'cpu_s': cpu,
+        return name, {'report': content, 'seconds': seconds,
+                      'cpu_s': now.ru_utime - used.ru_utime + now.ru_stime - used.ru_stime,
                       'status': status, 'error': error,
                       'parameters': params.read_text() if params.exists() else None}
-
-
-def _children_cpu_s() -> float:
-    """Return the processor time of all ended children; of one diagnosis in a worker process."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
 
 
 def diagnose_all(folder: Path, pool: Pool, show: Callable[[float], None]

@@ -27,7 +27,7 @@ class Setup(NamedTuple):
     trials: int  # number of trials, without those at strength zero
 
 
-def seal(folder: Path, seed: int | None, count: int, plan: Callable[[int, int], list[Plan]],
+def seal(folder: Path, seed: int | None, count: int, plan_all: Callable[[int, int], list[Plan]],
          make: Callable[[Plan], Drawn], pool: Pool, show: Callable[[float], None]) -> str:
     """
     Draw trials into a folder and publish the hash of their labels.
@@ -50,42 +50,32 @@ def seal(folder: Path, seed: int | None, count: int, plan: Callable[[int, int], 
                         'same options to continue it, or choose another folder')
     if digest is None:
         write(make_folder(drawn) / 'setup', json.dumps(setup).encode())
-        _draw(folder, drawn, plan(*setup), make, pool, show)
-        digest = _commit(folder, setup, [json.loads(path.read_bytes())
-                                         for path in sorted(drawn.glob('*.json'))])
+        plans, recordings = plan_all(*setup), make_folder(folder / 'recordings')
+
+        def keep(label: Label, *texts: str | None) -> None:
+            for suffix, text in zip(('csv', 'yaml', 'sim'), texts):
+                if text is not None:
+                    path = recordings / f'{label.name}.{suffix}'
+                    write(path, text.encode())
+                    # The time of writing would show how long the label took to draw.
+                    os.utime(path, (0, 0))
+            write(drawn / f'{label.name}.json', json.dumps(asdict(label)).encode())
+
+        todo = [plan for plan in plans if not (drawn / f'{plan.name}.json').exists()]
+        for_each(pool, make, [partial(tuple, (plan,)) for plan in todo], keep, show,
+                 len(plans) - len(todo))
+        rows = [json.loads(path.read_bytes()) for path in sorted(drawn.glob('*.json'))]
+        text = json.dumps({'salt': secrets.token_hex(16), **setup._asdict(), 'labels': rows},
+                          indent=1).encode()
+        digest = hashlib.sha256(text).hexdigest()
+        write(folder / 'labels' / 'labels.json', text)
+        write(folder / 'seal.json', json.dumps({
+            'sha256_of_salt_and_labels': digest, 'cases': len(rows), 'date': str(date.today()),
+        }, indent=1).encode())
     shutil.rmtree(drawn, ignore_errors=True)
     return digest
 
 
-def _draw(folder: Path, drawn: Path, plans: list[Plan], make: Callable[[Plan], Drawn],
-          pool: Pool, show: Callable[[float], None]) -> None:
-    """Draw the trials that are not there yet."""
-    recordings = make_folder(folder / 'recordings')
-
-    def keep(label: Label, recording: str, parameters: str, sim: str | None = None) -> None:
-        for suffix, text in (('csv', recording), ('yaml', parameters), ('sim', sim)):
-            if text is not None:
-                path = recordings / f'{label.name}.{suffix}'
-                write(path, text.encode())
-                # The time of writing would show how long the label took to draw.
-                os.utime(path, (0, 0))
-        write(drawn / f'{label.name}.json', json.dumps(asdict(label)).encode())
-
-    todo = [plan for plan in plans if not (drawn / f'{plan.name}.json').exists()]
-    for_each(pool, make, [partial(tuple, (plan,)) for plan in todo], keep, show,
-             len(plans) - len(todo))
-
-
-def _commit(folder: Path, setup: Setup, rows: list[dict[str, Any]]) -> str:
-    """Write the labels, and publish their hash."""
-    text = json.dumps({'salt': secrets.token_hex(16), **setup._asdict(),
-                       'labels': rows}, indent=1).encode()
-    digest = hashlib.sha256(text).hexdigest()
-    write(folder / 'labels' / 'labels.json', text)
-    write(folder / 'seal.json', json.dumps({
-        'sha256_of_salt_and_labels': digest, 'cases': len(rows), 'date': str(date.today()),
-    }, indent=1).encode())
-    return digest
 
 
 def published_hash(folder: Path) -> str | None:
@@ -113,13 +103,9 @@ def committed_labels(folder: Path) -> tuple[Setup, list[Label]]:
                         'they were changed since')
     try:
         content: dict[str, Any] = json.loads(text)
-        return Setup(content['seed'], content['trials']), list(map(label_of, content['labels']))
+        return Setup(content['seed'], content['trials']), [Label(**row | {
+            name: tuple(row[name]) for name in ('effects', 'seed', 'seconds')})
+            for row in content['labels']]
     except (ValueError, KeyError, TypeError):
         raise UserError(f'{path}: is of another version; draw a new check into another folder'
                         ) from None
-
-
-def label_of(row: dict[str, Any]) -> Label:
-    """Make a label of a row of the label file."""
-    lists = ('effects', 'seed', 'seconds')
-    return Label(**{**row, **{name: tuple(row[name]) for name in lists}})
