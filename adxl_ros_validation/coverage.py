@@ -151,7 +151,7 @@ def page(draws: Sequence[Draw], made: str) -> str:
     ratio = np.concatenate([d.bound_ratio for d in draws])
     kinds = [(field, value) for field in ('stage', 'axes', 'plan')
              for value in dict.fromkeys(getattr(d, field) for d in draws)]
-    rows = [_row(label, *_coverage(parts), np.concatenate(parts)) for label, parts in (
+    rows = [_row(label, np.concatenate(parts), *_coverage(parts)) for label, parts in (
         ('all coefficients', [d.z for d in draws]), ('tilt', [d.tilt_z for d in draws]),
         ('acceleration', [d.force_z for d in draws]),
         *((f'{field} {value}: coefficients', [d.z for d in draws if getattr(d, field) == value])
@@ -160,8 +160,8 @@ def page(draws: Sequence[Draw], made: str) -> str:
     for name in dict.fromkeys(name for d in draws for name in d.names):
         z = np.array([d.z[d.names.index(name)] for d in draws if name in d.names])
         inside = scipy.stats.binomtest(int(np.sum(np.abs(z) < Z_90)), len(z))
-        single.append(_row(f'{name} ({len(z)})', inside.statistic,
-                           *inside.proportion_ci(0.9, 'exact'), z))
+        single.append(_row(f'{name} ({len(z)})', z, inside.statistic,
+                           *inside.proportion_ci(0.9, 'exact')))
     head = ['coverage, %', 'rms of error / stated', 'ranks', 'p']
     return '\n'.join([
         f'## Coverage of the intervals: {len(draws)} drawn units and stages', '', made, '',
@@ -190,12 +190,12 @@ def screen_lines(draws: Sequence[Draw]) -> list[str]:
     return lines
 
 
-def _coverage(parts: Sequence[np.ndarray]) -> np.ndarray:
+def _coverage(parts: Sequence[np.ndarray]) -> tuple[float, float, float]:
     """Return the share of intervals with the truth, and its 90 % interval over draws."""
     return mean_with_interval([(int(np.sum(np.abs(z) < Z_90)), len(z)) for z in parts])
 
 
-def _row(label: str, share: float, low: float, high: float, z: np.ndarray) -> list[str]:
+def _row(label: str, z: np.ndarray, share: float, low: float, high: float) -> list[str]:
     counts = np.histogram(scipy.special.ndtr(z), BINS, (0, 1))[0]
     return [label, f'{100 * share:.1f} ({100 * low:.1f} to {100 * high:.1f})',
             f'{np.sqrt(np.mean(z ** 2)):.2f}', ' '.join(map(str, counts)),

@@ -263,13 +263,13 @@ def _interval(parts: Sequence[np.ndarray] | np.ndarray) -> str:
     return f'{mean:.3f} ({low:.3f} to {high:.3f})'
 
 
-def mean_with_interval(parts: Sequence[tuple[float, int]]) -> np.ndarray:
+def mean_with_interval(parts: Sequence[tuple[float, int]]) -> tuple[float, float, float]:
     """Return the mean of sums over counts, and its 90 % interval by bootstrap over the parts."""
     sums = np.array(parts, float)
     drawn = sums[np.random.default_rng(0).integers(0, len(sums), (1000, len(sums)))].sum(axis=1)
     total = sums.sum(axis=0)
-    return np.array([total[0] / total[1],
-                     *np.quantile(drawn[:, 0] / drawn[:, 1], [0.05, 0.95])])
+    low, high = np.quantile(drawn[:, 0] / drawn[:, 1], [0.05, 0.95])
+    return float(total[0] / total[1]), float(low), float(high)
 
 
 def _rms(values: np.ndarray) -> float:

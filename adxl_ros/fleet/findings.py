@@ -74,6 +74,10 @@ def effect_matrix(table: FleetTable) -> EffectMatrix:
     by_unit = share.to_numpy() > _MOST
     by_place = has.groupby([unit, [url.rpartition('/')[0] for url in frame['url']]]).mean()
     serials = [table.serials[i] for i in share.index]
+    below: dict[str, np.ndarray] = {}
+    for row, (_, folder) in enumerate(by_place.index):
+        for end in (i for i, letter in enumerate(f'{folder}/') if letter == '/' and i):
+            below.setdefault(folder[:end], np.zeros(len(by_place), bool))[row] = True
     is_common = (by_unit.sum(axis=0) > _MOST * len(serials)) & (len(serials) >= MIN_GROUP)
     findings = [
         *(f'{by_unit[:, i].sum()} of {len(by_unit)} units have {effects[i]}. ' + (
@@ -87,24 +91,19 @@ def effect_matrix(table: FleetTable) -> EffectMatrix:
         *(f'{inside} of {size} units that are recorded in {folder} have {name}, and {outside} '
           f'of {rest} elsewhere: {"a bad stage" if _of_stage(name) else "a bad place"}.'
           for folder, name, inside, size, outside, rest in _frequent(
-              _by_place([folder for _, folder in by_place.index]), effects,
+              below, effects,
               by_place.to_numpy() > _MOST)),
-        *_units_with_many(effects, by_unit & ~is_common, serials)]
+        # The unit or its mounting is at fault.
+        *(f'{serials[i]} has {names.sum()} effects ({", ".join(np.array(effects)[names])}): '
+          'check the unit and its mounting.'
+          for i, names in sorted(enumerate(by_unit & ~is_common), key=lambda row: -row[1].sum())
+          if names.sum() >= _MANY_EFFECTS)]
     return EffectMatrix(effects, share.index.to_numpy(), share.to_numpy(), tuple(findings))
 
 
 def _of_stage(name: str) -> bool:
     effect = library().get(name)
     return effect is not None and effect.place is Place.STAGE
-
-
-def _by_place(folders: Sequence[str]) -> dict[str, np.ndarray]:
-    """Return what lies below each folder, (k,) bool."""
-    groups: dict[str, np.ndarray] = {}
-    for i, folder in enumerate(folders):
-        for end in (j for j, letter in enumerate(f'{folder}/') if letter == '/' and j):
-            groups.setdefault(folder[:end], np.zeros(len(folders), bool))[i] = True
-    return groups
 
 
 def _frequent(groups: dict[str, np.ndarray], effects: Sequence[str], has: np.ndarray
@@ -131,15 +130,6 @@ def _frequent(groups: dict[str, np.ndarray], effects: Sequence[str], has: np.nda
             result.append((names[i], effect, int(inside[i]), int(size[i]),
                            named - int(inside[i]), total - int(size[i])))
     return result
-
-
-def _units_with_many(effects: Sequence[str], by_unit: np.ndarray, serials: Sequence[str]
-                     ) -> list[str]:
-    """Name the units that have many effects: the unit or its mounting is at fault."""
-    return [f'{serials[i]} has {count} effects ({", ".join(np.array(effects)[by_unit[i]])}): '
-            'check the unit and its mounting.'
-            for i in np.argsort(-by_unit.sum(axis=1), kind='stable')
-            if (count := int(by_unit[i].sum())) >= _MANY_EFFECTS]
 
 
 class State(IntEnum):

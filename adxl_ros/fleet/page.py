@@ -18,7 +18,6 @@ from adxl_ros.fleet.row import PAGE, POPULATION, reason_kind, TABLE, UNITS
 from adxl_ros.fleet.table import (
     analyse,
     far_out,
-    FarOut,
     FleetTable,
     MG,
     QuantityResult,
@@ -206,15 +205,27 @@ def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> 
     units = rank(table, results, distant)
     effects = effect_matrix(table)
     # Units that drift come first, although others may be more urgent.
-    plotted = [(unit, result) for unit in sorted(units, key=lambda unit: not unit.drifts)
-               if (result := _plotted_quantity(unit, results)) is not None][:_SHOWN]
+    plotted = [(unit, shown[0]) for unit in sorted(units, key=lambda unit: not unit.drifts)
+               if (shown := [*(drift.result for drift in unit.drifts), *(
+                   result for result in results if result.place_of(unit.unit) is not None)])
+               ][:_SHOWN]
     figures = {f'trend-{i}': _trend_figure(table, result, unit.unit)
                for i, (unit, result) in enumerate(plotted)}
     if effects.effects:
         figures['matrix'] = _matrix_figure(table, effects)
     counts = Counter(unit.state for unit in units)
+    years = table.years[np.isfinite(table.years)]
+    versions = ', '.join(sorted({text for text in table['version'] if text}))
+    about = [f'{len(table)} recordings', f'{len(table.serials)} units',
+             *([f'{date_text(years.min())} to {date_text(years.max())}'] if len(years) else []),
+             *([f'rows made by version {versions}'] if versions else [])]
+    batches = [f'{batch.members.sum()} units with a serial number {batch.prefix}… have a '
+               f'{result.quantity.label} that differs by '
+               + result.quantity.text(batch.difference, batch.low, batch.high) +
+               f' from that of the {(~batch.members).sum()} others: a bad batch.'
+               for result in results if (batch := result.batch) is not None]
     return html_page.render('adxl_ros.fleet', 'fleet.html', {
-        'title': 'Fleet', 'about': _about(table), 'badge': _badge(table, units, counts),
+        'title': 'Fleet', 'about': about, 'badge': _badge(table, units, counts),
         'tiles': _tiles(table, units, counts), 'shown': _SHOWN, 'figures': figures,
         'units': units, 'date': date_text, 'link': partial(_link, folder),
         'without_unit': _rows_without_unit(table),
@@ -222,31 +233,19 @@ def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> 
         'trends': [{'figure': f'trend-{i}', 'title': f'{unit.serial}: {result.quantity.label}',
                     'text': f'{unit.drifts[0].text}.' if unit.drifts else 'No slope is claimed.'}
                    for i, (unit, result) in enumerate(plotted)],
-        'findings': [*_batches(results), *effects.findings], 'has_effects': bool(effects.effects),
+        'findings': [*batches, *effects.findings], 'has_effects': bool(effects.effects),
         'judged': len(effects.units), 'populations': _population_rows(results),
-        'far_out': _far_out_rows(distant),
+        'far_out': [
+            [item.serial, item.quantity.label,
+             f'{item.value:.5g} {item.quantity.unit}'
+             if not item.quantity.unit.startswith('m/s') else
+             f'{number(item.value * item.quantity.factor)} {item.quantity.shown_unit}',
+             number(item.distance, True)] for item in distant[:_MOST_ROWS]],
         'outliers': _outlier_rows(table, results),
         'outlier_count': sum(int(result.is_outlier.sum()) for result in results),
         'refusals': _refusal_rows(table), 'most_rows': _MOST_ROWS,
         'tolerance': number(TOLERANCE_MG), 'false_discovery': f'{FALSE_DISCOVERY_RATE:.0%}',
         'drifts': sum(int(result.is_claimed.sum()) for result in results)})
-
-
-def _batches(results: Sequence[QuantityResult]) -> list[str]:
-    """Name the batches whose coefficient is not that of the other units."""
-    return [f'{batch.members.sum()} units with a serial number {batch.prefix}… have a '
-            f'{result.quantity.label} that differs by '
-            + result.quantity.text(batch.difference, batch.low, batch.high) +
-            f' from that of the {(~batch.members).sum()} others: a bad batch.'
-            for result in results if (batch := result.batch) is not None]
-
-
-def _about(table: FleetTable) -> list[str]:
-    years = table.years[np.isfinite(table.years)]
-    dates = [f'{date_text(years.min())} to {date_text(years.max())}'] if len(years) else []
-    versions = sorted({str(text) for text in table['version'] if text})
-    return [f'{len(table)} recordings', f'{len(table.serials)} units', *dates,
-            *([f'rows made by version {", ".join(versions)}'] if versions else [])]
 
 
 def _badge(table: FleetTable, units: Sequence[UnitState], counts: Counter[State]
@@ -307,14 +306,6 @@ def _link(folder: Path, report: str) -> str:
                  if report and (folder / name).exists()), '')
 
 
-def _plotted_quantity(unit: UnitState, results: Sequence[QuantityResult]
-                      ) -> QuantityResult | None:
-    """Return what the plot of a unit shows: its drift, else the first quantity that it has."""
-    if unit.drifts:
-        return unit.drifts[0].result
-    return next((result for result in results if result.place_of(unit.unit) is not None), None)
-
-
 def _population_rows(results: Sequence[QuantityResult]) -> list[list[str]]:
     rows = []
     for result in results:
@@ -337,14 +328,6 @@ def _population_rows(results: Sequence[QuantityResult]) -> list[list[str]]:
 def _scatter(value: float) -> str:
     """Return a scatter; one that is too small to matter as its limit."""
     return f'< {_SMALLEST_SCATTER:g}' if 0 < value < _SMALLEST_SCATTER else number(value)
-
-
-def _far_out_rows(distant: Sequence[FarOut]) -> list[list[str]]:
-    return [[item.serial, item.quantity.label,
-             f'{item.value:.5g} {item.quantity.unit}'
-             if not item.quantity.unit.startswith('m/s') else
-             f'{number(item.value * item.quantity.factor)} {item.quantity.shown_unit}',
-             number(item.distance, True)] for item in distant[:_MOST_ROWS]]
 
 
 def _outlier_rows(table: FleetTable, results: Sequence[QuantityResult]
