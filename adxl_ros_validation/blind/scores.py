@@ -133,7 +133,7 @@ def outcome(bar: Bar, score: Score) -> str:
     if score['count'] < FEWEST_TRIALS:
         return 'too few'
     # The interval of resampled trials may lie beside a score that is biased.
-    value, low, high = score['value'], *score['ci']
+    value, (low, high) = score['value'], score['ci']
     if bar.low <= min(value, low) and max(value, high) <= bar.high:
         return 'yes'
     reached = bar.low <= value <= bar.high or (low <= bar.high and high >= bar.low)
