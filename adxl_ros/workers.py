@@ -19,6 +19,7 @@ import logging
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection
 from multiprocessing.pool import ExceptionWithTraceback  # type: ignore[attr-defined]
+from multiprocessing.process import BaseProcess
 import os
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -34,11 +35,6 @@ from adxl_ros.errors import install_hint, one_line, UserError
 
 RETRIES = 2
 """Further attempts of a task that fails, by default; chosen."""
-_BY_CHANCE = 0.01
-"""Expected number of tasks that are blamed for workers that others end; chosen."""
-_MOST_DEATHS = 8
-"""Deaths of workers that chance may explain. Chosen: a task that kills its workers comes to an end
-where many others do so, too."""
 _TASKS_PER_WORKER = 3
 """Tasks that are submitted for each worker: one runs, two wait. Chosen: a worker is not idle where
 the client is slow, and no more arguments are in memory."""
@@ -135,8 +131,7 @@ class Processes(Pool):
                 pipe.send(task)
                 value, error = pipe.recv()
             except (EOFError, OSError):
-                pipe = None
-                value, error = None, WorkerDied()
+                pipe, value, error = None, None, WorkerDied()
             except Exception as problem:
                 # The task or its error cannot be sent.
                 value, error = None, problem
@@ -184,9 +179,13 @@ def _work(pipe: Connection, shared: tuple) -> None:
     Ctrl-C is left to the parent. A terminated worker ends by an exception, so that it removes its
     files and its own processes. A worker ends with its parent, however that ended.
     """
+    def end_with_parent() -> None:
+        cast(BaseProcess, parent_process()).join()
+        os.kill(os.getpid(), signal.SIGTERM)
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
-    Thread(target=_end_with_parent, daemon=True).start()
+    Thread(target=end_with_parent, daemon=True).start()
     try:
         while True:
             work, arguments = pipe.recv()
@@ -197,14 +196,6 @@ def _work(pipe: Connection, shared: tuple) -> None:
     except (SystemExit, EOFError, ConnectionError):
         # Threads of a task do not keep the process.
         os._exit(0)
-
-
-def _end_with_parent() -> None:
-    """Wait for the end of the parent, and end."""
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
-        os.kill(os.getpid(), signal.SIGTERM)
 
 
 class Cluster(Pool):
@@ -247,7 +238,7 @@ class Cluster(Pool):
         """Give a task to the scheduler."""
         from distributed.client import ClosedClientError
         try:
-            return self._client.submit(_on_cluster, partial(fn, **kwargs), self._shared, args,
+            return self._client.submit(lambda shared: fn(*shared, *args, **kwargs), self._shared,
                                        key=f'task-{uuid4().hex}')
         except (OSError, RuntimeError, ClosedClientError):
             # The client is closed, or closes.
@@ -287,11 +278,6 @@ class Cluster(Pool):
             self._client.close(timeout=_WAIT_S)
 
 
-def _on_cluster(work: Callable[..., Any], shared: tuple, arguments: tuple) -> Any:
-    """Run a task on a worker of a cluster."""
-    return work(*shared, *arguments)
-
-
 class Finished(NamedTuple):
     """The end of a task."""
 
@@ -301,26 +287,25 @@ class Finished(NamedTuple):
     attempts: int  # Number of attempts
 
 
-def finished_tasks(pool: Executor, work: Callable[..., Any], tasks: Iterable[tuple],
+def finished_tasks(pool: Pool, work: Callable[..., Any], tasks: Iterable[tuple],
                    retries: int = RETRIES) -> Generator[Finished, None, None]:
     """
     Run tasks in parallel; each gives one result, in the order in which they end.
 
-    A task that raises, or whose worker ends, is repeated after all others, and more often where
-    workers end at random. A `UserError` is not repeated: it would come again. After the loss of a
-    pool its tasks are submitted again, which does not count.
+    A task that raises, or whose worker ends, is repeated after all others. A `UserError` is not:
+    it would come again. After the loss of a pool its tasks are submitted again, which does not
+    count.
     """
-    workers, todo = cast(Pool, pool), ((arguments, 1) for arguments in tasks)
+    todo = ((arguments, 1) for arguments in tasks)
     again: deque[tuple[tuple, int]] = deque()
     running: dict[Any, tuple[tuple, int]] = {}
     ended: SimpleQueue[Any] = SimpleQueue()
-    attempts = deaths = 0
     try:
         while True:
-            slots = workers.slots
+            slots = pool.slots
             while len(running) < slots and (
                     item := next(todo, None) or (again.popleft() if again else None)):
-                future = workers.submit(work, *item[0])
+                future = pool.submit(work, *item[0])
                 running[future] = item
                 future.add_done_callback(ended.put)
             if not running:
@@ -330,15 +315,12 @@ def finished_tasks(pool: Executor, work: Callable[..., Any], tasks: Iterable[tup
                 arguments, attempt = running.pop(future)
             except (Empty, KeyError):  # KeyError: a task of a pool that was lost
                 continue
-            value, error = workers.end(future)
-            is_death = isinstance(error, WorkerDied)
-            attempts, deaths = attempts + 1, deaths + is_death
+            value, error = pool.end(future)
             if isinstance(error, PoolLost):
                 again.extend([(arguments, attempt), *running.values()])
                 running.clear()
-                workers.renew()
-            elif error is None or isinstance(error, UserError) or (attempt > retries and not (
-                    is_death and _is_chance(attempt, deaths, attempts))):
+                pool.renew()
+            elif error is None or isinstance(error, UserError) or attempt > retries:
                 yield Finished(arguments, value, error, attempt)
             else:
                 again.append((arguments, attempt + 1))
@@ -347,18 +329,7 @@ def finished_tasks(pool: Executor, work: Callable[..., Any], tasks: Iterable[tup
             future.cancel()
 
 
-def _is_chance(own: int, deaths: int, attempts: int) -> bool:
-    """
-    Return whether chance explains the deaths of the workers of one task.
-
-    Workers end at random if they also end under other tasks. The share of such attempts gives the
-    number of tasks that meet so many deaths by chance.
-    """
-    share = (deaths - own) / max(attempts - own, 1)
-    return own <= _MOST_DEATHS and attempts * share ** own > _BY_CHANCE
-
-
-def for_each(pool: Executor, work: Callable[..., Any], jobs: Iterable[Callable[[], tuple]],
+def for_each(pool: Pool, work: Callable[..., Any], jobs: Iterable[Callable[[], tuple]],
              keep: Callable[..., None], show: Callable[[float], None], done: int = 0) -> None:
     """Run jobs in parallel and keep each result as soon as it is there."""
     todo = list(jobs)

@@ -14,13 +14,13 @@ import tempfile
 import time
 from typing import NamedTuple
 
-from adxl_ros.closed_output import ended_by_closed_output
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.nodes.jobs import cpu_time_s, executable, running, use_own_graph
 from adxl_ros.nodes.run_node import program_parser
 from adxl_ros.nodes.topics import Inbox
-from adxl_ros_validation.bench_jobs import offline_jobs, print_table
+from adxl_ros.process import ended_by_closed_output
+from adxl_ros_validation.bench_jobs import offline_jobs, print_table, spread
 import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -161,7 +161,7 @@ def measure_live(seconds: float, rounds: int, iiod: str | None) -> None:
                                           ('compensation', 'imu/data', compensation, [driver])):
         try:
             firsts_s = [_first_sample_s(topic, command, before) for _ in range(rounds)]
-            print(f'First sample of {label}: {_spread(firsts_s)} s after its start')
+            print(f'First sample of {label}: {spread(firsts_s, ".2f")} s after its start')
         except UserError as error:
             print(f'First sample of {label}: {error}')
     print(f'Load of the machine after: {os.getloadavg()[0]:.1f}', flush=True)
@@ -261,13 +261,8 @@ def _row(label: str, results: Sequence[_Result]) -> str:
                        for load in np.median([result.loads for result in results], axis=0))
     return (f'{label:27} {np.median([result.rate_hz for result in results]):6.0f} '
             f'{np.median([result.missing for result in results]):4.0f} '
-            f'{_spread([result.p50_ms for result in results]):>16} '
-            f'{_spread([result.p99_ms for result in results]):>17}  {loads}')
-
-
-def _spread(values: Sequence[float]) -> str:
-    """Return the median of some values, and their range."""
-    return f'{np.median(values):.2f} ({min(values):.2f}-{max(values):.2f})'
+            f'{spread([result.p50_ms for result in results], ".2f"):>16} '
+            f'{spread([result.p99_ms for result in results], ".2f"):>17}  {loads}')
 
 
 _EXAMPLES = {'all measurements, ten minutes': '',

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from datetime import date
 from importlib import import_module
 from importlib.metadata import version
+from importlib.util import find_spec
 import os
 from pathlib import Path
 import platform
@@ -29,7 +30,7 @@ from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.links.support import wire_format
 from adxl_ros.model import coefficients, signal_chain
 from adxl_ros.model.coefficients import Coefficient
-from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2, with_axes
 from adxl_ros.nodes.jobs import executable
@@ -40,8 +41,7 @@ from adxl_ros.simulate.trajectories import rich, sweep
 import numpy as np
 import scipy
 
-_PACKAGES = ('numpy', 'scipy', 'pyarrow', 'polars', 'pandas', 'rosbags', 'allantools', 'imucal',
-             'mujoco')
+_PACKAGES = ('numpy', 'scipy', 'pyarrow', 'polars', 'pandas', 'rosbags', 'allantools', 'mujoco')
 """Libraries whose versions the table states."""
 
 
@@ -72,7 +72,7 @@ def print_table(jobs: Iterable[Job], rounds: int) -> None:
     """Measure each job and its rivals in turns, and print a table."""
     print(f'\n{date.today()}, adxl_ros {version("adxl-ros")}, CPython '
           f'{platform.python_version()}, {platform.machine()}, {os.cpu_count()} cores')
-    print(', '.join(f'{name} {text}' for name in _PACKAGES if (text := _version(name))))
+    print(', '.join(f'{name} {version(name)}' for name in _PACKAGES if find_spec(name)))
     print(f'\nProcessor time, s, and ratio: median (least to greatest) of {rounds} rounds in '
           'turns\n')
     print('| job | s | beside | ratio | goal |\n|---|---|---|---|---|', flush=True)
@@ -82,14 +82,6 @@ def print_table(jobs: Iterable[Job], rounds: int) -> None:
         except UserError as error:
             rows = [f'| {job.name} | {error} | – | – | – |']
         print(*rows, sep='\n', flush=True)
-
-
-def _version(name: str) -> str:
-    """Return the version of an installed package, or an empty text."""
-    try:
-        return version(name)
-    except ImportError:
-        return ''
 
 
 def rows_of(job: Job, rounds: int) -> list[str]:
@@ -106,18 +98,18 @@ def rows_of(job: Job, rounds: int) -> list[str]:
                     seconds[name].append(job.clock() - began_s)
     measured = np.array(seconds.pop(''))
     limit = f'{job.goal:g}' if job.goal else '–'
-    head = f'| {job.name}{job.detail()} | {_spread(measured)} |'
+    head = f'| {job.name}{job.detail()} | {spread(measured, ".2g")} |'
     if not job.rivals:
         return [f'{head} – | – | {limit} s |'.replace('– s', '–')]
-    ratios = [_spread(measured / np.array(theirs)) if theirs else 'not installed'
+    ratios = [spread(measured / np.array(theirs), '.2g') if theirs else 'not installed'
               for theirs in seconds.values()]
     return [f'{head} {name} | {ratio} | {limit if i == 0 else "–"} |'
             for i, (name, ratio) in enumerate(zip(seconds, ratios))]
 
 
-def _spread(values: np.ndarray) -> str:
-    """Return median, least and greatest of values as text."""
-    return f'{np.median(values):.2g} ({values.min():.2g}–{values.max():.2g})'
+def spread(values: Sequence[float] | np.ndarray, form: str) -> str:
+    """Return median, least and greatest of values as text, with the format of a number."""
+    return f'{np.median(values):{form}} ({min(values):{form}}–{max(values):{form}})'
 
 
 _ROWS = 300_000
@@ -184,8 +176,17 @@ def offline_jobs(hours: float) -> Iterator[Job]:
         samples = _recording(sensor, columns, _ROWS)
         yield from _reading_and_writing(folder, sensor, samples)
         yield _applying(folder, sensor, columns)
-        yield from (make() for make in (_simulating, _gravity_fit, _allan, _frames, _in_the_loop,
-                                        _help))
+        values = {name: coefficients.typical(effect, 'xyz') for name, effect in library().items()}
+        full = replace(with_axes(sensor, 'xyz'), rate_hz=_RATE_HZ, effects=tuple(values),
+                       values=values)
+        motion = replace(rich(np.random.default_rng(0)), duration_s=_SIMULATED_S)
+        yield Job(f'simulate, {_SIMULATED_S:g} s at 1 kHz, 3 axes, {len(values)} effects',
+                  lambda: simulate(full, motion, 0), 1.0, rounds=3)
+        yield from (make() for make in (_gravity_fit, _allan, _frames, _in_the_loop))
+        commands = [[executable(name), '--help'] for name in _TOOLS]
+        yield Job(f'--help of {len(commands)} tools', lambda: [
+            subprocess.run(command, check=True, capture_output=True) for command in commands],
+            _HELP_S * len(commands), rounds=3)
         demo = _Program('demo', '-o', str(folder / 'demo'))
         yield Job('demo, elapsed time', demo.run, _DEMO_S, rounds=1, clock=time.monotonic)
         for kind in ('csv', 'mcap'):
@@ -252,11 +253,11 @@ def _scales(names: Sequence[Coefficient]) -> np.ndarray:
 
 
 class _Program:
-    """An executable of the package; `elapsed_s` and `memory_mb` are those of its last run."""
+    """An executable of the package; `costs` are elapsed time and memory of its last run."""
 
     def __init__(self, name: str, *arguments: str) -> None:
         self._command = [executable(name), *arguments]
-        self.elapsed_s = self.memory_mb = 0.0
+        self.costs = ''
 
     def run(self) -> None:
         """Run it; raise UserError if it fails."""
@@ -265,11 +266,8 @@ class _Program:
                               stdout=subprocess.PIPE, text=True)
         if done.returncode:
             raise UserError(f'{self._command[0]} ended with status {done.returncode}')
-        self.elapsed_s, self.memory_mb = time.monotonic() - began_s, int(done.stdout) / 1e3
-
-    def costs(self) -> str:
-        """Return elapsed time and largest memory of the last run, for people."""
-        return f' ({self.elapsed_s:.0f} s elapsed, {self.memory_mb:.0f} MB)'
+        self.costs = (f' ({time.monotonic() - began_s:.0f} s elapsed, '
+                      f'{int(done.stdout) / 1e3:.0f} MB)')
 
 
 def _long_applying(folder: Path, sensor: Sensor, kind: str, hours: float) -> Iterator[Job]:
@@ -284,7 +282,7 @@ def _long_applying(folder: Path, sensor: Sensor, kind: str, hours: float) -> Ite
     _write_long(path, unit, hours)
     program = _Program('apply', str(path), '--params', str(params), '-o', str(output))
     yield Job(f'apply, {hours:g} h at 1 kHz, {kind.upper()} to {kind.upper()}', program.run,
-              hours * _LONG_GOAL_S_PER_H, rounds=1, detail=program.costs)
+              hours * _LONG_GOAL_S_PER_H, rounds=1, detail=lambda: program.costs)
     path.unlink()
     output.unlink()
 
@@ -304,16 +302,6 @@ def _write_long(path: Path, sensor: Sensor, hours: float) -> None:
             count = min(_LONG_BLOCK, rows - begin)
             append(replace(samples, time_s=(begin + np.arange(count)) / _RATE_HZ, columns={
                 name: values[:count] for name, values in columns.items()}))
-
-
-def _simulating() -> Job:
-    """Simulate ten minutes with every effect of the library."""
-    sensor = with_axes(parameter_file.load(parameter_file.nominal_path()), 'xyz')
-    values = {name: coefficients.typical(effect, 'xyz') for name, effect in library().items()}
-    sensor = replace(sensor, rate_hz=_RATE_HZ, effects=tuple(values), values=values)
-    motion = replace(rich(np.random.default_rng(0)), duration_s=_SIMULATED_S)
-    return Job(f'simulate, {_SIMULATED_S:g} s at 1 kHz, 3 axes, {len(values)} effects',
-               lambda: simulate(sensor, motion, 0), 1.0, rounds=3)
 
 
 def _gravity_fit() -> Job:
@@ -340,20 +328,7 @@ def _gravity_fit() -> Job:
 
     return Job(f'{_FITS} gravity fits with covariance, {_RESTS} rests',
                lambda: [fit_gravity(mean_v, std_v, sensor) for _ in range(_FITS)], 10.0,
-               {'least squares': by_least_squares, 'imucal, six rests': _by_imucal})
-
-
-def _by_imucal() -> None:
-    """Calibrate from six rests along the axes, as imucal needs them."""
-    imucal: Any = import_module('imucal')
-    rests = {f'acc_{axis}_{end}': sign * G0_MPS2 * np.eye(3)[[d]]
-             for d, axis in enumerate(AXES) for end, sign in (('p', 1.0), ('a', -1.0))}
-    still = {f'gyr_{axis}_{end}': np.zeros((1, 3)) for axis in AXES for end in 'pa'}
-    turns = {f'{kind}_{axis}_rot': np.ones((2, 3)) for kind in ('acc', 'gyr') for axis in AXES}
-    regions = imucal.FerrarisSignalRegions(**rests, **still, **turns)
-    with np.errstate(all='ignore'):
-        for _ in range(_FITS):
-            imucal.FerrarisCalibration(grav=G0_MPS2).compute(regions, 100.0, 'm/s^2', 'deg/s')
+               {'least squares': by_least_squares})
 
 
 def _allan() -> Job:
@@ -402,10 +377,3 @@ def _in_the_loop() -> Job:
             mujoco.mj_step(model, data)
 
     return Job(f'{_STEPS} steps of a sensor in the loop', ours, 0.0, {'mujoco': by_mujoco})
-
-
-def _help() -> Job:
-    commands = [[executable(name), '--help'] for name in _TOOLS]
-    return Job(f'--help of {len(commands)} tools', lambda: [
-        subprocess.run(command, check=True, capture_output=True) for command in commands],
-        _HELP_S * len(commands), rounds=3)

@@ -20,7 +20,7 @@ from adxl_ros.tools.command_line import (
     run,
 )
 from adxl_ros.workers import open_pool
-from adxl_ros_validation.blind import check, real_sensors, report_html, sealing, trials
+from adxl_ros_validation.blind import check, real_sensors, report_html, trials
 
 PROG = 'blind'
 """Name of the command, for messages."""
@@ -81,7 +81,7 @@ def _check(options: argparse.Namespace, folder: Path) -> int:
                                            options.trials, pool, progress)
             else:
                 with progress('draw') as show:
-                    digest = sealing.seal(folder, options.seed, options.trials, trials.plans,
+                    digest = check.seal(folder, options.seed, options.trials, trials.plans,
                                           trials.draw_trial, pool, show)
             print(f'SHA-256 of salt and labels: {digest}', flush=True)
         if options.seal:

@@ -26,6 +26,7 @@ from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros_validation import experiments
 from adxl_ros_validation.blind.report_html import markdown_table
+from adxl_ros_validation.reproduction_report import mean_with_interval
 import numpy as np
 import scipy
 
@@ -82,7 +83,8 @@ def draw(nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], se
     rng = np.random.default_rng([seed, number])
     stated = np.radians(np.exp(rng.uniform(*np.log(_RESOLUTION_DEG))))
     sensor = replace(with_axes(nominal, axes), stage_resolution_rad=float(stated))
-    truth = _unit(sensor, stage, rng)
+    terms = (*full_model.default_terms(axes), *['stage_eccentricity'] * (stage == 'eccentric'))
+    truth = _unit(sensor, terms, stage, rng)
     step = float(stated * np.exp(rng.uniform(*np.log(_STATED))))
     targets = pose_plan.guided(pose_plan.default_planes_rad(axes), pose_plan.STEP_RAD, 0) \
         if kind == 'full' else running_estimate.quick(sensor, _DWELL_S, _QUICK_RAD, 0)
@@ -93,9 +95,10 @@ def draw(nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], se
     error = get(fit.fitted, names) - get(truth_of_fit, names)
     sigma = step / np.sqrt(12)
     levels = StageError(0.0, sigma) if stage == STAGES[0] else StageError(sigma)
-    bound = experiments.sweep_bound(truth, poses, true_rad, levels,
-                                    _terms(axes, stage))
-    held_out = _random_poses(truth, rng)
+    bound = experiments.sweep_bound(truth, poses, true_rad, levels, terms)
+    angles = np.column_stack([np.arccos(rng.uniform(-1, 1, _HELD_OUT)),
+                              rng.uniform(0, 2 * np.pi, _HELD_OUT)])
+    held_out = _read(truth, _resting(truth, angles), angles, rng), angles
     tilt = experiments.angle_errors(fit.fitted, bound, *held_out)
     force, force_std = experiments.force_errors(fit.fitted, truth, *held_out)
     bound_std = dict(zip(bound.covariance_names, np.sqrt(np.diag(bound.covariance))))
@@ -106,14 +109,9 @@ def draw(nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], se
                 (force / force_std).ravel(), fit.converged)
 
 
-def _terms(axes: str, stage: str) -> tuple[str, ...]:
-    extra = ('stage_eccentricity',) if stage == 'eccentric' else ()
-    return (*full_model.default_terms(axes), *extra)
-
-
-def _unit(sensor: Sensor, stage: str, rng: np.random.Generator) -> Sensor:
+def _unit(sensor: Sensor, terms: Sequence[str], stage: str, rng: np.random.Generator) -> Sensor:
     """Draw a unit: each coefficient is normal with its typical size, in the gauge of the fit."""
-    effects = (*_terms(sensor.axes, stage), 'base_tilt')
+    effects = (*terms, 'base_tilt')
     unit = with_neutral(replace(sensor, effects=(), values={}), effects)
     names = [name for name in full_model.fitted_coefficients(sensor.axes, effects)
              if full_model.term_of(name) not in full_model.GAUGE
@@ -127,7 +125,7 @@ def _swept(truth: Sensor, targets: Sequence[pose_plan.Target], per_pose: bool, s
            rng: np.random.Generator) -> tuple[Poses, np.ndarray]:
     """Return the poses of a sweep, and where the stage really stood, rad, (k, 2)."""
     read = np.array([[t.alpha_rad, t.beta_rad] for t in targets])
-    poses = _resting(truth, read, rng)
+    poses = _resting(truth, read)
     error = np.empty_like(read)
     for joint, setting in enumerate((poses.alpha_setting, poses.beta_setting)):
         number = np.arange(len(read)) if per_pose else setting
@@ -135,14 +133,7 @@ def _swept(truth: Sensor, targets: Sequence[pose_plan.Target], per_pose: bool, s
     return _read(truth, poses, read + error, rng), read + error
 
 
-def _random_poses(truth: Sensor, rng: np.random.Generator) -> tuple[Poses, np.ndarray]:
-    """Return poses drawn evenly over the sphere, and their angles, rad, (k, 2)."""
-    angles = np.column_stack([np.arccos(rng.uniform(-1, 1, _HELD_OUT)),
-                              rng.uniform(0, 2 * np.pi, _HELD_OUT)])
-    return _read(truth, _resting(truth, angles, rng), angles, rng), angles
-
-
-def _resting(truth: Sensor, read_rad: np.ndarray, rng: np.random.Generator) -> Poses:
+def _resting(truth: Sensor, read_rad: np.ndarray) -> Poses:
     samples = round(_DWELL_S * truth.rate_hz)
     count = noise.effective_samples(samples, 1 / truth.rate_hz, truth.rc_s)
     return Poses.without_volts(read_rad[:, 0], read_rad[:, 1],
@@ -160,7 +151,7 @@ def page(draws: Sequence[Draw], made: str) -> str:
     ratio = np.concatenate([d.bound_ratio for d in draws])
     kinds = [(field, value) for field in ('stage', 'axes', 'plan')
              for value in dict.fromkeys(getattr(d, field) for d in draws)]
-    rows = [_several(label, parts) for label, parts in (
+    rows = [_row(label, np.concatenate(parts), *_coverage(parts)) for label, parts in (
         ('all coefficients', [d.z for d in draws]), ('tilt', [d.tilt_z for d in draws]),
         ('acceleration', [d.force_z for d in draws]),
         *((f'{field} {value}: coefficients', [d.z for d in draws if getattr(d, field) == value])
@@ -169,8 +160,8 @@ def page(draws: Sequence[Draw], made: str) -> str:
     for name in dict.fromkeys(name for d in draws for name in d.names):
         z = np.array([d.z[d.names.index(name)] for d in draws if name in d.names])
         inside = scipy.stats.binomtest(int(np.sum(np.abs(z) < Z_90)), len(z))
-        single.append(_row(f'{name} ({len(z)})', inside.statistic,
-                           inside.proportion_ci(0.9, 'exact'), z))
+        single.append(_row(f'{name} ({len(z)})', z, inside.statistic,
+                           *inside.proportion_ci(0.9, 'exact')))
     head = ['coverage, %', 'rms of error / stated', 'ranks', 'p']
     return '\n'.join([
         f'## Coverage of the intervals: {len(draws)} drawn units and stages', '', made, '',
@@ -194,29 +185,18 @@ def screen_lines(draws: Sequence[Draw]) -> list[str]:
              'acceleration': [d.force_z for d in draws]}
     lines = [f' Coverage of 90 % intervals over {len(draws)} drawn units and stages']
     for label, z_of_draws in parts.items():
-        share, (low, high) = _coverage(z_of_draws)
+        share, low, high = _coverage(z_of_draws)
         lines.append(f' {label:28}{100 * share:15.1f} %   ({100 * low:.1f} to {100 * high:.1f})')
     return lines
 
 
-def _coverage(parts: Sequence[np.ndarray]) -> tuple[float, tuple[float, float]]:
+def _coverage(parts: Sequence[np.ndarray]) -> tuple[float, float, float]:
     """Return the share of intervals with the truth, and its 90 % interval over draws."""
-    inside = np.array([[np.sum(np.abs(z) < Z_90), len(z)] for z in parts])
-    rng = np.random.default_rng(0)
-    resampled = inside[rng.integers(0, len(parts), (1000, len(parts)))].sum(axis=1)
-    low, high = np.quantile(resampled[:, 0] / resampled[:, 1], [0.05, 0.95])
-    total = inside.sum(axis=0)
-    return float(total[0] / total[1]), (float(low), float(high))
+    return mean_with_interval([(int(np.sum(np.abs(z) < Z_90)), len(z)) for z in parts])
 
 
-def _several(label: str, parts: Sequence[np.ndarray]) -> list[str]:
-    return _row(label, *_coverage(parts), np.concatenate(parts))
-
-
-def _row(label: str, share: float, share_interval: tuple[float, float], z: np.ndarray
-         ) -> list[str]:
-    low, high = (100 * end for end in share_interval)
+def _row(label: str, z: np.ndarray, share: float, low: float, high: float) -> list[str]:
     counts = np.histogram(scipy.special.ndtr(z), BINS, (0, 1))[0]
-    return [label, f'{100 * share:.1f} ({low:.1f} to {high:.1f})',
+    return [label, f'{100 * share:.1f} ({100 * low:.1f} to {100 * high:.1f})',
             f'{np.sqrt(np.mean(z ** 2)):.2f}', ' '.join(map(str, counts)),
             f'{scipy.stats.chisquare(counts).pvalue:.2f}']

@@ -364,17 +364,13 @@ def evaluate(nominal: Sensor, stage: Stage, seed: int) -> Unit:
         angles = {key: angle_errors(fitted, bound, *poses)
                   for key, poses in poses_of.items()}
         error, std = force_errors(fitted, truth, *poses_of['random'])
-        models[name] = ModelErrors(angles.pop('random'), angles, error / std,
-                                   _coefficients(fitted, truth),
+        names, coefficient_z = fitted.covariance_names, np.zeros(0)
+        if all(name.effect in truth.effects for name in names):
+            coefficient_z = (get(fitted, names) - get(truth, names)) / np.sqrt(
+                np.diag(fitted.covariance))
+        models[name] = ModelErrors(angles.pop('random'), angles, error / std, coefficient_z,
                                    motion_errors(fitted, *motion)[0])
     return Unit(models, search(truth, seed))
-
-
-def _coefficients(fitted: Sensor, truth: Sensor) -> np.ndarray:
-    if not all(name.effect in truth.effects for name in fitted.covariance_names):
-        return np.zeros(0)
-    error = get(fitted, fitted.covariance_names) - get(truth, fitted.covariance_names)
-    return error / np.sqrt(np.diag(fitted.covariance))
 
 
 def evaluate_all(nominal: Sensor, units: int, seed: int, show: Callable[[float], None]

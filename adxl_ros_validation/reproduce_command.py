@@ -17,7 +17,7 @@ from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.recording_columns import recorded_unit
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.package_version import package_version
+from adxl_ros.process import package_version
 from adxl_ros.tools.command_line import (
     argument_parser,
     command,

@@ -96,17 +96,16 @@ def draw_components(path: str | os.PathLike, truth: Sensor, fitted: Sensor,
     reach = np.linspace(-0.4, 0.4, 81)
     pose = [reach * G0_MPS2, np.full(81, -np.sqrt(0.5) * truth.local_gravity_mps2),
             np.full(81, np.sqrt(0.5) * truth.local_gravity_mps2)]
-    steps = (('linear model', linear, None),
-             ('+ bias (10 to 13)', fitted, ('bias', 'scale_factor', 'cross_axis',
-                                            'cross_axis_z')),
-             ('+ scale factor (15)', fitted, ('bias', 'scale_factor', 'cross_axis',
-                                              'cross_axis_z', 'scale_factor_z')),
-             ('+ misalignment (18)', fitted, tuple(fitted.effects)),
-             ('actual response', truth, None))
-    actual = _volts(truth, None, pose)
+    bias = ('bias', 'scale_factor', 'cross_axis', 'cross_axis_z')
+    steps = (('linear model', linear, linear.effects), ('+ bias (10 to 13)', fitted, bias),
+             ('+ scale factor (15)', fitted, (*bias, 'scale_factor_z')),
+             ('+ misalignment (18)', fitted, fitted.effects),
+             ('actual response', truth, truth.effects))
+    actual = signal_chain.static_response(truth)(pose)[0]
     figure, (response, difference) = pyplot().subplots(1, 2, figsize=(14, 5), layout='constrained')
     for label, unit, effects in steps:
-        volts = _volts(unit, effects, pose)
+        part = replace(unit, effects=effects, values={e: unit.values[e] for e in effects})
+        volts = signal_chain.static_response(part)(pose)[0]
         style: dict[str, Any] = {'color': 'k', 'ls': ':'} if unit is truth else {}
         response.plot(reach, volts, label=label, **style)
         difference.plot(reach, 1e3 * (volts - actual), label=label, **style)
@@ -118,20 +117,15 @@ def draw_components(path: str | os.PathLike, truth: Sensor, fitted: Sensor,
     write_bytes(path, png(figure))
 
 
-def _volts(unit: Sensor, effects: tuple[str, ...] | None, pose: list[np.ndarray]) -> np.ndarray:
-    if effects is not None:
-        unit = replace(unit, effects=effects, values={e: unit.values[e] for e in effects})
-    return signal_chain.static_response(unit)(pose)[0]
-
-
 TABLE_I = {('alpha', 'linear'): (2.88, 3.95), ('alpha', 'physical'): (0.32, 0.82),
            ('beta', 'linear'): (1.64, 2.36), ('beta', 'physical'): (0.60, 0.82)}
 """The paper's rms and largest error, deg."""
 MOTION_MMPS2 = {'linear': 299.8, 'physical': 20.8}
 """The paper's residuals of the motion experiment, mm/s²."""
-_STAGE_WORDS = {
-    'perfect': 'perfect stage',
-    'paper': "the paper's stage (5 arcmin, a new error with each move of a joint, level 0.1°)"}
+_STAGE_NAMES = {'perfect': 'perfect stage', 'paper': "the paper's stage"}
+_STAGE_TITLES = {
+    'perfect': 'Perfect stage',
+    'paper': "The paper's stage (5 arcmin, a new error with each move of a joint, level 0.1°)"}
 _FIGURE_TITLES = {
     'sweep': 'Figures 2 to 8: deviation from the linear model, and the physical model',
     'misalignment': 'Figure 9: the direction of the x axis', 'tilt': 'Figure 10: errors of tilt',
@@ -147,8 +141,8 @@ def page(results: dict[str, list[Unit]], bound_mmps2: float, made: str, coverage
              'Accelerometer", IEEE Sensors Journal, 2007, doi 10.1109/JSEN.2006.886995. In '
              'brackets: 90 % intervals over units, by bootstrap.']
     for stage, units in results.items():
-        parts += [f'## {_STAGE_WORDS[stage][0].upper()}{_STAGE_WORDS[stage][1:]}', _tilt(units),
-                  _to_reach(units), _motion(units, bound_mmps2)]
+        parts += [f'## {_STAGE_TITLES[stage]}', _tilt(units), _to_reach(units),
+                  _motion(units, bound_mmps2)]
     parts += [coverage, '## Direction of the x axis by (18)', _directions(results['paper']),
               '## Figures',
               *(f'![{title}]({FIGURES}/{name}.png)' for name, title in _FIGURE_TITLES.items()),
@@ -163,23 +157,19 @@ def screen_lines(results: dict[str, list[Unit]], bound_mmps2: float) -> list[str
         for row, angle in enumerate(('alpha', 'beta')):
             paper = ' / '.join(f'{rms:.2f}' for (a, _), (rms, _) in TABLE_I.items() if a == angle)
             errors = [*(_errors(units, name, row) for name in MODELS), _bounds(units, row)]
-            rows.append((f'{stage}, {angle}', paper, [np.degrees(_rms(e)) for e in errors]))
+            rows.append((f'{_STAGE_NAMES[stage]}, {angle}', paper,
+                         [np.degrees(_rms(e)) for e in errors]))
     paper = ' / '.join(f'{value:.1f}' for value in MOTION_MMPS2.values())
     for stage, units in results.items():
         both = [_rms(np.hypot(*_motion_errors(units, name))) for name in MODELS]
-        rows.append((f'{stage}, motion', paper, [*both, bound_mmps2]))
+        rows.append((f'{_STAGE_NAMES[stage]}, motion', paper, [*both, bound_mmps2]))
     return [f' {"Table I, rms error of":28}{"paper":>15}'
             + ''.join(f'{name:>9}' for name in MODELS) + f'{"bound":>8}',
-            *(f' {_screen_label(label):28}{paper:>15}' + ''.join(
+            *(f' {label:28}{paper:>15}' + ''.join(
                 f'{value:9.3g}' for value in values[:-1]) + f'{values[-1]:8.3g}'
               for label, paper, values in rows),
             ' tilt in °, motion in mm/s²; paper: linear / physical; bound: Cramér-Rao,',
             ' or the noise floor']
-
-
-def _screen_label(label: str) -> str:
-    stage, _, what = label.partition(', ')
-    return f'{_STAGE_WORDS[stage].partition(" (")[0]}, {what}'
 
 
 def in_words(angle: str) -> str:
@@ -268,12 +258,18 @@ def _directions(units: Sequence[Unit]) -> str:
 
 def _interval(parts: Sequence[np.ndarray] | np.ndarray) -> str:
     """Write the rms over all with its 90 % interval by bootstrap over units."""
-    squares = np.array([[np.sum(p ** 2), len(p)] for p in parts])
-    rng = np.random.default_rng(0)
-    drawn = squares[rng.integers(0, len(parts), (1000, len(parts)))].sum(axis=1)
-    low, high = np.sqrt(np.quantile(drawn[:, 0] / drawn[:, 1], [0.05, 0.95]))
-    total = squares.sum(axis=0)
-    return f'{np.sqrt(total[0] / total[1]):.3f} ({low:.3f} to {high:.3f})'
+    squares = [(float(np.sum(part ** 2)), len(part)) for part in parts]
+    mean, low, high = np.sqrt(mean_with_interval(squares))
+    return f'{mean:.3f} ({low:.3f} to {high:.3f})'
+
+
+def mean_with_interval(parts: Sequence[tuple[float, int]]) -> tuple[float, float, float]:
+    """Return the mean of sums over counts, and its 90 % interval by bootstrap over the parts."""
+    sums = np.array(parts, float)
+    drawn = sums[np.random.default_rng(0).integers(0, len(sums), (1000, len(sums)))].sum(axis=1)
+    total = sums.sum(axis=0)
+    low, high = np.quantile(drawn[:, 0] / drawn[:, 1], [0.05, 0.95])
+    return float(total[0] / total[1]), float(low), float(high)
 
 
 def _rms(values: np.ndarray) -> float:

@@ -178,18 +178,12 @@ def _gravity(run: Run, size: float, shape: Shape) -> None:
     run.gravity = G0 + size * shape['w'][0]
 
 
-def _late(run: Run, late_s: np.ndarray | float) -> None:
-    """Read the output some seconds late."""
-    run.volts = np.stack([np.interp(run.t - late_s, run.t, row) for row in run.volts])
-
-
-def _time_offset(run: Run, size: float, shape: Shape) -> None:
-    _late(run, size * shape['w'][0])
-
-
-def _clock_skew(run: Run, size: float, shape: Shape) -> None:
-    """Drift by `size` s/s, growing by some percent over the minutes."""
-    _late(run, size * shape['w'][0] * run.t * (1 + shape['growth'] * run.t / 600))
+def _late(law: sim.Law) -> sim.Act:
+    """Read the output late by a law, s."""
+    def act(run: Run, size: float, shape: Shape) -> None:
+        late_s = size * shape['w'][0] * law(run, shape)
+        run.volts = np.stack([np.interp(run.t - late_s, run.t, row) for row in run.volts])
+    return act
 
 
 def _mount_resonance(run: Run, size: float, shape: Shape) -> None:
@@ -209,10 +203,6 @@ def _misalignment(run: Run, size: float, shape: Shape) -> None:
         run.directions[d] = scipy.spatial.transform.Rotation.from_rotvec(angles).apply(
             run.directions[d])
     run.u = (run.directions @ run.force)[run.unit.axis_indices] / G0
-
-
-def _turns(rng: np.random.Generator, count: int) -> np.ndarray:
-    return rng.normal(size=count)
 
 
 def _other(run: Run) -> np.ndarray:
@@ -359,19 +349,10 @@ def _adc_inl(run: Run, size: float, shape: Shape) -> None:
         run.volts += size * (x - x ** 3 + 0.5 * x ** 5)
 
 
-def _curve(rng: np.random.Generator, count: int) -> np.ndarray:
-    return rng.random(count)
-
-
 def _motion_lag(run: Run, shape: Shape) -> np.ndarray:
     """Shift zero-g while and after a joint turns: current of a motor, charge of a mass."""
     rate = np.hypot(np.gradient(run.alpha, run.dt), np.gradient(run.beta, run.dt))
     return low_pass(1 - np.exp(-(rate / 0.3) ** 2), shape['late_s'], run.dt)
-
-
-def _magnet(run: Run, shape: Shape) -> np.ndarray:
-    """Shift zero-g by the direction in the room, beyond its first harmonics."""
-    return np.sin(3 * run.beta + shape['phase']) * (1 + 0.5 * np.cos(2 * run.alpha))
 
 
 def _two_levels(run: Run, shape: Shape) -> np.ndarray:
@@ -399,10 +380,12 @@ _LISTED = (
          bounds={'second': (-0.15, 0.15)}),
     Kind('backlash', _backlash, 4e-3, place=Place.STAGE, fixed=2, weigh=sim.positive),
     Kind('lever_arm', faults.lever_arm, 0.02, 0.5, place=Place.STAGE, fixed=3, needs='fast'),
-    Kind('time_offset', _time_offset, 5e-3, 0.2, place=Place.WIRE, fixed=1, needs='fast'),
-    Kind('clock_skew', _clock_skew, 5e-5, 2e-3, place=Place.WIRE, fixed=1, needs='fast',
-         bounds={'growth': (-0.1, 0.1)}),
-    Kind('misalignment', _misalignment, 3e-3, each=3, weigh=_turns, at_rest=True),
+    Kind('time_offset', _late(sim.constant), 5e-3, 0.2, place=Place.WIRE, fixed=1, needs='fast'),
+    # It grows by some percent over the minutes.
+    Kind('clock_skew', _late(lambda run, shape: run.t * (1 + shape['growth'] * run.t / 600)),
+         5e-5, 2e-3, place=Place.WIRE, fixed=1, needs='fast', bounds={'growth': (-0.1, 0.1)}),
+    Kind('misalignment', _misalignment, 3e-3, each=3,
+         weigh=np.random.Generator.standard_normal, at_rest=True),
     Kind('mount_resonance', _mount_resonance, 0.3, 1.0, place=Place.MOUNT, needs='shake',
          bounds={'hertz': (12.0, 45.0), 'damping': (0.03, 0.12)}),
     Kind('cross_axis', sim.added(_cross_axis), 3e-3, 0.1, at_rest=True, bounds=_ODD),
@@ -445,7 +428,8 @@ _LISTED = (
          bounds={'rate_hz': (0.03, 0.2)}),
     Kind('quantisation', _quantisation, 5e-3, 0.1, place=Place.SAMPLES, random=True,
          bounds={'cut': (0.0, 1.0)}),
-    Kind('adc_inl', _adc_inl, 3e-3, place=Place.SAMPLES, fixed=9, weigh=_curve, at_rest=True),
+    Kind('adc_inl', _adc_inl, 3e-3, place=Place.SAMPLES, fixed=9,
+         weigh=np.random.Generator.random, at_rest=True),
 )
 _UNLISTED = (
     # A radio carrier that beats with the clock.
@@ -460,8 +444,10 @@ _UNLISTED = (
          needs='fast', bounds={'late_s': (4.0, 15.0)}),
     Kind('motor_current', sim.added_at_output(_motion_lag), 3e-3, 0.1, place=Place.ELECTRONICS,
          needs='fast', bounds={'late_s': (0.03, 0.1)}),
-    Kind('magnet', sim.added_at_output(_magnet), 3e-3, 0.1, place=Place.ELECTRONICS,
-         bounds={'phase': _PHASE}),
+    # The direction in the room, beyond its first harmonics.
+    Kind('magnet', sim.added_at_output(lambda run, shape: np.sin(3 * run.beta + shape['phase']) * (
+        1 + 0.5 * np.cos(2 * run.alpha))), 3e-3, 0.1, place=Place.ELECTRONICS,
+        bounds={'phase': _PHASE}),
     Kind('two_levels', sim.added_at_output(_two_levels), 3e-3, 0.1, place=Place.ELECTRONICS,
          bounds={'period_s': (15.0, 60.0), 'phase': _PHASE}),
     # Leakage into a reference.

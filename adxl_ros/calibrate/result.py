@@ -29,7 +29,7 @@ from adxl_ros.model.covariance import leverage
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Envelope, Sensor, STRETCH
-from adxl_ros.package_version import package_version
+from adxl_ros.process import package_version
 import numpy as np
 
 _SAME_BETA_RAD = 1e-3

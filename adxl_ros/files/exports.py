@@ -24,7 +24,7 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Place
 from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.package_version import package_version
+from adxl_ros.process import package_version
 import numpy as np
 
 WHITE_NOISE = 'white noise'

@@ -19,7 +19,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.parameter_file import compose
 from adxl_ros.model.population import PooledCoefficient, Population
-from adxl_ros.package_version import package_version
+from adxl_ros.process import package_version
 import yaml
 
 FORMAT = 1

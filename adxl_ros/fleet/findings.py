@@ -29,11 +29,12 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from adxl_ros.fleet.populations import by_prefix, CHANCE, MIN_GROUP
-from adxl_ros.fleet.table import FleetTable, MG, QuantityResult, TOLERANCE_MG
+from adxl_ros.fleet.table import FarOut, FleetTable, MG, QuantityResult, TOLERANCE_MG
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Place
 from adxl_ros.report.quantities import number
 import numpy as np
+import pandas as pd
 import scipy
 
 _VERDICTS = ('no_gap', 'explained', 'partly', 'inseparable', 'unknown')
@@ -63,7 +64,6 @@ class EffectMatrix:
 
 def effect_matrix(table: FleetTable) -> EffectMatrix:
     """Count the named effects by unit, and look for what units with an effect have in common."""
-    import pandas as pd
     used = np.isin(table['status'].astype(str), _VERDICTS) & (table.unit >= 0) & table.first
     frame, unit = table.frame[used], table.unit[used]
     counts = Counter(name for names in frame['effects'] for name in names)
@@ -74,6 +74,10 @@ def effect_matrix(table: FleetTable) -> EffectMatrix:
     by_unit = share.to_numpy() > _MOST
     by_place = has.groupby([unit, [url.rpartition('/')[0] for url in frame['url']]]).mean()
     serials = [table.serials[i] for i in share.index]
+    below: dict[str, np.ndarray] = {}
+    for row, (_, folder) in enumerate(by_place.index):
+        for end in (i for i, letter in enumerate(f'{folder}/') if letter == '/' and i):
+            below.setdefault(folder[:end], np.zeros(len(by_place), bool))[row] = True
     is_common = (by_unit.sum(axis=0) > _MOST * len(serials)) & (len(serials) >= MIN_GROUP)
     findings = [
         *(f'{by_unit[:, i].sum()} of {len(by_unit)} units have {effects[i]}. ' + (
@@ -87,24 +91,19 @@ def effect_matrix(table: FleetTable) -> EffectMatrix:
         *(f'{inside} of {size} units that are recorded in {folder} have {name}, and {outside} '
           f'of {rest} elsewhere: {"a bad stage" if _of_stage(name) else "a bad place"}.'
           for folder, name, inside, size, outside, rest in _frequent(
-              _by_place([folder for _, folder in by_place.index]), effects,
+              below, effects,
               by_place.to_numpy() > _MOST)),
-        *_units_with_many(effects, by_unit & ~is_common, serials)]
+        # The unit or its mounting is at fault.
+        *(f'{serials[i]} has {names.sum()} effects ({", ".join(np.array(effects)[names])}): '
+          'check the unit and its mounting.'
+          for i, names in sorted(enumerate(by_unit & ~is_common), key=lambda row: -row[1].sum())
+          if names.sum() >= _MANY_EFFECTS)]
     return EffectMatrix(effects, share.index.to_numpy(), share.to_numpy(), tuple(findings))
 
 
 def _of_stage(name: str) -> bool:
     effect = library().get(name)
     return effect is not None and effect.place is Place.STAGE
-
-
-def _by_place(folders: Sequence[str]) -> dict[str, np.ndarray]:
-    """Return what lies below each folder, (k,) bool."""
-    groups: dict[str, np.ndarray] = {}
-    for i, folder in enumerate(folders):
-        for end in (j for j, letter in enumerate(f'{folder}/') if letter == '/' and j):
-            groups.setdefault(folder[:end], np.zeros(len(folders), bool))[i] = True
-    return groups
 
 
 def _frequent(groups: dict[str, np.ndarray], effects: Sequence[str], has: np.ndarray
@@ -131,15 +130,6 @@ def _frequent(groups: dict[str, np.ndarray], effects: Sequence[str], has: np.nda
             result.append((names[i], effect, int(inside[i]), int(size[i]),
                            named - int(inside[i]), total - int(size[i])))
     return result
-
-
-def _units_with_many(effects: Sequence[str], by_unit: np.ndarray, serials: Sequence[str]
-                     ) -> list[str]:
-    """Name the units that have many effects: the unit or its mounting is at fault."""
-    return [f'{serials[i]} has {count} effects ({", ".join(np.array(effects)[by_unit[i]])}): '
-            'check the unit and its mounting.'
-            for i in np.argsort(-by_unit.sum(axis=1), kind='stable')
-            if (count := int(by_unit[i].sum())) >= _MANY_EFFECTS]
 
 
 class State(IntEnum):
@@ -196,23 +186,17 @@ class UnitState:
 
 
 def rank(table: FleetTable, results: Sequence[QuantityResult],
-         far_out: Sequence[dict[str, str | float]]) -> list[UnitState]:
+         distant: Sequence[FarOut]) -> list[UnitState]:
     """Return all units, the most urgent first."""
-    labels = {result.quantity.column: result.quantity.label for result in results}
-    distant: dict[str, tuple[float, str]] = {}
-    for item in far_out:
-        distance = abs(float(item['distance']))
-        distant.setdefault(str(item['serial']), (
-            distance, f'{labels[str(item["coefficient"])]} is {distance:.1f} standard deviations '
-            'from the mean of the fleet.'))
-    ranked = [_state_of(unit, table, results, distant.get(serial))
+    farthest = {item.serial: item for item in reversed(distant)}
+    ranked = [_state_of(unit, table, results, farthest.get(serial))
               for unit, serial in enumerate(table.serials)]
     return [state for _, state in sorted(ranked, key=lambda item: (
         item[1].state, item[0], item[1].serial))]
 
 
 def _state_of(unit: int, table: FleetTable, results: Sequence[QuantityResult],
-              distant: tuple[float, str] | None) -> tuple[float, UnitState]:
+              distant: FarOut | None) -> tuple[float, UnitState]:
     """Return a unit and its rank among those of its state, the most urgent least."""
     rows = table.rows_of(unit)
     gap_mg, floor_mg, over_mg = _gap_now(table, rows)
@@ -240,7 +224,9 @@ def _state_of(unit: int, table: FleetTable, results: Sequence[QuantityResult],
                   'The last recording is refused: '
                   ) + str(table['refusal'][rows[-1]] or table['outcome'][rows[-1]])
     elif distant is not None:
-        state, urgency, reason = State.FAR_OUT, -distant[0], distant[1]
+        state, urgency = State.FAR_OUT, -abs(distant.distance)
+        reason = f'{distant.quantity.label} is {-urgency:.1f} standard deviations from the mean ' \
+            'of the fleet.'
     elif not age_days <= MAX_AGE_DAYS:
         state, urgency = State.OLD_CALIBRATION, -age_days if age_days > 0 else -np.inf
         reason = f'Its calibration is {age_days:.0f} days old.' if age_days > 0 else \

@@ -9,7 +9,7 @@ column `url`, and optionally `serial`, `params` and `date`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 import csv
 from dataclasses import dataclass, field, replace
@@ -23,6 +23,7 @@ from urllib.parse import urlsplit
 
 from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files import recording
+from adxl_ros.files.calibration_store import date_in
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.files.tables import TABLE_ENDINGS
@@ -143,24 +144,19 @@ def _of_input(text: str) -> Iterable[Source]:
         if _wild_characters(text) or not _is_recording_name(text):
             raise
         return [_unreachable(text, error)]
-    is_here = os.path.exists(path)
-    if _wild_characters(path) and not is_here:
+    if _wild_characters(path) and not os.path.exists(path):
         return _of_listing(text, fs, path, fs.glob(path, detail=True))
-    if is_here and not (os.path.isfile(path) or os.path.isdir(path)):
-        # A pipe or a device may never end.
-        return [look_up(fs, path)]
-    if _is_recording_name(path) and not os.path.isdir(path):
-        rows = _manifest_rows(text, fs, path)
-        return [look_up(fs, path)] if rows is None else _of_manifest(text, rows)
-    if fs.isdir(path):
+    # A web server answers `isdir` with the whole file.
+    if os.path.isdir(path) or (not _is_recording_name(path) and fs.isdir(path)):
         return _of_listing(text, fs, path, {path: {'type': 'directory'}})
-    return [look_up(fs, path)]
+    rows = _manifest_rows(text, fs, path)
+    return [look_up(fs, path)] if rows is None else _of_manifest(text, rows)
 
 
 def _of_listing(text: str, fs: Any, path: str, named: Mapping[str, Mapping[str, Any]]
-                ) -> Iterator[Source]:
+                ) -> list[Source]:
     """
-    Yield the recordings of a folder or a glob, those in folders too; a bag is one recording.
+    Return the recordings of a folder or a glob, those in folders too; a bag is one recording.
 
     named: what the folder or the glob names, by path. Hidden files do not count, unless the glob
     asks for them.
@@ -168,18 +164,18 @@ def _of_listing(text: str, fs: Any, path: str, named: Mapping[str, Mapping[str, 
     wild = [path.index(letter) for letter in _wild_characters(path) if path not in named]
     base = path[:path.rfind('/', 0, min(wild)) + 1] if wild else path
     asks_for_hidden = '/.' in f'/{path.removeprefix(base)}'
-    files: dict[str, Mapping[str, Any]] = {}
-    for name, info in named.items():
-        files |= fs.find(name, detail=True) if info['type'] == 'directory' else {name: info}
 
     def is_visible(name: str) -> bool:
         return asks_for_hidden or '/.' not in f'/{name.removeprefix(base).lstrip("/")}'
 
+    files: dict[str, Mapping[str, Any]] = {}
+    for name, info in named.items():
+        files |= fs.find(name, detail=True) if info['type'] == 'directory' else {name: info}
     bags: dict[str, dict[str, Any]] = {
-        name.rpartition('/')[0]: {} for name in sorted(files)
-        if file_name(name) == _BAG and is_visible(name)}
-    count = len(bags)
-    for name, info in sorted(files.items()):
+        name.rpartition('/')[0]: {} for name in files if file_name(name) == _BAG
+        and is_visible(name)}
+    found = []
+    for name, info in files.items():
         bag = name.rpartition('/')[0]
         while bag and bag not in bags:
             bag = bag.rpartition('/')[0]
@@ -187,13 +183,12 @@ def _of_listing(text: str, fs: Any, path: str, named: Mapping[str, Mapping[str, 
             bags[bag][name] = info
         elif is_visible(name) and not _is_of_fleet(fs, name) and (
                 name in named or _is_recording_name(name)):
-            count += 1
-            yield _of_info(fs, name, info)
-    for bag, content in bags.items():
-        yield _of_bag(fs, bag, content)
-    if not count:
+            found.append(_of_info(fs, name, info))
+    found += [_of_bag(fs, bag, content) for bag, content in bags.items()]
+    if not found:
         raise UserError(f'{text}: matches nothing' if wild else f'{text}: has no recording '
                         f'(*{", *".join(_ENDINGS)}, a bag or a table)')
+    return found
 
 
 def _unreachable(url: str, error: UserError) -> Source:
@@ -299,16 +294,13 @@ def _modified(info: Mapping[str, Any]) -> str:
     value = next((info[name] for name in _TIMES if info.get(name)), '')
     if isinstance(value, (int, float)):
         value = datetime.fromtimestamp(value, timezone.utc)
-    return as_date(str(value)) or ''
+    return as_date(str(value))
 
 
-def as_date(text: str) -> str | None:
-    """Return a date of ISO 8601 in UTC, or None if the text is none; UTC is the usual zone."""
-    try:
-        date = datetime.fromisoformat(text.strip().replace('Z', '+00:00'))
-    except ValueError:
-        return None
-    return date.replace(tzinfo=date.tzinfo or timezone.utc).astimezone(timezone.utc).isoformat()
+def as_date(text: str) -> str:
+    """Return a date of ISO 8601 in UTC; empty if the text is none. UTC is the usual zone."""
+    date = date_in(text.strip())
+    return date.isoformat() if date else ''
 
 
 def _manifest_rows(text: str, fs: Any, path: str) -> dict[int, dict[str, str]] | None:
@@ -318,6 +310,9 @@ def _manifest_rows(text: str, fs: Any, path: str) -> dict[int, dict[str, str]] |
     It is None for a recording, and where nothing can be read.
     """
     suffix = PurePosixPath(file_name(path)).suffix.lower()
+    if os.path.exists(path) and not os.path.isfile(path):
+        # A pipe or a device may never end.
+        return None
     try:
         if suffix == '.csv':
             with fs.open(path, 'r', encoding='utf-8-sig', newline='') as file:
@@ -379,7 +374,7 @@ def _of_manifest(text: str, rows: dict[int, dict[str, str]]) -> Iterable[Source]
     for number, row in rows.items():
         if not row['url']:
             raise UserError(f'{text}: row {number}: url is empty')
-        if row.get('date') and as_date(row['date']) is None:
+        if row.get('date') and not as_date(row['date']):
             raise UserError(f'{text}: row {number}: date is {row["date"]!r}, expected ISO 8601, '
                             'for example 2026-11-01T10:00:00Z')
 
@@ -392,7 +387,7 @@ def _of_manifest(text: str, rows: dict[int, dict[str, str]]) -> Iterable[Source]
         serial = row.get('serial', '')
         return replace(recorded, serial='' if serial == NO_UNIT else serial,
                        params=_beside(folder, params) if set(params) & set('/.') else params,
-                       date=as_date(row.get('date', '')) or '')
+                       date=as_date(row.get('date', '')))
 
     result: dict[str, Source] = {}
     with ThreadPoolExecutor(_THREADS) as pool:
@@ -436,7 +431,7 @@ def _stated(source: Source) -> Stated:
         if path.lower().endswith('.csv'):
             head = fs.cat_file(path, 0, _HEAD_BYTES).decode('utf-8', 'replace')
             texts = dict(_COMMENT.findall(head))
-            stated = Stated(texts.get('serial', ''), as_date(texts.get('date', '')) or '')
+            stated = Stated(texts.get('serial', ''), as_date(texts.get('date', '')))
         if not all(stated) and '://' not in source.url:
             first = next(recording.blocks(path, 1))
             stated = Stated(first.stream_info.texts.get('serial', ''), begin_of(first)[0])

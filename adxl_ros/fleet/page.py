@@ -15,13 +15,22 @@ from adxl_ros.files import population_file
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.fleet.findings import effect_matrix, EffectMatrix, rank, State, UnitState
 from adxl_ros.fleet.row import PAGE, POPULATION, reason_kind, TABLE, UNITS
-from adxl_ros.fleet.table import analyse, FleetTable, MG, QuantityResult, read, TOLERANCE_MG
+from adxl_ros.fleet.table import (
+    analyse,
+    far_out,
+    FleetTable,
+    MG,
+    QuantityResult,
+    read,
+    TOLERANCE_MG,
+)
 from adxl_ros.fleet.trends import FALSE_DISCOVERY_RATE
 from adxl_ros.model.constants import AXES, Z_90
 from adxl_ros.model.population import Population
 from adxl_ros.report import figures as plotly, page as html_page
-from adxl_ros.report.quantities import number
+from adxl_ros.report.quantities import decimals, number
 import numpy as np
+import pandas as pd
 import scipy
 
 _TREND_HEIGHT = 190
@@ -46,8 +55,6 @@ _MOST_ROWS = 50
 """Largest count of outliers and of reasons on the page; the table holds them all."""
 _SMALLEST_SCATTER = 1e-3
 """Smallest scatter on the page, mg, mg/g or µg. Chosen: far below the noise of any recording."""
-_NOTHING = 0.05
-"""Smaller standard deviations are nothing beside another one. Chosen: 0.1 % of the variance."""
 _MEASURES = ('gap_before_mps2', *(f'zero_g_{axis}_v' for axis in AXES))
 """Columns that tell whether a unit is within the tolerance."""
 _SENTENCES = {State.OUT_OF_TOLERANCE: 'Recalibrate what is at the head of the list.',
@@ -166,34 +173,19 @@ def write(folder: Path) -> list[Path]:
     table = read(folder / TABLE)
     results = analyse(table)
     distant = far_out(results, table.serials)
-    population_file.write(folder / POPULATION, population_of(results, POPULATION), distant)
+    population = Population(POPULATION, {
+        result.quantity.column: result.population.pooled for result in results
+        if result.population is not None and result.population.pooled.prediction_std > 0})
+    population_file.write(folder / POPULATION, population, [
+        {'serial': item.serial, 'coefficient': item.quantity.column, 'value': item.value,
+         'distance': item.distance} for item in distant])
     write_text(folder / UNITS, _units_csv(results, table.serials))
     write_text(folder / PAGE, page(table, results, folder))
     return [folder / name for name in (PAGE, POPULATION, UNITS)]
 
 
-def population_of(results: Sequence[QuantityResult], name: str) -> Population:
-    """Return what the units of a fleet are like."""
-    return Population(name, {
-        result.quantity.column: result.population.pooled for result in results
-        if result.population is not None and result.population.pooled.prediction_std > 0})
-
-
-def far_out(results: Sequence[QuantityResult], serials: Sequence[str]
-            ) -> list[dict[str, str | float]]:
-    """Return the units that are not of the population, the farthest first."""
-    units: list[dict[str, str | float]] = [
-        {'serial': serials[result.units[i]], 'coefficient': result.quantity.column,
-         'value': float(result.population.estimates[i]),
-         'distance': float(result.population.distances()[i])}
-        for result in results if result.population is not None
-        for i in np.flatnonzero(result.population.is_far_out)]
-    return sorted(units, key=lambda unit: -abs(float(unit['distance'])))
-
-
 def _units_csv(results: Sequence[QuantityResult], serials: Sequence[str]) -> str:
     """Return the estimates of all units, with and without the population."""
-    import pandas as pd
     columns = ('serial', 'coefficient', 'unit', 'estimate', 'std', 'shrunken', 'shrunken_std',
                'distance', 'is_far_out')
     rows: list[tuple] = []
@@ -213,15 +205,27 @@ def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> 
     units = rank(table, results, distant)
     effects = effect_matrix(table)
     # Units that drift come first, although others may be more urgent.
-    plotted = [(unit, result) for unit in sorted(units, key=lambda unit: not unit.drifts)
-               if (result := _plotted_quantity(unit, results)) is not None][:_SHOWN]
+    plotted = [(unit, shown[0]) for unit in sorted(units, key=lambda unit: not unit.drifts)
+               if (shown := [*(drift.result for drift in unit.drifts), *(
+                   result for result in results if result.place_of(unit.unit) is not None)])
+               ][:_SHOWN]
     figures = {f'trend-{i}': _trend_figure(table, result, unit.unit)
                for i, (unit, result) in enumerate(plotted)}
     if effects.effects:
         figures['matrix'] = _matrix_figure(table, effects)
     counts = Counter(unit.state for unit in units)
+    years = table.years[np.isfinite(table.years)]
+    versions = ', '.join(sorted({text for text in table['version'] if text}))
+    about = [f'{len(table)} recordings', f'{len(table.serials)} units',
+             *([f'{date_text(years.min())} to {date_text(years.max())}'] if len(years) else []),
+             *([f'rows made by version {versions}'] if versions else [])]
+    batches = [f'{batch.members.sum()} units with a serial number {batch.prefix}… have a '
+               f'{result.quantity.label} that differs by '
+               + result.quantity.text(batch.difference, batch.low, batch.high) +
+               f' from that of the {(~batch.members).sum()} others: a bad batch.'
+               for result in results if (batch := result.batch) is not None]
     return html_page.render('adxl_ros.fleet', 'fleet.html', {
-        'title': 'Fleet', 'about': _about(table), 'badge': _badge(table, units, counts),
+        'title': 'Fleet', 'about': about, 'badge': _badge(table, units, counts),
         'tiles': _tiles(table, units, counts), 'shown': _SHOWN, 'figures': figures,
         'units': units, 'date': date_text, 'link': partial(_link, folder),
         'without_unit': _rows_without_unit(table),
@@ -229,31 +233,19 @@ def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> 
         'trends': [{'figure': f'trend-{i}', 'title': f'{unit.serial}: {result.quantity.label}',
                     'text': f'{unit.drifts[0].text}.' if unit.drifts else 'No slope is claimed.'}
                    for i, (unit, result) in enumerate(plotted)],
-        'findings': [*_batches(results), *effects.findings], 'has_effects': bool(effects.effects),
+        'findings': [*batches, *effects.findings], 'has_effects': bool(effects.effects),
         'judged': len(effects.units), 'populations': _population_rows(results),
-        'far_out': _far_out_rows(distant, results),
+        'far_out': [
+            [item.serial, item.quantity.label,
+             f'{item.value:.5g} {item.quantity.unit}'
+             if not item.quantity.unit.startswith('m/s') else
+             f'{number(item.value * item.quantity.factor)} {item.quantity.shown_unit}',
+             number(item.distance, True)] for item in distant[:_MOST_ROWS]],
         'outliers': _outlier_rows(table, results),
         'outlier_count': sum(int(result.is_outlier.sum()) for result in results),
         'refusals': _refusal_rows(table), 'most_rows': _MOST_ROWS,
         'tolerance': number(TOLERANCE_MG), 'false_discovery': f'{FALSE_DISCOVERY_RATE:.0%}',
         'drifts': sum(int(result.is_claimed.sum()) for result in results)})
-
-
-def _batches(results: Sequence[QuantityResult]) -> list[str]:
-    """Name the batches whose coefficient is not that of the other units."""
-    return [f'{batch.members.sum()} units with a serial number {batch.prefix}… have a '
-            f'{result.quantity.label} that differs by '
-            + result.quantity.text(batch.difference, batch.low, batch.high) +
-            f' from that of the {(~batch.members).sum()} others: a bad batch.'
-            for result in results if (batch := result.batch) is not None]
-
-
-def _about(table: FleetTable) -> list[str]:
-    years = table.years[np.isfinite(table.years)]
-    dates = [f'{date_text(years.min())} to {date_text(years.max())}'] if len(years) else []
-    versions = sorted({str(text) for text in table['version'] if text})
-    return [f'{len(table)} recordings', f'{len(table.serials)} units', *dates,
-            *([f'rows made by version {", ".join(versions)}'] if versions else [])]
 
 
 def _badge(table: FleetTable, units: Sequence[UnitState], counts: Counter[State]
@@ -314,14 +306,6 @@ def _link(folder: Path, report: str) -> str:
                  if report and (folder / name).exists()), '')
 
 
-def _plotted_quantity(unit: UnitState, results: Sequence[QuantityResult]
-                      ) -> QuantityResult | None:
-    """Return what the plot of a unit shows: its drift, else the first quantity that it has."""
-    if unit.drifts:
-        return unit.drifts[0].result
-    return next((result for result in results if result.place_of(unit.unit) is not None), None)
-
-
 def _population_rows(results: Sequence[QuantityResult]) -> list[list[str]]:
     rows = []
     for result in results:
@@ -331,14 +315,12 @@ def _population_rows(results: Sequence[QuantityResult]) -> list[list[str]]:
         pooled, factor, unit = population.pooled, quantity.factor, quantity.shown_unit
         shown = (factor, unit) if quantity.unit.startswith('m/s') else (1.0, quantity.unit)
         mean, std = shown[0] * pooled.mean, shown[0] * pooled.mean_std
-        digits = int(np.clip(1 - np.floor(np.log10(std)), 0, 8)) if std > 0 else 4
-        # A scatter by calibrations that is nothing beside that of recordings is shown as nothing.
-        step = scatter.calibration if scatter.calibration > _NOTHING * scatter.recording else 0.0
         rows.append([
-            quantity.label, f'{mean:.{digits}f} ± {number(std, digits=2)} {shown[1]}',
+            quantity.label, f'{mean:.{decimals(std)}f} ± {number(std, digits=2)} {shown[1]}',
             f'{number(factor * pooled.spread)} ({number(factor * pooled.spread_low)} to '
             f'{number(factor * pooled.spread_high)}) {unit}',
-            f'{_scatter(factor * scatter.recording)} {unit}', f'{_scatter(factor * step)} {unit}',
+            *(f'{_scatter(factor * value)} {unit}'
+              for value in (scatter.recording, scatter.calibration)),
             str(pooled.units), str(int(population.is_far_out.sum()))])
     return rows
 
@@ -346,20 +328,6 @@ def _population_rows(results: Sequence[QuantityResult]) -> list[list[str]]:
 def _scatter(value: float) -> str:
     """Return a scatter; one that is too small to matter as its limit."""
     return f'< {_SMALLEST_SCATTER:g}' if 0 < value < _SMALLEST_SCATTER else number(value)
-
-
-def _far_out_rows(distant: Sequence[dict[str, str | float]], results: Sequence[QuantityResult]
-                  ) -> list[list[str]]:
-    by_column = {result.quantity.column: result.quantity for result in results}
-    rows = []
-    for item in distant[:_MOST_ROWS]:
-        quantity = by_column[str(item['coefficient'])]
-        rows.append([str(item['serial']), quantity.label,
-                     f'{float(item["value"]):.5g} {quantity.unit}'
-                     if not quantity.unit.startswith('m/s') else
-                     f'{number(float(item["value"]) * quantity.factor)} {quantity.shown_unit}',
-                     number(float(item['distance']), True)])
-    return rows
 
 
 def _outlier_rows(table: FleetTable, results: Sequence[QuantityResult]

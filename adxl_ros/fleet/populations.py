@@ -34,8 +34,6 @@ _EQUAL_VARIANCES = 1e6
 """Degrees of freedom of the common variance where units do not differ. Chosen: infinite."""
 _NO_FREEDOM = 1e-6
 """Degrees of freedom of the common variance of one unit, which moderates none. Chosen: small."""
-_NEWTON_STEPS = 20
-"""Steps of Newton's method; it converges in fewer than ten."""
 MIN_UNITS = 5
 """Smallest count of units with a spread: with fewer, a further unit has no finite variance."""
 _GRID = (np.arange(400) + 0.5) / 400
@@ -80,19 +78,12 @@ def _common_variance(variance: np.ndarray, freedom: np.ndarray) -> tuple[float, 
     log_variance = np.log(variance) - scipy.special.digamma(freedom / 2) + np.log(freedom / 2)
     mean = float(log_variance.mean())
     excess = float(log_variance.var(ddof=1) - scipy.special.polygamma(1, freedom / 2).mean())
-    if excess <= 0:
+    if excess <= 2 / _EQUAL_VARIANCES:
         return float(np.exp(mean)), _EQUAL_VARIANCES
-    half = _inverse_trigamma(excess)
+    # trigamma(x) is above 1/x², and near 1/x where x is large.
+    half = scipy.optimize.brentq(lambda x: float(scipy.special.polygamma(1, x)) - excess,
+                                 excess ** -0.5, _EQUAL_VARIANCES, xtol=1e-300, rtol=1e-14)
     return float(np.exp(mean + scipy.special.digamma(half) - np.log(half))), 2 * half
-
-
-def _inverse_trigamma(value: float) -> float:
-    """Solve trigamma(x) = value by Newton's method (Smyth 2004, appendix)."""
-    x = 0.5 + 1 / value
-    for _ in range(_NEWTON_STEPS):
-        trigamma = float(scipy.special.polygamma(1, x))
-        x += trigamma * (1 - trigamma / value) / float(scipy.special.polygamma(2, x))
-    return min(x, _EQUAL_VARIANCES / 2)
 
 
 @dataclass(frozen=True)

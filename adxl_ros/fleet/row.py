@@ -1,23 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The columns of a fleet's table: name, kind, unit and meaning, and the file that holds them.
+A row of a fleet's table: its columns, and the recipe that it follows from.
 
 A row is a dict with a value for each column; None stands for what is not known. Columns with
-`_x_`, `_y_` or `_z_` in their name are of one axis of the sensor.
+`_x_`, `_y_` or `_z_` in their name are of one axis of the sensor. The client sends the recipe to
+each worker once, with the texts of all parameter files: a worker needs no access to them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 from functools import lru_cache
+import hashlib
+import json
 import math
+from pathlib import Path
 import re
-from typing import Any
+from typing import Any, NamedTuple
 
+from adxl_ros.errors import one_line, UserError
+from adxl_ros.files import calibration_store, parameter_file
+from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
+from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.model.constants import AXES
+from adxl_ros.process import package_version
+import yaml
 
 Row = dict[str, Any]
 """The values of one recording by column."""
@@ -35,19 +45,13 @@ OUTCOMES = ('done', 'refused', 'crashed')
 """Values of `outcome`: the tasks gave results; the recording was refused, and `refusal` has the
 reason; the worker ended or failed at each attempt."""
 
-COEFFICIENT_FIELDS = {'name': 'text', 'unit': 'text', 'value': 'float', 'std': 'float',
-                      'source': 'text'}
-"""Types of the fields of one coefficient, by their names. `name` is `effect.parameter.axis` or
-`effect.parameter`; `source` is the task, `fit` or `diagnose`; `std` is a standard deviation."""
-
-
 @dataclass(frozen=True)
 class Column:
     """One column of the table."""
 
     name: str  # Its name, which ends in the unit where there is one
     # `text`, `float`, `integer`, `flag`, `time` (UTC), `texts`, `groups` (lists of texts) or
-    # `coefficients` (see `COEFFICIENT_FIELDS`)
+    # `coefficients` (see `arrow_schema`)
     kind: str
     meaning: str  # What it holds, for people
     unit: str = ''  # Its unit; empty for none
@@ -55,13 +59,12 @@ class Column:
     is_timing: bool = False
 
 
-def _with_interval(name: str, unit_name: str, meaning: str, unit: str, note: str = ''
-                   ) -> list[Column]:
-    """Return the columns of a quantity of the gap and of its interval."""
-    return [Column(f'{name}{unit_name}', 'float', meaning, unit),
-            *(Column(f'{name}_{end}{unit_name}', 'float',
-                     f'{word} end of its 90 % interval{note}', unit)
-              for end, word in (('low', 'lower'), ('high', 'upper')))]
+NOISE = (('n', 'white noise N', 'mps2_per_rthz', 'm/s²/√Hz'),
+         ('b', 'bias instability B', 'mps2', 'm/s²'),
+         ('k', 'random walk K', 'mps2_per_rts', 'm/s²/√s'))
+"""Terms of the noise: letter, name, unit in the names of columns, and unit."""
+_ENDS = (('', ''), ('_low', ': lower end of the 90 % interval'),
+         ('_high', ': upper end of the 90 % interval'))
 
 
 COLUMNS: tuple[Column, ...] = (
@@ -94,13 +97,7 @@ COLUMNS: tuple[Column, ...] = (
     Column('validity', 'text', 'valid, or why the calibration is not known to be valid'),
     *(Column(f'noise_{letter}{end}_{axis}_{unit_name}', 'float', f'{meaning}{note}, axis {axis}',
              unit)
-      for letter, meaning, unit_name, unit in (
-          ('n', 'white noise N', 'mps2_per_rthz', 'm/s²/√Hz'),
-          ('b', 'bias instability B', 'mps2', 'm/s²'),
-          ('k', 'random walk K', 'mps2_per_rts', 'm/s²/√s'))
-      for end, note in (('', ''), ('_low', ': lower end of the 90 % interval'),
-                        ('_high', ': upper end of the 90 % interval'))
-      for axis in AXES),
+      for letter, meaning, unit_name, unit in NOISE for end, note in _ENDS for axis in AXES),
     *(Column(f'{name}_{axis}_{unit_name}', 'float', f'{meaning}, axis {axis}', unit)
       for name, unit_name, meaning, unit in (
           ('zero_g', 'v', 'fitted zero-g', 'V'),
@@ -110,12 +107,14 @@ COLUMNS: tuple[Column, ...] = (
       for axis in AXES),
     Column('fit_model', 'text', 'model that was fitted'),
     Column('fit_poses', 'integer', 'poses that were fitted'),
-    *_with_interval('gap_before', '_mps2', 'rms of recording minus simulation', 'm/s²'),
-    *_with_interval('gap_after', '_mps2', 'rms with the named effects, on held-out blocks',
-                    'm/s²'),
-    *_with_interval('gap_floor', '_mps2', 'noise floor', 'm/s²', '; none if assumed'),
+    *(Column(f'gap_{name}{end}{"_mps2" * bool(unit)}', 'float', f'{meaning}{note}', unit)
+      for name, meaning, unit in (
+          ('before', 'rms of recording minus simulation', 'm/s²'),
+          ('after', 'rms with the named effects, on held-out blocks', 'm/s²'),
+          ('floor', 'noise floor; without an interval if assumed', 'm/s²'),
+          ('closed', 'closed share of the squared gap above the floor', ''))
+      for end, note in _ENDS),
     Column('gap_floor_source', 'text', 'where the floor is from: still, repeats or assumed'),
-    *_with_interval('gap_closed', '', 'closed share of the squared gap above the floor', ''),
     Column('status', 'text',
            'no_gap, explained, partly, inseparable, unknown, insufficient or bad_data'),
     Column('effects', 'texts', 'effects that are named for certain'),
@@ -128,7 +127,7 @@ COLUMNS: tuple[Column, ...] = (
     Column('version', 'text', 'version of the package'),
     Column('code', 'text', 'SHA-256 of the code that made the row'),
     Column('seconds', 'float', 'run time of the tasks', 's', is_timing=True),
-    Column('memory_mb', 'float', 'largest memory of the worker meanwhile', 'MB', is_timing=True),
+    Column('memory_mb', 'float', 'largest memory of the worker until then', 'MB', is_timing=True),
     Column('worker', 'text', 'host and process of the worker', is_timing=True),
     Column('attempts', 'integer', 'attempts until the row was made', is_timing=True),
     Column('written', 'time', 'when the row was made', is_timing=True),
@@ -162,11 +161,13 @@ def reason_kind(row: Row) -> str:
 def arrow_schema() -> Any:
     """Return the columns as a schema of pyarrow, with unit and meaning as metadata."""
     import pyarrow as pa
-    coefficient = pa.struct([(name, pa.float64() if kind == 'float' else pa.string())
-                             for name, kind in COEFFICIENT_FIELDS.items()])
-    types = {'text': pa.string(), 'float': pa.float64(), 'integer': pa.int64(),
-             'flag': pa.bool_(), 'time': pa.timestamp('us', 'UTC'),
-             'texts': pa.list_(pa.string()), 'groups': pa.list_(pa.list_(pa.string())),
+    text, number = pa.string(), pa.float64()
+    # `effect.parameter.axis` or `effect.parameter`; its source is the task, `fit` or `diagnose`
+    coefficient = pa.struct([('name', text), ('unit', text), ('value', number), ('std', number),
+                             ('source', text)])
+    types = {'text': text, 'float': number, 'integer': pa.int64(), 'flag': pa.bool_(),
+             'time': pa.timestamp('us', 'UTC'), 'texts': pa.list_(text),
+             'groups': pa.list_(pa.list_(text)),
              'coefficients': pa.list_(coefficient)}
     return pa.schema([
         pa.field(column.name, types[column.kind],
@@ -181,3 +182,138 @@ def as_table(rows: Iterable[Row]) -> Any:
     return pa.Table.from_pylist([
         {**row, **{name: datetime.fromisoformat(row[name]) for name in times if row[name]}}
         for row in rows], arrow_schema())
+
+
+TASKS = ('check', 'noise', 'fit', 'diagnose')
+"""All tasks, in the order in which they run."""
+
+_CACHED_CALIBRATIONS = 8192
+"""Stored calibrations that are kept after they were read. Chosen: 200 units for years."""
+
+
+class ParameterText(NamedTuple):
+    """A parameter file by its content."""
+
+    name: str  # Its name, for messages
+    text: str  # Its content; empty for the nominal sensor
+    calibration_id: str = ''  # Id of the calibration; empty for none
+    date: str = ''  # Date of the calibration, ISO 8601, UTC; empty if unknown
+
+
+_NOMINAL = ParameterText('the nominal sensor', '')
+"""Stands for the sensor that a tool takes without a parameter file."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What all tasks of a run share."""
+
+    tasks: tuple[str, ...]  # Names of the tasks
+    code: str  # SHA-256 of the code
+    # Parameter file of all recordings; None takes the calibration of each
+    params: ParameterText | None
+    stated: dict[str, ParameterText]  # Parameter files that a manifest names, by their names there
+    # Names and texts of the calibrations, by the folder of the unit in the store
+    store: dict[str, tuple[tuple[str, str], ...]]
+    reading: ReadingOptions = AS_IT_IS  # How recordings are to be read
+
+    def parameters_of(self, serial: str, date: str, stated: str) -> ParameterText:
+        """
+        Return the parameter file of a recording.
+
+        It is that of the manifest, else that of the command line, else the newest calibration of
+        the unit that is not younger than the recording, else the nominal sensor.
+        """
+        if stated:
+            return self.stated[stated]
+        if self.params is not None:
+            return self.params
+        if not date:
+            return _NOMINAL
+        files = self.store.get(calibration_store.unit_folder('', serial).name, ()) \
+            if serial not in ('', NO_UNIT) else ()
+        read = filter(None, (_stored_parameters(name, text) for name, text in files))
+        return max((parameters for unit, parameters in read
+                    if unit == serial and '' < parameters.date <= date),
+                   key=lambda parameters: parameters.date, default=_NOMINAL)
+
+    def digest(self, chosen: ParameterText, serial: str) -> str:
+        """Return the SHA-256 of all that a row follows from, beside the content."""
+        return sha256_of(chosen.text, serial, self.tasks, repr(self.reading), self.code)
+
+
+def sha256_of(*values: object) -> str:
+    """Return the SHA-256 of values as JSON."""
+    return hashlib.sha256(json.dumps(values).encode()).hexdigest()
+
+
+def age_days(chosen: ParameterText, date: str) -> float | None:
+    """Return the age of a calibration at a date, days."""
+    if not (chosen.date and date):
+        return None
+    begun, calibrated = map(datetime.fromisoformat, (date, chosen.date))
+    return (begun - calibrated) / timedelta(days=1)
+
+
+def task_names(text: str) -> tuple[str, ...]:
+    """Return the tasks that a text names with commas, in the order in which they run."""
+    chosen = [name.strip() for name in text.split(',')]
+    for name in chosen:
+        if name not in TASKS:
+            raise UserError(f'--do {text}: {name!r} is no task; tasks: {", ".join(TASKS)}')
+    return tuple(name for name in TASKS if name in chosen)
+
+
+def make_recipe(tasks: Iterable[str], params: str | None, stated: Iterable[str],
+                store: str | None, reading: ReadingOptions) -> Recipe:
+    """Read all parameter files of a run."""
+    return Recipe(tuple(tasks), code_version(),
+                  _read(params) if params else None,
+                  {name: _read(name) for name in set(stated) if name},
+                  _stored(store) if store else {}, reading)
+
+
+def _read(name: str) -> ParameterText:
+    """Read and check a parameter file."""
+    path = parameter_file.installed_path(name)
+    sensor = parameter_file.load(path, may_measure=True)
+    date = calibration_store.date_of(sensor)
+    return ParameterText(Path(name).name, Path(path).read_text(encoding='utf-8'),
+                         calibration_store.calibration_id(sensor) if sensor.effects else '',
+                         date.isoformat() if date else '')
+
+
+def _stored(folder: str) -> dict[str, tuple[tuple[str, str], ...]]:
+    """Return names and texts of all calibrations of a store, by the folder of the unit."""
+    root = Path(folder)
+    try:
+        return {unit.name: tuple((path.name, path.read_text(encoding='utf-8'))
+                                 for path in sorted(unit.glob('*.yaml')))
+                for unit in sorted(root.iterdir()) if unit.is_dir()} if root.is_dir() else {}
+    except (OSError, ValueError) as error:
+        raise UserError(f'{folder}: cannot be read: {one_line(error)}') from None
+
+
+@lru_cache(maxsize=_CACHED_CALIBRATIONS)
+def _stored_parameters(name: str, text: str) -> tuple[str, ParameterText] | None:
+    """Return serial number and content of a stored file; None for one that cannot be used."""
+    try:
+        keys = yaml.load(text, getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+                         )['/**']['ros__parameters']
+        provenance = keys['provenance']
+        date = calibration_store.date_in(provenance['date'])
+        return keys['sensor']['serial'], ParameterText(
+            name, text, provenance['id'], date.isoformat() if date else '')
+    except (yaml.YAMLError, KeyError, TypeError, AttributeError):
+        return None
+
+
+@lru_cache(maxsize=1)
+def code_version() -> str:
+    """Return the SHA-256 of version and code of the package, and of its default sensors."""
+    root = Path(__file__).resolve().parents[1]
+    hashed = hashlib.sha256(package_version().encode())
+    for path in (*sorted(root.rglob('*.py')), parameter_file.nominal_path(),
+                 parameter_file.any_imu_path()):
+        hashed.update(path.name.encode() + path.read_bytes())
+    return hashed.hexdigest()

@@ -11,7 +11,6 @@ written. One client at a time works on a folder.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor
 from contextlib import contextmanager
 from datetime import datetime, timezone
 import fcntl
@@ -25,11 +24,10 @@ from typing import Any, NamedTuple
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files.atomic_write import atomic_path
 from adxl_ros.fleet.inputs import as_date, Source, stated_by
-from adxl_ros.fleet.recipe import Recipe
-from adxl_ros.fleet.row import arrow_schema, as_table, Row, TABLE
+from adxl_ros.fleet.row import arrow_schema, as_table, Recipe, Row, TABLE
 from adxl_ros.fleet.staging import StagingError
 from adxl_ros.fleet.task import make_row, refused, Result, TaskCrashed
-from adxl_ros.workers import Finished, finished_tasks, make_folder, write
+from adxl_ros.workers import Finished, finished_tasks, make_folder, Pool, write
 
 _ROWS = 'rows'
 """Folder of the rows."""
@@ -68,22 +66,18 @@ def only_client(folder: Path) -> Iterator[None]:
         yield
 
 
+_KEPT = ('written', 'key', 'outcome', 'serial', 'date', 'date_source', 'size_bytes', 'seconds',
+         'tasks')
+"""Columns of a row that the client keeps in memory."""
+
+
 class Entry(NamedTuple):
-    """What the client keeps in memory of a row; a text is empty where nothing is known."""
+    """What the client keeps in memory of a row."""
 
     name: str  # Name of the row's file
-    written: str  # When it was written, ISO 8601, UTC
     stamp: str  # Stamp of the recording
     digest: str  # See `Recipe.digest`
-    key: str  # Key of the row
-    outcome: str  # One of `row.OUTCOMES`
-    # serial, date, date_source: Unit and begin of the recording, and where the date is from
-    serial: str
-    date: str
-    date_source: str
-    size_bytes: int  # Size of the recording, byte
-    seconds: float  # Run time of its tasks, s
-    tasks: tuple[str, ...]  # Its tasks
+    row: Row  # Columns `_KEPT`
 
 
 class Results:
@@ -102,14 +96,11 @@ class Results:
     def _add(self, name: str, content: dict[str, Any]) -> None:
         """Keep what is needed of a row."""
         row = content['row']
-        entry = Entry(name, row['written'], content['stamp'], content['digest'], row['key'],
-                      row['outcome'], row['serial'] or '', row['date'] or '',
-                      row['date_source'] or '', row['size_bytes'] or 0,
-                      row['seconds'] or 0.0, tuple(row['tasks']))
+        entry = Entry(name, content['stamp'], content['digest'], {key: row[key] for key in _KEPT})
         present = self.newest.get(row['url'])
-        if present is None or present.written <= entry.written:
+        if present is None or present.row['written'] <= row['written']:
             self.newest[row['url']] = entry
-        if row['hash'] and entry.outcome != 'crashed':
+        if row['hash'] and row['outcome'] != 'crashed':
             self.known.setdefault(row['key'], name)
 
     def put(self, result: Result, attempts: int) -> Row:
@@ -181,13 +172,13 @@ def plan(sources: Sequence[Source], recipe: Recipe, results: Results,
     chosen = _since(sources, selection.since, results) if selection.since else sources
     entries = {source.url: results.newest.get(source.url) for source in chosen}
     if selection.only_failed:
-        failed = {url for url, entry in entries.items() if entry and entry.outcome != 'done'}
-        todo, done = [source for source in chosen if source.url in failed], 0
+        todo, done = [source for source in chosen if (entry := entries[source.url])
+                      and entry.row['outcome'] != 'done'], 0
     else:
         todo = [source for source in chosen if not is_done(source, entries[source.url], recipe)]
         done = len(chosen) - len(todo)
     todo = todo[:selection.limit]
-    serials = [source.serial or (entry.serial if (entry := entries[source.url]) else '')
+    serials = [source.serial or ((entry := entries[source.url]) and entry.row['serial']) or ''
                for source in todo]
     size_bytes = sum(source.size_bytes or 0 for source in todo)
     return Plan(todo, done, len(sources) - done - len(todo), serials, size_bytes,
@@ -196,7 +187,7 @@ def plan(sources: Sequence[Source], recipe: Recipe, results: Results,
 
 def _since(sources: Sequence[Source], since: str, results: Results) -> list[Source]:
     """Return the recordings that began at a date or later, and those without a date."""
-    dates = {url: entry.date for url, entry in results.newest.items()}
+    dates = {url: entry.row['date'] for url, entry in results.newest.items()}
     # The server of an object states truly when it was written, which is after it began.
     unread = [source for source in sources if not (source.date or dates.get(source.url))
               and ('://' not in source.url or (source.modified or since) >= since)]
@@ -209,28 +200,28 @@ def is_done(source: Source, entry: Entry | None, recipe: Recipe) -> bool:
     """Return whether a row is that of a recording as it is now, by the present recipe."""
     if entry is None or source.stamp != entry.stamp or not (source.stamp or source.fault):
         return False
-    if source.date != (entry.date if entry.date_source == 'manifest' else ''):
+    row = entry.row
+    if source.date != (row['date'] if row['date_source'] == 'manifest' else ''):
         return False
-    parameters = recipe.parameters_of(source.serial or entry.serial, source.date or entry.date,
-                                      source.params)
+    parameters = recipe.parameters_of(source.serial or row['serial'] or '',
+                                      source.date or row['date'] or '', source.params)
     return recipe.digest(parameters, source.serial) == entry.digest
 
 
 def _expected_s(count: int, size_bytes: int, recipe: Recipe, results: Results) -> float:
     """Return the expected run time on one core, s: by earlier rows, else by usual times."""
-    earlier = [entry for entry in results.newest.values()
-               if entry.tasks == recipe.tasks and entry.outcome == 'done' and entry.size_bytes]
-    read = sum(entry.size_bytes for entry in earlier)
-    if read:
-        return size_bytes * sum(entry.seconds for entry in earlier) / read
+    earlier = [row for _, _, _, row in results.newest.values()
+               if row['tasks'] == [*recipe.tasks] and row['outcome'] == 'done']
+    if read := sum(row['size_bytes'] for row in earlier):
+        return size_bytes * sum(row['seconds'] for row in earlier) / read
     return sum(_SECONDS[name][0] * count + _SECONDS[name][1] * size_bytes / 1e9
                for name in recipe.tasks)
 
 
-def work(pool: Executor, sources: Sequence[Source], recipe: Recipe, results: Results,
+def work(pool: Pool, sources: Sequence[Source], recipe: Recipe, results: Results,
          retries: int, show: Callable[[float], None]) -> Iterator[Row]:
     """Work on recordings, and write each row as soon as it is there."""
-    failed = {url for url, entry in results.newest.items() if entry.outcome != 'done'}
+    failed = {url for url, entry in results.newest.items() if entry.row['outcome'] != 'done'}
     tasks = ((source, source.url in failed) for source in sources)
     for count, end in enumerate(finished_tasks(pool, make_row, tasks, retries), 1):
         show(count / len(sources))
@@ -243,15 +234,15 @@ def _written(end: Finished, recipe: Recipe, results: Results) -> Row:
     error = end.error
     if isinstance(error, UserError):
         raise error
-    if isinstance(error, TaskCrashed):
+    if error is None:
+        result = end.value
+    elif isinstance(error, TaskCrashed):
         result = error.args[0]
     elif isinstance(error, StagingError):
         result = refused(recipe, source, one_line(error).removeprefix(f'{source.url}: '))
-    elif error is not None:
-        reason = f'{type(error).__name__}: {one_line(error)}'
-        result = refused(recipe, source, f'{reason} ({end.attempts} attempts)', 'crashed')
     else:
-        result = end.value
+        result = refused(recipe, source, f'{type(error).__name__}: {one_line(error)} '
+                         f'({end.attempts} attempts)', 'crashed')
     # What a row costs in this run need not be what its tasks took.
     spent = {name: result.row[name] for name in _COST}
     if result.is_known:
@@ -267,6 +258,6 @@ def _written(end: Finished, recipe: Recipe, results: Results) -> Row:
 def since_text(text: str) -> str:
     """Return the date of --since, ISO 8601 in UTC; raise `UserError` for another text."""
     date = as_date(text)
-    if date is None:
+    if not date:
         raise UserError(f'--since {text}: expected a date, for example 2026-11-01')
     return date

@@ -10,7 +10,7 @@ first, and the copy is hashed. A recording that changes meanwhile is refused.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, ExitStack, suppress
 import fcntl
 import os
 from pathlib import Path
@@ -23,8 +23,8 @@ from adxl_ros.files.calibration_store import sha256
 from adxl_ros.fleet import inputs
 from adxl_ros.fleet.inputs import Source
 
-_SPARE_BYTES = 64 << 20
-"""Space that stays free, byte. Chosen: a task writes some MB."""
+_SPARE_MB = 64
+"""Space that stays free, MB. Chosen: a task writes some MB."""
 
 
 class StagingError(Exception):
@@ -40,40 +40,33 @@ class Staged(NamedTuple):
 
 
 @contextmanager
-def temporary_folder() -> Iterator[Path]:
-    """Yield an empty folder; those that killed workers left behind, unlocked, are removed."""
-    root = Path(tempfile.gettempdir(), f'adxl_ros_fleet_{os.getuid()}')
-    lock = None
-    try:
-        root.mkdir(mode=0o700, exist_ok=True)
-        root_lock = _lock(root, fcntl.LOCK_EX)
-        try:
-            for left in root.iterdir():
-                with suppress(OSError):
-                    os.close(_lock(left, fcntl.LOCK_EX | fcntl.LOCK_NB))
-                    shutil.rmtree(left)
-            folder = Path(tempfile.mkdtemp(dir=root))
-            lock = _lock(folder, fcntl.LOCK_EX)
-        finally:
-            os.close(root_lock)
-    except OSError as error:
-        raise StagingError(f'{root}: no temporary folder: {error.strerror}') from None
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-        os.close(lock)
-
-
-def _lock(folder: Path, how: int) -> int:
-    """Lock a folder as long as this process lives, or until the descriptor is closed."""
+def locked(folder: Path, how: int = fcntl.LOCK_EX) -> Iterator[None]:
+    """Lock a folder as long as the block, or this process, lasts; raise `OSError` if it cannot."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(descriptor, how)
-    except BaseException:
+        yield
+    finally:
         os.close(descriptor)
-        raise
-    return descriptor
+
+
+@contextmanager
+def temporary_folder() -> Iterator[Path]:
+    """Yield an empty folder; those that killed workers left behind, unlocked, are removed."""
+    root = Path(tempfile.gettempdir(), f'adxl_ros_fleet_{os.getuid()}')
+    with ExitStack() as stack:
+        try:
+            root.mkdir(mode=0o700, exist_ok=True)
+            with locked(root):
+                for left in root.iterdir():
+                    with suppress(OSError), locked(left, fcntl.LOCK_EX | fcntl.LOCK_NB):
+                        shutil.rmtree(left)
+                folder = Path(stack.enter_context(
+                    tempfile.TemporaryDirectory(dir=root, ignore_cleanup_errors=True)))
+                stack.enter_context(locked(folder))
+        except OSError as error:
+            raise StagingError(f'{root}: no temporary folder: {error.strerror}') from None
+        yield folder
 
 
 def stage(source: Source, folder: Path) -> Staged:
@@ -87,19 +80,19 @@ def stage(source: Source, folder: Path) -> Staged:
     if before.fault:
         error = UserError if before.fault == inputs.NO_FILE else StagingError
         raise error(f'{url}: {before.fault}')
-    free = shutil.disk_usage(folder).free
-    if (before.size_bytes or 0) + _SPARE_BYTES > free:
-        raise StagingError(f'{url}: needs {(before.size_bytes or 0) / 1e6:.3g} MB beside '
-                           f'{_SPARE_BYTES / 1e6:.3g} MB that stay free, but '
-                           f'{tempfile.gettempdir()} has {free / 1e6:.3g} MB free; set TMPDIR to '
-                           'a larger disk')
-    target = _inside(folder, inputs.file_name(path), url)
+    size_mb, free_mb = (before.size_bytes or 0) / 1e6, shutil.disk_usage(folder).free / 1e6
+    if size_mb + _SPARE_MB > free_mb:
+        raise StagingError(f'{url}: needs {size_mb:.3g} MB beside {_SPARE_MB} MB that stay free, '
+                           f'but {tempfile.gettempdir()} has {free_mb:.3g} MB free; set TMPDIR '
+                           'to a larger disk')
+    target = folder / inputs.file_name(path)
     try:
         # A web server answers `isdir` with the whole file.
         is_folder = fs.info(path)['type'] == 'directory'
         for name in fs.find(path) if is_folder else [path]:
-            copy = _inside(target, name.removeprefix(path).lstrip('/'), url) if is_folder \
-                else target
+            copy = target / name.removeprefix(path).lstrip('/') if is_folder else target
+            if folder not in copy.parents or '..' in copy.parts:
+                raise UserError(f'{url}: {name!r} leads outside of its folder')
             copy.parent.mkdir(parents=True, exist_ok=True)
             fs.get_file(name, str(copy))
     except UserError:
@@ -116,11 +109,3 @@ def stage(source: Source, folder: Path) -> Staged:
             before.size_bytes not in (None, size_bytes):
         raise StagingError(f'{url}: changed while it was read; is it still being written?')
     return Staged(target, sha256([target]), size_bytes)
-
-
-def _inside(folder: Path, name: str, url: str) -> Path:
-    """Return the path of a copy, which must not lie elsewhere."""
-    path = folder / name
-    if path == folder or folder not in path.parents or '..' in path.parts:
-        raise UserError(f'{url}: {name!r} leads outside of its folder')
-    return path

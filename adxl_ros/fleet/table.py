@@ -8,9 +8,10 @@ Each quantity has trends, a population and outliers.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import os
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.fleet.populations import (
@@ -20,13 +21,12 @@ from adxl_ros.fleet.populations import (
     random_effects,
     RandomEffects,
 )
+from adxl_ros.fleet.row import NOISE
 from adxl_ros.fleet.trends import claims, fit_trends, interval_factor, outliers, Recordings, Trends
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.report.quantities import number
 import numpy as np
-
-if TYPE_CHECKING:
-    import pandas as pd
+import pandas as pd
 
 _TEXTS = ['url', 'hash', 'serial', 'outcome', 'refusal', 'refused_by', 'calibration_id', 'status',
           'report', 'version']
@@ -145,12 +145,10 @@ def quantities(table: FleetTable | None) -> tuple[Quantity, ...]:
             Quantity(f'scale_{axis}_v_per_g', f'scale factor {axis}', 'V/g', 'mg/g', mg_per_v,
                      (f'scale_std_{axis}_v_per_g',))]
     listed += [
-        Quantity(f'noise_{letter}_{axis}_{name}', f'{label} {axis}', f'm/s²{per}', f'µg{per}',
-                 1e6 / G0_MPS2, (f'noise_{letter}_low_{axis}_{name}',
-                                 f'noise_{letter}_high_{axis}_{name}'))
-        for axis in AXES for letter, label, name, per in (
-            ('n', 'white noise', 'mps2_per_rthz', '/√Hz'), ('b', 'bias instability', 'mps2', ''),
-            ('k', 'random walk', 'mps2_per_rts', '/√s'))]
+        Quantity(f'noise_{letter}_{axis}_{name}', f'{label[:-2]} {axis}', unit,
+                 unit.replace('m/s²', 'µg'), 1e6 / G0_MPS2,
+                 tuple(f'noise_{letter}_{end}_{axis}_{name}' for end in ('low', 'high')))
+        for axis in AXES for letter, label, name, unit in NOISE]
     return tuple(listed)
 
 
@@ -222,3 +220,21 @@ def _population(trends: Trends, batch: BadBatch | None, tests: int) -> RandomEff
     is_far_out = batch.members.copy()
     is_far_out[others] = of_others.is_far_out
     return RandomEffects(of_others.pooled, trends.level, trends.level_std, is_far_out)
+
+
+class FarOut(NamedTuple):
+    """A unit that is not of the population."""
+
+    serial: str
+    quantity: Quantity
+    value: float
+    distance: float  # Distance from the mean, standard deviations
+
+
+def far_out(results: Sequence[QuantityResult], serials: Sequence[str]) -> list[FarOut]:
+    """Return the units that are not of the population, the farthest first."""
+    units = [FarOut(serials[result.units[i]], result.quantity,
+                    float(result.population.estimates[i]), float(result.population.distances()[i]))
+             for result in results if result.population is not None
+             for i in np.flatnonzero(result.population.is_far_out)]
+    return sorted(units, key=lambda unit: -abs(unit.distance))

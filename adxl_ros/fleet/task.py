@@ -9,11 +9,12 @@ other. A task that refuses leaves its reason. What a recording does not hold is 
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 import json
 import os
 from pathlib import Path
+from resource import getrusage, RUSAGE_SELF
 import shlex
 from time import monotonic
 import traceback
@@ -23,15 +24,23 @@ from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import recorded_unit, Recording
 from adxl_ros.files.stream_info import NO_UNIT
-from adxl_ros.files.tables import NoNumbers
 from adxl_ros.fleet.inputs import begin_of, is_manifest, Source
-from adxl_ros.fleet.recipe import age_days, code_version, ParameterText, Recipe, sha256_of
-from adxl_ros.fleet.row import empty_row, finite, Row
+from adxl_ros.fleet.row import (
+    age_days,
+    code_version,
+    empty_row,
+    finite,
+    NOISE,
+    ParameterText,
+    Recipe,
+    Row,
+    sha256_of,
+)
 from adxl_ros.fleet.staging import stage, Staged, temporary_folder
 from adxl_ros.model.coefficients import get, parameter_of
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.package_version import package_version
+from adxl_ros.process import package_version
 from adxl_ros.signals.axis_noise import recording_noise
 from adxl_ros.signals.findings import BLOCK_ROWS, check_recording, Findings
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
@@ -66,9 +75,6 @@ def make_row(recipe: Recipe, earlier: frozenset[str], source: Source, is_again: 
                         f'({code_version()[:12]}, the client has {recipe.code[:12]}); install the '
                         'same on all')
     begin_s = monotonic()
-    with suppress(OSError):
-        # Linux then measures the largest memory of this process from here on.
-        Path('/proc/self/clear_refs').write_text('5', encoding='ascii')
     try:
         if source.fault:
             raise UserError(f'{source.url}: {source.fault}')
@@ -78,8 +84,8 @@ def make_row(recipe: Recipe, earlier: frozenset[str], source: Source, is_again: 
         result = refused(recipe, source, one_line(error).removeprefix(f'{source.url}: '))
     row = result.row
     row |= {name: finite(value) for name, value in row.items() if isinstance(value, float)}
-    row |= {'seconds': round(monotonic() - begin_s, 6), 'memory_mb': _peak_mb(),
-            'worker': worker}
+    row |= {'seconds': round(monotonic() - begin_s, 6), 'worker': worker,
+            'memory_mb': getrusage(RUSAGE_SELF).ru_maxrss / 1024}
     if row['outcome'] == 'crashed':
         raise TaskCrashed(result)
     return result
@@ -103,16 +109,13 @@ def _in_folder(recipe: Recipe, source: Source, earlier: frozenset[str], folder: 
     try:
         first = next(recording.blocks(
             staged.path, 1, replace(recipe.reading, drop_bad_stamps=True)), None)
-    except NoNumbers as error:
-        fault = f'{one_line(error)}; a manifest needs a column url'
     except UserError as error:
         fault = one_line(error)
     recorded = first.stream_info.serial if first else NO_UNIT
     is_other = bool(source.serial) and recorded not in (NO_UNIT, '', source.serial)
     serial = source.serial or recorded
-    date = (source.date, 'manifest') if source.date else \
-        begin_of(first) if first is not None else ('', '')
-    date = date if date[0] else (source.modified, 'file')
+    dates = ((source.date, 'manifest'), begin_of(first) if first else ('', ''))
+    date = next((date for date in dates if date[0]), (source.modified, 'file'))
     parameters = recipe.parameters_of(serial, date[0], source.params)
     digest = recipe.digest(parameters, source.serial)
     # Which of both units it is of is not known.
@@ -159,7 +162,6 @@ class _Job:
     params: str | None  # Path of the parameter file; None for the nominal sensor
     row: Row
     files: dict[str, bytes] = field(default_factory=dict)
-    _read: Recording | None = None
 
     def run(self) -> None:
         """Run the tasks. One that does not fit the recording is skipped, unless all are."""
@@ -236,13 +238,11 @@ class _Job:
             beyond = float(np.max(envelope.beyond_k(np.array([low, high]))))
             row['validity'] = f'outside: temperature by {beyond:.3g} K' if beyond > 0 else 'valid'
 
+    @cached_property
     def _recording(self) -> Recording:
-        """Return the whole recording."""
-        if self._read is None:
-            read = recording.read(self.staged.path, self.recipe.reading)
-            # Reports name the recording, and not its copy.
-            self._read = replace(read, path=self.source.url)
-        return self._read
+        """Return the whole recording; reports name it, and not its copy."""
+        return replace(recording.read(self.staged.path, self.recipe.reading),
+                       path=self.source.url)
 
     def _noise(self) -> None:
         """Find the noise of the longest rest."""
@@ -250,19 +250,16 @@ class _Job:
             lambda: recording.blocks(self.staged.path, BLOCK_ROWS, self.recipe.reading),
             self.params)
         for noise in result.axes:
-            for letter, unit, estimate in zip('nbk', ('mps2_per_rthz', 'mps2', 'mps2_per_rts'),
-                                              noise.estimates):
-                self.row |= {
-                    f'noise_{letter}_{noise.axis}_{unit}':
-                        estimate.value if estimate.is_seen else None,
-                    f'noise_{letter}_low_{noise.axis}_{unit}': estimate.low,
-                    f'noise_{letter}_high_{noise.axis}_{unit}': estimate.high}
+            for (letter, _, unit, _), estimate in zip(NOISE, noise.estimates):
+                values = (estimate.value if estimate.is_seen else None, estimate.low,
+                          estimate.high)
+                self.row |= {f'noise_{letter}{end}_{noise.axis}_{unit}': value
+                             for end, value in zip(('', '_low', '_high'), values)}
 
     def _fit(self) -> None:
         """Fit a calibration to the recording alone."""
-        # A worker imports what its tasks need, and the client none of it.
-        from adxl_ros.calibrate import calibration, pose_extraction
-        read = self._recording()
+        from adxl_ros.calibrate import calibration, pose_extraction  # the client needs none
+        read = self._recording
         sensor, _ = measure_unstated(load_sensor(self.params, read), read)
         unit = recorded_unit(sensor, read)
         poses = pose_extraction.extract_poses(read, unit, None)
@@ -288,15 +285,15 @@ class _Job:
         from adxl_ros.diagnose import page
         from adxl_ros.diagnose.diagnosis import diagnose
         from adxl_ros.diagnose.report import as_json
-        read = self._recording()
+        read = self._recording
         sensor, _ = measure_unstated(load_sensor(self.params, read), read)
         diagnosis = diagnose([read], sensor)
         report = as_json(diagnosis)
         self._put_verdict(diagnosis, report)
         self.files['report.json'] = json.dumps(report, indent=1, allow_nan=False).encode()
-        parameters = '' if diagnosis.report is None else \
-            parameter_file.as_text(diagnosis.report.sensor, [report['summary']])
-        if parameters:
+        parameters = ''
+        if diagnosis.report is not None:
+            parameters = parameter_file.as_text(diagnosis.report.sensor, [report['summary']])
             self.files['params.yaml'] = parameters.encode('utf-8')
         if report['verdict']['status'] in _PAGES:
             params = ['--params', self.parameters.name] if self.parameters.text else []
@@ -315,9 +312,9 @@ class _Job:
         self.row['gap_floor_source'] = gap['floor_source']
         for name, unit in (('before', '_mps2'), ('after', '_mps2'), ('floor', '_mps2'),
                            ('closed', '')):
-            low, high = (gap[name] is not None and gap[f'{name}_ci']) or (None, None)
-            self.row |= {f'gap_{name}{unit}': gap[name], f'gap_{name}_low{unit}': low,
-                         f'gap_{name}_high{unit}': high}
+            interval = (gap[name] is not None and gap[f'{name}_ci']) or (None, None)
+            self.row |= {f'gap_{name}{end}{unit}': value for end, value in zip(
+                ('', '_low', '_high'), (gap[name], *interval))}
         best = diagnosis.report.hypotheses[0]
         self._put_coefficients('diagnose', best.sensor, {
             name: std for name, std, is_open in zip(best.names, best.std, best.undetermined)
@@ -330,12 +327,3 @@ class _Job:
             {'name': str(name), 'unit': parameter_of(name).unit, 'value': finite(value),
              'std': finite(std), 'source': source}
             for (name, std), value in zip(stds.items(), get(sensor, tuple(stds)))]
-
-
-def _peak_mb() -> float | None:
-    """Return the largest memory of this process, MB; None where the system does not state it."""
-    with suppress(OSError, StopIteration):
-        lines = Path('/proc/self/status').read_text(encoding='ascii').splitlines()
-        kilobytes = next(line for line in lines if line.startswith('VmHWM')).split()[1]
-        return round(int(kilobytes) / 1024, 3)
-    return None

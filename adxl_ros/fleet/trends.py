@@ -30,6 +30,7 @@ from dataclasses import dataclass, replace
 from adxl_ros.fleet.populations import moderated
 from adxl_ros.model.constants import MAD_TO_STD
 import numpy as np
+import pandas as pd
 import scipy
 
 FALSE_DISCOVERY_RATE = 0.05
@@ -279,9 +280,5 @@ def outliers(recordings: Recordings, tests: int) -> tuple[np.ndarray, np.ndarray
 
 
 def _medians(label: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """Return the median of the values with each label 0, 1, ..., which are sorted."""
-    order = np.lexsort((value, label))
-    counts = np.bincount(label)
-    starts = np.cumsum(counts) - counts
-    ordered = value[order]
-    return (ordered[starts + (counts - 1) // 2] + ordered[starts + counts // 2]) / 2
+    """Return the median of the values with each label 0, 1, ..."""
+    return pd.Series(value).groupby(label).median().to_numpy()

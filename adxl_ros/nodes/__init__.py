@@ -5,8 +5,7 @@
 from pathlib import Path
 import sys
 
-from adxl_ros.blas_threads import use_one_thread
-from adxl_ros.interrupt import end_silently_while_loading
+from adxl_ros.process import end_silently_while_loading, use_one_thread
 
 end_silently_while_loading()
 use_one_thread()

@@ -21,13 +21,13 @@ from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import acceptance, held_out as unseen
 from adxl_ros.calibrate.report.acceptance import acceptance_lines, error_table
 from adxl_ros.calibrate.report.coefficients import added_effect_lines, compare, truth_table
-from adxl_ros.closed_output import ended_by_closed_output
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording, sweep_journal
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes import jobs
 from adxl_ros.nodes.run_node import program_parser
+from adxl_ros.process import ended_by_closed_output
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 import rclpy

@@ -21,14 +21,13 @@ import sys
 import textwrap
 from typing import Any, NamedTuple
 
-from adxl_ros.closed_output import ended_by_closed_output
 from adxl_ros.errors import UserError
 from adxl_ros.links.support import base
 from adxl_ros.nodes import rclpy_internals
 from adxl_ros.nodes.parameters import check_params_files, Kind, nominal_specs, Spec, specs_of
 from adxl_ros.nodes.settings import DriverSettings, link_specs
 from adxl_ros.nodes.topics import type_name
-from adxl_ros.package_version import package_version
+from adxl_ros.process import ended_by_closed_output, package_version
 import rclpy
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node

@@ -20,7 +20,7 @@ from typing import Any
 from urllib.parse import unquote_plus
 
 from adxl_ros.errors import UserError
-from adxl_ros.package_version import package_version
+from adxl_ros.process import package_version
 from adxl_ros.report.figures import png
 
 _DPI = 100

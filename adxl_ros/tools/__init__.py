@@ -2,6 +2,6 @@
 
 """The command-line tools: arguments, progress and messages."""
 
-from adxl_ros.blas_threads import use_one_thread
+from adxl_ros.process import use_one_thread
 
 use_one_thread()

@@ -20,7 +20,6 @@ import textwrap
 from types import FrameType
 from typing import Any, Protocol, TYPE_CHECKING
 
-from adxl_ros.closed_output import ended_by_closed_output
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
 from adxl_ros.files.column_mapping import (
@@ -34,6 +33,7 @@ from adxl_ros.model import coefficients
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Effect
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.process import ended_by_closed_output
 from adxl_ros.report.quantities import column_unit
 from adxl_ros.report.screen import COLUMNS, end_lines, entry_list, NextStep
 import numpy as np
@@ -60,7 +60,7 @@ class _ShowVersion(argparse.Action):
 
     def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
                  values: Any, option_string: str | None = None) -> None:
-        from adxl_ros.package_version import package_version
+        from adxl_ros.process import package_version
         print(f'adxl_ros {package_version()}')
         parser.exit()
 

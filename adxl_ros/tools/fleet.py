@@ -16,8 +16,7 @@ from adxl_ros.errors import install_hint, UserError
 from adxl_ros.files import calibration_store
 from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.fleet.inputs import find_sources, stated_by
-from adxl_ros.fleet.recipe import make_recipe, Recipe, task_names, TASKS
-from adxl_ros.fleet.row import reason_kind, Row
+from adxl_ros.fleet.row import make_recipe, reason_kind, Recipe, Row, task_names, TASKS
 from adxl_ros.fleet.run import only_client, Plan, plan, Results, Selection, since_text, work
 from adxl_ros.report.page import as_utf_8, without_secrets
 from adxl_ros.report.quantities import counted, duration, file_size
@@ -67,8 +66,8 @@ def parser() -> argparse.ArgumentParser:
     pool.add_argument('--jobs', metavar='N', type=int,
                       help='processes of this machine (default: one for each core)')
     parse.add_argument('--retries', metavar='N', type=int, default=RETRIES,
-                       help='further attempts where a task crashes or its worker ends; more '
-                            'where workers end at random (default: %(default)s)')
+                       help='further attempts where a task crashes or its worker ends '
+                            '(default: %(default)s)')
     parse.add_argument('--only-failed', action='store_true',
                        help='repeat the recordings that were refused or crashed, no others')
     parse.add_argument('--since', metavar='DATE', default='',
@@ -140,7 +139,7 @@ def _check(options: argparse.Namespace) -> None:
 
 def _warn_of_replaced(to_do: Plan, results: Results, tasks: Sequence[str]) -> None:
     """Warn where rows of other tasks leave table and page, as a recording has one row there."""
-    before = [results.newest[source.url].tasks for source in to_do.todo
+    before = [results.newest[source.url].row['tasks'] for source in to_do.todo
               if source.url in results.newest]
     missing = [name for name in TASKS
                if name not in tasks and any(name in earlier for earlier in before)]

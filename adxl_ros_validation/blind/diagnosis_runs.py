@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
@@ -21,7 +20,7 @@ from typing import Any
 
 import adxl_ros
 from adxl_ros.errors import UserError
-from adxl_ros.workers import for_each, make_folder, write
+from adxl_ros.workers import for_each, make_folder, Pool, write
 from adxl_ros_validation.blind import trials
 from adxl_ros_validation.blind.trials import Label
 from adxl_ros_validation.blind.world import ideal_observer
@@ -73,28 +72,23 @@ def diagnose(name: str, recording: bytes, parameters: bytes, sim: bytes | None =
             if data is not None:
                 (folder / f'{name}{suffix}').write_bytes(data)
                 os.utime(folder / f'{name}{suffix}', (0, 0))
-        start, cpu = time.monotonic(), _children_cpu_s()
+        start, used = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
         status, error = call(
             folder, 'diagnose', f'{name}.csv', '--params', f'{name}.yaml', '-o', 'out', '--json',
             '--seed', '0', *(['--sim', f'{name}_sim.csv'] if sim else []))
-        seconds, cpu = time.monotonic() - start, _children_cpu_s() - cpu
+        seconds, now = time.monotonic() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
         params = folder / 'out' / 'params.yaml'
         try:
             content = json.loads(params.with_name('report.json').read_bytes())
         except (OSError, ValueError) as problem:
             content, error = None, error or f'no report: {problem}'
-        return name, {'report': content, 'seconds': seconds, 'cpu_s': cpu,
+        return name, {'report': content, 'seconds': seconds,
+                      'cpu_s': now.ru_utime - used.ru_utime + now.ru_stime - used.ru_stime,
                       'status': status, 'error': error,
                       'parameters': params.read_text() if params.exists() else None}
 
 
-def _children_cpu_s() -> float:
-    """Return the processor time of all ended children; of one diagnosis in a worker process."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
-
-
-def diagnose_all(folder: Path, pool: Executor, show: Callable[[float], None]
+def diagnose_all(folder: Path, pool: Pool, show: Callable[[float], None]
                  ) -> dict[str, Result]:
     """Diagnose all recordings of a folder that have no report yet."""
     reports, recordings = make_folder(folder / 'reports'), folder / 'recordings'
@@ -121,7 +115,7 @@ def diagnose_all(folder: Path, pool: Executor, show: Callable[[float], None]
 
 
 def kept(folder: Path, names: Sequence[str], work: Callable[..., tuple[str, Any]],
-         job: Callable[[str], tuple], pool: Executor, show: Callable[[float], None]
+         job: Callable[[str], tuple], pool: Pool, show: Callable[[float], None]
          ) -> dict[str, Any]:
     """Do the work that has no result in a folder yet, and return all results by name."""
     def keep(name: str, result: Any) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 from adxl_ros_validation.blind import trials
 from adxl_ros_validation.blind.trials import Label
 from adxl_ros_validation.blind.world.faults import KNOWN
-from adxl_ros_validation.blind.world.simulator import G0, Unit
+from adxl_ros_validation.blind.world.simulator import G0
 import numpy as np
 
 UNKNOWN = 'unknown'
@@ -116,7 +116,11 @@ def verdict_right(answer: Answer, label: Label) -> bool:
     accepted = right(label, answer.material_mps2)
     if answer.status == 'partly':
         accepted = [effects - {UNKNOWN} for effects in accepted if effects - {UNKNOWN}]
-    return any(_matches(answer, effects) for effects in accepted)
+    # One effect of each group is left, in some order.
+    return any(all(name in group for name, group in zip(order, answer.groups))
+               for effects in accepted if answer.certain <= effects
+               and len(effects - answer.certain) == len(answer.groups)
+               for order in permutations(effects - answer.certain))
 
 
 def limit_holds(answer: Answer, label: Label) -> bool | None:
@@ -134,15 +138,6 @@ def limit_holds(answer: Answer, label: Label) -> bool | None:
 def material(answer: Answer, label: Label) -> bool:
     """Return whether every effect of a trial is material."""
     return all(fault['strength_mps2'] >= answer.material_mps2 for fault in label.faults)
-
-
-def _matches(answer: Answer, effects: frozenset[str]) -> bool:
-    if not answer.certain <= effects:
-        return False
-    rest = effects - answer.certain
-    return len(rest) == len(answer.groups) and any(
-        all(name in group for name, group in zip(order, answer.groups))
-        for order in permutations(rest))
 
 
 def separable(label: Label) -> bool:
@@ -197,25 +192,19 @@ def true_parameters(label: Label) -> dict[str, float]:
         true |= {f'{name}.{part}': float(factor * w[i] + (0 if own is None else
                                                           unit.stage_rad[own]))
                  for part, i, factor, own in _PARAMETERS.get(name, ()) if i < len(w)}
-        true |= {f'{name}.{part}.{axis}': float(value)
-                 for part, values in _by_axis(name, unit, w).items()
-                 for axis, value in zip(unit.axes, values)}
+        m = w[:len(unit.axes)]
         if name == 'mount_resonance':
             true['mount_resonance.frequency_hz'] = fault['shape']['hertz']
+        elif name in ('bias', 'scale_factor', 'noise_excess'):
+            part, values = {
+                'bias': ('offset_v', unit.zero_v + m * unit.scale_v_per_g - 2.5),
+                'scale_factor': ('offset_v_per_g', unit.scale_v_per_g * (1 + m) - 1.0),
+                'noise_excess': ('ratio', np.hypot(
+                    unit.noise_g_per_rthz, m / unit.scale_v_per_g / _NOISE_BAND_HZ ** 0.5)
+                    / unit.stated_noise_g_per_rthz - 1)}[name]
+            true |= {f'{name}.{part}.{axis}': float(value)
+                     for axis, value in zip(unit.axes, values)}
     return true
-
-
-def _by_axis(name: str, unit: Unit, w: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the true values of a parameter that each axis has."""
-    w = w[:len(unit.axes)]
-    if name == 'bias':
-        return {'offset_v': unit.zero_v + w * unit.scale_v_per_g - 2.5}
-    if name == 'scale_factor':
-        return {'offset_v_per_g': unit.scale_v_per_g * (1 + w) - 1.0}
-    if name == 'noise_excess':
-        noise = np.hypot(unit.noise_g_per_rthz, w / unit.scale_v_per_g / _NOISE_BAND_HZ ** 0.5)
-        return {'ratio': noise / unit.stated_noise_g_per_rthz - 1}
-    return {}
 
 
 COMPONENTS = (*KNOWN, UNKNOWN)

@@ -10,7 +10,6 @@ rest (the baseline) is there already, and no error.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 import hashlib
@@ -21,13 +20,13 @@ import tempfile
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.workers import make_folder, write
+from adxl_ros.workers import make_folder, Pool, write
 from adxl_ros_validation.blind import (
+    check,
     diagnosis_runs,
     grading,
     report_html,
     scores,
-    sealing,
     trials,
 )
 from adxl_ros_validation.blind.diagnosis_runs import Show
@@ -89,15 +88,20 @@ class Half:
     noise_mps2: float  # rms of the noise of one sample
 
     @property
+    def samples(self) -> dict[str, tuple[float, float]]:
+        """Return the columns of samples, each with the value at 0 g and the step of 1 g."""
+        return {name: scale for d in 'xyz' for name, scale in (
+            (f'a{d}_mps2', (0.0, G0)), (f'{d}_v', (_ZERO_V, 1.0))) if name in self.columns}
+
+    @property
     def axes(self) -> str:
         """Return the measured axes."""
-        return ''.join(d for d in 'xyz' if f'a{d}_mps2' in self.columns
-                       or f'{d}_v' in self.columns)
+        return ''.join(name.lstrip('a')[0] for name in self.samples)
 
     def g(self) -> np.ndarray:
         """Return the samples, g, (m, n); volts by 2.5 V and 1 V/g."""
-        return np.stack([self.columns[f'a{d}_mps2'] / G0 if f'a{d}_mps2' in self.columns
-                         else self.columns[f'{d}_v'] - _ZERO_V for d in self.axes])
+        return np.stack([(self.columns[name] - zero) / step
+                         for name, (zero, step) in self.samples.items()])
 
     def texts(self) -> tuple[str, str, str | None]:
         """Return recording, parameters and another simulator's force as texts of files."""
@@ -114,10 +118,10 @@ class Half:
     def kinds(self) -> list[str]:
         """Return the defects that can be put into its samples and shown by its reference."""
         warm = self.columns.get('temperature_c', np.zeros(1))
-        out = set(_NO_PLACE)
-        out |= set() if np.ptp(warm) > 3 else _OF_TEMPERATURE
-        out |= _OF_MOTION if self.reference == 'rests' else set()
-        out |= _OF_FORCE | _OF_MOTION if np.std(self.g(), axis=1).max() < _STILL_G else set()
+        is_still = np.std(self.g(), axis=1).max() < _STILL_G
+        out = _NO_PLACE.union(() if np.ptp(warm) > 3 else _OF_TEMPERATURE,
+                              _OF_MOTION if is_still or self.reference == 'rests' else (),
+                              _OF_FORCE if is_still else ())
         return [name for name, kind in KINDS.items() if name not in out and (
             kind.place not in (Place.STAGE, Place.MOUNT) or name in _OF_MOTION)]
 
@@ -143,20 +147,17 @@ def _sources(source: Path) -> list[tuple[Path, Path | None, str]]:
     """List recordings, each with another simulator's force (NAME_sim.csv), and SHA-256."""
     if not source.exists():
         raise UserError(f'{source}: no such file or folder')
-    if source.is_dir():
-        paths = [(path, '') for path in sorted(source.glob('*.csv'))
-                 if not path.stem.endswith('_sim')]
-    else:
-        try:
-            rows = yaml.safe_load(source.read_text(encoding='utf-8'))['recordings']
-            paths = [(source.parent / row['file'], row.get('sha256', '')) for row in rows]
-        except (OSError, UnicodeError, yaml.YAMLError, KeyError, TypeError) as error:
-            raise UserError(f'{source}: no folder, and no manifest: {error}') from None
-    out = []
-    for path, digest in paths:
-        sim = path.with_name(path.stem.removesuffix('_real') + '_sim.csv')
-        out.append((path, sim if sim.exists() else None, digest))
-    return out
+    try:
+        rows = [{'file': path.name} for path in sorted(source.glob('*.csv'))
+                if not path.stem.endswith('_sim')] if source.is_dir() else \
+            yaml.safe_load(source.read_text(encoding='utf-8'))['recordings']
+        folder = source if source.is_dir() else source.parent
+        paths = [(folder / row['file'], row.get('sha256', '')) for row in rows]
+    except (OSError, UnicodeError, yaml.YAMLError, KeyError, TypeError) as error:
+        raise UserError(f'{source}: no folder, and no manifest: {error}') from None
+    sims = [path.with_name(path.stem.removesuffix('_real') + '_sim.csv') for path, _ in paths]
+    return [(path, sim if sim.exists() else None, digest)
+            for (path, digest), sim in zip(paths, sims)]
 
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, int]]:
@@ -200,7 +201,13 @@ def _half(path: Path, sim_path: Path | None) -> Half:
             (folder / f'{name}.csv').write_text(half.texts()[0])
         second = replace(second, parameters=_fitted(folder, 'temperature_c' in columns))
         if kind == 'rests':
-            angles = _angles_at_rest(_applied(folder), second.columns['time_s'])
+            status, error = diagnosis_runs.call(folder, 'apply', 'second.csv', '--params',
+                                                'unit.yaml', '-o', 'force.csv')
+            if status:
+                raise UserError(error)
+            applied = _read(folder / 'force.csv')[0]
+            angles = _angles_at_rest(np.stack([applied[f'a{d}_mps2'] for d in 'xyz']),
+                                     second.columns['time_s'])
             second = replace(second, columns={**second.columns, **angles},
                              digits={**digits, 'alpha_rad': 7, 'beta_rad': 7})
     return second
@@ -231,16 +238,6 @@ def _against_force(first: Half) -> str:
         replace(unit, stated_zero_v=zero, stated_scale_v_per_g=scale,
                 stated_noise_g_per_rthz=density, resolution_rad=1e-3),
         'unit', nominal_zero_v=0.0, is_certain=True, adc_bits=0, adc_vref_v=100.0, range_g=16.0)
-
-
-def _applied(folder: Path) -> np.ndarray:
-    """Return the calibrated force of the later part, m/s², (3, n)."""
-    status, error = diagnosis_runs.call(folder, 'apply', 'second.csv', '--params', 'unit.yaml',
-                                        '-o', 'force.csv')
-    if status:
-        raise UserError(error)
-    columns = _read(folder / 'force.csv')[0]
-    return np.stack([columns[f'a{d}_mps2'] for d in 'xyz'])
 
 
 def _angles_at_rest(force: np.ndarray, t: np.ndarray) -> dict[str, np.ndarray]:
@@ -312,10 +309,8 @@ def draw(halves: Sequence[Half], plan: Plan) -> Drawn:
             partial(_with_fault, half, plan.seed),
             Fault(kind, kind.start, kind.draw(rng, half.unit())), wanted)
         faults.append(trials.described(fault, strength))
-    columns = dict(half.columns)
-    for d, row in zip(half.axes, changed):
-        columns |= {f'a{d}_mps2': G0 * row} if f'a{d}_mps2' in columns else {
-            f'{d}_v': row + _ZERO_V}
+    columns = half.columns | {name: step * row + zero for (name, (zero, step)), row in zip(
+        half.samples.items(), changed)}
     return Drawn(Label(**asdict(plan), manoeuvre=f'{half.name} by {half.reference}',
                        axes=half.axes, floor_mps2=half.noise_mps2, faults=faults),
                  *replace(half, columns=columns).texts())
@@ -349,30 +344,26 @@ def _with_fault(half: Half, seed: tuple[int, ...], fault: Fault) -> tuple[float,
     if run.late or run.skew:
         run.volts = np.stack([np.interp(t - run.late_s(t), t, row) for row in run.volts])
     after = run.volts - _ZERO_V
-    return _strength(half, after - before, fault.kind.name), after
-
-
-def _strength(half: Half, change: np.ndarray, name: str) -> float:
-    """Return the rms of a change where the reference is known; zero-g and scale are free."""
+    # The rms counts where the reference is known; zero-g and scale factor are free.
     known = ~np.isnan(half.columns['alpha_rad']) if half.reference == 'rests' else slice(None)
-    rest, force = G0 * change[:, known], half.g()[:, known]
-    if name not in ('bias', 'scale_factor'):
-        for row, along in zip(rest, force):
+    rest = G0 * (after - before)[:, known]
+    if fault.kind.name not in ('bias', 'scale_factor'):
+        for row, along in zip(rest, before[:, known]):
             zero, scale = ideal_observer.line(along, row)
             row -= zero + scale * along
-    return ideal_observer.rms(rest)
+    return ideal_observer.rms(rest), after
 
 
-def seal(folder: Path, source: Path, seed: int | None, count: int, pool: Executor, show: Show
+def seal(folder: Path, source: Path, seed: int | None, count: int, pool: Pool, show: Show
          ) -> str:
     """Draw the trials of a folder or manifest into a folder; return the published hash."""
-    base, digest = folder / 'baseline' / 'recordings', sealing.published_hash(folder)
+    base, digest = folder / 'baseline' / 'recordings', check.published_hash(folder)
     if digest is not None and base.exists():
         return digest
     with show('first parts'):
         halves, left_out = prepare(source)
     with show('draw') as advance:
-        digest = sealing.seal(folder, seed, count, partial(plans, halves), partial(draw, halves),
+        digest = check.seal(folder, seed, count, partial(plans, halves), partial(draw, halves),
                               pool, advance)
     write(folder / 'left_out.json', json.dumps(left_out).encode())
     make_folder(base)
@@ -392,35 +383,33 @@ def right(answer: Answer, base: Answer, label: Label) -> tuple[bool, bool]:
     """
     if answer.status in ('failed', 'insufficient', 'bad_data'):
         return False, False
-    known = base.named
-    new = answer.certain - known
-    groups = [group for group in answer.groups if not group & known]
-    if label.group == 'outside':
-        found = answer.status == 'partly' or UNKNOWN in answer.named
-        exact = found and not (new - {UNKNOWN}) and not groups
-    else:
-        truth = frozenset(label.true)
-        found = truth <= answer.named
-        exact = truth <= answer.certain and not new - truth and not groups
-    small = label.faults and not grading.material(answer, label)
-    if small and not new and not groups:
+    truth, new = grading.truth(label), answer.certain - base.named
+    groups = [group for group in answer.groups if not group & base.named]
+    if not new and not groups and not grading.material(answer, label):
         return True, True
-    return exact, found
+    if label.group == 'outside':
+        found = certain = answer.status == 'partly' or UNKNOWN in answer.named
+    else:
+        found, certain = truth <= answer.named, truth <= answer.certain
+    return certain and not new - truth and not groups, found
 
 
-def score(folder: Path, pool: Executor, show: Show) -> dict[str, Any]:
+def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
     """Diagnose what has no report yet, compare labels with the hash, and score."""
     with show('untouched') as advance:
         untouched = diagnosis_runs.diagnose_all(folder / 'baseline', pool, advance)
     with show('diagnose') as advance:
         results = diagnosis_runs.diagnose_all(folder, pool, advance)
-    setup, labels = sealing.committed_labels(folder)
+    setup, labels = check.committed_labels(folder)
     base = {name: grading.answer(result) for name, result in untouched.items()}
     rows = []
     for label in labels:
         answer = grading.answer(results[label.name])
         source = label.manoeuvre.split(' by ')[0]
         exact, found = right(answer, base[source], label)
+        # How often the verdict is right by the labels of other trials of its recording
+        by_chance = [right(answer, base[source], other)[0] for other in labels
+                     if other.manoeuvre == label.manoeuvre and other is not label]
         rows.append({'name': label.name, 'recording': label.manoeuvre, 'group': label.group,
                      'effects': list(label.effects), 'exact': exact, 'in_set': found,
                      'noises': max([row['strength_mps2'] / label.floor_mps2
@@ -429,19 +418,12 @@ def score(folder: Path, pool: Executor, show: Show) -> dict[str, Any]:
                      'already': sorted(base[source].named),
                      'probability': answer.probability, 'seconds': answer.seconds,
                      'error': results[label.name]['error'],
-                     'by_chance': _by_chance(label, labels, base[source], answer)})
-    return {'hash': sealing.published_hash(folder), 'seed': setup.seed,
+                     'by_chance': float(np.mean(by_chance or [False]))})
+    return {'hash': check.published_hash(folder), 'seed': setup.seed,
             'trials': len(rows), 'diagnose_code': (folder / 'reports' / 'version.txt').read_text(),
             'left_out': json.loads((folder / 'left_out.json').read_text()), 'rows': rows,
             'baseline': {name: [answer.status, sorted(answer.named)]
                          for name, answer in base.items()}}
-
-
-def _by_chance(label: Label, labels: Sequence[Label], base: Answer, answer: Answer) -> float:
-    """Return how often a verdict is right by the labels of other trials of its recording."""
-    others = [other for other in labels
-              if other.manoeuvre == label.manoeuvre and other is not label]
-    return float(np.mean([right(answer, base, other)[0] for other in others])) if others else 0.0
 
 
 def tables(made: dict[str, Any]) -> dict[str, report_html.Table]:

@@ -78,11 +78,9 @@ def markdown(made: dict[str, Any]) -> str:
 
 def tables_as_markdown(said: list[str], tables: dict[str, Table]) -> str:
     """Return paragraphs and tables as Markdown."""
-    out = [line for text in said for line in (_filled(text), '')]
-    for title, table in tables.items():
-        if table[1]:
-            out += [f'### {title}', '', markdown_table(*table), '']
-    return '\n'.join(out)
+    return '\n'.join([*(f'{_filled(text)}\n' for text in said),
+                      *(f'### {title}\n\n{markdown_table(*table)}\n'
+                        for title, table in tables.items() if table[1])])
 
 
 def _filled(text: str) -> str:
@@ -120,11 +118,10 @@ def _drawn(made: dict[str, Any]) -> str:
 
 
 def _leaks(made: dict[str, Any]) -> str:
-    bad = [name.replace('_', ' ') for name, control in made['controls'].items()
-           if control['leaks']]
-    if bad:
-        return f'THE CHECK ITSELF LEAKS: not at chance: {", ".join(bad)}. Its scores mean nothing.'
-    return 'The controls came out at chance.'
+    bad = ', '.join(name.replace('_', ' ') for name, control in made['controls'].items()
+                    if control['leaks'])
+    return f'THE CHECK ITSELF LEAKS: not at chance: {bad}. Its scores mean nothing.' if bad \
+        else 'The controls came out at chance.'
 
 
 def _tables(made: dict[str, Any]) -> dict[str, Table]:

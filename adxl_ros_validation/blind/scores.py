@@ -101,10 +101,6 @@ class Bar(NamedTuple):
     low: float
     high: float
 
-    def holds(self, low: float, high: float) -> bool:
-        """Return whether some value between two meets the bar."""
-        return low <= self.high and high >= self.low
-
     def in_words(self) -> str:
         """Return the bar in words."""
         if math.isinf(self.low):
@@ -137,10 +133,10 @@ def outcome(bar: Bar, score: Score) -> str:
     if score['count'] < FEWEST_TRIALS:
         return 'too few'
     # The interval of resampled trials may lie beside a score that is biased.
-    values = (score['value'], *score['ci'])
-    if all(bar.holds(value, value) for value in values):
+    value, (low, high) = score['value'], score['ci']
+    if bar.low <= min(value, low) and max(value, high) <= bar.high:
         return 'yes'
-    reached = bar.holds(values[0], values[0]) or bar.holds(*score['ci'])
+    reached = bar.low <= value <= bar.high or (low <= bar.high and high >= bar.low)
     return 'not refuted' if reached else 'NO'
 
 

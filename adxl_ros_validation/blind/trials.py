@@ -124,26 +124,18 @@ def integer_seed(*seed: int) -> int:
 def draw_trial(plan: Plan) -> Drawn:
     """Draw a trial: its label, its recording and its parameter file."""
     drawn = scene(plan)
-    label = draw_label(plan, drawn)
+    clean, noisy = (drawn.volts([], noise=noise, fine_hz=800.0) for noise in (False, True))
+    noise = (noisy - clean) * drawn.unit.volts_to_mps2
+    label = Label(**asdict(plan), manoeuvre=drawn.manoeuvre.kind, axes=drawn.unit.axes,
+                  floor_mps2=ideal_observer.rms(noise - noise.mean(axis=1, keepdims=True)))
+    if label.true:
+        label = _with_faults(label, IdealObserver(drawn))
     return Drawn(label, drawn.recording(label.acting()),
                  simulator.parameter_file(drawn.unit, plan.name))
 
 
-def draw_label(plan: Plan, drawn: Scene) -> Label:
-    """Draw a label: sizes for the drawn strengths, and what the ideal observer sees."""
-    label = Label(**asdict(plan), manoeuvre=drawn.manoeuvre.kind, axes=drawn.unit.axes,
-                  floor_mps2=ideal_observer.rms(_noise(drawn)))
-    return _with_faults(label, IdealObserver(drawn)) if label.true else label
-
-
-def _noise(drawn: Scene) -> np.ndarray:
-    """Return the noise of a recording without its mean, m/s², (m, n)."""
-    clean, noisy = (drawn.volts([], noise=noise, fine_hz=800.0) for noise in (False, True))
-    difference = (noisy - clean) * drawn.unit.volts_to_mps2
-    return difference - difference.mean(axis=1, keepdims=True)
-
-
 def _with_faults(label: Label, observer: IdealObserver) -> Label:
+    """Draw the faults of a label: sizes for strengths, and what the ideal observer sees."""
     rng = np.random.default_rng([*label.seed, 9])
     rivals = observer.rivals()
     rows, flexible = [], 0.0

@@ -8,14 +8,13 @@ import json
 import shutil
 import sys
 
-from adxl_ros.workers import open_pool
+from adxl_ros.workers import open_pool, Pool
 from adxl_ros_validation.blind import (
     check,
     diagnosis_runs,
     grading,
     report_html,
     scores,
-    sealing,
     trials,
 )
 from adxl_ros_validation.blind.trials import Label, plans
@@ -89,9 +88,15 @@ def scored(folder, body, pool):
         return check.score(folder, pool, show)
 
 
+class Threads(Pool, ThreadPoolExecutor):
+    """Threads, which see what a test replaces."""
+
+    slots = 2
+
+
 @pytest.fixture(scope='module')
 def pool():
-    with ThreadPoolExecutor(2) as pool:
+    with Threads(2) as pool:
         yield pool
 
 
@@ -99,7 +104,7 @@ def pool():
 def committed_check(tmp_path_factory):
     folder = tmp_path_factory.mktemp('check') / 'blind'
     with open_pool(None) as pool:
-        sealing.seal(folder, SEED, TRIALS, short_plans, trials.draw_trial, pool, no_progress)
+        check.seal(folder, SEED, TRIALS, short_plans, trials.draw_trial, pool, no_progress)
     return folder
 
 
@@ -183,7 +188,7 @@ def answer(recording, parameters):
 
 def test_a_generator_that_leaks_labels_is_detected(null_check, tmp_path, pool):
     """The length of the recordings reveals which trials have an effect."""
-    folder, labels = tmp_path / 'blind', sealing.committed_labels(null_check[0])[1]
+    folder, labels = tmp_path / 'blind', check.committed_labels(null_check[0])[1]
     recordings = null_check[0] / 'recordings'
 
     def leaking(plan):
@@ -192,7 +197,7 @@ def test_a_generator_that_leaks_labels_is_detected(null_check, tmp_path, pool):
                             for suffix in ('csv', 'yaml'))
         return trials.Drawn(label, padded(label, text), parameters)
 
-    sealing.seal(folder, SEED, TRIALS, short_plans, leaking, pool, no_progress)
+    check.seal(folder, SEED, TRIALS, short_plans, leaking, pool, no_progress)
     shutil.copytree(null_check[0] / 'labels' / 'held', folder / 'labels' / 'held')
     made = scored(folder, PADDED, pool)
     assert made['controls']['metadata_only']['leaks'] and made['leaks']

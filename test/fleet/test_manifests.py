@@ -6,7 +6,7 @@ import os
 
 from adxl_ros.files.column_mapping import AS_IT_IS
 from adxl_ros.fleet.inputs import find_sources
-from adxl_ros.fleet.recipe import make_recipe
+from adxl_ros.fleet.row import make_recipe
 from adxl_ros.fleet.task import make_row
 from fleets import recording_text
 import pytest

@@ -143,7 +143,7 @@ def test_output_that_nobody_reads_ends_an_executable_without_a_message(name: str
 
 
 def test_a_pipe_between_processes_that_breaks_is_not_hidden() -> None:
-    code = ('from adxl_ros.closed_output import ended_by_closed_output\n'
+    code = ('from adxl_ros.process import ended_by_closed_output\n'
             'with ended_by_closed_output():\n    raise BrokenPipeError')
     done = subprocess.run([sys.executable, '-c', code], text=True, capture_output=True, timeout=60)
     assert done.returncode == 1 and 'BrokenPipeError' in done.stderr

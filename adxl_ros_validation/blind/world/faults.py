@@ -127,18 +127,6 @@ def _hysteresis(run: Run, size: float, shape: Shape) -> None:
             row += size * w * np.interp(run.t, run.t[::every], loop)
 
 
-def _arrhenius(run: Run, shape: Shape) -> np.ndarray:
-    """Change the scale factor by the law of Arrhenius from 25 °C."""
-    inverse = 1 / (_ZERO_C + 25.0) - 1 / (_ZERO_C + run.temperature)
-    return np.expm1(2500.0 * inverse)
-
-
-def _settling(run: Run, shape: Shape) -> np.ndarray:
-    """Shift zero-g after power-on by a stretched exponential, g."""
-    since = np.clip(run.t + 3.0, 0, None)
-    return np.exp(-(since / shape['lag']) ** 0.75)
-
-
 def _vibration_rectification(run: Run, shape: Shape) -> np.ndarray:
     """Shift zero-g by the power of the vibration, with a limit, 1/g."""
     fast = scipy.signal.sosfilt(scipy.signal.butter(2, 2.0, 'high', fs=1 / run.dt, output='sos'),
@@ -160,10 +148,6 @@ def _bandwidth(run: Run, size: float, shape: Shape) -> None:
         run.second_hz = 8 * run.corner_hz / (1 - factor)
 
 
-def _slower_or_faster(rng: np.random.Generator, count: int) -> np.ndarray:
-    return rng.choice([1.0, 1.0, -1.0], count)
-
-
 _ELEMENT = (
     Kind('bias', sim.added_at_output(sim.constant), 1e-3, 0.1, place=Place.ELECTRONICS),
     Kind('scale_factor', sim.scaled(sim.constant)),
@@ -183,13 +167,19 @@ _ELEMENT = (
     Kind('hysteresis', _hysteresis, 1e-3, 0.03),
     Kind('temperature_bias', sim.added(
         lambda run, shape: np.expm1((run.temperature - 25.0) / 25.0))),
-    Kind('temperature_scale', sim.scaled(_arrhenius), 1e-3, 0.1),
-    Kind('warm_up', sim.added(_settling), 1e-3, 0.1, bounds={'lag': (15, 50)},
-         spread_at={'lag': (15.0, 27.0, 50.0)}),
+    # The law of Arrhenius from 25 °C.
+    Kind('temperature_scale', sim.scaled(lambda run, shape: np.expm1(2500.0 * (
+        1 / (_ZERO_C + 25.0) - 1 / (_ZERO_C + run.temperature)))), 1e-3, 0.1),
+    # A stretched exponential after power-on.
+    Kind('warm_up', sim.added(
+        lambda run, shape: np.exp(-(np.clip(run.t + 3.0, 0, None) / shape['lag']) ** 0.75)),
+        1e-3, 0.1, bounds={'lag': (15, 50)}, spread_at={'lag': (15.0, 27.0, 50.0)}),
     Kind('vibration_rectification', sim.added(_vibration_rectification), 1e-2, 3.0),
     Kind('supply', _supply, 0.1, 1.5, place=Place.ELECTRONICS),
+    # Two of three are slower.
     Kind('bandwidth', _bandwidth, 0.1, 1.0, place=Place.ELECTRONICS, fixed=1,
-         weigh=_slower_or_faster, per_axis=False, sizes=(-1.0, 1.0, 4.0)),
+         weigh=lambda rng, count: rng.choice([1.0, 1.0, -1.0], count), per_axis=False,
+         sizes=(-1.0, 1.0, 4.0)),
 )
 
 
@@ -294,12 +284,6 @@ def _floor_sway(run: Run, size: float, shape: Shape) -> None:
     run.beta += sway
 
 
-def _dead_zone(run: Run, shape: Shape) -> np.ndarray:
-    """Have a dead zone about zero, g, as a class B output has."""
-    x = run.u / 0.12
-    return -x * np.exp(-x * x / 2)
-
-
 def _product(run: Run, shape: Shape) -> np.ndarray:
     """Add the product of the two other axes, g, as a frame does that shears."""
     x, y, z = run.force / G0
@@ -327,7 +311,9 @@ _UNLISTED = (
     # Shift by the sign of the rate of beta with a smooth limit, as a dragging cable does.
     Kind('rate_pull', sim.added(lambda run, shape: np.tanh(np.gradient(run.beta, run.dt) / 0.5))),
     Kind('floor_sway', _floor_sway, place=Place.STAGE, bounds={'hertz': (0.15, 0.6)}),
-    Kind('dead_zone', sim.added(_dead_zone)),
+    # A dead zone about zero, as a class B output has.
+    Kind('dead_zone', sim.added(
+        lambda run, shape: -run.u / 0.12 * np.exp(-(run.u / 0.12) ** 2 / 2))),
     Kind('product', sim.added(_product)),
     Kind('bearing_bump', _bearing_bump, 1e-3, 0.01, place=Place.STAGE,
          bounds={'sharp': (6.0, 20.0), 'at': (-3.1, 3.1)}),

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""What the processes of all executables share; it must load before numpy, and quickly."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
+import os
+from pathlib import Path
+import select
+import signal
+import sys
+
+_NODES = ('driver', 'stage', 'calibration', 'compensation', 'investigate', 'monitor', 'screen')
+"""Executables that set a handler of SIGINT of their own once they have loaded."""
+
+
+def package_version() -> str:
+    """Return the version of this package; 'unknown' when it runs from its source."""
+    try:
+        return version('adxl_ros')
+    except PackageNotFoundError:
+        return 'unknown'
+
+
+def use_one_thread() -> None:
+    """
+    Keep OpenBLAS to one thread, unless the user chooses a number; call it before numpy is loaded.
+
+    The matrices of this package are small. On busy cores the threads of OpenBLAS wait for each
+    other: a fit of 614 poses took 35 s of CPU instead of 2 s.
+    """
+    os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+
+def end_silently_while_loading() -> None:
+    """
+    Let SIGINT end the executable of a node without a traceback of its imports.
+
+    Programs that import the package, such as `ros2 launch`, keep their handler.
+    """
+    path = Path(sys.argv[0])
+    is_node = path.name in _NODES and path.parent.parts[-2:] == ('lib', 'adxl_ros')
+    if is_node and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+@contextmanager
+def ended_by_closed_output() -> Iterator[None]:
+    """End with status 1 and without a message when the reader of stdout is gone (`| head -1`)."""
+    try:
+        try:
+            yield
+        finally:
+            if sys.stdout is not None:
+                sys.stdout.flush()
+    except BrokenPipeError:
+        poll = select.poll()
+        poll.register(sys.stdout, 0)
+        # A pipe to another process that breaks is an error.
+        if not any(event & select.POLLERR for _, event in poll.poll(0)):
+            raise
+        # Python flushes once more at exit, and would report the pipe then.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
