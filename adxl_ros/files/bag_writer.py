@@ -126,7 +126,7 @@ class BagWriter(OpenBag):
         """Prepare to write to `path`."""
         super().__init__(path)
         self._sensor = sensor
-        self._imu = imu_template(self.types, _noise_covariance(sensor))
+        self._imu = imu_template(_noise_covariance(sensor))
 
     def write(self, recording: Recording) -> None:
         """Append samples."""
@@ -176,7 +176,8 @@ class BagWriter(OpenBag):
             rows = np.flatnonzero((is_sampled == pattern).all(axis=1))
             sampled_joints = [joint for joint, sampled in zip(joints, pattern) if sampled]
             if sampled_joints:
-                template = _joint_template(self.types, sampled_joints)
+                count = len(sampled_joints)
+                template = cdr.message('', count, *sampled_joints, count, np.zeros(count), 0, 0)
                 data = cdr.fill(template, cdr.joint_state(template), stamp_ns[rows],
                                 {'position': values[rows][:, pattern]})
                 batches.append(Batch(self.connection(topic, JOINT_STATE), rows, data))
@@ -190,8 +191,7 @@ class BagWriter(OpenBag):
             values = references.get(scalar.column, np.zeros(0))
             rows = np.flatnonzero(~np.isnan(values))
             if len(rows):
-                template = scalar.template(self.types)
-                data = cdr.fill(template, scalar.layout(template), stamp_ns[rows],
+                data = cdr.fill(scalar.template, scalar.layout(scalar.template), stamp_ns[rows],
                                 {scalar.field: values[rows]})
                 batches.append(Batch(self.connection(scalar.topic, scalar.kind), rows, data))
         return batches
@@ -216,7 +216,7 @@ class _Scalar(NamedTuple):
     topic: str
     kind: str
     field: str  # The message's field with the value
-    template: Callable[[Any], bytes]  # Makes a message, from the message types
+    template: bytes  # A message
     layout: Callable[[bytes], cdr.Layout]  # Finds the fields of a message
 
 
@@ -227,25 +227,12 @@ def _keep_file(file: Path, target: Path) -> None:
 
 def _qos(is_latched: bool) -> Any:
     """Return the QoS of `ros2 bag play`: reliable, and latched for late subscribers if asked."""
-    from rosbags.interfaces import (
-        Qos,
-        QosDurability,
-        QosHistory,
-        QosLiveliness,
-        QosReliability,
-        QosTime,
-    )
-    durability = QosDurability.TRANSIENT_LOCAL if is_latched else QosDurability.VOLATILE
-    forever = QosTime(*divmod(_LONGEST_NS, 1_000_000_000))
-    return Qos(QosHistory.KEEP_LAST, _LATCHED_DEPTH if is_latched else _DEPTH,
-               QosReliability.RELIABLE, durability, forever, forever, QosLiveliness.AUTOMATIC,
-               forever, False)
-
-
-def message_header(types: Any, frame: str) -> Any:
-    """Return a header with the stamp 0."""
-    time = types.types['builtin_interfaces/msg/Time'](sec=0, nanosec=0)
-    return types.types['std_msgs/msg/Header'](stamp=time, frame_id=frame)
+    from rosbags import interfaces as ros
+    durability = ros.QosDurability.TRANSIENT_LOCAL if is_latched else ros.QosDurability.VOLATILE
+    forever = ros.QosTime(*divmod(_LONGEST_NS, 1_000_000_000))
+    return ros.Qos(ros.QosHistory.KEEP_LAST, _LATCHED_DEPTH if is_latched else _DEPTH,
+                   ros.QosReliability.RELIABLE, durability, forever, forever,
+                   ros.QosLiveliness.AUTOMATIC, forever, False)
 
 
 def _noise_covariance(sensor: Sensor) -> np.ndarray:
@@ -256,59 +243,29 @@ def _noise_covariance(sensor: Sensor) -> np.ndarray:
     return np.diag(variance).ravel()
 
 
-def imu_template(types: Any, covariance: np.ndarray) -> bytes:
+def imu_template(covariance: np.ndarray) -> bytes:
     """
     Return an Imu without orientation and angular velocity, at the stamp 0.
 
     covariance: that of the acceleration by rows, (m/s²)², (9,).
     """
-    absent = np.zeros(9)
-    absent[0] = -1.0
-    vector = types.types['geometry_msgs/msg/Vector3'](x=0.0, y=0.0, z=0.0)
-    message = types.types[IMU](
-        header=message_header(types, FRAME),
-        orientation=types.types['geometry_msgs/msg/Quaternion'](x=0.0, y=0.0, z=0.0, w=1.0),
-        orientation_covariance=absent,
-        angular_velocity=vector, angular_velocity_covariance=absent,
-        linear_acceleration=vector, linear_acceleration_covariance=covariance)
-    return bytes(types.serialize_cdr(message, IMU))
+    absent = [-1.0, *[0.0] * 8]
+    return cdr.message(FRAME, [0.0, 0.0, 0.0, 1.0], absent, np.zeros(3), absent, np.zeros(3),
+                       covariance)
 
 
-def _joint_template(types: Any, names: list[str]) -> bytes:
-    """Return a JointState with the positions of some joints."""
-    none = np.zeros(0)
-    message = types.types[JOINT_STATE](
-        header=message_header(types, ''), name=names, position=np.zeros(len(names)),
-        velocity=none, effort=none)
-    return bytes(types.serialize_cdr(message, JOINT_STATE))
-
-
-def _temperature_template(types: Any) -> bytes:
-    """Return a Temperature of unknown variance."""
-    message = types.types[TEMPERATURE](
-        header=message_header(types, FRAME), temperature=0.0, variance=0.0)
-    return bytes(types.serialize_cdr(message, TEMPERATURE))
-
-
-def _battery_template(types: Any) -> bytes:
-    """Return a BatteryState of which only the voltage is measured."""
-    unknown = float('nan')
-    none = np.zeros(0, np.float32)
-    message = types.types[BATTERY_STATE](
-        header=message_header(types, FRAME), voltage=0.0, temperature=unknown, current=unknown,
-        charge=unknown, capacity=unknown, design_capacity=unknown, percentage=unknown,
-        power_supply_status=0, power_supply_health=0, power_supply_technology=0, present=True,
-        cell_voltage=none, cell_temperature=none, location='', serial_number='')
-    return bytes(types.serialize_cdr(message, BATTERY_STATE))
-
+_UNKNOWN = np.full(6, np.nan, np.float32)
+"""Temperature, current, charge, capacity, design capacity and percentage of a battery."""
 
 _SCALARS = (
-    _Scalar('temperature_c', '/temperature', TEMPERATURE, 'temperature', _temperature_template,
-            cdr.temperature),
-    _Scalar('supply_v', '/supply', BATTERY_STATE, 'voltage', _battery_template,
+    _Scalar('temperature_c', '/temperature', TEMPERATURE, 'temperature',
+            cdr.message(FRAME, np.zeros(2)), cdr.temperature),
+    _Scalar('supply_v', '/supply', BATTERY_STATE, 'voltage',
+            # Three states, present, no cell voltages and temperatures, location, serial number.
+            cdr.message(FRAME, np.float32(0), _UNKNOWN, np.uint8([0, 0, 0, 1]), 0, 0, '', ''),
             cdr.battery_state),
 )
-"""References that are one number."""
+"""References that are one number: of unknown variance, and of which only this is measured."""
 
 
 _VECTOR = 'geometry_msgs/msg/Vector3Stamped'
@@ -321,11 +278,7 @@ class TiltBag(OpenBag):
     def __init__(self, path: str | os.PathLike) -> None:
         """Prepare to write to `path`, which is replaced if it exists."""
         super().__init__(path)
-        self._imu = imu_template(self.types, np.zeros(9))
-        kinds = self.types.types
-        zero = kinds['geometry_msgs/msg/Vector3'](x=0.0, y=0.0, z=0.0)
-        self._tilt = bytes(self.types.serialize_cdr(
-            kinds[_VECTOR](header=message_header(self.types, FRAME), vector=zero), _VECTOR))
+        self._imu, self._tilt = imu_template(np.zeros(9)), cdr.message(FRAME, np.zeros(3))
 
     def write(self, stamp_ns: np.ndarray, imu_fields: Mapping[str, np.ndarray],
               tilt_rad: np.ndarray) -> None:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field
 import re
 
@@ -31,12 +31,12 @@ from adxl_ros.files.column_mapping import (
 )
 from adxl_ros.files.recording_columns import (
     ACCEL,
-    BadStamps,
     describe_bursts,
     JOINTS,
     LIMIT,
     Recording,
     sensor_columns,
+    StampCheck,
     stamped_rate_hz,
     TIME,
     VOLTS,
@@ -199,12 +199,12 @@ class _Converter:
     _remarks: list[str] = field(default_factory=list)
     _epoch_ns: int | None = None
     _begin: float = 0.0  # Origin of the times in the unit of the stamps
-    _last_s: float = -np.inf
     _count: int = 0
     _empty: int = 0
-    _duplicates: int = 0
-    _backward: int = 0
     _last_beta_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._stamps = StampCheck(self.table.path, self.reading.drop_bad_stamps)
 
     def convert(self, block: TableBlock) -> Recording:
         """Return the samples of a block."""
@@ -226,10 +226,12 @@ class _Converter:
             self._look_at_first(block, outputs[is_kept], time_s[is_kept])
         self._count += int(is_kept.sum())
         info = {key: text for key, text in block.info.items() if key != 'epoch_ns'}
+        left_out = f'{self.table.path}: left out, lines without a reading of the sensor: ' \
+                   f'{self._empty}'
         return Recording(self.table.path, time_s[is_kept], columns, info, cut=block.cut,
                          epoch_ns=self._epoch_ns or 0, done=block.done,
-                         remarks=(*self._remarks, *self._counts()),
-                         bad_stamps=BadStamps(self._duplicates, self._backward))
+                         remarks=(*self._remarks, *[left_out] * bool(self._empty),
+                                  *self._stamps.remarks), bad_stamps=self._stamps.bad)
 
     def _outputs(self, block: TableBlock) -> np.ndarray:
         """Return the output of the sensor, (n, m), V or m/s²."""
@@ -315,10 +317,8 @@ class _Converter:
             raise UserError(f'{block.where(row, column.name)} is {time_s[row]:g} s as '
                             f'{column.unit_name}, more than 200 years; state its unit, for '
                             'example ms, us or ns')
-        is_kept = is_sample & self._increasing(block, time_s, is_sample, column)
-        if is_kept.any():
-            self._last_s = float(time_s[is_kept][-1])
-        return time_s, is_kept
+        return time_s, self._stamps.increasing(time_s, is_sample,
+                                               lambda row: block.where(row, column.name))
 
     def _find_epoch(self, block: TableBlock, first_s: float) -> None:
         """Find the origin of the times: as comments state it, or near the first one."""
@@ -330,26 +330,6 @@ class _Converter:
         self._epoch_ns = int(text) or whole_s * 1_000_000_000
         unit = self.columns['time'].unit
         self._begin = whole_s * unit.divisor / unit.factor
-
-    def _increasing(self, block: TableBlock, time_s: np.ndarray, is_sample: np.ndarray,
-                    column: _Column) -> np.ndarray:
-        """Return which stamps increase, (n,); refuse the others unless they are left out."""
-        times = np.where(is_sample, time_s, -np.inf)
-        latest = np.maximum.accumulate(np.concatenate([[self._last_s], times]))[:-1]
-        wrong = is_sample & ~(time_s > latest)
-        if not wrong.any():
-            return is_sample
-        stands = wrong & (time_s == latest)
-        self._duplicates += int(stands.sum())
-        self._backward += int((wrong & ~stands).sum())
-        if not self.reading.drop_bad_stamps:
-            row = int(wrong.argmax())
-            verb = 'stands still' if stands[row] else 'runs backwards'
-            raise UserError(
-                f'{block.where(row, column.name)}: time {verb}, {latest[row] - time_s[row]:.3g} s '
-                f'before the newest sample{describe_bursts(time_s[is_sample])}; --drop-bad-stamps '
-                'leaves such samples out, --rate HZ stamps by index')
-        return ~wrong
 
     def _look_at_first(self, block: TableBlock, outputs: np.ndarray, time_s: np.ndarray) -> None:
         """Note what is assumed; refuse readings and stamps that are in another unit."""
@@ -400,12 +380,3 @@ class _Converter:
             raise UserError(f'{text}; state their unit, for example x={columns[0].name}:'
                             f'{likely_unit(length_g * G0_MPS2) or "UNIT"}')
         self._remarks.append(f'{text}: check the unit')
-
-    def _counts(self) -> Iterator[str]:
-        """Yield how many rows were left out so far."""
-        for count, what in (
-                (self._empty, 'lines without a reading of the sensor'),
-                (self._duplicates, 'samples with the stamp of the one before'),
-                (self._backward, 'samples whose stamp steps back')):
-            if count:
-                yield f'{self.table.path}: left out, {what}: {count}'

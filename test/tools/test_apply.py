@@ -157,7 +157,7 @@ def test_bad_input_leaves_the_earlier_output(run_tool: RunTool, tmp_path: Path) 
     text = path.read_text(encoding='utf-8')
     path.write_text(text + '10.004,nan,2.5\n', encoding='utf-8')
     line = text.count('\n') + 1
-    assert f'{path}:{line}:2: x_v is nan' in refused(run_tool, path)
+    assert f'{path}:{line}:2: x_v is empty or NaN' in refused(run_tool, path)
     (tmp_path / 'unit.yaml').write_text('/**:\n  ros__parameters:\n    format: 1\n')
     path.write_text(text, encoding='utf-8')
     assert f'{tmp_path}/unit.yaml:3:5: ' in refused(run_tool, path)
