@@ -55,6 +55,14 @@ _DEPTH = 10
 """Messages that any other topic keeps, the default depth of ROS."""
 
 
+class Form(NamedTuple):
+    """How the messages of a topic are written."""
+
+    kind: str  # Their type
+    find: Callable[[bytes], cdr.Layout]  # Finds the fields of a message
+    template: bytes  # A message
+
+
 class OpenBag:
     """
     A new bag: a rosbag2 directory, or one file for a name.mcap.
@@ -102,6 +110,12 @@ class OpenBag:
                             f'{stamp_ns[-1] / 1e9:g} s cannot be stamps of ROS messages, '
                             'which go from 0 to 2^31 s')
 
+    def batch(self, topic: str, form: Form, stamp_ns: np.ndarray, rows: np.ndarray,
+              fields: Mapping[str, np.ndarray]) -> Batch:
+        """Return the messages of some samples of all, whose stamps are `stamp_ns`."""
+        return Batch(self.connection(topic, form.kind), rows,
+                     cdr.fill(form.template, form.find, stamp_ns[rows], fields))
+
     def write_messages(self, stamp_ns: np.ndarray, batches: Sequence[Batch]) -> None:
         """
         Append the messages of samples.
@@ -126,7 +140,7 @@ class BagWriter(OpenBag):
         """Prepare to write to `path`."""
         super().__init__(path)
         self._sensor = sensor
-        self._imu = imu_template(_noise_covariance(sensor))
+        self._imu = _imu_form(_noise_covariance(sensor))
 
     def write(self, recording: Recording) -> None:
         """Append samples."""
@@ -138,12 +152,20 @@ class BagWriter(OpenBag):
         for start in range(0, len(recording), _ROWS_AT_ONCE):
             part = slice(start, start + _ROWS_AT_ONCE)
             references = {name: values[part] for name, values in recording.columns.items()}
-            batches = [self._imu_batch(stamp_ns[part], accel[part]),
+            force = np.zeros((len(stamp_ns[part]), 3))
+            force[:, :accel.shape[1]] = accel[part]
+            batches = [self.batch('/imu/data_raw', self._imu, stamp_ns[part],
+                                  np.arange(len(force)), {'linear_acceleration': force}),
                        *self._joint_batches(stamp_ns[part], references, JOINTS,
                                             '/stage/joint_states'),
                        *self._joint_batches(stamp_ns[part], _changes(references), COMMANDS,
-                                            '/stage/command'),
-                       *self._scalar_batches(stamp_ns[part], references)]
+                                            '/stage/command')]
+            for column, (topic, field, form) in _SCALARS.items():
+                values = references.get(column, np.zeros(0))
+                rows = np.flatnonzero(~np.isnan(values))
+                if len(rows):
+                    batches.append(self.batch(topic, form, stamp_ns[part], rows,
+                                              {field: values[rows]}))
             self.write_messages(stamp_ns[part], batches)
 
     def _write_info(self, recording: Recording, stamp_ns: int) -> None:
@@ -156,12 +178,6 @@ class BagWriter(OpenBag):
         raw = self.types.serialize_cdr(message, DIAGNOSTIC_STATUS)
         connection = self.connection('/sensor_info', DIAGNOSTIC_STATUS, is_latched=True)
         self._writer.write(connection, stamp_ns, raw)
-
-    def _imu_batch(self, stamp_ns: np.ndarray, accel: np.ndarray) -> Batch:
-        force = np.zeros((len(accel), 3))
-        force[:, :accel.shape[1]] = accel
-        data = cdr.fill(self._imu, cdr.imu(self._imu), stamp_ns, {'linear_acceleration': force})
-        return Batch(self.connection('/imu/data_raw', IMU), np.arange(len(accel)), data)
 
     def _joint_batches(self, stamp_ns: np.ndarray, columns: dict[str, np.ndarray],
                        names: Mapping[str, str], topic: str) -> list[Batch]:
@@ -178,22 +194,8 @@ class BagWriter(OpenBag):
             if sampled_joints:
                 count = len(sampled_joints)
                 template = cdr.message('', count, *sampled_joints, count, np.zeros(count), 0, 0)
-                data = cdr.fill(template, cdr.joint_state(template), stamp_ns[rows],
-                                {'position': values[rows][:, pattern]})
-                batches.append(Batch(self.connection(topic, JOINT_STATE), rows, data))
-        return batches
-
-    def _scalar_batches(self, stamp_ns: np.ndarray,
-                        references: dict[str, np.ndarray]) -> list[Batch]:
-        """Return the batches of temperature and supply, where they were sampled."""
-        batches = []
-        for scalar in _SCALARS:
-            values = references.get(scalar.column, np.zeros(0))
-            rows = np.flatnonzero(~np.isnan(values))
-            if len(rows):
-                data = cdr.fill(scalar.template, scalar.layout(scalar.template), stamp_ns[rows],
-                                {scalar.field: values[rows]})
-                batches.append(Batch(self.connection(scalar.topic, scalar.kind), rows, data))
+                batches.append(self.batch(topic, Form(JOINT_STATE, cdr.joint_state, template),
+                                          stamp_ns, rows, {'position': values[rows][:, pattern]}))
         return batches
 
 
@@ -206,18 +208,6 @@ def _changes(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
             new = np.concatenate([[True], values[1:] != values[:-1]])
             changed[name] = np.where(new & np.isfinite(values), values, np.nan)
     return changed
-
-
-class _Scalar(NamedTuple):
-    """A reference with a topic of its own."""
-
-    column: str  # Its column in a recording
-    # topic, kind: The topic and its type
-    topic: str
-    kind: str
-    field: str  # The message's field with the value
-    template: bytes  # A message
-    layout: Callable[[bytes], cdr.Layout]  # Finds the fields of a message
 
 
 def _keep_file(file: Path, target: Path) -> None:
@@ -243,29 +233,29 @@ def _noise_covariance(sensor: Sensor) -> np.ndarray:
     return np.diag(variance).ravel()
 
 
-def imu_template(covariance: np.ndarray) -> bytes:
+def _imu_form(covariance: np.ndarray) -> Form:
     """
-    Return an Imu without orientation and angular velocity, at the stamp 0.
+    Return the form of an Imu without orientation and angular velocity.
 
     covariance: that of the acceleration by rows, (m/s²)², (9,).
     """
     absent = [-1.0, *[0.0] * 8]
-    return cdr.message(FRAME, [0.0, 0.0, 0.0, 1.0], absent, np.zeros(3), absent, np.zeros(3),
-                       covariance)
+    return Form(IMU, cdr.imu, cdr.message(FRAME, [0.0, 0.0, 0.0, 1.0], absent, np.zeros(3), absent,
+                                          np.zeros(3), covariance))
 
 
 _UNKNOWN = np.full(6, np.nan, np.float32)
 """Temperature, current, charge, capacity, design capacity and percentage of a battery."""
 
-_SCALARS = (
-    _Scalar('temperature_c', '/temperature', TEMPERATURE, 'temperature',
-            cdr.message(FRAME, np.zeros(2)), cdr.temperature),
-    _Scalar('supply_v', '/supply', BATTERY_STATE, 'voltage',
-            # Three states, present, no cell voltages and temperatures, location, serial number.
-            cdr.message(FRAME, np.float32(0), _UNKNOWN, np.uint8([0, 0, 0, 1]), 0, 0, '', ''),
-            cdr.battery_state),
-)
-"""References that are one number: of unknown variance, and of which only this is measured."""
+_SCALARS = {
+    'temperature_c': ('/temperature', 'temperature', Form(
+        TEMPERATURE, cdr.temperature, cdr.message(FRAME, np.zeros(2)))),
+    'supply_v': ('/supply', 'voltage', Form(
+        # Three states, present, no cell voltages and temperatures, location, serial number.
+        BATTERY_STATE, cdr.battery_state, cdr.message(
+            FRAME, np.float32(0), _UNKNOWN, np.uint8([0, 0, 0, 1]), 0, 0, '', ''))),
+}
+"""Topic, field and form of references that are one number, by column."""
 
 
 _VECTOR = 'geometry_msgs/msg/Vector3Stamped'
@@ -278,7 +268,8 @@ class TiltBag(OpenBag):
     def __init__(self, path: str | os.PathLike) -> None:
         """Prepare to write to `path`, which is replaced if it exists."""
         super().__init__(path)
-        self._imu, self._tilt = imu_template(np.zeros(9)), cdr.message(FRAME, np.zeros(3))
+        self._imu = _imu_form(np.zeros(9))
+        self._tilt = Form(_VECTOR, cdr.vector3_stamped, cdr.message(FRAME, np.zeros(3)))
 
     def write(self, stamp_ns: np.ndarray, imu_fields: Mapping[str, np.ndarray],
               tilt_rad: np.ndarray) -> None:
@@ -288,15 +279,13 @@ class TiltBag(OpenBag):
         stamp_ns: stamps, ns, (n,), rising; imu_fields: fields of sensor_msgs/Imu by name, (n, k)
         each; tilt_rad: roll, pitch and inclination, rad, (n, 3).
         """
-        data, tilt = self.connection('/imu/data', IMU), self.connection('/tilt', _VECTOR)
-        if not len(stamp_ns):
-            return
-        self.check_stamps(stamp_ns)
-        rows = np.arange(len(stamp_ns))
-        self.write_messages(stamp_ns, [
-            Batch(data, rows, cdr.fill(self._imu, cdr.imu(self._imu), stamp_ns, imu_fields)),
-            Batch(tilt, rows, cdr.fill(self._tilt, cdr.vector3_stamped(self._tilt), stamp_ns,
-                                       {'vector': tilt_rad}))])
+        self.connection('/imu/data', IMU), self.connection('/tilt', _VECTOR)
+        if len(stamp_ns):
+            self.check_stamps(stamp_ns)
+            rows = np.arange(len(stamp_ns))
+            self.write_messages(stamp_ns, [
+                self.batch('/imu/data', self._imu, stamp_ns, rows, imu_fields),
+                self.batch('/tilt', self._tilt, stamp_ns, rows, {'vector': tilt_rad})])
 
 
 _FLUSH_NS = 500_000_000

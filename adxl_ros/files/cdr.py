@@ -208,14 +208,15 @@ def joined_tables(parts: Sequence[Sequence[bytes] | np.ndarray],
         begin += len(raws)
 
 
-def fill(template: bytes, layout: Layout, stamp_ns: np.ndarray,
+def fill(template: bytes, find: Callable[[bytes], Layout], stamp_ns: np.ndarray,
          fields: Mapping[str, np.ndarray]) -> np.ndarray:
     """
     Return one message for each stamp.
 
-    stamp_ns: stamps, ns, (n,); fields: values by field, (n, count); returns: the bytes of the
+    find: finds the fields of a message; stamp_ns: stamps, ns, (n,); fields: values by field, (n, count); returns: the bytes of the
     messages, (n, size), each as long as the template.
     """
+    layout = find(template)
     sec, nanosec = np.divmod(stamp_ns, 1_000_000_000)
     values = {'sec': sec, 'nanosec': nanosec, **fields}
     places = [layout.fields[name] for name in values]
