@@ -244,8 +244,8 @@ def _imu_form(covariance: np.ndarray) -> Form:
                                           np.zeros(3), covariance))
 
 
-_UNKNOWN = np.full(6, np.nan, np.float32)
-"""Temperature, current, charge, capacity, design capacity and percentage of a battery."""
+_VOLTAGE = np.array([0.0, *[np.nan] * 6], np.float32)
+"""Voltage of a battery; temperature, current, charge, capacities and percentage are unknown."""
 
 _SCALARS = {
     'temperature_c': ('/temperature', 'temperature', Form(
@@ -253,7 +253,7 @@ _SCALARS = {
     'supply_v': ('/supply', 'voltage', Form(
         # Three states, present, no cell voltages and temperatures, location, serial number.
         BATTERY_STATE, cdr.battery_state, cdr.message(
-            FRAME, np.float32(0), _UNKNOWN, np.uint8([0, 0, 0, 1]), 0, 0, '', ''))),
+            FRAME, _VOLTAGE, np.array([0, 0, 0, 1], np.uint8), 0, 0, '', ''))),
 }
 """Topic, field and form of references that are one number, by column."""
 

@@ -100,17 +100,7 @@ def _params_folder() -> Path:
 
 
 def installed_path(name: str | os.PathLike) -> Path:
-    """
-    Return the installed file of a sensor by its name, such as MPU-6050.
-
-    A path to a file stays as it is.
-
-    Raises
-    ------
-    UserError
-        No sensor has this name.
-
-    """
+    """Return the installed file of a sensor by its name, such as MPU-6050; a path stays."""
     path = Path(name)
     if path.exists() or path.suffix or path.name != str(name):
         return path
@@ -123,7 +113,11 @@ def installed_path(name: str | os.PathLike) -> Path:
 
 
 def load(path: str | os.PathLike, may_measure: bool = False) -> Sensor:
-    """Return the installed file of a sensor by its name, such as MPU-6050; a path stays."""
+    """
+    Read and check the parameter file of a sensor, by its path or its name.
+
+    may_measure: whether keys may be missing that a recording can show.
+    """
     path = installed_path(path)
     flat, marks = _read(path)
 
@@ -247,7 +241,14 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     try:
         parameters: Any = compose(path)
         for key in ('/**', 'ros__parameters'):
-            parameters = _child(parameters, key, path)
+            children = parameters.value if isinstance(parameters, yaml.MappingNode) else ()
+            below = [value for name, value in children
+                     if name.value == key and isinstance(value, yaml.MappingNode)]
+            if not below:
+                raise UserError(f'{_where(path, parameters and parameters.start_mark)}: no {key!r} '
+                                "with parameters below it; a parameter file begins with '/**:' "
+                                "and 'ros__parameters:'")
+            parameters = below[0]
         marks = {'': parameters.start_mark}
         _flatten(parameters, '', flat, marks, path)
     except yaml.YAMLError as error:
@@ -260,16 +261,6 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 def _where(path: str | os.PathLike, mark: Any) -> str:
     """Return file:line:column of a mark of yaml; the file alone without a mark."""
     return f'{path}:{mark.line + 1}:{mark.column + 1}' if mark else f'{path}'
-
-
-def _child(node: Any, key: str, path: Path) -> Any:
-    """Return the mapping below a key; `UserError` where there is none."""
-    if isinstance(node, yaml.MappingNode):
-        for name, value in node.value:
-            if name.value == key and isinstance(value, yaml.MappingNode):
-                return value
-    raise UserError(f'{_where(path, node and node.start_mark)}: no {key!r} with parameters below '
-                    "it; a parameter file begins with '/**:' and 'ros__parameters:'")
 
 
 def _flatten(node: yaml.MappingNode, prefix: str, flat: dict[str, Any], marks: dict[str, Any],
@@ -301,8 +292,11 @@ class _FlatReader:
                     and field.metadata['placeholder'] is not None]
         # The axes come first, as they say how many values the others have.
         axes = self._field(SENSOR_FIELDS['sensor.axes'])
-        values = {field.name: _placeholder(field, axes) if field in unstated else
-                  self._field(field, axes) for field in SENSOR_FIELDS.values()}
+        values = {field.name: self._field(field, axes) for field in SENSOR_FIELDS.values()
+                  if field not in unstated}
+        for field in unstated:
+            value = field.metadata['placeholder']
+            values[field.name] = np.full(len(axes), value) if field.type == 'np.ndarray' else value
         self._require(values['z_sign'], 'sensor.z_sign', '0, but must be 1 (upright) or -1')
         effects = self._names('effects')
         coefficients = {name: self._coefficients(name, axes) for name in effects}
@@ -470,12 +464,6 @@ class _FlatReader:
                           f'{name!r} is no parameter of {effect}')
             coefficients.append(Coefficient.parse(name))
         return dict(zip(coefficients, zip(*departures)))
-
-
-def _placeholder(field: Field[Any], axes: str) -> Any:
-    """Return what stands in a field of `Sensor` whose key a file leaves out."""
-    value = field.metadata['placeholder']
-    return np.full(len(axes), value) if field.type == 'np.ndarray' else value
 
 
 def _as_float(value: Any) -> str:
