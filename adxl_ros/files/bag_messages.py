@@ -37,7 +37,7 @@ _ENDINGS = ('.mcap', '.db3', '.mcap.zstd', '.db3.zstd')
 class Bag:
     """An open recording."""
 
-    def __init__(self, path: str, parts: list[_RosbagsPart | mcap_file.ScannedMcap], cut: str) -> None:
+    def __init__(self, path: str, parts: list[Part], cut: str) -> None:
         """Take the files of a recording."""
         self.path = path  # The file or directory, for messages
         self.cut = cut  # Where damaged files end; empty if all are whole
@@ -138,6 +138,10 @@ class _RosbagsPart:
                 raise _unreadable(self._path, error) from error
 
 
+Part = _RosbagsPart | mcap_file.ScannedMcap
+"""A file of a recording: its topics, how much of it was read, and its messages."""
+
+
 def _unreadable(path: Path, error: Exception) -> UserError:
     """Return the error of a file that rosbags cannot read."""
     reason = one_line(error) or f'damaged ({type(error).__name__})'
@@ -160,7 +164,7 @@ def open_bag(path: str | os.PathLike) -> Iterator[Bag]:
     bag_path = Path(path)
     rosbag2 = import_rosbags()
     with ExitStack() as stack:
-        parts: list[_RosbagsPart | mcap_file.ScannedMcap] = []
+        parts: list[Part] = []
         cuts = []
         for name in _files(bag_path):
             file = _unzipped(stack, name) if name.suffix == '.zstd' else name
@@ -171,7 +175,7 @@ def open_bag(path: str | os.PathLike) -> Iterator[Bag]:
         yield Bag(str(bag_path), parts, '; '.join(cuts))
 
 
-def _opened(stack: ExitStack, rosbag2: Any, name: Path, file: Path) -> _RosbagsPart | mcap_file.ScannedMcap:
+def _opened(stack: ExitStack, rosbag2: Any, name: Path, file: Path) -> Part:
     """Open a file; `name` is its packed form, for messages. `stack` closes it."""
     is_mcap = file.suffix == '.mcap'
     if is_mcap and not mcap_file.is_whole(file):

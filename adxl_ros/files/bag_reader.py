@@ -148,7 +148,8 @@ class _Samples:
         self.arrived_ns = np.concatenate([self.arrived_ns[-1:], stamp_ns])
 
         def place(row: int) -> str:
-            return f'{self.where}: message {self.count + row + 1}, stamped {seconds(stamp_ns[row])}'
+            number = self.count + row + 1
+            return f'{self.where}: message {number}, stamped {seconds(stamp_ns[row])}'
 
         is_kept = self.stamps.increasing((stamp_ns - self.epoch_ns) / 1e9,
                                          np.ones(len(stamp_ns), bool), place)

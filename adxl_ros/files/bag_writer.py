@@ -279,7 +279,8 @@ class TiltBag(OpenBag):
         stamp_ns: stamps, ns, (n,), rising; imu_fields: fields of sensor_msgs/Imu by name, (n, k)
         each; tilt_rad: roll, pitch and inclination, rad, (n, 3).
         """
-        self.connection('/imu/data', IMU), self.connection('/tilt', _VECTOR)
+        self.connection('/imu/data', IMU)
+        self.connection('/tilt', _VECTOR)
         if len(stamp_ns):
             self.check_stamps(stamp_ns)
             rows = np.arange(len(stamp_ns))

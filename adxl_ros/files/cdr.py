@@ -213,8 +213,8 @@ def fill(template: bytes, find: Callable[[bytes], Layout], stamp_ns: np.ndarray,
     """
     Return one message for each stamp.
 
-    find: finds the fields of a message; stamp_ns: stamps, ns, (n,); fields: values by field, (n, count); returns: the bytes of the
-    messages, (n, size), each as long as the template.
+    find: finds the fields of a message; stamp_ns: stamps, ns, (n,); fields: values by field,
+    (n, count); returns: the bytes of the messages, (n, size), each as long as the template.
     """
     layout = find(template)
     sec, nanosec = np.divmod(stamp_ns, 1_000_000_000)

@@ -218,10 +218,11 @@ def _whole_lines(path: str, file: BinaryIO) -> Iterator[bytes]:
         if len(data) > _CHUNK_BYTES + _LONGEST_LINE_BYTES:
             raise UserError(f'{path}: a line is longer than {_LONGEST_LINE_BYTES} bytes; '
                             'this is no CSV recording')
-        try:
-            data.isascii() or data.decode()
-        except UnicodeDecodeError:
-            data = data.decode('cp1252', errors='replace').encode()
+        if not data.isascii():
+            try:
+                data.decode()
+            except UnicodeDecodeError:
+                data = data.decode('cp1252', errors='replace').encode()
         yield data
 
 

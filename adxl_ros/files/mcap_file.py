@@ -99,7 +99,7 @@ def collected_pieces(messages: Iterable[tuple[str, bytes, int]]) -> Iterator[Pie
 
 
 def in_order(storage: Any, topics: Mapping[int, str]) -> list[Any]:
-    """Return the chunks that hold messages of some topics, if `read_chunk` can read all of them."""
+    """Return the chunks with messages of some topics, if `read_chunk` can read all of them."""
     chunks = [chunk for chunk in getattr(storage, 'chunks', ())
               if any(chunk.channel_count.get(channel, 0) for channel in topics)]
     chunks.sort(key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))

@@ -245,9 +245,9 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
             below = [value for name, value in children
                      if name.value == key and isinstance(value, yaml.MappingNode)]
             if not below:
-                raise UserError(f'{_where(path, parameters and parameters.start_mark)}: no {key!r} '
-                                "with parameters below it; a parameter file begins with '/**:' "
-                                "and 'ros__parameters:'")
+                place = _where(path, parameters and parameters.start_mark)
+                raise UserError(f'{place}: no {key!r} with parameters below it; a parameter file '
+                                "begins with '/**:' and 'ros__parameters:'")
             parameters = below[0]
         marks = {'': parameters.start_mark}
         _flatten(parameters, '', flat, marks, path)
