@@ -18,7 +18,7 @@ from pathlib import Path
 import re
 import shutil
 from tempfile import TemporaryDirectory
-from typing import Any, Protocol
+from typing import Any
 
 from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files import mcap_file
@@ -32,19 +32,6 @@ _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 
 _ENDINGS = ('.mcap', '.db3', '.mcap.zstd', '.db3.zstd')
 """Ends of the names of files in a recording's directory."""
-
-
-class Part(Protocol):
-    """One file of a recording."""
-
-    done: float  # Fraction of the file that has been read
-    types: set[tuple[str, str]]  # Topics that hold messages, each with its type
-
-    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, bytes, int]]:
-        """Yield topic, bytes and log time, ns, of each message, in the order of recording."""
-
-    def pieces(self, topics: Collection[str]) -> Iterator[Piece]:
-        """Yield the messages in pieces, in the order of recording."""
 
 
 class Bag:
@@ -76,9 +63,7 @@ class Bag:
         self._read = 0
         for part in self._parts:
             for topic, raw, log_ns in part.messages(topics):
-                # `--compression-mode message`: no CDR begins as compressed data does.
-                raw = self._unpacked(topic, raw) if raw[:4] == _ZSTD_MAGIC else raw
-                yield topic, raw, log_ns
+                yield topic, self._unpacked(topic, raw), log_ns
             self._read += 1
 
     def pieces(self, topics: Collection[str]) -> Iterator[Piece]:
@@ -91,16 +76,16 @@ class Bag:
             self._read += 1
 
     def _all_unpacked(self, topic: str, raws: Raws) -> Raws:
-        """Decompress the messages that are compressed one by one."""
         if isinstance(raws, np.ndarray):
             if not (raws[:, :len(_ZSTD_MAGIC)] == list(_ZSTD_MAGIC)).all(axis=1).any():
                 return raws
             raws = [row.tobytes() for row in raws]
-        return [self._unpacked(topic, raw) if raw[:4] == _ZSTD_MAGIC else raw for raw in raws]
+        return [self._unpacked(topic, raw) for raw in raws]
 
     def _unpacked(self, topic: str, raw: bytes) -> bytes:
+        """Unpack a message of `--compression-mode message`: no CDR begins as packed data does."""
         try:
-            return mcap_file.unpack('zstd', raw)
+            return mcap_file.unpack('zstd', raw) if raw[:4] == _ZSTD_MAGIC else raw
         except ValueError as error:
             raise UserError(f'{self.path}: topic {topic}: {error}') from None
 
@@ -151,6 +136,10 @@ class _RosbagsPart:
             except Exception as error:
                 # In a damaged file, rosbags can raise errors of any kind.
                 raise _unreadable(self._path, error) from error
+
+
+Part = _RosbagsPart | mcap_file.ScannedMcap
+"""A file of a recording: its topics, how much of it was read, and its messages."""
 
 
 def _unreadable(path: Path, error: Exception) -> UserError:
@@ -274,7 +263,6 @@ class Topics:
     imu: str  # The sensor's output
     joints: str | None = None  # Positions of the stage
     info: str | None = None  # What the sensor states of itself
-    # temperature, supply: References of these quantities
     temperature: str | None = None
     supply: str | None = None
     command: str | None = None  # Commands of the stage
@@ -288,19 +276,22 @@ class Topics:
 def find_topics(bag: Bag, topic: str = '') -> Topics:
     """Find the topics by their names, in any namespace, and their types."""
     imu = _find_imu(bag, topic)
-    space = imu.removesuffix('imu/data_raw')
-    if space == imu:
-        space = imu[:imu.rfind('/') + 1]
-    joints = _beside(bag, space, 'stage/joint_states', JOINT_STATE)
-    stage = (joints or f'{space}stage/joint_states').removesuffix('joint_states')
+    is_own = imu.endswith('imu/data_raw')
+    space = imu.removesuffix('imu/data_raw') if is_own else imu[:imu.rfind('/') + 1]
+
+    def beside(name: str, kind: str) -> str | None:
+        """Return a topic in the namespace of the sensor; other nodes use these names, too."""
+        return space + name if (space + name, kind) in bag.types else None
+
+    joints = beside('stage/joint_states', JOINT_STATE) or _only(bag, 'stage/joint_states',
+                                                                JOINT_STATE)
+    info = beside('sensor_info', DIAGNOSTIC_STATUS)
     # With several sensors, the only sensor_info may be that of another one.
-    is_alone = imu.endswith('imu/data_raw') or len(_imu_topics(bag)) == 1
-    return Topics(imu, joints,
-                  (_beside if is_alone else _typed)(bag, space, 'sensor_info', DIAGNOSTIC_STATUS),
-                  # Other nodes use these names, too: a topic of another type is ignored.
-                  _typed(bag, space, 'temperature', TEMPERATURE),
-                  _typed(bag, space, 'supply', BATTERY_STATE),
-                  _typed(bag, stage, 'command', JOINT_STATE))
+    if info is None and (is_own or len(_imu_topics(bag)) == 1):
+        info = _only(bag, 'sensor_info', DIAGNOSTIC_STATUS)
+    temperature, supply = beside('temperature', TEMPERATURE), beside('supply', BATTERY_STATE)
+    space = joints.removesuffix('joint_states') if joints else f'{space}stage/'
+    return Topics(imu, joints, info, temperature, supply, beside('command', JOINT_STATE))
 
 
 def find_ideal(bag: Bag) -> Topics:
@@ -333,16 +324,6 @@ def _find_imu(bag: Bag, named: str) -> str:
 
 def _imu_topics(bag: Bag) -> list[str]:
     return sorted(topic for topic, kind in bag.types if kind == IMU)
-
-
-def _typed(bag: Bag, space: str, name: str, kind: str) -> str | None:
-    """Return the topic in a namespace if the bag holds it with this type, else None."""
-    return space + name if (space + name, kind) in bag.types else None
-
-
-def _beside(bag: Bag, space: str, name: str, kind: str) -> str | None:
-    """Return the topic in the sensor's own namespace or, if there is none, the only one."""
-    return _typed(bag, space, name, kind) or _only(bag, name, kind)
 
 
 def _only(bag: Bag, name: str, kind: str) -> str | None:

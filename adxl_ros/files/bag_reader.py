@@ -4,25 +4,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 import itertools
 import os
 from pathlib import Path
+from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
-from adxl_ros.files.bag_messages import Bag, find_ideal, find_topics, open_bag, read_info, Topics
+from adxl_ros.files.bag_messages import (
+    Bag,
+    BATTERY_STATE,
+    find_ideal,
+    find_topics,
+    JOINT_STATE,
+    open_bag,
+    read_info,
+    TEMPERATURE,
+    Topics,
+)
 from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
 from adxl_ros.files.mcap_file import Piece, Raws
 from adxl_ros.files.recording_columns import (
     ACCEL,
     Alignment,
-    BadStamps,
     COMMANDS,
-    describe_bursts,
     JOINTS,
     LIMIT,
     Recording,
+    StampCheck,
 )
 from adxl_ros.files.reference_alignment import Command, LONGEST_MOVE_NS, seconds, Track
 from adxl_ros.model.constants import AXES, MEASURED_AXES
@@ -47,15 +57,20 @@ def blocks(path: str | os.PathLike, rows: int, ideal: bool = False,
         info = read_info(bag, topics.info)
         samples = _Samples(f'{bag.path}: topic {topics.imu}', AXES if ideal else info.get('axes'),
                            reading)
-        tracks = _tracks(bag, topics)
+        tracks, kinds = _tracks(bag, topics), dict(bag.types)
         commands = {column: Command() for column in COMMANDS.values() if topics.command}
-        for batch, is_last in _batches(bag, topics, rows):
-            samples.add(batch.messages.pop(topics.imu, []))
+        for pieces, is_last in _batches(bag, topics, rows):
+            messages = {topic: [piece.messages[topic] for piece in pieces
+                                if len(piece.messages.get(topic, ()))]
+                        for topic in topics.sampled()}
+            samples.add(messages.pop(topics.imu))
             if topics.command:
                 _add_commands(f'{bag.path}: topic {topics.command}', commands,
-                              batch.messages.pop(topics.command),
-                              samples.arrived_ns[batch.samples_before])
-            _add_references(bag, topics, tracks, batch.messages)
+                              messages.pop(topics.command),
+                              samples.arrived_ns[_samples_before(pieces, topics)])
+            for topic, parts in messages.items():
+                _add_references(f'{bag.path}: topic {topic}', _REFERENCES[kinds[topic]], parts,
+                                tracks)
             ready = len(samples.stamp_ns) if is_last else samples.ready(tracks)
             for start in range(0, ready, rows):
                 yield _block(bag, samples, tracks, commands, info,
@@ -74,40 +89,30 @@ def _refuse_mapping(bag: Bag, reading: ReadingOptions) -> None:
         raise UserError(f'--lsb-per-g: {bag.path} is a bag, whose readings are in m/s²')
 
 
-class _Batch:
-    """Messages in the order of recording."""
-
-    def __init__(self, topics: Topics) -> None:
-        self._topics = topics
-        # Their bytes by topic, in parts
-        self.messages: dict[str, list[Raws]] = {name: [] for name in topics.sampled()}
-        # How many samples of the batch precede each command, (k,)
-        self.samples_before: list[int] = []
-        self.count = 0  # Samples of the batch
-
-    def add(self, piece: Piece) -> None:
-        """Append messages."""
-        samples = piece.places.get(self._topics.imu, np.zeros(0, np.int64))
-        commands = piece.places.get(self._topics.command or '')
-        if commands is not None:
-            self.samples_before += (self.count + np.searchsorted(samples, commands)).tolist()
-        for topic, raws in piece.messages.items():
-            if len(raws):
-                self.messages[topic].append(raws)
-        self.count += len(samples)
-
-
-def _batches(bag: Bag, topics: Topics, rows: int) -> Iterator[tuple[_Batch, bool]]:
-    """Yield batches, each with `rows` samples of the sensor, and whether it is the last."""
-    batch = _Batch(topics)
+def _batches(bag: Bag, topics: Topics, rows: int) -> Iterator[tuple[list[Piece], bool]]:
+    """Yield pieces with `rows` samples of the sensor together, and whether they are the last."""
+    batch: list[Piece] = []
+    count = 0
     for piece in bag.pieces(topics.sampled()):
-        while batch.count + len(piece.places.get(topics.imu, ())) >= rows:
-            head, piece = piece.split(topics.imu, rows - batch.count)
-            batch.add(head)
-            yield batch, False
-            batch = _Batch(topics)
-        batch.add(piece)
+        while count + len(piece.places.get(topics.imu, ())) >= rows:
+            head, piece = piece.split(topics.imu, rows - count)
+            yield [*batch, head], False
+            batch, count = [], 0
+        batch.append(piece)
+        count += len(piece.places.get(topics.imu, ()))
     yield batch, True
+
+
+def _samples_before(pieces: list[Piece], topics: Topics) -> np.ndarray:
+    """Return how many samples of a batch precede each of its commands, (k,)."""
+    none, count = np.zeros(0, np.int64), 0
+    before = [none]
+    for piece in pieces:
+        samples = piece.places.get(topics.imu, none)
+        before.append(count + np.searchsorted(samples,
+                                              piece.places.get(topics.command or '', none)))
+        count += len(samples)
+    return np.concatenate(before)
 
 
 class _Samples:
@@ -115,18 +120,18 @@ class _Samples:
 
     def __init__(self, where: str, axes: str | None, reading: ReadingOptions) -> None:
         self.where = where  # File and topic, for messages
-        self._reading = reading
-        self._first_ns = 0
-        self.bad_stamps = BadStamps(0, 0)
+        self.stamps = StampCheck(where, reading.drop_bad_stamps)
         # Measured axes; None before the first sample, if sensor_info does not state them
         self.axes = axes
         self.epoch_ns = 0  # Origin of the times, ns
-        self.count = 0  # Samples so far
+        self.count = 0  # Messages so far
         self.stamp_ns = np.zeros(0, np.int64)  # Stamps of the waiting samples, ns, (n,)
-        self.accel = np.zeros((0, 3))  # Their specific force, m/s², (n, 3)
+        # Their specific force, m/s², (n,) by column
+        self.force: dict[str, np.ndarray] = dict.fromkeys(ACCEL, np.zeros(0))
         # Stamps of the newest batch after the stamp of the sample before it, ns; 0 is none
         self.arrived_ns = np.zeros(1, np.int64)
-        self._last_ns: int | None = None
+        self._rate_hz = reading.rate_hz
+        self._first_ns = 0
         self._frame: str | None = None
 
     def add(self, parts: list[Raws]) -> None:
@@ -134,51 +139,30 @@ class _Samples:
         if not parts:
             self.arrived_ns = self.arrived_ns[-1:]
             return
-        stamp_ns, accel = _values(self.where, parts, cdr.imu, 'linear_acceleration', 3,
-                                  self._check_frame)
-        size = len(stamp_ns)
-        if self._last_ns is None:
+        stamp_ns, force = _columns(self.where, parts, cdr.imu, ACCEL, self._force)
+        if not self.count:
             self._begin(parts[0][:1], int(stamp_ns[0]))
-            self._first_ns = int(stamp_ns[0])
-        if self._reading.rate_hz is not None:
-            number = self.count + np.arange(size)
-            stamp_ns = self._first_ns + np.rint(number * 1e9 / self._reading.rate_hz).astype(
-                np.int64)
+        if self._rate_hz is not None:
+            number = self.count + np.arange(len(stamp_ns))
+            stamp_ns = self._first_ns + np.rint(number * 1e9 / self._rate_hz).astype(np.int64)
         self.arrived_ns = np.concatenate([self.arrived_ns[-1:], stamp_ns])
-        is_kept = self._increasing(stamp_ns)
-        stamp_ns, accel = stamp_ns[is_kept], accel[is_kept]
-        self._last_ns = int(stamp_ns[-1]) if len(stamp_ns) else self._last_ns
-        self._check_values(stamp_ns, accel)
+
+        def place(row: int) -> str:
+            number = self.count + row + 1
+            return f'{self.where}: message {number}, stamped {seconds(stamp_ns[row])}'
+
+        is_kept = self.stamps.increasing((stamp_ns - self.epoch_ns) / 1e9,
+                                         np.ones(len(stamp_ns), bool), place)
+        for axis, values in zip(AXES, force.values()):
+            wrong = is_kept & ~(np.abs(values) <= LIMIT)
+            if wrong.any():
+                raise UserError(f'{place(int(wrong.argmax()))}: linear_acceleration.{axis} is '
+                                f'{values[wrong.argmax()]:g} m/s², expected a number within '
+                                f'±{LIMIT:g}')
         self.count += len(stamp_ns)
-        self.stamp_ns = np.concatenate([self.stamp_ns, stamp_ns])
-        self.accel = np.concatenate([self.accel, accel])
-
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        """Return what was left out, for people."""
-        left_out = sum(self.bad_stamps)
-        if not left_out:
-            return ()
-        return (f'{self.where}: left out, messages whose stamp does not increase: '
-                f'{left_out}',)
-
-    def _increasing(self, stamp_ns: np.ndarray) -> np.ndarray:
-        """Return which stamps, ns, (n,), increase; refuse the others unless they are left out."""
-        latest = np.maximum.accumulate(np.concatenate([
-            [stamp_ns[0] - 1 if self._last_ns is None else self._last_ns], stamp_ns]))[:-1]
-        is_kept = stamp_ns > latest
-        if not is_kept.all() and not self._reading.drop_bad_stamps:
-            i = int(is_kept.argmin())
-            verb = 'stands still' if stamp_ns[i] == latest[i] else 'runs backwards'
-            raise UserError(f'{self.where}: time {verb}: message {self.count + i + 1} is stamped '
-                            f'{seconds(stamp_ns[i])} after {seconds(latest[i])}'
-                            f'{describe_bursts((stamp_ns - stamp_ns[0]) / 1e9)}; '
-                            '--drop-bad-stamps leaves such messages out')
-        duplicates = int((stamp_ns == latest).sum())
-        self.bad_stamps = BadStamps(
-            self.bad_stamps.duplicates + duplicates,
-            self.bad_stamps.backward + int((~is_kept).sum()) - duplicates)
-        return is_kept
+        self.stamp_ns = np.concatenate([self.stamp_ns, stamp_ns[is_kept]])
+        self.force = {name: np.concatenate([self.force[name], values[is_kept]])
+                      for name, values in force.items()}
 
     def ready(self, tracks: dict[str, Track]) -> int:
         """Return how many samples have all their references; the last one always waits."""
@@ -189,9 +173,11 @@ class _Samples:
 
     def drop(self, count: int) -> None:
         """Forget the oldest samples."""
-        self.stamp_ns, self.accel = self.stamp_ns[count:], self.accel[count:]
+        self.stamp_ns = self.stamp_ns[count:]
+        self.force = {name: values[count:] for name, values in self.force.items()}
 
     def _begin(self, first: Raws, stamp_ns: int) -> None:
+        self._first_ns = stamp_ns
         if stamp_ns > _EXACT_NS:
             self.epoch_ns = stamp_ns // 1_000_000_000 * 1_000_000_000
         table = next(_tables(self.where, [first], cdr.imu))
@@ -206,20 +192,13 @@ class _Samples:
             raise UserError(f'{self.where}: linear_acceleration_covariance gives the axes '
                             f'{self.axes or "none"}, expected x, xy or xyz; record sensor_info')
 
-    def _check_frame(self, table: cdr.Table) -> None:
+    def _force(self, table: cdr.Table) -> dict[str, np.ndarray]:
         frame = table.layout.texts['frame_id']
         if self._frame not in (None, frame):
             raise UserError(f'{self.where}: frame_id changes from {self._frame!r} to {frame!r}; '
                             'record each sensor on a topic of its own')
         self._frame = frame
-
-    def _check_values(self, stamp_ns: np.ndarray, accel: np.ndarray) -> None:
-        wrong = ~(np.abs(accel) <= LIMIT)
-        if wrong.any():
-            i, axis = np.argwhere(wrong)[0].tolist()
-            raise UserError(f'{self.where}: message {self.count + i + 1}, stamped '
-                            f'{seconds(stamp_ns[i])}: linear_acceleration.{AXES[axis]} is '
-                            f'{accel[i, axis]:g} m/s², expected a number within ±{LIMIT:g}')
+        return dict(zip(ACCEL, table.numbers('linear_acceleration').T))
 
 
 def _tables(where: str, parts: list[Raws],
@@ -231,38 +210,38 @@ def _tables(where: str, parts: list[Raws],
         raise UserError(f'{where}: a message is damaged: {error}') from None
 
 
-def _values(where: str, parts: list[Raws], find: Callable[[bytes], cdr.Layout], name: str,
-            size: int = 1, look: Callable[[cdr.Table], None] = lambda table: None
-            ) -> tuple[np.ndarray, np.ndarray]:
-    """Return stamps, ns, (k,), and a field, (k, size), of messages; `look` sees each layout."""
-    count = sum(map(len, parts))
-    stamp_ns, values = np.empty(count, np.int64), np.empty((count, size))
-    for table in _tables(where, parts, find):
-        stamp_ns[table.rows] = table.stamp_ns()
-        values[table.rows] = table.numbers(name)
-        look(table)
-    return stamp_ns, values
-
-
-def _joints(where: str, parts: list[Raws], names: Mapping[str, str]
-            ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return stamps and positions by column; a joint that a message does not name is NaN there."""
+def _columns(where: str, parts: list[Raws], find: Callable[[bytes], cdr.Layout],
+             names: Iterable[str], values: Callable[[cdr.Table], Mapping[str, np.ndarray]]
+             ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return stamps, ns, (k,), and columns, (k,) each; NaN where a message has no value."""
     count = sum(map(len, parts))
     stamp_ns = np.empty(count, np.int64)
-    values = {column: np.full(count, np.nan) for column in names.values()}
-    for table in _tables(where, parts, cdr.joint_state):
+    columns = {name: np.full(count, np.nan) for name in names}
+    for table in _tables(where, parts, find):
         stamp_ns[table.rows] = table.stamp_ns()
-        joints = [text for key, text in table.layout.texts.items() if key != 'frame_id']
-        if 'position' in table.layout.fields:
-            for joint, value in zip(joints, table.numbers('position').T):
-                if joint in names:
-                    values[names[joint]][table.rows] = value
-    return {column: (stamp_ns, value) for column, value in values.items()}
+        for name, column in values(table).items():
+            if name in columns:
+                columns[name][table.rows] = column
+    return stamp_ns, columns
 
 
-_SCALARS = {'temperature_c': (cdr.temperature, 'temperature'),
-            'supply_v': (cdr.battery_state, 'voltage')}
-"""Layout and field of the messages of a reference that is one number."""
+def _positions(table: cdr.Table, names: Mapping[str, str]) -> dict[str, np.ndarray]:
+    """Return the positions of joints by column."""
+    if 'position' not in table.layout.fields:
+        return {}
+    joints = [text for key, text in table.layout.texts.items() if key != 'frame_id']
+    return {names[joint]: values for joint, values in zip(joints, table.numbers('position').T)
+            if joint in names}
+
+
+_REFERENCES: Mapping[str, tuple[Any, ...]] = {
+    JOINT_STATE: (cdr.joint_state, JOINTS.values(), lambda table: _positions(table, JOINTS)),
+    TEMPERATURE: (cdr.temperature, ['temperature_c'],
+                  lambda table: {'temperature_c': table.numbers('temperature')[:, 0]}),
+    BATTERY_STATE: (cdr.battery_state, ['supply_v'],
+                    lambda table: {'supply_v': table.numbers('voltage')[:, 0]}),
+}
+"""Layout, columns and values of the messages of a reference by their type."""
 
 
 def _tracks(bag: Bag, topics: Topics) -> dict[str, Track]:
@@ -274,23 +253,16 @@ def _tracks(bag: Bag, topics: Topics) -> dict[str, Track]:
             for column, topic in columns.items() if topic}
 
 
-def _add_references(bag: Bag, topics: Topics, tracks: dict[str, Track],
-                    messages: dict[str, list[Raws]]) -> None:
-    """Decode the messages of references, by topic, and add them to the tracks of their columns."""
-    for topic, parts in messages.items():
-        where = f'{bag.path}: topic {topic}'
-        if topic == topics.joints:
-            columns = _joints(where, parts, JOINTS)
-        else:
-            column = 'temperature_c' if topic == topics.temperature else 'supply_v'
-            stamp_ns, values = _values(where, parts, *_SCALARS[column])
-            columns = {column: (stamp_ns, values[:, 0])}
-        for column, (stamp_ns, value) in columns.items():
-            wrong = np.abs(value) > LIMIT
-            if wrong.any():
-                raise UserError(f'{where}: {column} is {value[wrong.argmax()]:g} at '
-                                f'{seconds(stamp_ns[wrong.argmax()])}, beyond ±{LIMIT:g}')
-            tracks[column].add(stamp_ns, value)
+def _add_references(where: str, kind: tuple[Any, ...], parts: list[Raws],
+                    tracks: dict[str, Track]) -> None:
+    """Decode the messages of references, and add them to the tracks of their columns."""
+    stamp_ns, columns = _columns(where, parts, *kind)
+    for column, value in columns.items():
+        wrong = np.abs(value) > LIMIT
+        if wrong.any():
+            raise UserError(f'{where}: {column} is {value[wrong.argmax()]:g} at '
+                            f'{seconds(stamp_ns[wrong.argmax()])}, beyond ±{LIMIT:g}')
+        tracks[column].add(stamp_ns, value)
 
 
 def _add_commands(where: str, commands: dict[str, Command], parts: list[Raws],
@@ -300,7 +272,9 @@ def _add_commands(where: str, commands: dict[str, Command], parts: list[Raws],
 
     A value that is no angle is left out, because the stage refuses it.
     """
-    for column, (stamp_ns, value) in _joints(where, parts, COMMANDS).items():
+    stamp_ns, columns = _columns(where, parts, cdr.joint_state, commands,
+                                 lambda table: _positions(table, COMMANDS))
+    for column, value in columns.items():
         commands[column].add(np.where(stamp_ns == 0, arrived_ns, stamp_ns),
                              np.where(np.abs(value) <= LIMIT, value, np.nan))
 
@@ -309,9 +283,7 @@ def _block(bag: Bag, samples: _Samples, tracks: dict[str, Track], commands: dict
            info: dict[str, str], part: slice) -> Recording:
     """Make a block of waiting samples, with references and commands at their stamps."""
     stamp_ns = samples.stamp_ns[part]
-    accel = samples.accel[part]
-    columns = {name: np.ascontiguousarray(accel[:, i])
-               for i, name in enumerate(ACCEL[:len(samples.axes or '')])}
+    columns = {name: samples.force[name][part] for name in ACCEL[:len(samples.axes or '')]}
     alignments = {}
     for name, track in tracks.items():
         columns[name] = track.interpolate(stamp_ns)
@@ -324,7 +296,7 @@ def _block(bag: Bag, samples: _Samples, tracks: dict[str, Track], commands: dict
     time_s = (stamp_ns - samples.epoch_ns) / 1e9
     cut = f'{bag.cut}; the last sample read is at {seconds(stamp_ns[-1])}' if bag.cut else ''
     return Recording(bag.path, time_s, columns, dict(info), alignments, cut, samples.epoch_ns,
-                     bag.done, samples.remarks, samples.bad_stamps)
+                     bag.done, samples.stamps.remarks, samples.stamps.bad)
 
 
 def drop_unsampled(recording: Recording) -> None:

@@ -55,6 +55,14 @@ _DEPTH = 10
 """Messages that any other topic keeps, the default depth of ROS."""
 
 
+class Form(NamedTuple):
+    """How the messages of a topic are written."""
+
+    kind: str  # Their type
+    find: Callable[[bytes], cdr.Layout]  # Finds the fields of a message
+    template: bytes  # A message
+
+
 class OpenBag:
     """
     A new bag: a rosbag2 directory, or one file for a name.mcap.
@@ -102,6 +110,12 @@ class OpenBag:
                             f'{stamp_ns[-1] / 1e9:g} s cannot be stamps of ROS messages, '
                             'which go from 0 to 2^31 s')
 
+    def batch(self, topic: str, form: Form, stamp_ns: np.ndarray, rows: np.ndarray,
+              fields: Mapping[str, np.ndarray]) -> Batch:
+        """Return the messages of some samples of all, whose stamps are `stamp_ns`."""
+        return Batch(self.connection(topic, form.kind), rows,
+                     cdr.fill(form.template, form.find, stamp_ns[rows], fields))
+
     def write_messages(self, stamp_ns: np.ndarray, batches: Sequence[Batch]) -> None:
         """
         Append the messages of samples.
@@ -126,7 +140,7 @@ class BagWriter(OpenBag):
         """Prepare to write to `path`."""
         super().__init__(path)
         self._sensor = sensor
-        self._imu = imu_template(self.types, _noise_covariance(sensor))
+        self._imu = _imu_form(_noise_covariance(sensor))
 
     def write(self, recording: Recording) -> None:
         """Append samples."""
@@ -138,12 +152,20 @@ class BagWriter(OpenBag):
         for start in range(0, len(recording), _ROWS_AT_ONCE):
             part = slice(start, start + _ROWS_AT_ONCE)
             references = {name: values[part] for name, values in recording.columns.items()}
-            batches = [self._imu_batch(stamp_ns[part], accel[part]),
+            force = np.zeros((len(stamp_ns[part]), 3))
+            force[:, :accel.shape[1]] = accel[part]
+            batches = [self.batch('/imu/data_raw', self._imu, stamp_ns[part],
+                                  np.arange(len(force)), {'linear_acceleration': force}),
                        *self._joint_batches(stamp_ns[part], references, JOINTS,
                                             '/stage/joint_states'),
                        *self._joint_batches(stamp_ns[part], _changes(references), COMMANDS,
-                                            '/stage/command'),
-                       *self._scalar_batches(stamp_ns[part], references)]
+                                            '/stage/command')]
+            for column, (topic, field, form) in _SCALARS.items():
+                values = references.get(column, np.zeros(0))
+                rows = np.flatnonzero(~np.isnan(values))
+                if len(rows):
+                    batches.append(self.batch(topic, form, stamp_ns[part], rows,
+                                              {field: values[rows]}))
             self.write_messages(stamp_ns[part], batches)
 
     def _write_info(self, recording: Recording, stamp_ns: int) -> None:
@@ -156,12 +178,6 @@ class BagWriter(OpenBag):
         raw = self.types.serialize_cdr(message, DIAGNOSTIC_STATUS)
         connection = self.connection('/sensor_info', DIAGNOSTIC_STATUS, is_latched=True)
         self._writer.write(connection, stamp_ns, raw)
-
-    def _imu_batch(self, stamp_ns: np.ndarray, accel: np.ndarray) -> Batch:
-        force = np.zeros((len(accel), 3))
-        force[:, :accel.shape[1]] = accel
-        data = cdr.fill(self._imu, cdr.imu(self._imu), stamp_ns, {'linear_acceleration': force})
-        return Batch(self.connection('/imu/data_raw', IMU), np.arange(len(accel)), data)
 
     def _joint_batches(self, stamp_ns: np.ndarray, columns: dict[str, np.ndarray],
                        names: Mapping[str, str], topic: str) -> list[Batch]:
@@ -176,24 +192,10 @@ class BagWriter(OpenBag):
             rows = np.flatnonzero((is_sampled == pattern).all(axis=1))
             sampled_joints = [joint for joint, sampled in zip(joints, pattern) if sampled]
             if sampled_joints:
-                template = _joint_template(self.types, sampled_joints)
-                data = cdr.fill(template, cdr.joint_state(template), stamp_ns[rows],
-                                {'position': values[rows][:, pattern]})
-                batches.append(Batch(self.connection(topic, JOINT_STATE), rows, data))
-        return batches
-
-    def _scalar_batches(self, stamp_ns: np.ndarray,
-                        references: dict[str, np.ndarray]) -> list[Batch]:
-        """Return the batches of temperature and supply, where they were sampled."""
-        batches = []
-        for scalar in _SCALARS:
-            values = references.get(scalar.column, np.zeros(0))
-            rows = np.flatnonzero(~np.isnan(values))
-            if len(rows):
-                template = scalar.template(self.types)
-                data = cdr.fill(template, scalar.layout(template), stamp_ns[rows],
-                                {scalar.field: values[rows]})
-                batches.append(Batch(self.connection(scalar.topic, scalar.kind), rows, data))
+                count = len(sampled_joints)
+                template = cdr.message('', count, *sampled_joints, count, np.zeros(count), 0, 0)
+                batches.append(self.batch(topic, Form(JOINT_STATE, cdr.joint_state, template),
+                                          stamp_ns, rows, {'position': values[rows][:, pattern]}))
         return batches
 
 
@@ -208,18 +210,6 @@ def _changes(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return changed
 
 
-class _Scalar(NamedTuple):
-    """A reference with a topic of its own."""
-
-    column: str  # Its column in a recording
-    # topic, kind: The topic and its type
-    topic: str
-    kind: str
-    field: str  # The message's field with the value
-    template: Callable[[Any], bytes]  # Makes a message, from the message types
-    layout: Callable[[bytes], cdr.Layout]  # Finds the fields of a message
-
-
 def _keep_file(file: Path, target: Path) -> None:
     if file.exists():
         os.replace(file, target)
@@ -227,25 +217,12 @@ def _keep_file(file: Path, target: Path) -> None:
 
 def _qos(is_latched: bool) -> Any:
     """Return the QoS of `ros2 bag play`: reliable, and latched for late subscribers if asked."""
-    from rosbags.interfaces import (
-        Qos,
-        QosDurability,
-        QosHistory,
-        QosLiveliness,
-        QosReliability,
-        QosTime,
-    )
-    durability = QosDurability.TRANSIENT_LOCAL if is_latched else QosDurability.VOLATILE
-    forever = QosTime(*divmod(_LONGEST_NS, 1_000_000_000))
-    return Qos(QosHistory.KEEP_LAST, _LATCHED_DEPTH if is_latched else _DEPTH,
-               QosReliability.RELIABLE, durability, forever, forever, QosLiveliness.AUTOMATIC,
-               forever, False)
-
-
-def message_header(types: Any, frame: str) -> Any:
-    """Return a header with the stamp 0."""
-    time = types.types['builtin_interfaces/msg/Time'](sec=0, nanosec=0)
-    return types.types['std_msgs/msg/Header'](stamp=time, frame_id=frame)
+    from rosbags import interfaces as ros
+    durability = ros.QosDurability.TRANSIENT_LOCAL if is_latched else ros.QosDurability.VOLATILE
+    forever = ros.QosTime(*divmod(_LONGEST_NS, 1_000_000_000))
+    return ros.Qos(ros.QosHistory.KEEP_LAST, _LATCHED_DEPTH if is_latched else _DEPTH,
+                   ros.QosReliability.RELIABLE, durability, forever, forever,
+                   ros.QosLiveliness.AUTOMATIC, forever, False)
 
 
 def _noise_covariance(sensor: Sensor) -> np.ndarray:
@@ -256,59 +233,29 @@ def _noise_covariance(sensor: Sensor) -> np.ndarray:
     return np.diag(variance).ravel()
 
 
-def imu_template(types: Any, covariance: np.ndarray) -> bytes:
+def _imu_form(covariance: np.ndarray) -> Form:
     """
-    Return an Imu without orientation and angular velocity, at the stamp 0.
+    Return the form of an Imu without orientation and angular velocity.
 
     covariance: that of the acceleration by rows, (m/s²)², (9,).
     """
-    absent = np.zeros(9)
-    absent[0] = -1.0
-    vector = types.types['geometry_msgs/msg/Vector3'](x=0.0, y=0.0, z=0.0)
-    message = types.types[IMU](
-        header=message_header(types, FRAME),
-        orientation=types.types['geometry_msgs/msg/Quaternion'](x=0.0, y=0.0, z=0.0, w=1.0),
-        orientation_covariance=absent,
-        angular_velocity=vector, angular_velocity_covariance=absent,
-        linear_acceleration=vector, linear_acceleration_covariance=covariance)
-    return bytes(types.serialize_cdr(message, IMU))
+    absent = [-1.0, *[0.0] * 8]
+    return Form(IMU, cdr.imu, cdr.message(FRAME, [0.0, 0.0, 0.0, 1.0], absent, np.zeros(3), absent,
+                                          np.zeros(3), covariance))
 
 
-def _joint_template(types: Any, names: list[str]) -> bytes:
-    """Return a JointState with the positions of some joints."""
-    none = np.zeros(0)
-    message = types.types[JOINT_STATE](
-        header=message_header(types, ''), name=names, position=np.zeros(len(names)),
-        velocity=none, effort=none)
-    return bytes(types.serialize_cdr(message, JOINT_STATE))
+_VOLTAGE = np.array([0.0, *[np.nan] * 6], np.float32)
+"""Voltage of a battery; temperature, current, charge, capacities and percentage are unknown."""
 
-
-def _temperature_template(types: Any) -> bytes:
-    """Return a Temperature of unknown variance."""
-    message = types.types[TEMPERATURE](
-        header=message_header(types, FRAME), temperature=0.0, variance=0.0)
-    return bytes(types.serialize_cdr(message, TEMPERATURE))
-
-
-def _battery_template(types: Any) -> bytes:
-    """Return a BatteryState of which only the voltage is measured."""
-    unknown = float('nan')
-    none = np.zeros(0, np.float32)
-    message = types.types[BATTERY_STATE](
-        header=message_header(types, FRAME), voltage=0.0, temperature=unknown, current=unknown,
-        charge=unknown, capacity=unknown, design_capacity=unknown, percentage=unknown,
-        power_supply_status=0, power_supply_health=0, power_supply_technology=0, present=True,
-        cell_voltage=none, cell_temperature=none, location='', serial_number='')
-    return bytes(types.serialize_cdr(message, BATTERY_STATE))
-
-
-_SCALARS = (
-    _Scalar('temperature_c', '/temperature', TEMPERATURE, 'temperature', _temperature_template,
-            cdr.temperature),
-    _Scalar('supply_v', '/supply', BATTERY_STATE, 'voltage', _battery_template,
-            cdr.battery_state),
-)
-"""References that are one number."""
+_SCALARS = {
+    'temperature_c': ('/temperature', 'temperature', Form(
+        TEMPERATURE, cdr.temperature, cdr.message(FRAME, np.zeros(2)))),
+    'supply_v': ('/supply', 'voltage', Form(
+        # Three states, present, no cell voltages and temperatures, location, serial number.
+        BATTERY_STATE, cdr.battery_state, cdr.message(
+            FRAME, _VOLTAGE, np.array([0, 0, 0, 1], np.uint8), 0, 0, '', ''))),
+}
+"""Topic, field and form of references that are one number, by column."""
 
 
 _VECTOR = 'geometry_msgs/msg/Vector3Stamped'
@@ -321,11 +268,8 @@ class TiltBag(OpenBag):
     def __init__(self, path: str | os.PathLike) -> None:
         """Prepare to write to `path`, which is replaced if it exists."""
         super().__init__(path)
-        self._imu = imu_template(self.types, np.zeros(9))
-        kinds = self.types.types
-        zero = kinds['geometry_msgs/msg/Vector3'](x=0.0, y=0.0, z=0.0)
-        self._tilt = bytes(self.types.serialize_cdr(
-            kinds[_VECTOR](header=message_header(self.types, FRAME), vector=zero), _VECTOR))
+        self._imu = _imu_form(np.zeros(9))
+        self._tilt = Form(_VECTOR, cdr.vector3_stamped, cdr.message(FRAME, np.zeros(3)))
 
     def write(self, stamp_ns: np.ndarray, imu_fields: Mapping[str, np.ndarray],
               tilt_rad: np.ndarray) -> None:
@@ -335,15 +279,14 @@ class TiltBag(OpenBag):
         stamp_ns: stamps, ns, (n,), rising; imu_fields: fields of sensor_msgs/Imu by name, (n, k)
         each; tilt_rad: roll, pitch and inclination, rad, (n, 3).
         """
-        data, tilt = self.connection('/imu/data', IMU), self.connection('/tilt', _VECTOR)
-        if not len(stamp_ns):
-            return
-        self.check_stamps(stamp_ns)
-        rows = np.arange(len(stamp_ns))
-        self.write_messages(stamp_ns, [
-            Batch(data, rows, cdr.fill(self._imu, cdr.imu(self._imu), stamp_ns, imu_fields)),
-            Batch(tilt, rows, cdr.fill(self._tilt, cdr.vector3_stamped(self._tilt), stamp_ns,
-                                       {'vector': tilt_rad}))])
+        self.connection('/imu/data', IMU)
+        self.connection('/tilt', _VECTOR)
+        if len(stamp_ns):
+            self.check_stamps(stamp_ns)
+            rows = np.arange(len(stamp_ns))
+            self.write_messages(stamp_ns, [
+                self.batch('/imu/data', self._imu, stamp_ns, rows, imu_fields),
+                self.batch('/tilt', self._tilt, stamp_ns, rows, {'vector': tilt_rad})])
 
 
 _FLUSH_NS = 500_000_000

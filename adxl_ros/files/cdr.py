@@ -132,6 +132,26 @@ battery_state = _one_field('voltage', 'f4')
 """Finds the voltage of a sensor_msgs/BatteryState."""
 
 
+def message(stamped_frame: str, *parts: str | int | Sequence[float] | np.ndarray) -> bytes:
+    """
+    Return a message at the stamp 0, little-endian.
+
+    parts: what follows its header: strings, lengths of sequences, and numbers in their own type.
+    """
+    data = bytearray(b'\0\1\0\0')
+    for part in (np.zeros(2, np.int32), stamped_frame, *parts):
+        if isinstance(part, str):
+            text = part.encode() + b'\0'
+            part, rest = len(text), text
+        else:
+            rest = b''
+        values = np.uint32(part) if isinstance(part, int) else np.asarray(part)
+        if values.size:
+            data += bytes((_BODY_OFFSET - len(data)) % values.itemsize) + values.tobytes()
+        data += rest
+    return bytes(data)
+
+
 @dataclass(frozen=True)
 class Table:
     """Messages of one layout."""
@@ -188,14 +208,15 @@ def joined_tables(parts: Sequence[Sequence[bytes] | np.ndarray],
         begin += len(raws)
 
 
-def fill(template: bytes, layout: Layout, stamp_ns: np.ndarray,
+def fill(template: bytes, find: Callable[[bytes], Layout], stamp_ns: np.ndarray,
          fields: Mapping[str, np.ndarray]) -> np.ndarray:
     """
     Return one message for each stamp.
 
-    stamp_ns: stamps, ns, (n,); fields: values by field, (n, count); returns: the bytes of the
-    messages, (n, size), each as long as the template.
+    find: finds the fields of a message; stamp_ns: stamps, ns, (n,); fields: values by field,
+    (n, count); returns: the bytes of the messages, (n, size), each as long as the template.
     """
+    layout = find(template)
     sec, nanosec = np.divmod(stamp_ns, 1_000_000_000)
     values = {'sec': sec, 'nanosec': nanosec, **fields}
     places = [layout.fields[name] for name in values]

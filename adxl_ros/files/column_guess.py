@@ -76,6 +76,10 @@ _REFERENCES = {
 }
 """Names of references by role."""
 
+_USUAL = {Quantity.ANGLE: (2 * np.pi, 'rad', 'deg'), Quantity.TEMPERATURE: (200.0, 'c', 'k'),
+          Quantity.VOLTAGE: (100.0, 'v', 'mv')}
+"""Largest usual value of a reference in a unit, that unit, and the unit of larger values."""
+
 _ATTITUDE = re.compile(r'(?i)yaw|heading|quat')
 """Names beside an attitude that software has estimated."""
 
@@ -359,25 +363,14 @@ def _references(table: Table, values: Mapping[str, np.ndarray], used: set[str]
                 ) -> dict[str, Source]:
     """Return the columns of references, with their units."""
     sources: dict[str, Source] = {}
-    for role, pattern in _REFERENCES.items():
-        name = next((name for name in values if table.has_names and name not in used
-                     and pattern.search(name)), None)
+    for role, pattern in _REFERENCES.items() if table.has_names else ():
+        name = next((name for name in values if name not in used and pattern.search(name)), None)
         if name:
-            stated = unit_in_name(name, ROLES[role])
-            sources[role] = Source(name, stated or _reference_unit(role, values[name]))
+            limit, usual, other = _USUAL[ROLES[role]]
+            likely = other if (np.abs(values[name]) > limit).any() else usual
+            sources[role] = Source(name, unit_in_name(name, ROLES[role]) or likely)
     # An estimate of attitude, which has a yaw, is made of the readings and is no reference.
     is_estimate = any(_ATTITUDE.search(name) for name in values)
-    if ('roll' in sources) != ('pitch' in sources) or 'alpha' in sources or is_estimate:
+    if not {'roll', 'pitch'} <= set(sources) or 'alpha' in sources or is_estimate:
         sources.pop('roll', None), sources.pop('pitch', None)
     return sources
-
-
-def _reference_unit(role: str, values: np.ndarray) -> str:
-    """Return the likely unit of a reference."""
-    finite = np.abs(values[np.isfinite(values)])
-    largest = float(finite.max()) if len(finite) else 0.0
-    if ROLES[role] is Quantity.ANGLE:
-        return 'deg' if largest > 2 * np.pi else 'rad'
-    if ROLES[role] is Quantity.TEMPERATURE:
-        return 'k' if largest > 200 else 'c'
-    return 'mv' if largest > 100 else 'v'

@@ -18,8 +18,9 @@ import numpy as np
 _EXAMPLE = 'time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg'
 """A mapping, for messages."""
 
-_ENTRY = re.compile(r"""\s*([^=,\s]+)\s*=\s*((?:"[^"]*"|'[^']*'|[^,"'])+?)\s*(?:,|\n|$)""")
-"""An entry of a mapping: a role, and its column with an optional unit."""
+_ENTRY = re.compile(r"""\s*([^=,\s]+)\s*=\s*(?:"([^"]*)"|'([^']*)'|([^,"'\n]*?))\s*"""
+                    r"""(?::\s*([^:,"'\n]*?))?\s*(?:,|\n|$)""")
+"""An entry of a mapping: a role, its column in double, single or no quotes, and a unit."""
 
 
 @dataclass(frozen=True)
@@ -105,49 +106,36 @@ def parse_mapping(text: str) -> ColumnMapping:
         if entry is None:
             raise UserError(f'{where}: {text[place:place + 40].strip()!r} is no role=column:unit; '
                             f'write for example {_EXAMPLE}')
-        role = entry[1]
+        role, *columns, unit = entry.groups(default='')
+        column = next(filter(None, columns), '').strip()
         if role not in ROLES:
             raise UserError(f'{where}: no role {role!r}; the roles are {", ".join(ROLES)}')
         if role in sources:
             raise UserError(f'{where}: {role} stands twice; keep one')
-        sources[role] = _source(where, role, entry[2].strip())
+        if not column:
+            raise UserError(f'{where}: {role} names no column')
+        name = unit_name(unit, ROLES[role]) if unit else ''
+        if name is None:
+            raise UserError(f'{where}: {role}={column}:{unit}: unknown unit {unit!r}; write one '
+                            f'of {", ".join(UNITS[ROLES[role]])}, or quote a name that has a '
+                            'colon')
+        sources[role] = Source(column, name)
         place = entry.end()
     _check_roles(where, sources)
     return ColumnMapping(sources, where)
 
 
 def _content(path: str) -> str:
-    """Return the entries of a mapping file on one line."""
+    """Return the text of a mapping file without comments."""
     try:
-        lines = Path(path).read_text(encoding='utf-8').splitlines()
+        text = re.sub('#.*', '', Path(path).read_text(encoding='utf-8'))
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f'--columns {path}: is neither a mapping nor a file that can be read '
                         f'({getattr(error, "strerror", None) or error}); write for example '
                         f'{_EXAMPLE}') from None
-    entries = [line.partition('#')[0].strip().rstrip(',') for line in lines]
-    text = ','.join(entry for entry in entries if entry)
     if '=' not in text:
         raise UserError(f'--columns {path}: holds no mapping; write for example {_EXAMPLE}')
     return text
-
-
-def _source(where: str, role: str, text: str) -> Source:
-    """Return column and unit of an entry."""
-    quoted = re.fullmatch(r"""(?:"([^"]*)"|'([^']*)')\s*(?::\s*(.*))?""", text)
-    if quoted:
-        column, unit = quoted[1] or quoted[2] or '', quoted[3] or ''
-    else:
-        column, _, unit = text.rpartition(':') if ':' in text else (text, '', '')
-    column = column.strip()
-    if not column:
-        raise UserError(f'{where}: {role} names no column')
-    if not unit:
-        return Source(column)
-    name = unit_name(unit, ROLES[role])
-    if name is None:
-        raise UserError(f'{where}: {role}={text}: unknown unit {unit!r}; write one of '
-                        f'{", ".join(UNITS[ROLES[role]])}, or quote a name that has a colon')
-    return Source(column, name)
 
 
 def _check_roles(where: str, sources: Mapping[str, Source]) -> None:
@@ -156,10 +144,10 @@ def _check_roles(where: str, sources: Mapping[str, Source]) -> None:
     if not axes or axes != AXES[:len(axes)]:
         raise UserError(f'{where}: names the axes {axes or "none"}, expected x, x and y, or x, y '
                         f'and z; write for example {_EXAMPLE}')
-    tilts = [role for role in ('roll', 'pitch') if role in sources]
-    stage = [role for role in ('alpha', 'beta') if role in sources]
-    if tilts and stage:
-        raise UserError(f'{where}: {tilts[0]} and {stage[0]} are two references; keep roll and '
+    given = [role for role in ('roll', 'pitch', 'alpha', 'beta') if role in sources]
+    tilts = [role for role in given if role in ('roll', 'pitch')]
+    if tilts and given != tilts:
+        raise UserError(f'{where}: {tilts[0]} and {given[-1]} are two references; keep roll and '
                         'pitch, or alpha and beta')
     if len(tilts) == 1:
         other = 'pitch' if tilts == ['roll'] else 'roll'

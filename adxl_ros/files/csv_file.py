@@ -203,7 +203,11 @@ def _opened(path: str) -> Iterator[BinaryIO]:
 
 
 def _whole_lines(path: str, file: BinaryIO) -> Iterator[bytes]:
-    """Yield a file in UTF-8, without its mark, in parts that end with a line."""
+    """
+    Yield a file in UTF-8, without its mark, in parts that end with a line.
+
+    What is not UTF-8 is taken as Windows-1252.
+    """
     mark = file.read(3)
     if mark[:2] in (b'\xff\xfe', b'\xfe\xff'):
         raise UserError(f'{path}:1:1: is UTF-16; save the file as UTF-8')
@@ -214,16 +218,12 @@ def _whole_lines(path: str, file: BinaryIO) -> Iterator[bytes]:
         if len(data) > _CHUNK_BYTES + _LONGEST_LINE_BYTES:
             raise UserError(f'{path}: a line is longer than {_LONGEST_LINE_BYTES} bytes; '
                             'this is no CSV recording')
-        yield data if data.isascii() else _utf8(data)
-
-
-def _utf8(data: bytes) -> bytes:
-    """Return text that is UTF-8 or, failing that, Windows-1252 as UTF-8."""
-    try:
-        data.decode()
-    except UnicodeDecodeError:
-        return data.decode('cp1252', errors='replace').encode()
-    return data
+        if not data.isascii():
+            try:
+                data.decode()
+            except UnicodeDecodeError:
+                data = data.decode('cp1252', errors='replace').encode()
+        yield data
 
 
 def _by_pandas(lines: _Lines, names: Sequence[str], used: Sequence[str]

@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass
 import re
 
 from adxl_ros.errors import UserError
@@ -31,16 +31,17 @@ from adxl_ros.files.column_mapping import (
 )
 from adxl_ros.files.recording_columns import (
     ACCEL,
-    BadStamps,
     describe_bursts,
     JOINTS,
     LIMIT,
     Recording,
     sensor_columns,
+    StampCheck,
     stamped_rate_hz,
     TIME,
     VOLTS,
 )
+from adxl_ros.files.stream_info import StreamInfo
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.kinematics import stage_angles
 import numpy as np
@@ -135,9 +136,9 @@ def blocks(table: Table, mapping: ColumnMapping | None, reading: ReadingOptions,
     Without a mapping it must have the columns of the package, and further ones are kept, too.
     """
     stated = mapping or native_mapping(table, output)
-    converter = _Converter(table, _resolved(table, stated, reading), stated, reading,
-                           mapping is None)
-    names = list(dict.fromkeys(column.name for column in converter.columns.values()))
+    columns = _resolved(table, stated, reading)
+    converter = _Converter(table, columns, stated, reading, mapping is None)
+    names = list(dict.fromkeys(column.name for column in columns.values()))
     count = 0
     for block in table.blocks(table.names if mapping is None else names, names):
         recording = converter.convert(block)
@@ -187,37 +188,38 @@ def _column(table: Table, mapping: ColumnMapping, role: str) -> _Column:
     return _Column(name, UNITS[ROLES[role]][unit], unit, bool(stated))
 
 
-@dataclass
 class _Converter:
-    """Converts the blocks of one table."""
+    """Converts the blocks of one table; the arguments are those of `blocks`."""
 
-    table: Table  # The table
-    columns: Mapping[str, _Column]  # Its columns by role
-    mapping: ColumnMapping  # What states them
-    reading: ReadingOptions  # See `ReadingOptions`
-    is_native: bool  # Whether the columns are those of the package
-    _remarks: list[str] = field(default_factory=list)
-    _epoch_ns: int | None = None
-    _begin: float = 0.0  # Origin of the times in the unit of the stamps
-    _last_s: float = -np.inf
-    _count: int = 0
-    _empty: int = 0
-    _duplicates: int = 0
-    _backward: int = 0
-    _last_beta_rad: float = 0.0
+    def __init__(self, table: Table, columns: Mapping[str, _Column], mapping: ColumnMapping,
+                 reading: ReadingOptions, is_native: bool) -> None:
+        self._path = table.path
+        self._columns, self._mapping, self._reading = columns, mapping, reading
+        self._axes = [columns[axis] for axis in AXES if axis in columns]
+        self._is_native = is_native  # Whether the columns are those of the package
+        self._stamps = StampCheck(table.path, reading.drop_bad_stamps)
+        self._remarks: list[str] = []
+        self._epoch_ns: int | None = None
+        self._begin = 0.0  # Origin of the times in the unit of the stamps
+        self._count = 0  # Samples so far
+        self._empty = 0  # Rows without a reading
+        self._last_beta_rad = 0.0
 
     def convert(self, block: TableBlock) -> Recording:
         """Return the samples of a block."""
         outputs = self._outputs(block)
         # In the package's own recordings, every line is a sample.
         is_sample = ~np.isnan(outputs).all(axis=1) | (
-            self.is_native and not self.reading.drop_bad_stamps)
+            self._is_native and not self._reading.drop_bad_stamps)
         self._empty += int((~is_sample).sum())
-        self._check_outputs(block, outputs, is_sample)
+        for column, values in zip(self._axes, outputs.T):
+            _refuse(block, column, is_sample & ~(np.abs(values) <= LIMIT),
+                    f', no reading of a sensor in {column.unit_name}; delete the line, or correct '
+                    'the unit', 'every sample needs it')
         time_s, is_kept = self._times(block, is_sample)
-        kinds = VOLTS if self.columns['x'].unit.is_volts else ACCEL
-        columns = dict(zip(kinds, outputs.T)) | self._references(block)
-        if self.is_native:
+        columns = dict(zip(VOLTS if self._axes[0].unit.is_volts else ACCEL, outputs.T))
+        columns |= self._references(block)
+        if self._is_native:
             columns = {**columns, **{name: values for name, values in block.columns.items()
                                      if name not in columns and name != TIME}}
         columns = {name: np.ascontiguousarray(values[is_kept])
@@ -226,19 +228,19 @@ class _Converter:
             self._look_at_first(block, outputs[is_kept], time_s[is_kept])
         self._count += int(is_kept.sum())
         info = {key: text for key, text in block.info.items() if key != 'epoch_ns'}
-        return Recording(self.table.path, time_s[is_kept], columns, info, cut=block.cut,
+        left_out = f'{self._path}: left out, lines without a reading of the sensor: {self._empty}'
+        return Recording(self._path, time_s[is_kept], columns, info, cut=block.cut,
                          epoch_ns=self._epoch_ns or 0, done=block.done,
-                         remarks=(*self._remarks, *self._counts()),
-                         bad_stamps=BadStamps(self._duplicates, self._backward))
+                         remarks=(*self._remarks, *[left_out] * bool(self._empty),
+                                  *self._stamps.remarks), bad_stamps=self._stamps.bad)
 
     def _outputs(self, block: TableBlock) -> np.ndarray:
         """Return the output of the sensor, (n, m), V or m/s²."""
-        axes = [axis for axis in AXES if axis in self.columns]
-        per_g = np.broadcast_to(np.array(self.reading.lsb_per_g or 1.0), len(axes))
-        zero = np.broadcast_to(np.array(self.reading.lsb_at_0g or 0.0), len(axes))
+        count = len(self._axes)
+        per_g = np.broadcast_to(np.array(self._reading.lsb_per_g or 1.0), count)
+        zero = np.broadcast_to(np.array(self._reading.lsb_at_0g or 0.0), count)
         outputs = []
-        for index, axis in enumerate(axes):
-            column = self.columns[axis]
+        for index, column in enumerate(self._axes):
             values = block.columns[column.name]
             if column.unit_name == UNSIGNED:
                 values = signed(values)
@@ -247,42 +249,23 @@ class _Converter:
             outputs.append(column.unit.convert(values))
         return np.column_stack(outputs)
 
-    def _check_outputs(self, block: TableBlock, outputs: np.ndarray, is_sample: np.ndarray
-                       ) -> None:
-        """Refuse a sample with a reading that is empty, not finite or too large."""
-        wrong = ~(np.abs(outputs) <= LIMIT) & is_sample[:, None]
-        if wrong.any():
-            row, index = np.argwhere(wrong)[0].tolist()
-            column = self.columns[AXES[index]]
-            value = block.columns[column.name][row]
-            reason = 'is empty or NaN; every sample needs it' if np.isnan(value) else \
-                f'is {value:g}, no reading of a sensor in {column.unit_name}; delete the line, ' \
-                'or correct the unit'
-            raise UserError(f'{block.where(row, column.name)} {reason}')
-
     def _references(self, block: TableBlock) -> dict[str, np.ndarray]:
         """Return the columns of references by name, (n,) each; NaN where not sampled."""
-        values = {role: self._reference(block, role) for role in self.columns
-                  if role != 'time' and role not in AXES}
+        values = {}
+        for role, column in self._columns.items():
+            if role == 'time' or role in AXES:
+                continue
+            stated = block.columns[column.name]
+            if role in ('roll', 'pitch') and column.unit_name == 'rad':
+                _refuse(block, column, np.abs(stated) > _TURN_RAD, ' rad, more than a turn; if it '
+                        f'is in degrees, write {role}={column.name}:deg')
+            _refuse(block, column, np.abs(stated) > LIMIT,
+                    f' {column.unit_name}, no {role}; delete the line')
+            values[role] = column.unit.convert(stated)
         if 'roll' in values:
             values['alpha'], beta_rad = stage_angles(values['roll'], values['pitch'])
             values['beta'] = self._unwrapped(beta_rad)
         return {name: values[role] for name, role in _NATIVE.items() if role in values}
-
-    def _reference(self, block: TableBlock, role: str) -> np.ndarray:
-        """Return a reference in the unit of the package, (n,); NaN where it was not sampled."""
-        column = self.columns[role]
-        values = block.columns[column.name]
-        is_tilt = role in ('roll', 'pitch') and column.unit_name == 'rad'
-        for limit, reason in ((_TURN_RAD if is_tilt else np.inf,
-                               f'rad, more than a turn; if it is in degrees, write '
-                               f'{role}={column.name}:deg'),
-                              (LIMIT, f'{column.unit_name}, no {role}; delete the line')):
-            wrong = np.abs(values) > limit
-            if wrong.any():
-                row = int(wrong.argmax())
-                raise UserError(f'{block.where(row, column.name)} is {values[row]:g} {reason}')
-        return column.unit.convert(values)
 
     def _unwrapped(self, beta_rad: np.ndarray) -> np.ndarray:
         """Return beta without steps of a turn, rad, (n,); rows without it stay NaN."""
@@ -295,117 +278,86 @@ class _Converter:
 
     def _times(self, block: TableBlock, is_sample: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return stamps, s, (n,), and which rows are kept, (n,)."""
-        if self.reading.rate_hz is not None:
+        if self._reading.rate_hz is not None:
             number = self._count + np.cumsum(is_sample) - 1
-            return number / self.reading.rate_hz, is_sample
-        column = self.columns['time']
+            return number / self._reading.rate_hz, is_sample
+        column = self._columns['time']
         stamps = block.columns[column.name]
-        missing = is_sample & ~np.isfinite(stamps)
-        if missing.any():
-            row = int(missing.argmax())
-            text = 'empty or NaN' if np.isnan(stamps[row]) else 'not finite'
-            raise UserError(f'{block.where(row, column.name)} is {text}; every sample needs a '
-                            'time: delete the line, or give --rate HZ to stamp by index')
+        needed = 'every sample needs a time: delete the line, or give --rate HZ to stamp by index'
+        _refuse(block, column, is_sample & ~np.isfinite(stamps), f', not finite; {needed}', needed)
         if self._epoch_ns is None and is_sample.any():
             self._find_epoch(block, float(column.unit.convert(stamps[is_sample][:1])[0]))
         time_s = column.unit.convert(stamps - self._begin)
-        wrong = is_sample & (np.abs(time_s) > _TIME_LIMIT_S)
-        if wrong.any():
-            row = int(wrong.argmax())
-            raise UserError(f'{block.where(row, column.name)} is {time_s[row]:g} s as '
-                            f'{column.unit_name}, more than 200 years; state its unit, for '
-                            'example ms, us or ns')
-        is_kept = is_sample & self._increasing(block, time_s, is_sample, column)
-        if is_kept.any():
-            self._last_s = float(time_s[is_kept][-1])
-        return time_s, is_kept
+        _refuse(block, column, is_sample & (np.abs(time_s) > _TIME_LIMIT_S),
+                f' {column.unit_name}, more than 200 years; state its unit, for example ms, us or '
+                'ns')
+        return time_s, self._stamps.increasing(time_s, is_sample,
+                                               lambda row: block.where(row, column.name))
 
     def _find_epoch(self, block: TableBlock, first_s: float) -> None:
         """Find the origin of the times: as comments state it, or near the first one."""
         text = block.info.get('epoch_ns', '0')
         if not re.fullmatch(r'-?\d{1,19}', text) or abs(int(text)) >= 1 << 63:
-            raise UserError(f'{self.table.path}: epoch_ns is {text!r}, expected whole nanoseconds')
-        is_since_1970 = _EPOCH_S < first_s <= _TIME_LIMIT_S and not self.is_native
+            raise UserError(f'{self._path}: epoch_ns is {text!r}, expected whole nanoseconds')
+        is_since_1970 = _EPOCH_S < first_s <= _TIME_LIMIT_S and not self._is_native
         whole_s = int(first_s) if is_since_1970 and not int(text) else 0
         self._epoch_ns = int(text) or whole_s * 1_000_000_000
-        unit = self.columns['time'].unit
+        unit = self._columns['time'].unit
         self._begin = whole_s * unit.divisor / unit.factor
-
-    def _increasing(self, block: TableBlock, time_s: np.ndarray, is_sample: np.ndarray,
-                    column: _Column) -> np.ndarray:
-        """Return which stamps increase, (n,); refuse the others unless they are left out."""
-        times = np.where(is_sample, time_s, -np.inf)
-        latest = np.maximum.accumulate(np.concatenate([[self._last_s], times]))[:-1]
-        wrong = is_sample & ~(time_s > latest)
-        if not wrong.any():
-            return is_sample
-        stands = wrong & (time_s == latest)
-        self._duplicates += int(stands.sum())
-        self._backward += int((wrong & ~stands).sum())
-        if not self.reading.drop_bad_stamps:
-            row = int(wrong.argmax())
-            verb = 'stands still' if stands[row] else 'runs backwards'
-            raise UserError(
-                f'{block.where(row, column.name)}: time {verb}, {latest[row] - time_s[row]:.3g} s '
-                f'before the newest sample{describe_bursts(time_s[is_sample])}; --drop-bad-stamps '
-                'leaves such samples out, --rate HZ stamps by index')
-        return ~wrong
 
     def _look_at_first(self, block: TableBlock, outputs: np.ndarray, time_s: np.ndarray) -> None:
         """Note what is assumed; refuse readings and stamps that are in another unit."""
-        if len(time_s) > _FEWEST_STAMPS and self.reading.rate_hz is None:
+        if len(time_s) > _FEWEST_STAMPS and self._reading.rate_hz is None:
             self._check_step(block, time_s)
-        self._check_length(outputs)
-        assumed = [f'{column.name} in {column.unit_name}' for column in self.columns.values()
+        if len(self._axes) == len(AXES) and not self._axes[0].unit.is_volts:
+            self._check_length(outputs)
+        assumed = [f'{column.name} in {column.unit_name}' for column in self._columns.values()
                    if not column.is_stated]
         if assumed:
-            self._remarks.append(f'{self.table.path}: columns without a unit are read as '
+            self._remarks.append(f'{self._path}: columns without a unit are read as '
                                  f'{", ".join(assumed)}')
         bursts = describe_bursts(time_s)
         if bursts:
-            self._remarks.append(f'{self.table.path}: {bursts.removeprefix("; ")}; this rate is '
+            self._remarks.append(f'{self._path}: {bursts.removeprefix("; ")}; this rate is '
                                  'used, and --rate HZ stamps by index')
 
     def _check_step(self, block: TableBlock, time_s: np.ndarray) -> None:
         """Refuse stamps whose steps no sensor has, unless the file states their rate."""
-        column = self.columns['time']
+        column = self._columns['time']
         rate_hz = stamped_rate_hz(time_s)
-        stated_hz = Recording(self.table.path, time_s, {}, dict(block.info)).stream_info.rate_hz
-        if stated_hz and abs(stated_hz / rate_hz - 1) < _SAME_RATE:
-            return
+        stated_hz = StreamInfo(block.info, self._path).rate_hz
         stamps, step = time_s * column.unit.divisor, column.unit.divisor / rate_hz
         is_whole = bool((np.abs(stamps - np.rint(stamps)) < _WHOLE).all())
-        if is_sensor_step(1 / rate_hz, is_whole):
+        if (stated_hz and abs(stated_hz / rate_hz - 1) < _SAME_RATE) or \
+                is_sensor_step(1 / rate_hz, is_whole):
             return
         unit = time_unit_of_step(step, is_whole)
-        fitting = {**self.mapping.sources, 'time': Source(column.name, unit)}
+        fitting = {**self._mapping.sources, 'time': Source(column.name, unit)}
         raise UserError(
-            f'{self.table.path}: {column.name} has steps of {step:.4g}, which as '
+            f'{self._path}: {column.name} has steps of {step:.4g}, which as '
             f'{column.unit_name} are {rate_hz:.3g} Hz; if that is right, give --rate '
             f'{rate_hz:.3g}, and if they are {unit}:',
             f'--columns {shell_quoted(str(ColumnMapping(fitting)))}')
 
     def _check_length(self, outputs: np.ndarray) -> None:
         """Compare the length of the readings with gravity: a wrong unit shows in it."""
-        columns = [self.columns[axis] for axis in AXES if axis in self.columns]
-        if len(columns) < len(AXES) or columns[0].unit.is_volts:
-            return
+        first = self._axes[0]
         length_g = float(np.median(np.linalg.norm(outputs, axis=1))) / G0_MPS2
         if _LENGTHS_G[0] < length_g < _LENGTHS_G[1]:
             return
-        names = ', '.join(column.name for column in columns)
-        text = f'{self.table.path}: {names} have a length of {length_g:.3g} g in ' \
-               f'{columns[0].unit_name}, where gravity has 1 g'
-        if not columns[0].is_stated:
-            raise UserError(f'{text}; state their unit, for example x={columns[0].name}:'
+        text = f'{self._path}: {", ".join(column.name for column in self._axes)} have a length ' \
+               f'of {length_g:.3g} g in {first.unit_name}, where gravity has 1 g'
+        if not first.is_stated:
+            raise UserError(f'{text}; state their unit, for example x={first.name}:'
                             f'{likely_unit(length_g * G0_MPS2) or "UNIT"}')
         self._remarks.append(f'{text}: check the unit')
 
-    def _counts(self) -> Iterator[str]:
-        """Yield how many rows were left out so far."""
-        for count, what in (
-                (self._empty, 'lines without a reading of the sensor'),
-                (self._duplicates, 'samples with the stamp of the one before'),
-                (self._backward, 'samples whose stamp steps back')):
-            if count:
-                yield f'{self.table.path}: left out, {what}: {count}'
+
+def _refuse(block: TableBlock, column: _Column, wrong: np.ndarray, reason: str,
+            reason_of_none: str = '') -> None:
+    """Refuse cells of a column, (n,): for a reason, or for another one where they are empty."""
+    if wrong.any():
+        row = int(wrong.argmax())
+        value = block.columns[column.name][row]
+        text = f'empty or NaN; {reason_of_none}' if np.isnan(value) else f'{value:g}{reason}'
+        raise UserError(f'{block.where(row, column.name)} is {text}')

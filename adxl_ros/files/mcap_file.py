@@ -16,7 +16,6 @@ from __future__ import annotations
 from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from io import BytesIO
 from itertools import islice, pairwise
 import os
 from pathlib import Path
@@ -27,17 +26,15 @@ import zlib
 from adxl_ros.errors import UserError
 import numpy as np
 
-_MESSAGE = 5
-"""Operation code of a message record (specification, "Records"; so is the next one)."""
+_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX = 3, 4, 5, 6, 7
+"""Operation codes of records (specification, "Records")."""
 
-_MESSAGE_INDEX = 7
-"""Operation code of a message index record."""
+_RECORD_HEAD = struct.Struct('<BQ')
+"""Operation code and length of a record."""
 
-_CHUNK = 6
-"""Operation code of a chunk record."""
-
-_RECORD_HEAD_BYTES = 9
-"""Size of the operation code and length of a record."""
+_CHUNK_HEAD = struct.Struct('<QQQII')
+"""First and last time of a chunk, its size, CRC-32, and the length of its compression's name; the
+name and the 8 bytes of the length of its records follow."""
 
 _MESSAGE_HEAD = np.dtype([('code', 'u1'), ('size', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
                           ('log_ns', '<u8'), ('publish_ns', '<u8')])
@@ -49,43 +46,24 @@ _INDEX_HEAD = np.dtype([('code', 'u1'), ('size', '<u8'), ('channel', '<u2'), ('b
 _INDEX_ENTRY = np.dtype([('log_ns', '<u8'), ('offset', '<u8')])
 """Log time of a message, and where its record begins in the chunk."""
 
-_CHUNK_HEAD = np.dtype([('code', 'u1'), ('size', '<u8'), ('begin_ns', '<u8'), ('end_ns', '<u8'),
-                        ('unpacked_bytes', '<u8'), ('crc', '<u4'), ('compression', '<u4'),
-                        ('bytes', '<u8')])
-"""Beginning of a chunk record without compression and CRC-32; the records follow."""
+_INDEX_OFFSET = struct.Struct('<HQ')
+"""A channel, and where its message index begins in the file."""
 
-_PLACES_HEAD = np.dtype([('begin_ns', '<u8'), ('end_ns', '<u8'), ('offset', '<u8'),
-                         ('chunk_bytes', '<u8'), ('places_bytes', '<u4')])
-"""Beginning of the entry of a chunk in the index of the file; places of the indices follow."""
-
-_PLACE = np.dtype([('channel', '<u2'), ('offset', '<u8')])
-"""Where the message index of a channel begins in the file."""
-
-_PLACES_END = np.dtype([('index_bytes', '<u8'), ('compression', '<u4'), ('bytes', '<u8'),
-                        ('unpacked_bytes', '<u8')])
-"""End of the entry of a chunk without compression."""
+_INDEX_BYTE = 32
+"""Place of the length of the message index offsets in a chunk index record. They follow, and the
+size of the message indices."""
 
 _CHUNK_BYTES = 1 << 20
 """Size that a chunk hardly exceeds, bytes; that of rosbags."""
-
-_CRC_BYTES = 4
-"""Size of a CRC-32."""
-
-_CRC_BYTE = 24
-"""Place of the CRC-32 in the content of a chunk record."""
-
-_DATA_BYTE = 40
-"""Place of the data in the content of a chunk record without the name of its compression."""
-
-
-Raws = Sequence[bytes] | np.ndarray
-"""Messages of one type: their bytes one by one, or as rows of equal length, (n, size)."""
 
 _LARGE_BYTES = 2 << 30
 """Size from which a file that is read leaves the cache (chosen): smaller ones are read again."""
 
 _PIECE_MESSAGES = 4096
 """Messages that are collected to a piece (chosen: some MB)."""
+
+Raws = Sequence[bytes] | np.ndarray
+"""Messages of one type: their bytes one by one, or as rows of equal length, (n, size)."""
 
 
 @dataclass(frozen=True)
@@ -101,150 +79,89 @@ class Piece:
         last = self.places[topic][count - 1]
         cuts = {name: int(np.searchsorted(places, last, 'right'))
                 for name, places in self.places.items()}
-        return (Piece({name: raws[:cuts[name]] for name, raws in self.messages.items()},
-                      {name: places[:cuts[name]] for name, places in self.places.items()}),
-                Piece({name: raws[cuts[name]:] for name, raws in self.messages.items()},
-                      {name: places[cuts[name]:] for name, places in self.places.items()}))
+        head, tail = (
+            Piece({name: raws[part(cuts[name])] for name, raws in self.messages.items()},
+                  {name: places[part(cuts[name])] for name, places in self.places.items()})
+            for part in (lambda cut: slice(cut), lambda cut: slice(cut, None)))
+        return head, tail
 
 
 def collected_pieces(messages: Iterable[tuple[str, bytes, int]]) -> Iterator[Piece]:
     """Collect messages with topic and log time, ns, to pieces."""
     iterator = iter(messages)
     while batch := list(islice(iterator, _PIECE_MESSAGES)):
-        yield collected([(topic, raw) for topic, raw, _ in batch])
-
-
-def collected(messages: list[tuple[str, bytes]]) -> Piece:
-    """Collect messages with their topics to one piece."""
-    raws: dict[str, list[bytes]] = {topic: [] for topic, _ in messages}
-    places: dict[str, list[int]] = {topic: [] for topic in raws}
-    for place, (topic, raw) in enumerate(messages):
-        raws[topic].append(raw)
-        places[topic].append(place)
-    return Piece(raws, {topic: np.array(numbers) for topic, numbers in places.items()})
-
-
-class IndexFault(ValueError):
-    """A message index that does not describe its chunk."""
-
-
-class _Found(NamedTuple):
-    """Messages of one channel in a chunk."""
-
-    raws: Raws  # The messages
-    log_ns: np.ndarray  # Their log times, ns, (n,)
-    offset: np.ndarray  # Where their records begin in the chunk, (n,)
+        raws: dict[str, list[bytes]] = {topic: [] for topic, _, _ in batch}
+        places: dict[str, list[int]] = {topic: [] for topic in raws}
+        for place, (topic, raw, _) in enumerate(batch):
+            raws[topic].append(raw)
+            places[topic].append(place)
+        yield Piece(raws, {topic: np.array(numbers) for topic, numbers in places.items()})
 
 
 def in_order(storage: Any, topics: Mapping[int, str]) -> list[Any]:
-    """Return the chunks that hold messages of some topics."""
+    """Return the chunks with messages of some topics, if `read_chunk` can read all of them."""
     chunks = [chunk for chunk in getattr(storage, 'chunks', ())
               if any(chunk.channel_count.get(channel, 0) for channel in topics)]
     chunks.sort(key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))
     is_ordered = all(first.message_end_time <= second.message_start_time
                      and first.chunk_start_offset < second.chunk_start_offset
                      for first, second in pairwise(chunks))
-    return chunks if is_ordered else []
+    return chunks if is_ordered and len(set(topics.values())) == len(topics) else []
 
 
 def read_chunk(file: Any, chunk: Any, topics: Mapping[int, str]) -> Piece:
-    """
-    Read the messages of a chunk.
-
-    Where its message index does not describe it, its records are read one by one.
-    """
-    from rosbags.rosbag2.storage_mcap import decompress, msgsrc
-    try:
-        file.seek(chunk.chunk_start_offset + _RECORD_HEAD_BYTES + _CRC_BYTE)
-        crc = int.from_bytes(file.read(_CRC_BYTES), 'little')
-        file.seek(chunk.chunk_start_offset + _RECORD_HEAD_BYTES + _DATA_BYTE
-                  + len(chunk.compression))
-        data = np.frombuffer(decompress(file.read(chunk.compressed_size), chunk.compression,
-                                        chunk.uncompressed_size, crc), np.uint8)
-        _release_read(file)
-        return _ordered({topic: _messages(data, channel, _index(file, chunk, channel))
-                         for channel, topic in _channels(chunk, topics).items()})
-    except IndexFault:
-        names: Any = dict(topics)
-        records: Any = msgsrc(chunk, names, 0, chunk.message_end_time + 1, file)
-        return collected([(topic, raw) for _, _, topic, raw in records if raw is not None])
-
-
-def _release_read(file: BinaryIO) -> None:
-    """Give back the page cache of what was read of a large file, up to the present place."""
+    """Read the messages of a chunk, each topic of one channel, by its message indices."""
+    from rosbags.rosbag2.storage_mcap import decompress
+    file.seek(chunk.chunk_start_offset + _RECORD_HEAD.size)
+    *_, crc, name_bytes = _CHUNK_HEAD.unpack(file.read(_CHUNK_HEAD.size))
+    file.seek(name_bytes + 8, os.SEEK_CUR)
+    data = np.frombuffer(decompress(file.read(chunk.compressed_size), chunk.compression,
+                                    chunk.uncompressed_size, crc), np.uint8)
     if os.fstat(file.fileno()).st_size > _LARGE_BYTES:
         # From its begin on, because the system keeps a large page that is only partly within.
         os.posix_fadvise(file.fileno(), 0, file.tell(), os.POSIX_FADV_DONTNEED)
-
-
-def _channels(chunk: Any, topics: Mapping[int, str]) -> dict[int, str]:
-    """Return the topics of a chunk by channel number; two channels of a topic are a fault."""
-    channels = {channel: topic for channel, topic in topics.items()
-                if channel in chunk.message_index_offsets}
-    if len(set(channels.values())) < len(channels):
-        raise IndexFault('several channels have one topic')
-    return channels
-
-
-def _ordered(parts: dict[str, _Found]) -> Piece:
-    """Put the messages of a chunk, by topic, in the order of their log times."""
-    order = np.lexsort((np.concatenate([part.offset for part in parts.values()]),
-                        np.concatenate([part.log_ns for part in parts.values()])))
-    place = np.empty(len(order), np.int64)
-    place[order] = np.arange(len(order))
-    bounds = np.cumsum([len(part.offset) for part in parts.values()])[:-1]
-    return Piece({topic: part.raws for topic, part in parts.items()},
-                 dict(zip(parts, np.split(place, bounds))))
+    indices = {channel: _index(file, chunk, channel) for channel in topics
+               if chunk.channel_count.get(channel, 0)}
+    raws = {topics[channel]: _messages(data, channel, index) for channel, index in indices.items()}
+    entries = np.concatenate(list(indices.values()))
+    places = np.empty(len(entries), np.int64)
+    places[np.lexsort((entries['offset'], entries['log_ns']))] = np.arange(len(entries))
+    bounds = np.cumsum([len(index) for index in indices.values()])[:-1]
+    return Piece(raws, dict(zip(raws, np.split(places, bounds))))
 
 
 def _index(file: Any, chunk: Any, channel: int) -> np.ndarray:
     """Return the entries of the message index of a channel, (n,), in the order of time."""
     file.seek(chunk.message_index_offsets[channel])
-    head = np.frombuffer(file.read(_INDEX_HEAD.itemsize), _INDEX_HEAD)
-    if len(head) != 1 or head['code'] != _MESSAGE_INDEX or head['channel'] != channel:
-        raise IndexFault('no message index where the file says')
-    content = file.read(int(head['bytes'][0]))
-    if len(content) != head['bytes'] or len(content) % _INDEX_ENTRY.itemsize:
-        raise IndexFault('a message index is cut off')
-    entries = np.frombuffer(content, _INDEX_ENTRY)
+    head = np.frombuffer(file.read(_INDEX_HEAD.itemsize), _INDEX_HEAD)[0]
+    if head['code'] != _MESSAGE_INDEX or head['channel'] != channel:
+        raise ValueError('no message index where the file says')
+    entries = np.frombuffer(file.read(int(head['bytes'])), _INDEX_ENTRY)
     return entries[np.lexsort((entries['offset'], entries['log_ns']))]
 
 
-def _messages(data: np.ndarray, channel: int, entries: np.ndarray) -> _Found:
-    """
-    Take the messages of a channel out of a chunk.
-
-    entries: its message index, (n,).
-    """
+def _messages(data: np.ndarray, channel: int, entries: np.ndarray) -> Raws:
+    """Take the messages of a channel out of a chunk by its message index, (n,)."""
     offset = entries['offset'].astype(np.int64)
     head_bytes = _MESSAGE_HEAD.itemsize
-    if not len(offset) or offset.min() < 0 or offset.max() + head_bytes > len(data):
-        raise IndexFault('a message index points out of its chunk')
-    heads = _rows(data, offset, head_bytes).view(_MESSAGE_HEAD)[:, 0]
-    sizes = heads['size'].astype(np.int64) + _RECORD_HEAD_BYTES - head_bytes
+    if offset.min() < 0 or offset.max() + head_bytes > len(data):
+        raise ValueError('a message index points out of its chunk')
+    heads = _windows(data, head_bytes)[_even(offset)].view(_MESSAGE_HEAD)[:, 0]
+    begin = offset + head_bytes
+    sizes = heads['size'].astype(np.int64) + _RECORD_HEAD.size - head_bytes
     if ((heads['code'] != _MESSAGE) | (heads['channel'] != channel)
             | (heads['log_ns'] != entries['log_ns']) | (sizes < 1)
-            | (offset + head_bytes + sizes > len(data))).any():
-        raise IndexFault('a message index does not describe its chunk')
-    begin = offset + head_bytes
-    raws: Raws
+            | (begin + sizes > len(data))).any():
+        raise ValueError('a message index does not describe its chunk')
     if (sizes == sizes[0]).all():
-        raws = _rows(data, begin, int(sizes[0]))
-    else:
-        raws = [data[first:last].tobytes()
-                for first, last in zip(begin.tolist(), (begin + sizes).tolist())]
-    return _Found(raws, entries['log_ns'], offset)
+        return _windows(data, int(sizes[0]))[_even(begin)]
+    return [data[first:last].tobytes()
+            for first, last in zip(begin.tolist(), (begin + sizes).tolist())]
 
 
-def _rows(data: np.ndarray, begin: np.ndarray, size: int) -> np.ndarray:
-    """Return `size` bytes from each of the places, (n,), as rows, (n, size)."""
-    return np.lib.stride_tricks.sliding_window_view(data, size)[_even(begin)]
-
-
-def _put(data: np.ndarray, begin: np.ndarray, rows: np.ndarray) -> None:
-    """Copy rows, (n, size), to the places, (n,)."""
-    windows = np.lib.stride_tricks.sliding_window_view(data, rows.shape[1], writeable=True)
-    windows[_even(begin)] = rows
+def _windows(data: np.ndarray, size: int) -> np.ndarray:
+    """Return a view of `size` bytes from each place on, (n, size)."""
+    return np.lib.stride_tricks.sliding_window_view(data, size, writeable=data.flags.writeable)
 
 
 def _even(begin: np.ndarray) -> slice | np.ndarray:
@@ -265,7 +182,7 @@ class Batch(NamedTuple):
 
 def write_messages(writer: Any, stamp_ns: np.ndarray, batches: Sequence[Batch]) -> None:
     """
-    Append messages to an MCAP file, sample by sample, in chunks of their own.
+    Append messages to an MCAP file by rosbags' writer, sample by sample, in chunks of their own.
 
     stamp_ns: stamps of the samples, ns, (n,), rising.
     """
@@ -284,77 +201,43 @@ def write_messages(writer: Any, stamp_ns: np.ndarray, batches: Sequence[Batch]) 
 
 
 def _write_chunk(writer: Any, stamp_ns: np.ndarray, batches: list[Batch]) -> None:
-    """Append a chunk with its message indices; the arguments are those of `write_messages`."""
-    storage = writer.storage
-    # Schemas and channels of new topics wait in the open chunk of rosbags.
-    pending = storage.chunk.bio.getvalue()
-    storage.chunk.bio.seek(0)
-    storage.chunk.bio.truncate()
-    records, offsets = _records(stamp_ns, batches, len(pending))
-    content_bytes = len(pending) + len(records)
-    first, last = (int(stamp_ns[pick(batch.rows[end] for batch in batches)])
-                   for pick, end in ((min, 0), (max, -1)))
-    chunk_begin = storage.bio.tell()
-    storage.bio.write(_packed(_CHUNK_HEAD, _CHUNK, content_bytes + _CHUNK_HEAD.itemsize
-                              - _RECORD_HEAD_BYTES, first, last, content_bytes, 0, 0,
-                              content_bytes))
-    storage.bio.write(pending)
-    storage.bio.write(records)
-    chunk_end = storage.bio.tell()
-    places = b''
-    for channel in dict.fromkeys(batch.connection.id for batch in batches):
-        places += _packed(_PLACE, channel, storage.bio.tell())
-        entries = _entries(stamp_ns, [
-            (batch.rows, offset) for batch, offset in zip(batches, offsets)
-            if batch.connection.id == channel])
-        storage.bio.write(_packed(_INDEX_HEAD, _MESSAGE_INDEX, entries.nbytes
-                                  + _INDEX_HEAD.itemsize - _RECORD_HEAD_BYTES, channel,
-                                  entries.nbytes))
+    """Append a chunk with its message indices, which rosbags would write message by message."""
+    storage, chunk = writer.storage, writer.storage.chunk
+    stamps = stamp_ns[np.concatenate([batch.rows for batch in batches])]
+    first, last = int(stamps.min()), int(stamps.max())
+    for counter in (chunk, storage):
+        counter.message_start_time = min(counter.message_start_time, first)
+        counter.message_end_time = max(counter.message_end_time, last)
+    writer.min_timestamp = min(writer.min_timestamp, first)
+    writer.max_timestamp = max(writer.max_timestamp, last)
+    records, places = _records(stamp_ns, batches)
+    indices: dict[int, list[np.ndarray]] = {}
+    for (connection, rows, _), place in zip(batches, places):
+        entries = np.empty(len(rows), _INDEX_ENTRY)
+        entries['log_ns'], entries['offset'] = stamp_ns[rows], place + chunk.bio.tell()
+        indices.setdefault(connection.id, []).append(entries)
+        storage.channel_stats[connection.id] += len(rows)
+        writer.counts[connection.id] += len(rows)
+    chunk.bio.write(records)
+    storage.close_chunk()
+    begin, offsets = storage.bio.tell(), b''
+    for channel, parts in indices.items():
+        entries = np.concatenate(parts)
+        entries = entries[np.argsort(entries['offset'], kind='stable')]  # fast where it rises
+        offsets += _INDEX_OFFSET.pack(channel, storage.bio.tell())
+        storage.bio.write(np.array([(_MESSAGE_INDEX, entries.nbytes + 6, channel, entries.nbytes)],
+                                   _INDEX_HEAD).tobytes())
         storage.bio.write(entries)
-    entry = BytesIO()
-    entry.write(_packed(_PLACES_HEAD, first, last, chunk_begin, chunk_end - chunk_begin,
-                        len(places)))
-    entry.write(places)
-    entry.write(_packed(_PLACES_END, storage.bio.tell() - chunk_end, 0, content_bytes,
-                        content_bytes))
-    storage.chunks.append(entry)
-    _count(writer, batches, first, last)
+    # The entry of the chunk in the index of the file states no message index yet.
+    entry = storage.chunks[-1]
+    text = entry.getvalue()
+    entry.seek(_INDEX_BYTE)
+    entry.write(len(offsets).to_bytes(4, 'little') + offsets
+                + (storage.bio.tell() - begin).to_bytes(8, 'little') + text[_INDEX_BYTE + 12:])
 
 
-def _entries(stamp_ns: np.ndarray, messages: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    """
-    Make the message index of a channel.
-
-    stamp_ns: stamps of the samples, ns, (n,); messages: samples and places in the chunk of its
-    messages, (k,) each, by batch.
-    """
-    rows, offset = map(np.concatenate, zip(*messages))
-    order = np.argsort(offset, kind='stable')  # fast where the places rise
-    entries = np.empty(len(order), _INDEX_ENTRY)
-    entries['log_ns'], entries['offset'] = stamp_ns[rows[order]], offset[order]
-    return entries
-
-
-def _count(writer: Any, batches: list[Batch], first_ns: int, last_ns: int) -> None:
-    """Count messages in what rosbags states at the end of the file; the times are in ns."""
-    storage = writer.storage
-    for batch in batches:
-        storage.channel_stats[batch.connection.id] += len(batch.rows)
-        writer.counts[batch.connection.id] += len(batch.rows)
-    storage.message_start_time = min(storage.message_start_time, first_ns)
-    storage.message_end_time = max(storage.message_end_time, last_ns)
-    writer.min_timestamp = min(writer.min_timestamp, first_ns)
-    writer.max_timestamp = max(writer.max_timestamp, last_ns)
-
-
-def _records(stamp_ns: np.ndarray, batches: list[Batch], begin: int
-             ) -> tuple[np.ndarray, list[np.ndarray]]:
-    """
-    Make the message records of a chunk, sample by sample.
-
-    stamp_ns: stamps of the samples, ns, (n,); returns: their bytes, (size,). Where the records of
-    each batch begin in the chunk.
-    """
+def _records(stamp_ns: np.ndarray, batches: list[Batch]) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return the bytes of message records, (size,), sample by sample; and their places."""
     lengths = [batch.data.shape[1] + _MESSAGE_HEAD.itemsize for batch in batches]
     counts = [len(batch.rows) for batch in batches]
     order = np.argsort(np.concatenate([batch.rows for batch in batches]), kind='stable')
@@ -364,28 +247,18 @@ def _records(stamp_ns: np.ndarray, batches: list[Batch], begin: int
     places = np.split(begins, np.cumsum(counts)[:-1])
     records = np.empty(stops[-1], np.uint8)
     for batch, length, place in zip(batches, lengths, places):
-        head = np.array([(_MESSAGE, length - _RECORD_HEAD_BYTES, batch.connection.id, 0, 0, 0)],
-                        _MESSAGE_HEAD)
-        heads = head.repeat(len(place))
+        heads = np.zeros(len(place), _MESSAGE_HEAD)
+        heads['code'], heads['size'] = _MESSAGE, length - _RECORD_HEAD.size
+        heads['channel'] = batch.connection.id
         heads['log_ns'] = heads['publish_ns'] = stamp_ns[batch.rows]
-        _put(records, place, heads.view(np.uint8).reshape(len(place), -1))
-        _put(records, place + _MESSAGE_HEAD.itemsize, batch.data)
-    return records, [place + begin for place in places]
-
-
-def _packed(layout: np.dtype, *values: int) -> bytes:
-    """Return the bytes of one record."""
-    return np.array([values], layout).tobytes()
+        for begin, rows in ((place, heads.view(np.uint8).reshape(len(place), -1)),
+                            (place + _MESSAGE_HEAD.itemsize, batch.data)):
+            _windows(records, rows.shape[1])[_even(begin)] = rows
+    return records, places
 
 
 _MAGIC = b'\x89MCAP0\r\n'
 """First and last bytes of a whole file (specification, "Magic")."""
-
-_SCHEMA = 3
-"""Operation code of a schema record."""
-
-_CHANNEL = 4
-"""Operation code of a channel record."""
 
 _LAST_CODE = 0x0F
 """Largest operation code of the specification."""
@@ -393,36 +266,14 @@ _LAST_CODE = 0x0F
 _FIRST_PRIVATE_CODE = 0x80
 """Smallest operation code of records that the specification leaves to applications."""
 
-_LOG_TIME = struct.Struct('<Q')
-"""Log time of a message, ns."""
+_MESSAGE_BEGIN = struct.Struct('<HIQQ')
+"""Beginning of the content of a message record: channel, sequence number, log and publish time."""
 
-_LOG_TIME_BYTE = 6
-"""Place of the log time in a message record, after channel and sequence number."""
-
-_RECORD_HEAD = struct.Struct('<BQ')
-"""Operation code and length of a record."""
-
-_CHUNK_BEGIN = struct.Struct('<QQQII')
-"""First and last time of a chunk, its size, CRC-32, and the length of its compression's name."""
-
-_LENGTH_BYTES = 8
-"""Size of the length of a chunk's records, which follows the compression's name."""
-
-_MESSAGE_HEAD_BYTES = 22
-"""Size of the beginning of a message record: channel, sequence, two times."""
-
-_SMALLEST_BYTES = {_SCHEMA: 6, _CHANNEL: 8, _MESSAGE: _MESSAGE_HEAD_BYTES}
+_SMALLEST_BYTES = {_SCHEMA: 6, _CHANNEL: 8, _MESSAGE: _MESSAGE_BEGIN.size}
 """Smallest size of the content of a record, by operation code."""
 
-
-class Record(NamedTuple):
-    """One whole record."""
-
-    code: int  # Operation code
-    data: bytes  # Bytes that hold the record
-    # start, stop: Where its content begins and ends in them
-    start: int
-    stop: int
+Record = tuple[int, bytes]
+"""Operation code and content of a whole record."""
 
 
 def is_whole(path: Path) -> bool:
@@ -460,10 +311,9 @@ def open_scan(path: Path) -> Iterator[ScannedMcap]:
     """Open an MCAP file that may have no end."""
     with open(path, 'rb') as file:
         magic = file.read(len(_MAGIC))
-        if not magic:
-            raise UserError(f'{path}: is empty')
         if magic != _MAGIC:
-            raise UserError(f'{path}: is no MCAP file: it does not begin as one')
+            raise UserError(f'{path}: is no MCAP file: it does not begin as one' if magic
+                            else f'{path}: is empty')
         yield ScannedMcap(file)
 
 
@@ -479,15 +329,15 @@ class ScannedMcap:
         self._offset = 0
         self._channels: dict[int, tuple[str, str]] = {}
         schemas: dict[int, str] = {}
-        for record in self._records():
-            data, start = record.data, record.start
-            if record.code == _MESSAGE and (channel := self._channels.get(_u16(data, start))):
-                self.types.add(channel)
-            elif record.code == _SCHEMA:
-                schemas[_u16(data, start)] = _text(data, start + 2)
-            elif record.code == _CHANNEL:
-                kind = schemas.get(_u16(data, start + 2), '')
-                self._channels[_u16(data, start)] = (_text(data, start + 4), kind)
+        for code, content in self._records():
+            number = int.from_bytes(content[:2], 'little')
+            if code == _MESSAGE and number in self._channels:
+                self.types.add(self._channels[number])
+            elif code == _SCHEMA:
+                schemas[number] = _text(content, 2)
+            elif code == _CHANNEL:
+                kind = schemas.get(int.from_bytes(content[2:4], 'little'), '')
+                self._channels[number] = (_text(content, 4), kind)
         self.cut = ''  # Where the file is cut off or damaged; empty if it is whole
         if self._offset != self._size - len(_MAGIC) or not _has_end(file):
             self.cut = (f'cut off or damaged in the record that begins at byte {self._offset} '
@@ -495,11 +345,12 @@ class ScannedMcap:
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, bytes, int]]:
         """Yield topic, CDR and log time, ns, of each whole message, in the order of the file."""
-        wanted = {key: topic for key, (topic, _) in self._channels.items() if topic in topics}
-        for code, data, start, stop in self._records():
-            if code == _MESSAGE and (topic := wanted.get(_u16(data, start))) is not None:
-                log_ns, = _LOG_TIME.unpack_from(data, start + _LOG_TIME_BYTE)
-                yield topic, data[start + _MESSAGE_HEAD_BYTES:stop], log_ns
+        for code, content in self._records():
+            if code == _MESSAGE:
+                channel, _, log_ns, _ = _MESSAGE_BEGIN.unpack_from(content)
+                topic, _ = self._channels.get(channel, ('', ''))
+                if topic in topics:
+                    yield topic, content[_MESSAGE_BEGIN.size:], log_ns
 
     def pieces(self, topics: Collection[str]) -> Iterator[Piece]:
         """Yield the messages in pieces, in the order of the file."""
@@ -520,7 +371,7 @@ class ScannedMcap:
             if code == _CHUNK:
                 is_whole = yield from _chunk(content, is_whole)
             elif is_whole:
-                yield Record(code, content, 0, size)
+                yield code, content
             if not is_whole:
                 return
             self._offset = begin + size
@@ -529,12 +380,12 @@ class ScannedMcap:
 
 def _chunk(content: bytes, is_whole: bool) -> Generator[Record, None, bool]:
     """Yield the records of a chunk, whose end may be missing; return whether it is whole."""
-    if len(content) < _CHUNK_BEGIN.size:
+    if len(content) < _CHUNK_HEAD.size:
         return False
-    _, _, _, crc, length = _CHUNK_BEGIN.unpack_from(content)
-    begin = _CHUNK_BEGIN.size + length + _LENGTH_BYTES
+    *_, crc, name_bytes = _CHUNK_HEAD.unpack_from(content)
     try:
-        data = unpack(_text(content, _CHUNK_BEGIN.size - 4), content[begin:])
+        data = unpack(_text(content, _CHUNK_HEAD.size - 4),
+                      content[_CHUNK_HEAD.size + name_bytes + 8:])
     except ValueError:
         return False  # a chunk cut within compressed data cannot be decompressed
     if is_whole and crc and zlib.crc32(data) != crc:
@@ -546,7 +397,7 @@ def _chunk(content: bytes, is_whole: bool) -> Generator[Record, None, bool]:
         offset = start + size
         if offset > len(data) or not _is_record(code, size):
             return False
-        yield Record(code, data, start, offset)
+        yield code, data[start:offset]
     return is_whole
 
 
@@ -554,11 +405,6 @@ def _is_record(code: int, size: int) -> bool:
     """Return whether a record may have this code and size; damaged bytes rarely look like it."""
     is_known = 0 < code <= _LAST_CODE or code >= _FIRST_PRIVATE_CODE
     return is_known and size >= _SMALLEST_BYTES.get(code, 0)
-
-
-def _u16(data: bytes, offset: int) -> int:
-    """Return the 16-bit number at an offset."""
-    return data[offset] | data[offset + 1] << 8
 
 
 def _text(data: bytes, offset: int) -> str:

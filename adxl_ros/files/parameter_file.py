@@ -100,17 +100,7 @@ def _params_folder() -> Path:
 
 
 def installed_path(name: str | os.PathLike) -> Path:
-    """
-    Return the installed file of a sensor by its name, such as MPU-6050.
-
-    A path to a file stays as it is.
-
-    Raises
-    ------
-    UserError
-        No sensor has this name.
-
-    """
+    """Return the installed file of a sensor by its name, such as MPU-6050; a path stays."""
     path = Path(name)
     if path.exists() or path.suffix or path.name != str(name):
         return path
@@ -123,7 +113,11 @@ def installed_path(name: str | os.PathLike) -> Path:
 
 
 def load(path: str | os.PathLike, may_measure: bool = False) -> Sensor:
-    """Return the installed file of a sensor by its name, such as MPU-6050; a path stays."""
+    """
+    Read and check the parameter file of a sensor, by its path or its name.
+
+    may_measure: whether keys may be missing that a recording can show.
+    """
     path = installed_path(path)
     flat, marks = _read(path)
 
@@ -224,32 +218,21 @@ def compose(path: str | os.PathLike) -> yaml.Node | None:
     """
     Read a YAML file as a tree of nodes, which know their places; None for an empty file.
 
-    Raises
-    ------
-    UserError
-        The file cannot be read, or is not YAML. The message names line and column.
-
+    An error names line and column.
     """
     try:
         return yaml.compose(Path(path).read_text(encoding='utf-8'), Loader=yaml.SafeLoader)
-    except OSError as error:
-        raise UserError(f'{path}: cannot be read: {error.strerror}') from None
-    except UnicodeDecodeError:
-        raise UserError(f'{path}: cannot be read: not UTF-8 text') from None
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else 'not UTF-8 text'
+        raise UserError(f'{path}: cannot be read: {reason}') from None
     except yaml.YAMLError as error:
         raise _yaml_error(path, error) from None
 
 
 def _yaml_error(path: str | os.PathLike, error: yaml.YAMLError) -> UserError:
-    """
-    Read a YAML file as a tree of nodes, which know their places; None for an empty file.
-
-    An error names line and column.
-    """
-    problem, mark = str(error), None
-    if isinstance(error, yaml.MarkedYAMLError):
-        problem, mark = str(error.problem), error.problem_mark
-    return UserError(f'{_where(path, mark)}: not YAML: {" ".join(problem.split())}')
+    problem = str(getattr(error, 'problem', error))
+    place = _where(path, getattr(error, 'problem_mark', None))
+    return UserError(f'{place}: not YAML: {" ".join(problem.split())}')
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -258,7 +241,14 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     try:
         parameters: Any = compose(path)
         for key in ('/**', 'ros__parameters'):
-            parameters = _child(parameters, key, path)
+            children = parameters.value if isinstance(parameters, yaml.MappingNode) else ()
+            below = [value for name, value in children
+                     if name.value == key and isinstance(value, yaml.MappingNode)]
+            if not below:
+                place = _where(path, parameters and parameters.start_mark)
+                raise UserError(f'{place}: no {key!r} with parameters below it; a parameter file '
+                                "begins with '/**:' and 'ros__parameters:'")
+            parameters = below[0]
         marks = {'': parameters.start_mark}
         _flatten(parameters, '', flat, marks, path)
     except yaml.YAMLError as error:
@@ -271,16 +261,6 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 def _where(path: str | os.PathLike, mark: Any) -> str:
     """Return file:line:column of a mark of yaml; the file alone without a mark."""
     return f'{path}:{mark.line + 1}:{mark.column + 1}' if mark else f'{path}'
-
-
-def _child(node: Any, key: str, path: Path) -> Any:
-    """Return the mapping below a key; `UserError` where there is none."""
-    if isinstance(node, yaml.MappingNode):
-        for name, value in node.value:
-            if name.value == key and isinstance(value, yaml.MappingNode):
-                return value
-    raise UserError(f'{_where(path, node and node.start_mark)}: no {key!r} with parameters below '
-                    "it; a parameter file begins with '/**:' and 'ros__parameters:'")
 
 
 def _flatten(node: yaml.MappingNode, prefix: str, flat: dict[str, Any], marks: dict[str, Any],
@@ -312,10 +292,12 @@ class _FlatReader:
                     and field.metadata['placeholder'] is not None]
         # The axes come first, as they say how many values the others have.
         axes = self._field(SENSOR_FIELDS['sensor.axes'])
-        values = {field.name: _placeholder(field, axes) if field in unstated else
-                  self._field(field, axes) for field in SENSOR_FIELDS.values()}
-        if values['z_sign'] == 0:
-            raise self.make_error('sensor.z_sign', '0, but must be 1 (upright) or -1')
+        values = {field.name: self._field(field, axes) for field in SENSOR_FIELDS.values()
+                  if field not in unstated}
+        for field in unstated:
+            value = field.metadata['placeholder']
+            values[field.name] = np.full(len(axes), value) if field.type == 'np.ndarray' else value
+        self._require(values['z_sign'], 'sensor.z_sign', '0, but must be 1 (upright) or -1')
         effects = self._names('effects')
         coefficients = {name: self._coefficients(name, axes) for name in effects}
         covariance, covariance_names = self._covariance(effects, axes)
@@ -329,6 +311,10 @@ class _FlatReader:
                       link=self._below(_LINK),
                       unstated=tuple(field.name for field in unstated))
 
+    def _require(self, is_right: Any, key: str, reason: str) -> None:
+        if not is_right:
+            raise self.make_error(key, reason)
+
     def _below(self, begin: str) -> dict[str, Any]:
         """Return the values of the keys with this begin, by the rest of the key."""
         return {key.removeprefix(begin): value for key, value in self.flat.items()
@@ -336,51 +322,46 @@ class _FlatReader:
 
     def _field(self, field: Field[Any], axes: str = '') -> Any:
         """Return the value of a field of `Sensor`."""
-        key, kind = field.metadata['key'], field.type
-        if key not in self.flat:
-            raise self.make_error(key, f'missing; it is the {field.metadata["doc"]}')
+        about, kind = field.metadata, str(field.type)
+        key = about['key']
+        self._require(key in self.flat, key, f'missing; it is the {about["doc"]}')
         value = self.flat[key]
         if kind == 'np.ndarray':
             value = self._numbers(key, value, axes)
         elif kind == 'float':
             value = self._numbers(key, [value])[0].item()
-        elif not isinstance(value, {'int': int, 'str': str}[str(kind)]) or isinstance(value, bool):
-            raise self.make_error(
-                key, f'{value!r} is not {"a whole number" if kind == "int" else "text"}')
-        choices = field.metadata['choices']
-        if choices and value not in choices:
-            raise self.make_error(key, f'{value!r} is not one of {", ".join(choices)}')
-        if field.metadata['lower'] is not None:
-            self._check_bounds(key, value, field.metadata['lower'], field.metadata['upper'],
-                               field.metadata['unit'])
+        else:
+            self._require(type(value) is {'int': int, 'str': str}[kind], key,
+                          f'{value!r} is not {"a whole number" if kind == "int" else "text"}')
+        choices = about['choices'] or [value]
+        self._require(about['choices'] is None or value in choices, key,
+                      f'{value!r} is not one of {", ".join(map(str, choices))}')
+        if about['lower'] is not None:
+            self._check_bounds(key, value, about['lower'], about['upper'], about['unit'])
         return value
 
     def _check_bounds(self, key: str, values: Any, lower: float, upper: float, unit: str) -> None:
         for value in np.ravel(values):
-            if not lower <= value <= upper:
-                raise self.make_error(
-                    key, f'{value:g} {unit} is outside {lower:g} to {upper:g}')
+            self._require(lower <= value <= upper, key,
+                          f'{value:g} {unit} is outside {lower:g} to {upper:g}')
 
     def _numbers(self, key: str, value: Any, axes: str = '') -> np.ndarray:
         """Return a number or a list of numbers, one for each of the axes, as an array."""
         numbers = value if isinstance(value, (list, tuple, np.ndarray)) else [value]
         for number in numbers:
-            if not isinstance(number, float):
-                raise self.make_error(
-                    key, f'{number!r} is not a floating-point number{_as_float(number)}')
-            if not np.isfinite(number):
-                raise self.make_error(key, f'{number} is not a finite number')
-        if axes and len(numbers) != len(axes):
-            raise self.make_error(key, f'{len(numbers)} values for {len(axes)} axes ({axes})')
+            self._require(isinstance(number, float), key,
+                          f'{number!r} is not a floating-point number{_as_float(number)}')
+            self._require(np.isfinite(number), key, f'{number} is not a finite number')
+        self._require(not axes or len(numbers) == len(axes), key,
+                      f'{len(numbers)} values for {len(axes)} axes ({axes})')
         return np.array(numbers, float)
 
     def _names(self, key: str) -> tuple[str, ...]:
         """Return a list of different names; none where the key is missing."""
         names = self.flat.get(key) or []
-        if not isinstance(names, (list, tuple)) or not all(isinstance(n, str) for n in names):
-            raise self.make_error(key, f'{names!r} is not a list of names')
-        if len(set(names)) != len(names):
-            raise self.make_error(key, 'a name stands twice')
+        self._require(isinstance(names, (list, tuple)) and all(isinstance(n, str) for n in names),
+                      key, f'{names!r} is not a list of names')
+        self._require(len(set(names)) == len(names), key, 'a name stands twice')
         return tuple(names)
 
     def _effect(self, key: str, name: str) -> Effect:
@@ -394,118 +375,95 @@ class _FlatReader:
         effect = self._effect('effects', name)
         values = {parameter.name: self._values(effect, parameter, axes)
                   for parameter in effect.parameters}
-        for key in self.flat:
-            if key.startswith(f'{name}.') and key.removeprefix(f'{name}.') not in values:
-                raise self.make_error(
-                    key, f'unknown parameter; {name} has {", ".join(sorted(values))}')
+        for parameter in self._below(f'{name}.'):
+            self._require(parameter in values, f'{name}.{parameter}',
+                          f'unknown parameter; {name} has {", ".join(sorted(values))}')
         return values
 
     def _values(self, effect: Effect, parameter: Parameter, axes: str) -> np.ndarray:
         """Return the value of a parameter by axis, (m,), or () where it has no axes."""
         key = str(Coefficient(effect.name, parameter.name))
-        if key not in self.flat:
-            if parameter.role is Role.OPTIONAL:
-                return neutral(effect, axes)[parameter.name]
-            raise self.make_error(key, f'missing; it is the {parameter.doc}, {parameter.unit}'
-                                  f'{", by axis" if parameter.axes else ""}')
-        if parameter.axes:
-            values = self._numbers(key, self.flat[key], axes)
-        elif isinstance(self.flat[key], (list, tuple)):
-            raise self.make_error(
-                key, f'{self.flat[key]} is a list; it is one number without axes')
-        else:
-            values = self._numbers(key, self.flat[key])[0]
+        if key not in self.flat and parameter.role is Role.OPTIONAL:
+            return neutral(effect, axes)[parameter.name]
+        self._require(key in self.flat, key, f'missing; it is the {parameter.doc}, '
+                      f'{parameter.unit}{", by axis" if parameter.axes else ""}')
+        stated = self.flat[key]
+        self._require(parameter.axes or not isinstance(stated, (list, tuple)), key,
+                      f'{stated} is a list; it is one number without axes')
+        values = self._numbers(key, stated, axes if parameter.axes else '')
         self._check_bounds(key, values, parameter.lower, parameter.upper, parameter.unit)
-        for axis, value in zip(axes, np.atleast_1d(values)) if parameter.axes else ():
-            if axis not in parameter.axes and value != parameter.neutral:
-                raise self.make_error(key, f'{value:g} for {axis}, which it does not act on; '
-                                      f'write {parameter.neutral!r}')
+        if not parameter.axes:
+            return values[0]
+        for axis, value in zip(axes, values):
+            self._require(axis in parameter.axes or value == parameter.neutral, key,
+                          f'{value:g} for {axis}, which it does not act on; write '
+                          f'{parameter.neutral!r}')
         return values
 
     def _covariance(self, effects: Sequence[str], axes: str
                     ) -> tuple[np.ndarray, tuple[Coefficient, ...]]:
-        """Return the covariance, (k, k), and the names of its k coefficients."""
-        names = self._names('covariance_names')
-        coefficients: dict[str, Coefficient] = {}
-        for effect in effects:
-            coefficients |= {str(name): name for name in names_of(effect_named(effect), axes)}
+        """Return the covariance, (k, k), symmetric and positive, and its k coefficients."""
+        key, names = 'covariance', self._names('covariance_names')
+        coefficients = {str(name): name for effect in effects
+                        for name in names_of(effect_named(effect), axes)}
         for name in names:
-            if name not in coefficients:
-                raise self.make_error('covariance_names',
-                                      f'{name!r} is no parameter of the listed effects')
+            self._require(name in coefficients, 'covariance_names',
+                          f'{name!r} is no parameter of the listed effects')
         if not names:
             return np.zeros((0, 0)), ()
-        if 'covariance' not in self.flat:
-            raise self.make_error('covariance',
-                                  f'missing; {len(names)} names stand in covariance_names')
-        matrix = self._numbers('covariance', self.flat['covariance'])
-        if matrix.size != len(names) ** 2:
-            raise self.make_error('covariance', f'{matrix.size} values, but {len(names)} names '
-                                  f'need {len(names) ** 2}')
+        self._require(key in self.flat, key, f'missing; {len(names)} names stand in '
+                      'covariance_names')
+        matrix = self._numbers(key, self.flat[key])
+        self._require(matrix.size == len(names) ** 2, key, f'{matrix.size} values, but '
+                      f'{len(names)} names need {len(names) ** 2}')
         matrix = matrix.reshape(len(names), -1)
-        self._check_covariance(matrix, names)
-        return matrix, tuple(coefficients[name] for name in names)
-
-    def _check_covariance(self, matrix: np.ndarray, names: Sequence[str]) -> None:
-        """Refuse a matrix that is not symmetric and positive."""
-        for name, variance in zip(names, np.diag(matrix)):
-            if variance < 0:
-                raise self.make_error(
-                    'covariance', f'the variance of {name} is {variance:g}, not positive')
-        std = np.sqrt(np.maximum(np.diag(matrix), _SMALLEST_VARIANCE))
+        variances = np.diag(matrix)
+        for name, variance in zip(names, variances):
+            self._require(variance >= 0, key,
+                          f'the variance of {name} is {variance:g}, not positive')
+        std = np.sqrt(np.maximum(variances, _SMALLEST_VARIANCE))
         correlation = matrix / np.outer(std, std)
-        if np.abs(correlation - correlation.T).max() > _ASYMMETRY:
-            raise self.make_error('covariance', 'not symmetric')
+        self._require(np.abs(correlation - correlation.T).max() <= _ASYMMETRY, key,
+                      'not symmetric')
         smallest = np.linalg.eigvalsh(correlation).min()
-        if smallest < _LOWEST_EIGENVALUE:
-            raise self.make_error('covariance', 'not positive: its smallest eigenvalue is '
-                                  f'{smallest:.3g} in units of the variances')
+        self._require(smallest >= _LOWEST_EIGENVALUE, key, 'not positive: its smallest eigenvalue '
+                      f'is {smallest:.3g} in units of the variances')
+        return matrix, tuple(coefficients[name] for name in names)
 
     def _envelope(self) -> Envelope:
         """Return the validity range, as far as the file states it."""
-        values_by_name: dict[str, Any] = {}
+        stated: dict[str, Any] = {}
         for name, meaning in ENVELOPE.items():
             key = f'envelope.{name}'
-            if key not in self.flat:
-                continue
-            values = self._numbers(key, self.flat[key])
-            count = ENVELOPE_LISTS.get(name, 1)
-            if len(values) != count or (count == 1 and values[0] < 0) or \
-                    (name == 'temperature_c' and values[0] > values[1]):
-                raise self.make_error(key, f'{self.flat[key]} is not the {meaning}')
-            values_by_name[name] = float(values[0]) if count == 1 else tuple(values.tolist())
-        return Envelope(**values_by_name)
+            if key in self.flat:
+                values = self._numbers(key, self.flat[key])
+                count = ENVELOPE_LISTS.get(name, 1)
+                is_right = len(values) == count and (count > 1 or values[0] >= 0) and (
+                    name != 'temperature_c' or values[0] <= values[1])
+                self._require(is_right, key, f'{self.flat[key]} is not the {meaning}')
+                stated[name] = values[0].item() if count == 1 else tuple(values.tolist())
+        return Envelope(**stated)
 
     def _datasheet(self) -> dict[Coefficient, tuple[float, float]]:
         """Return the typical and the greatest departure by `effect.parameter`."""
-        if 'datasheet.figures' not in self.flat:
-            return {}
         names = self._names('datasheet.figures')
-        typical = self._departures('typical', len(names))
-        maximum = self._departures('maximum', len(names))
+        departures = []
+        for key in ('datasheet.typical', 'datasheet.maximum') if names else ():
+            self._require(key in self.flat, key,
+                          f'missing; {len(names)} names stand in datasheet.figures')
+            values = self._numbers(key, self.flat[key])
+            self._require(len(values) == len(names) and (values >= 0).all(), key,
+                          f'{len(values)} values, but {len(names)} names need as many, of 0 or '
+                          'more')
+            departures.append(values.tolist())
+        coefficients = []
         for name in names:
             effect, _, parameter = name.partition('.')
-            if all(p.name != parameter
-                   for p in self._effect('datasheet.figures', effect).parameters):
-                raise self.make_error('datasheet.figures', f'{name!r} is no parameter of {effect}')
-        return dict(zip(map(Coefficient.parse, names), zip(typical, maximum)))
-
-    def _departures(self, name: str, count: int) -> list[float]:
-        """Return a list of `count` departures by the datasheet, all of 0 or more."""
-        key = f'datasheet.{name}'
-        if key not in self.flat:
-            raise self.make_error(key, f'missing; {count} names stand in datasheet.figures')
-        values = self._numbers(key, self.flat[key])
-        if len(values) != count or (values < 0).any():
-            raise self.make_error(key, f'{len(values)} values, but {count} names need as many, '
-                                  'of 0 or more')
-        return values.tolist()
-
-
-def _placeholder(field: Field[Any], axes: str) -> Any:
-    """Return what stands in a field of `Sensor` whose key a file leaves out."""
-    value = field.metadata['placeholder']
-    return np.full(len(axes), value) if field.type == 'np.ndarray' else value
+            known = self._effect('datasheet.figures', effect).parameters
+            self._require(parameter in [each.name for each in known], 'datasheet.figures',
+                          f'{name!r} is no parameter of {effect}')
+            coefficients.append(Coefficient.parse(name))
+        return dict(zip(coefficients, zip(*departures)))
 
 
 def _as_float(value: Any) -> str:

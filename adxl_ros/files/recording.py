@@ -150,28 +150,23 @@ def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> Recording:
 @contextmanager
 def writer(path: str | os.PathLike, sensor: Sensor) -> Iterator[Callable[[Recording], None]]:
     """
-    Read the ideal specific force of another simulator, with times since `epoch_ns`.
-
-    It is a CSV file with `time_s, ax_mps2, ay_mps2, az_mps2`, or a bag with one topic of type
-    sensor_msgs/Imu, or several of which one is `imu/data_raw`.
-    """
-    if Path(path).suffix == '.csv':
-        with csv_writer(path) as append:
-            yield lambda block: append({TIME: block.time_s, **block.columns}, _csv_info(block))
-    else:
-        with BagWriter(path, sensor) as bag:
-            yield bag.write
-
-
-def _csv_info(recording: Recording) -> dict[str, str]:
-    """
     Open a new recording, and yield a function that appends a block of samples to it.
 
     The recording appears under its name when the block ends without an error, or not at all; its
     ending determines the format. A bag holds the nominal conversion of `sensor`.
     """
-    info = {key: value for key, value in recording.info.items() if key != 'epoch_ns'}
-    return {**info, 'epoch_ns': str(recording.epoch_ns)} if recording.epoch_ns else info
+    if Path(path).suffix != '.csv':
+        with BagWriter(path, sensor) as bag:
+            yield bag.write
+        return
+    with csv_writer(path) as append:
+        def write_block(block: Recording) -> None:
+            info = {key: value for key, value in block.info.items() if key != 'epoch_ns'}
+            if block.epoch_ns:
+                info['epoch_ns'] = str(block.epoch_ns)
+            append({TIME: block.time_s, **block.columns}, info)
+
+        yield write_block
 
 
 def write(path: str | os.PathLike, recording: Recording, sensor: Sensor) -> None:
@@ -198,7 +193,7 @@ def write(path: str | os.PathLike, recording: Recording, sensor: Sensor) -> None
 
 
 def _is_bag(path: str | os.PathLike) -> bool:
-    """Write a whole recording; see `writer`."""
+    """Return whether a recording is a bag; refuse bags that cannot be read under their name."""
     file_path = Path(path)
     if file_path.is_dir():
         return True

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -263,6 +263,42 @@ def describe_bursts(time_s: np.ndarray) -> str:
         return ''
     return f'; stamps come in bursts of about {size} samples (USB, or a buffer), at a mean of ' \
            f'{stamped_rate_hz(time_s):.4g} Hz'
+
+
+class StampCheck:
+    """Finds samples whose stamp does not increase: they are refused, or left out and counted."""
+
+    def __init__(self, path: str, may_drop: bool) -> None:
+        self.bad = BadStamps(0, 0)  # What was left out so far
+        self._path, self._may_drop = path, may_drop
+        self._last_s = -np.inf
+
+    def increasing(self, time_s: np.ndarray, is_sample: np.ndarray, where: Callable[[int], str]
+                   ) -> np.ndarray:
+        """Return which samples among rows, (n,), increase; `where` names the place of a row."""
+        latest = np.maximum.accumulate(np.concatenate([
+            [self._last_s], np.where(is_sample, time_s, -np.inf)]))
+        self._last_s, latest = latest[-1], latest[:-1]
+        wrong = is_sample & ~(time_s > latest)
+        stands = wrong & (time_s == latest)
+        if wrong.any() and not self._may_drop:
+            row = int(wrong.argmax())
+            raise UserError(
+                f'{where(row)}: time {"stands still" if stands[row] else "runs backwards"}, '
+                f'{latest[row] - time_s[row]:.3g} s before the newest sample'
+                f'{describe_bursts(time_s[is_sample])}; --drop-bad-stamps leaves such samples '
+                'out, --rate HZ stamps by index')
+        duplicates = int(stands.sum())
+        self.bad = BadStamps(self.bad.duplicates + duplicates,
+                             self.bad.backward + int(wrong.sum()) - duplicates)
+        return is_sample & ~wrong
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What was left out, for people."""
+        kinds = ('samples with the stamp of the one before', 'samples whose stamp steps back')
+        return tuple(f'{self._path}: left out, {kind}: {count}'
+                     for kind, count in zip(kinds, self.bad) if count)
 
 
 def check_unit(info: StreamInfo, axes: str, sensor: Sensor) -> None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import redirect_stdout
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from functools import partial
 from io import StringIO
@@ -14,8 +14,6 @@ import os
 from pathlib import Path
 import re
 from typing import Any
-import zipfile
-import zlib
 
 from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files.column_mapping import Quantity, Table, TableBlock, unit_in_name, UNITS
@@ -72,17 +70,30 @@ def _row_places(path: str, first: int) -> Callable[[int, str], str]:
     return lambda row, column: f'{path}: row {first + row + 1} of {column}'
 
 
+@contextmanager
+def _library(path: str, kind: str, package: str) -> Iterator[None]:
+    """Name a package that is missing, and refuse a file that it cannot read."""
+    try:
+        yield
+    except ImportError:
+        raise UserError(f'{path}: {kind} needs the Python package {package}: '
+                        f'{install_hint(package)}') from None
+    except OSError as error:
+        raise UserError(f'{path}: cannot read it as {kind}: {error.strerror or one_line(error)}'
+                        ) from None
+    except Exception as error:
+        # In a damaged file, a library can raise errors of any kind.
+        raise UserError(f'{path}: cannot read it as {kind}: '
+                        f'{one_line(error) or type(error).__name__}') from None
+
+
 def _open_npz(path: str) -> Table:
     """Read the arrays of a file; those of another length than most are left out."""
     columns: dict[str, np.ndarray] = {}
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            for name in arrays.files:
-                columns |= _array_columns(name, arrays[name])
-    except (OSError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile,
-            zlib.error) as error:
-        raise UserError(f'{path}: cannot read it as .npz: {one_line(error)}; save '
-                        'plain arrays of numbers with numpy.savez') from None
+    with _library(path, '.npz of plain arrays', 'numpy'), \
+            np.load(path, allow_pickle=False) as arrays:
+        for name in arrays.files:
+            columns |= _array_columns(name, arrays[name])
     if not columns:
         raise UserError(f'{path}: holds no array of numbers with several rows')
     rows = Counter(map(len, columns.values())).most_common(1)[0][0]
@@ -106,41 +117,25 @@ def _array_columns(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
 
 def _open_parquet(path: str) -> Table:
     """Open a Parquet file with the library pyarrow: its columns of numbers and of times."""
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise UserError(f'{path}: Parquet needs the Python package pyarrow: '
-                        f'{install_hint("pyarrow")}') from None
-    errors = (OSError, pyarrow.ArrowException)
-
-    def refusal(error: Exception) -> UserError:
-        return UserError(f'{path}: cannot read it as Parquet: {one_line(error)}')
-
     def blocks(names: Collection[str], _: Collection[str]) -> Iterator[TableBlock]:
         first = 0
-        try:
-            with pyarrow.parquet.ParquetFile(path) as file:
-                for batch in file.iter_batches(_BLOCK_ROWS, columns=list(names)):
-                    last = first + batch.num_rows
-                    yield TableBlock({name: numbers(batch.column(name)) for name in names},
-                                     _row_places(path, first), done=last / file.metadata.num_rows)
-                    first = last
-        except errors as error:
-            raise refusal(error) from None
+        with _library(path, 'Parquet', 'pyarrow'), pyarrow.parquet.ParquetFile(path) as file:
+            for batch in file.iter_batches(_BLOCK_ROWS, columns=list(names)):
+                last = first + batch.num_rows
+                yield TableBlock({name: numbers(batch.column(name)) for name in names},
+                                 _row_places(path, first), done=last / file.metadata.num_rows)
+                first = last
 
     def numbers(column: Any) -> np.ndarray:
         """Return a column as floats; an empty cell is NaN."""
-        if pyarrow.types.is_temporal(column.type):
+        if kinds.is_temporal(column.type):
             column = column.cast(pyarrow.int64())
         return np.asarray(column.cast(pyarrow.float64(), safe=False).to_numpy(
             zero_copy_only=False), float)
 
-    try:
-        schema = pyarrow.parquet.read_schema(path)
-    except errors as error:
-        raise refusal(error) from None
-    kinds = pyarrow.types
+    with _library(path, 'Parquet', 'pyarrow'):
+        import pyarrow.parquet
+        schema, kinds = pyarrow.parquet.read_schema(path), pyarrow.types
     units = {each.name: each.type.unit for each in schema
              if kinds.is_timestamp(each.type) or kinds.is_duration(each.type)}
     names = tuple(each.name for each in schema if each.name in units
@@ -152,7 +147,10 @@ def _open_parquet(path: str) -> Table:
 
 def _open_ulog(path: str, topic: str) -> Table:
     """Read one message of a log of PX4 with the library pyulog: it is a table."""
-    log = _read_ulog(path)
+    # The library prints its warnings.
+    with _library(path, 'a log of PX4', 'pyulog'), redirect_stdout(StringIO()):
+        from pyulog import ULog
+        log = ULog(path)
     # The first instance of a message has no number.
     messages = {f'{data.name}_{data.multi_id}' if data.multi_id else str(data.name): data
                 for data in log.data_list}
@@ -181,25 +179,6 @@ def _open_ulog(path: str, topic: str) -> Table:
     cut = f'{path}: is damaged; what can be read of it is used' * bool(log.file_corruption)
     return _in_memory(path, columns, cut, default_mapping=mapping,
                       units={'timestamp': 'us', 'timestamp_sample': 'us'})
-
-
-def _read_ulog(path: str) -> Any:
-    """Return the parsed log."""
-    try:
-        from pyulog import ULog
-    except ImportError:
-        raise UserError(f'{path}: logs of PX4 need the Python package pyulog: '
-                        f'{install_hint("pyulog")}') from None
-    try:
-        # The library prints its warnings.
-        with redirect_stdout(StringIO()):
-            return ULog(path)
-    except OSError as error:
-        raise UserError(f'{path}: cannot read: {error.strerror or error}') from None
-    except Exception as error:
-        # In a damaged file, pyulog can raise errors of any kind.
-        raise UserError(f'{path}: cannot read it as a log of PX4: '
-                        f'{one_line(error) or type(error).__name__}') from None
 
 
 _FORMATS: Mapping[str, Callable[[str], Table]] = {
