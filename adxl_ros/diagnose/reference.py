@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from os.path import basename
+from typing import Any
 
 from adxl_ros.diagnose.comparison import (
     BaselineComparison,
