@@ -25,8 +25,8 @@ from adxl_ros.diagnose.data_checks import CheckedRecording, compare_checked
 from adxl_ros.diagnose.evidence import used_by_block
 from adxl_ros.diagnose.held_out import block_weights, HeldOutFits, reproducible_rest
 from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
-from adxl_ros.diagnose.next_experiment import CouldShow, NextExperiment, RecordedEvidence
-from adxl_ros.diagnose.noise_effects import Detection, NoiseComparison, NoiseRemainder, UNKNOWN
+from adxl_ros.diagnose.next_experiment import CouldShow, NextExperiment
+from adxl_ros.diagnose.noise_effects import Detection, NoiseComparison, NoiseRemainder
 from adxl_ros.diagnose.noise_model import drift_effects, NoiseFloor
 from adxl_ros.diagnose.reference import DataFault
 from adxl_ros.diagnose.residual_map import not_covered, residual_map, ResidualCell
@@ -167,7 +167,7 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     detections = _detections(checked, search.best, model.baseline)
     verdict = rule.decide(
         evidence, cache(lambda effects, drift: reproducible_rest(fits[effects][drift][0], model)),
-        [d.effect for d in detections if d.effect != UNKNOWN])
+        [d.effect for d in detections])
     show('report', 0.0)
     if verdict.status == 'no_gap' and not any(map(_could_show, model.comparisons)):
         verdict = replace(verdict, status='insufficient')
@@ -287,7 +287,7 @@ def _named_sensor(verdict: Verdict, best: Hypothesis, detections: Sequence[Detec
         before = get(sensor, hidden)
         sensor = put(replace(sensor, values={**sensor.values, **{
             e: fitted.values[e] for e in (*best.effects, *straight)}}), hidden, before)
-    in_noise = {d.effect: d.values for d in detections if d.effect != UNKNOWN}
+    in_noise = {d.effect: d.values for d in detections}
     for drift in [e for e in drift_effects() if e in verdict.named][:1]:
         densities = fits[drift].drift_densities()[:len(sensor.axes)]
         in_noise[drift] = {effect_named(drift).parameters[0].name: densities}
@@ -349,8 +349,7 @@ def _report(checked: Sequence[CheckedRecording], model: LinearModel, search: Sea
         tuple(residual_map(model.comparisons[0], seed)), lacking,
         tuple(next_experiment.could_show(model, comparisons[0], floor.noise_v,
                                          verdict.material_mps2)),
-        next_experiment.propose_next_experiment(verdict, lacking, RecordedEvidence(
-            baseline, model, seed)),
+        next_experiment.propose_next_experiment(verdict, lacking, baseline, model, seed),
         baseline, sensor, model)
 
 

@@ -95,9 +95,10 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
                    'mean': _rounded(c.mean_mps2), 'share': _rounded(c.share), 'p': _rounded(c.p)}
                   for c in report.residual_cells if c.p < SIGNIFICANT_P][:_MOST_CELLS],
         'not_covered': list(report.not_covered), 'notes': notes(diagnosis),
-        'could_show': [{'effect': r.effect, 'parameter': r.parameter, 'axis': r.axis or None,
-                        'unit': r.unit, 'smallest': _rounded(r.smallest), 'could_show': r.shows}
-                       for r in report.could_show],
+        'could_show': [
+            {'effect': r.effect, 'parameter': r.name.parameter, 'axis': r.name.axis or None,
+             'unit': parameter_of(r.name).unit, 'smallest': _rounded(r.smallest),
+             'could_show': r.shows} for r in report.could_show],
         'candidates': _candidates(report),
         'noise_remainders': [
             {'effect': r.effect, 'quantity': r.quantity, 'unit': r.unit,
@@ -107,8 +108,8 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
              'left': _rounded(r.remains[r.largest])} for r in report.noise_remainders],
         'next_experiment': proposal and {
             'manoeuvre': proposal.manoeuvre, 'why': proposal.why, 'command': proposal.command,
-            'menu': [{'manoeuvre': w.text, 'minutes': _rounded(w.minutes),
-                      'nats_per_minute': _rounded(w.nats_per_minute)} for w in proposal.menu]},
+            'menu': [{'manoeuvre': w.manoeuvre.name, 'minutes': _rounded(w.manoeuvre.minutes),
+                      'nats_per_minute': _rounded(w.per_minute)} for w in proposal.menu]},
         'summary': summary(diagnosis)}
 
 
@@ -370,11 +371,11 @@ def closes(report: Report) -> bool:
 
 def shown_row(row: CouldShow, scale_v_per_g: float) -> list[str]:
     """Return effect, parameter, smallest and typical size, and the manoeuvre that shows it."""
-    smallest, typical = (parameter_text({'value': v, 'unit': row.unit}, scale_v_per_g, 2)
-                         for v in (row.smallest, row.typical))
-    return [row.effect, parameter_label(row.parameter, False),
-            smallest if row.shows else 'cannot show', typical,
-            MENU[row.revealed_by].text if row.revealed_by else '']
+    p, revealed_by = parameter_of(row.name), effect_named(row.effect).diagnosis.revealed_by
+    smallest, typical = (parameter_text({'value': v, 'unit': p.unit}, scale_v_per_g, 2)
+                         for v in (row.smallest, p.scale))
+    return [row.effect, parameter_label(p.name, False), smallest if row.shows else 'cannot show',
+            typical, MENU[revealed_by].text if revealed_by else '']
 
 
 def shows_row(row: CouldShow, scale_v_per_g: float) -> tuple[str, str, str, str]:
