@@ -145,9 +145,10 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
         show_progress(f'{i + 1}/{len(names)} {stage}', ends[i] + share * (ends[i + 1] - ends[i]))
 
     show('checks', 0.0)
-    checked = check(recordings, sensor, sim, align)
-    if isinstance(checked, Diagnosis):
-        return checked
+    try:
+        checked = check(recordings, sensor, sim, align)
+    except DataFault as fault:
+        return Diagnosis(fault.comparisons, fault=fault)
     model = build_linear_model([c.search_comparison for c in checked],
                                lambda share: show('library of effects', share))
     search = Search(model)
@@ -178,27 +179,16 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
 
 
 def check(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = None,
-          align: bool = False) -> list[CheckedRecording] | Diagnosis:
-    """Put recordings beside their simulation; return the diagnosis of the first fault instead."""
+          align: bool = False) -> list[CheckedRecording]:
+    """Put recordings beside their simulation; raise DataFault for the first fault."""
     if not sensor.effects:
         sensor = with_axes(sensor, recordings[0].axes)
     compared: list[BaselineComparison] = []
     for recording in recordings:
         check_unit(recording.stream_info, recording.axes, sensor)
-        comparison = compare_checked(recording, sensor, sim, align)
-        if isinstance(comparison, DataFault):
-            return Diagnosis((), (), comparison)
-        compared.append(comparison)
-    short = data_checks.find_length_fault(compared)
-    if short is not None:
-        return Diagnosis(tuple(compared), (), short)
-    checked: list[CheckedRecording] = []
-    for comparison in compared:
-        result = data_checks.check_recording(comparison)
-        if isinstance(result, DataFault):
-            return Diagnosis((comparison,), (), result)
-        checked.append(result)
-    return checked
+        compared.append(compare_checked(recording, sensor, sim, align))
+    data_checks.check_length(compared)
+    return [data_checks.check_recording(comparison) for comparison in compared]
 
 
 def material_mps2(model: LinearModel, floor: NoiseFloor, material_mg: float = MATERIAL_MG
@@ -356,10 +346,10 @@ def _report(checked: Sequence[CheckedRecording], model: LinearModel, search: Sea
 def what_shows(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = None
                ) -> list[CouldShow] | DataFault:
     """Return what recordings can show, before any diagnosis; or why they cannot be compared."""
-    checked = check(recordings, sensor, sim)
-    if isinstance(checked, Diagnosis):
-        assert checked.fault is not None
-        return checked.fault
+    try:
+        checked = check(recordings, sensor, sim)
+    except DataFault as fault:
+        return fault
     model = build_linear_model([c.search_comparison for c in checked])
     floor = noise_model.estimate([c.comparison for c in checked])
     return next_experiment.could_show(model, checked[0].comparison, floor.noise_v,

@@ -370,8 +370,7 @@ def calibration_takes_up(effect: str) -> bool:
 def build_linear_model(comparisons: Sequence[BaselineComparison],
                        show_progress: Callable[[float], None] = lambda fraction: None,
                        filters: Sequence[list[Whitener]] | None = None,
-                       only: Sequence[str] | None = None,
-                       flexible: Sequence[evidence.FlexibleColumns] | None = None) -> LinearModel:
+                       only: Sequence[str] | None = None) -> LinearModel:
     """Differentiate the baseline by the whole library in all recordings."""
     baseline_v = [c.simulated_v(c.sensor) for c in comparisons]
     # The same variant of several recordings, by the number of the recording.
@@ -413,8 +412,7 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
             k = len(channels)
             channels.append(evidence.whiten_channel(
                 residual_v, np.array([c.values for c in by_channel[k]]).T,
-                np.array([c.number for c in by_channel[k]]), comparison.used, chosen[k],
-                None if flexible is None else flexible[k], False))
+                np.array([c.number for c in by_channel[k]]), comparison.used, chosen[k], False))
     show_progress(1.0)
     # The first column of an effect is that of its smallest start.
     nuisance_columns = [{names[c.number]: c.values for c in reversed(channel)

@@ -51,10 +51,6 @@ axis, and distance of the neighbours, samples. Chosen: normal noise exceeds it o
 samples; one or two may be anything; the next sample shares an RC filter."""
 _SPIKE_LOCAL_S, _SPIKE_LOCAL_FEWEST = 0.2, 9
 """Width of the blocks of the local scale, s and samples. Chosen: shorter than a move."""
-_LEVEL_CELL, _LEVEL_RARITY, _LEVEL_FEWEST = 0.02, 4.0, 10
-"""Width of a level as a share of the range; spikes cluster if their levels hold less than the
-inverse of the second of all samples; fewest spikes of which levels are compared. Tuned on working
-cases: codes of a wrong ADC jump at few levels."""
 NOISE_EXCESS, _RESTING_FEWEST = 1.2, 500
 """Noise, divided by the stated noise, from which it is excessive, and fewest resting samples that
 show it. Chosen: units differ by less; a standard deviation of 3 %."""
@@ -131,7 +127,7 @@ def isolated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, se
     """Find single samples that deviate from the straight line between their neighbours."""
     spikes, size_v = _spikes(volts, used, sensor)
     count = int(spikes.any(axis=1).sum())
-    if not count or _at_few_levels(volts, spikes):
+    if not count:
         return used, None
     rate_hz = spikes.sum() / len(sensor.axes) / float(time_s[-1] - time_s[0])
     return used & ~spikes.any(axis=1), _detection(
@@ -175,16 +171,6 @@ def _spikes(volts: np.ndarray, used: np.ndarray, sensor: Sensor
             isolated[:, d] = spikes
             size_v[d] = float(np.median(deviation[spikes]))
     return isolated, size_v
-
-
-def _at_few_levels(volts: np.ndarray, spikes: np.ndarray) -> bool:
-    """Determine whether spikes cluster at some levels, as steps of an ADC do."""
-    expected, count = 0.0, int(spikes.sum())
-    for v, isolated in zip(volts.T, spikes.T):
-        level = np.floor(v / (_LEVEL_CELL * max(np.nanmax(v) - np.nanmin(v), 1e-9)))
-        before = np.roll(level, _SPIKE_NEIGHBOUR)
-        expected += float(np.isin(before, np.unique(before[isolated])).mean()) * isolated.sum()
-    return bool(count > _LEVEL_FEWEST and expected / count < 1 / _LEVEL_RARITY)
 
 
 def coarse_codes(volts: np.ndarray, sensor: Sensor) -> Detection | None:
