@@ -158,22 +158,20 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     counts = np.sum([used_by_block(c.used) for c in model.comparisons], axis=0)
     fits = _held_out(model, search, floor, max(counts.sum(), 1.0))
     evidence = rule.Evidence(
-        {e: rule.Candidate({d: f.figures for d, (f, _) in drifts.items()},
-                           {d: size for d, (_, size) in drifts.items()})
-         for e, drifts in fits.items()},
+        {e: {d: f.figures for d, f in drifts.items()} for e, drifts in fits.items()},
         counts, block_weights(seed), material_mps2(model, floor, material_mg),
         model.smallest_angle_rad() * G0_MPS2,
         any(c.fading_hz is not None for c in model.comparisons),
         np.inf if floor.source == 'assumed' else floor.rms_mps2)
     detections = _detections(checked, search.best, model.baseline)
     verdict = rule.decide(
-        evidence, cache(lambda effects, drift: reproducible_rest(fits[effects][drift][0], model)),
+        evidence, cache(lambda effects, drift: reproducible_rest(fits[effects][drift])),
         [d.effect for d in detections])
     show('report', 0.0)
     if verdict.status == 'no_gap' and not any(map(_could_show, model.comparisons)):
         verdict = replace(verdict, status='insufficient')
     report = _report(checked, model, search, verdict, detections, floor, evidence,
-                     {d: f for d, (f, _) in fits[verdict.best].items()}, seed)
+                     fits[verdict.best], seed)
     show('report', 1.0)
     return Diagnosis(tuple(model.comparisons), tuple(c.comparison for c in checked), None, report)
 
@@ -200,23 +198,23 @@ def material_mps2(model: LinearModel, floor: NoiseFloor, material_mg: float = MA
 
 
 def _held_out(model: LinearModel, search: Search, floor: NoiseFloor, count: float
-              ) -> dict[frozenset[str], dict[str, tuple[HeldOutFits, float]]]:
-    """Return held-out fits of all sets by the drift of their noise, with its size, m/s²."""
+              ) -> dict[frozenset[str], dict[str, HeldOutFits]]:
+    """Return held-out fits of all sets by the drift of their noise."""
     best = search.best
     beside = linearise(model, best.effects, best.sensor, model.filters)
     drifts = drift_effects() if beside.fit(drifts=drift_effects()).log_evidence \
         > beside.fit().log_evidence else ()
     out = {}
     for effects, hypothesis in search.found.items():
-        healthy = HeldOutFits(hypothesis.linearised)
+        healthy = HeldOutFits(hypothesis.linearised, model)
         left = healthy.figures.squares.sum() / count - floor.rms_mps2 ** 2
         linearised = linearise(model, hypothesis.effects, hypothesis.sensor, model.filters) \
             if drifts else hypothesis.linearised
-        fits = {d: HeldOutFits(linearised, (d,)) for d in drifts}
+        fits = {d: HeldOutFits(linearised, model, (d,)) for d in drifts}
         # A drift that should be far larger than what is left is none.
-        sized = {d: (f, size) for d, f in fits.items()
-                 if (size := f.drift_mps2(model)) ** 2 <= _DRIFT_LIMIT * max(left, 0.0)}
-        out[effects] = {HEALTHY: (healthy, 0.0), **sized}
+        out[effects] = {HEALTHY: healthy} | {
+            d: f for d, f in fits.items()
+            if f.drift_mps2 ** 2 <= _DRIFT_LIMIT * max(left, 0.0)}
     return out
 
 
@@ -292,7 +290,7 @@ def _closure(verdict: Verdict, evidence: rule.Evidence, floor: NoiseFloor,
              remainders: Sequence[NoiseRemainder], sensor: Sensor, seed: int) -> GapClosure:
     """Return the gap before and after the best set, above the floor without noise-like effects."""
     best = verdict.best if verdict.closes else frozenset[str]()
-    before, after = (evidence.mean(evidence.candidates[e].figures[HEALTHY].squares)
+    before, after = (evidence.mean(evidence.candidates[e][HEALTHY].squares)
                      for e in (frozenset[str](), best))
     stated = noise.sample_std_v(sensor) / (sensor.scale_v_per_g / G0_MPS2)
     stated_mps2 = float(np.sqrt(np.mean(stated ** 2)))

@@ -58,6 +58,7 @@ class HeldOutFits:
     """The fits of a linearised set of effects to all blocks but those held out."""
 
     linearised: LinearisedHypothesis  # The set of effects, linearised at its fit to all blocks
+    model: LinearModel
     # Effects by which the zero-g may drift more than that of a healthy unit
     drifts: tuple[str, ...] = ()
 
@@ -89,7 +90,7 @@ class HeldOutFits:
                 white = np.einsum('i,bij,j->b', v, channel.block_grams[f][held_out], v)
                 log_likelihood[held_out] += channel.log_scales[f][held_out] - 0.5 * (
                     white / variance + channel.counts[held_out] * np.log(variance))
-        return HeldOut(squares, log_likelihood)
+        return HeldOut(squares, log_likelihood, self.drift_mps2)
 
     def drift_densities(self) -> np.ndarray:
         """Return the densities of the drift by channel; 0 for that of a healthy unit."""
@@ -97,18 +98,19 @@ class HeldOutFits:
                                                    self.full.filter_indices)]
         return np.array([0.0 if w.healthy else w.density for w in chosen])
 
-    def drift_mps2(self, model: LinearModel) -> float:
+    @property
+    def drift_mps2(self) -> float:
         """Return the expected rms of the drift that the fitted noise has, m/s²."""
         sizes = []
         for number, density in enumerate(self.drift_densities()):
-            comparison = model.comparisons[model.place_of_channel(number)[0]]
+            comparison = self.model.comparisons[self.model.place_of_channel(number)[0]]
             spectrum = self.linearised.filters[number][self.full.filter_indices[number]].spectrum
             sizes.append(expected_drift_g(spectrum, density, comparison.span_s,
                                           comparison.sensor.rate_hz))
         return float(G0_MPS2 * np.sqrt(np.mean(np.square(sizes))))
 
 
-def reproducible_rest(fits: HeldOutFits, model: LinearModel) -> Rest:
+def reproducible_rest(fits: HeldOutFits) -> Rest:
     """
     Predict held-out blocks by flexible functions of everything that a residual may follow.
 
@@ -116,7 +118,7 @@ def reproducible_rest(fits: HeldOutFits, model: LinearModel) -> Rest:
     1992), so that functions that follow noise vanish. The effects keep their values, so that the
     functions take up only what the effects leave.
     """
-    linearised, every = fits.linearised, [d.value for d in FormDimension]
+    linearised, model, every = fits.linearised, fits.model, [d.value for d in FormDimension]
     by_choice = {name: np.zeros(BLOCKS) for name in ('all', 'steady', 'nats')}
     whole = linearised.departures(fits.full, fits.full)
     for number, (columns, filters) in enumerate(zip(linearised.columns, linearised.filters)):

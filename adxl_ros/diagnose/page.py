@@ -17,7 +17,7 @@ from adxl_ros.diagnose.comparison import BaselineComparison
 from adxl_ros.diagnose.diagnosis import Diagnosis, Report
 from adxl_ros.diagnose.evidence import bridged
 from adxl_ros.diagnose.next_experiment import by_effect
-from adxl_ros.diagnose.residual_map import BLOCK_S, RANGES, ResidualCell, SIGNIFICANT_P
+from adxl_ros.diagnose.residual_map import BLOCK_S, ResidualCell, SIGNIFICANT_P
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import with_neutral
 from adxl_ros.model.constants import AXES, Z_90
@@ -47,6 +47,8 @@ _SEGMENT, _POINTS_PER_OCTAVE = 4096, 12
 _COLOURS = {'explained': 'green', 'partly': 'amber', 'no_gap': 'grey', 'inseparable': 'amber',
             'insufficient': 'amber', 'unknown': 'red', 'bad_data': 'red'}
 """Colour of the badge for each status."""
+_MOST_CELLS = 20
+"""Largest number of parts of the map. Chosen: one screen."""
 _PLOTTED_POINTS = 3000
 """Largest number of points of a line. Chosen: more than a wide screen has columns."""
 _INK, _EFFECT_COLOUR = '#1f2933', '#5b8fd6'
@@ -117,8 +119,7 @@ def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> 
     rows, scale = words.figure_rows(diagnosis), float(report.baseline.scale_v_per_g.mean())
     return {
         'has_verdict': True,
-        'figures': {'waterfall': waterfall(report), 'map': map_figure(report.residual_cells),
-                    'signals': signals(compared, best.sensor),
+        'figures': {'waterfall': waterfall(report), 'signals': signals(compared, best.sensor),
                     'spectrum': gap_spectrum(full_rate, best.sensor),
                     **{f'proof-{name}': drawn for name, (drawn, _) in proofs.items()}},
         'tiles': rows[:3] + [r for r in rows[3:] if r.label in (
@@ -130,10 +131,21 @@ def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> 
         'hypotheses': [[', '.join(h['effects']) or 'no gap', percent(h['probability'])]
                        for h in objects['hypotheses']],
         'not_covered': objects['not_covered'],
+        'where': [_cell(c) for c in report.residual_cells if c.p < SIGNIFICANT_P][:_MOST_CELLS],
         'menu': [[m['manoeuvre'], f'{m["minutes"]:.1f}', f'{m["nats_per_minute"]:.2g}']
                  for m in proposal['menu']] if proposal else [],
         'could_show': [(row.shows, *words.shown_row(row, scale))
                        for row in by_effect(report.could_show).values()]}
+
+
+def _cell(cell: ResidualCell) -> list[str]:
+    """Return quantity, range, axis, mean and share of a part of the map."""
+    name, unit, factor = cell.dimension, cell.dimension.rpartition('_')[2], 1.0
+    if 'rad' in name:
+        unit, factor = '°/s' if 'rate' in name else '°', float(np.degrees(1.0))
+    return [name.split('_rad')[0].replace('_', ' '),
+            f'{factor * cell.low:.4g} to {factor * cell.high:.4g} {unit}', cell.axis,
+            mg_text(cell.mean_mps2), percent(cell.share)]
 
 
 def _effect(candidate: dict[str, Any], report: Report) -> dict[str, Any]:
@@ -162,7 +174,8 @@ def _proof(effect: str, comparison: BaselineComparison, full_rate: BaselineCompa
             'Points: recording minus a simulation with all other effects, with 90 % bars. ' \
             'Line: the model of this effect.'
     if acts_on_noise:
-        text = 'The effect is there if the recorded spectrum follows the green line, not the red one.'
+        text = 'The effect is there if the recorded spectrum follows the green line, not the ' \
+            'red one.'
         signals_v = {'recorded': full_rate.residual_v(sensor)} | {
             label: full_rate.simulated_noise_v(s, 0) for label, s in labelled.items()}
     else:
@@ -349,31 +362,3 @@ def gap_spectrum(comparison: BaselineComparison, after: Sensor) -> Figure:
     curves += [Curve(axis, 'stated noise', frequency_hz, stated[:, d])
                for d, axis in enumerate(comparison.sensor.axes)]
     return _panels(curves, Over.FREQUENCY.value, 'mg/√Hz')
-
-
-def map_figure(cells: Sequence[ResidualCell]) -> Figure:
-    """Draw the mean residual over ranges of all dimensions; significant cells have a dot."""
-    means = sorted(cells, key=lambda c: (c.dimension, c.axis, c.low))
-    labels, values, texts, marks = [], [], [], []
-    for name, axis in dict.fromkeys((c.dimension, c.axis) for c in means):
-        row = [c for c in means if (c.dimension, c.axis) == (name, axis)]
-        in_degrees = 'rad' in name
-        unit = name.rpartition('_')[2] if not in_degrees else '°/s' if 'rate' in name else '°'
-        factor = float(np.degrees(1.0)) if in_degrees else 1.0
-        labels.append(f'{name.split("_rad")[0].replace("_", " ")}: {axis}')
-        pad = [None] * (RANGES - len(row))
-        values.append([*rounded([mg(c.mean_mps2) for c in row]), *pad])
-        texts.append([f'{factor * c.low:.4g} to {factor * c.high:.4g} {unit}' for c in row] + pad)
-        marks += [(i, labels[-1]) for i, c in enumerate(row) if c.p < SIGNIFICANT_P]
-    largest = float(max((abs(mg(c.mean_mps2)) for c in means), default=1.0))
-    heat = {'type': 'heatmap', 'y': labels, 'x': list(range(RANGES)), 'z': values,
-            'text': texts, 'hovertemplate': '%{y}, %{text}<br>mean %{z:.3~g} mg<extra></extra>',
-            'colorscale': 'RdBu', 'zmin': -largest, 'zmax': largest, 'xgap': 2, 'ygap': 2,
-            'colorbar': {'title': {'text': 'mg'}, 'thickness': 12}}
-    dots = {'type': 'scatter', 'mode': 'markers', 'x': [i for i, _ in marks],
-            'y': [label for _, label in marks], 'hoverinfo': 'skip', 'showlegend': False,
-            'marker': {'color': _INK, 'size': 5}}
-    return figure([heat, dots], 80 + 22 * len(labels), xaxis={
-        'showticklabels': False, 'showgrid': False, 'zeroline': False,
-        'title': {'text': 'parts of the range, ascending'}},
-        yaxis={'type': 'category', 'showgrid': False, 'dtick': 1})

@@ -69,6 +69,7 @@ class HeldOut:
     # (blocks,)
     squares: np.ndarray
     log_likelihood: np.ndarray  # Log likelihood by block, (blocks,)
+    drift_mps2: float = 0.0  # Expected rms of the fitted drift, m/s²
 
 
 @dataclass(frozen=True)
@@ -82,15 +83,6 @@ class Rest:
     by_dimension: dict[str, np.ndarray]  # Decrease by the functions of one dimension alone
     # Probability that a drift has increments with such jumps or lines; 1 beside a healthy unit
     drift_p: float = 1.0
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A fitted set of effects."""
-
-    # Held-out figures by the drift that the noise may have; '' is that of a healthy unit
-    figures: Mapping[str, HeldOut]
-    drift_mps2: Mapping[str, float]  # Expected rms of the fitted drift, m/s², by the same
 
 
 @dataclass(frozen=True)
@@ -148,8 +140,8 @@ _ALL = slice(None)
 class Evidence:
     """What the rule weighs; its methods return one value for each draw of the blocks in `rows`."""
 
-    # Sets of effects by name; the empty one is among them
-    candidates: Mapping[frozenset[str], Candidate]
+    # Sets of effects, the empty one among them, by the drift that the noise may have
+    candidates: Mapping[frozenset[str], Mapping[str, HeldOut]]
     counts: np.ndarray  # Samples by block, (blocks,)
     # How often each block is drawn, (draws, blocks); once each in the first row
     weights: np.ndarray
@@ -161,7 +153,7 @@ class Evidence:
 
     def left(self, effects: frozenset[str], rows: slice) -> np.ndarray:
         """Return the power above the noise floor that a set leaves."""
-        squares = self.candidates[effects].figures[HEALTHY].squares
+        squares = self.candidates[effects][HEALTHY].squares
         return self.mean(squares, rows) - self.floor_mps2 ** 2
 
     def material_power(self, pose_share: float) -> float:
@@ -175,12 +167,12 @@ class Evidence:
 
     def gain(self, more: frozenset[str], less: frozenset[str], rows: slice) -> np.ndarray:
         """Return by how much one set explains more power than another."""
-        a, b = (self.candidates[e].figures[HEALTHY] for e in (more, less))
+        a, b = (self.candidates[e][HEALTHY] for e in (more, less))
         return self.mean(b.squares - a.squares, rows)
 
     def nats(self, more: _Modelled, less: _Modelled, rows: slice) -> np.ndarray:
         """Return by how much a set, with its noise, makes the held-out samples more probable."""
-        a, b = (self.candidates[e].figures[noise] for e, noise in (more, less))
+        a, b = (self.candidates[e][noise] for e, noise in (more, less))
         return self.weights[rows] @ (a.log_likelihood - b.log_likelihood)
 
     def interval(self, draws: np.ndarray) -> Interval:
@@ -232,7 +224,7 @@ def drifts_beside(evidence: Evidence, effects: frozenset[str], rest: Rest) -> li
     that a smooth reference lacks.
     """
     candidate, healthy = evidence.candidates[effects], (effects, HEALTHY)
-    drifts = sorted((d for d in candidate.figures if d != HEALTHY), key=lambda d: -evidence.nats(
+    drifts = sorted((d for d in candidate if d != HEALTHY), key=lambda d: -evidence.nats(
         (effects, d), healthy, _ALL)[0])
     if not drifts or evidence.fades:
         return []
@@ -241,7 +233,7 @@ def drifts_beside(evidence: Evidence, effects: frozenset[str], rest: Rest) -> li
     exact = all(effect_named(e).exact for e in effects)
     smallest = max(evidence.material_mps2 ** 2,
                    (_SHARE_OF_SET if exact else _SHARE_OF_FORM) * explained)
-    if candidate.drift_mps2[drifts[0]] ** 2 <= smallest or not _predicts(nats) \
+    if candidate[drifts[0]].drift_mps2 ** 2 <= smallest or not _predicts(nats) \
             or not _predicts(nats - evidence.weights @ rest.steady_log_likelihood):
         return []
     return [d for d in drifts if d == drifts[0] or not _predicts(evidence.nats(
@@ -272,7 +264,7 @@ def _answer(evidence: Evidence, rest: Rest, drifts: Sequence[str], detected: fro
     rest_material = evidence.material_power(
         float(np.clip(pose / total, 0.0, 1.0)) if total > 0 else 0.0)
     left = float(repeats[0]) if _low(repeats) > rest_material else 0.0
-    drift = evidence.candidates[best].drift_mps2.get(drifts[0], 0.0) ** 2 if drifts else 0.0
+    drift = evidence.candidates[best][drifts[0]].drift_mps2 ** 2 if drifts else 0.0
     follows = _low(steady) > rest_material and float(steady[0]) > _SHARE_OF_FORM * drift
     if drifts and (follows or rest.drift_p < _SMALLEST_P):
         # A drift follows time alone, and at random; its fit takes up what does not, too.
