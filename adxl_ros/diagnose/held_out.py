@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-import warnings
 
 from adxl_ros.diagnose import evidence
 from adxl_ros.diagnose.evidence import BLOCKS, LinearFit
@@ -23,16 +22,12 @@ from adxl_ros.diagnose.verdict import HeldOut, Rest
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.diagnosis_hints import FormDimension
 import numpy as np
-import scipy
 
 FOLDS, _RUN_BLOCKS = 4, 2
 """Parts of a recording, each of which is held out once, and neighbouring blocks that are held out
 together. Chosen: run time, and slow effects change within two."""
 _DRAWS = 200
 """Draws of blocks. Chosen: the 5 % quantile has 10 draws below it."""
-_FIRST_MEAN_S, _FEWEST_MEANS, _FEWEST_STEPS = 0.1, 16, 12
-"""Shortest mean in which a drift is looked for, s, and fewest means, and increments, that show a
-form. Chosen: noise of sensors is white below it."""
 _ROUNDS, _FIRST_LEVEL_G, _SMALLEST_LEVEL = 12, 1e-3, 1e-4
 """Rounds of the fit of the levels of flexible functions, first level, g rms, and level, in first
 ones, below which a function is left out. Chosen: any other start ends at the same levels."""
@@ -152,42 +147,7 @@ def reproducible_rest(fits: HeldOutFits) -> Rest:
                 if name == 'steady':
                     by_choice['nats'][held_out] += 0.5 * gained / variance
     together, steady, nats = (by_choice.pop(name) for name in ('all', 'steady', 'nats'))
-    p = [increments_p(c.values @ np.concatenate([[1.0], -whole[c.places]]), comparison.used,
-                      comparison.sensor.rate_hz)
-         for number, c in enumerate(linearised.columns if fits.drifts else ())
-         for comparison in (model.comparisons[model.place_of_channel(number)[0]],)]
-    return Rest(together, steady, nats, by_choice, min([1.0, *(len(p) * v for v in p)]))
-
-
-def increments_p(values: np.ndarray, used: np.ndarray, rate_hz: float) -> float:
-    """
-    Return how probable the increments of a residual are if they are those of a random drift.
-
-    The means are those over the time from which the drift exceeds the noise: twice that of the
-    smallest Allan deviation. A drift has Gaussian increments (test of Anscombe and Glynn 1983)
-    without a line (test of Fisher 1929); jumps between levels and slow oscillations have not.
-    """
-    longest = int(used.sum()) // _FEWEST_MEANS
-    lengths = np.unique(np.geomspace(max(1.0, _FIRST_MEAN_S * rate_hz), max(longest, 1), 12
-                                     ).astype(int))
-
-    def increments(length: int) -> np.ndarray:
-        whole = len(values) // length * length
-        count, total = (v[:whole].reshape(-1, length).sum(axis=1)
-                        for v in (used, np.where(used, values, 0.0)))
-        means = np.where(count > length / 2, total / np.maximum(count, 1), np.nan)
-        return np.diff(means)[np.isfinite(np.diff(means))]
-
-    quietest = min(lengths.tolist(), key=lambda n: np.mean(increments(n) ** 2))
-    steps = increments(min(2 * quietest, longest)) if len(lengths) > 1 else np.zeros(0)
-    if len(steps) < _FEWEST_STEPS or not np.ptp(steps):
-        return 1.0
-    power = np.abs(np.fft.rfft(steps - steps.mean())[1:(len(steps) + 1) // 2]) ** 2
-    line = len(power) * (1 - power.max() / power.sum()) ** (len(power) - 1)
-    with warnings.catch_warnings():
-        # Older versions warn below 20 increments, where the test is rougher.
-        warnings.simplefilter('ignore')
-        return float(min(1.0, 2 * min(line, scipy.stats.kurtosistest(steps).pvalue)))
+    return Rest(together, steady, nats, by_choice)
 
 
 def _products(grams: np.ndarray, departures: np.ndarray, chosen: np.ndarray | slice = slice(None)

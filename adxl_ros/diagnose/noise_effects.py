@@ -123,27 +123,15 @@ def shortest_repeat(volts: np.ndarray, axes: int) -> int:
 
 
 def isolated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, sensor: Sensor
-                     ) -> tuple[np.ndarray, Detection | None]:
+                     ) -> tuple[np.ndarray, list[Detection]]:
     """Find single samples that deviate from the straight line between their neighbours."""
     spikes, size_v = _spikes(volts, used, sensor)
     count = int(spikes.any(axis=1).sum())
     if not count:
-        return used, None
+        return used, []
     rate_hz = spikes.sum() / len(sensor.axes) / float(time_s[-1] - time_s[0])
-    return used & ~spikes.any(axis=1), _detection(
-        Detector.ISOLATED_SAMPLES, count, rate_hz=rate_hz, amplitude_v=size_v)
-
-
-def residual_shows_spikes(spikes: Detection, residual_v: np.ndarray, used: np.ndarray,
-                          sensor: Sensor) -> bool:
-    """
-    Determine whether the residual of the best hypothesis shows the spikes of the recording.
-
-    Without this check, motion of the sensor may look like spikes, which are not among `used`.
-    """
-    isolated, _ = _spikes(residual_v, np.isfinite(residual_v).all(axis=1), sensor)
-    expected = float(spikes.values['rate_hz']) * len(sensor.axes) * len(used) / sensor.rate_hz
-    return bool(isolated[~used].sum() > expected / 2)
+    return used & ~spikes.any(axis=1), [_detection(
+        Detector.ISOLATED_SAMPLES, count, rate_hz=rate_hz, amplitude_v=size_v)]
 
 
 def _spikes(volts: np.ndarray, used: np.ndarray, sensor: Sensor
@@ -437,7 +425,7 @@ def _statistics(comparison: BaselineComparison, detection: Detection, volts: np.
         yield 'white noise', 'm/s^2', white_noise_v(noise_v, sensor) / scale
     elif detector is Detector.ISOLATED_SAMPLES:
         spikes = isolated_samples(volts, time_s, finite, sensor)[1]
-        values = spikes.values if spikes else {'rate_hz': np.zeros(1),
+        values = spikes[0].values if spikes else {'rate_hz': np.zeros(1),
                                                'amplitude_v': np.zeros(len(scale))}
         yield 'spikes per second and axis', '1/s', np.atleast_1d(values['rate_hz'])
         yield 'size of a spike', 'm/s^2', values['amplitude_v'] / scale

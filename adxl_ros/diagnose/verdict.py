@@ -32,9 +32,6 @@ _SHARE_OF_SET, _SHARE_OF_FORM = 0.03, 0.1
 whose form is not exact over the same variables."""
 _NATS = 3.0
 """Held-out log likelihood that a further effect must gain."""
-_SMALLEST_P = 0.001
-"""Probability of the increments of a drift below which they are of something else. Chosen: one
-error in 1000."""
 _LOWEST, _HIGHEST = 0.05, 0.95
 """Quantiles of the 90 % intervals."""
 _REPEATED, _RIGHT = (0.0, 0.5, 0.8, 0.95, 1.0), (0.2, 0.4, 0.6, 0.75, 0.9)
@@ -81,8 +78,6 @@ class Rest:
     steady_squares: np.ndarray
     steady_log_likelihood: np.ndarray
     by_dimension: dict[str, np.ndarray]  # Decrease by the functions of one dimension alone
-    # Probability that a drift has increments with such jumps or lines; 1 beside a healthy unit
-    drift_p: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -266,8 +261,8 @@ def _answer(evidence: Evidence, rest: Rest, drifts: Sequence[str], detected: fro
     left = float(repeats[0]) if _low(repeats) > rest_material else 0.0
     drift = evidence.candidates[best][drifts[0]].drift_mps2 ** 2 if drifts else 0.0
     follows = _low(steady) > rest_material and float(steady[0]) > _SHARE_OF_FORM * drift
-    if drifts and (follows or rest.drift_p < _SMALLEST_P):
-        # A drift follows time alone, and at random; its fit takes up what does not, too.
+    if drifts and follows:
+        # A drift follows time alone; its fit takes up what does not, too.
         drifts, drift, left = (), 0.0, max(float(repeats[0]), above)
     if left > explained + drift:
         return _Answer('unknown', _NOTHING, frozenset())
