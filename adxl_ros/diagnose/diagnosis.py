@@ -23,7 +23,6 @@ from adxl_ros.diagnose import (
 from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
 from adxl_ros.diagnose.data_checks import CheckedRecording, compare_checked
 from adxl_ros.diagnose.evidence import used_by_block
-from adxl_ros.diagnose.held_out import block_weights, HeldOutFits, reproducible_rest
 from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
 from adxl_ros.diagnose.next_experiment import CouldShow, NextExperiment
 from adxl_ros.diagnose.noise_effects import Detection, NoiseComparison, NoiseRemainder
@@ -31,7 +30,7 @@ from adxl_ros.diagnose.noise_model import drift_effects, NoiseFloor
 from adxl_ros.diagnose.reference import DataFault
 from adxl_ros.diagnose.residual_map import not_covered, residual_map, ResidualCell
 from adxl_ros.diagnose.search import Hypothesis, linearise, Search
-from adxl_ros.diagnose.verdict import HEALTHY, MATERIAL_MG, Verdict
+from adxl_ros.diagnose.verdict import HEALTHY, HeldOutFits, MATERIAL_MG, Verdict
 from adxl_ros.files.recording_columns import check_unit, Recording
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
@@ -159,13 +158,13 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     fits = _held_out(model, search, floor, max(counts.sum(), 1.0))
     evidence = rule.Evidence(
         {e: {d: f.figures for d, f in drifts.items()} for e, drifts in fits.items()},
-        counts, block_weights(seed), material_mps2(model, floor, material_mg),
+        counts, rule.block_weights(seed), material_mps2(model, floor, material_mg),
         model.smallest_angle_rad() * G0_MPS2,
         any(c.fading_hz is not None for c in model.comparisons),
         np.inf if floor.source == 'assumed' else floor.rms_mps2)
     detections = _detections(checked, search.best, model.baseline)
     verdict = rule.decide(
-        evidence, cache(lambda effects, drift: reproducible_rest(fits[effects][drift])),
+        evidence, cache(lambda effects, drift: rule.reproducible_rest(fits[effects][drift])),
         [d.effect for d in detections])
     show('report', 0.0)
     if verdict.status == 'no_gap' and not any(map(_could_show, model.comparisons)):

@@ -107,8 +107,8 @@ def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> 
     shown = [c for c in objects['candidates']
              if c['effect'] in named or c['probability'] >= words.PROBABLE]
     shown.sort(key=lambda c: named.index(c['effect']) if c['effect'] in named else len(named))
-    best, compared, full_rate = report.hypotheses[0], diagnosis.comparisons[0], \
-        diagnosis.full_rate[0]
+    best = report.hypotheses[0]
+    compared, full_rate = diagnosis.comparisons[0], diagnosis.full_rate[0]
     in_noise, proofs = {d.effect for d in report.detections} & {*report.sensor.effects}, {}
     for name in (c['effect'] for c in shown
                  if Over.STEP not in effect_named(c['effect']).diagnosis.proof):
