@@ -274,6 +274,8 @@ class CheckedRecording(NamedTuple):
     search_comparison: BaselineComparison  # The same at the rate of the search
     # Noise-like effects that the samples themselves show
     detections: tuple[noise_effects.Detection, ...]
+    # Isolated samples; the residual of the best hypothesis must show them, too
+    possible_spikes: list[noise_effects.Detection]
     stated_bits: int  # Bits of the ADC by the parameter file
 
 
@@ -305,7 +307,7 @@ def check_recording(comparison: BaselineComparison) -> CheckedRecording:
     every = round(sensor.rate_hz / search_comparison.sensor.rate_hz)
     return CheckedRecording(replace(comparison, used=used),
                             replace(search_comparison, used=used[::every]),
-                            (*detections, *spikes), sensor.adc_bits)
+                            tuple(detections), spikes, sensor.adc_bits)
 
 
 def check_length(comparisons: Sequence[BaselineComparison]) -> None:

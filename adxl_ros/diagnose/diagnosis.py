@@ -222,13 +222,17 @@ def _detections(checked: Sequence[CheckedRecording], best: Hypothesis, baseline:
     """
     Return the noise-like effects of the recordings and of the residual, the strongest of each.
 
-    Excess noise counts only where it exceeds that of the baseline, too: a filter also changes the
-    noise.
+    Spikes count only where the residual of the best set shows them, too, and excess noise only
+    where it exceeds that of the baseline, too: a filter also changes the noise.
     """
     detections = [d for c in checked for d in c.detections]
     for c in checked:
-        comparison = c.comparison
+        comparison, used = c.comparison, c.comparison.used
         residual_v = comparison.residual_v(best.sensor)
+        # In motion, a smooth reference lacks knocks that look like spikes.
+        regular = used if comparison.fading_hz is None else used | ~comparison.at_rest
+        detections += [d for d in c.possible_spikes if noise_effects.residual_shows_spikes(
+            d, residual_v, regular, comparison.sensor)]
         found, of_baseline = (noise_effects.residual_detections(comparison, residual_v, s)
                               for s in (best.sensor, baseline))
         detections += [d for d in found if d.effect in {o.effect for o in of_baseline}]

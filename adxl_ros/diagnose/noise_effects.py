@@ -134,6 +134,18 @@ def isolated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, se
         Detector.ISOLATED_SAMPLES, count, rate_hz=rate_hz, amplitude_v=size_v)]
 
 
+def residual_shows_spikes(spikes: Detection, residual_v: np.ndarray, used: np.ndarray,
+                          sensor: Sensor) -> bool:
+    """
+    Determine whether the residual of the best hypothesis shows the spikes of the recording.
+
+    Without this check, motion of the sensor may look like spikes, which are not among `used`.
+    """
+    isolated, _ = _spikes(residual_v, np.isfinite(residual_v).all(axis=1), sensor)
+    expected = float(spikes.values['rate_hz']) * len(sensor.axes) * len(used) / sensor.rate_hz
+    return bool(isolated[~used].sum() > expected / 2)
+
+
 def _spikes(volts: np.ndarray, used: np.ndarray, sensor: Sensor
             ) -> tuple[np.ndarray, np.ndarray]:
     """Return isolated samples, (n, m) bool, and their median size by axis, V, (m,)."""

@@ -46,9 +46,9 @@ _HEALTHY_STDS = 3.0
 """Largest departure of a healthy unit, in standard deviations: one unit in 400 exceeds it."""
 LARGEST_SET = 3
 """Largest number of effects in a set. Chosen: one recording hardly separates more."""
-_SINGLES, _FITTED_SINGLES, _FURTHER, _COMPLETED = 8, 5, 3, 4
+_SINGLES, _FITTED_SINGLES, _FURTHER, _COMPLETED, _OTHER_STARTS = 8, 5, 3, 4, 2
 """Singles whose pairs are ranked, singles that are fitted, further effects beside the best set,
-and sets that are fitted without each effect. Chosen: run time."""
+sets that are fitted without each effect, and other shapes that are tried. Chosen: run time."""
 _IMMATERIAL = 0.01
 """Share of the gain of a set that a further effect must gain, so that a third one is looked for.
 Chosen: a third of what each effect of a set must explain."""
@@ -294,11 +294,12 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
 
 
 class _Ranked(NamedTuple):
-    """Variants on the linear model: gain of log evidence, numbers and fit."""
+    """Variants on the linear model: gain of log evidence, numbers, fit, and other shapes."""
 
     gain: float
     chosen: tuple[int, ...]
     fit: LinearFit
+    others: tuple[_Ranked, ...] = ()
 
 
 class Search:
@@ -380,7 +381,7 @@ class Search:
         """
         Fit sets of variants beside present ones on a linear model, by falling gain.
 
-        Of each set of effects the best variants are ranked.
+        Of each set of effects the best variants are ranked, with the next best shapes.
         """
         without = model.fit_variants(present) if present else model.null_fit
         by_effects: dict[frozenset[str], list[_Ranked]] = {}
@@ -390,42 +391,52 @@ class Search:
                 fit = model.fit_variants([*present, *chosen], without)
                 by_effects.setdefault(effects, []).append(
                     _Ranked(fit.log_evidence - without.log_evidence, chosen, fit))
-        ranked = [max(same, key=lambda f: f.gain - _start_loss(model, f))
-                  for same in by_effects.values()]
+        ranked = []
+        for same in by_effects.values():
+            best, *others = sorted(same, key=lambda f: _start_loss(model, f) - f.gain)
+            ranked.append(best._replace(others=tuple(
+                f for f in others if 2 * f.gain > best.gain
+                and all(model.variants[i].shape for i in f.chosen))[:_OTHER_STARTS]))
         return sorted(ranked, key=lambda f: -f.gain)
 
-    def _fit(self, model: LinearModel, ranked: _Ranked, beside: Hypothesis | None = None) -> None:
-        """Fit a ranked set beside another one."""
-        effects = (*(beside.effects if beside else ()),
-                   *(model.variants[i].effect for i in ranked.chosen))
-        if ranked.gain < _WORTH_FITTING or frozenset(effects) in self.found:
+    def _fit(self, model: LinearModel, first: _Ranked, beside: Hypothesis | None = None) -> None:
+        """Fit a ranked set beside another one, from other shapes where it does not converge."""
+        present = beside.effects if beside else ()
+        effects = (*present, *(model.variants[i].effect for i in first.chosen))
+        if first.gain < _WORTH_FITTING or frozenset(effects) in self.found:
             return
-        start = dict(zip(beside.names, beside.values)) if beside else {}
-        shapes: dict[Coefficient, float] = {}
-        own = {k for i in ranked.chosen for k in model.column_ids[i]}
-        start |= {model.names[k]: float(v) for k, v in zip(
-            ranked.fit.column_ids, ranked.fit.values) if k in own}
-        for variant in (model.variants[i] for i in ranked.chosen):
-            # Limits and sizes start where the effect was simulated.
-            start |= {name: value - (0.0 if parameter_of(name).is_size
-                                     else parameter_of(name).scale)
-                      for name, value in variant.first_limits(start).items()}
-            start |= {name: float(np.clip(start.get(name, size), size / _NEAR_START,
-                                          size * _NEAR_START))
-                      for name, size in _stepped(variant).items()}
-            shapes |= {Coefficient(variant.effect, p): v for p, v in variant.shape.items()}
-        self._add(effects, start, shapes)
+        for ranked in (first, *first.others):
+            start = dict(zip(beside.names, beside.values)) if beside else {}
+            shapes: dict[Coefficient, float] = {}
+            own = {k for i in ranked.chosen for k in model.column_ids[i]}
+            start |= {model.names[k]: float(v) for k, v in zip(
+                ranked.fit.column_ids, ranked.fit.values) if k in own}
+            for variant in (model.variants[i] for i in ranked.chosen):
+                # Limits and sizes start where the effect was simulated.
+                start |= {name: value - (0.0 if parameter_of(name).is_size
+                                         else parameter_of(name).scale)
+                          for name, value in variant.first_limits(start).items()}
+                start |= {name: float(np.clip(start.get(name, size), size / _NEAR_START,
+                                              size * _NEAR_START))
+                          for name, size in _stepped(variant).items()}
+                shapes |= {Coefficient(variant.effect, p): v for p, v in variant.shape.items()}
+            fitted = self._add(effects, start, shapes, self._lowest)
+            if fitted is not None and (fitted.converged or fitted.log_evidence < self._lowest):
+                break
 
     def _add(self, effects: Iterable[str], start: Mapping[Coefficient, float],
-             shapes: Mapping[Coefficient, float], lowest: float | None = None) -> None:
-        """Keep the fit of a set, unless it cannot be simulated, is singular or does not show."""
-        key = frozenset(effects)
+             shapes: Mapping[Coefficient, float], lowest: float | None = None
+             ) -> Hypothesis | None:
+        """Fit a set; None where it cannot be simulated, is singular or does not show."""
+        key, fitted = frozenset(effects), None
         with suppress(UserError, np.linalg.LinAlgError):
             fitted = fit_hypothesis(self.model, tuple(effects), start, shapes,
                                     self._lowest if lowest is None else lowest)
-            if _shows_time_constants(self.model, fitted) and (
-                    key not in self.found or fitted.log_evidence > self.found[key].log_evidence):
-                self.found[key] = fitted
+        if fitted is None or not _shows_time_constants(self.model, fitted):
+            return None
+        if key not in self.found or fitted.log_evidence > self.found[key].log_evidence:
+            self.found[key] = fitted
+        return fitted
 
 
 def _identifiable(model: LinearModel) -> list[int]:
