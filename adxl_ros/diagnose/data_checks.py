@@ -10,8 +10,9 @@ like inverted x and y. The explanation with fewer changes is named.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
+from typing import NamedTuple
 
 from adxl_ros.diagnose import noise_effects, reference
 from adxl_ros.diagnose.comparison import (
@@ -88,31 +89,24 @@ _UNIT_RATIOS = {9.80665: 'm/s² instead of g', 1e3: 'mV instead of V', 1e-3: 'kV
 """Gain of an output in the wrong unit, and which unit it has instead of which."""
 
 
-def bad(name: str, message: str) -> DataFault:
-    """Return a fault that a new recording or other files mend."""
-    return DataFault(name, 'bad_data', message)
-
-
 def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, may_shift: bool
-                    ) -> BaselineComparison | DataFault:
-    """Put a recording beside the simulator, without the parts that have no reference."""
+                    ) -> BaselineComparison:
+    """
+    Put a recording beside the simulator, without the parts that have no reference.
+
+    Raise DataFault where that is meaningless.
+    """
     notes: list[str] = []
     even = even_stamps(recording.time_s)
     if even is not None and even.certain:
         recording, notes = replace(recording, time_s=even.time_s), even.notes
-    fault = find_clock_fault(recording.time_s) or _too_slow(recording)
-    if fault is None and sim is None:
-        fault = find_encoder_fault(recording, sensor)
-    if fault is not None:
-        return fault
+    _check_clock(recording)
     left_out: list[reference.LeftOut] = []
     if sim is not None:
-        aligned = reference.align_force(recording, sensor, sim, may_shift)
-        if isinstance(aligned, DataFault):
-            return aligned
-        recording, sim, more = aligned
+        recording, sim, more = reference.align_force(recording, sensor, sim, may_shift)
         notes = notes + more
     else:
+        _check_encoder(recording, sensor)
         step_rad = reference.seen_step_rad(recording, sensor.stage_resolution_rad)
         if step_rad > sensor.stage_resolution_rad:
             notes = [*notes, f'the stage reads in steps of {np.degrees(step_rad):.3g}°, not of '
@@ -149,18 +143,31 @@ def _roughness(comparison: BaselineComparison) -> float:
     return float(np.nanmean(np.diff(comparison.residual_v(comparison.sensor), axis=0) ** 2))
 
 
-def _too_slow(recording: Recording) -> DataFault | None:
-    """Find stamps that are too far apart to follow the stage, as milliseconds in place of s."""
-    step_s, angles_rad = float(np.median(np.diff(recording.time_s))), recording.stage_angles
-    if angles_rad is None or step_s <= _LONGEST_STEP_S or np.all(
-            np.nanmax(angles_rad, axis=0) - np.nanmin(angles_rad, axis=0) < _SMALLEST_MOVE_RAD):
-        return None
-    return bad('unit', f'time_s: {step_s:.3g} s between samples while the stage moves, at most '
-               f'{_LONGEST_STEP_S:g} s are followed; divide stamps in milliseconds by 1000')
+def _check_clock(recording: Recording) -> None:
+    """
+    Refuse stamps that run backwards, jump, or are too far apart to follow the stage.
+
+    Milliseconds in place of seconds are too far apart.
+    """
+    time_s, angles_rad = recording.time_s, recording.stage_angles
+    steps_s = np.diff(time_s)
+    step_s, backward = float(np.median(steps_s)), np.flatnonzero(steps_s <= 0)
+    if len(backward):
+        raise DataFault('clock_jump', f'the stamps run backwards at {time_s[backward[0]]:.6g} s; '
+                        'record again with a steady clock')
+    wide = np.flatnonzero(steps_s > _JUMP_STEPS * step_s)
+    if len(wide) and float(steps_s[wide].sum()) > _LARGEST_JUMP_SHARE * float(steps_s.sum()):
+        raise DataFault('clock_jump', f'the stamps jump by {steps_s[wide].max():.3g} s at '
+                        f'{time_s[wide[0]]:.6g} s; cut the recording there, and diagnose the '
+                        'parts together')
+    if step_s > _LONGEST_STEP_S and angles_rad is not None and np.any(
+            np.nanmax(angles_rad, axis=0) - np.nanmin(angles_rad, axis=0) >= _SMALLEST_MOVE_RAD):
+        raise DataFault('unit', f'time_s: {step_s:.3g} s between samples while the stage moves, '
+                        f'at most {_LONGEST_STEP_S:g} s are followed; divide stamps in '
+                        'milliseconds by 1000')
 
 
-@dataclass(frozen=True)
-class EvenStamps:
+class EvenStamps(NamedTuple):
     """The instants of samples that were taken evenly."""
 
     time_s: np.ndarray  # The instants, s, (n,)
@@ -201,17 +208,17 @@ def even_stamps(stamps_s: np.ndarray) -> EvenStamps | None:
                       [note] if largest > _MENTIONED else [])
 
 
-def find_encoder_fault(recording: Recording, sensor: Sensor) -> DataFault | None:
-    """Find an angle with the wrong sign, or in degrees."""
+def _check_encoder(recording: Recording, sensor: Sensor) -> None:
+    """Refuse an angle with the wrong sign, or in degrees."""
     angles_rad, axes = recording.stage_angles, len(sensor.axes)
     if angles_rad is None:
-        return None
+        return
     measured_g = (recording.volts(sensor) - sensor.zero_g_v) / sensor.scale_v_per_g
     rows = np.flatnonzero(np.isfinite(np.hstack([angles_rad, measured_g])).all(axis=1))
     rows = rows[::max(1, len(rows) // _SAMPLES)]
     angles_rad, measured_g = angles_rad[rows], measured_g[rows]
     if len(rows) < 2 or np.sum(np.var(measured_g, axis=0)) < SMALLEST_MOTION_G ** 2:
-        return None
+        return
 
     def force_g(factors: tuple[float, ...]) -> np.ndarray:
         alpha_rad, beta_rad = (angles_rad * factors).T
@@ -229,7 +236,7 @@ def find_encoder_fault(recording: Recording, sensor: Sensor) -> DataFault | None
              for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
     factors = min(tried, key=unexplained)
     if recorded < _WRONG or unexplained(factors) > min(_RIGHT, recorded / 2):
-        return None
+        return
     correlation = np.sqrt(1 - unexplained(factors))
     in_degrees = [i for i in (0, 1) if abs(factors[i]) != 1]
     names = [list(JOINTS.values())[i] for i in in_degrees or (0, 1)
@@ -239,30 +246,28 @@ def find_encoder_fault(recording: Recording, sensor: Sensor) -> DataFault | None
                   for name, i in zip(names, in_degrees)}
         reached = ' and '.join(f'{name} is {recording.columns[name][rows[k]]:.4g} at '
                                f'{recording.time_s[rows[k]]:.4g} s' for name, k in places.items())
-        return bad('unit', f'{reached}: degrees in a column of radians (as degrees it fits the '
-                   f'output, correlation {correlation:.2f}); multiply {" and ".join(names)} by '
-                   'π/180')
+        raise DataFault('unit', f'{reached}: degrees in a column of radians (as degrees it fits '
+                        f'the output, correlation {correlation:.2f}); multiply '
+                        f'{" and ".join(names)} by π/180')
     mirrored = np.flatnonzero(np.std(force_g(factors) - force_g((1.0, 1.0)), axis=0)
                               > SMALLEST_MOTION_G)
-    inverted = ' and '.join(sensor.axes[d] for d in mirrored)
     if len(mirrored) < len(names):
-        return None
-    rival = f'the sensor is mounted half a turn about z, with {inverted} mirrored'
-    if len(mirrored) == len(names):
-        d, rival = int(mirrored[0]), f'the axis {inverted} is inverted'
-        # The zero-g of an inverted axis is mirrored, too.
-        zero_g = float(((sensor.zero_g_v - sensor.nominal_zero_g_v) / sensor.scale_v_per_g)[d])
-        offset_g = float(np.mean(measured_g[:, d] - force_g(factors)[:, d]))
-        if abs(zero_g) > _AGED_ZERO_G and abs(offset_g + 2 * zero_g) < abs(offset_g):
-            return None
-    joined = ' and '.join(names)
-    return bad('encoder_sign', f'{joined}: opposite sign of the encoder (correlation '
-               f'{correlation:.2f} with the sign changed); change the sign of {joined}, unless '
-               f'{rival}')
+        return
+    # The zero-g of an inverted axis is mirrored, too.
+    zero_g = ((sensor.zero_g_v - sensor.nominal_zero_g_v) / sensor.scale_v_per_g)[mirrored[0]]
+    offset_g = np.mean(measured_g - force_g(factors), axis=0)[mirrored[0]]
+    if len(mirrored) == len(names) and abs(zero_g) > _AGED_ZERO_G \
+            and abs(offset_g + 2 * zero_g) < abs(offset_g):
+        return
+    joined, inverted = (' and '.join(n) for n in (names, [sensor.axes[d] for d in mirrored]))
+    rival = f'the axis {inverted} is inverted' if len(mirrored) == len(names) else \
+        f'the sensor is mounted half a turn about z, with {inverted} mirrored'
+    raise DataFault('encoder_sign', f'{joined}: opposite sign of the encoder (correlation '
+                    f'{correlation:.2f} with the sign changed); change the sign of {joined}, '
+                    f'unless {rival}')
 
 
-@dataclass(frozen=True)
-class CheckedRecording:
+class CheckedRecording(NamedTuple):
     """A recording that can be diagnosed."""
 
     comparison: BaselineComparison  # The recording beside the baseline at its full rate
@@ -270,20 +275,22 @@ class CheckedRecording:
     # Noise-like effects that the samples themselves show
     detections: tuple[noise_effects.Detection, ...]
     # Isolated samples; the residual of the best hypothesis must show them, too
-    possible_spikes: noise_effects.Detection | None
+    possible_spikes: list[noise_effects.Detection]
     stated_bits: int  # Bits of the ADC by the parameter file
 
 
-def check_recording(comparison: BaselineComparison) -> CheckedRecording | DataFault:
+def check_recording(comparison: BaselineComparison) -> CheckedRecording:
     """
-    Check a recording, and mark the samples that are not used.
+    Check a recording, and mark the samples that are not used; raise DataFault.
 
     Where the codes of the ADC are coarser than stated, the baseline gets their number of bits.
     """
     search_comparison = at_search_rate(comparison)
-    fault = find_data_fault(comparison, search_comparison)
-    if fault is not None:
-        return fault
+    try:
+        _check_samples(comparison, search_comparison)
+    except DataFault as fault:
+        fault.comparisons = (comparison,)
+        raise
     volts, time_s, sensor = comparison.volts, comparison.time_s, comparison.sensor
     used = comparison.used & np.isfinite(volts).all(axis=1)
     coarse = noise_effects.coarse_codes(volts, sensor)
@@ -303,50 +310,45 @@ def check_recording(comparison: BaselineComparison) -> CheckedRecording | DataFa
                             tuple(detections), spikes, sensor.adc_bits)
 
 
-def find_length_fault(comparisons: Sequence[BaselineComparison]) -> DataFault | None:
-    """Find recordings that are too short together; one at rest may have any length."""
+def check_length(comparisons: Sequence[BaselineComparison]) -> None:
+    """Refuse recordings that are too short together; one at rest may have any length."""
     span_s = sum(c.span_s for c in comparisons)
     used_s = sum(c.span_s * float(c.used.mean()) for c in comparisons)
     if used_s >= SHORTEST_S or all(c.reference is Reference.NONE for c in comparisons):
-        return None
-    return DataFault('too_short', 'insufficient', (
+        return
+    raise DataFault('too_short', (
         f'{span_s:.3g} s in all are too short for a verdict; record at least one minute'
         if span_s < SHORTEST_S else f'{used_s:.3g} of {span_s:.3g} s have a usable reference, '
-        'which is too short for a verdict; the note says why'))
+        'which is too short for a verdict; the note says why'), 'insufficient',
+        tuple(comparisons))
 
 
-def find_data_fault(comparison: BaselineComparison, search_comparison: BaselineComparison
-                    ) -> DataFault | None:
-    """Find what makes a diagnosis of effects meaningless."""
+def _check_samples(comparison: BaselineComparison, search_comparison: BaselineComparison) -> None:
+    """Refuse what makes a diagnosis of effects meaningless."""
     if len(comparison) < _FEWEST_SAMPLES:
-        return DataFault('too_short', 'insufficient', f'{len(comparison)} samples are too few; '
-                         f'a recording needs {_FEWEST_SAMPLES}')
+        raise DataFault('too_short', f'{len(comparison)} samples are too few; a recording needs '
+                        f'{_FEWEST_SAMPLES}', 'insufficient')
     finite = np.isfinite(comparison.volts).all(axis=1)
     if finite.mean() < 1 - _LARGEST_MISSING_SHARE:
-        return bad('missing', f'{100 * (1 - finite.mean()):.0f} % of the samples are not numbers; '
-                   'record again')
-    return (find_clock_fault(comparison.time_s) or _range_fault(comparison, finite)
-            or (_unexplained_motion(comparison, finite) if comparison.reference is Reference.NONE
-                else _axis_fault(search_comparison)) or _level_fault(comparison, finite))
+        raise DataFault('missing', f'{100 * (1 - finite.mean()):.0f} % of the samples are not '
+                        'numbers; record again')
+    _check_range(comparison, finite)
+    if comparison.reference is Reference.NONE:
+        _check_rest(comparison, finite)
+    else:
+        _check_axes(search_comparison)
+    # No sensor can output more.
+    sensor = comparison.sensor
+    level_g = np.abs(np.median(comparison.volts[finite], axis=0) - sensor.zero_g_v) \
+        / sensor.scale_v_per_g
+    worst = int(np.argmax(level_g))
+    if level_g[worst] >= _LARGEST_LEVEL_G:
+        raise DataFault('unit', f'{sensor.axes[worst]} is at {level_g[worst]:.3g} g; correct the '
+                        'unit of its column, or --params')
 
 
-def find_clock_fault(time_s: np.ndarray) -> DataFault | None:
-    """Find stamps that run backwards or jump."""
-    steps_s = np.diff(time_s)
-    backward = np.flatnonzero(steps_s <= 0)
-    if len(backward):
-        return bad('clock_jump', f'the stamps run backwards at {time_s[backward[0]]:.6g} s; '
-                   'record again with a steady clock')
-    wide = np.flatnonzero(steps_s > _JUMP_STEPS * float(np.median(steps_s)))
-    if len(wide) and float(steps_s[wide].sum()) > _LARGEST_JUMP_SHARE * float(steps_s.sum()):
-        return bad('clock_jump', f'the stamps jump by {steps_s[wide].max():.3g} s at '
-                   f'{time_s[wide[0]]:.6g} s; cut the recording there, and diagnose the parts '
-                   'together')
-    return None
-
-
-def _range_fault(comparison: BaselineComparison, finite: np.ndarray) -> DataFault | None:
-    """Find an axis at the end of its range, or one that does not change as a sensor does."""
+def _check_range(comparison: BaselineComparison, finite: np.ndarray) -> None:
+    """Refuse an axis at the end of its range, or one that does not change as a sensor does."""
     sensor = comparison.sensor
     volts, simulated_v = (v[finite] for v in (comparison.volts, comparison.simulated_v(sensor)))
     lsb_v, range_v = max(sensor.lsb_v, _SMALLEST_STEP_V), np.ptp(volts, axis=0)
@@ -359,44 +361,33 @@ def _range_fault(comparison: BaselineComparison, finite: np.ndarray) -> DataFaul
                 at_rail &= np.abs(expected_v - rail_v) > step_v
             railed = max(railed, at_rail.mean() * (at_rail.mean() > _RAIL_SHARE))
     if railed > _LARGEST_MISSING_SHARE:
-        return bad('saturated', f'{100 * railed:.0f} % of the samples are at the end of the '
-                   'range; check supply, range and wiring')
+        raise DataFault('saturated', f'{100 * railed:.0f} % of the samples are at the end of the '
+                        'range; check supply, range and wiring')
     expected_v = np.ptp(simulated_v, axis=0)
     # At rest, codes may all be the same where their step exceeds the noise.
     noisy = noise.analog_std_v(sensor) > sensor.lsb_v
     dead = np.where(expected_v > _SMALLEST_RANGE_V, range_v < _DEAD_SHARE * expected_v,
                     (range_v < _SMALLEST_STEP_V) & ((range_v > 0) | noisy))
-    return bad('constant', f'{sensor.axes[int(np.argmax(dead))]} does not change with motion or '
-               'noise; check its wiring') if dead.any() else None
+    if dead.any():
+        raise DataFault('constant', f'{sensor.axes[int(np.argmax(dead))]} does not change with '
+                        'motion or noise; check its wiring')
 
 
-def _level_fault(comparison: BaselineComparison, finite: np.ndarray) -> DataFault | None:
-    """Find an axis that no sensor can output."""
-    sensor = comparison.sensor
-    level_g = np.abs(np.median(comparison.volts[finite], axis=0) - sensor.zero_g_v) \
-        / sensor.scale_v_per_g
-    worst = int(np.argmax(level_g))
-    return None if level_g[worst] < _LARGEST_LEVEL_G else bad(
-        'unit', f'{sensor.axes[worst]} is at {level_g[worst]:.3g} g; correct the unit of its '
-        'column, or --params')
-
-
-def _unexplained_motion(comparison: BaselineComparison, finite: np.ndarray) -> DataFault | None:
-    """Find a sensor that moves although no reference describes the motion."""
+def _check_rest(comparison: BaselineComparison, finite: np.ndarray) -> None:
+    """Refuse a sensor that moves although no reference describes the motion."""
     force_g = comparison.volts[finite] / comparison.sensor.scale_v_per_g
     step_g = np.std(np.diff(force_g, axis=0), axis=0)
     range_g = np.subtract(*np.quantile(force_g, _RANGE_QUANTILES[::-1], axis=0))
     worst = int(np.argmax(range_g))
-    if range_g[worst] < _LARGEST_UNEXPLAINED_MOTION_G or step_g[worst] > range_g[worst]:
-        return None
-    angles = 'its stage angles do not change' if comparison.has_stage_angles else \
-        'it has no stage angles'
-    return bad('reference', f'{comparison.sensor.axes[worst]} moves by {range_g[worst]:.2f} g, '
-               f'but {angles}; give the angles, or --sim with the specific force of the same '
-               'manoeuvre')
+    if range_g[worst] >= _LARGEST_UNEXPLAINED_MOTION_G and step_g[worst] <= range_g[worst]:
+        angles = 'its stage angles do not change' if comparison.has_stage_angles else \
+            'it has no stage angles'
+        raise DataFault('reference', f'{comparison.sensor.axes[worst]} moves by '
+                        f'{range_g[worst]:.2f} g, but {angles}; give the angles, or --sim with '
+                        'the specific force of the same manoeuvre')
 
 
-def _axis_fault(comparison: BaselineComparison) -> DataFault | None:
+def _check_axes(comparison: BaselineComparison) -> None:
     """Compare order, sign, unit and time of the axes with the simulated output."""
     sensor, finite = comparison.sensor, np.isfinite(comparison.volts).all(axis=1)
     simulated_g, measured_g = (
@@ -404,7 +395,7 @@ def _axis_fault(comparison: BaselineComparison) -> DataFault | None:
         for v in (comparison.simulated_v(sensor), comparison.volts))
     moving = np.flatnonzero(simulated_g.std(axis=0) > SMALLEST_MOTION_G)
     if not len(moving):
-        return None
+        return
     lags, _, by_lag = reference.correlations(simulated_g, np.nan_to_num(measured_g),
                                              2 * len(simulated_g) // 3)
     by_lag = np.where(np.abs(lags) <= _LARGEST_DELAY_S * sensor.rate_hz, by_lag, -1.0)
@@ -412,25 +403,27 @@ def _axis_fault(comparison: BaselineComparison) -> DataFault | None:
     delay_s = lags[best] / sensor.rate_hz
     if by_lag[best] > max(reference.CORRELATED, by_lag[lags == 0][0] + _CORRELATION_GAIN) \
             and abs(delay_s) > _SEARCHED_DELAY_S:
-        return bad('time_misaligned', f'the sensor is {abs(delay_s):.2f} s '
-                   f'{"later" if delay_s > 0 else "earlier"} than the reference, but the search '
-                   f'covers {_SEARCHED_DELAY_S:g} s; shift its stamps')
+        raise DataFault('time_misaligned', f'the sensor is {abs(delay_s):.2f} s '
+                        f'{"later" if delay_s > 0 else "earlier"} than the reference, but the '
+                        f'search covers {_SEARCHED_DELAY_S:g} s; shift its stamps')
     simulated_g, measured_g = simulated_g[finite][:, moving], measured_g[finite][:, moving]
     count, axes = len(moving), [sensor.axes[d] for d in moving]
     with np.errstate(all='ignore'):
         correlation = np.nan_to_num(np.corrcoef(measured_g.T, simulated_g.T)[:count, count:])
     polarity = find_polarity_fault(correlation, list(range(count)), _SWAPPED)
     if polarity is not None:
-        return bad('axis_inverted' if polarity.axis == polarity.follows else 'axis_swapped',
-                   polarity.describe(axes[polarity.axis], axes[polarity.follows]))
+        raise DataFault(
+            'axis_inverted' if polarity.axis == polarity.follows else 'axis_swapped',
+            polarity.describe(axes[polarity.axis], axes[polarity.follows]))
     gains = [np.polyfit(simulated_g[:, d], measured_g[:, d], 1)[0]
              for d in np.flatnonzero(np.diag(correlation) > reference.CORRELATED)]
     for ratio, units in _UNIT_RATIOS.items() if gains else ():
         if abs(np.log(np.median(gains) / ratio)) < _UNIT_TOLERANCE:
-            return bad('unit', f'the output is {np.median(gains):.4g} times the simulated output, '
-                       f'as values in {units} are; correct the unit of the columns')
+            raise DataFault('unit', f'the output is {np.median(gains):.4g} times the simulated '
+                            f'output, as values in {units} are; correct the unit of the columns')
     largest = float(np.max(np.abs(correlation)))
-    return None if largest >= _UNCORRELATED else bad(
-        'reference', f'the output does not follow the reference (correlation {largest:.2f}); '
-        'check that both belong to one recording, with clocks that differ by less than '
-        f'{_LARGEST_DELAY_S:g} s')
+    if largest < _UNCORRELATED:
+        raise DataFault(
+            'reference', f'the output does not follow the reference (correlation {largest:.2f}); '
+            'check that both belong to one recording, with clocks that differ by less than '
+            f'{_LARGEST_DELAY_S:g} s')

@@ -23,15 +23,14 @@ from adxl_ros.diagnose import (
 from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
 from adxl_ros.diagnose.data_checks import CheckedRecording, compare_checked
 from adxl_ros.diagnose.evidence import used_by_block
-from adxl_ros.diagnose.held_out import block_weights, HeldOutFits, reproducible_rest
 from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
-from adxl_ros.diagnose.next_experiment import CouldShow, NextExperiment, RecordedEvidence
-from adxl_ros.diagnose.noise_effects import Detection, NoiseComparison, NoiseRemainder, UNKNOWN
+from adxl_ros.diagnose.next_experiment import CouldShow, NextExperiment
+from adxl_ros.diagnose.noise_effects import Detection, NoiseComparison, NoiseRemainder
 from adxl_ros.diagnose.noise_model import drift_effects, NoiseFloor
 from adxl_ros.diagnose.reference import DataFault
 from adxl_ros.diagnose.residual_map import not_covered, residual_map, ResidualCell
 from adxl_ros.diagnose.search import Hypothesis, linearise, Search
-from adxl_ros.diagnose.verdict import HEALTHY, MATERIAL_MG, Verdict
+from adxl_ros.diagnose.verdict import HEALTHY, HeldOutFits, MATERIAL_MG, Verdict
 from adxl_ros.files.recording_columns import check_unit, Recording
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
@@ -145,9 +144,10 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
         show_progress(f'{i + 1}/{len(names)} {stage}', ends[i] + share * (ends[i + 1] - ends[i]))
 
     show('checks', 0.0)
-    checked = check(recordings, sensor, sim, align)
-    if isinstance(checked, Diagnosis):
-        return checked
+    try:
+        checked = check(recordings, sensor, sim, align)
+    except DataFault as fault:
+        return Diagnosis(fault.comparisons, fault=fault)
     model = build_linear_model([c.search_comparison for c in checked],
                                lambda share: show('library of effects', share))
     search = Search(model)
@@ -157,48 +157,35 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     counts = np.sum([used_by_block(c.used) for c in model.comparisons], axis=0)
     fits = _held_out(model, search, floor, max(counts.sum(), 1.0))
     evidence = rule.Evidence(
-        {e: rule.Candidate({d: f.figures for d, (f, _) in drifts.items()},
-                           {d: size for d, (_, size) in drifts.items()})
-         for e, drifts in fits.items()},
-        counts, block_weights(seed), material_mps2(model, floor, material_mg),
+        {e: {d: f.figures for d, f in drifts.items()} for e, drifts in fits.items()},
+        counts, rule.block_weights(seed), material_mps2(model, floor, material_mg),
         model.smallest_angle_rad() * G0_MPS2,
         any(c.fading_hz is not None for c in model.comparisons),
         np.inf if floor.source == 'assumed' else floor.rms_mps2)
     detections = _detections(checked, search.best, model.baseline)
     verdict = rule.decide(
-        evidence, cache(lambda effects, drift: reproducible_rest(fits[effects][drift][0], model)),
-        [d.effect for d in detections if d.effect != UNKNOWN])
+        evidence, cache(lambda effects, drift: rule.reproducible_rest(fits[effects][drift])),
+        [d.effect for d in detections])
     show('report', 0.0)
     if verdict.status == 'no_gap' and not any(map(_could_show, model.comparisons)):
         verdict = replace(verdict, status='insufficient')
     report = _report(checked, model, search, verdict, detections, floor, evidence,
-                     {d: f for d, (f, _) in fits[verdict.best].items()}, seed)
+                     fits[verdict.best], seed)
     show('report', 1.0)
     return Diagnosis(tuple(model.comparisons), tuple(c.comparison for c in checked), None, report)
 
 
 def check(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = None,
-          align: bool = False) -> list[CheckedRecording] | Diagnosis:
-    """Put recordings beside their simulation; return the diagnosis of the first fault instead."""
+          align: bool = False) -> list[CheckedRecording]:
+    """Put recordings beside their simulation; raise DataFault for the first fault."""
     if not sensor.effects:
         sensor = with_axes(sensor, recordings[0].axes)
     compared: list[BaselineComparison] = []
     for recording in recordings:
         check_unit(recording.stream_info, recording.axes, sensor)
-        comparison = compare_checked(recording, sensor, sim, align)
-        if isinstance(comparison, DataFault):
-            return Diagnosis((), (), comparison)
-        compared.append(comparison)
-    short = data_checks.find_length_fault(compared)
-    if short is not None:
-        return Diagnosis(tuple(compared), (), short)
-    checked: list[CheckedRecording] = []
-    for comparison in compared:
-        result = data_checks.check_recording(comparison)
-        if isinstance(result, DataFault):
-            return Diagnosis((comparison,), (), result)
-        checked.append(result)
-    return checked
+        compared.append(compare_checked(recording, sensor, sim, align))
+    data_checks.check_length(compared)
+    return [data_checks.check_recording(comparison) for comparison in compared]
 
 
 def material_mps2(model: LinearModel, floor: NoiseFloor, material_mg: float = MATERIAL_MG
@@ -210,23 +197,23 @@ def material_mps2(model: LinearModel, floor: NoiseFloor, material_mg: float = MA
 
 
 def _held_out(model: LinearModel, search: Search, floor: NoiseFloor, count: float
-              ) -> dict[frozenset[str], dict[str, tuple[HeldOutFits, float]]]:
-    """Return held-out fits of all sets by the drift of their noise, with its size, m/s²."""
+              ) -> dict[frozenset[str], dict[str, HeldOutFits]]:
+    """Return held-out fits of all sets by the drift of their noise."""
     best = search.best
     beside = linearise(model, best.effects, best.sensor, model.filters)
     drifts = drift_effects() if beside.fit(drifts=drift_effects()).log_evidence \
         > beside.fit().log_evidence else ()
     out = {}
     for effects, hypothesis in search.found.items():
-        healthy = HeldOutFits(hypothesis.linearised)
+        healthy = HeldOutFits(hypothesis.linearised, model)
         left = healthy.figures.squares.sum() / count - floor.rms_mps2 ** 2
         linearised = linearise(model, hypothesis.effects, hypothesis.sensor, model.filters) \
             if drifts else hypothesis.linearised
-        fits = {d: HeldOutFits(linearised, (d,)) for d in drifts}
+        fits = {d: HeldOutFits(linearised, model, (d,)) for d in drifts}
         # A drift that should be far larger than what is left is none.
-        sized = {d: (f, size) for d, f in fits.items()
-                 if (size := f.drift_mps2(model)) ** 2 <= _DRIFT_LIMIT * max(left, 0.0)}
-        out[effects] = {HEALTHY: (healthy, 0.0), **sized}
+        out[effects] = {HEALTHY: healthy} | {
+            d: f for d, f in fits.items()
+            if f.drift_mps2 ** 2 <= _DRIFT_LIMIT * max(left, 0.0)}
     return out
 
 
@@ -244,9 +231,8 @@ def _detections(checked: Sequence[CheckedRecording], best: Hypothesis, baseline:
         residual_v = comparison.residual_v(best.sensor)
         # In motion, a smooth reference lacks knocks that look like spikes.
         regular = used if comparison.fading_hz is None else used | ~comparison.at_rest
-        if c.possible_spikes is not None and noise_effects.residual_shows_spikes(
-                c.possible_spikes, residual_v, regular, comparison.sensor):
-            detections.append(c.possible_spikes)
+        detections += [d for d in c.possible_spikes if noise_effects.residual_shows_spikes(
+            d, residual_v, regular, comparison.sensor)]
         found, of_baseline = (noise_effects.residual_detections(comparison, residual_v, s)
                               for s in (best.sensor, baseline))
         detections += [d for d in found if d.effect in {o.effect for o in of_baseline}]
@@ -287,7 +273,7 @@ def _named_sensor(verdict: Verdict, best: Hypothesis, detections: Sequence[Detec
         before = get(sensor, hidden)
         sensor = put(replace(sensor, values={**sensor.values, **{
             e: fitted.values[e] for e in (*best.effects, *straight)}}), hidden, before)
-    in_noise = {d.effect: d.values for d in detections if d.effect != UNKNOWN}
+    in_noise = {d.effect: d.values for d in detections}
     for drift in [e for e in drift_effects() if e in verdict.named][:1]:
         densities = fits[drift].drift_densities()[:len(sensor.axes)]
         in_noise[drift] = {effect_named(drift).parameters[0].name: densities}
@@ -302,7 +288,7 @@ def _closure(verdict: Verdict, evidence: rule.Evidence, floor: NoiseFloor,
              remainders: Sequence[NoiseRemainder], sensor: Sensor, seed: int) -> GapClosure:
     """Return the gap before and after the best set, above the floor without noise-like effects."""
     best = verdict.best if verdict.closes else frozenset[str]()
-    before, after = (evidence.mean(evidence.candidates[e].figures[HEALTHY].squares)
+    before, after = (evidence.mean(evidence.candidates[e][HEALTHY].squares)
                      for e in (frozenset[str](), best))
     stated = noise.sample_std_v(sensor) / (sensor.scale_v_per_g / G0_MPS2)
     stated_mps2 = float(np.sqrt(np.mean(stated ** 2)))
@@ -349,18 +335,17 @@ def _report(checked: Sequence[CheckedRecording], model: LinearModel, search: Sea
         tuple(residual_map(model.comparisons[0], seed)), lacking,
         tuple(next_experiment.could_show(model, comparisons[0], floor.noise_v,
                                          verdict.material_mps2)),
-        next_experiment.propose_next_experiment(verdict, lacking, RecordedEvidence(
-            baseline, model, seed)),
+        next_experiment.propose_next_experiment(verdict, lacking, baseline, model, seed),
         baseline, sensor, model)
 
 
 def what_shows(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = None
                ) -> list[CouldShow] | DataFault:
     """Return what recordings can show, before any diagnosis; or why they cannot be compared."""
-    checked = check(recordings, sensor, sim)
-    if isinstance(checked, Diagnosis):
-        assert checked.fault is not None
-        return checked.fault
+    try:
+        checked = check(recordings, sensor, sim)
+    except DataFault as fault:
+        return fault
     model = build_linear_model([c.search_comparison for c in checked])
     floor = noise_model.estimate([c.comparison for c in checked])
     return next_experiment.could_show(model, checked[0].comparison, floor.noise_v,

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple, Protocol
 
 from adxl_ros.model.diagnosis_hints import DriftSpectrum
 from adxl_ros.model.effects import effect_named
@@ -31,17 +30,39 @@ _CACHED_VALUES = 100_000
 """Number of values that are filtered at once. Chosen: 0.8 MB stay in the cache of a processor."""
 _RIDGE = 1e-12
 """Ridge on the scaled precision. Chosen: columns that differ by a millionth are separable."""
+_SERIES = 16
+"""Series that are filtered together. Chosen: little memory beside all series."""
 
 
-class HeldErrors(Protocol):
-    """A filter for errors of angles and rounding, which comes before those for noise."""
+@dataclass(frozen=True)
+class AngleErrorFilter:
+    """A filter that gives noise with errors of angles the spectrum of noise without them."""
 
-    @property
-    def scale(self) -> np.ndarray:
-        """Return the standard deviation of the noise over that of the innovation, (n,)."""
+    rms_v: float  # Rms of the errors, V
+    pole: float  # Pole a of the noise
+    transition: np.ndarray  # Factor of the estimate of u from sample to sample, (n,)
+    gain: np.ndarray  # Gain of the estimate of u, 1/V, (n,)
+    weight: np.ndarray  # Change of the predicted sample by the estimate of u, V, (n,)
+    scale: np.ndarray  # Standard deviation of the noise divided by that of the innovation, (n,)
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
         """Filter k series, (k, n)."""
+        lower = np.ones((2, len(self.gain)))
+        lower[1, :-1] = -self.transition[1:]
+        filtered = np.empty_like(values)
+        for first in range(0, len(values), _SERIES):
+            part = values[first:first + _SERIES]
+            changes = part.copy()
+            changes[:, 1:] -= self.pole * part[:, :-1]
+            changes[:, 0] = 0.0
+            estimates = scipy.linalg.lapack.dtbtrs(lower, (changes * self.gain).T, uplo='L',
+                                                   diag='U')[0].T
+            changes[:, 1:] -= self.weight[1:] * estimates[:, :-1]
+            changes *= self.scale
+            changes[:, 0] = part[:, 0]
+            filtered[first:first + _SERIES] = scipy.signal.lfilter(
+                [1.0], [1.0, -self.pole], changes)
+        return filtered
 
 
 @dataclass(frozen=True)
@@ -54,7 +75,7 @@ class Whitener:
     density: float  # Density of the drift, in the unit of the effect's parameter
     # Filter for the errors of angles and rounding; None where there are none, or where the drift
     # exceeds them: they would take up a part of it
-    errors: HeldErrors | None = None
+    errors: AngleErrorFilter | None = None
 
     @property
     def spectrum(self) -> DriftSpectrum:
@@ -100,17 +121,8 @@ class WhitenedChannel:
     drift_effects: np.ndarray
 
 
-class FlexibleColumns(NamedTuple):
-    """Functions that are integrated out of a channel."""
-
-    # Functions times the prior standard deviations of their coefficients, V, (n, m)
-    values: np.ndarray
-    variance_v2: float  # Variance of the whitened noise, V²
-
-
 def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.ndarray,
-                   used: np.ndarray, filters: Sequence[Whitener],
-                   flexible: FlexibleColumns | None = None, by_block: bool = True
+                   used: np.ndarray, filters: Sequence[Whitener], by_block: bool = True
                    ) -> WhitenedChannel:
     """
     Whiten one axis of one recording.
@@ -119,9 +131,8 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
     column_ids: numbers of the columns, (k,); used: samples that are used, (n,) bool; the others
     are bridged by straight lines.
     """
-    parts = [residual_v[:, None], columns, *([] if flexible is None else [flexible.values])]
-    data = np.empty((sum(values.shape[1] for values in parts), len(used)))
-    np.concatenate([values.T for values in parts], out=data)
+    data = np.empty((1 + columns.shape[1], len(used)))
+    data[0], data[1:] = residual_v, columns.T
     if not used.all():
         data = bridged(data.T, used).T
     before = {id(f.errors): data if f.errors is None else f.errors(data)
@@ -145,13 +156,8 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
             for b in blocks:
                 inside = white[:, edges[b] - part.start:edges[b + 1] - part.start]
                 np.matmul(inside, inside.T, out=grams[i, b])
-    total, count = grams.sum(axis=1), 1 + columns.shape[1]
-    if flexible is not None:
-        cross = total[:, :count, count:]
-        precision = total[:, count:, count:] + flexible.variance_v2 * np.eye(len(data) - count)
-        total = total[:, :count, :count] - cross @ np.linalg.solve(precision,
-                                                                   cross.transpose(0, 2, 1))
-    grams = grams[:, :, :count, :count] if by_block else np.zeros((len(filters), 0, count, count))
+    total = grams.sum(axis=1)
+    grams = grams if by_block else np.zeros((len(filters), 0, len(data), len(data)))
     # The log determinant of the filter for errors, sample by sample.
     log_scales = np.array([np.zeros(BLOCKS) if f.errors is None else np.add.reduceat(
         np.where(used, np.log(f.errors.scale), 0.0), edges[:-1]) for f in filters])

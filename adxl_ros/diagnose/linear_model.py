@@ -83,7 +83,6 @@ class Variant:
     shape: dict[str, float]  # Values of the shape parameters
     step: float  # Step of the derivative, in typical sizes; for a limit the number of its level
     names: tuple[Coefficient, ...]  # Names of the coefficients, (p,)
-    prior_std: np.ndarray  # Their prior standard deviations, (p,)
     columns: list[list[Column]]  # Sensitivities of each axis
     # Only for an effect with a limit: first values of its fit, by coefficient. The columns are
     # then the change of the output by these values, V.
@@ -179,7 +178,6 @@ def _limit_variants(comparison: BaselineComparison, effect: Effect, limit: Param
         clipped = [d for d in range(len(axes)) if np.any(np.abs(change_v[:, d]) > _SMALLEST_V)]
         if clipped:
             yield Variant(effect.name, {}, float(number), tuple(names[d] for d in clipped),
-                          np.ones(len(clipped)),
                           [[Column(clipped.index(d), change_v[:, d])] if d in clipped else []
                            for d in range(len(axes))],
                           dict(zip(names, values)) | start, beyond)
@@ -191,7 +189,6 @@ def _variant(comparison: BaselineComparison, effect: Effect, parameters: Sequenc
     axes = comparison.sensor.axes
     start = with_values(with_neutral(comparison.sensor, [effect.name]), effect.name, shape)
     names: list[Coefficient] = []
-    prior_std: list[float] = []
     columns: list[list[Column]] = [[] for _ in axes]
     for p in parameters:
         values = np.asarray(start.values[effect.name][p.name], float)
@@ -211,9 +208,7 @@ def _variant(comparison: BaselineComparison, effect: Effect, parameters: Sequenc
                 for d in reached:
                     columns[d].append(Column(len(names), change[:, d]))
                 names.append(name)
-                prior_std.append(PRIOR_WIDTH * p.scale)
-    return Variant(effect.name, shape, step, tuple(names), np.array(prior_std), columns) \
-        if names else None
+    return Variant(effect.name, shape, step, tuple(names), columns) if names else None
 
 
 def sensitivities_at(simulate: Simulate, sensor: Sensor, names: Sequence[Coefficient],
@@ -370,8 +365,7 @@ def calibration_takes_up(effect: str) -> bool:
 def build_linear_model(comparisons: Sequence[BaselineComparison],
                        show_progress: Callable[[float], None] = lambda fraction: None,
                        filters: Sequence[list[Whitener]] | None = None,
-                       only: Sequence[str] | None = None,
-                       flexible: Sequence[evidence.FlexibleColumns] | None = None) -> LinearModel:
+                       only: Sequence[str] | None = None) -> LinearModel:
     """Differentiate the baseline by the whole library in all recordings."""
     baseline_v = [c.simulated_v(c.sensor) for c in comparisons]
     # The same variant of several recordings, by the number of the recording.
@@ -390,19 +384,17 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
     column_ids: list[list[int]] = []
     columns: list[list[list[Column]]] = [[[] for _ in c.sensor.axes] for c in comparisons]
     for by_recording in every.values():
-        numbers: dict[Coefficient, int] = {}
+        own = dict.fromkeys(chain(*(v.names for v in by_recording.values())))
+        numbers = {name: len(names) + i for i, name in enumerate(own)}
+        names += own
         for i, variant in by_recording.items():
-            for name, std in zip(variant.names, variant.prior_std):
-                if name not in numbers:
-                    numbers[name] = len(names)
-                    names.append(name)
-                    prior_std.append(float(std))
             for d, axis in enumerate(variant.columns):
                 columns[i][d] += [Column(numbers[variant.names[c.number]], c.values) for c in axis]
-        ids = list(numbers.values())
-        kept.append(replace(next(iter(by_recording.values())), names=tuple(numbers),
-                            prior_std=np.array([prior_std[j] for j in ids])))
-        column_ids.append(ids)
+        kept.append(replace(next(iter(by_recording.values())), names=tuple(own)))
+        # The columns of a limit are the change by its first value.
+        prior_std += [1.0 if kept[-1].limit_start else PRIOR_WIDTH * parameter_of(name).scale
+                      for name in own]
+        column_ids.append(list(numbers.values()))
     by_channel = list(chain(*columns))
     if filters is None:
         filters = [whiteners(c, d) for c in comparisons for d in range(len(c.sensor.axes))]
@@ -413,8 +405,7 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
             k = len(channels)
             channels.append(evidence.whiten_channel(
                 residual_v, np.array([c.values for c in by_channel[k]]).T,
-                np.array([c.number for c in by_channel[k]]), comparison.used, chosen[k],
-                None if flexible is None else flexible[k], False))
+                np.array([c.number for c in by_channel[k]]), comparison.used, chosen[k], False))
     show_progress(1.0)
     # The first column of an effect is that of its smallest start.
     nuisance_columns = [{names[c.number]: c.values for c in reversed(channel)

@@ -17,10 +17,11 @@ distances bound it from below (Kolchinsky and Tracey 2017, Entropy 19, 361, equa
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from dataclasses import replace
+from functools import cache
+from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence, noise_effects
 from adxl_ros.diagnose.comparison import (
@@ -67,29 +68,24 @@ _OTHER_REFERENCE = 'ros2 run adxl_ros diagnose next.csv --sim next_simulated.csv
 """Command for another recording beside another reference."""
 
 
-@dataclass(frozen=True)
-class CouldShow:
+class CouldShow(NamedTuple):
     """Smallest size of one parameter of an effect that recordings would have shown."""
 
-    # effect, parameter, axis: The coefficient; `axis` is '' where it has none
-    effect: str
-    parameter: str
-    axis: str
-    unit: str  # Unit of the size
+    name: Coefficient  # The coefficient
     smallest: float  # The size; infinite where nothing of the effect reaches the output
-    typical: float  # Typical size
-    shows: bool  # Whether the smallest size is one that the parameter can have
     # Share of the effect's signal that zero-g, scale factor and latency cannot imitate
-    share: float
-    revealed_by: Manoeuvre | None  # Manoeuvre that shows the effect best
+    share: float = 1.0
 
+    @property
+    def effect(self) -> str:
+        """Return the name of the effect."""
+        return self.name.effect
 
-def _could_show(name: Coefficient, size: float, share: float) -> CouldShow:
-    """Describe the smallest size of a coefficient."""
-    p = parameter_of(name)
-    return CouldShow(name.effect, name.parameter, name.axis, p.unit, float(size), p.scale,
-                     bool(size <= p.upper - p.neutral), share,
-                     effect_named(name.effect).diagnosis.revealed_by)
+    @property
+    def shows(self) -> bool:
+        """Return whether the smallest size is one that the parameter can have."""
+        p = parameter_of(self.name)
+        return bool(self.smallest <= p.upper - p.neutral)
 
 
 def could_show(model: LinearModel, comparison: BaselineComparison, noise_v: np.ndarray,
@@ -132,14 +128,14 @@ def could_show(model: LinearModel, comparison: BaselineComparison, noise_v: np.n
             if hints.nuisance:
                 size = np.hypot(size, 3 * model.tolerance(name))
             if name not in best or size < best[name].smallest:
-                best[name] = _could_show(name, size, share)
+                best[name] = CouldShow(name, float(size), share)
     seen = {row.effect for row in best.values()} | {
         v.effect for v in model.variants if v.limit_start}
-    hidden = [_could_show(Coefficient(e.name, e.parameters[0].name), np.inf, 0.0)
+    hidden = [CouldShow(Coefficient(e.name, e.parameters[0].name), np.inf, 0.0)
               for e in candidates() if e.name not in seen]
     return sorted([*best.values(), *hidden, *_noise_could_show(comparison, noise_v,
                                                                material_mps2)],
-                  key=lambda r: (r.effect, r.parameter, r.axis))
+                  key=lambda r: (r.effect, r.name.parameter, r.name.axis))
 
 
 def _noise_could_show(comparison: BaselineComparison, noise_v: np.ndarray, material_mps2: float
@@ -166,20 +162,19 @@ def _noise_could_show(comparison: BaselineComparison, noise_v: np.ndarray, mater
             parameter, size = sizes[hints.detector]
         else:
             continue
-        rows.append(_could_show(Coefficient(effect.name, parameter), size, 1.0))
+        rows.append(CouldShow(Coefficient(effect.name, parameter), float(size)))
     return rows
 
 
 def by_effect(rows: Sequence[CouldShow]) -> dict[str, CouldShow]:
     """Return for each effect its coefficient that shows best, by smallest over typical size."""
     best: dict[str, CouldShow] = {}
-    for row in sorted(rows, key=lambda r: r.smallest / r.typical):
+    for row in sorted(rows, key=lambda r: r.smallest / parameter_of(r.name).scale):
         best.setdefault(row.effect, row)
     return best
 
 
-@dataclass(frozen=True)
-class Belief:
+class Belief(NamedTuple):
     """What a hypothesis knows of k coefficients."""
 
     mean: np.ndarray  # Mean, (k,)
@@ -218,35 +213,23 @@ def expected_information(gram: np.ndarray, probabilities: Sequence[float],
     return max(float(-weights[positive] @ np.log((overlap @ weights)[positive])), 0.0)
 
 
-class Experiment(Protocol):
+class Experiment(NamedTuple):
     """A manoeuvre that can be recorded next."""
 
-    @property
-    def name(self) -> str:
-        """Return its name."""
-
-    @property
-    def motion(self) -> Motion:
-        """Return its motion."""
-
-    @property
-    def begin_s(self) -> float:
-        """Return the time of its motion at which it begins, s."""
+    name: str
+    begin_s: float  # Time of its motion at which it begins, s
+    motion: Motion
 
     @property
     def minutes(self) -> float:
-        """Return its duration, min."""
+        """Return the duration, min."""
+        return self.motion.duration_s / 60
 
 
-Key = tuple
-"""Variant and coefficient of a column; dimension, channel and number of a flexible function."""
-
-
-@dataclass(frozen=True)
-class ManoeuvreWorth:
+class ManoeuvreWorth(NamedTuple):
     """What a manoeuvre is expected to tell."""
 
-    manoeuvre: Experiment  # The manoeuvre
+    manoeuvre: Experiment
     information: float  # Expected decrease of the entropy of the hypotheses, nat
 
     @property
@@ -255,12 +238,15 @@ class ManoeuvreWorth:
         return self.information / self.manoeuvre.minutes
 
 
-@dataclass(frozen=True)
-class PredictedResponse:
+Key = tuple
+"""Variant and coefficient of a column; dimension, channel and number of a flexible function."""
+
+
+class PredictedResponse(NamedTuple):
     """Products of the sensitivities of one manoeuvre."""
 
-    manoeuvre: Experiment  # The manoeuvre
-    linear_model: LinearModel  # Its linear model
+    manoeuvre: Experiment
+    linear_model: LinearModel
     places: dict[Key, int]  # Place of each column
     gram: np.ndarray  # Products, in units of the noise, (k, k)
 
@@ -268,17 +254,6 @@ class PredictedResponse:
     def effects(self) -> set[str]:
         """Return the effects that the manoeuvre excites."""
         return {v.effect for v in self.linear_model.variants}
-
-
-@dataclass(frozen=True)
-class _Posterior:
-    """What a hypothesis knows after the samples so far."""
-
-    keys: tuple[Key, ...]  # Columns of its k coefficients
-    mean: np.ndarray  # Their means, (k,)
-    covariance: np.ndarray  # Their covariance, (k, k)
-    unseen: tuple[str, ...]  # Effects of the hypothesis about which only the prior is known
-    dimensions: tuple[FormDimension, ...]  # Dimensions in which it has an unknown function
 
 
 def leading(hypotheses: Sequence[WeightedHypothesis]) -> tuple[WeightedHypothesis, ...]:
@@ -341,7 +316,14 @@ def rank_responses(responses: Sequence[PredictedResponse],
     """Rank manoeuvres by their expected information per minute."""
     leaders = leading(hypotheses)
     named = next((h.effects for h in leaders if UNKNOWN not in h.effects), ())
-    best: dict[str, int | None] = {}
+
+    @cache
+    def best_variant(effect: str) -> int | None:
+        """Return the number of the variant of an effect that fits the samples best."""
+        return None if model is None else max(
+            _variants_of(model, effect), default=None,
+            key=lambda i: model.fit_variants([i], model.null_fit).log_evidence)
+
     posteriors = []
     for hypothesis in leaders:
         # Something unknown acts beside the best other hypothesis.
@@ -349,11 +331,12 @@ def rank_responses(responses: Sequence[PredictedResponse],
         effects = named if unknown else hypothesis.effects
         functions = {*(dimensions if unknown else ()),
                      *((FormDimension.TIME,) if evidence.drifts_among(effects) else ())}
-        posteriors.append(_posterior(model, effects, tuple(functions), best))
+        seen = {e: i for e in effects if (i := best_variant(e)) is not None}
+        posteriors.append((_fitted(model, list(seen.values())), {*effects} - {*seen}, functions))
     total = sum(h.probability for h in leaders)
     probabilities = [h.probability / total for h in leaders]
     worth = [ManoeuvreWorth(r.manoeuvre, expected_information(
-        r.gram, probabilities, [_belief(p, r) for p in posteriors], _EVIDENCE_FACTOR))
+        r.gram, probabilities, [_belief(r, *p) for p in posteriors], _EVIDENCE_FACTOR))
         for r in responses]
     return tuple(sorted(worth, key=lambda w: -w.per_minute))
 
@@ -363,41 +346,44 @@ def _variants_of(model: LinearModel, effect: str) -> list[int]:
     return [i for i, v in enumerate(model.variants) if v.effect == effect and not v.limit_start]
 
 
-def _posterior(model: LinearModel | None, effects: Sequence[str],
-               functions: tuple[FormDimension, ...], best: dict[str, int | None]) -> _Posterior:
-    """Return what a hypothesis knows; `best` keeps the variants of effects that fit best."""
+_Fitted = tuple[Sequence[Key], np.ndarray, np.ndarray]
+"""Columns of k coefficients, their means, (k,), and their covariance, (k, k)."""
+
+
+def _fitted(model: LinearModel | None, chosen: list[int]) -> _Fitted:
+    """Return what the samples so far say of the coefficients of variants."""
     if model is None:
-        return _Posterior((), np.zeros(0), np.zeros((0, 0)), tuple(effects), functions)
-    for effect in effects:
-        if effect not in best:
-            best[effect] = max(_variants_of(model, effect), default=None,
-                               key=lambda i: model.fit_variants([i], model.null_fit).log_evidence)
-    chosen = [i for e in effects if (i := best[e]) is not None]
+        return (), np.zeros(0), np.zeros((0, 0))
     fit, keys = model.fit_variants(chosen, model.null_fit), _keys(model)
-    return _Posterior(tuple(keys[int(i)] for i in fit.column_ids), fit.values, fit.covariance,
-                      tuple(e for e in effects if best[e] is None), functions)
+    return [keys[int(i)] for i in fit.column_ids], fit.values, fit.covariance
 
 
-def _belief(posterior: _Posterior, response: PredictedResponse) -> Belief:
-    """Return what a hypothesis knows of the columns of a manoeuvre."""
+def _belief(response: PredictedResponse, fitted: _Fitted, unseen: Collection[str],
+            functions: Collection[FormDimension]) -> Belief:
+    """
+    Return what a hypothesis knows of the columns of a manoeuvre.
+
+    Of `unseen` effects only the prior is known; unknown functions act in some dimensions.
+    """
     places, model, keys = response.places, response.linear_model, _keys(response.linear_model)
-    kept = [i for i, key in enumerate(posterior.keys) if key in places]
-    at = [places[posterior.keys[i]] for i in kept]
+    columns, means, covariance = fitted
+    kept = [i for i, key in enumerate(columns) if key in places]
+    at = [places[columns[i]] for i in kept]
     mean, root = np.zeros(len(places)), np.zeros((len(places), len(kept)))
-    mean[at] = posterior.mean[kept]
+    mean[at] = means[kept]
     # A square root of a covariance whose units may differ by orders.
-    covariance = posterior.covariance[np.ix_(kept, kept)]
+    covariance = covariance[np.ix_(kept, kept)]
     std = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
     root[at] = std[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     # Prior standard deviations of what the samples do not determine; the middle one of the shapes
     # of an effect stands for all.
-    chosen = [numbers[len(numbers) // 2] for effect in posterior.unseen
+    chosen = [numbers[len(numbers) // 2] for effect in unseen
               if (numbers := _variants_of(model, effect))]
     prior_std = model.prior(chosen)
     ids = {k for i in chosen for k in model.column_ids[i]} | set(model.nuisance_ids)
     stds = {places[keys[k]]: float(prior_std[k]) for k in ids if keys[k] in places}
-    stds |= {place: 1.0 for key, place in places.items() if key[0] in posterior.dimensions}
+    stds |= {place: 1.0 for key, place in places.items() if key[0] in functions}
     more = np.diag([stds.get(place, 0.0) * (place not in at) for place in range(len(places))])
     return Belief(mean, np.hstack([root, more[:, more.any(axis=0)]]))
 
@@ -430,65 +416,28 @@ MENU = {
 """All manoeuvres. An effect names the one that reveals it best in its own file."""
 
 
-@dataclass(frozen=True)
-class MenuManoeuvre:
-    """A manoeuvre of the menu."""
-
-    manoeuvre: Manoeuvre  # Its place in the menu
-    motion: Motion  # Its motion, which begins at 0 s
-    begin_s: float = 0.0  # Time at which it begins, s
-
-    @property
-    def name(self) -> str:
-        """Return what to do, for people."""
-        return MENU[self.manoeuvre].text
-
-    @property
-    def minutes(self) -> float:
-        """Return the duration, min."""
-        return self.motion.duration_s / 60
-
-
-@dataclass(frozen=True)
-class RecordedEvidence:
-    """What recordings are compared with, and what they show."""
-
-    sensor: Sensor  # The baseline
-    linear_model: LinearModel | None  # Linear model of the recordings; None without any
-    seed: int  # Seed of the manoeuvres of the menu
-
-    @property
-    def beside_simulator(self) -> bool:
-        """Return whether the motion is that of another simulator, without a stage."""
-        return self.linear_model is not None and all(
-            c.reference is Reference.SIMULATOR for c in self.linear_model.comparisons)
-
-
-class MenuWorth(NamedTuple):
-    """What a manoeuvre of the menu is expected to tell."""
-
-    text: str  # What to do, for people
-    minutes: float  # Duration, min
-    nats_per_minute: float  # Expected information on the hypotheses, nat/min
-
-
-@dataclass(frozen=True)
-class NextExperiment:
+class NextExperiment(NamedTuple):
     """What to record next."""
 
     manoeuvre: str  # What to do, for people
     why: str  # The reason, for people
     command: str  # Command that simulates the manoeuvre, or that diagnoses its recording
     # All manoeuvres that can be simulated, the best first; empty where nothing has to be separated
-    menu: tuple[MenuWorth, ...] = ()
+    menu: tuple[ManoeuvreWorth, ...] = ()
     # Whether the reference has to change, so that nothing can be simulated
     concerns_reference: bool = False
     beside_simulator: bool = False  # Whether another simulator makes its motion
 
 
-def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str],
-                            evidence: RecordedEvidence) -> NextExperiment | None:
-    """Propose the manoeuvre that separates most of what is not separated."""
+def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], sensor: Sensor,
+                            model: LinearModel | None, seed: int) -> NextExperiment | None:
+    """
+    Propose the manoeuvre that separates most of what is not separated.
+
+    sensor: the baseline; model: linear model of the recordings, or None.
+    """
+    no_stage = model is not None and all(
+        c.reference is Reference.SIMULATOR for c in model.comparisons)
     # An error of the reference that another effect imitates.
     same = next((g for g in verdict.groups if any(
         effect_named(effect).diagnosis.imitated_by in g for effect in g)), None)
@@ -504,7 +453,11 @@ def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str],
             'because it lacks motion that the sensor has', _OTHER_REFERENCE,
             concerns_reference=True)
     if verdict.groups:
-        return _separating_experiment(verdict, evidence)
+        ranked = _ranked_menu(verdict, sensor, model, seed, no_stage)
+        group, best = verdict.groups[0], ranked[0].manoeuvre.name
+        why = f'to separate {", ".join(group[:-1])} and {group[-1]}'
+        return _experiment(next(m for m in MENU if _text(m, no_stage) == best), why,
+                           no_stage)._replace(menu=ranked)
     if verdict.status == 'no_gap' and not not_covered:
         return None
     why = 'to confirm the verdict on another recording'
@@ -513,33 +466,26 @@ def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str],
     elif not_covered:
         why = f'because the recordings have no {", no ".join(not_covered)}'
     revealed_by = [h.revealed_by for h in hints]
-    best = max(MENU, key=revealed_by.count)
-    if best not in revealed_by:
-        best = Manoeuvre.SPEEDS if verdict.status == 'unknown' or not not_covered \
+    most = max(MENU, key=revealed_by.count)
+    if most not in revealed_by:
+        most = Manoeuvre.SPEEDS if verdict.status == 'unknown' or not not_covered \
             else Manoeuvre.PLANES
-    return _experiment(best, why, evidence.beside_simulator)
+    return _experiment(most, why, no_stage)
 
 
-def _separating_experiment(verdict: Verdict, evidence: RecordedEvidence) -> NextExperiment:
-    """Rank the whole menu by its expected information; propose the best manoeuvre."""
+def _ranked_menu(verdict: Verdict, sensor: Sensor, model: LinearModel | None, seed: int,
+                 no_stage: bool) -> tuple[ManoeuvreWorth, ...]:
+    """Rank the whole menu by its expected information."""
     effects = sorted({effect for h in leading(verdict.hypotheses) for effect in h.effects})
-    dimensions, no_stage = unknown_dimensions(verdict), evidence.beside_simulator
-    planned = {described.text: MenuManoeuvre(manoeuvre, trajectories.TRAJECTORIES[
-        described.trajectory](np.random.default_rng(evidence.seed)))
-        for manoeuvre, described in MENU.items()}
-    responses = []
-    for manoeuvre in planned.values():
+    dimensions, responses = unknown_dimensions(verdict), []
+    for manoeuvre, described in MENU.items():
+        motion = trajectories.TRAJECTORIES[described.trajectory](np.random.default_rng(seed))
         # At rest the pose is unknown, so that a baseline with effects of the stage has no place.
         with suppress(UserError):
-            responses.append(predict(manoeuvre, _remounted(evidence.sensor) if MENU[
-                manoeuvre.manoeuvre].remounted else evidence.sensor, effects, dimensions))
-    ranked = rank_responses(responses, verdict.hypotheses, evidence.linear_model, dimensions)
-    group = verdict.groups[0]
-    best = planned[ranked[0].manoeuvre.name].manoeuvre
-    return replace(_experiment(
-        best, f'to separate {", ".join(group[:-1])} and {group[-1]}', no_stage), menu=tuple(
-        MenuWorth(_text(planned[w.manoeuvre.name].manoeuvre, no_stage),
-                  float(w.manoeuvre.minutes), float(w.per_minute)) for w in ranked))
+            responses.append(predict(
+                Experiment(_text(manoeuvre, no_stage), 0.0, motion),
+                _remounted(sensor) if described.remounted else sensor, effects, dimensions))
+    return rank_responses(responses, verdict.hypotheses, model, dimensions)
 
 
 def _text(manoeuvre: Manoeuvre, no_stage: bool) -> str:

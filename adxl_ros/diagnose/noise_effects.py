@@ -42,9 +42,6 @@ _LINE_PART_S, _LINE_BESIDE = 4.0, 4.0
 """Length of the parts of which the amplitude of a line is taken, s, and distance at which the
 power beside it is taken, in inverse parts. Chosen: the phase of the mains wanders little within
 it; beyond the main lobe of the window."""
-_LINE_REST_S = 10.0
-"""Shortest total rest that can show a line of another frequency than the mains, s. Chosen: a
-resolution of 0.1 Hz."""
 _HARMONICS, _HARMONIC_SHARE, _DISTINCT_HZ = (1, 2, 3), 0.2, 1.0
 """Multiples of a line that are compared, smallest amplitude of a harmonic, divided by that of the
 line, and smallest distance of two lines, Hz. Chosen: mains hum has these, behind rectifiers."""
@@ -54,10 +51,6 @@ axis, and distance of the neighbours, samples. Chosen: normal noise exceeds it o
 samples; one or two may be anything; the next sample shares an RC filter."""
 _SPIKE_LOCAL_S, _SPIKE_LOCAL_FEWEST = 0.2, 9
 """Width of the blocks of the local scale, s and samples. Chosen: shorter than a move."""
-_LEVEL_CELL, _LEVEL_RARITY, _LEVEL_FEWEST = 0.02, 4.0, 10
-"""Width of a level as a share of the range; spikes cluster if their levels hold less than the
-inverse of the second of all samples; fewest spikes of which levels are compared. Tuned on working
-cases: codes of a wrong ADC jump at few levels."""
 NOISE_EXCESS, _RESTING_FEWEST = 1.2, 500
 """Noise, divided by the stated noise, from which it is excessive, and fewest resting samples that
 show it. Chosen: units differ by less; a standard deviation of 3 %."""
@@ -90,17 +83,16 @@ shorter than the recording. Chosen: fewer means scatter by more."""
 class Detection:
     """One noise-like effect that shows."""
 
-    effect: str  # Name of the effect; 'unknown' for a line that is no mains frequency
+    effect: str  # Name of the effect
     values: dict[str, np.ndarray]  # Parameters of the effect by name, (m,) or () each
     log_bayes_factor: float  # Approximate log Bayes factor of the effect
-    message: str  # What was found, for people
 
 
-def _detection(detector: Detector, values: dict[str, np.ndarray], count: float, message: str
-               ) -> Detection:
+def _detection(detector: Detector, count: float, **values: np.ndarray | float) -> Detection:
     """Return the detection of a detector's effect, by the number of events or its log factor."""
     name = next(e.name for e in library().values() if e.diagnosis.detector is detector)
-    return Detection(name, values, _LOG_BAYES_FACTORS.get(detector, 1.0) * count, message)
+    return Detection(name, {key: np.asarray(value) for key, value in values.items()},
+                     _LOG_BAYES_FACTORS.get(detector, 1.0) * count)
 
 
 def repeated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, sensor: Sensor
@@ -115,10 +107,9 @@ def repeated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, se
     if not repeats:
         return used, []
     duration_s = float(np.median([time_s[end - 1] - time_s[begin] for begin, end in repeats]))
-    return used & ~repeated, [_detection(Detector.REPEATED_SAMPLES, {
-        'rate_hz': np.array(len(repeats) / float(time_s[-1] - time_s[0])),
-        'duration_s': np.array(duration_s + 1 / sensor.rate_hz)}, len(repeats),
-        f'samples repeat {len(repeats)} times, for {duration_s:.3g} s (median)')]
+    return used & ~repeated, [_detection(
+        Detector.REPEATED_SAMPLES, len(repeats), rate_hz=len(repeats) / np.ptp(time_s),
+        duration_s=duration_s + 1 / sensor.rate_hz)]
 
 
 def shortest_repeat(volts: np.ndarray, axes: int) -> int:
@@ -132,16 +123,15 @@ def shortest_repeat(volts: np.ndarray, axes: int) -> int:
 
 
 def isolated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, sensor: Sensor
-                     ) -> tuple[np.ndarray, Detection | None]:
+                     ) -> tuple[np.ndarray, list[Detection]]:
     """Find single samples that deviate from the straight line between their neighbours."""
     spikes, size_v = _spikes(volts, used, sensor)
     count = int(spikes.any(axis=1).sum())
-    if not count or _at_few_levels(volts, spikes):
-        return used, None
+    if not count:
+        return used, []
     rate_hz = spikes.sum() / len(sensor.axes) / float(time_s[-1] - time_s[0])
-    return used & ~spikes.any(axis=1), _detection(
-        Detector.ISOLATED_SAMPLES, {'rate_hz': np.array(rate_hz), 'amplitude_v': size_v}, count,
-        f'{count} single samples deviate, by up to {size_v.max() * 1e3:.3g} mV (median by axis)')
+    return used & ~spikes.any(axis=1), [_detection(
+        Detector.ISOLATED_SAMPLES, count, rate_hz=rate_hz, amplitude_v=size_v)]
 
 
 def residual_shows_spikes(spikes: Detection, residual_v: np.ndarray, used: np.ndarray,
@@ -183,16 +173,6 @@ def _spikes(volts: np.ndarray, used: np.ndarray, sensor: Sensor
     return isolated, size_v
 
 
-def _at_few_levels(volts: np.ndarray, spikes: np.ndarray) -> bool:
-    """Determine whether spikes cluster at some levels, as steps of an ADC do."""
-    expected, count = 0.0, int(spikes.sum())
-    for v, isolated in zip(volts.T, spikes.T):
-        level = np.floor(v / (_LEVEL_CELL * max(np.nanmax(v) - np.nanmin(v), 1e-9)))
-        before = np.roll(level, _SPIKE_NEIGHBOUR)
-        expected += float(np.isin(before, np.unique(before[isolated])).mean()) * isolated.sum()
-    return bool(count > _LEVEL_FEWEST and expected / count < 1 / _LEVEL_RARITY)
-
-
 def coarse_codes(volts: np.ndarray, sensor: Sensor) -> Detection | None:
     """Find an ADC whose codes are coarser than stated, on all axes or on some."""
     if not sensor.lsb_v:
@@ -204,12 +184,9 @@ def coarse_codes(volts: np.ndarray, sensor: Sensor) -> Detection | None:
     if not (bits < threshold).any():
         common = float(np.nanmedian(bits) if np.nanmax(bits) - np.nanmin(bits) < threshold
                        else np.nanmin(bits))
-    further = np.where(bits - common >= threshold, bits - common, 0.0)
-    where = '' if common or len(bits) == 1 else ' on ' + ', '.join(
-        axis for axis, lost in zip(sensor.axes, further) if lost)
-    return _detection(Detector.COARSE_CODES, {
-        'lost_bits': np.array(common), 'axis_lost_bits': further}, 1,
-        f'codes are {2 ** np.nanmax(bits):.3g} steps apart{where}')
+    return _detection(
+        Detector.COARSE_CODES, 1, lost_bits=common,
+        axis_lost_bits=np.where(bits - common >= threshold, bits - common, 0.0))
 
 
 def _lost_bits(volts: np.ndarray, sensor: Sensor) -> float:
@@ -233,11 +210,6 @@ def residual_detections(comparison: BaselineComparison, residual_v: np.ndarray, 
     at_rest = comparison.at_rest & comparison.used
     white = np.diff(_innovations(residual_v, sensor)[0], axis=0)
     line = _line(white, residual_v, comparison.time_s, sensor)
-    if line is not None and line.effect == UNKNOWN:
-        # A line of another frequency than the mains must also show at rest.
-        resting = _line(white * at_rest[2:, None], residual_v, comparison.time_s, sensor) \
-            if at_rest.sum() >= _LINE_REST_S * sensor.rate_hz else None
-        line = line if resting is not None and resting.effect == UNKNOWN else None
     # In motion, effects that are not modelled would look like noise, so that rests are preferred.
     resting = at_rest.sum() > _RESTING_FEWEST
     excess = _excess(residual_v, comparison.simulated_noise_v(sensor, 0), sensor,
@@ -266,8 +238,7 @@ def _excess(residual_v: np.ndarray, simulated_v: np.ndarray, sensor: Sensor, row
         ratio = np.minimum(ratio, recorded_v / np.where(drawn_v > 0, drawn_v, np.inf))
     largest = np.max(ratio)
     return None if largest <= NOISE_EXCESS else _detection(
-        Detector.NOISE_LEVEL, {'ratio': ratio - 1}, len(rows) * float(np.log(largest) ** 2),
-        f'white noise is {largest:.2f} times the stated noise')
+        Detector.NOISE_LEVEL, len(rows) * float(np.log(largest) ** 2), ratio=ratio - 1)
 
 
 def white_noise_v(noise_v: np.ndarray, sensor: Sensor, rows: np.ndarray | None = None
@@ -289,7 +260,7 @@ def white_noise_v(noise_v: np.ndarray, sensor: Sensor, rows: np.ndarray | None =
 
 def _line(white: np.ndarray, residual_v: np.ndarray, time_s: np.ndarray, sensor: Sensor
           ) -> Detection | None:
-    """Return the strongest line of a whitened residual, None where chance explains it."""
+    """Return the mains line that is the strongest of a whitened residual, or None."""
     frequency_hz, power = scipy.signal.periodogram(white, sensor.rate_hz, 'hann', axis=0)
     kept = frequency_hz > _LINE_LOWEST_HZ
     frequency_hz, power = frequency_hz[kept], power[kept]
@@ -303,17 +274,11 @@ def _line(white: np.ndarray, residual_v: np.ndarray, time_s: np.ndarray, sensor:
     excess = sum(p / np.interp(np.arange(len(p)), middles, v) for p, v in zip(power.T, level.T))
     best = int(np.argmax(excess))
     log_excess = float(excess[best]) - np.log(len(frequency_hz)) - len(sensor.axes)
-    if not log_excess >= LINE_LOG_EXCESS:
+    mains_hz = _mains_frequency_hz(float(frequency_hz[best]), sensor.rate_hz)
+    if not log_excess >= LINE_LOG_EXCESS or mains_hz is None:
         return None
-    line_hz = float(frequency_hz[best])
-    mains_hz = _mains_frequency_hz(line_hz, sensor.rate_hz)
-    text = f'the spectrum has a line at {line_hz:.2f} Hz'
-    if mains_hz is None:
-        return Detection(UNKNOWN, {}, log_excess, f'{text}, which is no mains frequency')
-    amplitude_v = line_amplitude_v(residual_v, time_s, mains_hz)
-    return _detection(Detector.MAINS_LINE, {
-        'amplitude_v': amplitude_v, 'frequency_hz': np.array(mains_hz),
-        'phase_rad': np.array(0.0)}, log_excess, f'{text}, {amplitude_v.max() * 1e3:.3g} mV')
+    return _detection(Detector.MAINS_LINE, log_excess, amplitude_v=line_amplitude_v(
+        residual_v, time_s, mains_hz), frequency_hz=mains_hz, phase_rad=0.0)
 
 
 def line_amplitude_v(values_v: np.ndarray, time_s: np.ndarray, line_hz: float) -> np.ndarray:
@@ -418,13 +383,12 @@ def noise_remainders(comparisons: Sequence[BaselineComparison], mean_sensor: Sen
                      named_sensor: Sensor, detections: Sequence[Detection], seed: int
                      ) -> list[NoiseRemainder]:
     """Compare the noise-like effects of the recordings with those of their simulation."""
-    named = [d for d in detections if d.effect != UNKNOWN]
     # By effect, quantity and unit: pairs of recorded and simulated values, one of each recording
     values: dict[tuple[str, str, str], list] = {}
     for c in comparisons:
         signals = [(c.volts, bridged(c.residual_v(mean_sensor), c.used)),
-                   _simulated(c, named_sensor, seed)] if named else []
-        for detection in named:
+                   _simulated(c, named_sensor, seed)] if detections else []
+        for detection in detections:
             recorded, simulated = (list(_statistics(c, detection, *s)) for s in signals)
             for (quantity, unit, value), (*_, other) in zip(recorded, simulated):
                 values.setdefault((detection.effect, quantity, unit), []).append((value, other))
@@ -473,7 +437,7 @@ def _statistics(comparison: BaselineComparison, detection: Detection, volts: np.
         yield 'white noise', 'm/s^2', white_noise_v(noise_v, sensor) / scale
     elif detector is Detector.ISOLATED_SAMPLES:
         spikes = isolated_samples(volts, time_s, finite, sensor)[1]
-        values = spikes.values if spikes else {'rate_hz': np.zeros(1),
+        values = spikes[0].values if spikes else {'rate_hz': np.zeros(1),
                                                'amplitude_v': np.zeros(len(scale))}
         yield 'spikes per second and axis', '1/s', np.atleast_1d(values['rate_hz'])
         yield 'size of a spike', 'm/s^2', values['amplitude_v'] / scale

@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 from math import sqrt
 
 from adxl_ros.diagnose.comparison import BaselineComparison, CachedPath, gravity_slopes
-from adxl_ros.diagnose.evidence import Whitener
+from adxl_ros.diagnose.evidence import AngleErrorFilter, Whitener
 from adxl_ros.model import noise
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.diagnosis_hints import DriftSpectrum
@@ -67,8 +67,6 @@ _TOP_OF_RATE = 0.25
 _SMALLEST_HELD_SHARE = 0.01
 """Share of the rounding that is held, below which all of it is white. Chosen: the noise is then
 a third of a step, as in any unit whose ADC suits it."""
-_SERIES = 16
-"""Series that are filtered together. Chosen: little memory beside all series."""
 
 
 @dataclass(frozen=True)
@@ -191,37 +189,6 @@ def find_repeat(first: np.ndarray, second: np.ndarray, rate_hz: float, resolutio
     moved = first[:, :count].std(axis=1).max()
     return (lag, count) if mean_square[best] <= largest_rad ** 2 and moved >= _REPEAT_MOTION \
         else None
-
-
-@dataclass(frozen=True)
-class AngleErrorFilter:
-    """A filter that gives noise with errors of angles the spectrum of noise without them."""
-
-    rms_v: float  # Rms of the errors, V
-    pole: float  # Pole a of the noise
-    transition: np.ndarray  # Factor of the estimate of u from sample to sample, (n,)
-    gain: np.ndarray  # Gain of the estimate of u, 1/V, (n,)
-    weight: np.ndarray  # Change of the predicted sample by the estimate of u, V, (n,)
-    scale: np.ndarray  # Standard deviation of the noise divided by that of the innovation, (n,)
-
-    def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Filter k series, (k, n)."""
-        lower = np.ones((2, len(self.gain)))
-        lower[1, :-1] = -self.transition[1:]
-        filtered = np.empty_like(values)
-        for first in range(0, len(values), _SERIES):
-            part = values[first:first + _SERIES]
-            changes = part.copy()
-            changes[:, 1:] -= self.pole * part[:, :-1]
-            changes[:, 0] = 0.0
-            estimates = scipy.linalg.lapack.dtbtrs(lower, (changes * self.gain).T, uplo='L',
-                                                   diag='U')[0].T
-            changes[:, 1:] -= self.weight[1:] * estimates[:, :-1]
-            changes *= self.scale
-            changes[:, 0] = part[:, 0]
-            filtered[first:first + _SERIES] = scipy.signal.lfilter(
-                [1.0], [1.0, -self.pole], changes)
-        return filtered
 
 
 def angle_error_filter(comparison: BaselineComparison, axis: int) -> AngleErrorFilter | None:

@@ -3,14 +3,13 @@
 The diagnosis as one HTML page that opens offline, with its figures and proofs.
 
 The proof of an effect is the recording minus a simulation with all other effects, over the
-effect's own variable, or spectra and histograms with and without it.
+effect's own variable, or spectra with and without it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 from adxl_ros.diagnose import report as words
@@ -18,7 +17,7 @@ from adxl_ros.diagnose.comparison import BaselineComparison
 from adxl_ros.diagnose.diagnosis import Diagnosis, Report
 from adxl_ros.diagnose.evidence import bridged
 from adxl_ros.diagnose.next_experiment import by_effect
-from adxl_ros.diagnose.residual_map import BLOCK_S, RANGES, ResidualCell, SIGNIFICANT_P
+from adxl_ros.diagnose.residual_map import BLOCK_S, ResidualCell, SIGNIFICANT_P
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import with_neutral
 from adxl_ros.model.constants import AXES, Z_90
@@ -51,13 +50,11 @@ _CONTRIBUTION = 'what the model of the effect predicts, mg'
 _SEGMENT, _POINTS_PER_OCTAVE = 4096, 12
 """Samples in a segment of a spectrum, and points of its plot in an octave. Chosen: 0.06 Hz at
 250 Hz, and lines stay visible."""
-_HISTOGRAM_BINS, _HISTOGRAM_QUANTILE = 81, 0.9999
-"""Bins, and share of the samples within. Chosen: a bin at 0, and spikes of 0.1 %."""
 _COLOURS = {'explained': 'green', 'partly': 'amber', 'no_gap': 'grey', 'inseparable': 'amber',
             'insufficient': 'amber', 'unknown': 'red', 'bad_data': 'red'}
 """Colour of the badge for each status."""
-_MARGIN = 0.06
-"""Margin beside the whiskers of sizes, as a share of their range. Chosen: no dot is cut."""
+_MOST_CELLS = 20
+"""Largest number of parts of the map. Chosen: one screen."""
 _PLOTTED_POINTS = 3000
 """Largest number of points of a line. Chosen: more than a wide screen has columns."""
 _INK, _EFFECT_COLOUR = '#1f2933', '#5b8fd6'
@@ -69,7 +66,7 @@ _WIDE = {'l': 8, 'r': 12, 't': 36, 'b': 8}
 
 
 class Curve(NamedTuple):
-    """A spectrum or a histogram of one axis."""
+    """A spectrum of one axis."""
 
     axis: str
     label: str
@@ -116,10 +113,11 @@ def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> 
     shown = [c for c in objects['candidates']
              if c['effect'] in named or c['probability'] >= words.PROBABLE]
     shown.sort(key=lambda c: named.index(c['effect']) if c['effect'] in named else len(named))
-    best, compared, full_rate = report.hypotheses[0], diagnosis.comparisons[0], \
-        diagnosis.full_rate[0]
+    best = report.hypotheses[0]
+    compared, full_rate = diagnosis.comparisons[0], diagnosis.full_rate[0]
     in_noise, proofs = {d.effect for d in report.detections} & {*report.sensor.effects}, {}
-    for name in (c['effect'] for c in shown):
+    for name in (c['effect'] for c in shown
+                 if Over.STEP not in effect_named(c['effect']).diagnosis.proof):
         sensors = [report.sensor] if name in in_noise else [
             h.sensor for h in report.hypotheses if name in h.effects]
         if sensors:
@@ -127,8 +125,7 @@ def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> 
     rows, scale = words.figure_rows(diagnosis), float(report.baseline.scale_v_per_g.mean())
     return {
         'has_verdict': True,
-        'figures': {'waterfall': waterfall(report), 'map': map_figure(report.residual_cells),
-                    'signals': signals(compared, best.sensor),
+        'figures': {'waterfall': waterfall(report), 'signals': signals(compared, best.sensor),
                     'spectrum': gap_spectrum(full_rate, best.sensor),
                     **{f'proof-{name}': drawn for name, (drawn, _) in proofs.items()}},
         'tiles': rows[:3] + [r for r in rows[3:] if r.label in (
@@ -139,45 +136,31 @@ def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> 
         'converged': best.converged,
         'hypotheses': [[', '.join(h['effects']) or 'no gap', percent(h['probability'])]
                        for h in objects['hypotheses']],
-        'not_covered': objects['not_covered'], 'noise': _noise_rows(objects),
+        'not_covered': objects['not_covered'],
+        'where': [_cell(c) for c in report.residual_cells if c.p < SIGNIFICANT_P][:_MOST_CELLS],
         'menu': [[m['manoeuvre'], f'{m["minutes"]:.1f}', f'{m["nats_per_minute"]:.2g}']
                  for m in proposal['menu']] if proposal else [],
         'could_show': [(row.shows, *words.shown_row(row, scale))
                        for row in by_effect(report.could_show).values()]}
 
 
+def _cell(cell: ResidualCell) -> list[str]:
+    """Return quantity, range, axis, mean and share of a part of the map."""
+    name, unit, factor = cell.dimension, cell.dimension.rpartition('_')[2], 1.0
+    if 'rad' in name:
+        unit, factor = '°/s' if 'rate' in name else '°', float(np.degrees(1.0))
+    return [name.split('_rad')[0].replace('_', ' '),
+            f'{factor * cell.low:.4g} to {factor * cell.high:.4g} {unit}', cell.axis,
+            mg_text(cell.mean_mps2), percent(cell.share)]
+
+
 def _effect(candidate: dict[str, Any], report: Report) -> dict[str, Any]:
-    """Return one effect with its sizes, as dot and whisker where they have an interval."""
-    effect, parameters = effect_named(candidate['effect']), candidate['parameters']
-    docs, sizes = {p.name: p.doc for p in effect.parameters}, []
-    is_single = len({key.partition('.')[0] for key in parameters}) == 1
-    for key, parameter in parameters.items():
-        text, mark = parameter_text(parameter, words.axis_scale(report, key)), None
-        if parameter.get('ci'):
-            ends = [v for p in parameters.values() if p.get('ci')
-                    and p['unit'] == parameter['unit'] for v in p['ci']]
-            low, high = min(0.0, *ends), max(0.0, *ends)
-            margin = _MARGIN * (high - low)
-            mark = plots.whisker(parameter['value'], parameter['ci'][0], parameter['ci'][1],
-                                 (low - margin, high + margin), text)
-        sizes.append({'label': parameter_label(key, is_single) or 'size', 'text': text,
-                      'doc': docs[key.partition('.')[0]], 'mark': mark})
-    return {'name': effect.name, 'sure': percent(candidate['probability']),
-            'share': '' if candidate['share'] is None else
-            f'{percent(candidate["share"])} of the gap', 'cause': effect.cause,
-            'rivals': candidate['inseparable_from'], 'sizes': sizes}
-
-
-def _noise_rows(objects: dict[str, Any]) -> list[list[str]]:
-    """Return ratios of recorded and simulated noise, before and after."""
-    rows = []
-    for ratios in objects['gap']['noise']:
-        names = [f'{low:.3g} to {high:.3g} Hz' for low, high in pairwise(ratios['bands_hz'])]
-        names += [f'Allan deviation at {t:g} s' for t in ratios['allan_s']]
-        before, after = ([*ratios[f'power_ratio_{when}'], *ratios[f'allan_ratio_{when}']]
-                         for when in ('before', 'after'))
-        rows += [[name, f'{b:.2f}', f'{a:.2f}'] for name, b, a in zip(names, before, after)]
-    return rows
+    """Return one effect with its sizes."""
+    share = candidate['share']
+    return {'name': candidate['effect'], 'sure': percent(candidate['probability']),
+            'share': '' if share is None else f'{percent(share)} of the gap',
+            'cause': candidate['cause'], 'rivals': candidate['inseparable_from'],
+            'sizes': words.size_lines(report, candidate)}
 
 
 def _proof(effect: str, comparison: BaselineComparison, full_rate: BaselineComparison,
@@ -185,33 +168,27 @@ def _proof(effect: str, comparison: BaselineComparison, full_rate: BaselineCompa
     """
     Show an effect of a sensor, which has all effects of the verdict, in a recording.
 
-    It is drawn as means over a variable, spectra, or histograms of the changes from one sample to
-    the next; the text explains it in one sentence.
+    It is drawn as means over a variable or spectra; the text explains it in one sentence.
     """
     described = effect_named(effect)
     variables, acts_on_noise = described.diagnosis.proof, described.acts_on is ActsOn.NOISE
     neutral = with_neutral(comparison.sensor, [effect]).values[effect]
     without = replace(sensor, values={**sensor.values, effect: neutral})
     labelled = {'without the effect': without, 'with the effect': sensor}
-    text = 'The effect is there if the recorded {} follows the green line, not the red one.'
-    if Over.STEP in variables:
-        signals_v = {'recorded': full_rate.volts} | {
-            label: full_rate.simulated_v(replace(without, rate_hz=full_rate.sensor.rate_hz))
-            + full_rate.simulated_noise_v(s, 0) for label, s in labelled.items()}
-        return _panels(_histograms(full_rate, signals_v), Over.STEP.value, 'samples',
-                       False), text.format('histogram')
     if not acts_on_noise and Over.FREQUENCY not in variables:
         return _binned(variables, comparison, sensor, without), \
             'Points: recording minus a simulation with all other effects, with 90 % bars. ' \
             'Line: the model of this effect.'
-    signals_v = {label: full_rate.residual_v(s) for label, s in labelled.items()}
     if acts_on_noise:
+        text = 'The effect is there if the recorded spectrum follows the green line, not the ' \
+            'red one.'
         signals_v = {'recorded': full_rate.residual_v(sensor)} | {
             label: full_rate.simulated_noise_v(s, 0) for label, s in labelled.items()}
+    else:
+        text = 'The effect is there if the spectrum of the difference falls from red to green.'
+        signals_v = {label: full_rate.residual_v(s) for label, s in labelled.items()}
     curves = [curve for label, v in signals_v.items() for curve in _spectra(full_rate, v, label)]
-    return _panels(curves, Over.FREQUENCY.value, 'mg/√Hz', True), text.format('spectrum') \
-        if acts_on_noise else 'The effect is there if the spectrum of the difference falls from ' \
-        'red to green.'
+    return _panels(curves, Over.FREQUENCY.value, 'mg/√Hz'), text
 
 
 def _binned(variables: Sequence[Over], comparison: BaselineComparison, sensor: Sensor,
@@ -303,17 +280,6 @@ def _spectra(comparison: BaselineComparison, signal_v: np.ndarray, label: str) -
             for d, axis in enumerate(comparison.sensor.axes)]
 
 
-def _histograms(comparison: BaselineComparison, signals_v: dict[str, np.ndarray]) -> list[Curve]:
-    """Return histograms of the changes from one sample to the next, recorded and simulated."""
-    steps = {label: np.diff(mg(v / comparison.scale_v_per_mps2), axis=0)
-             for label, v in signals_v.items()}
-    reach = np.nanquantile(np.abs(steps['recorded']), _HISTOGRAM_QUANTILE, axis=0)
-    edges = [np.linspace(-r, r, _HISTOGRAM_BINS + 1) for r in reach]
-    return [Curve(axis, label, (edges[d][1:] + edges[d][:-1]) / 2,
-                  np.histogram(values[:, d], edges[d])[0])
-            for d, axis in enumerate(comparison.sensor.axes) for label, values in steps.items()]
-
-
 def waterfall(report: Report) -> Figure:
     """Draw the gap, what each effect takes off it, what stays, and the noise floor."""
     closure = report.closure
@@ -355,7 +321,7 @@ def _stacked(panels: Sequence[tuple[dict[str, Any], Sequence[Figure]]], height: 
                   xaxis={'anchor': plots.axis_number('y', count), **xaxis}, **layout)
 
 
-def _panels(curves: Sequence[Curve], title: str, unit: str, is_log: bool) -> Figure:
+def _panels(curves: Sequence[Curve], title: str, unit: str) -> Figure:
     """Draw curves in one panel for each axis."""
     panels = []
     for axis in dict.fromkeys(curve.axis for curve in curves):
@@ -365,7 +331,7 @@ def _panels(curves: Sequence[Curve], title: str, unit: str, is_log: bool) -> Fig
                        [line(c.x[c.y > 0], c.y[c.y > 0], c.label, _CURVE_COLOURS[c.label])
                         for c in own]))
     return _stacked(panels, 60 + 190 * len(panels), _WIDE, {
-        'title': {'text': title}, **(plots.log_axis(curves[0].x) if is_log else {})})
+        'title': {'text': title}, **plots.log_axis(curves[0].x)})
 
 
 def signals(comparison: BaselineComparison, after: Sensor) -> Figure:
@@ -401,32 +367,4 @@ def gap_spectrum(comparison: BaselineComparison, after: Sensor) -> Figure:
                 / comparison.scale_v_per_mps2)
     curves += [Curve(axis, 'stated noise', frequency_hz, stated[:, d])
                for d, axis in enumerate(comparison.sensor.axes)]
-    return _panels(curves, 'frequency, Hz', 'mg/√Hz', True)
-
-
-def map_figure(cells: Sequence[ResidualCell]) -> Figure:
-    """Draw the mean residual over ranges of all dimensions; significant cells have a dot."""
-    means = sorted(cells, key=lambda c: (c.dimension, c.axis, c.low))
-    labels, values, texts, marks = [], [], [], []
-    for name, axis in dict.fromkeys((c.dimension, c.axis) for c in means):
-        row = [c for c in means if (c.dimension, c.axis) == (name, axis)]
-        in_degrees = 'rad' in name
-        unit = name.rpartition('_')[2] if not in_degrees else '°/s' if 'rate' in name else '°'
-        factor = float(np.degrees(1.0)) if in_degrees else 1.0
-        labels.append(f'{name.split("_rad")[0].replace("_", " ")}: {axis}')
-        pad = [None] * (RANGES - len(row))
-        values.append([*rounded([mg(c.mean_mps2) for c in row]), *pad])
-        texts.append([f'{factor * c.low:.4g} to {factor * c.high:.4g} {unit}' for c in row] + pad)
-        marks += [(i, labels[-1]) for i, c in enumerate(row) if c.p < SIGNIFICANT_P]
-    largest = float(max((abs(mg(c.mean_mps2)) for c in means), default=1.0))
-    heat = {'type': 'heatmap', 'y': labels, 'x': list(range(RANGES)), 'z': values,
-            'text': texts, 'hovertemplate': '%{y}, %{text}<br>mean %{z:.3~g} mg<extra></extra>',
-            'colorscale': 'RdBu', 'zmin': -largest, 'zmax': largest, 'xgap': 2, 'ygap': 2,
-            'colorbar': {'title': {'text': 'mg'}, 'thickness': 12}}
-    dots = {'type': 'scatter', 'mode': 'markers', 'x': [i for i, _ in marks],
-            'y': [label for _, label in marks], 'hoverinfo': 'skip', 'showlegend': False,
-            'marker': {'color': _INK, 'size': 5}}
-    return figure([heat, dots], 80 + 22 * len(labels), xaxis={
-        'showticklabels': False, 'showgrid': False, 'zeroline': False,
-        'title': {'text': 'parts of the range, ascending'}},
-        yaxis={'type': 'category', 'showgrid': False, 'dtick': 1})
+    return _panels(curves, Over.FREQUENCY.value, 'mg/√Hz')

@@ -94,13 +94,14 @@ reference; gain over it that no sensor has; and power of the reference, divided 
 one, below which it has faded. Chosen."""
 
 
-@dataclass(frozen=True)
-class DataFault:
-    """A fault of the recording."""
+@dataclass(eq=False)
+class DataFault(Exception):
+    """A fault of the recording, with the recordings that were compared before."""
 
     name: str  # Name in the report: `verdict.data_fault`
-    status: str  # Status of the verdict: 'bad_data' or 'insufficient'
     message: str  # What is wrong and what to do, one line
+    status: str = 'bad_data'  # Status of the verdict: 'bad_data' or 'insufficient'
+    comparisons: tuple[BaselineComparison, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -137,11 +138,11 @@ class _Shift:
 
 
 def align_force(recording: Recording, sensor: Sensor, sim: Motion, may_shift: bool
-                ) -> tuple[Recording, Motion, list[str]] | DataFault:
+                ) -> tuple[Recording, Motion, list[str]]:
     """
     Find the part of a recording that another simulator covers, and check their time.
 
-    Return that part, the simulator, shifted where it was asked for, and notes.
+    Return that part, the simulator, shifted where it was asked for, and notes; raise DataFault.
     """
     force, notes = sim.force, []
     assert isinstance(force, ForcePath)
@@ -158,13 +159,13 @@ def align_force(recording: Recording, sensor: Sensor, sim: Motion, may_shift: bo
     if not covered.any():
         advice = f'its motion fits, but is {shift.text}; use --align' if shift is not None else \
             'no shift makes its motion fit; give the simulation of this recording'
-        return DataFault('no_overlap', 'bad_data', '--sim does not overlap the recording in '
-                         f'time: {basename(recording.path)} is from {recording.time_s[0]:.6g} '
-                         f'to {recording.time_s[-1]:.6g} s, --sim from {begin_s:.6g} to '
-                         f'{end_s:.6g} s; {advice}')
+        raise DataFault('no_overlap', '--sim does not overlap the recording in '
+                        f'time: {basename(recording.path)} is from {recording.time_s[0]:.6g} '
+                        f'to {recording.time_s[-1]:.6g} s, --sim from {begin_s:.6g} to '
+                        f'{end_s:.6g} s; {advice}')
     if shift is not None and not may_shift:
-        return DataFault('time_misaligned', 'bad_data', f'--sim is {shift.text}; use --align, or '
-                         f'shift its stamps by {-shift.late_s:+.6g} s')
+        raise DataFault('time_misaligned', f'--sim is {shift.text}; use --align, or shift its '
+                        f'stamps by {-shift.late_s:+.6g} s')
     if not covered.all():
         outside_s = (1 - covered.mean()) * float(np.ptp(recording.time_s))
         notes.append(f'left out: {outside_s:.3g} s of the recording that --sim does not cover '

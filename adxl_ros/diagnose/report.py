@@ -29,6 +29,7 @@ from adxl_ros.report.quantities import (
     percent,
     power_text,
 )
+from adxl_ros.report.screen import COLUMNS, wrapped
 import numpy as np
 
 _DIGITS = 6
@@ -95,9 +96,10 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
                    'mean': _rounded(c.mean_mps2), 'share': _rounded(c.share), 'p': _rounded(c.p)}
                   for c in report.residual_cells if c.p < SIGNIFICANT_P][:_MOST_CELLS],
         'not_covered': list(report.not_covered), 'notes': notes(diagnosis),
-        'could_show': [{'effect': r.effect, 'parameter': r.parameter, 'axis': r.axis or None,
-                        'unit': r.unit, 'smallest': _rounded(r.smallest), 'could_show': r.shows}
-                       for r in report.could_show],
+        'could_show': [
+            {'effect': r.effect, 'parameter': r.name.parameter, 'axis': r.name.axis or None,
+             'unit': parameter_of(r.name).unit, 'smallest': _rounded(r.smallest),
+             'could_show': r.shows} for r in report.could_show],
         'candidates': _candidates(report),
         'noise_remainders': [
             {'effect': r.effect, 'quantity': r.quantity, 'unit': r.unit,
@@ -107,8 +109,8 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
              'left': _rounded(r.remains[r.largest])} for r in report.noise_remainders],
         'next_experiment': proposal and {
             'manoeuvre': proposal.manoeuvre, 'why': proposal.why, 'command': proposal.command,
-            'menu': [{'manoeuvre': w.text, 'minutes': _rounded(w.minutes),
-                      'nats_per_minute': _rounded(w.nats_per_minute)} for w in proposal.menu]},
+            'menu': [{'manoeuvre': w.manoeuvre.name, 'minutes': _rounded(w.manoeuvre.minutes),
+                      'nats_per_minute': _rounded(w.per_minute)} for w in proposal.menu]},
         'summary': summary(diagnosis)}
 
 
@@ -210,16 +212,16 @@ def _parameters(report: Report, hypothesis: Hypothesis | None, effect: str) -> d
         return {_key(name): {'value': _rounded(float(get(sensor, [name])[0])),
                              'unit': parameter_of(name).unit} for name in names}
     parameters: dict[str, dict[str, Any]] = {}
-    for name in names if hypothesis else ():
-        if name in hypothesis.names:  # type: ignore[union-attr]
-            assert hypothesis is not None
-            place = hypothesis.names.index(name)
-            value, half = float(get(hypothesis.sensor, [name])[0]), Z_90 * hypothesis.std[place]
-            known = not hypothesis.undetermined[place]
-            parameters[_key(name)] = {
-                'value': _rounded(value) if known else None,
-                'ci': _rounded((value - half, value + half)) if known else None,
-                'unit': parameter_of(name).unit, 'determined': known}
+    for name in names:
+        if hypothesis is None or name not in hypothesis.names:
+            continue
+        place = hypothesis.names.index(name)
+        value, half = float(get(hypothesis.sensor, [name])[0]), Z_90 * hypothesis.std[place]
+        known = not hypothesis.undetermined[place]
+        parameters[_key(name)] = {
+            'value': _rounded(value) if known else None,
+            'ci': _rounded((value - half, value + half)) if known else None,
+            'unit': parameter_of(name).unit, 'determined': known}
     return parameters
 
 
@@ -272,13 +274,13 @@ def headline(diagnosis: Diagnosis) -> str:
 
 def concern(verdict: Verdict) -> str | None:
     """Return what a verdict is about, joined by 'and', within a group by 'or'; None for none."""
-    parts = {_concerns(group) for group in (*((e,) for e in verdict.effects), *verdict.groups)}
-    return ' and '.join(sorted(parts)) or None
+    return ' and '.join(sorted(_concerns(verdict))) or None
 
 
-def _concerns(effects: Sequence[str]) -> str:
-    """Return what one of some effects is an error of."""
-    return ' or '.join(sorted({effect_named(e).concern.value for e in effects}))
+def _concerns(verdict: Verdict) -> set[str]:
+    """Return what each certain effect, and one of each group, is an error of."""
+    groups = (*((e,) for e in verdict.effects), *verdict.groups)
+    return {' or '.join(sorted({effect_named(e).concern.value for e in g})) for g in groups}
 
 
 def _of_reference(verdict: Verdict) -> str:
@@ -287,7 +289,7 @@ def _of_reference(verdict: Verdict) -> str:
     if concern(verdict) == reference:
         return f' This is an error of the {reference}, not of the sensor.'
     certain = [e for e in verdict.effects if effect_named(e).concern is Concern.REFERENCE]
-    undecided = [_concerns(group) for group in verdict.groups if reference in _concerns(group)]
+    undecided = [c for c in _concerns(verdict) if ' or ' in c and reference in c]
     sentences = [f' {listed(certain, "and")} is of the {reference}.'] if certain else []
     return ''.join(sentences + [
         f' The error is of the {c.replace(" or ", " or of the ")}; both give the same samples.'
@@ -370,11 +372,11 @@ def closes(report: Report) -> bool:
 
 def shown_row(row: CouldShow, scale_v_per_g: float) -> list[str]:
     """Return effect, parameter, smallest and typical size, and the manoeuvre that shows it."""
-    smallest, typical = (parameter_text({'value': v, 'unit': row.unit}, scale_v_per_g, 2)
-                         for v in (row.smallest, row.typical))
-    return [row.effect, parameter_label(row.parameter, False),
-            smallest if row.shows else 'cannot show', typical,
-            MENU[row.revealed_by].text if row.revealed_by else '']
+    p, revealed_by = parameter_of(row.name), effect_named(row.effect).diagnosis.revealed_by
+    smallest, typical = (parameter_text({'value': v, 'unit': p.unit}, scale_v_per_g, 2)
+                         for v in (row.smallest, p.scale))
+    return [row.effect, parameter_label(p.name, False), smallest if row.shows else 'cannot show',
+            typical, MENU[revealed_by].text if revealed_by else '']
 
 
 def shows_row(row: CouldShow, scale_v_per_g: float) -> tuple[str, str, str, str]:
@@ -385,8 +387,6 @@ def shows_row(row: CouldShow, scale_v_per_g: float) -> tuple[str, str, str, str]
         'needs --sim' if of_reference else f'needs: {manoeuvre}'
 
 
-COLUMNS = 79
-"""Columns of text. Chosen: a terminal of 80 columns."""
 _BADGE_COLUMNS, _GAP_COLUMNS, _LABEL_COLUMNS = 29, 24, 9
 """Columns of the verdict, of the gap before and after, and of the words before rows of text."""
 _SURE_COLUMNS, _SHARE_COLUMNS = 8, 7
@@ -397,10 +397,10 @@ _MOST_SHOWN, _MOST_HIDDEN, _MOST_OTHERS = 4, 4, 3
 
 def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
     """Return the diagnosis as lines of at most `COLUMNS` columns; the first one is the subject."""
-    lines, word, report = [*_wrapped(subject), ''], badge(diagnosis), diagnosis.report
+    lines, word, report = [*wrapped(subject), ''], badge(diagnosis), diagnosis.report
     note_lines = [line for note in notes(diagnosis) for line in _row_lines('note', note)]
     if report is None:
-        return lines + _wrapped(f'{word}  {headline(diagnosis)}', len(word) + 2) + note_lines
+        return lines + wrapped(f'{word}  {headline(diagnosis)}', len(word) + 2) + note_lines
     objects, rows = as_json(diagnosis), figure_rows(diagnosis)
     closure, first = report.closure, {row.label: row.note for row in rows}
     # The gap, with the effects, and the floor stand in the first line.
@@ -414,9 +414,9 @@ def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
               for remark in (*remarks, f'noise floor {first["noise floor"]}')
               for line in wrap(remark, COLUMNS - _BADGE_COLUMNS)]
     if report.verdict.status != 'explained' or 'REFERENCE' in word:
-        lines += _wrapped(headline(diagnosis))
+        lines += wrapped(headline(diagnosis))
     elif is_only_noise(report):
-        lines += _wrapped(NOISE_STAYS)
+        lines += wrapped(NOISE_STAYS)
     lines += [*_effect_table(report, objects), '', *_row_lines('figures', '; '.join(
         f'{row.label} {row.text}' for row in rows[3 if closes(report) else 2:]))]
     lines += [line for i, row in enumerate(remainder_rows(report))
@@ -503,10 +503,4 @@ def axis_scale(report: Report, key: str) -> float:
 
 def _row_lines(label: str, text: str, indent: int = _LABEL_COLUMNS) -> list[str]:
     """Return a text behind its label, wrapped between words."""
-    return _wrapped(text, indent, f' {label:{min(indent, _LABEL_COLUMNS) - 1}}')
-
-
-def _wrapped(text: str, indent: int = 0, start: str = '') -> list[str]:
-    """Wrap a text between words; further lines have an indent."""
-    return list(wrap(text, COLUMNS, initial_indent=start, subsequent_indent=indent * ' ',
-                     break_long_words=False, break_on_hyphens=False))
+    return wrapped(f' {label:{min(indent, _LABEL_COLUMNS) - 1}}{text}', indent)

@@ -60,8 +60,6 @@ _HOPELESS_SHARE, _SMALLEST_DEFICIT = 0.2, 100.0
 refined or extended. Its form would have to be wrong by as much of the gap."""
 _LARGEST_GAIN_RATIO = 5.0
 """What a fit in full may gain, divided by what the linear model promises."""
-_PRESENT_FORM_ERROR = 0.3
-"""Share of the present effects by which their form may differ where further ones are ranked."""
 _NEAR_START = 1.4
 """Largest ratio of the start of a size to the one at which the effect was simulated: the starts
 differ by factors of two."""
@@ -99,12 +97,6 @@ class ChannelColumns(NamedTuple):
     # Products of the same divided by the scale factor and the root of the number of axes, by
     # block, (m/s²)², (blocks, k + 1, k + 1)
     plain: np.ndarray
-
-    def of_effect(self, names: Sequence[Coefficient], effect: str) -> tuple[np.ndarray, list[int]]:
-        """Return the sensitivities to the coefficients of an effect, and their places."""
-        own = [i for i, k in enumerate(self.places)
-               if k < len(names) and names[k].effect == effect]
-        return self.values[:, 1:][:, own], [int(self.places[i]) for i in own]
 
 
 @dataclass(frozen=True)
@@ -458,7 +450,7 @@ def _model_about(model: LinearModel, best: Hypothesis) -> LinearModel:
     Return the linear model about a set: residuals and sensitivities at its fit.
 
     Filter and latency stay those of the parameter file, unless they are effects of the set, so
-    that their tolerance is the same as before. What the form of the effects may lack is free.
+    that their tolerance is the same as before.
     """
     file_values, values = with_neutral(model.baseline, best.sensor.effects).values, {}
     for effect, fitted in best.sensor.values.items():
@@ -468,20 +460,7 @@ def _model_about(model: LinearModel, best: Hypothesis) -> LinearModel:
     comparisons = [replace(c, sensor=replace(best.sensor, values=values,
                                              rate_hz=c.sensor.rate_hz))
                    for c in model.comparisons]
-    flexible = []
-    for number, columns in enumerate(best.linearised.columns):
-        recording, axis = model.place_of_channel(number)
-        basis = model.flexible_bases[recording][axis]
-        functions = [np.zeros((len(comparisons[recording]), 0))]
-        for effect in best.effects:
-            own, places = columns.of_effect(best.names, effect)
-            size_v = _PRESENT_FORM_ERROR * float(np.std(own @ best.values[places]))
-            functions += [size_v * basis[d] for d in effect_named(effect).diagnosis.form
-                          if d in basis]
-        flexible.append(evidence.FlexibleColumns(
-            np.concatenate(functions, axis=1), float(best.fit.innovation_variance_v2[number])))
-    return linear.build_linear_model(comparisons, filters=[[w] for w in best.whiteners],
-                                     flexible=flexible)
+    return linear.build_linear_model(comparisons, filters=[[w] for w in best.whiteners])
 
 
 def _stepped(variant: Variant) -> dict[Coefficient, float]:

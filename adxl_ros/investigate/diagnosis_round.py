@@ -12,6 +12,7 @@ from typing import Any
 from adxl_ros.diagnose.diagnosis import diagnose, Diagnosis
 from adxl_ros.diagnose.linear_model import candidates
 from adxl_ros.diagnose.next_experiment import (
+    Experiment,
     leading,
     ManoeuvreWorth,
     predict,
@@ -151,7 +152,8 @@ def rank(assessment: Assessment, sensor: Sensor, manoeuvres: Sequence[PlannedMan
     considered = {e for h in leading(assessment.hypotheses) for e in h.effects}
     needed = sorted(considered | (set(library()) - seen))
     dimensions = unknown_dimensions(report.verdict if report else None)
-    responses = [predict(m, sensor, needed, dimensions) for m in manoeuvres]
+    responses = [predict(Experiment(m.name, m.begin_s, m.motion), sensor, needed, dimensions)
+                 for m in manoeuvres]
     excited = {effect for response in responses for effect in response.effects}
     complete = _with_unseen(assessment, excited - seen, len(excited | seen))
     worth = rank_responses(responses, complete.hypotheses, model, dimensions)

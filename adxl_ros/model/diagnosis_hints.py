@@ -118,7 +118,7 @@ class ProofVariable(Enum):
     FREQUENCY = 'frequency, Hz'
     """The plot shows spectra."""
     STEP = 'change from one sample to the next, mg'
-    """The plot shows histograms."""
+    """No plot: the report compares counts and sizes, recorded and simulated."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from functools import cache
 import json
 
 from adxl_ros.diagnose.diagnosis import diagnose
-from adxl_ros.diagnose.next_experiment import propose_next_experiment, RecordedEvidence
+from adxl_ros.diagnose.next_experiment import propose_next_experiment
 from adxl_ros.diagnose.report import as_json
 from adxl_ros.diagnose.verdict import WeightedHypothesis
 from adxl_ros.errors import UserError
@@ -225,8 +225,8 @@ def test_next_experiment_separates_most():
     verdict = replace(
         verdict, status='inseparable', groups=(rivals,),
         hypotheses=tuple(WeightedHypothesis((effect,), 0.5) for effect in rivals))
-    proposal = propose_next_experiment(verdict, [], RecordedEvidence(sensor, None, 0))
-    worth = {m.text: m.nats_per_minute for m in proposal.menu}
+    proposal = propose_next_experiment(verdict, [], sensor, None, 0)
+    worth = {m.manoeuvre.name: m.per_minute for m in proposal.menu}
     assert max(worth.values()) == worth[proposal.manoeuvre] > 0
     assert worth['shake along x from 2 to 40 Hz'] < 0.1 * worth['dwell, heat and cool']
 
