@@ -286,7 +286,7 @@ def _run_recording(folder: Path, path: Path, length_s: float) -> None:
         poses = _show_replay(graph, output, path)
     fitted = parameter_file.load(output)
     nominal = replace(fitted.without_covariance(), effects=(), values={})
-    _print('', *gravity_lines(
+    _print('', *acceptance.gravity_lines(
         gravity_fit.fit_gravity(poses.volts, poses.std_v, nominal)), '',
            *file_lines({'Page': report / 'report.html', 'Calibration': output}))
 
