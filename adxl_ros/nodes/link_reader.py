@@ -23,7 +23,6 @@ from adxl_ros.nodes import topics
 from adxl_ros.nodes.sample_output import References, SampleOutput
 from rclpy.clock import ROSClock
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import Imu, JointState, Temperature
 
 _SIMULATOR_QUEUE = 1000
@@ -110,8 +109,8 @@ makes up its samples, and the queue of imu/data_raw holds them at 1 kHz."""
 _DISCOVERY_NS = 300_000_000
 """Time after which a new subscriber is sure to receive, ns; chosen."""
 _CLOCK_SEARCH_NS = 1_000_000_000
-"""Time between two searches for another clock, and before the first sample, ns; chosen: nodes find
-each other within it."""
+"""Time before the first sample in which another clock is found, ns; chosen: nodes find each other
+within it."""
 _QUEUE = 5000
 """Messages of the stage that are kept between two reads."""
 _LOG_INTERVAL_S = 1.0
@@ -128,10 +127,10 @@ class LinkReader:
         ros = node.get_clock()
         assert isinstance(ros, ROSClock), 'the clock of a node is that of ROS'
         self._ros = ros
-        self._clock_is_searched = self._is_real_time = False
+        self._is_real_time = False
         self._now_ns: int | None = None
         self._subscribed_ns = 0
-        self._ticked_ns = self._searched_ns = time.monotonic_ns()
+        self._ticked_ns = self._opened_ns = time.monotonic_ns()
         self._due_s = time.monotonic()
         self._newest_ns: int | None = None
         self._stage: topics.Inbox | None = None
@@ -227,9 +226,8 @@ class LinkReader:
         """Publish the samples that are due."""
         steady_ns = time.monotonic_ns()
         step_ns, self._ticked_ns = steady_ns - self._ticked_ns, steady_ns
-        is_searched = self._search_clock(steady_ns)
         if self._now_ns is None:
-            if not is_searched or not self._may_begin(step_ns):
+            if not self._may_begin(step_ns):
                 return
             self._now_ns = self._begin()
         samples = self._link.read(self._due_ns(self._now_ns, step_ns))
@@ -240,21 +238,12 @@ class LinkReader:
         if samples.missing:
             self._on_level(Level.WARN)
 
-    def _search_clock(self, steady_ns: int) -> bool:
-        """Follow the clock of another node; return whether the first search is over."""
-        if self._output.is_clock and steady_ns - self._searched_ns >= _CLOCK_SEARCH_NS:
-            self._searched_ns = steady_ns
-            name = self._output.follow_other_clock()
-            self._clock_is_searched = True
-            if name:
-                self._node.set_parameters([Parameter('use_sim_time', value=True)])
-                self._node.get_logger().warning(
-                    f'/clock comes from {name}: this driver follows it, and link.speed is that '
-                    'of this clock')
-        return self._clock_is_searched or not self._output.is_clock
-
     def _may_begin(self, step_ns: int) -> bool:
         """Return whether the link may begin: time runs, and some links wait for a subscriber."""
+        if self._output.is_clock and self._output.clock is None:
+            if self._ticked_ns - self._opened_ns < _CLOCK_SEARCH_NS:
+                return False
+            self._output.begin_clock()
         if not self._output.is_clock and not self._ros.now().nanoseconds:
             return False
         self._subscribed_ns = self._subscribed_ns + step_ns if self._output.subscribed() else 0
