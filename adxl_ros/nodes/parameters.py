@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import field, fields
 from difflib import get_close_matches
 from itertools import pairwise
-from pathlib import Path
 import re
 import sys
 from typing import Any, NamedTuple, TypeVar
@@ -165,7 +164,7 @@ def _place_of(key: str) -> str:
     Return the place of a parameter in the files: 'file:line:column: ', or ''.
 
     The last argument that gives a parameter counts. A parameter that none gives belongs to the
-    last file of a sensor, which has a format.
+    last file of a sensor, which has a format, or to the last file.
     """
     for flag, value in reversed(list(pairwise(sys.argv))):
         # A rule is [NODE:]NAME:=VALUE.
@@ -174,16 +173,10 @@ def _place_of(key: str) -> str:
         marks = [found.start_mark for _, name, found in _entries(value) if name == key] \
             if flag == _FILE_FLAG else []
         if marks:
-            return 'parameters of the launch file: ' if _is_of_launch(value) else \
-                f'{value}:{marks[0].line + 1}:{marks[0].column + 1}: '
-    files = [path for path in reversed(_paths()) if not _is_of_launch(path)]
-    of_sensor = [path for path in files if any(name == 'format' for _, name, _ in _entries(path))]
-    return ''.join(f'{path}: ' for path in [*of_sensor, *files][:1])
-
-
-def _is_of_launch(path: str) -> bool:
-    """Return whether launch_ros wrote a file for the parameters of a launch file."""
-    return Path(path).name.startswith('launch_params_')
+            return f'{value}:{marks[0].line + 1}:{marks[0].column + 1}: '
+    files = sorted(_paths(), key=lambda path: any(
+        name == 'format' for _, name, _ in _entries(path)))
+    return f'{files[-1]}: ' if files else ''
 
 
 def _paths() -> list[str]:

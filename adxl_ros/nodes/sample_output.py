@@ -23,7 +23,6 @@ import numpy as np
 from rclpy.clock import Clock as StampClock
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
 
@@ -177,6 +176,8 @@ class References:
         return message
 
 
+_UNKNOWN_NODE = '_NODE_NAME_UNKNOWN_'
+"""Name that the middleware gives a node that it has not discovered yet (rmw_dds_common)."""
 _QUEUE = 5000
 """Samples that are kept for a slow subscriber: 5 s at 1 kHz."""
 
@@ -216,21 +217,24 @@ class SampleOutput:
         self._data = topics.create_publisher(node, Imu, 'imu/data_raw', _QUEUE)
         self._info = topics.create_publisher(node, DiagnosticStatus, 'sensor_info', 1,
                                              latched=True)
-        self.clock: Publisher | None = None  # Made by `begin_clock`
+        self._clock = topics.create_publisher(node, Clock, '/clock', 1) if is_clock else None
 
     def destroy(self) -> None:
         """Remove the topics."""
-        for publisher in filter(None, (self._data, self._info, self.clock)):
+        for publisher in filter(None, (self._data, self._info, self._clock)):
             self._node.destroy_publisher(publisher)
 
-    def begin_clock(self) -> None:
-        """Be the clock of the graph, or follow the node that is; a killed self does not count."""
-        topic, own = '/clock', (self._node.get_namespace(), self._node.get_name())
-        self.is_clock = all((info.node_namespace, info.node_name) == own for info in
-                            self._node.get_publishers_info_by_topic(topic))
-        if self.is_clock:
-            self.clock = topics.create_publisher(self._node, Clock, topic, 1)
+    def follow_other_clock(self) -> None:
+        """Stop being the clock if another node is; of drivers, the one that sorts first stays."""
+        own = self._node.get_namespace(), self._node.get_name()
+        clocks = [(info.node_namespace, info.node_name) for info in
+                  self._node.get_publishers_info_by_topic('/clock')
+                  if info.node_name != _UNKNOWN_NODE]
+        if self._clock is None or not any(
+                name != own and (name[1] != own[1] or name < own) for name in clocks):
             return
+        self._node.destroy_publisher(self._clock)
+        self._clock, self.is_clock = None, False
         self._node.set_parameters([Parameter('use_sim_time', value=True)])
         self._node.get_logger().warning('another node publishes /clock: this driver follows it, '
                                         'and link.speed is that of this clock')
@@ -268,5 +272,5 @@ class SampleOutput:
             finite.stamp_ns, missing=finite.missing, estimated=finite.estimated,
             saturated=int(self.sensor.saturated(finite.volts).any(axis=1).sum()))
         self.tally.now_ns = samples.until_ns
-        if self.clock is not None:
-            self.clock.publish(Clock(clock=topics.stamp(samples.until_ns)))
+        if self._clock is not None:
+            self._clock.publish(Clock(clock=topics.stamp(samples.until_ns)))
