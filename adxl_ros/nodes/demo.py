@@ -259,15 +259,15 @@ def _show_sweep(graph: DemoGraph, output: Path) -> Poses:
     """Show the sweep, the fit and the check while they run; return the poses."""
     total = len(pose_plan.guided(np.radians(_PLANES_DEG).tolist(), float(np.radians(_STEP_DEG)),
                                  _CHECK_POSES))
-    with jobs.step('1/3 sweep', 'starting', total) as step:
+    with jobs.Step('1/3 sweep', 'starting', total) as step:
         def accepted() -> int:
             return _show_accepted(step, output, f' of {total} poses')
         graph.wait(lambda: accepted() == total, accepted, _SILENT_S)
     fitting = f'{total - _CHECK_POSES} poses'
-    with jobs.step('2/3 fit', fitting) as step:
+    with jobs.Step('2/3 fit', fitting) as step:
         graph.wait(output.exists)
         step.show(f'{fitting}, {parameter_file.load(output).model} model')
-    with jobs.step('3/3 check', f'{_CHECK_POSES} poses that the fit has not seen'):
+    with jobs.Step('3/3 check', f'{_CHECK_POSES} poses that the fit has not seen'):
         graph.wait(lambda: bool(_fitted_poses(output)))
         graph.close()
     return Poses.from_records(_fitted_poses(output))
@@ -293,10 +293,10 @@ def _run_recording(folder: Path, path: Path, length_s: float) -> None:
 
 def _show_replay(graph: DemoGraph, output: Path, path: Path) -> Poses:
     """Show the replay of a recording and the fit while they run; return the rests."""
-    with jobs.step('1/2 replay', 'starting') as step:
+    with jobs.Step('1/2 replay', 'starting') as step:
         graph.wait(lambda: graph.reports.get('driver', {}).get('link_state') == 'ended',
                    lambda: _show_accepted(step, output, ' rests'), _SILENT_S)
-    with jobs.step('2/2 fit', f'{len(_accepted_poses(output))} rests') as step:
+    with jobs.Step('2/2 fit', f'{len(_accepted_poses(output))} rests') as step:
         answer = graph.finish()
         if not output.exists():
             raise UserError(f'{path}: {answer}')

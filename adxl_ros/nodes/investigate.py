@@ -12,8 +12,14 @@ import signal
 from textwrap import wrap
 
 from adxl_ros.files.bag_writer import LiveBag
-from adxl_ros.investigate.background import BackgroundDiagnoser, OutputFolder
-from adxl_ros.investigate.diagnosis_round import Answer, hypothesis_text, listed, Outcome
+from adxl_ros.investigate.diagnosis_round import (
+    Answer,
+    BackgroundDiagnoser,
+    hypothesis_text,
+    listed,
+    Outcome,
+    OutputFolder,
+)
 from adxl_ros.investigate.investigation import Investigation, State, Status as Situation
 from adxl_ros.investigate.manoeuvres import description, Pose, StageLimits
 from adxl_ros.links.support.base import Watchdog

@@ -11,14 +11,7 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
-from adxl_ros.links.support.base import (
-    ImuLink,
-    Level,
-    Link,
-    LinkStatus,
-    StageLink,
-    Watchdog,
-)
+from adxl_ros.links.support.base import ImuLink, Level, Link, LinkStatus, StageLink
 from adxl_ros.nodes import topics
 from adxl_ros.nodes.sample_output import References, SampleOutput
 from rclpy.clock import ROSClock
@@ -33,16 +26,8 @@ _FIELDS = {'orientation': 4, 'orientation_covariance': 9, 'angular_velocity': 3,
 _PAUSE_S = 0.004
 """Time between two looks at the samples, s. At 1 kHz four of them then share a run of the chain,
 which costs as much as ten samples."""
-_FOREIGN_NS = 60_000_000_000
-"""Largest distance of stamps from the clock of the node, ns; chosen: a larger one is another
-clock."""
-_CLOCK_WAIT_S = 5.0
-"""Time for which samples may be of another clock before a warning, s; chosen: within it nodes find
-each other, and a reset of the simulator reaches samples and /clock."""
 _COUNT_S = 1.0
 """Time after which the publishers of the samples are counted again, s; chosen."""
-_LONGEST_TURN_S = 0.25
-"""Longest time that counts from one look at the samples to the next, s."""
 
 
 class SimulatorInput:
@@ -51,8 +36,6 @@ class SimulatorInput:
     def __init__(self, node: Node, link: ImuLink) -> None:
         self._node, self._link = node, link
         self.frame_id = ''  # Frame of the newest samples
-        self._foreign = Watchdog(_LONGEST_TURN_S)
-        self._is_warned = False
         self._due_s = self._counted_s = time.monotonic()
         self._inbox = topics.Inbox(node, Imu, link.imu_topic, _SIMULATOR_QUEUE)
         self._temperature = topics.create_subscription(
@@ -77,19 +60,7 @@ class SimulatorInput:
         if raws:
             stamps_ns, fields = topics.decoded(raws, cdr.imu, **_FIELDS)
             self.frame_id = cdr.imu(raws[-1]).texts['frame_id']
-            self._warn_of_clock(int(stamps_ns[-1]))
             self._link.sense_imu(stamps_ns, fields)
-
-    def _warn_of_clock(self, stamp_ns: int) -> None:
-        """Warn once of samples that belong to another clock than the node's and go on to."""
-        away_ns = self._node.get_clock().now().nanoseconds - stamp_ns
-        if abs(away_ns) <= _FOREIGN_NS:
-            self._foreign.feed()
-        if self._foreign.check() > _CLOCK_WAIT_S and not self._is_warned:
-            self._is_warned = True
-            self._node.get_logger().warning(
-                f'{self._link.imu_topic}: stamps are {away_ns * 1e-9:+.0f} s from the clock of '
-                'this node; set use_sim_time:=true, and let the simulator publish /clock')
 
 
 _PERIOD_S = 0.004

@@ -13,9 +13,9 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.files.recording_columns import check_unit, unit_of
 from adxl_ros.files.stream_info import NO_UNIT, StreamInfo
-from adxl_ros.monitor import records
+from adxl_ros.monitor import changes
+from adxl_ros.monitor.changes import DiagnosisResult, DiagnosisRun, iso_time
 from adxl_ros.monitor.live_gap import AxisGap, GapSettings, LiveGap
-from adxl_ros.monitor.records import DiagnosisResult, DiagnosisRun, iso_time
 from adxl_ros.monitor.reference_stream import ReferenceKind, ReferenceStream
 from adxl_ros.nodes import topics
 from adxl_ros.nodes.parameters import declare_all, declare_sensor, make_sensor
@@ -251,18 +251,17 @@ class Monitor(Node):
 
     def _advance(self) -> None:
         """Compare, and put changes on disk before they are published."""
-        changes = self._live.advance()
-        for change in changes:
+        found = self._live.advance()
+        for change in found:
             self.get_logger().warning(
-                f'changed since {records.iso_time(change.since_ns)}: {change.text()}')
+                f'changed since {iso_time(change.since_ns)}: {change.text()}')
             try:
-                self._output.mkdir(parents=True, exist_ok=True)
-                records.append(self._output, change, self._live.sensor.serial)
-            except (UserError, OSError) as error:
-                self.get_logger().error(f'{self._output}: the change is not on disk: {error}')
-        if changes:
+                changes.append(self._output, change, self._live.sensor.serial)
+            except UserError as error:
+                self.get_logger().error(f'the change is not on disk: {error}')
+        if found:
             # The waiting time of a diagnosis does not start again with a further change.
-            self._changed_ns = self._changed_ns or min(change.since_ns for change in changes)
+            self._changed_ns = self._changed_ns or min(change.since_ns for change in found)
             self._diagnostics.notice(Level.WARN)
 
     def _diagnose_if_due(self) -> None:
