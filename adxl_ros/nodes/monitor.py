@@ -39,66 +39,56 @@ class GapState:
     def __init__(self, live: LiveGap, obstacle: str, likely: DiagnosisResult | None,
                  window_s: float) -> None:
         """Put together why nothing is compared, if so, the gap, and the newest diagnosis."""
-        self._live, self._obstacle = live, obstacle
-        self._axes = live.report()
+        gaps, serial = live.report(), live.sensor.serial
         newest_ns = max((change.since_ns for change in live.changes), default=0)
         event = sorted((change for change in live.changes
                         if newest_ns - change.since_ns < _TOGETHER_NS),
                        key=lambda change: change.since_ns)
-        is_fine = not obstacle and self._axes and not live.changes
-        self.level = Level.OK if is_fine and not any(gap.is_open for gap in self._axes) \
-            else Level.WARN
-        self.text = obstacle or 'comparing; the first result takes some seconds'
-        self.values: dict[str, object] = {'window_s': window_s, 'changes': len(live.changes)}
-        parts = []
-        if self._axes:
-            gaps, floors = (', '.join(
-                f'{gap.axis} {getattr(gap, name).value:.3g}' for gap in self._axes)
+        is_fine = gaps and not (obstacle or event or any(gap.is_open for gap in gaps))
+        text = 'comparing; the first result takes some seconds'
+        values: dict[str, object] = {'window_s': window_s, 'changes': len(live.changes)}
+        if gaps:
+            gap_mg, floor_mg = (', '.join(
+                f'{gap.axis} {getattr(gap, name).value:.3g}' for gap in gaps)
                 for name in ('gap', 'floor'))
-            parts.append(f'gap {gaps} mg, floor {floors} mg')
+            text = f'gap {gap_mg} mg, floor {floor_mg} mg'
         if event:
             latest = {(change.axis, change.quantity): change.text() for change in event}
             since = iso_time(event[0].since_ns)
-            parts.append(f'changed since {since}: {", ".join(latest.values())}')
-            self.values |= {'changed_since': since, 'changed_since_s': event[0].since_ns * 1e-9,
-                            'detected_s': event[0].detected_ns * 1e-9}
+            text += f'; changed since {since}: {", ".join(latest.values())}'
+            values |= {'changed_since': since, 'changed_since_s': event[0].since_ns * 1e-9,
+                       'detected_s': event[0].detected_ns * 1e-9}
         if likely is not None:
-            parts.append('likely ' * bool(likely.effects) + likely.text)
-            self.values |= {'likely_effect': ', '.join(likely.effects),
-                            'probability': likely.probability, 'report': likely.report}
-        if self._axes and not obstacle:
-            self.text = '; '.join(parts)
-
-    def axes(self) -> dict[str, Status]:
-        """Return the state of each axis; nothing where nothing is compared."""
-        return {} if self._obstacle else {gap.axis: Status(
-            Level.WARN if gap.is_open else Level.OK, _axis_text(gap), self._live.sensor.serial,
-            _axis_values(gap)) for gap in self._axes}
+            text += f'; {"likely " * bool(likely.effects)}{likely.text}'
+            values |= {'likely_effect': ', '.join(likely.effects),
+                       'probability': likely.probability, 'report': likely.report}
+        self.summary = Status(Level.OK if is_fine else Level.WARN, obstacle or text, serial,
+                              values)
+        # By axis; nothing where nothing is compared
+        self.axes = {} if obstacle else {gap.axis: _axis_status(gap, serial) for gap in gaps}
+        self._stamp = topics.stamp(live.newest_ns)
 
     def message(self) -> DiagnosticArray:
         """Return the message of the topic `gap`: the summary, then one status for each axis."""
-        summary = Status(self.level, self.text, self._live.sensor.serial, self.values)
-        parts = {'gap': summary} | {f'gap: {axis}': part for axis, part in self.axes().items()}
+        parts = {'gap': self.summary} | {
+            f'gap: {axis}': status for axis, status in self.axes.items()}
         array = DiagnosticArray(status=[topics.status_message(*part) for part in parts.items()])
-        array.header.stamp = topics.stamp(self._live.newest_ns)
+        array.header.stamp = self._stamp
         return array
 
 
-def _axis_values(gap: AxisGap) -> dict[str, object]:
-    """Return the values of an axis by key; `explained` is absent where nothing is to explain."""
+def _axis_status(gap: AxisGap, serial: str) -> Status:
+    """Return the gap of an axis; `explained` is absent where nothing is to explain."""
     values: dict[str, object] = {'offset_mg': gap.offset_mg, 'floor_source': gap.floor_source}
     for name, interval in (('gap', gap.gap), ('floor', gap.floor)):
         values |= {f'{name}_mg': interval.value, f'{name}_low_mg': interval.low,
                    f'{name}_high_mg': interval.high}
-    return values if gap.explained is None else values | {'explained': gap.explained}
-
-
-def _axis_text(gap: AxisGap) -> str:
-    """Return the gap of an axis in words."""
-    share = '' if gap.explained is None else \
-        f'; the parameters explain {100 * gap.explained:.0f} %'
-    return (f'gap {gap.gap.value:.3g} mg ({gap.gap.low:.3g} to {gap.gap.high:.3g}), floor '
-            f'{gap.floor.value:.3g} mg{share}')
+    text = (f'gap {gap.gap.value:.3g} mg ({gap.gap.low:.3g} to {gap.gap.high:.3g}), floor '
+            f'{gap.floor.value:.3g} mg')
+    if gap.explained is not None:
+        values['explained'] = gap.explained
+        text += f'; the parameters explain {100 * gap.explained:.0f} %'
+    return Status(Level.WARN if gap.is_open else Level.OK, text, serial, values)
 
 
 _INPUT_QUEUE = 10000
@@ -332,13 +322,13 @@ class Monitor(Node):
     def _status(self) -> Status:
         """Return the state for /diagnostics, with counts."""
         state = self._state()
-        values = state.values | {
-            f'{axis}_{key}': value for axis, status in state.axes().items()
-            for key, value in status.values.items()}
+        values = {**state.summary.values, **{
+            f'{axis}_{key}': value for axis, status in state.axes.items()
+            for key, value in status.values.items()}}
         values |= {**vars(self._live.counts), 'diagnosis_runs': self._run is not None,
                    'false_alarms_per_day': self._settings.false_alarms_per_day}
-        level = Level.ERROR if self._refusal or self._streams.fault() else state.level
-        return Status(level, state.text, self._live.sensor.serial, values)
+        level = Level.ERROR if self._refusal or self._streams.fault() else state.summary.level
+        return replace(state.summary, level=level, values=values)
 
 
 def main() -> int:

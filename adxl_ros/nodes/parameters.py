@@ -99,13 +99,14 @@ def declare(node: Node, spec: Spec) -> Any:
     descriptor = msg.ParameterDescriptor(
         description=spec.meaning, read_only=not spec.live, dynamic_typing=spec.default == (),
         additional_constraints=spec.limits)
-    # ROS has no range for lists.
-    if spec.lower is not None and spec.upper is not None and kind == Kind.DOUBLE:
-        descriptor.floating_point_range = [msg.FloatingPointRange(
-            from_value=float(spec.lower), to_value=float(spec.upper))]
-    elif spec.lower is not None and spec.upper is not None and kind == Kind.INTEGER:
-        descriptor.integer_range = [msg.IntegerRange(
-            from_value=int(spec.lower), to_value=int(spec.upper))]
+    if spec.lower is not None and spec.upper is not None:
+        # ROS has no range for lists.
+        if kind == Kind.DOUBLE:
+            descriptor.floating_point_range = [msg.FloatingPointRange(
+                from_value=float(spec.lower), to_value=float(spec.upper))]
+        elif kind == Kind.INTEGER:
+            descriptor.integer_range = [msg.IntegerRange(
+                from_value=int(spec.lower), to_value=int(spec.upper))]
     try:
         value = node.declare_parameter(
             name, '' if spec.default == () else spec.default, descriptor).value

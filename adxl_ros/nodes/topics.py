@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 import struct
 import threading
 import time
@@ -33,7 +34,7 @@ from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPo
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import serialize_message
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import Imu
+from sensor_msgs.msg import BatteryState, Imu, Temperature
 
 _OVERRIDING = QoSOverridingOptions((QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH,
                                     QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY))
@@ -79,6 +80,18 @@ def create_subscription(node: Node, kind: Any, topic: str, callback: Callable[[A
             kind, topic, take_all, qos, raw=raw, callback_group=group,
             qos_overriding_options=_OVERRIDING)
     return subscription
+
+
+def subscribe_surroundings(node: Node, depth: int, take: Callable[[str, int, float], object]
+                           ) -> None:
+    """Give temperature, °C, and supply, V, to a function, with topic and stamp, ns."""
+    def give(topic: str, field: str, message: Any) -> None:
+        stamp = message.header.stamp
+        take(topic, stamp.sec * 10 ** 9 + stamp.nanosec, getattr(message, field))
+
+    for topic, kind, field in (('temperature', Temperature, 'temperature'),
+                               ('supply', BatteryState, 'voltage')):
+        create_subscription(node, kind, topic, partial(give, topic, field), depth)
 
 
 class OnePublisher:
