@@ -16,11 +16,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol
 
 from adxl_ros.errors import UserError
-from adxl_ros.investigate.diagnosis_round import Answer, Outcome, Question
-from adxl_ros.investigate.manoeuvres import CommandStream, description, plan, Pose, StageLimits
+from adxl_ros.investigate.diagnosis_round import (
+    Answer,
+    BackgroundDiagnoser,
+    Outcome,
+    Question,
+)
+from adxl_ros.investigate.manoeuvres import CATALOGUE, CommandStream, plan, Pose, StageLimits
 import numpy as np
 
 _FIRST_REST_S = 1.0
@@ -45,19 +49,6 @@ class State(Enum):
     STOPPED = 'stopped'
 
 
-class Diagnoser(Protocol):
-    """A diagnosis in the background."""
-
-    def ask(self, question: Question) -> None:
-        """Begin to answer a question."""
-
-    def answer(self) -> Answer | None:
-        """Return the answer, or None while it is worked out."""
-
-    def cancel(self) -> None:
-        """End the work on an answer."""
-
-
 @dataclass(frozen=True)
 class Status:
     """What an investigation does."""
@@ -71,7 +62,7 @@ class Status:
 class Investigation:
     """The state machine."""
 
-    def __init__(self, limits: StageLimits, longest_minutes: float, diagnoser: Diagnoser,
+    def __init__(self, limits: StageLimits, longest_minutes: float, diagnoser: BackgroundDiagnoser,
                  show: Callable[[float, Answer], None] = lambda minutes, answer: None,
                  flush: Callable[[], None] = lambda: None) -> None:
         """Wait for sensor and stage."""
@@ -114,7 +105,7 @@ class Investigation:
         """Return what it does."""
         texts = {State.RECORDING: 'waiting for samples and stage',
                  State.DIAGNOSING: 'diagnosing the samples so far; the stage rests',
-                 State.MOVING: description(self._manoeuvre) if self._manoeuvre else '',
+                 State.MOVING: CATALOGUE[self._manoeuvre].text if self._manoeuvre else '',
                  State.FINISHED: 'finished', State.STOPPED: f'stopped: {self.reason}'}
         remaining_s = self._stream.remaining_s if self._stream else 0.0
         return Status(self.state, texts[self.state], self._minutes(), remaining_s)

@@ -339,18 +339,9 @@ def _diagnose(folder: Path, given: DiagnosisInput, tool: str) -> DiagnosisResult
 
 
 def result_of(report: dict, page: str) -> DiagnosisResult:
-    """Put a report of `diagnose` into words."""
+    """Return what a report of `diagnose` says."""
     verdict = report['verdict']
-    status, effects = verdict['status'], tuple(verdict['effects'])
+    effects = tuple(verdict['effects'])
     probability = float(verdict.get('probability') or 0.0)
-    names = ' and '.join(effects)
     likely = tuple(effect for group in verdict.get('groups') or [] for effect in group)
-    texts = {
-        'explained': f'{names} ({100 * probability:.0f} %)',
-        'partly': f'partly {names} ({100 * probability:.0f} %), and something else',
-        'no_gap': 'no gap: the parameters explain the samples',
-        'inseparable': f'one of {", ".join(likely)}: these samples cannot choose',
-        'unknown': 'a cause that is not in the library',
-        'insufficient': 'too little motion or time for a cause',
-        'bad_data': f'a fault of the data: {verdict.get("data_fault")}'}
-    return DiagnosisResult(True, texts.get(status, status), page, effects or likely, probability)
+    return DiagnosisResult(True, report['summary'], page, effects or likely, probability)

@@ -21,7 +21,7 @@ from adxl_ros.investigate.diagnosis_round import (
     OutputFolder,
 )
 from adxl_ros.investigate.investigation import Investigation, State, Status as Situation
-from adxl_ros.investigate.manoeuvres import description, Pose, StageLimits
+from adxl_ros.investigate.manoeuvres import CATALOGUE, Pose, StageLimits
 from adxl_ros.links.support.base import Watchdog
 from adxl_ros.nodes import topics
 from adxl_ros.nodes.jobs import LiveLine
@@ -29,6 +29,7 @@ from adxl_ros.nodes.parameters import declare_all, declare_sensor, low_and_high,
 from adxl_ros.nodes.run_node import command_lines, NodeHelp, run
 from adxl_ros.nodes.settings import check_given_parameters, InvestigateSettings
 from adxl_ros.nodes.topics import Level, Status
+from adxl_ros.report.units import percent
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.clock import Clock, ClockType
@@ -60,14 +61,14 @@ def answer_lines(minutes: float, answer: Answer) -> list[str]:
     """Return the probabilities after a diagnosis, and what follows."""
     named = [hypothesis for hypothesis in answer.hypotheses[:_MOST_NAMED]
              if hypothesis.probability >= _SMALLEST_SHOWN]
-    parts = [f'{hypothesis_text(h.effects)} {_percent(h.probability)}' for h in named]
+    parts = [f'{hypothesis_text(h.effects)} {percent(h.probability)}' for h in named]
     others = 1 - sum(hypothesis.probability for hypothesis in named)
     if others >= _SMALLEST_SHOWN / 2:
-        parts.append(f'others {_percent(others)}')
+        parts.append(f'others {percent(others)}')
     lines = wrap(f'{minutes:5.1f} min  {"  ".join(parts)}', _COLUMNS, subsequent_indent=_INDENT)
     if answer.outcome is Outcome.GO_ON:
-        lines += wrap(f'next: {description(answer.manoeuvre)}', _COLUMNS, initial_indent=_INDENT,
-                      subsequent_indent=_INDENT)
+        lines += wrap(f'next: {CATALOGUE[answer.manoeuvre].text}', _COLUMNS,
+                      initial_indent=_INDENT, subsequent_indent=_INDENT)
     return lines
 
 
@@ -99,12 +100,6 @@ def _next(arguments: str) -> list[str]:
     """Return a command for the terminal."""
     first, *others = command_lines(arguments, 13, 15)
     return [f' {"Next":12}{first[13:]}', *others]
-
-
-def _percent(probability: float) -> str:
-    """Return a probability in percent; 99 % stands for all below 1."""
-    percent = 100 * probability
-    return f'{min(percent, 99) if probability < 0.9995 else percent:.0f} %'
 
 
 _SAMPLES = 'imu/data_raw'

@@ -23,8 +23,8 @@ from adxl_ros.nodes.rclpy_internals import NotForExecutors, take_request
 from adxl_ros.nodes.run_node import NodeHelp, run
 from adxl_ros.nodes.settings import check_given_parameters, MonitorSettings
 from adxl_ros.nodes.topics import Inbox, Level, Status
+from adxl_ros.report.units import percent
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
 from std_srvs.srv import Trigger
@@ -59,7 +59,8 @@ class GapState:
             values |= {'changed_since': since, 'changed_since_s': event[0].since_ns * 1e-9,
                        'detected_s': event[0].detected_ns * 1e-9}
         if likely is not None:
-            text += f'; {"likely " * bool(likely.effects)}{likely.text}'
+            named = f'likely {" or ".join(likely.effects)} ({percent(likely.probability)})'
+            text += f'; {named if likely.effects else likely.text}'
             values |= {'likely_effect': ', '.join(likely.effects),
                        'probability': likely.probability, 'report': likely.report}
         self.summary = Status(Level.OK if is_fine else Level.WARN, obstacle or text, serial,
@@ -101,18 +102,14 @@ class MonitorStreams:
     def __init__(self, node: Node, kind: ReferenceKind, reference_topic: str) -> None:
         self._kind = kind
         reference = JointState if kind is ReferenceKind.STAGE else Imu
-        self._samples, self._reference, self._temperature, self._supply = (
+        self.samples, self._reference, self._temperature, self._supply = (
             Inbox(node, message, topic, _INPUT_QUEUE) for message, topic in (
                 (Imu, 'imu/data_raw'), (reference, reference_topic),
                 (Temperature, 'temperature'), (BatteryState, 'supply')))
 
-    def take_samples(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the samples that wait: stamps, ns, (n,), and acceleration, m/s², (n, 3)."""
-        return topics.imu_samples(self._samples.take())
-
     def fault(self) -> str:
         """Return that several nodes publish samples or reference, so that none count, or ''."""
-        return self._samples.fault() or self._reference.fault()
+        return self.samples.fault() or self._reference.fault()
 
     def take_others(self, reference: ReferenceStream) -> int:
         """Add reference and surroundings that wait; return how many messages of it came."""
@@ -226,7 +223,7 @@ class Monitor(Node):
     def _turn(self) -> None:
         """Take what has come, compare, and serve."""
         now_s = time.monotonic()
-        stamps_ns, accel_mps2 = self._streams.take_samples()
+        stamps_ns, accel_mps2 = topics.imu_samples(self._streams.samples.take())
         if len(stamps_ns):
             self._begun_s = self._begun_s or now_s
             self._sampled_s = now_s

@@ -55,7 +55,6 @@ class NodeHelp(NamedTuple):
     examples: Mapping[str, str]  # Arguments of each example, by its purpose
     settings: Sequence[type] = ()  # Dataclasses of its parameters
     has_sensor: bool = True  # Whether it has those of a sensor, too
-    variants: Mapping[str, type] = {}  # Dataclasses of further parameters, by what needs them
 
 
 def print_if_asked(arguments: Sequence[str], make_node: Callable[[], Node], node_help: NodeHelp
@@ -89,11 +88,8 @@ def _help_lines(name: str, make_node: Callable[[], Node], node_help: NodeHelp) -
              f'{"":{len(name) + 8}}--params-file FILE -r FROM:=TO ...]', '',
              *_wrapped(node_help.description or ''), '',
              'parameters: type, default, meaning', *_spec_lines(own)]
-    variants = {title: specs_of(part) for title, part in node_help.variants.items()}
-    if DriverSettings in node_help.settings:
-        variants |= {f'link.type:={link}': link_specs(link) for link in base.link_names()}
-    for title, specs in variants.items():
-        lines += ['', f'with {title}', *_spec_lines(specs)]
+    for link in base.link_names() if DriverSettings in node_help.settings else ():
+        lines += ['', f'with link.type:={link}', *_spec_lines(link_specs(link))]
     if node_help.has_sensor:
         of_file = nominal_specs()
         listed = [spec for spec in of_file if spec.name.startswith(_LISTED_OF_SENSOR)]

@@ -14,7 +14,7 @@ import signal
 import sys
 from textwrap import wrap
 import time
-from typing import TextIO, TYPE_CHECKING
+from typing import Any, TextIO
 
 from adxl_ros.calibrate.guided import screen_contents as screen
 from adxl_ros.calibrate.guided.screen_contents import ScreenContents
@@ -30,11 +30,6 @@ from rclpy.executors import Executor
 from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
-
-if TYPE_CHECKING:
-    from prompt_toolkit.application import Application
-    from prompt_toolkit.formatted_text import StyleAndTextTuples
-    from prompt_toolkit.key_binding import KeyPressEvent
 
 Line = list[tuple[str, str]]
 """A line of the screen: styles of prompt_toolkit, each with its text."""
@@ -162,8 +157,8 @@ _REFRESH_S = 0.2
 
 
 def full_screen(lines: Callable[[int, int], list[Line]], press: Callable[[str], None],
-                leave: Callable[[], None]) -> Application[None]:
-    """Make the application of a full screen."""
+                leave: Callable[[], None]) -> Any:
+    """Make the application of prompt_toolkit with a full screen."""
     try:
         from prompt_toolkit.application import Application
         from prompt_toolkit.input import create_input
@@ -175,14 +170,14 @@ def full_screen(lines: Callable[[int, int], list[Line]], press: Callable[[str], 
     stdin, stdout = _terminal()
     output, keys = create_output(stdout), KeyBindings()
 
-    def fragments() -> StyleAndTextTuples:
+    def fragments() -> Line:
         rows, columns = output.get_size()
-        drawn: StyleAndTextTuples = []
+        drawn: Line = []
         for line in lines(columns, rows):
             drawn += [*line, ('', '\n')]
         return drawn[:-1]
 
-    def end(event: KeyPressEvent) -> None:
+    def end(event: Any) -> None:
         leave()
         event.app.exit()
 

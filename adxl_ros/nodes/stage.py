@@ -324,7 +324,4 @@ class Stage(Node):
 
 def main() -> int:
     """Run the node."""
-    return run(Stage, NodeHelp(
-        __doc__, _EXAMPLES, (settings.StageSettings, settings.SimulatedStageSettings),
-        has_sensor=False,
-        variants={'stage.type:=trajectory, or joint_state': settings.BridgeSettings}))
+    return run(Stage, NodeHelp(__doc__, _EXAMPLES, settings.NODES['stage'], has_sensor=False))

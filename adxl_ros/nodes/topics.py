@@ -94,42 +94,6 @@ def subscribe_surroundings(node: Node, depth: int, take: Callable[[str, int, flo
         create_subscription(node, kind, topic, partial(give, topic, field), depth)
 
 
-class OnePublisher:
-    """
-    Withholds messages while several nodes send them on one topic, because a mixture is no signal.
-
-    Each publisher numbers its messages. The number steps back once where a publisher was started
-    again, and over and over where two send by turns.
-    """
-
-    def __init__(self, node: Node, topic: str) -> None:
-        self._node, self._topic = node, node.resolve_topic_name(topic)
-        self._number = 0
-        self._back_s, self._until_s = -_MIXED_S, 0.0
-
-    def __call__(self, number: int | None) -> bool:
-        """Return whether to take a message of a sequence number; None where the RMW has none."""
-        if number is not None:
-            if number <= self._number:
-                now_s = time.monotonic()
-                if now_s - self._back_s < _MIXED_S:
-                    self._until_s = now_s + _MIXED_S
-                self._back_s = now_s
-            self._number = number
-        return not self._mixes
-
-    @property
-    def _mixes(self) -> bool:
-        return bool(self._until_s) and time.monotonic() <= self._until_s
-
-    def fault(self) -> str:
-        """Return how many nodes publish on the topic while messages are withheld, or ''."""
-        if not self._mixes:
-            return ''
-        count = max(self._node.count_publishers(self._topic), 2)
-        return f'{self._topic}: {count} nodes publish it, and their samples mix; end all but one'
-
-
 @contextmanager
 def _qos_errors(topic: str, entity: str) -> Iterator[None]:
     """Turn rclpy's errors of an invalid QoS override into one line for the user."""
@@ -208,13 +172,16 @@ class Inbox:
     Keeps the serialized messages of a topic until they are taken, without waking an executor.
 
     At 1 kHz an executor that wakes for each message takes a tenth of a core. It subscribes best
-    effort. Samples (sensor_msgs/Imu) of several publishers are withheld.
+    effort. Samples (sensor_msgs/Imu) are withheld while several nodes send them, because a mixture
+    is no signal. Each publisher numbers its messages: the number steps back once where a publisher
+    was started again, and over and over where two send by turns.
     """
 
     def __init__(self, node: Node, kind: Any, topic: str, depth: int, reliable: bool = False
                  ) -> None:
         self._node, self._kind, self._depth = node, kind, depth
-        self._publishers = OnePublisher(node, topic)
+        self._topic = node.resolve_topic_name(topic)
+        self._number, self._back_s, self._mixed_until_s = 0, -_MIXED_S, 0.0
         self._subscription = create_subscription(
             node, kind, topic, lambda _: None, depth, raw=True, group=NotForExecutors(),
             reliable=reliable)
@@ -231,12 +198,26 @@ class Inbox:
             callback(message)
 
     def _waiting(self) -> Iterator[bytes]:
-        accept = (self._publishers,) if self._kind is Imu else ()
+        accept = (self._accepts,) if self._kind is Imu else ()
         return take_messages(self._subscription, self._kind, True, self._depth, *accept)
+
+    def _accepts(self, number: int | None) -> bool:
+        """Return whether to take a message of a sequence number; None where the RMW has none."""
+        if number is not None:
+            if number <= self._number:
+                now_s = time.monotonic()
+                if now_s - self._back_s < _MIXED_S:
+                    self._mixed_until_s = now_s + _MIXED_S
+                self._back_s = now_s
+            self._number = number
+        return time.monotonic() > self._mixed_until_s
 
     def fault(self) -> str:
         """Return that several nodes publish on the topic, so that nothing is taken, or ''."""
-        return self._publishers.fault()
+        if time.monotonic() > self._mixed_until_s:
+            return ''
+        count = max(self._node.count_publishers(self._topic), 2)
+        return f'{self._topic}: {count} nodes publish it, and their samples mix; end all but one'
 
     def destroy(self) -> None:
         """Remove the subscription; a thread that waits must have ended."""
