@@ -22,16 +22,9 @@ import shlex
 import shutil
 from typing import Any
 
-from adxl_ros.diagnose import page
+from adxl_ros.diagnose import next_experiment, page
 from adxl_ros.diagnose.diagnosis import diagnose, Diagnosis
 from adxl_ros.diagnose.linear_model import candidates
-from adxl_ros.diagnose.next_experiment import (
-    leading,
-    ManoeuvreWorth,
-    predict,
-    rank_responses,
-    unknown_dimensions,
-)
 from adxl_ros.diagnose.noise_effects import UNKNOWN
 from adxl_ros.diagnose.report import as_json, screen_lines
 from adxl_ros.diagnose.verdict import normalised, WeightedHypothesis
@@ -129,7 +122,7 @@ class Ranking:
     """The manoeuvres by what they are expected to tell per minute."""
 
     assessment: Assessment  # The assessment, with the effects that only the manoeuvres can show
-    worth: tuple[ManoeuvreWorth, ...]  # Manoeuvres, the best first
+    worth: tuple[next_experiment.ManoeuvreWorth, ...]  # Manoeuvres, the best first
     # Effects that neither the samples nor a manoeuvre of this stage can show
     hidden: tuple[str, ...]
 
@@ -167,13 +160,13 @@ def rank(assessment: Assessment, sensor: Sensor, manoeuvres: Sequence[PlannedMan
     report = diagnosis.report if diagnosis else None
     model = report.linear_model if report else None
     seen = {v.effect for v in model.variants} if model else set()
-    considered = {e for h in leading(assessment.hypotheses) for e in h.effects}
+    considered = {e for h in next_experiment.leading(assessment.hypotheses) for e in h.effects}
     needed = sorted(considered | (set(library()) - seen))
-    dimensions = unknown_dimensions(report.verdict if report else None)
-    responses = [predict(m, sensor, needed, dimensions) for m in manoeuvres]
+    dimensions = next_experiment.unknown_dimensions(report.verdict if report else None)
+    responses = [next_experiment.predict(m, sensor, needed, dimensions) for m in manoeuvres]
     excited = {effect for response in responses for effect in response.effects}
     complete = _with_unseen(assessment, excited - seen, len(excited | seen))
-    worth = rank_responses(responses, complete.hypotheses, model, dimensions)
+    worth = next_experiment.rank_responses(responses, complete.hypotheses, model, dimensions)
     on_the_mean = {e.name for e in candidates()}
     return Ranking(complete, worth, tuple(sorted(on_the_mean - excited - seen)))
 

@@ -18,12 +18,8 @@ from dataclasses import dataclass
 from enum import Enum
 
 from adxl_ros.errors import UserError
-from adxl_ros.investigate.diagnosis_round import (
-    Answer,
-    BackgroundDiagnoser,
-    Outcome,
-    Question,
-)
+from adxl_ros.investigate import diagnosis_round
+from adxl_ros.investigate.diagnosis_round import Answer, Outcome
 from adxl_ros.investigate.manoeuvres import CATALOGUE, CommandStream, plan, Pose, StageLimits
 import numpy as np
 
@@ -62,7 +58,8 @@ class Status:
 class Investigation:
     """The state machine."""
 
-    def __init__(self, limits: StageLimits, longest_minutes: float, diagnoser: BackgroundDiagnoser,
+    def __init__(self, limits: StageLimits, longest_minutes: float,
+                 diagnoser: diagnosis_round.BackgroundDiagnoser,
                  show: Callable[[float, Answer], None] = lambda minutes, answer: None,
                  flush: Callable[[], None] = lambda: None) -> None:
         """Wait for sensor and stage."""
@@ -159,7 +156,7 @@ class Investigation:
         self.state, self._stream = State.DIAGNOSING, None
         self._asked_minutes = self._minutes()
         self._flush()
-        self._diagnoser.ask(Question(
+        self._diagnoser.ask(diagnosis_round.Question(
             self._command or self._limits.nearest(*pose), self._asked_minutes,
             max(self._longest_s - self._moved_s, 0.0) / 60, bool(self.answers),
             tuple(answer.manoeuvre for _, answer in self.answers),

@@ -187,18 +187,16 @@ def main() -> int:
         # A recording that cannot be read is refused before the sweep.
         length_s = 0.0 if options.real is None else \
             float(np.ptp(recording.read(options.real).time_s))
-        options.output.mkdir(parents=True, exist_ok=True)
+        try:
+            options.output.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UserError(f'{options.output}: {error.strerror}') from None
         _run_sweep(options.output, options.speed, options.seed)
         if options.real is not None:
             _run_recording(options.output, options.real, length_s)
         _print('', *file_lines({'Next': f'your own sensor: {NEXT_PAGE}'}))
     except UserError as error:
         print(f'demo: {error}', file=sys.stderr)
-        return 1
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        print(f'demo: {options.output}: {error.strerror}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         return 130
@@ -296,7 +294,8 @@ def _show_replay(graph: DemoGraph, output: Path, path: Path) -> Poses:
     with jobs.Step('1/2 replay', 'starting') as step:
         graph.wait(lambda: graph.reports.get('driver', {}).get('link_state') == 'ended',
                    lambda: _show_accepted(step, output, ' rests'), _SILENT_S)
-    with jobs.Step('2/2 fit', f'{len(_accepted_poses(output))} rests') as step:
+        rests = _show_accepted(step, output, ' rests')
+    with jobs.Step('2/2 fit', f'{rests} rests') as step:
         answer = graph.finish()
         if not output.exists():
             raise UserError(f'{path}: {answer}')
@@ -333,14 +332,10 @@ def _journal(output: Path) -> Path:
 
 def _show_accepted(step: jobs.Step, output: Path, unit: str) -> int:
     """Show and return how many poses the journal has so far."""
-    if count := len(_accepted_poses(output)):
+    count = len(sweep_journal.accepted_poses(_entries(output)))
+    if count:
         step.show(f'{count}{unit}', count)
     return count
-
-
-def _accepted_poses(output: Path) -> list[sweep_journal.PoseRecord]:
-    """Return the poses that the journal has so far."""
-    return sweep_journal.accepted_poses(_entries(output))
 
 
 def _fitted_poses(output: Path) -> list[sweep_journal.PoseRecord]:

@@ -12,14 +12,8 @@ import signal
 from textwrap import wrap
 
 from adxl_ros.files.bag_writer import LiveBag
-from adxl_ros.investigate.diagnosis_round import (
-    Answer,
-    BackgroundDiagnoser,
-    hypothesis_text,
-    listed,
-    Outcome,
-    OutputFolder,
-)
+from adxl_ros.investigate import diagnosis_round
+from adxl_ros.investigate.diagnosis_round import Answer, Outcome, OutputFolder
 from adxl_ros.investigate.investigation import Investigation, State, Status as Situation
 from adxl_ros.investigate.manoeuvres import CATALOGUE, Pose, StageLimits
 from adxl_ros.links.support.base import Watchdog
@@ -61,7 +55,7 @@ def answer_lines(minutes: float, answer: Answer) -> list[str]:
     """Return the probabilities after a diagnosis, and what follows."""
     named = [hypothesis for hypothesis in answer.hypotheses[:_MOST_NAMED]
              if hypothesis.probability >= _SMALLEST_SHOWN]
-    parts = [f'{hypothesis_text(h.effects)} {percent(h.probability)}' for h in named]
+    parts = [f'{diagnosis_round.hypothesis_text(h.effects)} {percent(h.probability)}' for h in named]
     others = 1 - sum(hypothesis.probability for hypothesis in named)
     if others >= _SMALLEST_SHOWN / 2:
         parts.append(f'others {percent(others)}')
@@ -75,9 +69,7 @@ def answer_lines(minutes: float, answer: Answer) -> list[str]:
 def status_line(status: Situation) -> str:
     """Return one line about what happens now."""
     remaining = f', {status.remaining_s:.0f} s left' if status.state is State.MOVING else ''
-    text = f'{status.minutes:5.1f} min  {status.text}'
-    room = _COLUMNS - len(remaining)
-    return (text if len(text) <= room else f'{text[:room - 1]}…') + remaining
+    return f'{status.minutes:5.1f} min{remaining}  {status.text}'[:_COLUMNS]
 
 
 def closing_lines(investigation: Investigation, folder: OutputFolder) -> list[str]:
@@ -91,7 +83,7 @@ def closing_lines(investigation: Investigation, folder: OutputFolder) -> list[st
         return ['', *stopped, *named, *(_next(
             f'diagnose {bag} --params {baseline} -o {gap}') if investigation.has_moved else [])]
     answer = investigation.answers[-1][1]
-    hidden = f'It cannot show {listed(answer.hidden)}.' if answer.hidden else ''
+    hidden = f'It cannot show {diagnosis_round.listed(answer.hidden)}.' if answer.hidden else ''
     return ['', *wrap(answer.sentence, _COLUMNS), *wrap(hidden, _COLUMNS), *named,
             *_next(f'simulate rich --params {parameters} -o sim.csv')]
 
@@ -214,7 +206,7 @@ class Investigate(Node):
         self._recorder = BagRecorder(self, self._watchdogs['imu/data_raw'])
         self._folder = OutputFolder.free(Path(own.output))
         self._investigation = Investigation(
-            limits, own.minutes, BackgroundDiagnoser(self._folder, limits, own.seed),
+            limits, own.minutes, diagnosis_round.BackgroundDiagnoser(self._folder, limits, own.seed),
             lambda minutes, answer: self._print(answer_lines(minutes, answer)),
             self._recorder.flush)
         self._screen: LiveLine | None = None

@@ -170,7 +170,7 @@ def full_screen(lines: Callable[[int, int], list[Line]], press: Callable[[str], 
     stdin, stdout = _terminal()
     output, keys = create_output(stdout), KeyBindings()
 
-    def fragments() -> Line:
+    def fragments() -> Any:
         rows, columns = output.get_size()
         drawn: Line = []
         for line in lines(columns, rows):
