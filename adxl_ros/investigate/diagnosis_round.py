@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from enum import Enum
-from itertools import chain, count
+from itertools import accumulate, chain, count
 import json
 import os
 from pathlib import Path
@@ -213,13 +213,9 @@ def decide(ranking: Ranking, question: Question, has_time: bool) -> Answer:
 
 def _with_90_percent(hypotheses: Sequence[WeightedHypothesis]) -> list[WeightedHypothesis]:
     """Return the fewest hypotheses that together have 90 %."""
-    total, kept = 0.0, []
-    for hypothesis in hypotheses:
-        kept.append(hypothesis)
-        total += hypothesis.probability
-        if total >= CERTAIN:
-            break
-    return kept
+    totals = accumulate(hypothesis.probability for hypothesis in hypotheses)
+    needed = next((i for i, total in enumerate(totals, 1) if total >= CERTAIN), None)
+    return list(hypotheses[:needed])
 
 
 def _sentence(outcome: Outcome, named: Sequence[WeightedHypothesis]) -> str:

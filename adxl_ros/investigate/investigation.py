@@ -70,7 +70,8 @@ class Investigation:
         self._limits, self._longest_s = limits, 60 * longest_minutes
         self._diagnoser, self._show, self._flush = diagnoser, show, flush
         self._begin_s: float | None = None
-        self._now_s = self._since_s = self._moved_s = 0.0
+        self.moved_s = 0.0  # Time of the manoeuvres so far, s
+        self._now_s = self._since_s = 0.0
         self._asked_minutes = 0.0
         self._pose: Pose | None = None
         self._command: Pose | None = None
@@ -87,11 +88,6 @@ class Investigation:
         """Return whether it has come to a verdict."""
         return self.state is State.FINISHED and bool(self.answers) \
             and self.answers[-1][1].outcome not in (Outcome.GO_ON, Outcome.TIME_OVER)
-
-    @property
-    def has_moved(self) -> bool:
-        """Return whether it has recorded a part of a manoeuvre."""
-        return self._moved_s > 0
 
     @property
     def speed(self) -> Pose | None:
@@ -143,9 +139,8 @@ class Investigation:
         if now_s - self._since_s < _FIRST_REST_S:
             return
         if self._limits.excess_rad(pose) > _OUTSIDE_RAD:
-            alpha_deg, beta_deg = np.degrees(pose)
-            self.stop(f'the stage is at alpha {alpha_deg:.1f}°, beta {beta_deg:.1f}°, outside of '
-                      'its limits; move it, or set limits.alpha_deg and limits.beta_deg')
+            self.stop(f'the stage is at {_text(pose)}, outside of its limits; move it, or set '
+                      'limits.alpha_deg and limits.beta_deg')
             return
         self._begin_s = now_s
         self._ask(pose)
@@ -158,7 +153,7 @@ class Investigation:
         self._flush()
         self._diagnoser.ask(diagnosis_round.Question(
             self._command or self._limits.nearest(*pose), self._asked_minutes,
-            max(self._longest_s - self._moved_s, 0.0) / 60, bool(self.answers),
+            max(self._longest_s - self.moved_s, 0.0) / 60, bool(self.answers),
             tuple(answer.manoeuvre for _, answer in self.answers),
             self.answers[-1][1].verdict if self.answers else ''))
 
@@ -190,8 +185,8 @@ class Investigation:
         """Command the next step; diagnose when the stage has settled at the end."""
         stream = self._stream
         assert stream is not None
-        self._moved_s += elapsed_s
-        if self._moved_s > self._longest_s:
+        self.moved_s += elapsed_s
+        if self.moved_s > self._longest_s:
             self._hold()
             self._ask(pose)
             return

@@ -55,7 +55,8 @@ def answer_lines(minutes: float, answer: Answer) -> list[str]:
     """Return the probabilities after a diagnosis, and what follows."""
     named = [hypothesis for hypothesis in answer.hypotheses[:_MOST_NAMED]
              if hypothesis.probability >= _SMALLEST_SHOWN]
-    parts = [f'{diagnosis_round.hypothesis_text(h.effects)} {percent(h.probability)}' for h in named]
+    parts = [f'{diagnosis_round.hypothesis_text(h.effects)} {percent(h.probability)}'
+             for h in named]
     others = 1 - sum(hypothesis.probability for hypothesis in named)
     if others >= _SMALLEST_SHOWN / 2:
         parts.append(f'others {percent(others)}')
@@ -81,7 +82,7 @@ def closing_lines(investigation: Investigation, folder: OutputFolder) -> list[st
     if investigation.state is State.STOPPED:
         stopped = wrap(f'Stopped without a verdict: {investigation.reason}', _COLUMNS)
         return ['', *stopped, *named, *(_next(
-            f'diagnose {bag} --params {baseline} -o {gap}') if investigation.has_moved else [])]
+            f'diagnose {bag} --params {baseline} -o {gap}') if investigation.moved_s else [])]
     answer = investigation.answers[-1][1]
     hidden = f'It cannot show {diagnosis_round.listed(answer.hidden)}.' if answer.hidden else ''
     return ['', *wrap(answer.sentence, _COLUMNS), *wrap(hidden, _COLUMNS), *named,
@@ -206,7 +207,8 @@ class Investigate(Node):
         self._recorder = BagRecorder(self, self._watchdogs['imu/data_raw'])
         self._folder = OutputFolder.free(Path(own.output))
         self._investigation = Investigation(
-            limits, own.minutes, diagnosis_round.BackgroundDiagnoser(self._folder, limits, own.seed),
+            limits, own.minutes,
+            diagnosis_round.BackgroundDiagnoser(self._folder, limits, own.seed),
             lambda minutes, answer: self._print(answer_lines(minutes, answer)),
             self._recorder.flush)
         self._screen: LiveLine | None = None
