@@ -65,6 +65,10 @@ class StreamBuffer:
         self._nothing = np.zeros(0, np.int64), np.zeros((0, columns))
         self._pieces: deque[tuple[np.ndarray, np.ndarray]] = deque()
 
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return self._rows
+
     @property
     def newest_ns(self) -> int | None:
         """Return the newest stamp, ns; None without rows."""
