@@ -31,8 +31,6 @@ from adxl_ros.report.figures import Figure, figure, line, rounded
 from adxl_ros.report.quantities import (
     mg,
     mg_text,
-    parameter_label,
-    parameter_text,
     percent,
 )
 import numpy as np

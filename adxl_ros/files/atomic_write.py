@@ -6,8 +6,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+import errno
 import fcntl
 from glob import escape
+from io import FileIO
 import os
 from pathlib import Path
 import shutil
@@ -112,6 +114,25 @@ def sync(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def append_line(file: FileIO, line: str) -> None:
+    """
+    Append a line to a file that is open to append and read, and wait until it is on the disk.
+
+    A line that a power cut has torn ends before it. Where it cannot be written, nothing of it is.
+    """
+    size = file.seek(0, os.SEEK_END)
+    is_torn = size > 0 and os.pread(file.fileno(), 1, size - 1) != b'\n'
+    data = f'{chr(10) * is_torn}{line}\n'.encode()
+    try:
+        if file.write(data) != len(data):
+            raise OSError(errno.ENOSPC, 'the disk is full')
+        os.fsync(file.fileno())
+    except OSError:
+        with suppress(OSError):
+            file.truncate(size)
+        raise
 
 
 _KEPT_BYTES = 256 << 20

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, MISSING
 from datetime import datetime, timezone
 import fcntl
@@ -17,7 +16,7 @@ import shutil
 from typing import Any, NamedTuple, TypeAlias
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.atomic_write import atomic_path, sync
+from adxl_ros.files.atomic_write import append_line, atomic_path, sync
 
 FORMAT = 1
 """Version of the format, in the head of each journal; raised with each change of the lines."""
@@ -200,15 +199,9 @@ class Journal:
         self._file.close()
 
     def _append_line(self, line: Mapping[str, Any]) -> None:
-        size_before = self._file.seek(0, os.SEEK_END)
-        data = json.dumps(line).encode() + b'\n'
         try:
-            if self._file.write(data) != len(data):
-                raise OSError(0, 'the disk is full')
-            os.fsync(self._file.fileno())
+            append_line(self._file, json.dumps(line))
         except OSError as error:
-            with suppress(OSError):
-                self._file.truncate(size_before)
             raise UserError(f'{self.path}: cannot write the journal: {error.strerror}; make '
                             'room and try again') from None
 

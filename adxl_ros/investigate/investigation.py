@@ -16,11 +16,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol
 
 from adxl_ros.errors import UserError
-from adxl_ros.investigate.diagnosis_round import Answer, Outcome, Question
-from adxl_ros.investigate.manoeuvres import CommandStream, description, plan, Pose, StageLimits
+from adxl_ros.investigate import diagnosis_round
+from adxl_ros.investigate.diagnosis_round import Answer, Outcome
+from adxl_ros.investigate.manoeuvres import CATALOGUE, CommandStream, plan, Pose, StageLimits
 import numpy as np
 
 _FIRST_REST_S = 1.0
@@ -45,19 +45,6 @@ class State(Enum):
     STOPPED = 'stopped'
 
 
-class Diagnoser(Protocol):
-    """A diagnosis in the background."""
-
-    def ask(self, question: Question) -> None:
-        """Begin to answer a question."""
-
-    def answer(self) -> Answer | None:
-        """Return the answer, or None while it is worked out."""
-
-    def cancel(self) -> None:
-        """End the work on an answer."""
-
-
 @dataclass(frozen=True)
 class Status:
     """What an investigation does."""
@@ -71,7 +58,8 @@ class Status:
 class Investigation:
     """The state machine."""
 
-    def __init__(self, limits: StageLimits, longest_minutes: float, diagnoser: Diagnoser,
+    def __init__(self, limits: StageLimits, longest_minutes: float,
+                 diagnoser: diagnosis_round.BackgroundDiagnoser,
                  show: Callable[[float, Answer], None] = lambda minutes, answer: None,
                  flush: Callable[[], None] = lambda: None) -> None:
         """Wait for sensor and stage."""
@@ -82,7 +70,8 @@ class Investigation:
         self._limits, self._longest_s = limits, 60 * longest_minutes
         self._diagnoser, self._show, self._flush = diagnoser, show, flush
         self._begin_s: float | None = None
-        self._now_s = self._since_s = self._moved_s = 0.0
+        self.moved_s = 0.0  # Time of the manoeuvres so far, s
+        self._now_s = self._since_s = 0.0
         self._asked_minutes = 0.0
         self._pose: Pose | None = None
         self._command: Pose | None = None
@@ -101,11 +90,6 @@ class Investigation:
             and self.answers[-1][1].outcome not in (Outcome.GO_ON, Outcome.TIME_OVER)
 
     @property
-    def has_moved(self) -> bool:
-        """Return whether it has recorded a part of a manoeuvre."""
-        return self._moved_s > 0
-
-    @property
     def speed(self) -> Pose | None:
         """Return the speed on the way to the newest command, rad/s; None at its end."""
         return None if self._stream is None or self._stream.is_done else self._stream.speed
@@ -114,7 +98,7 @@ class Investigation:
         """Return what it does."""
         texts = {State.RECORDING: 'waiting for samples and stage',
                  State.DIAGNOSING: 'diagnosing the samples so far; the stage rests',
-                 State.MOVING: description(self._manoeuvre) if self._manoeuvre else '',
+                 State.MOVING: CATALOGUE[self._manoeuvre].text if self._manoeuvre else '',
                  State.FINISHED: 'finished', State.STOPPED: f'stopped: {self.reason}'}
         remaining_s = self._stream.remaining_s if self._stream else 0.0
         return Status(self.state, texts[self.state], self._minutes(), remaining_s)
@@ -155,9 +139,8 @@ class Investigation:
         if now_s - self._since_s < _FIRST_REST_S:
             return
         if self._limits.excess_rad(pose) > _OUTSIDE_RAD:
-            alpha_deg, beta_deg = np.degrees(pose)
-            self.stop(f'the stage is at alpha {alpha_deg:.1f}°, beta {beta_deg:.1f}°, outside of '
-                      'its limits; move it, or set limits.alpha_deg and limits.beta_deg')
+            self.stop(f'the stage is at {_text(pose)}, outside of its limits; move it, or set '
+                      'limits.alpha_deg and limits.beta_deg')
             return
         self._begin_s = now_s
         self._ask(pose)
@@ -168,9 +151,9 @@ class Investigation:
         self.state, self._stream = State.DIAGNOSING, None
         self._asked_minutes = self._minutes()
         self._flush()
-        self._diagnoser.ask(Question(
+        self._diagnoser.ask(diagnosis_round.Question(
             self._command or self._limits.nearest(*pose), self._asked_minutes,
-            max(self._longest_s - self._moved_s, 0.0) / 60, bool(self.answers),
+            max(self._longest_s - self.moved_s, 0.0) / 60, bool(self.answers),
             tuple(answer.manoeuvre for _, answer in self.answers),
             self.answers[-1][1].verdict if self.answers else ''))
 
@@ -202,8 +185,8 @@ class Investigation:
         """Command the next step; diagnose when the stage has settled at the end."""
         stream = self._stream
         assert stream is not None
-        self._moved_s += elapsed_s
-        if self._moved_s > self._longest_s:
+        self.moved_s += elapsed_s
+        if self.moved_s > self._longest_s:
             self._hold()
             self._ask(pose)
             return

@@ -59,19 +59,19 @@ class StageLimits:
     beta_rad: tuple[float, float]
     rate_rad_s: float  # Largest rate of each joint, rad/s
 
+    def of(self, joint: str) -> tuple[float, float]:
+        """Return the lowest and highest angle of a joint, rad."""
+        return self.alpha_rad if joint == 'alpha' else self.beta_rad
+
     def nearest(self, alpha_rad: float, beta_rad: float) -> Pose:
         """Return the pose within the limits that is nearest to a pose."""
-        return Pose(_within(alpha_rad, self.alpha_rad), _within(beta_rad, self.beta_rad))
+        return Pose(float(np.clip(alpha_rad, *self.alpha_rad)),
+                    float(np.clip(beta_rad, *self.beta_rad)))
 
     def excess_rad(self, pose: Pose) -> float:
         """Return how far the worse angle of a pose is beyond the limits, rad; 0 within them."""
         nearest = self.nearest(*pose)
         return max(abs(pose.alpha_rad - nearest.alpha_rad), abs(pose.beta_rad - nearest.beta_rad))
-
-
-def _within(value: float, limits: tuple[float, float]) -> float:
-    """Return the value within limits that is nearest to a value."""
-    return min(max(value, limits[0]), limits[1])
 
 
 class Path:
@@ -112,7 +112,7 @@ class Path:
     def swing(self, joint: str, share: float = 1.0) -> None:
         """Turn one joint about its angle, forth and back."""
         middle_rad = getattr(self._script, joint)
-        low_rad, high_rad = self.limits.alpha_rad if joint == 'alpha' else self.limits.beta_rad
+        low_rad, high_rad = self.limits.of(joint)
         # A joint at its limit swings to the inner side.
         middle_rad = min(max(middle_rad, min(low_rad + _SWING_RAD, high_rad)),
                          max(high_rad - _SWING_RAD, low_rad))
@@ -121,19 +121,13 @@ class Path:
                 self.turn(joint, middle_rad + side * _SWING_RAD, share)
         self.turn(joint, middle_rad, share)
 
-    def turn_of_beta(self, alpha_deg: float, share: float = 1.0) -> None:
-        """Turn beta over its range, a turn at most, forth and back."""
-        low_rad, high_rad = self.limits.beta_rad
-        self.rest(alpha_deg, np.degrees(low_rad), 1.0)
-        self.turn('beta', min(high_rad, low_rad + 2 * np.pi), share)
-        self.turn('beta', low_rad, share)
-
-    def turn_of_alpha(self, beta_deg: float, share: float = 1.0) -> None:
-        """Turn alpha over its range, a turn at most, forth and back."""
-        low_rad, high_rad = self.limits.alpha_rad
-        self.rest(np.degrees(low_rad), beta_deg, 1.0)
-        self.turn('alpha', min(high_rad, low_rad + 2 * np.pi), share)
-        self.turn('alpha', low_rad, share)
+    def full_turn(self, joint: str, other_deg: float, share: float = 1.0) -> None:
+        """Turn one joint over its range, a turn at most, forth and back."""
+        low_rad, high_rad = self.limits.of(joint)
+        low_deg = float(np.degrees(low_rad))
+        self.rest(*((low_deg, other_deg) if joint == 'alpha' else (other_deg, low_deg)), 1.0)
+        self.turn(joint, min(high_rad, low_rad + 2 * np.pi), share)
+        self.turn(joint, low_rad, share)
 
     def motion(self) -> Motion:
         """Return the path as a motion that begins at its own time."""
@@ -168,22 +162,22 @@ CATALOGUE = {
         [('rest', 90, beta_deg, 2.0) for beta_deg in (0, 90, 180, 270)]),
     'slow_turn_of_beta': Manoeuvre(
         'turns of beta', 'turn beta once, forth and back, slowly',
-        [('turn_of_beta', 90.0, _SLOW_SHARE)]),
+        [('full_turn', 'beta', 90.0, _SLOW_SHARE)]),
     'fast_turn_of_beta': Manoeuvre(
         'turns of beta', 'turn beta once, forth and back, at the limit of rate',
-        [('turn_of_beta', 90.0)]),
+        [('full_turn', 'beta', 90.0)]),
     'inclined_turn_of_beta': Manoeuvre(
         'turns of beta', 'turn beta once at alpha 45°, forth and back, at the limit of rate',
-        [('turn_of_beta', 45.0)]),
+        [('full_turn', 'beta', 45.0)]),
     'level_turn_of_beta': Manoeuvre(
         'turns of beta', 'turn beta once with z upright, at the limit of rate',
-        [('turn_of_beta', 0.0)]),
+        [('full_turn', 'beta', 0.0)]),
     'slow_turn_of_alpha': Manoeuvre(
         'turns of alpha', 'turn alpha over its range, forth and back, slowly',
-        [('turn_of_alpha', 45.0, _SLOW_SHARE)]),
+        [('full_turn', 'alpha', 45.0, _SLOW_SHARE)]),
     'fast_turns_of_alpha': Manoeuvre(
         'turns of alpha', 'turn alpha over its range at two angles beta, at the limit of rate',
-        [('turn_of_alpha', 0.0), ('turn_of_alpha', 90.0)]),
+        [('full_turn', 'alpha', 0.0), ('full_turn', 'alpha', 90.0)]),
     'two_rates_of_beta': Manoeuvre(
         'rates', 'turn beta over half a turn at three rates, forth and back',
         [('rest', 90, 0, 1.0), *(('turn', 'beta', to_rad, share) for share in (1.0, 0.5, 0.25)
@@ -220,11 +214,6 @@ class PlannedManoeuvre:
     def minutes(self) -> float:
         """Return the duration, min."""
         return self.motion.duration_s / 60
-
-
-def description(name: str) -> str:
-    """Return what a manoeuvre does, for people."""
-    return CATALOGUE[name].text
 
 
 def plan(name: str, limits: StageLimits, pose: Pose, begin_s: float = 0.0) -> PlannedManoeuvre:

@@ -15,8 +15,7 @@ from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.monitor import reference_stream
-from adxl_ros.monitor.change_test import ChangeSettings, ChangeTest
-from adxl_ros.monitor.records import DiagnosisInput, GapChange
+from adxl_ros.monitor.changes import ChangeSettings, ChangeTest, DiagnosisInput, GapChange
 from adxl_ros.monitor.reference_stream import Block, ReferenceKind
 from adxl_ros.report.quantities import Interval
 import numpy as np

@@ -260,8 +260,8 @@ class Prediction:
 
     def __init__(self, sensor: Sensor, reference: ReferenceStream) -> None:
         # Effects that need the angles of a stage, which the reference has not
-        self.left_out = tuple(name for name in sensor.effects if _needs_stage(name)) \
-            if reference.kind is ReferenceKind.IMU else ()
+        self.left_out = () if reference.kind is not ReferenceKind.IMU else tuple(
+            name for name in sensor.effects if effect_named(name).concern is Concern.STAGE)
         effects = tuple(name for name in sensor.effects if name not in self.left_out)
         self._sensor, self._reference = sensor, reference
         self._sensors = [noiseless(replace(sensor, effects=effects)),
@@ -303,12 +303,6 @@ class Prediction:
             end_ns, mean_mps2, (modelled ** 2).mean(axis=0),
             modelled.var(axis=0) / freedom + _SMALLEST_MPS2 ** 2, _log_noise(modelled),
             (datasheet ** 2).mean(axis=0), motion.error_mps2[:len(mean_mps2)] ** 2, motion.moves)
-
-
-def _needs_stage(name: str) -> bool:
-    """Return whether an effect needs the angles of a stage."""
-    effect = effect_named(name)
-    return effect.concern is Concern.STAGE
 
 
 def _log_noise(residual: np.ndarray) -> np.ndarray:

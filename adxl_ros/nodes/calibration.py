@@ -29,7 +29,7 @@ import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
-from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
+from sensor_msgs.msg import Imu, JointState
 from std_srvs.srv import Trigger
 
 _POLL_S = 0.02
@@ -71,6 +71,7 @@ class Samples:
         self.fault = ''  # Why the newest samples cannot be used, or ''
         self.restart_silence()
         self._subscription = topics.Inbox(node, Imu, _SAMPLES, _SAMPLES_QUEUE)
+        self.mixture = self._subscription.fault  # That several nodes publish the samples, or ''
 
     def restart_silence(self) -> None:
         """Restart the time without samples."""
@@ -113,11 +114,6 @@ class Samples:
         if new:
             self.restart_silence()
 
-    @property
-    def is_mixed(self) -> bool:
-        """Return whether several nodes publish the samples, so that none is taken."""
-        return bool(self._subscription.fault())
-
     def _fault(self, is_raw: bool, finite: np.ndarray, unit: Sensor) -> str:
         """Return why samples with these finite values, (n, m), cannot be used, or ''."""
         if not is_raw:
@@ -133,8 +129,8 @@ class Samples:
 
     def silence(self) -> str:
         """Return in words why or for how long no sample has come; '' while samples come."""
-        if self.is_mixed:
-            return self._subscription.fault()
+        if mixture := self.mixture():
+            return mixture
         silent_s = (STEADY.now().nanoseconds - self._heard_ns) * 1e-9
         if silent_s < _SILENT_S:
             return ''
@@ -198,12 +194,7 @@ class Calibration(Node):
         if self._has_stage:
             self._stage = topics.Inbox(self, JointState, 'stage/joint_states', _STAGE_QUEUE)
             topics.create_subscription(self, JointState, 'stage/command', self._on_command, _QUEUE)
-        topics.create_subscription(
-            self, Temperature, 'temperature', lambda message: self._controller.read_quantity(
-                'temperature', _stamp_ns(message), message.temperature), _QUEUE)
-        topics.create_subscription(
-            self, BatteryState, 'supply', lambda message: self._controller.read_quantity(
-                'supply', _stamp_ns(message), message.voltage), _QUEUE)
+        topics.subscribe_surroundings(self, _QUEUE, self._controller.read_quantity)
         start = self._controller.start
         requests: dict[str, Callable[[], Answer]] = {
             'start': start, 'resume': partial(start, start_over=False),
@@ -244,7 +235,7 @@ class Calibration(Node):
                       report.values)
 
     def _level(self, late: bool) -> Level:
-        if self._samples.is_mixed:
+        if self._samples.mixture():
             return Level.ERROR
         return Level.WARN if late else Level.OK
 
@@ -320,10 +311,6 @@ def _session_settings(own: CalibrationSettings) -> SessionSettings:
 def _angles(position_rad: dict[str, float]) -> tuple[float, float]:
     """Return the angles alpha and beta, rad; NaN for a joint that is not named."""
     return position_rad.get('alpha', math.nan), position_rad.get('beta', math.nan)
-
-
-def _stamp_ns(message: Temperature | BatteryState) -> int:
-    return message.header.stamp.sec * 10 ** 9 + message.header.stamp.nanosec
 
 
 def main() -> int:

@@ -34,7 +34,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.task import Future
-from sensor_msgs.msg import BatteryState, Imu, Temperature
+from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
 _RPY = 'mounting.rpy_rad'
@@ -191,10 +191,7 @@ class Compensation(Node):
         self.create_timer(_LOOK_S, self._look, clock=STEADY)
         topics.create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1,
                                    latched=True)
-        topics.create_subscription(self, Temperature, 'temperature', lambda message:
-                                   self._surround('temperature_c', message.temperature), 1)
-        topics.create_subscription(self, BatteryState, 'supply', lambda message:
-                                   self._surround('supply_v', message.voltage), 1)
+        topics.subscribe_surroundings(self, 1, self._surround)
         self._thread = topics.RepeatingThread(
             self, lambda: self._samples.receive(self._stream), 'imu/data_raw')
 
@@ -289,8 +286,9 @@ class Compensation(Node):
                    f'publishing nothing: {refusal}' if refusal else 'publishing again')
         self._diagnostics.notice(Level.ERROR if refusal else Level.OK)
 
-    def _surround(self, name: str, value: float) -> None:
+    def _surround(self, topic: str, _: int, value: float) -> None:
         """Use a temperature, °C, or supply, V, from the next sample on; ignore NaN."""
+        name = {'temperature': 'temperature_c', 'supply': 'supply_v'}[topic]
         if isfinite(value):
             self._stream.surround(name, value)
             self._heard_ns[name] = self.get_clock().now().nanoseconds

@@ -187,18 +187,16 @@ def main() -> int:
         # A recording that cannot be read is refused before the sweep.
         length_s = 0.0 if options.real is None else \
             float(np.ptp(recording.read(options.real).time_s))
-        options.output.mkdir(parents=True, exist_ok=True)
+        try:
+            options.output.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UserError(f'{options.output}: {error.strerror}') from None
         _run_sweep(options.output, options.speed, options.seed)
         if options.real is not None:
             _run_recording(options.output, options.real, length_s)
         _print('', *file_lines({'Next': f'your own sensor: {NEXT_PAGE}'}))
     except UserError as error:
         print(f'demo: {error}', file=sys.stderr)
-        return 1
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        print(f'demo: {options.output}: {error.strerror}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         return 130
@@ -259,15 +257,15 @@ def _show_sweep(graph: DemoGraph, output: Path) -> Poses:
     """Show the sweep, the fit and the check while they run; return the poses."""
     total = len(pose_plan.guided(np.radians(_PLANES_DEG).tolist(), float(np.radians(_STEP_DEG)),
                                  _CHECK_POSES))
-    with jobs.step('1/3 sweep', 'starting', total) as step:
+    with jobs.Step('1/3 sweep', 'starting', total) as step:
         def accepted() -> int:
             return _show_accepted(step, output, f' of {total} poses')
         graph.wait(lambda: accepted() == total, accepted, _SILENT_S)
     fitting = f'{total - _CHECK_POSES} poses'
-    with jobs.step('2/3 fit', fitting) as step:
+    with jobs.Step('2/3 fit', fitting) as step:
         graph.wait(output.exists)
         step.show(f'{fitting}, {parameter_file.load(output).model} model')
-    with jobs.step('3/3 check', f'{_CHECK_POSES} poses that the fit has not seen'):
+    with jobs.Step('3/3 check', f'{_CHECK_POSES} poses that the fit has not seen'):
         graph.wait(lambda: bool(_fitted_poses(output)))
         graph.close()
     return Poses.from_records(_fitted_poses(output))
@@ -286,17 +284,18 @@ def _run_recording(folder: Path, path: Path, length_s: float) -> None:
         poses = _show_replay(graph, output, path)
     fitted = parameter_file.load(output)
     nominal = replace(fitted.without_covariance(), effects=(), values={})
-    _print('', *gravity_lines(
+    _print('', *acceptance.gravity_lines(
         gravity_fit.fit_gravity(poses.volts, poses.std_v, nominal), poses.time_s[:, 0]), '',
            *file_lines({'Page': report / 'report.html', 'Calibration': output}))
 
 
 def _show_replay(graph: DemoGraph, output: Path, path: Path) -> Poses:
     """Show the replay of a recording and the fit while they run; return the rests."""
-    with jobs.step('1/2 replay', 'starting') as step:
+    with jobs.Step('1/2 replay', 'starting') as step:
         graph.wait(lambda: graph.reports.get('driver', {}).get('link_state') == 'ended',
                    lambda: _show_accepted(step, output, ' rests'), _SILENT_S)
-    with jobs.step('2/2 fit', f'{len(_accepted_poses(output))} rests') as step:
+        rests = _show_accepted(step, output, ' rests')
+    with jobs.Step('2/2 fit', f'{rests} rests') as step:
         answer = graph.finish()
         if not output.exists():
             raise UserError(f'{path}: {answer}')
@@ -333,14 +332,10 @@ def _journal(output: Path) -> Path:
 
 def _show_accepted(step: jobs.Step, output: Path, unit: str) -> int:
     """Show and return how many poses the journal has so far."""
-    if count := len(_accepted_poses(output)):
+    count = len(sweep_journal.accepted_poses(_entries(output)))
+    if count:
         step.show(f'{count}{unit}', count)
     return count
-
-
-def _accepted_poses(output: Path) -> list[sweep_journal.PoseRecord]:
-    """Return the poses that the journal has so far."""
-    return sweep_journal.accepted_poses(_entries(output))
 
 
 def _fitted_poses(output: Path) -> list[sweep_journal.PoseRecord]:

@@ -165,10 +165,11 @@ class Driver(LifecycleNode):
             # A simulator may publish no /clock, although the node waits for one.
             sensor_ns = self._stamp_clock.now().nanoseconds or sensor_ns
         values, warning = self._tally.report(STEADY.now().nanoseconds, sensor_ns)
-        topic = self.resolve_topic_name('imu/data_raw')
-        if (publishers := self.count_publishers(topic)) > 1:
-            several = f'{publishers} nodes publish {topic}; end all but one'
-            warning = ', '.join(filter(None, (several, warning)))
+        counts = {topic: self.count_publishers(topic) for topic in (
+            self.resolve_topic_name('imu/data_raw'), '/clock')}
+        several = [f'{count} nodes publish {topic}; end all but one'
+                   for topic, count in counts.items() if count > 1]
+        warning = ', '.join(filter(None, (*several, warning)))
         level = self._level()
         if warning and level is Level.OK:
             level = Level.WARN

@@ -12,10 +12,10 @@ import signal
 from textwrap import wrap
 
 from adxl_ros.files.bag_writer import LiveBag
-from adxl_ros.investigate.background import BackgroundDiagnoser, OutputFolder
-from adxl_ros.investigate.diagnosis_round import Answer, hypothesis_text, listed, Outcome
+from adxl_ros.investigate import diagnosis_round
+from adxl_ros.investigate.diagnosis_round import Answer, Outcome, OutputFolder
 from adxl_ros.investigate.investigation import Investigation, State, Status as Situation
-from adxl_ros.investigate.manoeuvres import description, Pose, StageLimits
+from adxl_ros.investigate.manoeuvres import CATALOGUE, Pose, StageLimits
 from adxl_ros.links.support.base import Watchdog
 from adxl_ros.nodes import topics
 from adxl_ros.nodes.jobs import LiveLine
@@ -23,6 +23,7 @@ from adxl_ros.nodes.parameters import declare_all, declare_sensor, low_and_high,
 from adxl_ros.nodes.run_node import command_lines, NodeHelp, run
 from adxl_ros.nodes.settings import check_given_parameters, InvestigateSettings
 from adxl_ros.nodes.topics import Level, Status
+from adxl_ros.report.quantities import percent
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.clock import Clock, ClockType
@@ -54,23 +55,22 @@ def answer_lines(minutes: float, answer: Answer) -> list[str]:
     """Return the probabilities after a diagnosis, and what follows."""
     named = [hypothesis for hypothesis in answer.hypotheses[:_MOST_NAMED]
              if hypothesis.probability >= _SMALLEST_SHOWN]
-    parts = [f'{hypothesis_text(h.effects)} {_percent(h.probability)}' for h in named]
+    parts = [f'{diagnosis_round.hypothesis_text(h.effects)} {percent(h.probability)}'
+             for h in named]
     others = 1 - sum(hypothesis.probability for hypothesis in named)
     if others >= _SMALLEST_SHOWN / 2:
-        parts.append(f'others {_percent(others)}')
+        parts.append(f'others {percent(others)}')
     lines = wrap(f'{minutes:5.1f} min  {"  ".join(parts)}', _COLUMNS, subsequent_indent=_INDENT)
     if answer.outcome is Outcome.GO_ON:
-        lines += wrap(f'next: {description(answer.manoeuvre)}', _COLUMNS, initial_indent=_INDENT,
-                      subsequent_indent=_INDENT)
+        lines += wrap(f'next: {CATALOGUE[answer.manoeuvre].text}', _COLUMNS,
+                      initial_indent=_INDENT, subsequent_indent=_INDENT)
     return lines
 
 
 def status_line(status: Situation) -> str:
     """Return one line about what happens now."""
     remaining = f', {status.remaining_s:.0f} s left' if status.state is State.MOVING else ''
-    text = f'{status.minutes:5.1f} min  {status.text}'
-    room = _COLUMNS - len(remaining)
-    return (text if len(text) <= room else f'{text[:room - 1]}…') + remaining
+    return f'{status.minutes:5.1f} min{remaining}  {status.text}'[:_COLUMNS]
 
 
 def closing_lines(investigation: Investigation, folder: OutputFolder) -> list[str]:
@@ -82,9 +82,9 @@ def closing_lines(investigation: Investigation, folder: OutputFolder) -> list[st
     if investigation.state is State.STOPPED:
         stopped = wrap(f'Stopped without a verdict: {investigation.reason}', _COLUMNS)
         return ['', *stopped, *named, *(_next(
-            f'diagnose {bag} --params {baseline} -o {gap}') if investigation.has_moved else [])]
+            f'diagnose {bag} --params {baseline} -o {gap}') if investigation.moved_s else [])]
     answer = investigation.answers[-1][1]
-    hidden = f'It cannot show {listed(answer.hidden)}.' if answer.hidden else ''
+    hidden = f'It cannot show {diagnosis_round.listed(answer.hidden)}.' if answer.hidden else ''
     return ['', *wrap(answer.sentence, _COLUMNS), *wrap(hidden, _COLUMNS), *named,
             *_next(f'simulate rich --params {parameters} -o sim.csv')]
 
@@ -93,12 +93,6 @@ def _next(arguments: str) -> list[str]:
     """Return a command for the terminal."""
     first, *others = command_lines(arguments, 13, 15)
     return [f' {"Next":12}{first[13:]}', *others]
-
-
-def _percent(probability: float) -> str:
-    """Return a probability in percent; 99 % stands for all below 1."""
-    percent = 100 * probability
-    return f'{min(percent, 99) if probability < 0.9995 else percent:.0f} %'
 
 
 _SAMPLES = 'imu/data_raw'
@@ -213,7 +207,8 @@ class Investigate(Node):
         self._recorder = BagRecorder(self, self._watchdogs['imu/data_raw'])
         self._folder = OutputFolder.free(Path(own.output))
         self._investigation = Investigation(
-            limits, own.minutes, BackgroundDiagnoser(self._folder, limits, own.seed),
+            limits, own.minutes,
+            diagnosis_round.BackgroundDiagnoser(self._folder, limits, own.seed),
             lambda minutes, answer: self._print(answer_lines(minutes, answer)),
             self._recorder.flush)
         self._screen: LiveLine | None = None

@@ -102,25 +102,6 @@ _TEXT_WIDTH = 16
 """Columns of the text beside a bar."""
 _LINE_WIDTH = 69
 """Columns of a line without a bar, before its time."""
-_TENTHS = 10
-"""Largest number of lines of a step where there is no terminal."""
-
-
-@contextmanager
-def step(name: str, text: str, total: int = 0) -> Iterator[Step]:
-    """
-    Show one step of a job while it runs.
-
-    A terminal shows one line with the time and, where the total is known, a bar. Elsewhere, and
-    without rich, there is a line for each tenth of the total and one at the end.
-    """
-    shown, succeeded = Step(name, text, total), False
-    try:
-        yield shown
-        succeeded = True
-    finally:
-        shown.close(succeeded)
-
 
 def drawable() -> bool:
     """Return whether stdout is a terminal that can draw, and rich is installed."""
@@ -157,11 +138,10 @@ class LiveLine:
             else:
                 self._progress.console.print(line, soft_wrap=True)
 
-    def show(self, text: str, done: int = 0) -> bool:
-        """Show what happens now; return whether it is drawn."""
+    def show(self, text: str, done: int = 0) -> None:
+        """Show what happens now."""
         if self._progress is not None:
             self._progress.update(self._task, description=text, completed=done)
-        return self._progress is not None
 
     def close(self) -> None:
         """Stop drawing."""
@@ -170,31 +150,32 @@ class LiveLine:
             self._progress = None
 
 
-class Step:
-    """One step, wherever it is shown."""
+class Step(LiveLine):
+    """
+    One step of a job while it runs: a line with the time and, where the total is known, a bar.
 
-    def __init__(self, name: str, text: str, total: int) -> None:
-        self._name, self._total = name, total
-        self._begin_s, self._tenth = time.monotonic(), 0
+    Where nothing can be drawn, there is one line at its end.
+    """
+
+    def __init__(self, name: str, text: str, total: int = 0) -> None:
         bar = ('bar', '{task.percentage:3.0f} %') if total else ()
-        self._line = LiveLine((*bar, '{task.elapsed:4.0f} s'), total)
+        super().__init__((*bar, '{task.elapsed:4.0f} s'), total)
+        self._name, self._total, self._begin_s = name, total, time.monotonic()
         self.show(text)
 
+    def __enter__(self) -> Step:
+        return self
+
     def show(self, text: str, done: int = 0) -> None:
-        """Show how far the step is: a line for each tenth where nothing is drawn."""
+        """Show how far the step is."""
         width = _TEXT_WIDTH if self._total else _LINE_WIDTH - _NAME_WIDTH - 2
-        self._text, self._done = f' {self._name:{_NAME_WIDTH}} {text:{width}}', done
-        tenth = _TENTHS * done // self._total if self._total else 0
-        if not self._line.show(self._text, done) and self._tenth < tenth < _TENTHS:
-            self._print()
-        self._tenth = max(tenth, self._tenth)
+        share = f' {100 * done / self._total:3.0f} %' if self._total else ''
+        line = f' {self._name:{_NAME_WIDTH}} {text:{width}}'
+        self._plain = line + share
+        super().show(line, done)
 
-    def close(self, succeeded: bool) -> None:
-        """Stop drawing."""
-        if succeeded and not drawable():
-            self._print()
-        self._line.close()
-
-    def _print(self) -> None:
-        share = f' {100 * self._done / self._total:3.0f} %' if self._total else ''
-        print(f'{self._text}{share} {time.monotonic() - self._begin_s:4.0f} s', flush=True)
+    def __exit__(self, kind: object, *_: object) -> None:
+        """Stop drawing; a step that has failed leaves no line."""
+        if kind is None and self._progress is None:
+            print(f'{self._plain} {time.monotonic() - self._begin_s:4.0f} s', flush=True)
+        self.close()

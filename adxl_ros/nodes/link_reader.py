@@ -11,19 +11,11 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
-from adxl_ros.links.support.base import (
-    ImuLink,
-    Level,
-    Link,
-    LinkStatus,
-    StageLink,
-    Watchdog,
-)
+from adxl_ros.links.support.base import ImuLink, Level, Link, LinkStatus, StageLink
 from adxl_ros.nodes import topics
 from adxl_ros.nodes.sample_output import References, SampleOutput
 from rclpy.clock import ROSClock
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import Imu, JointState, Temperature
 
 _SIMULATOR_QUEUE = 1000
@@ -34,16 +26,8 @@ _FIELDS = {'orientation': 4, 'orientation_covariance': 9, 'angular_velocity': 3,
 _PAUSE_S = 0.004
 """Time between two looks at the samples, s. At 1 kHz four of them then share a run of the chain,
 which costs as much as ten samples."""
-_FOREIGN_NS = 60_000_000_000
-"""Largest distance of stamps from the clock of the node, ns; chosen: a larger one is another
-clock."""
-_CLOCK_WAIT_S = 5.0
-"""Time for which samples may be of another clock before a warning, s; chosen: within it nodes find
-each other, and a reset of the simulator reaches samples and /clock."""
 _COUNT_S = 1.0
 """Time after which the publishers of the samples are counted again, s; chosen."""
-_LONGEST_TURN_S = 0.25
-"""Longest time that counts from one look at the samples to the next, s."""
 
 
 class SimulatorInput:
@@ -52,8 +36,6 @@ class SimulatorInput:
     def __init__(self, node: Node, link: ImuLink) -> None:
         self._node, self._link = node, link
         self.frame_id = ''  # Frame of the newest samples
-        self._foreign = Watchdog(_LONGEST_TURN_S)
-        self._is_warned = False
         self._due_s = self._counted_s = time.monotonic()
         self._inbox = topics.Inbox(node, Imu, link.imu_topic, _SIMULATOR_QUEUE)
         self._temperature = topics.create_subscription(
@@ -78,19 +60,7 @@ class SimulatorInput:
         if raws:
             stamps_ns, fields = topics.decoded(raws, cdr.imu, **_FIELDS)
             self.frame_id = cdr.imu(raws[-1]).texts['frame_id']
-            self._warn_of_clock(int(stamps_ns[-1]))
             self._link.sense_imu(stamps_ns, fields)
-
-    def _warn_of_clock(self, stamp_ns: int) -> None:
-        """Warn once of samples that belong to another clock than the node's and go on to."""
-        away_ns = self._node.get_clock().now().nanoseconds - stamp_ns
-        if abs(away_ns) <= _FOREIGN_NS:
-            self._foreign.feed()
-        if self._foreign.check() > _CLOCK_WAIT_S and not self._is_warned:
-            self._is_warned = True
-            self._node.get_logger().warning(
-                f'{self._link.imu_topic}: stamps are {away_ns * 1e-9:+.0f} s from the clock of '
-                'this node; set use_sim_time:=true, and let the simulator publish /clock')
 
 
 _PERIOD_S = 0.004
@@ -128,10 +98,11 @@ class LinkReader:
         ros = node.get_clock()
         assert isinstance(ros, ROSClock), 'the clock of a node is that of ROS'
         self._ros = ros
-        self._clock_is_searched = self._is_real_time = False
+        self._is_real_time = False
         self._now_ns: int | None = None
         self._subscribed_ns = 0
-        self._ticked_ns = self._searched_ns = time.monotonic_ns()
+        self._ticked_ns = self._opened_ns = time.monotonic_ns()
+        self._search_ns = self._opened_ns + _CLOCK_SEARCH_NS
         self._due_s = time.monotonic()
         self._newest_ns: int | None = None
         self._stage: topics.Inbox | None = None
@@ -227,9 +198,11 @@ class LinkReader:
         """Publish the samples that are due."""
         steady_ns = time.monotonic_ns()
         step_ns, self._ticked_ns = steady_ns - self._ticked_ns, steady_ns
-        is_searched = self._search_clock(steady_ns)
+        if self._output.is_clock and steady_ns >= self._search_ns:
+            self._search_ns = steady_ns + _CLOCK_SEARCH_NS
+            self._output.follow_other_clock()
         if self._now_ns is None:
-            if not is_searched or not self._may_begin(step_ns):
+            if not self._may_begin(step_ns):
                 return
             self._now_ns = self._begin()
         samples = self._link.read(self._due_ns(self._now_ns, step_ns))
@@ -240,22 +213,12 @@ class LinkReader:
         if samples.missing:
             self._on_level(Level.WARN)
 
-    def _search_clock(self, steady_ns: int) -> bool:
-        """Follow the clock of another node; return whether the first search is over."""
-        if self._output.is_clock and steady_ns - self._searched_ns >= _CLOCK_SEARCH_NS:
-            self._searched_ns = steady_ns
-            name = self._output.follow_other_clock()
-            self._clock_is_searched = True
-            if name:
-                self._node.set_parameters([Parameter('use_sim_time', value=True)])
-                self._node.get_logger().warning(
-                    f'/clock comes from {name}: this driver follows it, and link.speed is that '
-                    'of this clock')
-        return self._clock_is_searched or not self._output.is_clock
-
     def _may_begin(self, step_ns: int) -> bool:
         """Return whether the link may begin: time runs, and some links wait for a subscriber."""
-        if not self._output.is_clock and not self._ros.now().nanoseconds:
+        if self._output.is_clock:
+            if self._ticked_ns - self._opened_ns < _CLOCK_SEARCH_NS:
+                return False
+        elif not self._ros.now().nanoseconds:
             return False
         self._subscribed_ns = self._subscribed_ns + step_ns if self._output.subscribed() else 0
         return not self._link.waits_for_listener or self._subscribed_ns >= _DISCOVERY_NS

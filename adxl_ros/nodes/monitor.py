@@ -13,9 +13,9 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.files.recording_columns import check_unit, unit_of
 from adxl_ros.files.stream_info import NO_UNIT, StreamInfo
-from adxl_ros.monitor import records
+from adxl_ros.monitor import changes
+from adxl_ros.monitor.changes import DiagnosisResult, DiagnosisRun, iso_time
 from adxl_ros.monitor.live_gap import AxisGap, GapSettings, LiveGap
-from adxl_ros.monitor.records import DiagnosisResult, DiagnosisRun, iso_time
 from adxl_ros.monitor.reference_stream import ReferenceKind, ReferenceStream
 from adxl_ros.nodes import topics
 from adxl_ros.nodes.parameters import declare_all, declare_sensor, make_sensor
@@ -23,8 +23,8 @@ from adxl_ros.nodes.rclpy_internals import NotForExecutors, take_request
 from adxl_ros.nodes.run_node import NodeHelp, run
 from adxl_ros.nodes.settings import check_given_parameters, MonitorSettings
 from adxl_ros.nodes.topics import Inbox, Level, Status
+from adxl_ros.report.quantities import percent
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
 from std_srvs.srv import Trigger
@@ -39,66 +39,57 @@ class GapState:
     def __init__(self, live: LiveGap, obstacle: str, likely: DiagnosisResult | None,
                  window_s: float) -> None:
         """Put together why nothing is compared, if so, the gap, and the newest diagnosis."""
-        self._live, self._obstacle = live, obstacle
-        self._axes = live.report()
+        gaps, serial = live.report(), live.sensor.serial
         newest_ns = max((change.since_ns for change in live.changes), default=0)
         event = sorted((change for change in live.changes
                         if newest_ns - change.since_ns < _TOGETHER_NS),
                        key=lambda change: change.since_ns)
-        is_fine = not obstacle and self._axes and not live.changes
-        self.level = Level.OK if is_fine and not any(gap.is_open for gap in self._axes) \
-            else Level.WARN
-        self.text = obstacle or 'comparing; the first result takes some seconds'
-        self.values: dict[str, object] = {'window_s': window_s, 'changes': len(live.changes)}
-        parts = []
-        if self._axes:
-            gaps, floors = (', '.join(
-                f'{gap.axis} {getattr(gap, name).value:.3g}' for gap in self._axes)
+        is_fine = gaps and not (obstacle or event or any(gap.is_open for gap in gaps))
+        text = 'comparing; the first result takes some seconds'
+        values: dict[str, object] = {'window_s': window_s, 'changes': len(live.changes)}
+        if gaps:
+            gap_mg, floor_mg = (', '.join(
+                f'{gap.axis} {getattr(gap, name).value:.3g}' for gap in gaps)
                 for name in ('gap', 'floor'))
-            parts.append(f'gap {gaps} mg, floor {floors} mg')
+            text = f'gap {gap_mg} mg, floor {floor_mg} mg'
         if event:
             latest = {(change.axis, change.quantity): change.text() for change in event}
             since = iso_time(event[0].since_ns)
-            parts.append(f'changed since {since}: {", ".join(latest.values())}')
-            self.values |= {'changed_since': since, 'changed_since_s': event[0].since_ns * 1e-9,
-                            'detected_s': event[0].detected_ns * 1e-9}
+            text += f'; changed since {since}: {", ".join(latest.values())}'
+            values |= {'changed_since': since, 'changed_since_s': event[0].since_ns * 1e-9,
+                       'detected_s': event[0].detected_ns * 1e-9}
         if likely is not None:
-            parts.append('likely ' * bool(likely.effects) + likely.text)
-            self.values |= {'likely_effect': ', '.join(likely.effects),
-                            'probability': likely.probability, 'report': likely.report}
-        if self._axes and not obstacle:
-            self.text = '; '.join(parts)
-
-    def axes(self) -> dict[str, Status]:
-        """Return the state of each axis; nothing where nothing is compared."""
-        return {} if self._obstacle else {gap.axis: Status(
-            Level.WARN if gap.is_open else Level.OK, _axis_text(gap), self._live.sensor.serial,
-            _axis_values(gap)) for gap in self._axes}
+            named = f'likely {" or ".join(likely.effects)} ({percent(likely.probability)})'
+            text += f'; {named if likely.effects else likely.text}'
+            values |= {'likely_effect': ', '.join(likely.effects),
+                       'probability': likely.probability, 'report': likely.report}
+        self.summary = Status(Level.OK if is_fine else Level.WARN, obstacle or text, serial,
+                              values)
+        # By axis; nothing where nothing is compared
+        self.axes = {} if obstacle else {gap.axis: _axis_status(gap, serial) for gap in gaps}
+        self._stamp = topics.stamp(live.newest_ns)
 
     def message(self) -> DiagnosticArray:
         """Return the message of the topic `gap`: the summary, then one status for each axis."""
-        summary = Status(self.level, self.text, self._live.sensor.serial, self.values)
-        parts = {'gap': summary} | {f'gap: {axis}': part for axis, part in self.axes().items()}
+        parts = {'gap': self.summary} | {
+            f'gap: {axis}': status for axis, status in self.axes.items()}
         array = DiagnosticArray(status=[topics.status_message(*part) for part in parts.items()])
-        array.header.stamp = topics.stamp(self._live.newest_ns)
+        array.header.stamp = self._stamp
         return array
 
 
-def _axis_values(gap: AxisGap) -> dict[str, object]:
-    """Return the values of an axis by key; `explained` is absent where nothing is to explain."""
+def _axis_status(gap: AxisGap, serial: str) -> Status:
+    """Return the gap of an axis; `explained` is absent where nothing is to explain."""
     values: dict[str, object] = {'offset_mg': gap.offset_mg, 'floor_source': gap.floor_source}
     for name, interval in (('gap', gap.gap), ('floor', gap.floor)):
         values |= {f'{name}_mg': interval.value, f'{name}_low_mg': interval.low,
                    f'{name}_high_mg': interval.high}
-    return values if gap.explained is None else values | {'explained': gap.explained}
-
-
-def _axis_text(gap: AxisGap) -> str:
-    """Return the gap of an axis in words."""
-    share = '' if gap.explained is None else \
-        f'; the parameters explain {100 * gap.explained:.0f} %'
-    return (f'gap {gap.gap.value:.3g} mg ({gap.gap.low:.3g} to {gap.gap.high:.3g}), floor '
-            f'{gap.floor.value:.3g} mg{share}')
+    text = (f'gap {gap.gap.value:.3g} mg ({gap.gap.low:.3g} to {gap.gap.high:.3g}), floor '
+            f'{gap.floor.value:.3g} mg')
+    if gap.explained is not None:
+        values['explained'] = gap.explained
+        text += f'; the parameters explain {100 * gap.explained:.0f} %'
+    return Status(Level.WARN if gap.is_open else Level.OK, text, serial, values)
 
 
 _INPUT_QUEUE = 10000
@@ -111,18 +102,14 @@ class MonitorStreams:
     def __init__(self, node: Node, kind: ReferenceKind, reference_topic: str) -> None:
         self._kind = kind
         reference = JointState if kind is ReferenceKind.STAGE else Imu
-        self._samples, self._reference, self._temperature, self._supply = (
+        self.samples, self._reference, self._temperature, self._supply = (
             Inbox(node, message, topic, _INPUT_QUEUE) for message, topic in (
                 (Imu, 'imu/data_raw'), (reference, reference_topic),
                 (Temperature, 'temperature'), (BatteryState, 'supply')))
 
-    def take_samples(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the samples that wait: stamps, ns, (n,), and acceleration, m/s², (n, 3)."""
-        return topics.imu_samples(self._samples.take())
-
     def fault(self) -> str:
         """Return that several nodes publish samples or reference, so that none count, or ''."""
-        return self._samples.fault() or self._reference.fault()
+        return self.samples.fault() or self._reference.fault()
 
     def take_others(self, reference: ReferenceStream) -> int:
         """Add reference and surroundings that wait; return how many messages of it came."""
@@ -236,7 +223,7 @@ class Monitor(Node):
     def _turn(self) -> None:
         """Take what has come, compare, and serve."""
         now_s = time.monotonic()
-        stamps_ns, accel_mps2 = self._streams.take_samples()
+        stamps_ns, accel_mps2 = topics.imu_samples(self._streams.samples.take())
         if len(stamps_ns):
             self._begun_s = self._begun_s or now_s
             self._sampled_s = now_s
@@ -251,18 +238,17 @@ class Monitor(Node):
 
     def _advance(self) -> None:
         """Compare, and put changes on disk before they are published."""
-        changes = self._live.advance()
-        for change in changes:
+        found = self._live.advance()
+        for change in found:
             self.get_logger().warning(
-                f'changed since {records.iso_time(change.since_ns)}: {change.text()}')
+                f'changed since {iso_time(change.since_ns)}: {change.text()}')
             try:
-                self._output.mkdir(parents=True, exist_ok=True)
-                records.append(self._output, change, self._live.sensor.serial)
-            except (UserError, OSError) as error:
-                self.get_logger().error(f'{self._output}: the change is not on disk: {error}')
-        if changes:
+                changes.append(self._output, change, self._live.sensor.serial)
+            except UserError as error:
+                self.get_logger().error(f'the change is not on disk: {error}')
+        if found:
             # The waiting time of a diagnosis does not start again with a further change.
-            self._changed_ns = self._changed_ns or min(change.since_ns for change in changes)
+            self._changed_ns = self._changed_ns or min(change.since_ns for change in found)
             self._diagnostics.notice(Level.WARN)
 
     def _diagnose_if_due(self) -> None:
@@ -333,13 +319,13 @@ class Monitor(Node):
     def _status(self) -> Status:
         """Return the state for /diagnostics, with counts."""
         state = self._state()
-        values = state.values | {
-            f'{axis}_{key}': value for axis, status in state.axes().items()
-            for key, value in status.values.items()}
+        values = {**state.summary.values, **{
+            f'{axis}_{key}': value for axis, status in state.axes.items()
+            for key, value in status.values.items()}}
         values |= {**vars(self._live.counts), 'diagnosis_runs': self._run is not None,
                    'false_alarms_per_day': self._settings.false_alarms_per_day}
-        level = Level.ERROR if self._refusal or self._streams.fault() else state.level
-        return Status(level, state.text, self._live.sensor.serial, values)
+        level = Level.ERROR if self._refusal or self._streams.fault() else state.summary.level
+        return replace(state.summary, level=level, values=values)
 
 
 def main() -> int:

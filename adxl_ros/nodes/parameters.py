@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import field, fields
 from difflib import get_close_matches
 from itertools import pairwise
-from pathlib import Path
 import re
 import sys
 from typing import Any, NamedTuple, TypeVar
@@ -100,13 +99,14 @@ def declare(node: Node, spec: Spec) -> Any:
     descriptor = msg.ParameterDescriptor(
         description=spec.meaning, read_only=not spec.live, dynamic_typing=spec.default == (),
         additional_constraints=spec.limits)
-    # ROS has no range for lists.
-    if spec.lower is not None and spec.upper is not None and kind == Kind.DOUBLE:
-        descriptor.floating_point_range = [msg.FloatingPointRange(
-            from_value=float(spec.lower), to_value=float(spec.upper))]
-    elif spec.lower is not None and spec.upper is not None and kind == Kind.INTEGER:
-        descriptor.integer_range = [msg.IntegerRange(
-            from_value=int(spec.lower), to_value=int(spec.upper))]
+    if spec.lower is not None and spec.upper is not None:
+        # ROS has no range for lists.
+        if kind == Kind.DOUBLE:
+            descriptor.floating_point_range = [msg.FloatingPointRange(
+                from_value=float(spec.lower), to_value=float(spec.upper))]
+        elif kind == Kind.INTEGER:
+            descriptor.integer_range = [msg.IntegerRange(
+                from_value=int(spec.lower), to_value=int(spec.upper))]
     try:
         value = node.declare_parameter(
             name, '' if spec.default == () else spec.default, descriptor).value
@@ -165,7 +165,7 @@ def _place_of(key: str) -> str:
     Return the place of a parameter in the files: 'file:line:column: ', or ''.
 
     The last argument that gives a parameter counts. A parameter that none gives belongs to the
-    last file of a sensor, which has a format.
+    last file of a sensor, which has a format, or to the last file.
     """
     for flag, value in reversed(list(pairwise(sys.argv))):
         # A rule is [NODE:]NAME:=VALUE.
@@ -174,16 +174,10 @@ def _place_of(key: str) -> str:
         marks = [found.start_mark for _, name, found in _entries(value) if name == key] \
             if flag == _FILE_FLAG else []
         if marks:
-            return 'parameters of the launch file: ' if _is_of_launch(value) else \
-                f'{value}:{marks[0].line + 1}:{marks[0].column + 1}: '
-    files = [path for path in reversed(_paths()) if not _is_of_launch(path)]
-    of_sensor = [path for path in files if any(name == 'format' for _, name, _ in _entries(path))]
-    return ''.join(f'{path}: ' for path in [*of_sensor, *files][:1])
-
-
-def _is_of_launch(path: str) -> bool:
-    """Return whether launch_ros wrote a file for the parameters of a launch file."""
-    return Path(path).name.startswith('launch_params_')
+            return f'{value}:{marks[0].line + 1}:{marks[0].column + 1}: '
+    files = sorted(_paths(), key=lambda path: any(
+        name == 'format' for _, name, _ in _entries(path)))
+    return f'{files[-1]}: ' if files else ''
 
 
 def _paths() -> list[str]:
@@ -210,16 +204,9 @@ def _entries(path: str) -> Iterator[tuple[str, str, yaml.Node]]:
 
 
 def check_params_files() -> None:
-    """Check syntax and lists of all parameter files; rcl would name neither line nor column."""
+    """Check the syntax of all parameter files; rcl would name neither line nor column."""
     for path in _paths():
-        for _, _, value in _entries(path):
-            items = value.value if isinstance(value, yaml.SequenceNode) else []
-            for item in items[1:]:
-                if item.tag != items[0].tag:
-                    mark = item.start_mark
-                    raise UserError(
-                        f'{path}:{mark.line + 1}:{mark.column + 1}: {item.value} is not of the '
-                        f'type of {items[0].value} before it; a list has one type (1.0, never 1)')
+        parameter_file.compose(path)
 
 
 def has_section(path: str, node_name: str) -> bool:

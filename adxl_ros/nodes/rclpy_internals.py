@@ -10,7 +10,7 @@ import sys
 from typing import Any
 
 from adxl_ros.errors import one_line
-from rclpy.callback_groups import CallbackGroup
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -25,7 +25,7 @@ _LONGEST_WAIT_NS = 100_000_000
 """Longest wait for a message, ns; chosen: a thread that waits sees within it that it shall end."""
 
 
-class NotForExecutors(CallbackGroup):
+class NotForExecutors(ReentrantCallbackGroup):
     """
     Keeps a subscription out of the executor that spins its node.
 
@@ -36,13 +36,6 @@ class NotForExecutors(CallbackGroup):
     def can_execute(self, entity: Any) -> bool:
         """Return False: no executor may take from the subscription."""
         return False
-
-    def beginning_execution(self, entity: Any) -> bool:
-        """Return False: no executor may take from the subscription."""
-        return False
-
-    def ending_execution(self, entity: Any) -> None:
-        """Do nothing: nothing was executed."""
 
 
 def take_messages(subscription: Subscription, kind: Any, raw: bool, limit: int,
@@ -119,16 +112,6 @@ def given_parameters(node: Node) -> Iterable[tuple[str, Any]]:
     that no declaration can know their names.
     """
     return ((name, parameter.value) for name, parameter in node._parameter_overrides.items())
-
-
-def is_rclpy_error(error: BaseException) -> bool:
-    """Return whether an error is one of rclpy's own, which have no common base class."""
-    return type(error).__module__.startswith('rclpy')
-
-
-def is_usage_error(error: BaseException) -> bool:
-    """Return whether rclpy refuses the ROS arguments; the class is in its C++ module alone."""
-    return 'ROSArgs' in type(error).__name__
 
 
 def start_error_text(error: BaseException) -> str:

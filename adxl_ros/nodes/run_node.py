@@ -23,8 +23,8 @@ from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.links.support import base
-from adxl_ros.nodes import rclpy_internals
 from adxl_ros.nodes.parameters import check_params_files, Kind, nominal_specs, Spec, specs_of
+from adxl_ros.nodes.rclpy_internals import start_error_text
 from adxl_ros.nodes.settings import DriverSettings, link_specs
 from adxl_ros.nodes.topics import type_name
 from adxl_ros.process import ended_by_closed_output, package_version
@@ -54,7 +54,6 @@ class NodeHelp(NamedTuple):
     examples: Mapping[str, str]  # Arguments of each example, by its purpose
     settings: Sequence[type] = ()  # Dataclasses of its parameters
     has_sensor: bool = True  # Whether it has those of a sensor, too
-    variants: Mapping[str, type] = {}  # Dataclasses of further parameters, by what needs them
 
 
 def print_if_asked(arguments: Sequence[str], make_node: Callable[[], Node], node_help: NodeHelp
@@ -74,16 +73,11 @@ def program_parser(name: str, description: str | None, examples: Mapping[str, st
                    ) -> argparse.ArgumentParser:
     """Make the parser of a program that starts nodes, with `--version` and examples."""
     parser = argparse.ArgumentParser(
-        prog=name, description='\n'.join(_wrapped(_purpose(description))),
+        prog=name, description='\n'.join(_wrapped(description or '')),
         epilog='\n'.join(_example_lines(name, examples)[1:]),
         formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--version', action='version', version=f'adxl_ros {package_version()}')
     return parser
-
-
-def _purpose(description: str | None) -> str:
-    """Return a docstring as one line."""
-    return ' '.join((description or '').split())
 
 
 def _help_lines(name: str, make_node: Callable[[], Node], node_help: NodeHelp) -> list[str]:
@@ -91,13 +85,10 @@ def _help_lines(name: str, make_node: Callable[[], Node], node_help: NodeHelp) -
     own = list(chain.from_iterable(map(specs_of, node_help.settings)))
     lines = [f'usage: {name} [--help] [--version] [--ros-args -p NAME:=VALUE ...',
              f'{"":{len(name) + 8}}--params-file FILE -r FROM:=TO ...]', '',
-             *_wrapped(_purpose(node_help.description)), '',
+             *_wrapped(node_help.description or ''), '',
              'parameters: type, default, meaning', *_spec_lines(own)]
-    variants = {title: specs_of(part) for title, part in node_help.variants.items()}
-    if DriverSettings in node_help.settings:
-        variants |= {f'link.type:={link}': link_specs(link) for link in base.link_names()}
-    for title, specs in variants.items():
-        lines += ['', f'with {title}', *_spec_lines(specs)]
+    for link in base.link_names() if DriverSettings in node_help.settings else ():
+        lines += ['', f'with link.type:={link}', *_spec_lines(link_specs(link))]
     if node_help.has_sensor:
         of_file = nominal_specs()
         listed = [spec for spec in of_file if spec.name.startswith(_LISTED_OF_SENSOR)]
@@ -129,15 +120,10 @@ def _topics(make_node: Callable[[], Node]) -> dict[str, dict[str, str]]:
                 'services': {service.srv_name: type_name(service.srv_type)
                              for service in node.services if service.srv_name.startswith('~/')}}
     finally:
-        _close(node)
+        if hasattr(node, 'close'):
+            node.close()
         node.destroy_node()
         rclpy.shutdown()
-
-
-def _close(node: Node) -> None:
-    """Close what a node holds open."""
-    if hasattr(node, 'close'):
-        node.close()
 
 
 def _typed(endpoints: Iterable[Any]) -> dict[str, str]:
@@ -163,7 +149,7 @@ def command_lines(arguments: str, indent: int, further: int) -> list[str]:
 def _wrapped(text: str, indent: int = 0, further: int | None = None, reserve: int = 0
              ) -> list[str]:
     """Wrap a text between words, all lines or further ones with an indent."""
-    return textwrap.wrap(text, _COLUMNS - reserve, initial_indent=indent * ' ',
+    return textwrap.wrap(' '.join(text.split()), _COLUMNS - reserve, initial_indent=indent * ' ',
                          subsequent_indent=(indent if further is None else further) * ' ',
                          break_long_words=False, break_on_hyphens=False)
 
@@ -231,14 +217,16 @@ def run(make_node: Callable[[], Node], node_help: NodeHelp,
         if is_initialised and not rclpy.ok():
             # A signal has ended the context during the start.
             return 0
-        if not isinstance(error, UserError) and not rclpy_internals.is_rclpy_error(error):
+        # The errors of rclpy have no common base class, and one is in its C++ module alone.
+        if not isinstance(error, UserError) and not type(error).__module__.startswith('rclpy'):
             raise
-        print(f'{name}: {rclpy_internals.start_error_text(error)}', file=sys.stderr)
-        return 2 if rclpy_internals.is_usage_error(error) else 1
+        print(f'{name}: {start_error_text(error)}', file=sys.stderr)
+        return 2 if 'ROSArgs' in type(error).__name__ else 1
     try:
         _spin(node, work)
     finally:
-        _close(node)
+        if hasattr(node, 'close'):
+            node.close()
         rclpy.try_shutdown()
         # A launch passes Ctrl-C on, although the terminal has sent it too. The second signal may
         # come after Python has removed its handlers.

@@ -22,6 +22,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.clock import Clock as StampClock
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
 
@@ -175,10 +176,10 @@ class References:
         return message
 
 
-_QUEUE = 5000
-"""Samples that are kept for a slow subscriber: 5 s at 1 kHz."""
 _UNKNOWN_NODE = '_NODE_NAME_UNKNOWN_'
 """Name that the middleware gives a node that it has not discovered yet (rmw_dds_common)."""
+_QUEUE = 5000
+"""Samples that are kept for a slow subscriber: 5 s at 1 kHz."""
 
 
 def imu_writer(sensor: Sensor, frame_id: str) -> topics.MessageWriter:
@@ -204,7 +205,7 @@ class SampleOutput:
     Publishes samples, the values that make them readable, and sensor time.
 
     sensor, frame_id, is_clock, tally: as given; `sensor` may be replaced, `frame_id` may follow
-    that of a simulator, and `is_clock` ends beside another clock.
+    that of a simulator, and `is_clock` ends where another node publishes /clock.
     """
 
     def __init__(self, node: Node, sensor: Sensor, frame_id: str, delay_ns: int, is_clock: bool,
@@ -223,22 +224,20 @@ class SampleOutput:
         for publisher in filter(None, (self._data, self._info, self._clock)):
             self._node.destroy_publisher(publisher)
 
-    def follow_other_clock(self) -> str:
-        """Stop being the clock if another node is; the one that sorts first stays."""
-        if self._clock is None:
-            return ''
-        own = self._node.get_fully_qualified_name()
-        # A publisher may be discovered before the name of its node; the next search has it.
-        others = [name for name in (
-            f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in
-            self._node.get_publishers_info_by_topic(self._clock.topic_name)
-            if info.node_name != _UNKNOWN_NODE) if name != own
-            and (name.split('/')[-1] != self._node.get_name() or name < own)]
-        if not others:
-            return ''
+    def follow_other_clock(self) -> None:
+        """Stop being the clock if another node is; of drivers, the one that sorts first stays."""
+        own = self._node.get_namespace(), self._node.get_name()
+        clocks = [(info.node_namespace, info.node_name) for info in
+                  self._node.get_publishers_info_by_topic('/clock')
+                  if info.node_name != _UNKNOWN_NODE]
+        if self._clock is None or not any(
+                name != own and (name[1] != own[1] or name < own) for name in clocks):
+            return
         self._node.destroy_publisher(self._clock)
         self._clock, self.is_clock = None, False
-        return others[0]
+        self._node.set_parameters([Parameter('use_sim_time', value=True)])
+        self._node.get_logger().warning('another node publishes /clock: this driver follows it, '
+                                        'and link.speed is that of this clock')
 
     def use(self, sensor: Sensor) -> None:
         """Convert samples by the nominal values of a sensor, and publish these."""

@@ -6,18 +6,19 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 import os
 import signal
 import sys
+from textwrap import wrap
 import time
-from typing import TextIO, TYPE_CHECKING
+from typing import Any, TextIO
 
+from adxl_ros.calibrate.guided import screen_contents as screen
 from adxl_ros.calibrate.guided.screen_contents import ScreenContents
 from adxl_ros.errors import UserError
-from adxl_ros.nodes.draw import draw, Line, LogLine
 from adxl_ros.nodes.jobs import held_output
 from adxl_ros.nodes.parameters import declare_all
 from adxl_ros.nodes.run_node import NodeHelp, run
@@ -30,18 +31,134 @@ from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-if TYPE_CHECKING:
-    from prompt_toolkit.application import Application
-    from prompt_toolkit.formatted_text import StyleAndTextTuples
-    from prompt_toolkit.key_binding import KeyPressEvent
+Line = list[tuple[str, str]]
+"""A line of the screen: styles of prompt_toolkit, each with its text."""
+Row = tuple[str, str, str]
+"""Label, text and style of a row."""
+
+_COLOURS = {'dwell': 'ansigreen', 'refused': 'ansired', 'silent': 'ansired',
+            'question': 'ansiyellow', 'rest': 'ansiyellow', 'stage': 'ansiyellow',
+            'operator': 'bold ansicyan', 'fit': 'ansigreen'}
+"""Styles by phase."""
+_MOTIONS = {'rms': 'moving', 'drift': 'drifting'}
+"""What a sensor does that is not at rest, by the quantity that shows it."""
+_LEAST_WIDTH = 20
+"""A narrower terminal is drawn as if it had this width, columns."""
+_LEAST_LINES = 4
+"""Lines that a low terminal keeps beside log and keys: title, text, pose and angles."""
+_TEXT_LINES = 5
+"""Largest number of lines of the text at the top."""
+_LABEL_WIDTH = 11
+"""Width of the labels with a space, columns: the longest is 'tilt error'."""
+_BAR_WIDTH = 12
+"""Width of a bar, columns."""
+_COEFFICIENT_BAR_WIDTH = 3
+"""Width of the bar of a coefficient, columns: the intervals of three axes are long."""
+_SHORTEST_NAME = 8
+"""Smallest width of the name of a coefficient, columns."""
+_FEW_LINES = 3
+"""Largest number of lines of the log, and of a text with a label."""
+
+
+def draw(contents: screen.ScreenContents, log: Iterable[tuple[str, str]], columns: int, rows: int
+         ) -> list[Line]:
+    """Lay contents and log, styles and messages, out in the lines of a terminal."""
+    width = max(columns - 1, _LEAST_WIDTH)
+    task = f' of {contents.unit or "no sensor yet"} into {contents.output}'
+    title = f' calibration{task if contents.output else ""}'
+    top = [('reverse', f'{title:{width}}'),
+           *((_COLOURS.get(contents.phase, 'bold'), line)
+             for line in wrap(contents.text, width)[:_TEXT_LINES])]
+    for label, text, style in (*_readings(contents.progress, contents.live),
+                               *_progress(contents.progress, contents.estimate)):
+        top += [(style, line) for line in wrap(
+            text, width, initial_indent=f'{label:{_LABEL_WIDTH}}',
+            subsequent_indent=_LABEL_WIDTH * ' ')[:_FEW_LINES]]
+    coefficients = contents.estimate.coefficients if contents.estimate else ()
+    # A line of the outcome that fits keeps its spaces.
+    middle = [line for text in contents.outcome
+              for line in ([text] if len(text) <= width else wrap(text, width))
+              ] or _coefficients(coefficients, width)
+    messages = [(style, line) for style, text in log for line in wrap(text, width)][-_FEW_LINES:]
+    # A small terminal keeps the keys and the first lines, which say what to do.
+    room = max(rows - len(messages) - 1, _LEAST_LINES)
+    body = [*top, *(('', line) for line in middle), *[('', '')] * room][:room]
+    keys = [(key.key, key.action) for key in contents.keys] + [('q', 'quit')]
+    return [*([(style, line[:width])] for style, line in (*body, *messages)),
+            [part for key, action in keys
+             for part in (('reverse', f' {key} '), ('', f' {action}  '))]]
+
+
+def _readings(progress: screen.Progress | None, live: screen.LiveReading | None) -> Iterator[Row]:
+    """Yield the pose, where the stage is, and what the sensor reads."""
+    if progress is not None:
+        total = '' if progress.remaining_s is None else f' of {progress.total}'
+        yield 'pose', f'{progress.number}{total}: {progress.destination}', ''
+        if progress.position:
+            yield 'now', progress.position, ''
+    if live is None:
+        return
+    axes = '  '.join(f'{axis.axis} {axis.mean_mps2:+.3f} ± {axis.rms_mps2:.3f}'
+                     for axis in live.axes)
+    rate = '' if live.rate_hz is None else f'  {live.rate_hz:.0f} Hz'
+    yield 'reads', f'{axes} m/s²{rate}', ''
+    if (rest := live.rest) is not None:
+        share = rest.value_mps2 / rest.limit_mps2 if rest.limit_mps2 else 1.0
+        motion = 'at rest' if rest.at_rest else _MOTIONS[rest.quantity]
+        yield 'rest', (
+            f'{_bar(share)} {motion}: {rest.value_mps2:.2g} m/s² {rest.quantity} on {rest.axis}, '
+            f'must be below {rest.limit_mps2:.2g}'), 'green' if rest.at_rest else 'yellow'
+    if progress is not None and progress.dwell_s is not None and progress.dwelt_s is not None:
+        bar = _bar(progress.dwelt_s / progress.dwell_s)
+        yield 'dwell', f'{bar} {progress.dwelt_s:.1f} of {progress.dwell_s:g} s', ''
+
+
+def _progress(progress: screen.Progress | None, estimate: screen.Estimate | None) -> Iterator[Row]:
+    """Yield how many poses are done, what they cover, and how good the fit will be."""
+    if progress is None or estimate is None:
+        return
+    closed = progress.accepted + progress.skipped
+    skipped = f'{progress.skipped} left out, ' if progress.skipped else ''
+    time = ' for a good fit' if progress.remaining_s is None else \
+        f', about {progress.remaining_s / 60:.0f} min'
+    yield 'parts' if estimate.range_error else 'poses', (
+        f'{_bar(closed / progress.total)} {progress.accepted} done, {skipped}'
+        f'{max(progress.total - closed, 0)} left{time}'), ''
+    covered = ', '.join(f'{row.group} {row.accepted}/{row.total}' for row in estimate.coverage)
+    faces = f' ({estimate.covered_faces} up)' if estimate.covered_faces else ''
+    yield 'coverage', covered + faces, ''
+    if estimate.range_error:
+        yield 'error', estimate.range_error, ''
+    elif estimate.tilt_error_deg is None:
+        yield 'tilt error', 'no pose shows both angles to one axis', ''
+    else:
+        final = '' if estimate.final_tilt_error_deg is None else \
+            f', {estimate.final_tilt_error_deg:.2g}° after all poses'
+        yield 'tilt error', f'{estimate.tilt_error_deg:.2g}° expected now{final}', 'bold'
+
+
+def _coefficients(rows: Sequence[screen.CoefficientRow], width: int) -> list[str]:
+    """Return a row for each coefficient: name without unit, bar and intervals."""
+    texts = {row.name.split(',')[0]: f'{_bar(row.determined, _COEFFICIENT_BAR_WIDTH)} '
+             + ' '.join(row.intervals).replace(' ± ', '±') for row in rows}
+    room = max(min(max(map(len, texts), default=0),
+                   width - 1 - max(map(len, texts.values()), default=0)), _SHORTEST_NAME)
+    return [f'{name[:room]:{room}} {text}' for name, text in texts.items()]
+
+
+def _bar(share: float, width: int = _BAR_WIDTH) -> str:
+    """Return a bar of a width in columns, of which a share from 0 to 1 is full."""
+    full = round(min(max(share, 0.0), 1.0) * width)
+    return '█' * full + '░' * (width - full)
+
 
 _REFRESH_S = 0.2
 """Time between two drawings, s: the node publishes contents five times a second."""
 
 
 def full_screen(lines: Callable[[int, int], list[Line]], press: Callable[[str], None],
-                leave: Callable[[], None]) -> Application[None]:
-    """Make the application of a full screen."""
+                leave: Callable[[], None]) -> Any:
+    """Make the application of prompt_toolkit with a full screen."""
     try:
         from prompt_toolkit.application import Application
         from prompt_toolkit.input import create_input
@@ -53,14 +170,14 @@ def full_screen(lines: Callable[[int, int], list[Line]], press: Callable[[str], 
     stdin, stdout = _terminal()
     output, keys = create_output(stdout), KeyBindings()
 
-    def fragments() -> StyleAndTextTuples:
+    def fragments() -> Any:
         rows, columns = output.get_size()
-        drawn: StyleAndTextTuples = []
+        drawn: Line = []
         for line in lines(columns, rows):
             drawn += [*line, ('', '\n')]
         return drawn[:-1]
 
-    def end(event: KeyPressEvent) -> None:
+    def end(event: Any) -> None:
         leave()
         event.app.exit()
 
@@ -93,10 +210,10 @@ _SILENT_S = 2.0
 """Age at which a display is reported as missing, s; chosen: ten missing messages."""
 _QUEUE = 100
 """Lines of all nodes' logs that wait; chosen: far more than come between two callbacks."""
-_MESSAGES = 3
-"""Messages of the log that are kept: as many as the screen shows at most."""
 _STYLES = {Log.WARN: 'ansiyellow', Log.ERROR: 'ansired', Log.FATAL: 'ansired'}
-"""Styles of log lines by level; others have that of `LogLine`."""
+"""Styles of log lines by level."""
+_PLAIN = 'ansibrightblack'
+"""Style of other log lines."""
 _EXAMPLES = {
     'the screen of a calibration that runs elsewhere': '',
     'in the namespace of the sensor': '--ros-args -r __ns:=/arm',
@@ -113,7 +230,7 @@ class Screen(Node):
         name, self._node_pid = own.node, own.node_pid
         self._target = self.resolve_topic_name(name)
         self._contents, self._received_s = ScreenContents('info', ''), 0.0
-        self._log: deque[LogLine] = deque(maxlen=_MESSAGES)
+        self._log: deque[tuple[str, str]] = deque(maxlen=_FEW_LINES)  # Styles and messages
         self._finish_is_confirmed = False
         self._application = full_screen(
             lambda columns, rows: draw(self._shown(), self._log, columns, rows), self._press,
@@ -208,12 +325,12 @@ class Screen(Node):
 
     def _on_log(self, message: Log) -> None:
         if message.name == self._target.strip('/').replace('/', '.'):
-            self._log.append(LogLine(message.msg, _STYLES.get(message.level, LogLine('').style)))
+            self._log.append((_STYLES.get(message.level, _PLAIN), message.msg))
 
     def _say(self, text: str) -> None:
         """Show a line unless the log shows it."""
-        if all(line.text != text for line in self._log):
-            self._log.append(LogLine(text))
+        if all(line != text for _, line in self._log):
+            self._log.append((_PLAIN, text))
 
 
 def main() -> int:

@@ -27,8 +27,6 @@ _JUMP_NS = 1_000_000_000
 """Smallest jump of ROS time after which the motion goes on from there, ns; chosen."""
 _QUEUE = 1000
 """Poses that are kept for a slow subscriber: 10 s of ROS time."""
-_LIMITS = ('slew_rate_rad_s', 'slew_rate_m_s', 'settling_time_s', 'stage.resolution_rad')
-"""Parameters that the log states at the start."""
 
 
 class SimulatedStageNode:
@@ -52,7 +50,6 @@ class SimulatedStageNode:
         self._writer = topics.MessageWriter(
             JointState(name=list(JOINTS), position=zeros, velocity=zeros), cdr.joint_state)
         self._simulated_ns = 0
-        self._is_commanded = False
         self._refusal_count = 0
         self._refusal = ''
         self._encoders = topics.create_publisher(node, JointState, 'stage/joint_states', _QUEUE)
@@ -60,11 +57,8 @@ class SimulatedStageNode:
         self._diagnostics = topics.DiagnosticsReporter(node, 'stage', self._status)
         topics.create_subscription(node, JointState, 'stage/command', self._on_command,
                                    _COMMAND_QUEUE)
-        limits = (f'{name} {node.get_parameter(name).value:g}' for name in _LIMITS)
-        pose = ', '.join(f'{name} {p:.4g}' for name, p in zip(JOINTS, self._stage.encoder()))
-        node.get_logger().info(
-            f'simulated stage at {pose} (rad, rad, m): {", ".join(limits)}; waiting for '
-            f'{node.resolve_topic_name("stage/command")}')
+        node.get_logger().info('simulated stage: waiting for '
+                               f'{node.resolve_topic_name("stage/command")}')
         # The timer runs on ROS time: each message of a faster clock wakes the node.
         node.create_timer(_STEP_NS * 1e-9, self._tick)
 
@@ -81,10 +75,6 @@ class SimulatedStageNode:
             self._node.get_logger().warning(
                 f'{self._refusal}; the stage stays with the command before')
             self._diagnostics.notice(Level.WARN)
-            return
-        if not self._is_commanded:
-            self._is_commanded = True
-            self._node.get_logger().info(f'first command: {positions}')
 
     def _tick(self) -> None:
         """Simulate up to the time at which a new command may take effect; show what is due."""
@@ -203,12 +193,9 @@ class StageBridge:
                                    _COMMAND_QUEUE)
         topics.create_subscription(node, JointState, own.joint_states, self._on_states,
                                    _STATES_QUEUE)
-        joints = ', '.join(f'{name} is {joint.name}' for name, joint in self._joints.items())
-        speed = f' at most {self._speed_rad_s:g} rad/s' if kind == 'trajectory' else ''
         node.get_logger().info(
-            f'bridge ({kind}){speed}: {joints}; commands go to {self._commands.topic_name}, '
-            f'positions come from {self._states_topic}; waiting for '
-            f'{node.resolve_topic_name("stage/command")}')
+            f'bridge ({kind}): commands go to {self._commands.topic_name}, positions come from '
+            f'{self._states_topic}; waiting for {node.resolve_topic_name("stage/command")}')
 
     def _on_command(self, message: JointState) -> None:
         positions = dict(zip(message.name, message.position))
@@ -227,8 +214,6 @@ class StageBridge:
         # The calibration repeats its command: a controller would begin its trajectory each time.
         if goal == self._goal and (self._arrived() or now_ns < self._resend_ns):
             return
-        if not self._goal:
-            self._node.get_logger().info(f'first command: {positions}')
         # The longer way to the goal counts, or half a turn where it is unknown.
         ways_rad = [abs(goal[name] - joint.angle_rad) for name, joint in self._joints.items()
                     if joint.angle_rad is not None]
@@ -339,7 +324,4 @@ class Stage(Node):
 
 def main() -> int:
     """Run the node."""
-    return run(Stage, NodeHelp(
-        __doc__, _EXAMPLES, (settings.StageSettings, settings.SimulatedStageSettings),
-        has_sensor=False,
-        variants={'stage.type:=trajectory, or joint_state': settings.BridgeSettings}))
+    return run(Stage, NodeHelp(__doc__, _EXAMPLES, settings.NODES['stage'], has_sensor=False))

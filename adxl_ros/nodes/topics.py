@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 import struct
 import threading
 import time
@@ -33,7 +34,7 @@ from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPo
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import serialize_message
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import Imu
+from sensor_msgs.msg import BatteryState, Imu, Temperature
 
 _OVERRIDING = QoSOverridingOptions((QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH,
                                     QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY))
@@ -81,40 +82,16 @@ def create_subscription(node: Node, kind: Any, topic: str, callback: Callable[[A
     return subscription
 
 
-class OnePublisher:
-    """
-    Withholds messages while several nodes send them on one topic, because a mixture is no signal.
+def subscribe_surroundings(node: Node, depth: int, take: Callable[[str, int, float], object]
+                           ) -> None:
+    """Give temperature, °C, and supply, V, to a function, with topic and stamp, ns."""
+    def give(topic: str, field: str, message: Any) -> None:
+        stamp = message.header.stamp
+        take(topic, stamp.sec * 10 ** 9 + stamp.nanosec, getattr(message, field))
 
-    Each publisher numbers its messages. The number steps back once where a publisher was started
-    again, and over and over where two send by turns.
-    """
-
-    def __init__(self, node: Node, topic: str) -> None:
-        self._node, self._topic = node, node.resolve_topic_name(topic)
-        self._number = 0
-        self._back_s, self._until_s = -_MIXED_S, 0.0
-
-    def __call__(self, number: int | None) -> bool:
-        """Return whether to take a message of a sequence number; None where the RMW has none."""
-        if number is not None:
-            if number <= self._number:
-                now_s = time.monotonic()
-                if now_s - self._back_s < _MIXED_S:
-                    self._until_s = now_s + _MIXED_S
-                self._back_s = now_s
-            self._number = number
-        return not self._mixes
-
-    @property
-    def _mixes(self) -> bool:
-        return bool(self._until_s) and time.monotonic() <= self._until_s
-
-    def fault(self) -> str:
-        """Return how many nodes publish on the topic while messages are withheld, or ''."""
-        if not self._mixes:
-            return ''
-        count = max(self._node.count_publishers(self._topic), 2)
-        return f'{self._topic}: {count} nodes publish it, and their samples mix; end all but one'
+    for topic, kind, field in (('temperature', Temperature, 'temperature'),
+                               ('supply', BatteryState, 'voltage')):
+        create_subscription(node, kind, topic, partial(give, topic, field), depth)
 
 
 @contextmanager
@@ -195,13 +172,16 @@ class Inbox:
     Keeps the serialized messages of a topic until they are taken, without waking an executor.
 
     At 1 kHz an executor that wakes for each message takes a tenth of a core. It subscribes best
-    effort. Samples (sensor_msgs/Imu) of several publishers are withheld.
+    effort. Samples (sensor_msgs/Imu) are withheld while several nodes send them, because a mixture
+    is no signal. Each publisher numbers its messages: the number steps back once where a publisher
+    was started again, and over and over where two send by turns.
     """
 
     def __init__(self, node: Node, kind: Any, topic: str, depth: int, reliable: bool = False
                  ) -> None:
         self._node, self._kind, self._depth = node, kind, depth
-        self._publishers = OnePublisher(node, topic)
+        self._topic = node.resolve_topic_name(topic)
+        self._number, self._back_s, self._mixed_until_s = 0, -_MIXED_S, 0.0
         self._subscription = create_subscription(
             node, kind, topic, lambda _: None, depth, raw=True, group=NotForExecutors(),
             reliable=reliable)
@@ -218,12 +198,26 @@ class Inbox:
             callback(message)
 
     def _waiting(self) -> Iterator[bytes]:
-        accept = (self._publishers,) if self._kind is Imu else ()
+        accept = (self._accepts,) if self._kind is Imu else ()
         return take_messages(self._subscription, self._kind, True, self._depth, *accept)
+
+    def _accepts(self, number: int | None) -> bool:
+        """Return whether to take a message of a sequence number; None where the RMW has none."""
+        if number is not None:
+            if number <= self._number:
+                now_s = time.monotonic()
+                if now_s - self._back_s < _MIXED_S:
+                    self._mixed_until_s = now_s + _MIXED_S
+                self._back_s = now_s
+            self._number = number
+        return time.monotonic() > self._mixed_until_s
 
     def fault(self) -> str:
         """Return that several nodes publish on the topic, so that nothing is taken, or ''."""
-        return self._publishers.fault()
+        if time.monotonic() > self._mixed_until_s:
+            return ''
+        count = max(self._node.count_publishers(self._topic), 2)
+        return f'{self._topic}: {count} nodes publish it, and their samples mix; end all but one'
 
     def destroy(self) -> None:
         """Remove the subscription; a thread that waits must have ended."""

@@ -6,11 +6,11 @@ from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 
+from adxl_ros.diagnose.next_experiment import ManoeuvreWorth
 from adxl_ros.diagnose.verdict import WeightedHypothesis
 from adxl_ros.investigate.diagnosis_round import (
     Assessment,
     decide,
-    ManoeuvreWorth,
     Outcome,
     Question,
     rank,

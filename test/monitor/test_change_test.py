@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from adxl_ros.monitor.change_test import Change, ChangeSettings, ChangeTest
+from adxl_ros.monitor.changes import Change, ChangeSettings, ChangeTest
 import numpy as np
 import pytest
 from scipy.stats import poisson

@@ -7,7 +7,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.monitor.live_gap import GapChange, GapSettings, LiveGap
+from adxl_ros.monitor.changes import GapChange
+from adxl_ros.monitor.live_gap import GapSettings, LiveGap
 from adxl_ros.monitor.reference_stream import ReferenceKind
 from adxl_ros.simulate.motion import Held, Motion
 from adxl_ros.simulate.response import Response

@@ -27,19 +27,17 @@ def test_titles() -> None:
 def test_steps_without_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     out = io.StringIO()
     monkeypatch.setattr(sys, 'stdout', out)
-    with jobs.step('1/2 sweep', 'starting', 146) as step:
+    with jobs.Step('1/2 sweep', 'starting', 146) as step:
         for count in range(1, 147):
             step.show(f'{count} of 146 poses', count)
-    with jobs.step('2/2 fit', '130 poses') as step:
+    with jobs.Step('2/2 fit', '130 poses') as step:
         step.show('130 poses, full model')
-    with pytest.raises(UserError), jobs.step('3/3 check', '16 poses'):
+    with pytest.raises(UserError), jobs.Step('3/3 check', '16 poses'):
         raise UserError('it fails')
     lines = out.getvalue().splitlines()
-    assert [line.split()[2] for line in lines[:10]] == [
-        '15', '30', '44', '59', '73', '88', '103', '117', '132', '146']
-    assert lines[9].split() == ['1/2', 'sweep', '146', 'of', '146', 'poses', '100', '%', '0', 's']
-    assert lines[10].split() == ['2/2', 'fit', '130', 'poses,', 'full', 'model', '0', 's']
-    assert len(lines) == 11 and max(map(len, lines)) <= 79
+    assert lines[0].split() == ['1/2', 'sweep', '146', 'of', '146', 'poses', '100', '%', '0', 's']
+    assert lines[1].split() == ['2/2', 'fit', '130', 'poses,', 'full', 'model', '0', 's']
+    assert len(lines) == 2 and max(map(len, lines)) <= 79
     assert '\x1b' not in out.getvalue()
 
 
