@@ -91,9 +91,9 @@ class Arm(ForcePath):
     def __init__(self) -> None:
         """Take the swing of a joint."""
         super().__init__(CARRIED_S, self.force(self.turn(0.0)))
-        self.modes = {'joint1': (self.force(self.turn(0.0) + 1e-4) - self.force(self.turn(0.0)))
-                      / 1e-4,
-                      'flexible': (self.force(self.turn(1e-5)) - self.force(self.turn(0.0))) / 1e-5}
+        q, force = self.turn(0.0), self.force(self.turn(0.0))
+        self.modes = {'joint1': (self.force(q + 1e-4) - force) / 1e-4,
+                      'flexible': (self.force(self.turn(1e-5)) - force) / 1e-5}
 
     def turn(self, compliance_s2: float) -> np.ndarray:
         """Return the angle of the joint, rad, with links that yield."""

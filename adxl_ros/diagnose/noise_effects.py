@@ -99,6 +99,8 @@ def repeated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, se
                      ) -> tuple[np.ndarray, list[Detection]]:
     """Find samples that repeat the one before in all axes, in runs too long for chance."""
     same = np.concatenate([[False], (np.diff(volts, axis=0) == 0).all(axis=1)])
+    # At their rails all axes repeat, too.
+    same &= ~sensor.saturated(volts).all(axis=1)
     shortest = shortest_repeat(volts, len(sensor.axes))
     repeated = np.zeros(len(volts), bool)
     for begin, end in true_runs(same):

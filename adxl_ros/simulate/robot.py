@@ -249,6 +249,14 @@ class RobotPath(ForcePath):
         return Motion(float(np.ptp(self.time_s)), force=self,
                       internal_rate_hz=max(rate_hz, INTERNAL_RATE_HZ))
 
+    def text(self) -> str:
+        """Return what is known of the robot, for people."""
+        error_mg = 1e3 / G0_MPS2 * np.sqrt(np.mean(
+            (self.rounding_mps2 + 2 * self.smoothing_mps2) ** 2))
+        return (f'{self._robot.frame} moves by {", ".join(self.joints) or "its base"}, from '
+                f'{self.time_s[0]:.3g} to {self.time_s[-1]:.3g} s; the encoders leave an error of '
+                f'{error_mg:.2g} mg rms')
+
     @property
     def step_rad(self) -> float:
         """Step of one encoder whose error is that of all joints together, rad."""

@@ -140,6 +140,7 @@ def parser() -> argparse.ArgumentParser:
                        help='the sensor, for recordings in volts (default: the nominal sensor)')
     parse.add_argument('--report', metavar='DIR', help='write the page check.html there')
     parse.add_argument('--json', action='store_true', help='print the result as JSON')
+    cli.add_robot_options(parse)
     cli.add_recording_options(parse)
     return parse
 
@@ -157,7 +158,7 @@ def check(options: argparse.Namespace) -> int:
 
             results.append(check_recording(path, options.params, reading, step))
         if len(results) == 1:
-            results = [_with_what_shows(results[0], options.params, reading)]
+            results = [_with_what_shows(results[0], options, reading)]
     page = []
     if options.report:
         cli.make_folder(Path(options.report))
@@ -171,24 +172,29 @@ def check(options: argparse.Namespace) -> int:
     return 0 if all(result.is_sound for result in results) else 1
 
 
-def _with_what_shows(result: Findings, params: str | None, reading: ReadingOptions) -> Findings:
+def _with_what_shows(result: Findings, options: argparse.Namespace, reading: ReadingOptions
+                     ) -> Findings:
     """Add which effects `diagnose` could show in a recording, and from which size."""
-    if not result.is_sound or not any(a.tool == 'diagnose' and a.is_able
-                                      for a in result.abilities):
+    if not result.is_sound or not (options.urdf or any(
+            a.tool == 'diagnose' and a.is_able for a in result.abilities)):
         return result
+    remarks, sim = result.remarks, None
     try:
         if result.contents is None or result.contents.samples > _MOST_SHOWN:
             raise UserError('what diagnose could show is listed for recordings of '
                             f'{_MOST_SHOWN} samples at most; check a part')
         read = recording.read(result.path, reading)
-        sensor, _ = measure_unstated(load_sensor(params, read), read)
-        shown = what_shows([read], sensor)
+        sensor, _ = measure_unstated(load_sensor(options.params, read), read)
+        if options.urdf:
+            robot = cli.robot_path(options, read, sensor)
+            remarks, sim = (*remarks, robot.text()), robot.as_motion()
+        shown = what_shows([read], sensor, sim)
         if isinstance(shown, DataFault):
             raise UserError(f'diagnose: {shown.message}')
     except UserError as error:
         return replace(result, remarks=(*result.remarks, one_line(error)))
     scale_v_per_g = float(sensor.scale_v_per_g.mean())
-    return replace(result, shows=tuple(
+    return replace(result, remarks=remarks, shows=tuple(
         shows_row(effect, scale_v_per_g) for effect in sorted(
             by_effect(shown).values(), key=lambda effect: (not effect.shows, effect.effect))))
 

@@ -185,7 +185,8 @@ def drawn(seed):
     name = str(rng.choice(['rich', 'tilt_both', 'tumble', 'soak']))
     motion = trajectories.TRAJECTORIES[name](rng)
     motion = replace(motion, duration_s=min(motion.duration_s, rng.uniform(25, 50)))
-    effects = rng.choice(sorted(library()), rng.integers(0, 3), replace=False)
+    known = sorted(e.name for e in library().values() if Need.ROBOT not in e.needs)
+    effects = rng.choice(known, rng.integers(0, 3), replace=False)
     effects = [e for e in map(str, effects) if sensor.adc_bits or e != 'quantisation']
 
     def change(columns):
