@@ -55,7 +55,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """End with the reasons of skipped tests."""
     reasons = Counter(report.longrepr[2].removeprefix('Skipped: ')
                       for report in terminalreporter.stats.get('skipped', ()))
     if reasons:
@@ -65,14 +64,12 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 @pytest.fixture(scope='module')
 def browser() -> Iterator[object]:
-    """Yield a headless Chromium."""
     with running_browser() as launched:
         yield launched
 
 
 @pytest.fixture
 def opened(browser: object) -> Iterator[Callable]:
-    """Give a function that opens a file, and returns the page and messages of the browser."""
     with opener(browser) as begin:
         yield begin
 

@@ -9,14 +9,7 @@ import shutil
 import sys
 
 from adxl_ros.workers import open_pool, Pool
-from adxl_ros_validation.blind import (
-    check,
-    diagnosis_runs,
-    grading,
-    report_html,
-    scores,
-    trials,
-)
+from adxl_ros_validation.blind import check, diagnosis_runs, grading, report_html, scores, trials
 from adxl_ros_validation.blind.trials import Label, plans
 from adxl_ros_validation.blind.world import faults, ideal_observer, motion, simulator
 import numpy as np
@@ -63,7 +56,6 @@ def answer(recording, parameters):
 
 
 def short_plans(seed, count):
-    """Plan trials of short recordings."""
     return plans(seed, count, SECONDS)
 
 
@@ -73,12 +65,10 @@ def no_progress(fraction):
 
 @contextmanager
 def show(stage):
-    """Give what receives the progress of a stage."""
     yield no_progress
 
 
 def scored(folder, body, pool):
-    """Score a check with a diagnosis that is a script."""
     path = folder.parent / 'diagnosis.py'
     path.write_text(SCRIPT.format(body=body))
     real = diagnosis_runs.executable
@@ -153,7 +143,6 @@ def test_scores_of_a_diagnosis_without_effects(null_check):
 
 
 def test_a_diagnosis_cannot_reach_the_labels(committed_check, null_check, tmp_path, pool):
-    """Working directory, arguments and environment of a diagnosis do not lead to a label."""
     folder = copied(committed_check, null_check, tmp_path)
     blindfolded = scored(folder, CHEAT.format(folder='.'), pool)
     assert not any(row['named'] for row in blindfolded['rows'])
@@ -258,7 +247,6 @@ def test_every_fault_changes_a_recording(name):
 
 
 def test_the_command_commits_and_scores(run_tool, tmp_path, monkeypatch):
-    """One call commits the labels. Another call diagnoses, opens and scores."""
     monkeypatch.setattr(trials, 'plans', partial(plans, seconds=(60.0, 62.0)))
     sealed = run_tool('blind', '--seal', 'dir', '--trials', 1, '--seed', 156)
     assert sealed.returncode == 0, sealed.stderr

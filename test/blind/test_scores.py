@@ -17,7 +17,6 @@ def label(group, effects=(), power=1.0, inseparable=()):
 
 
 def diagnoses(*effects):
-    """Return a group of diagnoses, each given by its effects as words."""
     return {frozenset(words.split()) for words in effects}
 
 
@@ -51,12 +50,10 @@ def test_true_group_has_what_the_ideal_observer_cannot_separate():
     assert grading.true_group(label('zero', ['bias'])) == diagnoses('')
     assert grading.true_group(label('outside', ['creep'])) == diagnoses('unknown')
     pair = label('pair', ['bias', 'gravity'], inseparable=['supply'])
-    assert grading.true_group(pair) == diagnoses(
-        'bias gravity', 'bias supply', 'supply gravity')
+    assert grading.true_group(pair) == diagnoses('bias gravity', 'bias supply', 'supply gravity')
 
 
 def said(status, *effects, **words):
-    """Return an answer that names effects for certain."""
     return Answer(status, frozenset(effects), probability=0.8,
                   hypotheses=((frozenset(effects), 0.8),), **words)
 

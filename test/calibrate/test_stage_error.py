@@ -18,7 +18,6 @@ ERROR = StageError(4e-4, 2e-4, 1.3)
 
 @pytest.fixture(scope='module')
 def poses():
-    """Return a sweep with errors by setting."""
     rng = np.random.default_rng(3)
     return swept(rng, drawn(rng, nominal()), per_setting=True, check_poses=4)
 
@@ -37,7 +36,6 @@ def dense(slope, poses, error):
 
 
 def test_products_and_determinant_are_those_of_the_dense_covariance(poses):
-    """Woodbury's formula equals the inverse of the dense matrix."""
     slope = angle_jacobian(nominal(), poses)
     columns = np.random.default_rng(1).normal(size=(len(poses), 2, 5))
     matrix = dense(slope, poses, ERROR)
@@ -66,7 +64,6 @@ def test_predicted_errors_are_the_best_linear_estimates(poses):
 
 
 def test_the_stated_error_counts_where_poses_do_not_determine_it(poses):
-    """With few poses the level is the stated one, and many poses determine it."""
     unit = with_neutral(nominal(), ('bias', 'scale_factor', 'base_tilt'))
     names = full_model.fitted_coefficients('xy', ('bias', 'scale_factor'))
     precision = full_model.prior_precision(names)

@@ -57,8 +57,7 @@ def test_the_source_of_a_calibration_is_stated_in_one_line() -> None:
     ('nominal_scale_v_per_g', '0.3, 0.3', 'nominal_scale_v_per_g is [0.3, 0.3], but [1.0, 1.0]'),
     ('format', '99', 'format version 99, but this package reads version 1'),
     ('rate_hz', 'nan', "rate_hz is 'nan', expected samples a second"),
-    ('rate_hz', '-1', "rate_hz is '-1', expected samples a second"),
-])
+    ('rate_hz', '-1', "rate_hz is '-1', expected samples a second")])
 def test_a_stream_is_refused_until_it_belongs_to_the_unit(key: str, value: str,
                                                           reason: str) -> None:
     policy = policy_for(unit(), **{key: value})
@@ -111,8 +110,7 @@ def test_a_newer_calibration_is_announced_unless_one_was_named(tmp_path: Path) -
     ({'received': 0}, State.SILENT, 'no samples on /imu/data_raw'),
     ({'received': 9, 'dropped': 5}, State.DROPPING, '5 samples dropped'),
     ({'received': 9, 'saturated': 2}, State.SATURATED, '2 samples with the ADC at its rail'),
-    ({'received': 9, 'outside': 3}, State.OUTSIDE, '3 samples outside of what was calibrated'),
-])
+    ({'received': 9, 'outside': 3}, State.OUTSIDE, '3 samples outside of what was calibrated')])
 def test_states_of_the_samples(counts: dict[str, int], state: State, text: str) -> None:
     interval = replace(QUIET, counts=counts, outside=('temperature 40.0 degC',))
     status = policy_for(unit()).status(interval, None, '')

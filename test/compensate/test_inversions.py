@@ -28,7 +28,6 @@ def filtered(inputs, rate_hz=RATE_HZ, fine=16):
 
 
 def test_amplitude_and_phase_are_restored():
-    """10, 60 and 150 Hz behind 15 Hz filters are restored to a thousandth, without delay."""
     def felt(t):
         return np.sin(62.8 * t) + 0.5 * np.cos(377 * t) + 0.2 * np.sin(942 * t)
 
@@ -74,7 +73,6 @@ def test_a_stream_gives_the_same_samples_with_a_delay_of_eight():
 
 
 def test_the_predicted_variance_of_restored_noise_is_right():
-    """The inverse of simulated noise at rest has the variance `noise_variance_v2`."""
     sensor = put(with_neutral(nominal(), ['bandwidth']),
                  [Coefficient('bandwidth', 'resistance_ratio', 'x')], [-0.2])
     time_s = np.arange(200_000) / sensor.rate_hz
@@ -85,7 +83,6 @@ def test_the_predicted_variance_of_restored_noise_is_right():
 
 
 def unit(rng, **options):
-    """Draw a unit of the paper's terms."""
     return drawn(rng, nominal(**options))
 
 

@@ -23,11 +23,9 @@ G = 9.80665
 
 
 def unit(axes: str) -> Sensor:
-    """Draw a unit with a covariance of its zero-g."""
     sensor = drawn(np.random.default_rng(1), nominal(axes))
     names = tuple(Coefficient('bias', 'offset_v', axis) for axis in axes)
-    return replace(sensor, covariance_names=names,
-                   covariance=1e-6 * (np.eye(len(axes)) + 0.3))
+    return replace(sensor, covariance_names=names, covariance=1e-6 * (np.eye(len(axes)) + 0.3))
 
 
 def samples(sensor: Sensor, force: list[np.ndarray]) -> list[list[float]]:
@@ -48,7 +46,6 @@ def at_rest(alpha: float, beta: float, count: int) -> list[np.ndarray]:
 
 
 def follower(sensor: Sensor) -> Callable[[list[float], float], Estimate | None]:
-    """Return an estimator of nominally converted samples, m/s²."""
     live = LiveEstimator(sensor)
 
     def follow(accel_mps2: list[float], time_s: float) -> Estimate | None:
@@ -138,7 +135,6 @@ def big_endian(raw: bytes) -> bytes:
 @pytest.mark.parametrize('frame_id', ['', 'a', 'abc', 'imu_link', 'arm/imu_of_the_left_hand'])
 @pytest.mark.parametrize('order', ['little', 'big'])
 def test_written_bytes_equal_the_serialized_messages(frame_id: str, order: str) -> None:
-    """Rclpy reads the written values from the bytes, in both byte orders."""
     message = imu(frame_id)
     raw = serialize_message(message)
     if order == 'big':

@@ -13,6 +13,7 @@ from adxl_ros.diagnose.verdict import WeightedHypothesis
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.model.effects import library
+from adxl_ros.model.effects.base import Need
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Held, Knots, Motion
 from adxl_ros.tools.command_line import with_effects
@@ -25,7 +26,6 @@ pytestmark = pytest.mark.long
 
 
 def report_of(diagnosis):
-    """Return a report as JSON, after what holds for every report."""
     report = as_json(diagnosis)
     json.dumps(report, allow_nan=False)
     probabilities = [h['probability'] for h in report['hypotheses']]
@@ -38,19 +38,16 @@ def report_of(diagnosis):
 
 @cache
 def diagnosed(*effects):
-    """Diagnose a recording of the unit with effects; return the diagnosis and its report."""
     diagnosis = diagnose([simulated(unit(), *effects)], unit())
     return diagnosis, report_of(diagnosis)
 
 
 def named(report):
-    """Return the certain effects of a verdict and those of its groups."""
     verdict = report['verdict']
     return {*verdict['effects'], *(e for group in verdict['groups'] for e in group)}
 
 
 def test_no_gap_has_an_upper_limit():
-    """A unit as in its file has no gap; the parameters to simulate with are those of the file."""
     diagnosis, report = diagnosed()
     assert (report['verdict']['status'], named(report)) == ('no_gap', set())
     assert 1e-4 < report['gap']['upper_limit'] < report['gap']['floor']
@@ -67,7 +64,6 @@ def test_no_gap_has_an_upper_limit():
     # As in the parameter file: the estimate plus the value of the baseline.
     ('bias:offset_v=0.04', 'offset_v.y', 0.04)])
 def test_one_effect_is_named_and_the_gap_closed(option, parameter, value):
-    """The verdict names the effect, and its parameter closes nearly all of the gap."""
     name, report = option.split(':')[0], diagnosed(option)[1]
     assert (report['verdict']['status'], report['verdict']['effects']) == ('explained', [name])
     found = next(c for c in report['candidates'] if c['effect'] == name)['parameters'][parameter]
@@ -77,12 +73,9 @@ def test_one_effect_is_named_and_the_gap_closed(option, parameter, value):
 
 @pytest.mark.parametrize('option, effect', [
     ('mains_hum:amplitude_v=0.003', 'mains_hum'),
-    ('noise_excess:ratio=1.0', 'noise_excess'),
-    ('spikes:rate_hz=0.5,amplitude_v=0.05', 'spikes'),
-    ('stuck:rate_hz=0.2,duration_s=0.1', 'stuck'),
-    ('quantisation:lost_bits=4', 'quantisation')])
+    ('noise_excess:ratio=1.0', 'noise_excess'), ('spikes:rate_hz=0.5,amplitude_v=0.05', 'spikes'),
+    ('stuck:rate_hz=0.2,duration_s=0.1', 'stuck'), ('quantisation:lost_bits=4', 'quantisation')])
 def test_effects_of_the_noise_are_named(option, effect):
-    """Line, level, isolated and repeated samples and coarse codes show in the noise."""
     report = diagnosed(option)[1]
     assert (report['verdict']['status'], report['verdict']['effects']) == ('explained', [effect])
 
@@ -95,7 +88,6 @@ def test_noise_is_compared_with_the_simulated_noise():
 
 
 def test_two_effects_and_the_parameters_that_close_their_gap(run_tool, two_effects):
-    """Intervals hold the sizes. The file holds the named effects alone, and closes the gap."""
     screen = (two_effects / 'screen.txt').read_text()
     assert 'GAP EXPLAINED by 2 effects' in screen
     assert 'self-check: 1 of 1 simulated recordings had the same verdict' in screen
@@ -166,7 +158,6 @@ def values(change):
     (lambda c: c | {'x_v': np.clip(c['x_v'], 2.4, 2.6)}, 'saturated'),
     (lambda c: {k: v[:1250] for k, v in c.items()}, 'too_short')])
 def test_faults_of_the_recording_are_one_line(change, fault):
-    """The verdict names the fault and no effect, and there is nothing to simulate with."""
     name, _, text = fault.partition(': ')
     diagnosis = diagnose([simulated(unit(), change=change)], unit())
     report = report_of(diagnosis)
@@ -177,7 +168,6 @@ def test_faults_of_the_recording_are_one_line(change, fault):
 
 
 def drawn(seed):
-    """Draw a recording: any rate, axes, manoeuvre and effects, and one column that is odd."""
     rng = np.random.default_rng(seed)
     axes = str(rng.choice(['x', 'xy', 'xyz']))
     sensor = replace(nominal(axes), adc_bits=int(rng.choice([0, 16])),
@@ -202,7 +192,6 @@ def drawn(seed):
 
 @pytest.mark.parametrize('seed', range(6))
 def test_any_recording_ends_with_a_verdict_or_one_line(seed):
-    """Nothing but a report, a fault or a refusal comes of an odd recording."""
     made, sensor = drawn(seed)
     try:
         report_of(diagnose([made], sensor))
@@ -211,7 +200,6 @@ def test_any_recording_ends_with_a_verdict_or_one_line(seed):
 
 
 def test_a_recording_at_rest_is_insufficient():
-    """A minute at rest has no verdict. The report says what is not covered."""
     still = Motion(60.0, Held(1.0), Held(0.5))
     report = report_of(diagnose([simulated(unit(), motion=still)], unit()))
     assert report['verdict']['status'] == 'insufficient'
@@ -233,7 +221,6 @@ def test_next_experiment_separates_most():
 
 
 def test_a_sensor_that_moves_without_a_reference_gets_no_verdict(run_tool, tmp_path, shared_dir):
-    """A sensor turned by hand has no reference, and one line reports this."""
     run = run_tool('diagnose', shared_dir / 'real' / 'mpu9150_0.csv', '-o', tmp_path, '--json')
     verdict = json.loads(run.stdout)['verdict']
     assert (verdict['status'], verdict['data_fault']) == ('bad_data', 'reference')
@@ -241,7 +228,6 @@ def test_a_sensor_that_moves_without_a_reference_gets_no_verdict(run_tool, tmp_p
 
 @pytest.mark.parametrize('name', ['no_gap', 'time_offset'])
 def test_samples_of_another_generator(run_tool, tmp_path, shared_dir, name):
-    """The shared samples have the right verdict after a linear fit."""
     folder = shared_dir / 'samples' / name
     run_tool('fit', folder / 'cal.csv', '--model', 'linear', '-o', tmp_path / 'unit.yaml')
     run = run_tool('diagnose', folder / 'run.csv', '--params', tmp_path / 'unit.yaml', '-o',

@@ -6,9 +6,7 @@ import ast
 from pathlib import Path
 
 from adxl_ros import diagnose
-from adxl_ros.model.diagnosis_hints import (
-    FormDimension,
-)
+from adxl_ros.model.diagnosis_hints import FormDimension
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import ActsOn, Need, Place
 import pytest

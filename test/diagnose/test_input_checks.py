@@ -23,12 +23,10 @@ pytest.importorskip('plotly')  # the page of `diagnose`
 
 
 def unit(rate_hz=100.0):
-    """Return a nominal unit on a stage with a fine encoder."""
     return replace(nominal('xyz'), rate_hz=rate_hz, stage_resolution_rad=1e-4)
 
 
 def script(turns=3):
-    """Turn beta in several planes, with rests."""
     path = trajectories.Script(np.pi / 2, 0.0)
     for alpha in (np.pi / 2, 1.0, 2.2)[:turns]:
         path.go(alpha, 0.0)
@@ -39,14 +37,12 @@ def script(turns=3):
 
 
 def made(sensor, turns=3, seed=3):
-    """Simulate a recording."""
     path = script(turns)
     columns = simulate(sensor, Motion(path.now, *path.joints()), seed)
     return Recording('made', columns.pop('time_s'), columns, sensor_info(sensor))
 
 
 def report_of(run_tool, tmp_path, sensor, *recordings, options=()):
-    """Run `diagnose` on recordings; return its report and the process."""
     parameter_file.save(tmp_path / 'unit.yaml', sensor)
     names = [f'run{i}.csv' for i in range(len(recordings))]
     for name, recorded in zip(names, recordings):
@@ -82,7 +78,6 @@ def test_a_shifted_simulator_is_late(run_tool, tmp_path, late_s):
 
 
 def test_a_simulator_of_another_time_does_not_overlap(run_tool, tmp_path):
-    """Both ranges of time are named, and the shift that makes the motion fit."""
     report, run = report_of(run_tool, tmp_path, unit(), made(unit()),
                             options=['--sim', ideal(tmp_path, 1000.0)])
     assert (run.returncode, report['verdict']['data_fault']) == (1, 'no_overlap')
@@ -93,9 +88,7 @@ def test_a_simulator_of_another_time_does_not_overlap(run_tool, tmp_path):
 
 @pytest.mark.parametrize('late_s', [1000.0, 0.7, 0.02])
 def test_align_shifts_the_simulator(tmp_path, late_s):
-    """`--align` removes a shift, and leaves a latency of the sensor where it is."""
-    force = motion_from_force(recording.read_ideal(tmp_path / ideal(tmp_path, late_s)),
-                              False)[0]
+    force = motion_from_force(recording.read_ideal(tmp_path / ideal(tmp_path, late_s)), False)[0]
     comparison = compare_checked(made(unit()), unit(), force, True)
     residual_g = comparison.residual_v(comparison.sensor)[comparison.used]
     assert np.sqrt(np.mean(residual_g ** 2)) < (1e-3 if late_s > 0.1 else 1e-2)
@@ -104,7 +97,6 @@ def test_align_shifts_the_simulator(tmp_path, late_s):
 
 
 def test_a_simulator_of_another_motion_is_no_shift(run_tool, tmp_path):
-    """A motion that fits at no shift is named as another recording's."""
     recorded = made(unit())
     time_s = recorded.time_s
     rng = np.random.default_rng(1)
@@ -119,7 +111,6 @@ def test_a_simulator_of_another_motion_is_no_shift(run_tool, tmp_path):
 @pytest.mark.parametrize('signs', [(1, -1), (-1, 1)])
 @pytest.mark.parametrize('axes', ['xy', 'xyz'])
 def test_an_encoder_that_counts_backwards_is_named(run_tool, tmp_path, signs, axes):
-    """The wrong sign of an encoder is not blamed on the sensor."""
     sensor = replace(nominal(axes), rate_hz=100.0, stage_resolution_rad=1e-4)
     recorded = made(sensor)
     for name, sign in zip(('alpha_rad', 'beta_rad'), signs):
@@ -132,7 +123,6 @@ def test_an_encoder_that_counts_backwards_is_named(run_tool, tmp_path, signs, ax
 
 @pytest.mark.parametrize('names', [['beta_rad'], ['alpha_rad'], ['alpha_rad', 'beta_rad']])
 def test_degrees_in_a_column_of_radians_are_named(run_tool, tmp_path, names):
-    """Column, value, unit and remedy are named."""
     recorded = made(unit())
     for name in names:
         recorded.columns[name] = np.degrees(recorded.columns[name])

@@ -12,14 +12,12 @@ EFFECTS = ('temperature_bias', 'lever_arm')
 
 @pytest.fixture
 def page(opened, two_effects):
-    """Return the page with two effects, drawn."""
     drawn, _ = opened(two_effects / 'gap' / 'report.html', 1280)
     wait_until_drawn(drawn)
     return drawn
 
 
 def test_the_first_screen(page):
-    """Badge, tiles, waterfall and effects are visible without scrolling."""
     page.set_viewport_size({'width': 1280, 'height': 900})
     assert 'green' in page.locator('.badge').get_attribute('class')
     assert page.locator('.tile').count() == 4
@@ -69,7 +67,6 @@ def test_each_effect_has_its_proof(page):
 
 
 def test_zoom_is_linked(page):
-    """A zoom in one panel of the signals changes the time of all."""
     plot = page.locator('[data-figure=signals]')
     plot.scroll_into_view_if_needed()
     box = plot.locator('.nsewdrag').first.bounding_box()

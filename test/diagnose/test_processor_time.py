@@ -61,7 +61,6 @@ def used_by(folder, rate_hz, duration_s, *effects):
 
 
 def test_five_minutes_at_250_hz_take_eight_seconds(tmp_path):
-    """Three axes need 8 s of processor time in the median, and never more than 20 s."""
     seconds = [used_by(tmp_path, 250.0, 300.0, *effects)[0] for effects in (
         (), ('hysteresis',), ('lever_arm', 'temperature_bias'), ('bias_walk', 'nonlinearity'))]
     assert np.median(seconds) < 8.0
@@ -69,7 +68,6 @@ def test_five_minutes_at_250_hz_take_eight_seconds(tmp_path):
 
 
 def test_ten_minutes_at_1_khz_take_25_s_and_1_gb(tmp_path):
-    """Three axes need at most 25 s of processor time and 1 GB."""
     seconds, gigabytes = used_by(tmp_path, 1000.0, 600.0, 'backlash', 'cross_axis')
     assert seconds < 25.0
     assert gigabytes < 1.0

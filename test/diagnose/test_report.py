@@ -23,12 +23,10 @@ pytestmark = pytest.mark.long
 
 
 def unit(**changes):
-    """Return a nominal unit of two axes at 62.5 Hz, with a fine encoder."""
     return nominal('xy', rate_hz=62.5, stage_resolution_rad=1e-4, **changes)
 
 
 def turning(alphas_rad=(np.pi / 2, np.pi / 4)):
-    """Turn beta forth and back at two speeds in each plane, with rests."""
     script = trajectories.Script(alphas_rad[0], 0.0)
     for alpha in alphas_rad:
         script.go(alpha, 0.0)
@@ -62,7 +60,6 @@ class Report:
         self.sensor = parameter_file.load(folder / 'out' / 'params.yaml')
 
     def parameters(self, effect):
-        """Return the parameters of a candidate."""
         return next(c for c in self.json['candidates'] if c['effect'] == effect)['parameters']
 
 
@@ -107,7 +104,6 @@ def test_a_line_that_stays_is_shown_and_not_called_closed(diagnosed):
 
 
 def test_terminal_page_and_report_agree(diagnosed):
-    """The same figures of the gap stand in all three."""
     report = diagnosed(unit(), 'scale_factor:offset_v_per_g=0.01')
     gap, mg = report.json['gap'], G0_MPS2 / 1e3
     assert gap['closed'] == pytest.approx(

@@ -24,15 +24,13 @@ EPOCH_NS, IMU, INFO, JOINTS, STORE, STRING, TYPES = (
 
 
 def recorded(count: int = 3000, axes: str = 'xyz') -> Recording:
-    """Return a recording with references of every kind at every sample."""
     rng = np.random.default_rng(1)
     columns = {f'{axis}_v': rng.normal(2.5, 0.5, count) for axis in axes}
     columns.update({name: rng.normal(size=count) for name in REFERENCES})
     columns['supply_v'] = columns['supply_v'].astype(np.float32).astype(float)
     steps = rng.integers(10**5, 10**7, count)
     return Recording('made', np.cumsum(steps) / 1e9, columns,
-                     {**sensor_info(nominal(axes)), 'place': 'bench 3'},
-                     epoch_ns=EPOCH_NS)
+                     {**sensor_info(nominal(axes)), 'place': 'bench 3'}, epoch_ns=EPOCH_NS)
 
 
 @pytest.mark.parametrize('name', ['run', 'run.v2', 'run.mcap'])
@@ -94,10 +92,8 @@ def test_a_written_bag_is_readable_by_other_software(tmp_path: Path) -> None:
 
 
 def converted(source: Path, target: Path, storage: str, mode: str) -> None:
-    """Copy a bag into another storage and compression, with topics of another robot."""
     with rosbag2.Reader(source) as reader:
-        writer = rosbag2.Writer(target, version=9,
-                                storage_plugin=rosbag2.StoragePlugin[storage])
+        writer = rosbag2.Writer(target, version=9, storage_plugin=rosbag2.StoragePlugin[storage])
         writer.set_compression(rosbag2.CompressionMode[mode], rosbag2.CompressionFormat.ZSTD)
         with writer:
             new = {c.id: writer.add_connection(c.topic, c.msgtype, typestore=STORE)
@@ -273,8 +269,7 @@ CUT_IMU = bytes(STORE.serialize_cdr(imu(T[1]).message, IMU))[:100]
     ([imu(T[0]), imu(T[1], (1, 1, 1e38))],
      ': topic /imu/data_raw: message 2, stamped 1750000000.124456789 s: linear_acceleration.z is '
      '1e+38 m/s²'),
-    ([imu(T[0], variance=(-1, 0, 0))],
-     ': topic /imu/data_raw: states no linear acceleration'),
+    ([imu(T[0], variance=(-1, 0, 0))], ': topic /imu/data_raw: states no linear acceleration'),
     ([imu(T[0], variance=(1, 1e6, 1))],
      ': topic /imu/data_raw: linear_acceleration_covariance gives the axes xz'),
     ([imu(T[0]), Sent('/imu/data_raw', IMU, T[1], raw=CUT_IMU)],
@@ -290,8 +285,7 @@ CUT_IMU = bytes(STORE.serialize_cdr(imu(T[1]).message, IMU))[:100]
      ': topic /sensor_info: serial changes from A to B; record each sensor by itself'),
     ([info(axes='yx'), imu(T[0])], ": topic /sensor_info: axes is 'yx', expected x, xy or xyz"),
     ([imu(T[0]), Sent('/sensor_info', INFO, 0, raw=b'\0\1\0\0\7')],
-     ': topic /sensor_info: damaged message: '),
-])
+     ': topic /sensor_info: damaged message: ')])
 def test_invalid_bags_are_refused_in_one_line(
         tmp_path: Path, messages: list[Sent], message: str) -> None:
     assert refusal(bags.bag_of(tmp_path / 'run', messages)).startswith(message)

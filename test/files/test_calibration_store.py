@@ -25,8 +25,7 @@ def swept_csv(made_once):
 
 
 def sweep(folder):
-    (folder / 'u7.yaml').write_text(
-        NOMINAL.read_text().replace('serial: nominal', 'serial: U/7'))
+    (folder / 'u7.yaml').write_text(NOMINAL.read_text().replace('serial: nominal', 'serial: U/7'))
     done = subprocess.run([executable('simulate'), 'sweep', '--params', 'u7.yaml', '--rate', '100',
                            '--effect', 'bias', '--effect', 'misalignment', '--seed', '5', '-o',
                            'sweep.csv'], cwd=folder, capture_output=True, text=True, timeout=120)
@@ -83,7 +82,6 @@ def test_provenance_store_and_the_previous_file(run_tool, swept_csv, tmp_path):
 
 @pytest.mark.parametrize('serial', ['17', 'A/B', '..', 'ä €', '-x', 'ä' * 200])
 def test_each_serial_number_has_its_folder(tmp_path, serial):
-    """The folder is inside the store for every serial number."""
     sensor = replace(drawn(np.random.default_rng(1), nominal(serial=serial)), provenance=DATED)
     path = calibration_store.put(tmp_path / 'store', sensor)
     assert path.parent.parent == tmp_path / 'store'
@@ -95,7 +93,6 @@ def test_each_serial_number_has_its_folder(tmp_path, serial):
 
 
 def test_history_is_ordered_by_date_and_names_unreadable_files(tmp_path):
-    """An incomplete file or one of another unit does not hide the others."""
     sensor = drawn(np.random.default_rng(1), nominal(serial='17'))
     dates = ['2026-03-01T00:00:00+00:00', '2025-12-24T00:00:00+00:00', '2026-02-01T00:00:00']
     for date in dates:

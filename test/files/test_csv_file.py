@@ -36,7 +36,6 @@ def written(tmp_path: Path, text: str | bytes, name: str = 'run.csv') -> Path:
 
 
 def recorded(rng: np.random.Generator, count: int = 3000, axes: str = 'xyz') -> Recording:
-    """Return a recording of full-precision numbers, with references of every kind."""
     columns = {f'{axis}_v': rng.normal(2.5, 0.5, count) for axis in axes}
     for name in ('alpha_rad', 'beta_rad', 'shift_m', 'temperature_c', 'supply_v'):
         columns[name] = np.where(rng.random(count) < 0.3, np.nan, rng.normal(size=count))
@@ -45,7 +44,6 @@ def recorded(rng: np.random.Generator, count: int = 3000, axes: str = 'xyz') -> 
 
 
 def same_bits(first: np.ndarray, second: np.ndarray) -> bool:
-    """Return whether two float64 arrays are equal, with NaN equal to NaN."""
     return np.array_equal(first, second, equal_nan=True) and np.array_equal(
         np.signbit(first[~np.isnan(first)]), np.signbit(second[~np.isnan(second)]))
 
@@ -78,13 +76,10 @@ def test_another_unit_is_refused() -> None:
 
 
 @pytest.mark.parametrize('text', [
-    f'{HEADER}\n{GOOD}',
-    f'{HEADER}\n{GOOD}'.rstrip('\n'),
-    f'{HEADER}\n{GOOD}'.replace('\n', '\r\n'),
-    f'\ufeff{HEADER}\n{GOOD}',
+    f'{HEADER}\n{GOOD}', f'{HEADER}\n{GOOD}'.rstrip('\n'),
+    f'{HEADER}\n{GOOD}'.replace('\n', '\r\n'), f'\ufeff{HEADER}\n{GOOD}',
     f'# serial: A17\n\n# a remark: of many words\n{HEADER}\n# axes: xy\n{GOOD}\n# end: 1\n',
-    f'{HEADER}\n   \n{GOOD}',
-    f' time_s, x_v , y_v,alpha_rad,beta_rad\n{GOOD}'.replace(',', ' , '),
+    f'{HEADER}\n   \n{GOOD}', f' time_s, x_v , y_v,alpha_rad,beta_rad\n{GOOD}'.replace(',', ' , '),
     f'{HEADER}\n{GOOD}'.replace(',,\n', ',nan,NaN\n'),
     'beta_rad,y_v,alpha_rad,time_s,x_v\n0.1,2.6,1.5,0,2.5\n,2.61,,1e-3,2.51\n'
     '0.2,2.62,1.6,.002,2.52\n',
@@ -113,25 +108,20 @@ def test_forms_that_are_read(tmp_path: Path, text: str | bytes) -> None:
 
 @pytest.mark.parametrize(('text', 'message'), [
     ('', ': is empty'),
-    ('# serial: A17\n', ': is empty'),
-    (f'{HEADER}\n', ': has a header, but no samples'),
+    ('# serial: A17\n', ': is empty'), (f'{HEADER}\n', ': has a header, but no samples'),
     (f'{HEADER}', ': has a header, but no samples'),
     (GOOD, ': no column time_s; the columns are 1, 2, 3, 4, 5 (no header)'),
     (f'{HEADER}\n{GOOD}'.replace('time_s', 't'), ':1: no column time_s; the columns are t, x_v, '),
     (f'time_s,alpha_rad\n{GOOD}', ':1: no column of a sensor: needs x_v'),
     (f'#\ntime_s,y_v,z_v\n{GOOD}', ':2: no column x_v beside y_v, z_v'),
     (f'time_s,x_v,y_v,x_v\n{GOOD}', ':1: column x_v stands twice; keep one'),
-    (f'time_s,x_mv\n{GOOD}', ':1:2: column x_mv is in another unit; expected the column x_v'),
-    (f'time_s,x_v,y_v,z_mv\n{GOOD}', ':1:4: column z_mv is in another unit; expected the column '
-                                     'z_v'),
-    (f'time_s,ax_g,ay_g\n{GOOD}', ':1:2: column ax_g is in another unit; expected the column '
-                                  'ax_mps2'),
-    (f'time_s,x_v,alpha_deg\n{GOOD}', ':1:3: column alpha_deg is in another unit; expected the '
-                                      'column alpha_rad'),
+    *((f'{head}\n{GOOD}', f':1:{place}: column {head.split(",")[place - 1]} is in another unit; '
+       f'expected the column {right}') for head, place, right in (
+        ('time_s,x_mv', 2, 'x_v'), ('time_s,x_v,y_v,z_mv', 4, 'z_v'),
+        ('time_s,ax_g,ay_g', 2, 'ax_mps2'), ('time_s,x_v,alpha_deg', 3, 'alpha_rad'),
+        ('time_s,x_v,temperature_k', 3, 'temperature_c'))),
     ('time_ms,x_v\n0,2.5\n1,2.5\n', ':1:1: column time_ms is in another unit; expected the column '
                                     'time_s'),
-    (f'time_s,x_v,temperature_k\n{GOOD}', ':1:3: column temperature_k is in another unit; '
-                                          'expected the column temperature_c'),
     ('time;x_v\n0;1\n', ':1: no column time_s; the columns are time, x_v (separated by '
                         'semicolons'),
     (f'{HEADER}\n{GOOD}0.003,2.5x,2,1,1\n', ":5:2: x_v is '2.5x', not a number"),
@@ -160,8 +150,7 @@ def test_forms_that_are_read(tmp_path: Path, text: str | bytes) -> None:
     (b'a' * 6_000_000, ': a line is longer than 1048576 bytes'),
     (b'#ROSBAG V2.0\n', ': is a bag of ROS 1; convert it: rosbags-convert'),
     (b'\x89MCAP0\r\n', ': is a bag; rename it so that it ends in .mcap'),
-    (b'\x28\xb5\x2f\xfd', ': is compressed; name the directory with its metadata.yaml'),
-])
+    (b'\x28\xb5\x2f\xfd', ': is compressed; name the directory with its metadata.yaml')])
 def test_invalid_files_are_refused_in_one_line(tmp_path: Path, text: str | bytes, message: str
                                                ) -> None:
     assert refusal(written(tmp_path, text)).startswith(message)

@@ -65,12 +65,10 @@ BAD = {
     'a float that YAML reads as text': ('rc_capacitance_f: 0.33e-6', 'rc_capacitance_f: 1e-6',
                                         r":13:25: sensor.rc_capacitance_f: '1e-6' is not a "
                                         r'floating-point number; write 1\.0e-06'),
-    'text': ('adc_vref_v: 5.0', 'adc_vref_v: five', r":15:19: sensor.adc_vref_v: 'five' is not a"),
     'a float for an int': ('adc_bits: 16', 'adc_bits: 16.0',
                            r':14:17: sensor.adc_bits: 16.0 is not a whole number'),
     'an int for text': ("serial: '17'", 'serial: 17', r':7:15: sensor.serial: 17 is not text'),
     'NaN': ('offset_v: [0.02,', 'offset_v: [.nan,', r':24:17: bias.offset_v: nan is not a finite'),
-    'infinity': ('rate_hz: 1000.0', 'rate_hz: .inf', r':16:16: sensor.rate_hz: inf is not a fin'),
     'out of range': ('rate_hz: 1000.0', 'rate_hz: -1.0',
                      r':16:16: sensor.rate_hz: -1 Hz is outside 0.01 to 100000'),
     'a coefficient out of range': ('offset_v: [0.02,', 'offset_v: [20.0,',
@@ -78,8 +76,6 @@ BAD = {
     'another axis': ('axes: xy', 'axes: xz', r":8:13: sensor.axes: 'xz' is not one of x, xy, xyz"),
     'too few figures': ('nominal_zero_g_v: [2.5, 2.5]', 'nominal_zero_g_v: [2.5]',
                         r':9:25: sensor.nominal_zero_g_v: 1 values for 2 axes'),
-    'too many coefficients': ('offset_v: [0.02, -0.03]', 'offset_v: [0.02, -0.03, 0.1]',
-                              r':24:17: bias.offset_v: 3 values for 2 axes'),
     'z_sign': ('z_sign: 1', 'z_sign: 0', r':19:15: sensor.z_sign: 0, but must be 1'),
     'unknown format': ('format: 1', 'format: 7',
                        r':3:13: format: version 7, but this package reads version 1'),
@@ -109,8 +105,7 @@ BAD = {
     'negative variance': ('[1.0e-6, 0.0, 0.0, 1.0e-6]', '[-1.0e-6, 0.0, 0.0, 1.0e-6]',
                           r':28:17: covariance: the variance of bias.offset_v.x is -1e-06, not'),
     'no namespace': ('/**:', 'driver:', r":1:1: no '/\*\*' with parameters below it"),
-    'no ros__parameters': ('ros__parameters:', 'parameters:', r":2:3: no 'ros__parameters'"),
-}
+    'no ros__parameters': ('ros__parameters:', 'parameters:', r":2:3: no 'ros__parameters'")}
 
 
 def refusal(path: Path) -> str:

@@ -14,7 +14,6 @@ import pytest
     ('Policy=SECRET&Signature=SECRET&Key-Pair-Id=SECRET', ''),
     ('X-Goog-Algorithm=SECRET&x-goog-signature=SECRET', ''),
     ('sv=2022&se=2026&sr=b&sp=r&sig=SECRET%2F&snapshot=7', '?snapshot=7'),
-    ('api%5Fkey=SECRET&apikey=SECRET', ''),
-])
+    ('api%5Fkey=SECRET&apikey=SECRET', '')])
 def test_secrets_of_a_query(query, kept):
     assert without_secrets(f'https://host/run.csv?{query}') == f'https://host/run.csv{kept}'

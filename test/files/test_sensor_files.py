@@ -18,7 +18,6 @@ each_file = pytest.mark.parametrize('path', COMPLETE, ids=lambda path: path.stem
 
 @each_file
 def test_a_file_is_a_nominal_sensor_with_its_source(path):
-    """A file has no effect and no unit, and its head names the datasheet."""
     sensor = parameter_file.load(path)
     head = re.match('(#.*\n)+', path.read_text('utf-8'))[0]
     assert (sensor.model, sensor.serial, sensor.effects) == ('nominal', 'nominal', ())
@@ -29,7 +28,6 @@ def test_a_file_is_a_nominal_sensor_with_its_source(path):
 
 @each_file
 def test_a_still_recording_has_the_stated_noise_and_zero_g(run_tool, tmp_path, path):
-    """`simulate` follows a still reference at the sensor's rate with its noise and zero-g."""
     sensor = parameter_file.load(path)
     times = np.arange(4096) / sensor.rate_hz
     measured = ''.join(f',{axis}_v' for axis in sensor.axes)
@@ -54,7 +52,6 @@ def test_a_still_recording_has_the_stated_noise_and_zero_g(run_tool, tmp_path, p
 
 
 def test_a_sensor_is_taken_by_its_name(run_tool, tmp_path):
-    """`--params MPU-6050` is the installed file; a file of that name in the folder is first."""
     installed = parameter_file.nominal_path().with_name('mpu6050.yaml')
     for number, params in enumerate(('MPU-6050', installed)):
         done = run_tool('simulate', 'motion', '--params', params, '--rate', 25,
@@ -67,7 +64,6 @@ def test_a_sensor_is_taken_by_its_name(run_tool, tmp_path):
 
 
 def test_an_unknown_sensor_is_refused(run_tool):
-    """A name without a file is answered with the names that have one."""
     done = run_tool('simulate', 'motion', '--params', 'mpu6051', '-o', 'out.csv')
     assert done.returncode == 1 and done.stderr.count('\n') == 1
     assert 'mpu6051: no file' in done.stderr and 'mpu6050' in done.stderr

@@ -26,7 +26,6 @@ FLEETS = {
 
 @pytest.fixture(scope='module')
 def folders(tmp_path_factory):
-    """Return the folders of fleets with their pages, by name."""
     made = {}
     for name, fleet in FLEETS.items():
         made[name] = tmp_path_factory.mktemp(name)
@@ -48,7 +47,6 @@ def page_without(column, fleet, folder):
 
 @pytest.fixture
 def page(opened, folders):
-    """Return the page of the bad fleet, drawn."""
     drawn, _ = opened(folders['bad'] / 'fleet.html', 1280)
     wait_until_drawn(drawn)
     return drawn
@@ -56,7 +54,6 @@ def page(opened, folders):
 
 @NEEDS_CHROMIUM
 def test_the_page_names_what_is_wrong(page):
-    """Counts come first, then the drifting unit; batch and stage are sentences."""
     assert page.locator('.tile').first.inner_text().split()[1] == '720'
     first = page.locator('#urgent tbody tr').first.inner_text()
     assert 'A-0003' in first and 'drifts' in first and 'out of tolerance in' in first
@@ -75,7 +72,6 @@ def test_the_page_names_what_is_wrong(page):
 
 @NEEDS_CHROMIUM
 def test_search(page):
-    """The table of all units shows those whose text has all words."""
     page.get_by_role('tab', name='all units').click()
     rows = page.locator('#all-units tbody tr')
     assert rows.filter(visible=True).count() == 60
@@ -103,7 +99,6 @@ def test_a_sound_fleet_is_in_order(folders):
 
 
 def test_files_beside_the_page(folders):
-    """The population can be read, and units.csv has each unit's shrunken estimate."""
     population = population_file.read(folders['bad'] / 'population.yaml')
     pooled = population.coefficients['zero_g_y_v']
     assert pooled.units == 60

@@ -48,7 +48,6 @@ def test_the_closed_form_of_equal_errors():
 
 @pytest.mark.parametrize('count', [6, 25, 200])
 def test_intervals_hold_the_truth(count):
-    """Mean, spread and a further unit are inside their 90 % intervals in 90 % of fleets."""
     rng = np.random.default_rng(count)
     spreads, means, further, false = [], [], [], []
     for _ in range(300):

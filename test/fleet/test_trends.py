@@ -70,7 +70,6 @@ def test_the_share_of_false_claims(changes):
 
 
 def test_a_recalibration_is_no_drift():
-    """Steps at calibrations give no claim, and the drift between them is still claimed."""
     rng = np.random.default_rng(4)
     drift = np.where(np.arange(60) == 7, 8.0, 0.0)
     recordings = fleet(rng, counts=(40, 60), units=60, step=5.0, drift=drift)

@@ -45,7 +45,6 @@ class Counts(ctypes.Structure):
 
 @pytest.fixture(scope='module')
 def library(made_once):
-    """Compile frame.c and load it."""
     compiler = shutil.which('cc') or shutil.which('gcc') or shutil.which('clang')
     if compiler is None:
         pytest.skip('no C compiler: apt install gcc')
@@ -59,7 +58,6 @@ def library(made_once):
 
 
 def data(library, counts, time_us, index, overruns, codes, bits=16):
-    """Encode a frame of samples by the firmware, and check that it stays within its room."""
     count, channels = codes.shape
     room = 24 + 2 * codes.size + 4 + (28 + 2 * codes.size) // 254 + 2
     out = (ctypes.c_uint8 * (room + 8))(*[0xAA] * (room + 8))
@@ -126,7 +124,6 @@ def test_no_stream_breaks_the_receiver(library, parts):
 
 @pytest.fixture(scope='module')
 def sketch(made_once):
-    """Compile the sketch for this machine."""
     compiler = shutil.which('g++') or shutil.which('clang++')
     if compiler is None:
         pytest.skip('no C++ compiler: apt install g++')
@@ -138,7 +135,6 @@ def sketch(made_once):
 
 @contextmanager
 def running_sketch(sketch, tmp_path, baud, **parameters):
-    """Give a link that reads the sketch on a terminal."""
     board_fd, driver_fd = pty.openpty()
     tty.setraw(driver_fd)
     (tmp_path / 'port').symlink_to(os.ttyname(driver_fd))

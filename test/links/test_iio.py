@@ -28,7 +28,6 @@ def library():
 
 @pytest.fixture
 def served():
-    """Give a function that starts a server and opens a link on it."""
     opened = []
 
     def serve(sensor=None, adc=None, **settings):
@@ -45,7 +44,6 @@ def served():
 
 
 def read_samples(link, count, timeout_s=60.0):
-    """Read until so many samples have come or the time is over, and return the parts."""
     parts, end_s = [], time.monotonic() + timeout_s
     while sum(len(part.stamp_ns) for part in parts) < count and time.monotonic() < end_s:
         parts.append(link.read(0))

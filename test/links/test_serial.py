@@ -46,7 +46,6 @@ class ConnectedBoard:
         self.link.read(0)
 
     def plug(self):
-        """Make the terminal and its name."""
         self.board_fd, self.driver_fd = pty.openpty()
         tty.setraw(self.driver_fd)
         self.path.unlink(missing_ok=True)
@@ -59,22 +58,18 @@ class ConnectedBoard:
         os.close(self.driver_fd)
 
     def send(self, raw):
-        """Send bytes."""
         os.write(self.board_fd, raw)
 
     def send_info(self):
-        """Send an info frame."""
         self.send(self.encoder.info_frame())
 
     def send_frames(self, count=1, pause_s=0.0):
-        """Send frames of samples, with a pause after each."""
         for _ in range(count):
             self.send(self.encoder.sample_frame(self.index * 1000, self.index, self.codes))
             self.index += len(self.codes)
             time.sleep(pause_s)
 
     def read(self, timeout_s=0.2, until=lambda parts: False):
-        """Read the link until a condition holds, and return the parts with samples."""
         end_s = time.monotonic() + timeout_s
         parts = []
         while time.monotonic() < end_s and not until(parts):
@@ -84,11 +79,9 @@ class ConnectedBoard:
         return parts
 
     def read_samples(self, count, timeout_s=60.0):
-        """Read until so many samples have come, and return the parts."""
         return self.read(timeout_s, lambda parts: sample_count(parts) >= count)
 
     def wait_for(self, text, send=lambda: None, timeout_s=60.0):
-        """Send, and read the link, until its status has a text."""
         end_s = time.monotonic() + timeout_s
         while text not in self.link.status().text:
             assert time.monotonic() < end_s, self.link.status().text
@@ -96,7 +89,6 @@ class ConnectedBoard:
             self.link.read(0)
 
     def commands(self):
-        """Return the latencies of the commands that have come, µs."""
         os.set_blocking(self.board_fd, False)
         try:
             received = os.read(self.board_fd, 4096)
@@ -105,11 +97,9 @@ class ConnectedBoard:
         return [decode_command(raw) for raw in Splitter().split(received)]
 
     def value(self, name):
-        """Return one of the link's statistics."""
         return self.link.status().statistics[name]
 
     def close(self):
-        """Close the link, then the terminal."""
         self.link.close()
         self.unplug()
 
@@ -135,14 +125,12 @@ def stamps_of(parts):
 
 
 def reference(name, parts):
-    """Return the values of a reference that are not NaN."""
     values = np.concatenate([part.references[name] for part in parts])
     return values[np.isfinite(values)]
 
 
 @pytest.fixture
 def connect(tmp_path):
-    """Give a function that connects a board."""
     boards = []
 
     def make(**settings):

@@ -21,22 +21,19 @@ EFFECTS = ('quadratic', 'temperature_bias:per_k.x=4e-4,per_k.y=-3e-4,per_k.z=2e-
 
 
 def unit(*effects: str, **changes: object) -> Sensor:
-    """Return a unit without noise and ADC, with some effects."""
     quiet = {'noise_density_g_per_rthz': np.zeros(3), 'adc_bits': 0}
     return with_effects(nominal('xyz', **quiet | changes), effects or EFFECTS)
 
 
 def force(time_s: np.ndarray) -> np.ndarray:
     """Return a smooth specific force, m/s², (n, 3)."""
-    return np.column_stack([3 * np.sin(2 * time_s), 2 * np.cos(3 * time_s),
-                            9.8 + np.sin(time_s)])
+    return np.column_stack([3 * np.sin(2 * time_s), 2 * np.cos(3 * time_s), 9.8 + np.sin(time_s)])
 
 
 def fields(accel: np.ndarray) -> dict[str, np.ndarray]:
     """Return the fields of messages with gyroscope and orientation, (n, k) each."""
     count = len(accel)
-    return {'linear_acceleration': accel,
-            'angular_velocity': np.tile([0.1, 0.2, 0.3], (count, 1)),
+    return {'linear_acceleration': accel, 'angular_velocity': np.tile([0.1, 0.2, 0.3], (count, 1)),
             'angular_velocity_covariance': np.tile(np.diag([1., 2., 3.]).ravel(), (count, 1)),
             'orientation': np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
             'orientation_covariance': np.tile(np.eye(3).ravel(), (count, 1))}
@@ -44,13 +41,11 @@ def fields(accel: np.ndarray) -> dict[str, np.ndarray]:
 
 def feed(link: topic.EmulatedSensor, stamps: np.ndarray, accel: np.ndarray | None = None
          ) -> Samples:
-    """Give samples to a link, and return what it makes of them."""
     link.sense_imu(stamps, fields(force(stamps * 1e-9) if accel is None else accel))
     return link.read(0)
 
 
 def statistics(link: topic.EmulatedSensor) -> dict[str, int]:
-    """Return the counts of a link."""
     return link.status().statistics
 
 

@@ -23,8 +23,7 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 
-PAYLOAD = bytes.fromhex(
-    '010100000700000040420f00000000004600000000000202008000003412ffff')
+PAYLOAD = bytes.fromhex('010100000700000040420f00000000004600000000000202008000003412ffff')
 FRAME = bytes.fromhex(
     '03010101020701010440420f01010101024601010101030202028001093412ffffe9e413f100')
 INFO = BoardInfo(1000.0, 16, 2, 5.0, 'A7')
@@ -74,8 +73,7 @@ def test_a_single_changed_lost_or_added_byte_never_decodes():
     raw = FRAME[:-1]
     for _ in range(3000):
         k, byte = int(rng.integers(len(raw))), bytes([rng.integers(256)])
-        for bad in (raw[:k] + byte + raw[k + 1:], raw[:k] + raw[k + 1:],
-                    raw[:k] + byte + raw[k:]):
+        for bad in (raw[:k] + byte + raw[k + 1:], raw[:k] + raw[k + 1:], raw[:k] + byte + raw[k:]):
             for part in bad.split(b'\0'):
                 if part == raw:
                     continue

@@ -7,14 +7,7 @@ from functools import cache
 
 from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
-from adxl_ros.model.coefficients import (
-    get,
-    names_of,
-    parameter_of,
-    put,
-    typical,
-    with_neutral,
-)
+from adxl_ros.model.coefficients import get, names_of, parameter_of, put, typical, with_neutral
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import ActsOn, Coefficient, Need, Place
 from adxl_ros.model.filters import play, resonator
@@ -40,8 +33,6 @@ _TIME_S = np.arange(0.0, 12.0, 0.01)
 
 
 class RobotForce(ForcePath):
-    """A recorded force with errors of a robot, which are none in particular."""
-
     is_robot = True
 
     def __init__(self, time_s, force_mps2):
@@ -56,7 +47,6 @@ FOLLOWED = Motion(12.0, force=RobotForce(_TIME_S, G * np.column_stack([
 
 
 def with_effect(name, sensor=None, **changes):
-    """Return a sensor with one effect at its typical values, except for the changes."""
     sensor = sensor or nominal('xyz', **CLEAN)
     values = {**typical(library()[name], sensor.axes), **{k: np.asarray(v, float)
                                                           for k, v in changes.items()}}
@@ -69,7 +59,6 @@ def motion_of(name):
 
 
 def volts(sensor, motion=None, seed=1):
-    """Simulate a motion; return volts, (n, m)."""
     if motion is None:
         motion = motion_of(sensor.effects[0]) if sensor.effects else MOTION
     columns = simulate(sensor, motion, seed)
@@ -78,12 +67,10 @@ def volts(sensor, motion=None, seed=1):
 
 @pytest.fixture(scope='module')
 def plain():
-    """Give a function that returns volts without an effect, in its motion, with noise and ADC."""
     return cache(lambda name: volts(nominal('xyz'), motion_of(name)))
 
 
 def test_the_library_has_the_documented_effects():
-    """The library contains all effects on which other software relies."""
     names = ('bias scale_factor cross_axis scale_factor_z cross_axis_z misalignment '
              'nonlinearity quadratic hysteresis bandwidth mount_resonance temperature_bias '
              'temperature_scale warm_up bias_walk supply saturation quantisation adc_inl '
@@ -96,13 +83,11 @@ def test_the_library_has_the_documented_effects():
 
 @pytest.mark.parametrize('name', NAMES)
 def test_neutral_is_identity_to_the_bit(name, plain):
-    """An effect at its neutral values changes no bit of a noisy recording in motion."""
     np.testing.assert_array_equal(volts(with_neutral(nominal('xyz'), [name])), plain(name))
 
 
 @pytest.mark.parametrize('name', NAMES)
 def test_typical_values_change_a_recording_and_blocks_join(name, plain):
-    """A typical effect changes the volts, equally in one block and in many."""
     sensor = with_effect(name, nominal('xyz'))
     if name == 'saturation':
         sensor = put(sensor, [Coefficient('saturation', 'limit_g', 'z')], [0.3])
@@ -121,7 +106,6 @@ def test_typical_values_change_a_recording_and_blocks_join(name, plain):
 @pytest.mark.parametrize('name', [n for n in NAMES if library()[n].smooth
                                   and library()[n].acts_on is ActsOn.MEAN])
 def test_tangents_do_not_depend_on_the_step(name):
-    """Finite differences of smooth effects with two steps agree."""
     sensor = with_effect(name)
     for coefficient in names_of(library()[name], 'xyz'):
         value, scale = get(sensor, [coefficient])[0], parameter_of(coefficient).scale
@@ -134,7 +118,6 @@ def test_tangents_do_not_depend_on_the_step(name):
 
 @pytest.mark.parametrize('name', NAMES)
 def test_bounds_contain_neutral_and_typical_values(name):
-    """Every parameter states its unit and source, every effect its cause."""
     effect = library()[name]
     assert effect.cause.endswith('.')
     for p in effect.parameters:
@@ -249,7 +232,6 @@ def test_bias_walks_with_the_root_of_time():
 
 
 def test_inverse_uses_temperature_supply_and_time():
-    """Given temperature, supply and time since power-on, the inverse is exact."""
     names = [n for n in NAMES if library()[n].invertible and Need.STAGE not in library()[n].needs]
     sensor = with_neutral(nominal('xyz'), names)
     sensor = replace(sensor, values={n: typical(library()[n], 'xyz') for n in names})
@@ -267,6 +249,5 @@ def test_inverse_uses_temperature_supply_and_time():
     ('noise_excess', {'noise_density_g_per_rthz': np.zeros(3)}, MOTION),
     ('backlash', {}, Motion(1.0, force=lambda at_s: [0 * at_s] * 3))])
 def test_an_effect_without_its_stage_of_the_chain_is_refused(name, changes, motion):
-    """The message names the effect if the sensor has no ADC, noise or stage."""
     with pytest.raises(UserError, match=f'^{name} acts on the '):
         Response(replace(with_effect(name, nominal('xyz')), **changes), motion, 0)

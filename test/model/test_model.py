@@ -24,7 +24,6 @@ def test_matrix_of_misalignment_equals_equations_18_and_19():
 
 
 def test_means_of_simulated_noise_have_the_predicted_deviation():
-    """Means over 5 s of simulated noise have a standard deviation of σ/√237."""
     sensor = nominal(adc_bits=0)
     fed = Fed(sensor, 5)
     volts = np.vstack([fed([np.zeros(50000), np.zeros(50000), np.full(50000, 9.8)])

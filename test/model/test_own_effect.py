@@ -19,7 +19,6 @@ PAGE = REPO / 'docs' / 'howto' / 'own_effect.md'
 
 
 def test_the_documented_package_works(tmp_path, monkeypatch, run_tool):
-    """Its effect is available to `simulate`, to parameter files and to `apply`."""
     pytest.importorskip('plotly')
     blocks = re.findall(r'`([a-z_.]+)`:\n\n```\w+\n(.*?)```', PAGE.read_text(), re.DOTALL)
     assert {name for name, _ in blocks} == {'pyproject.toml', 'crane_effects.py'}
@@ -50,8 +49,7 @@ def test_the_documented_package_works(tmp_path, monkeypatch, run_tool):
                                         '      resistance_ohm: 2.0\n      current_a: 7.0e-4\n'
                                         '      growth_per_g: [0.05, 0.05]\n')
     path.write_text(text)
-    applied = run_executable('apply', 'a.csv', '--params', path, '-o', 'out.csv',
-                             cwd=tmp_path)
+    applied = run_executable('apply', 'a.csv', '--params', path, '-o', 'out.csv', cwd=tmp_path)
     assert applied.returncode == 0, applied.stderr
     run_tool('apply', 'b.csv', '-o', 'bare.csv')
     ax = [np.genfromtxt(tmp_path / name, delimiter=',', names=True)['ax_mps2']

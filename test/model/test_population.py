@@ -20,7 +20,6 @@ POPULATION = Population('population.yaml', {
 
 
 def estimated(zero_g_v, scale_v_per_g, covariance):
-    """Return a unit with estimates of zero-g and scale factor."""
     unit = put(with_neutral(nominal('x'), ['bias', 'scale_factor']), [ZERO_G, SCALE],
                [zero_g_v - 2.5, scale_v_per_g - 1.0])
     return replace(unit, covariance=np.asarray(covariance), covariance_names=(ZERO_G, SCALE))
@@ -38,7 +37,6 @@ def test_the_posterior_is_that_of_two_normal_densities():
 
 
 def test_intervals_are_smaller_and_still_true():
-    """Over drawn units the 90 % intervals hold 90 % of the truths, and one in 1000 is refused."""
     rng = np.random.default_rng(0)
     covariance = np.array([[4e-4, 1e-4], [1e-4, 2e-4]])
     inside, strangers = [], 0

@@ -8,14 +8,7 @@ from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
 from adxl_ros.model.covariance import coefficient_tangent, force_covariance
 from adxl_ros.model.effects import library
-from adxl_ros.model.effects.base import (
-    ARRAYS,
-    Coefficient,
-    Environment,
-    FLOATS,
-    Need,
-    Role,
-)
+from adxl_ros.model.effects.base import ARRAYS, Coefficient, Environment, FLOATS, Need, Role
 from adxl_ros.model.kinematics import angles, roll_pitch_covariance, specific_force, tilt
 from adxl_ros.model.sensor import Sensor
 from hypothesis import given, strategies as st
@@ -33,7 +26,6 @@ INVERTIBLE = tuple(name for name, effect in library().items()
 
 @st.composite
 def sensors(draw: st.DrawFn, axes: str) -> Sensor:
-    """Draw a unit with every invertible effect of the library, within twice its typical size."""
     sensor = with_neutral(nominal(axes), INVERTIBLE)
     names = coefficients(sensor)
     return put(sensor, names, [
@@ -47,7 +39,6 @@ def coefficients(sensor: Sensor) -> tuple[Coefficient, ...]:
 
 
 def drawn_sensor(axes: str, seed: int) -> Sensor:
-    """Draw a unit at datasheet spread with a covariance of its coefficients."""
     rng = np.random.default_rng(seed)
     sensor = with_neutral(nominal(axes), INVERTIBLE)
     names = tuple(n for n in coefficients(sensor) if parameter_of(n).role is not Role.SHAPE)
@@ -112,7 +103,6 @@ def test_volts_without_a_solution_are_nan_and_change_no_other_sample(axes: str, 
 
 @pytest.mark.parametrize('axes', ['xy', 'xyz'])
 def test_intervals_have_their_stated_coverage(axes: str) -> None:
-    """90 % intervals contain the truth in 88 to 92 % of units drawn from a calibration."""
     sensor = drawn_sensor(axes, 3)
     rng = np.random.default_rng(4)
     beta = np.radians([-150, -60, 20, 80])
@@ -171,7 +161,6 @@ def test_angles_of_known_poses() -> None:
 
 
 def test_floats_and_arrays_agree() -> None:
-    """The formulas give the same result for a live sample and for a recording."""
     rng = np.random.default_rng(7)
     force = rng.normal(size=(3, 200)) * 6
     mixed = rng.normal(size=(200, 3, 3)) * 0.1

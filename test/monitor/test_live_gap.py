@@ -30,7 +30,6 @@ class Swing:
         self._amplitude, self._rate = amplitude, rate
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
-        """Return a derivative of the angle, rad."""
         phase = self._rate * time_s + order * np.pi / 2
         return (0.7 if not order else 0.0) + self._amplitude * self._rate ** order * np.sin(phase)
 
@@ -59,7 +58,6 @@ class World:
 
     def run(self, seconds: int, change: Callable[[np.ndarray], np.ndarray] = lambda a: a
             ) -> list[GapChange]:
-        """Send some seconds of samples, changed by a function; return what is reported."""
         changes = []
         for _ in range(seconds * 10):
             time_s = (self.step + np.arange(20)) / RATE_HZ

@@ -29,23 +29,19 @@ class Camera:
         self._count = 0
 
     def connected(self) -> None:
-        """Wait until a node subscribes."""
         self.graph.spin_until(self._publisher.get_subscription_count, 20, 'a subscriber')
 
     def rest(self, force_mps2: list[float], seconds: float) -> None:
-        """Publish a rest, faster than real time."""
         for _ in range(round(seconds * RATE_HZ)):
             self.send(np.asarray(force_mps2) + self._rng.normal(0, NOISE_MPS2, 3))
             if self._count % 20 == 0:
                 self.graph.spin(0.005)
 
     def turn(self, seconds: float = 0.5) -> None:
-        """Publish motion."""
         for _ in range(round(seconds * RATE_HZ)):
             self.send(self._rng.normal(0, 5.0, 3))
 
     def send(self, force_mps2: np.ndarray) -> None:
-        """Publish one sample."""
         message = Imu()
         time_ns = 1_700_000_000_000_000_000 + round(
             (self._count + self._jitter.uniform(0, 0.9)) * 1e9 / RATE_HZ)

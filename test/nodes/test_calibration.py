@@ -28,8 +28,7 @@ LOSSLESS = (*RELIABLE, '-p', f'qos_overrides./imu/data_raw.subscription.depth:={
             '-p', 'qos_overrides./stage/command.publisher.depth:=1000')
 KEPT = ('-p', f'qos_overrides./imu/data_raw.publisher.depth:={QUEUE}')
 QUICK = ('-p', 'sweep.planes_deg:=[45.0, 90.0, 135.0]', '-p',
-         'sweep.step_deg:=45.0', '-p', 'sweep.dwell_s:=1.0', '-p',
-         'sweep.check_poses:=6')
+         'sweep.step_deg:=45.0', '-p', 'sweep.dwell_s:=1.0', '-p', 'sweep.check_poses:=6')
 
 
 def _files(tmp_path, seed=3, axes='xy'):
@@ -42,7 +41,6 @@ def _files(tmp_path, seed=3, axes='xy'):
 
 
 def _record(graph, kind, topic):
-    """Keep the arrival and the bytes of a topic's messages, as a bag does."""
     kept = []
     qos = QoSProfile(depth=QUEUE)
     if topic == '/sensor_info':
@@ -58,7 +56,6 @@ def _record(graph, kind, topic):
 
 
 def _sweep(start, truth, bare, *options, speed=4.0, slew_rad_s=0.5):
-    """Return the processes of driver and calibration."""
     driver = start('driver', '--ros-args', '--params-file', truth, '-p', 'link.type:=sim', '-p',
                    f'link.speed:={speed}', *FAST, *KEPT)
     start('stage', '--ros-args', '--params-file', bare, *FAST, '-p',
@@ -69,7 +66,6 @@ def _sweep(start, truth, bare, *options, speed=4.0, slew_rad_s=0.5):
 
 
 def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp_path):
-    """The live sweep and `fit` on its bag, with its journal, give the same coefficients."""
     rosbags = pytest.importorskip('bags', reason='rosbags is not installed: pip install rosbags')
     truth, bare = _files(tmp_path)
     kinds = {'/imu/data_raw': Imu, '/stage/joint_states': JointState,
@@ -136,7 +132,6 @@ def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp
 
 
 def test_services_and_refusals(start, tmp_path):
-    """Two sweeps at once, a finish without poses and an abort have an answer with a text."""
     truth, bare = _files(tmp_path)
     with Graph() as graph:
         def ask(name):
@@ -172,7 +167,6 @@ def test_services_and_refusals(start, tmp_path):
 
 @pytest.mark.parametrize('output, status', [('unit.yaml', 0), ('none/unit.yaml', 1)])
 def test_the_node_can_end_with_its_calibration(start, tmp_path, output, status):
-    """Its status tells success, and its last diagnostics have the poses and a short verdict."""
     truth, bare = _files(tmp_path)
     with Graph() as graph:
         _, node = _sweep(start, truth, bare, '-p', 'autostart:=true', '-p',
@@ -195,7 +189,6 @@ def test_the_node_can_end_with_its_calibration(start, tmp_path, output, status):
     ('thermal.range_c:=[50.0, 0.0]', 'thermal.range_c: [50.0, 0.0] is no lowest'),
     ('output:=.', 'output: . is a directory; name a')])
 def test_settings_out_of_range_end_the_node(start, tmp_path, setting, words):
-    """A step of 0, or a directory for a file, is refused at the start, in one line."""
     _, bare = _files(tmp_path)
     node = start('calibration', '--ros-args', '--params-file', bare, '-p', setting)
     assert node.wait() == 1
@@ -204,7 +197,6 @@ def test_settings_out_of_range_end_the_node(start, tmp_path, setting, words):
 
 
 def test_a_resting_sensor_is_calibrated_over_temperature(start, tmp_path):
-    """The span and the expected error show; the file is written when both ways are covered."""
     unit = with_neutral(nominal('xyz', serial='T7', rate_hz=20.0), ['bias'])
     parameter_file.save(tmp_path / 'base.yaml', replace(unit, model='linear'))
     motion = Motion(440.0, Held(0.7), Held(0.4), temperature_c=Knots(
@@ -237,7 +229,6 @@ def test_a_resting_sensor_is_calibrated_over_temperature(start, tmp_path):
 
 
 def test_a_compensated_stream_and_a_wrong_rate_are_refused(start, tmp_path):
-    """A stream of compensated samples or with missing samples is reported at once."""
     _, bare = _files(tmp_path)
     common = ('--ros-args', '--params-file', bare, '-p', 'autostart:=true')
     with Graph() as graph:

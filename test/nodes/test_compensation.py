@@ -14,7 +14,7 @@ from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Vector3Stamped
 from graph import accel, Graph, RELIABLE, stamp_ns
 import numpy as np
@@ -45,7 +45,6 @@ class Robot:
         self.graph = graph
         self.data = graph.listen(Imu, 'imu/data')
         self.tilt = graph.listen(Vector3Stamped, 'tilt')
-        self._diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
         self._raw = graph.node.create_publisher(Imu, 'imu/data_raw', 100)
         self._info = graph.node.create_publisher(DiagnosticStatus, 'sensor_info', QoSProfile(
             depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
@@ -53,7 +52,6 @@ class Robot:
         self._informed = False
 
     def inform(self, sensor: Sensor, **changes: str) -> None:
-        """Publish sensor_info."""
         self._informed = True
         self._info.publish(DiagnosticStatus(values=[
             KeyValue(key=k, value=v) for k, v in {**sensor_info(sensor), **changes}.items()]))
@@ -68,7 +66,6 @@ class Robot:
             timeout_s, 'compensation connected')
 
     def send(self, values: list[float]) -> None:
-        """Publish one sample of nominal acceleration, m/s²."""
         message = Imu()
         self._sent += 1
         message.header.stamp.sec = self._sent
@@ -79,7 +76,6 @@ class Robot:
         self._raw.publish(message)
 
     def answer(self, values: list[float]) -> Imu:
-        """Publish one sample and return the corrected sample."""
         count, tilts = len(self.data), len(self.tilt)
         self.send(values)
         self.graph.spin_until(lambda: len(self.data) > count and len(self.tilt) > tilts, 10.0,
@@ -97,23 +93,14 @@ class Robot:
         return result.reason
 
     def get(self, *names: str) -> list:
-        """Return the values of parameters."""
         request = GetParameters.Request(names=list(names))
         values = self.graph.call(GetParameters, f'{NODE}/get_parameters', request).values
         return [parameter_value_to_python(value) for value in values]
 
     def level(self, level: bytes, text: str) -> None:
-        """Wait for diagnostics of a level with a text."""
         self.graph.spin_until(
             lambda: self.graph.reports(NODE, text)
             and self.graph.diagnostics[NODE].level == level, 10.0, f'{level!r} {text}')
-
-    def warned(self, text: str, count: int) -> None:
-        """Wait until warnings have counted a number of samples; a message covers one second."""
-        self.graph.spin_until(lambda: count == sum(
-            int(status.message.split()[0])
-            for array in self._diagnostics for status in array.status
-            if status.level == DiagnosticStatus.WARN and text in status.message), 10.0, text)
 
 
 @pytest.fixture
@@ -200,7 +187,6 @@ def test_without_a_file_the_nominal_sensor_applies(robot: Robot, start: Start) -
 
 
 def test_samples_of_two_drivers_are_not_mixed(robot: Robot, start: Start) -> None:
-    """The samples are withheld while both publish, and come again when one has ended."""
     graph = robot.graph
     process = start('compensation')
     start('driver')
@@ -271,10 +257,8 @@ def test_best_effort_publishers_are_received(robot: Robot, start: Start, tmp_pat
     ('format: 1', 'format: 9', ':3:13: format: version 9, but this package reads version 1'),
     ('units: V, V/g, 1/g, rad', 'units: mV', ":4:12: units: 'mV', but coefficients are in"),
     ('[2.0e-06, 1.0e-06, 1.0e-06, 3.0e-06]', '[2.0e-06, 9.0e-06, 9.0e-06, 3.0e-06]',
-     'covariance: not positive'),
-    ('rate_hz: 1000.0', 'rate_hz: 1000', 'rate_hz'),
-    ('effects: [', 'effects: [[', 'not YAML'),
-])
+     'covariance: not positive'), ('rate_hz: 1000.0', 'rate_hz: 1000', 'rate_hz'),
+    ('effects: [', 'effects: [[', 'not YAML')])
 def test_a_bad_file_ends_it_with_one_line(start: Start, tmp_path: Path, right: str, wrong: str,
                                           message: str) -> None:
     path = _saved(tmp_path, unit())

@@ -47,8 +47,7 @@ def test_serialized_samples_are_what_rclpy_serializes(axes):
     accel = to_nominal_mps2(volts, sensor)
     messages = imu_writer(sensor, 'imu_link').messages(stamps, linear_acceleration=accel)
     for message, stamp, a in zip(messages, stamps, accel):
-        template.header.stamp.sec, template.header.stamp.nanosec = map(
-            int, divmod(stamp, 10 ** 9))
+        template.header.stamp.sec, template.header.stamp.nanosec = map(int, divmod(stamp, 10 ** 9))
         for axis, value in zip('xyz', [*map(float, a), 0.0, 0.0]):
             setattr(template.linear_acceleration, axis, value)
         # The 3 bytes of padding after the frame have arbitrary values.

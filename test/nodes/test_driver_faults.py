@@ -44,7 +44,6 @@ def lines(process):
 
 
 def test_every_fault_of_a_board_is_counted_exactly(start, tmp_path):
-    """One report covers all faults during which the board's count continues."""
     by_name = {fault.name: fault for fault in SERIAL_FAULTS}
     faults = [*(byte_fault(kind, 1e-3) for kind in ('flip', 'lose', 'insert', 'burst')),
               *(by_name[name] for name in (

@@ -36,7 +36,6 @@ class Simulator:
         self.sent: list[int] = []
 
     def step(self, factor: float = 2.0) -> None:
-        """Advance by one step, at a number of times real time."""
         self.now_ns += STEP_NS
         stamp = Time(sec=self.now_ns // 10 ** 9, nanosec=self.now_ns % 10 ** 9)
         if self.has_clock:
@@ -54,7 +53,6 @@ class Simulator:
 
     def run_until(self, condition: Callable[[], object], purpose: str, factor: float = 2.0
                   ) -> None:
-        """Advance until a condition holds."""
         end_s = time.monotonic() + PATIENCE * 60
         while not condition():
             self.step(factor)
@@ -63,7 +61,6 @@ class Simulator:
 
 
 def start_driver(start: Callable[..., Started], *arguments: str) -> Started:
-    """Start the driver behind a simulator."""
     return start('driver', '--ros-args', '-p', 'link.type:=topic', '-p', 'use_sim_time:=true',
                  *arguments)
 

@@ -25,7 +25,6 @@ CHOICES = 'set it to iio, replay, serial, topic, or to sim for a simulated senso
 
 @pytest.fixture
 def unit(tmp_path: Path) -> Path:
-    """Return the parameter file of a unit."""
     parameter_file.save(tmp_path / 'unit.yaml', nominal(serial='17'))
     return tmp_path / 'unit.yaml'
 
@@ -40,7 +39,6 @@ def refusal(start, name: str, *arguments: object) -> str:
 
 
 def listed(graph: Graph, node: str) -> list[str]:
-    """Return the names of the parameters of a node."""
     return graph.call(ListParameters, f'{node}/list_parameters',
                       ListParameters.Request()).result.names
 

@@ -59,13 +59,11 @@ class Laboratory(Graph):
                            *FAST, *options)
 
     def wait_for_motion(self):
-        """Wait until the stage is some degrees from where it is now."""
         del self.states[:]
         self.spin_until(lambda: self.states and np.abs(np.subtract(
             self.states[-1].position, self.states[0].position)).max() > 0.1, 90, 'motion')
 
     def wait_for_rest(self):
-        """Wait until the stage rests; its last second must be still."""
         def rests():
             newest = self.states[-100:]
             return len(self.states) > 100 \

@@ -8,7 +8,6 @@ import pytest
 
 @pytest.mark.kills
 def test_no_kill_loses_a_pose_or_breaks_a_file(ros_env, tmp_path):
-    """Five kills at different moments of a sweep, which resumes each time until its end."""
     sweeps = kill(tmp_path, ros_env, 5, 1)
     assert sweeps.lost == [] and sweeps.broken == []
     assert sweeps.poses >= 10 and sweeps.sweeps >= 1, 'too few poses or complete sweeps'

@@ -23,7 +23,6 @@ pytestmark = NEEDS_ROS2
 
 @pytest.fixture
 def launch(ros_env: dict[str, str], tmp_path: Path) -> Iterator[Callable[..., Started]]:
-    """Give a function of a launch file and its arguments that launches it in the test's graph."""
     started: list[Started] = []
 
     def begin(name: str, *arguments: str) -> Started:
@@ -155,7 +154,6 @@ def test_the_launch_of_a_calibration_ends_with_it(launch, tmp_path, output, stat
 
 
 def test_a_launch_shows_the_screen_in_its_terminal(ros_env, tmp_path):
-    """No log line tears the screen; its last lines remain there after the launch."""
     seen = Terminal([shutil.which('ros2'), 'launch', 'adxl_ros', 'calibrate.launch.py',
                      'output:=unit.yaml', 'screen:=true', 'speed:=20',
                      'sweep_planes_deg:=30,60,90', 'sweep_step_deg:=60', 'sweep_dwell_s:=1',

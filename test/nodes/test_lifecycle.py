@@ -20,7 +20,6 @@ import serial
 
 @pytest.fixture
 def port() -> Iterator[str]:
-    """Return the name of a terminal that stands for a serial port."""
     board, device = pty.openpty()
     name = os.ttyname(device)
     os.close(device)
@@ -63,7 +62,6 @@ def make_driver(ros_env: dict[str, str], port: str, monkeypatch: pytest.MonkeyPa
 
 
 def is_free(port: str) -> bool:
-    """Return whether no process holds a port."""
     try:
         serial.Serial(port, exclusive=True).close()
     except serial.SerialException:

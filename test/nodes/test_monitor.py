@@ -61,7 +61,6 @@ class Streams:
         self.has_reference = True
 
     def turn(self) -> None:
-        """Publish a tenth of a second, and listen."""
         time_s = (self.step + np.arange(10)) / RATE_HZ
         volts = [respond(time_s) for respond in self._responses]
         samples = to_nominal_mps2(volts[self.is_shifted], UNIT)
@@ -76,7 +75,6 @@ class Streams:
         self._graph.spin(0.005)
 
     def run_until(self, condition: Callable[[], object], purpose: str) -> None:
-        """Publish until a condition holds."""
         end_s = time.monotonic() + PATIENCE * 60
         while not condition():
             self.turn()
@@ -110,12 +108,10 @@ def graph(ros_env) -> Iterator[Graph]:
 
 
 def values(status: DiagnosticStatus) -> dict[str, str]:
-    """Return the values of a status by key."""
     return {pair.key: pair.value for pair in status.values}
 
 
 def numbers(messages: list[DiagnosticArray]) -> list[float]:
-    """Return all values of messages that are numbers."""
     texts = [pair.value for message in messages for status in message.status
              for pair in status.values]
     return [float(text) for text in texts if text.replace('.', '', 1).lstrip('-')[:1].isdigit()
@@ -193,7 +189,6 @@ def test_a_killed_monitor_loses_no_change(monitor, graph, tmp_path) -> None:
 
 
 def test_no_sample_at_1_khz_is_lost(start, graph) -> None:
-    """The monitor counts every sample that the driver has published since it listens."""
     # A machine that is held up for seconds would drop messages between nodes.
     start('monitor', '--ros-args', '-p', 'diagnose.automatic:=false', *RELIABLE)
     graph.spin_until(lambda: 'monitor' in graph.diagnostics, 20, 'the monitor')

@@ -19,13 +19,11 @@ PROGRAMS = (*NODES, 'screen', 'demo', 'bench')
 
 
 def parts_of(text: str) -> dict[str, str]:
-    """Return the parts of a help text by their first lines."""
     return {part.split('\n')[0]: part for part in text.split('\n\n')}
 
 
 @cache
 def help_of(name: str) -> subprocess.CompletedProcess:
-    """Run `--help` of a program once for all tests."""
     # A path has no place to wrap at; no file of this one is written.
     return run_executable(name, '--help', env=os.environ | {'ROS_HOME': '/ros'})
 

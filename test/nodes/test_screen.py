@@ -19,7 +19,6 @@ PLAN = ('-p', 'sweep.planes_deg:=[45.0, 90.0]', '-p', 'sweep.step_deg:=90.0', '-
 
 @pytest.fixture
 def screen(ros_env, tmp_path):
-    """Give a function that runs the screen in a terminal; all are closed at the end."""
     opened = []
 
     def begin(*options, **size):
@@ -33,7 +32,6 @@ def screen(ros_env, tmp_path):
 
 
 def bench(start, tmp_path):
-    """Start a sensor on its stage, at four times real time, and a node without a terminal."""
     base = nominal('xyz', serial='T1')
     parameter_file.save(tmp_path / 'truth.yaml', drawn(np.random.default_rng(3), base))
     parameter_file.save(tmp_path / 'bare.yaml', base)
@@ -46,7 +44,6 @@ def bench(start, tmp_path):
 
 
 def test_a_screen_drives_the_sweep_of_a_node_without_a_terminal(start, screen, tmp_path):
-    """Keys begin, leave out, abort, go on and finish; leaving the screen leaves the node."""
     node = bench(start, tmp_path)
     seen = screen(lines=24, columns=80)
     seen.wait_for('press b to begin', 'calibration of T1 (xyz) into unit.yaml', '1000 Hz')
@@ -87,7 +84,6 @@ def test_a_screen_drives_the_sweep_of_a_node_without_a_terminal(start, screen, t
 
 @pytest.mark.kills
 def test_a_screen_waits_for_its_node_and_survives_it(start, screen):
-    """A screen in a namespace shows each node of its name, before and after a kill."""
     seen = screen('--ros-args', '-r', '__ns:=/bench', '-p', 'node:=bridge')
     seen.wait_for('waiting for /bench/bridge', 'q  quit')
     names = ('--ros-args', '-r', '__ns:=/bench', '-r', '__node:=bridge')
@@ -112,7 +108,6 @@ def test_a_screen_waits_for_its_node_and_survives_it(start, screen):
 
 @pytest.mark.parametrize('number', ['TERM', 'HUP', 'INT'])
 def test_a_signal_ends_a_screen_and_restores_its_terminal(screen, number):
-    """A screen without a node ends with status 0, and its terminal is as before."""
     seen = screen()
     seen.wait_for('waiting for /calibration')
     subprocess.run(['kill', f'-{number}', str(seen.popen.pid)], check=True)

@@ -31,13 +31,11 @@ def joined(name, node):
 
 
 def permitted(profile):
-    """Return the names that a node may publish, subscribe, serve and call."""
     return [{joined(entry.text, profile.get('node')) for entry in profile.findall(f'{kind}/*')}
             for kind in KINDS]
 
 
 def existing(graph, node):
-    """Return the names that a node publishes, subscribes, serves and calls."""
     def of_topics(find):
         # A node of the same name that ended a moment ago may still be in the graph, so that the
         # queries by the name of a node may answer for that one.

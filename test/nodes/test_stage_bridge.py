@@ -40,20 +40,17 @@ class Controller(Graph):
         return self
 
     def publish(self):
-        """Publish the states of the joints."""
         message = JointState(name=list(self.angles), position=[
             math.remainder(angle, 2 * math.pi) for angle in self.angles.values()])
         message.header.stamp = self.node.get_clock().now().to_msg()
         self.states.publish(message)
 
     def goal(self):
-        """Return the angles of the newest command by joint."""
         newest = self.commands[-1]
         return dict(zip(newest.joint_names, newest.points[0].positions)) \
             if self.kind == 'trajectory' else dict(zip(newest.name, newest.position))
 
     def send_command(self, alpha, beta):
-        """Command the stage to angles, rad."""
         self.command.publish(JointState(name=['alpha', 'beta'], position=[alpha, beta]))
 
     def command_until(self, alpha, beta, condition, purpose):
@@ -66,7 +63,6 @@ class Controller(Graph):
         self.spin_until(holds, 20, purpose)
 
     def at(self):
-        """Return the newest published angles of the stage, rad, by joint."""
         if not self.stage_states:
             return {}
         return dict(zip(self.stage_states[-1].name, self.stage_states[-1].position))
@@ -74,7 +70,6 @@ class Controller(Graph):
 
 @pytest.mark.parametrize('kind', ['trajectory', 'joint_state'])
 def test_commands_and_states_pass_with_names_signs_and_offsets(start, kind):
-    """Commands reach the joints of the controller, and their states return."""
     with Controller(kind) as graph:
         start('stage', '--ros-args', '-p', f'stage.type:={kind}', *NAMES, *MOUNTED)
         graph.spin_until(graph.at, 30, 'the stage')
@@ -107,7 +102,6 @@ def test_a_turn_beyond_half_a_turn_is_unwrapped(start):
 
 
 def test_a_command_that_is_lost_is_sent_again(start):
-    """A controller that starts later or ignores a goal receives the command again."""
     with Controller('trajectory') as graph:
         start('stage', '--ros-args', '-p', 'stage.type:=trajectory', *NAMES, '-p',
               'bridge.speed_rad_s:=10.0')
@@ -127,7 +121,6 @@ def test_a_command_that_is_lost_is_sent_again(start):
     (('-p', 'bridge.alpha.joint:=tilt'), 'bridge.beta.joint: is not set'),
     ((*NAMES, '-p', 'bridge.beta.sign:=0'), 'bridge.beta.sign: 0 is not 1 or -1')])
 def test_missing_names_end_the_node(start, options, words):
-    """One line names the parameter that is missing."""
     stage = start('stage', '--ros-args', '-p', 'stage.type:=joint_state', *options)
     assert stage.wait() == 1
     assert words in stage.output() and 'Traceback' not in stage.output()

@@ -30,7 +30,6 @@ SIGNALS = {'term': signal.SIGTERM, 'hup': signal.SIGHUP, 'kill': signal.SIGKILL}
 
 @pytest.fixture
 def terminal(ros_env, tmp_path):
-    """Give a function that runs the calibration in a terminal; all are closed at the end."""
     opened = []
     base = nominal('xyz', serial='T1')
     parameter_file.save(tmp_path / 'truth.yaml', drawn(np.random.default_rng(3), base))
@@ -58,7 +57,6 @@ class Hands(Graph):
         return self
 
     def turn(self, alpha_deg, beta_deg):
-        """Turn the stage until it is there and rests."""
         def there():
             self.command.publish(JointState(name=['alpha', 'beta'], position=[
                 np.radians(alpha_deg), np.radians(beta_deg)]))
@@ -70,7 +68,6 @@ class Hands(Graph):
 
 
 def bench(start, tmp_path):
-    """Start the sensor on its stage, at four times real time."""
     start('driver', '--ros-args', '--params-file', tmp_path / 'truth.yaml', '-p',
           'link.type:=sim', '-p', 'link.speed:=4.0', *FAST)
     start('stage', '--ros-args', '--params-file', tmp_path / 'bare.yaml', *FAST, '-p',
@@ -78,7 +75,6 @@ def bench(start, tmp_path):
 
 
 def test_the_screen_guides_an_operator_through_a_sweep(start, terminal, tmp_path):
-    """Keys begin, capture, skip, redo and finish, and the screen shows each result."""
     bench(start, tmp_path)
     (tmp_path / 'unit.yaml').write_text('the earlier one\n')
     with Hands() as hands:
@@ -164,7 +160,6 @@ def _tilt(screen):
 @pytest.mark.kills
 @pytest.mark.parametrize('how', ['ctrl-c', 'term', 'hup', 'kill', 'kill of the screen'])
 def test_the_terminal_is_restored(terminal, how):
-    """After each kind of end, settings, screen and cursor are as before."""
     seen = terminal()
     seen.wait_for('press b to begin')
     screen, = children(seen.popen.pid)
@@ -184,7 +179,6 @@ def test_the_terminal_is_restored(terminal, how):
 
 
 def test_without_prompt_toolkit_there_are_plain_lines():
-    """The screen is an extra, and one line names its missing package."""
     done = run_without_extras("""
 import os
 from adxl_ros.nodes.display import open_screen

@@ -22,7 +22,6 @@ def evaluations():
 
 
 def angles_of(evaluated, model):
-    """Return the angles of all experiments of all units."""
     return [a for unit in evaluated for a in unit.models[model].all_angles()]
 
 
@@ -58,7 +57,6 @@ def test_motion_error_reaches_the_noise_floor(evaluations):
 
 @pytest.mark.parametrize('stage', ['perfect', 'paper'])
 def test_intervals_have_their_stated_coverage(evaluations, stage):
-    """90 % intervals of the acceleration contain 90 % of the held-out poses."""
     # Poses of one unit share the errors of its few settings of alpha. Units are independent.
     inside = np.array([np.mean(np.abs(unit.models['full'].force_z) < Z_90)
                        for unit in evaluations[stage]])
@@ -79,7 +77,6 @@ def test_the_command_writes_the_page_and_its_plots(run_tool, tmp_path):
 
 
 def test_the_command_on_a_recording(run_tool, tmp_path):
-    """A recorded sweep is calibrated and compared with the results of the paper."""
     run_tool('simulate', 'sweep', '--params', NOMINAL, '--effect', 'cross_axis_z', '--effect',
              'misalignment', '-o', tmp_path / 'sweep.csv')
     done = run_tool('reproduce', tmp_path / 'sweep.csv', '-o', tmp_path / 'out')
@@ -90,7 +87,6 @@ def test_the_command_on_a_recording(run_tool, tmp_path):
 @pytest.mark.parametrize('option, words', [
     (('--units', '0'), 'at least 1'), (('--seed', '-1'), 'at least 0')])
 def test_wrong_options_are_refused_in_one_line(run_tool, tmp_path, option, words):
-    """The reason is reported, and no file is written."""
     done = run_tool('reproduce', *option, '-o', tmp_path / 'out')
     assert done.returncode == 1 and words in done.stderr
     assert not (tmp_path / 'out').exists()

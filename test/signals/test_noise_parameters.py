@@ -14,7 +14,6 @@ STEP_S = 1.0
 
 def cells(seed: int, count: int = 7200, terms: tuple[float, float, float] = (N, B, K)
           ) -> np.ndarray:
-    """Return means of 1 s of samples at 10 Hz."""
     samples = still_samples(np.random.default_rng(seed), 10 * count, 10.0, *terms)
     return samples.reshape(count, 10).mean(axis=1)
 

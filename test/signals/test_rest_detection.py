@@ -44,7 +44,6 @@ def handled_stream(rng, rate_hz, rest_s, turn_s=1.0, sigma=SIGMA):
 
 
 def filtered_noise(rng, count, sigma, rate_hz=1000.0, tau_s=TAU_S):
-    """Make the noise of an RC filter, (count, 3)."""
     a = np.exp(-1 / (rate_hz * tau_s))
     white = rng.normal(size=(count + 200, 3)) * np.sqrt(1 - a * a)
     return sigma * lfilter([1.0], [1.0, -a], white, axis=0)[200:]
@@ -77,7 +76,6 @@ def test_rests_of_1_s_to_60_s(rate_hz):
 
 
 def damaged(rng, time_s, samples):
-    """Put NaN, gaps, a step back in time and very large spikes into a stream."""
     samples = samples.copy()
     samples[rng.integers(len(samples), size=20)] = np.nan
     samples[rng.integers(len(samples), size=2), 0] = (1e38, -np.inf)
@@ -92,7 +90,6 @@ def damaged(rng, time_s, samples):
        strategies.sampled_from([1.0, 20.0, 100.0, 400.0]), strategies.booleans(),
        strategies.booleans())
 def test_live_equals_offline(seed, axes, rate_hz, known_noise, with_stage):
-    """The rests and their means do not depend on the portions of a stream, to the last bit."""
     rng = np.random.default_rng(seed)
     scale_s = 1.0 if rate_hz > 10 else 30.0
     time_s, samples, _, _ = handled_stream(rng, rate_hz, scale_s * rng.uniform(1, 8, 12), scale_s)

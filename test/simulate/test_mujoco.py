@@ -69,8 +69,7 @@ def mujoco_loop(mujoco, sensor, count=12000):
         data.ctrl[:] = 0.02 * (goal - data.qpos) - 0.004 * data.qvel
         mujoco.mj_step(model, data)
         ideal[step] = data.sensor('imu').data
-        readings[step] = sensor(ideal[step], model.opt.timestep,
-                                temperature=25 + step / 600)
+        readings[step] = sensor(ideal[step], model.opt.timestep, temperature=25 + step / 600)
     return ideal, readings
 
 

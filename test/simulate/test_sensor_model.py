@@ -4,7 +4,6 @@
 
 from dataclasses import replace
 from time import process_time
-from types import SimpleNamespace
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import population_file
@@ -16,7 +15,7 @@ from adxl_ros.model.population import PooledCoefficient, Population
 from adxl_ros.model.sensor import to_nominal_mps2
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
-from adxl_ros.simulate.sensor_model import SensorModel, SensorNoise
+from adxl_ros.simulate.sensor_model import SensorModel
 from adxl_ros.tools.command_line import with_effects
 import numpy as np
 import pytest
@@ -39,9 +38,9 @@ def quiet(*effects):
     return unit(*effects, noise_density_g_per_rthz=np.zeros(3))
 
 
-def swing(count=300):
+def swing(count=300, late_s=0.0):
     """Return specific force of a swinging body, m/s², (n, 3)."""
-    time_s = np.arange(count) / RATE_HZ
+    time_s = np.arange(count) / RATE_HZ - late_s
     return G0_MPS2 * np.column_stack([np.sin(7 * time_s), np.cos(5 * time_s),
                                       np.sin(3 * time_s + 1)])
 
@@ -61,10 +60,10 @@ def recorded(sensor, seed):
     return to_nominal_mps2(volts, sensor)
 
 
-def called(sensor, seed, force):
+def called(sensor, seed, force, begin=0):
     model = SensorModel(sensor, seed)
     return np.array([model(f, 1 / RATE_HZ, temperature=t)
-                     for f, t in zip(force, temperature_c())])
+                     for f, t in zip(force[begin:], temperature_c()[begin:])])
 
 
 @pytest.mark.parametrize('effect', sorted(set(library()) - STAGE - CLOCK))
@@ -93,21 +92,13 @@ def test_effects_that_a_simulator_cannot_call_are_named():
 @pytest.mark.parametrize('delay_s', [0.0012, 0.005, 0.0327])
 def test_time_offset_delays_the_force(delay_s):
     """It reads the force of an earlier time, between the steps of the simulator."""
-    def force(time_s):
-        return G0_MPS2 * np.stack([np.sin(7 * time_s), np.cos(5 * time_s), np.sin(3 * time_s)], -1)
-
-    time_s = np.arange(300) / RATE_HZ
-    late, prompt = unit(f'time_offset:offset_s={delay_s}'), unit()
-    begin = 100
-    batch = np.stack([force(time_s), 0.5 * force(time_s)], axis=1)
-    expected = np.stack([force(time_s - delay_s), 0.5 * force(time_s - delay_s)], axis=1)
+    late, prompt, begin = unit(f'time_offset:offset_s={delay_s}'), unit(), 100
+    lsb_mps2 = late.lsb_v / late.nominal_scale_v_per_g[0] * G0_MPS2
+    batch, expected = (np.stack([force, 0.5 * force], axis=1)
+                       for force in (swing(), swing(late_s=delay_s)))
     assert called(late, 1, batch)[begin:] == pytest.approx(
-        called(prompt, 1, expected)[begin:], abs=2 * lsb_mps2(late))
-    assert np.abs(batch - expected)[begin:].max() > 5 * lsb_mps2(late)
-
-
-def lsb_mps2(sensor):
-    return sensor.lsb_v / sensor.nominal_scale_v_per_g[0] * G0_MPS2
+        called(prompt, 1, expected)[begin:], abs=2 * lsb_mps2)
+    assert np.abs(batch - expected)[begin:].max() > 5 * lsb_mps2
 
 
 @pytest.mark.parametrize(('force', 'dt_s', 'words'), [
@@ -134,8 +125,7 @@ def test_4096_sensors_run_in_real_time(capsys):
     for name, call in (('chain', SensorModel(quiet(*MEAN))),
                        ('chain with white noise', SensorModel(unit(*MEAN))),
                        ('units that differ', SensorModel(nominal('xyz', rate_hz=RATE_HZ), 0,
-                                                         'datasheet')),
-                       ('Gaussian', gaussian)):
+                                                         'datasheet')), ('Gaussian', gaussian)):
         call(force, 1 / RATE_HZ)
         begin_s = process_time()
         for _ in range(steps):
@@ -160,14 +150,10 @@ def test_a_sensor_that_is_reset_reads_as_a_new_one(effect):
         if step == begin:
             model.reset(np.array([1]))
         readings.append(model(f, 1 / RATE_HZ, temperature=temperature_c()[step]))
-    alone, new = SensorModel(sensor), SensorModel(sensor)
-    expected = np.array([alone(f, 1 / RATE_HZ, temperature=t)
-                         for f, t in zip(force, temperature_c())])
-    anew = np.array([new(f, 1 / RATE_HZ, temperature=t)
-                     for f, t in zip(force[begin:], temperature_c()[begin:])])
-    assert np.array(readings)[:, [0, 2]] == pytest.approx(
-        np.repeat(expected[:, None], 2, axis=1), abs=1e-9)
-    assert np.array(readings)[begin:, 1] == pytest.approx(anew, abs=1e-9)
+    readings, alone = np.array(readings), called(sensor, 0, force)
+    assert readings[:, 0] == pytest.approx(alone, abs=1e-9)
+    assert readings[:, 2] == pytest.approx(alone, abs=1e-9)
+    assert readings[begin:, 1] == pytest.approx(called(sensor, 0, force, begin), abs=1e-9)
 
 
 def test_noise_and_drift_of_reset_sensors_are_those_of_others():
@@ -239,12 +225,3 @@ def test_arrays_of_other_libraries_have_the_same_numbers(library_name):
         assert type(readings) is type(given) and readings.dtype == given.dtype
         assert np.asarray(readings) == pytest.approx(
             model(f.astype(np.float32), 1 / RATE_HZ), abs=1e-6)
-
-
-def test_simulators_call_it_as_their_noise_model():
-    """The interface of `NoiseModel` in Isaac Lab and mjlab: configuration, reset, call."""
-    cfg = SimpleNamespace(params=unit('bias'), dt=1 / RATE_HZ, units=None)
-    noise = SensorNoise(cfg, 4, 'cpu')
-    noise.reset(None)
-    alone = SensorModel(unit('bias'))
-    assert noise(np.zeros((4, 3))) == pytest.approx(alone(np.zeros((4, 3)), 1 / RATE_HZ))

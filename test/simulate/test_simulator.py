@@ -25,7 +25,6 @@ CLEAN = {'noise_density_g_per_rthz': np.zeros(3), 'adc_bits': 0}
 
 
 def with_all(sensor, acts_on=tuple(ActsOn)):
-    """Return a sensor with every effect of the library at its typical values."""
     names = [name for name, e in library().items() if e.acts_on in acts_on]
     values = {name: typical(library()[name], sensor.axes) for name in names}
     return replace(sensor, effects=tuple(names), values=values)
@@ -33,7 +32,6 @@ def with_all(sensor, acts_on=tuple(ActsOn)):
 
 @pytest.mark.parametrize('everything', [False, True])
 def test_rich_at_250_hz_equals_rich_at_16_khz(everything):
-    """Without noise the volts at both rates differ by less than 1 µV rms."""
     sensor = nominal('xyz', **CLEAN)
     if everything:
         sensor = with_all(sensor, (ActsOn.MEAN,))
@@ -65,14 +63,12 @@ def test_velocity_and_acceleration_are_derivatives_of_the_position(name):
 
 @pytest.mark.perf
 def test_ten_minutes_with_all_effects_take_seconds():
-    """10 min of three axes at 1 kHz with all effects need at most 3 s of processor time."""
     sensor, motion = with_all(nominal('xyz')), rich(np.random.default_rng(0))
     with within(3.0 * motion.duration_s / 600):
         simulate(sensor, motion, 0)
 
 
 def test_noise_has_the_stated_spectrum_and_allan_deviation():
-    """White noise of 110 µg/√Hz behind the RC: density and Allan deviation within 3 %."""
     sensor = nominal('xyz', adc_bits=0)
     data = np.concatenate([np.column_stack([simulate(sensor, Motion(3000.0), seed)[f'{a}_v']
                                             for a in 'xyz']) for seed in range(2)], axis=1)
@@ -104,11 +100,9 @@ def allan_variance(variance, decay, length):
 
 
 def test_a_recording_is_simulated_again(run_tool, tmp_path):
-    """A simulation of a recording has its stamps, its references and its volts."""
     first, second = tmp_path / 'first.csv', tmp_path / 'second.mcap'
     for args in (('rich', '--rate', '100', '--effect', 'lever_arm:z_m=0.05', '-o', str(first)),
-                 (str(first), '--effect', 'lever_arm:z_m=0.05', '--seed', '1', '-o',
-                  str(second))):
+                 (str(first), '--effect', 'lever_arm:z_m=0.05', '--seed', '1', '-o', str(second))):
         done = run_tool('simulate', *args)
         assert done.returncode == 0, done.stderr
     original, repeated = recording.read(first), recording.read(second)
@@ -120,7 +114,6 @@ def test_a_recording_is_simulated_again(run_tool, tmp_path):
 
 
 def test_a_recorded_specific_force_passes_through_the_chain(run_tool, tmp_path):
-    """The trajectory `imu` uses a recorded force, at its rate and at another."""
     time_s = np.arange(4000) / 200
     force = np.column_stack([np.sin(time_s), np.cos(3 * time_s), np.full(4000, G)])
     lines = ['time_s,ax_mps2,ay_mps2,az_mps2'] + [
@@ -144,10 +137,12 @@ def test_a_recorded_specific_force_passes_through_the_chain(run_tool, tmp_path):
     (('rich', '--effect', 'lever_arm:z_m.x=1'), 'one number without axes'),
     (('rich', '--effect', 'temperature_bias:per_k=0.1mg/K'), 'is in g/K'),
     (('rich', '--effect', 'bias:offset_v=0.1', '--effect', 'bias:offset_v=0.2'), 'stated twice'),
+    (('rich', '--effect', 'bias:offset_v=nine'), "'nine' is not a number"),
+    (('rich', '--effect', 'cross_axis:linear.z=0.1'), "no axis 'z' to act on"),
     (('rich', '--rate', '0'), 'outside 0.01 to 100000 Hz'),
+    (('rich', '--params', 'none.yaml'), 'none.yaml: cannot be read'),
     (('imu',), '--force RECORDING')])
 def test_bad_input_is_one_line_and_no_file(run_tool, tmp_path, args, message):
-    """The exit status is 1, one line states what to do, and no file is written."""
     out = tmp_path / 'out.csv'
     done = run_tool('simulate', *args, '-o', str(out))
     assert done.returncode == 1 and message in done.stderr
@@ -155,7 +150,6 @@ def test_bad_input_is_one_line_and_no_file(run_tool, tmp_path, args, message):
 
 
 def test_apply_corrects_for_temperature_and_supply(run_tool, tmp_path):
-    """`apply` uses the recorded values, and reports a missing supply."""
     effects = ('--effect', 'supply', '--effect', 'temperature_bias:per_k=1e-3')
     made = run_tool('simulate', 'soak', '--rate', '2', *effects, '-o', 'soak.csv')
     assert made.returncode == 0, made.stderr

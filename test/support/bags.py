@@ -65,7 +65,6 @@ def info(topic: str = '/sensor_info', **values: str) -> Sent:
 
 
 def bag_of(path: Path, messages: Iterable[Sent], little_endian: bool = True) -> Path:
-    """Write messages to a bag, in this order."""
     connections: dict[tuple[str, str], Any] = {}
     with rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
         for i, sent in enumerate(messages):

@@ -21,7 +21,6 @@ and rmw_fastrtps always uses it with LOCALHOST. The profile limits the processes
 
 
 def domain_in_use(domain: int) -> bool:
-    """Return whether a process uses the discovery port of a domain."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.bind(('', 7400 + 250 * domain))

@@ -11,8 +11,6 @@ from rig import SampleReport, suspend
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault of a device or of its driver."""
-
     name: str  # Name in the table
     # Function of the rig, the process id of the driver and a duration, s. It returns the monotonic
     # time at which the device works again, ns, or 0 where it was never absent.
@@ -23,15 +21,12 @@ class Fault:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The samples during and after a fault."""
-
     report: SampleReport  # Samples during the fault and after it
     # Time until samples came again, ms; None where the device was never absent
     recovery_ms: float | None
 
 
 def byte_fault(kind, rate):
-    """Return a fault of the bytes at a rate."""
     def inject(rig, pid, duration_s):
         rig.command(f'fault {kind} {rate:g}')
         rig.graph.spin(duration_s)
@@ -41,7 +36,6 @@ def byte_fault(kind, rate):
 
 
 def board_fault(name, command, exact=True):
-    """Return a fault that a command of the board injects."""
     def inject(rig, pid, duration_s):
         return rig.command(command)
     return Fault(name, inject, exact)
@@ -91,7 +85,6 @@ IIO_FAULTS = (
 
 
 def run_fault(fault, rig, pid, duration_s):
-    """Inject a fault into a rig with the driver `pid`, and return its outcome."""
     rig.begin_report()
     back_ns = fault.inject(rig, pid, duration_s)
     recovery_ms = rig.recovery_ms(back_ns) if back_ns else None

@@ -83,7 +83,6 @@ class FaultyBoard:
             self.write(BANNER)
 
     def plug(self):
-        """Make the terminal and its name."""
         self.board_fd, self.driver_fd = pty.openpty()
         tty.setraw(self.driver_fd)
         os.set_blocking(self.board_fd, False)
@@ -94,7 +93,6 @@ class FaultyBoard:
         self.unsent = b''
 
     def unplug(self):
-        """Remove the name and the terminal."""
         self.path.unlink()
         os.close(self.board_fd)
         os.close(self.driver_fd)
@@ -117,7 +115,6 @@ class FaultyBoard:
         return max(min((due_ns - time.monotonic_ns()) * 1e-9, 0.02), 0)
 
     def take_commands(self):
-        """Obey the commands of the host, as the firmware does."""
         try:
             received = os.read(self.board_fd, 4096)
         except (BlockingIOError, OSError):
@@ -130,7 +127,6 @@ class FaultyBoard:
                     self.informed_ns = 0
 
     def send_frame(self):
-        """Send the next frame of samples."""
         k = np.arange(self.next_sample, self.next_sample + self.block)
         codes = np.full((self.block, self.channels), 32768)
         codes[:, 0], codes[:, 1] = k % CODES + 1, mark(k)
@@ -153,13 +149,11 @@ class FaultyBoard:
         return True
 
     def flush(self):
-        """Send the bytes that wait, as far as there is room."""
         with suppress(BlockingIOError):
             if self.unsent:
                 self.unsent = self.unsent[os.write(self.board_fd, self.unsent):]
 
     def damage(self, raw):
-        """Return bytes with the present fault."""
         draw = self.random
         if self.fault == 'baud':
             return bytes(draw.randrange(256) for _ in raw)
@@ -191,7 +185,6 @@ class FaultyBoard:
                 continue
 
     def obey(self, words):
-        """Carry out a command."""
         name, *rest = words
         number = float(rest[-1]) if rest else 0.0
         if name == 'fault':
@@ -228,7 +221,6 @@ class FaultyBoard:
 
 
 def main():
-    """Run the board until stdin ends."""
     options = json.loads(sys.argv[2]) if len(sys.argv) > 2 else {}
     board = FaultyBoard(sys.argv[1], options)
     print(json.dumps({'origin_ns': board.origin_ns}), flush=True)

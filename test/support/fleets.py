@@ -23,7 +23,6 @@ def recording_text(serial, date, seed, span_s=SPAN_S):
 
 
 def write_fleet(folder, units=3, days=2, first_seed=0, span_s=SPAN_S):
-    """Write recordings of some units and days, and return their paths in order."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for unit in range(units):
@@ -37,7 +36,6 @@ def write_fleet(folder, units=3, days=2, first_seed=0, span_s=SPAN_S):
 
 
 def table_of(folder):
-    """Return the rows of a fleet's table."""
     from pyarrow import parquet
     return parquet.read_table(Path(folder) / 'fleet.parquet').to_pylist()
 
@@ -48,5 +46,4 @@ def without_timing(rows):
 
 
 def row_files(folder):
-    """Return the content of all files of rows by name."""
     return {path.name: path.read_bytes() for path in Path(folder, 'rows').glob('[!.]*.json')}

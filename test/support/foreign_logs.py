@@ -33,7 +33,6 @@ class Turned:
 
 
 def turned(rate_hz: float = 100.0, rest_s: float = 2.0, seed: int = 3) -> Turned:
-    """Return a sensor with small errors in 32 rests on the sphere."""
     rng = np.random.default_rng(seed)
     forces, angles = [], []
     steps = np.linspace(0, 1, int(0.7 * rate_hz))[:, None]
@@ -151,7 +150,6 @@ FORMS = {'arduino.csv': _arduino, 'german.csv': _german, 'phyphox.csv': _phyphox
 
 
 def text_with_angles(log: Turned, angles_deg: np.ndarray, names: str) -> str:
-    """Return a table with semicolons and two columns of angles, which are empty in motion."""
     return f't;x;y;z;{names}\n' + lines([log.time_s, *log.output_g.T, *angles_deg.T],
                                         ['%.3f'] + ['%.4f'] * 3 + ['%.3f'] * 2, ';')
 

@@ -16,7 +16,6 @@ from units import nominal
 
 
 def unit(axes='xy'):
-    """Return a calibrated unit."""
     names = tuple(Coefficient(effect, parameter, axis) for effect, parameter in (
         ('bias', 'offset_v'), ('scale_factor', 'offset_v_per_g')) for axis in axes)
     return replace(
@@ -47,7 +46,6 @@ def warm(motion):
 
 
 def simulated(sensor, *effects, motion=None, seed=3, change=lambda columns: columns):
-    """Simulate a recording with effects of the library."""
     made = with_effects(sensor, list(effects))
     columns = change(simulate(made, motion or warm(turning()), seed))
     return Recording('made', columns.pop('time_s'), columns, sensor_info(sensor))

@@ -23,12 +23,10 @@ time."""
 
 
 def stamp_ns(message):
-    """Return the stamp of a message's header, ns."""
     return message.header.stamp.sec * 10 ** 9 + message.header.stamp.nanosec
 
 
 def accel(message):
-    """Return the linear acceleration of an Imu, m/s², (3,)."""
     a = message.linear_acceleration
     return np.array([a.x, a.y, a.z])
 
@@ -66,7 +64,6 @@ class Graph:
             self.diagnostics[status.name.split(':')[0]] = status
 
     def listen(self, kind, topic, depth=10000, latched=False, raw=False):
-        """Keep the messages of a topic, or their bytes; return the list that receives them."""
         qos = QoSProfile(depth=depth)
         if latched:
             qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
@@ -93,13 +90,11 @@ class Graph:
                             f'diagnostics: {self.diagnostics}')
 
     def spin(self, seconds):
-        """Listen for some seconds."""
         end_s = time.monotonic() + seconds
         while (remaining_s := end_s - time.monotonic()) > 0:
             self._executor.spin_once(timeout_sec=remaining_s)
 
     def call(self, kind, service, request, timeout_s=20.0):
-        """Call a service and return its answer."""
         # A new client may miss the answer, so each service has one client.
         client = self._clients.get(service)
         if client is None:
@@ -110,14 +105,11 @@ class Graph:
         return future.result()
 
     def change(self, node, transition):
-        """Change the state of a managed node; return whether it succeeded."""
         request = ChangeState.Request(transition=Transition(id=transition))
         return self.call(ChangeState, f'{node}/change_state', request).success
 
     def reports(self, node, text):
-        """Return whether the newest diagnostics of a node contain a text."""
         return node in self.diagnostics and text in self.diagnostics[node].message
 
     def value(self, node, key):
-        """Return a value of the newest diagnostics of a node."""
         return {pair.key: pair.value for pair in self.diagnostics[node].values}[key]

@@ -60,7 +60,6 @@ class Format(NamedTuple):
 
 
 def parse_format(channel):
-    """Return the format of a channel."""
     order, rest = channel.get('format', FORMAT).split(':')
     bits, rest = rest[1:].split('/')
     stored, shift = rest.split('>>')
@@ -97,11 +96,9 @@ class Adc:
         return (self.began_ns - time.monotonic_ns()) * 1e-9 + k / self.rate / self.drift
 
     def stamp(self, k):
-        """Return the time stamp of sample k, ns."""
         return self.began_ns + self.offset_ns + round(k * 1e9 / self.rate)
 
     def begin(self, count, mask):
-        """Begin a buffer of a number of samples, with the channels of a mask."""
         self.enabled = [i for i in range(self.stamp_index + 1) if mask >> i & 1]
         self.count, self.next_sample = count, self.sample_count()
 
@@ -132,7 +129,6 @@ class Adc:
         return out + b'\0' * (-len(out) % max(map(len, elements)))
 
     def element(self, i, k):
-        """Return the bytes of channel i at sample k."""
         if i == self.stamp_index:
             return self.stamp(k).to_bytes(8, 'little', signed=True)
         form = parse_format(self.channels[i])
@@ -143,7 +139,6 @@ class Adc:
         return value.to_bytes(form.stored // 8, 'big' if form.order == 'be' else 'little')
 
     def channel_xml(self, i):
-        """Return the element of channel i."""
         channel = self.channels[i]
         names = [name for name in ('label', 'offset', 'scale', 'raw')
                  if name in channel or name in DEFAULTS]
@@ -153,7 +148,6 @@ class Adc:
         return f'<channel id="{channel["id"]}" type="input">{scan}{attributes}</channel>'
 
     def xml(self):
-        """Return the context."""
         channels = ''.join(map(self.channel_xml, range(len(self.channels))))
         stamp = '' if self.options.get('unstamped') else (
             '<channel id="timestamp" type="input">'
@@ -198,11 +192,9 @@ class Client(socketserver.StreamRequestHandler):
     disable_nagle_algorithm = True
 
     def answer(self, number, data=b''):
-        """Answer a command by a number and data."""
         self.wfile.write(b'%d\n' % number + data)
 
     def handle(self):
-        """Answer commands until the client leaves."""
         for line in self.rfile:
             words = line.decode().split()
             if words and words[0] == 'EXIT':
@@ -211,7 +203,6 @@ class Client(socketserver.StreamRequestHandler):
                 self.obey(words[0], words[1:])
 
     def obey(self, command, rest):
-        """Answer one command."""
         adc = self.server.adc
         time.sleep(adc.options.get('answer_s', 0.0))
         if command == 'VERSION':
@@ -255,7 +246,6 @@ class Server(socketserver.ThreadingTCPServer):
 
 
 def main():
-    """Serve until the process is ended."""
     options = json.loads(sys.argv[1]) if len(sys.argv) > 1 else {}
     with Server(('127.0.0.1', options.get('port', 0)), Client) as server:
         server.adc = Adc(options)

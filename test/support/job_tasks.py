@@ -18,7 +18,6 @@ _PART_BYTES = 1000
 
 
 def numbered(number, pause_s=0.01):
-    """Take a while, and return the number."""
     time.sleep(pause_s)
     return number
 
@@ -33,7 +32,6 @@ def deadly(number, fatal, faulty):
 
 
 def long_with_file(folder):
-    """Keep a file for the time of a long task."""
     path = Path(folder) / str(os.getpid())
     try:
         path.write_text('')
@@ -43,7 +41,6 @@ def long_with_file(folder):
 
 
 def half_sent(number):
-    """End the worker while it sends the result."""
     def send(self, buffer):
         os.write(self.fileno(), bytes(buffer[:_PART_BYTES]))
         if len(buffer) > _PART_BYTES:
@@ -54,14 +51,12 @@ def half_sent(number):
 
 
 def children(pid):
-    """Return the worker processes of a process."""
     listed = subprocess.run(['pgrep', '-P', str(pid), '-f', 'spawn_main'], capture_output=True,
                             text=True, check=False).stdout.split()
     return [int(word) for word in listed]
 
 
 def free_port():
-    """Return a port that nothing listens on."""
     with socket.socket() as probe:
         probe.bind(('127.0.0.1', 0))
         return probe.getsockname()[1]
@@ -78,8 +73,7 @@ class DaskCluster:
         self.workers = [self._worker() for _ in range(2)]
 
     def _start(self, module, *words):
-        environment = os.environ | {
-            'PYTHONPATH': os.pathsep.join([str(SUPPORT), *sys.path])}
+        environment = os.environ | {'PYTHONPATH': os.pathsep.join([str(SUPPORT), *sys.path])}
         return subprocess.Popen([sys.executable, '-m', f'distributed.cli.{module}', *words,
                                  '--no-dashboard'], env=environment, cwd=self._folder,
                                 stdout=self._log, stderr=self._log)
@@ -93,7 +87,6 @@ class DaskCluster:
                            '--local-directory', str(self._folder))
 
     def kill_worker(self, number):
-        """Kill a worker, and start another one."""
         self._end(self.workers[number])
         self.workers[number] = self._worker()
 
@@ -110,7 +103,6 @@ class DaskCluster:
         process.wait()
 
     def close(self):
-        """End all processes."""
         for process in (*self.workers, self.scheduler):
             self._end(process)
         self._log.close()
@@ -118,7 +110,6 @@ class DaskCluster:
 
 @contextmanager
 def dask_cluster(folder):
-    """Yield a cluster of this machine with two workers."""
     cluster = DaskCluster(folder)
     try:
         yield cluster

@@ -62,12 +62,10 @@ class Sweeps:
         with open(self.folder / f'{name}.log', 'wb') as log:
             return subprocess.Popen(
                 [executable(name), '--ros-args', '--params-file', self.folder / file, *SIM,
-                 *arguments],
-                env=self.env, cwd=self.folder, stdin=subprocess.DEVNULL, stdout=log,
+                 *arguments], env=self.env, cwd=self.folder, stdin=subprocess.DEVNULL, stdout=log,
                 stderr=subprocess.STDOUT)
 
     def end(self):
-        """End driver and stage."""
         for process in self._others:
             process.send_signal(signal.SIGINT)
         for process in self._others:
@@ -101,7 +99,6 @@ class Sweeps:
         return moment == 'write' and 'fitting' in output and bool(self._unfinished())
 
     def _unfinished(self):
-        """Return the hidden folders in which files are written."""
         while True:
             # A folder may be finished while the search looks into it.
             with suppress(FileNotFoundError):

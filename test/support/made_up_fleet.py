@@ -29,7 +29,6 @@ class MadeUpFleet:
     stage_fault: bool = False
 
     def write(self, folder, seed=0):
-        """Write fleet.parquet into a folder; return it."""
         rng = np.random.default_rng(seed)
         n, m = self.units * self.per_unit, self.units
         unit = np.repeat(np.arange(m), self.per_unit)

@@ -68,7 +68,6 @@ FAULTS = r"""
 
 @contextmanager
 def running_browser():
-    """Yield a headless Chromium; without playwright the test is skipped."""
     driver = pytest.importorskip(
         'playwright.sync_api', reason='playwright is not installed: pip install playwright')
     with driver.sync_playwright() as playwright:
@@ -99,7 +98,6 @@ def opener(browser):
 
 
 def wait_until_drawn(page):
-    """Wait until all plots of the page are there."""
     page.wait_for_function('document.body.dataset.drawn === "yes"')
 
 

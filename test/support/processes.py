@@ -38,7 +38,6 @@ def wait_until(condition: Callable[[], object], timeout_s: float, purpose: str) 
 
 
 def children(pid: int) -> list[int]:
-    """Return the processes that a process has started."""
     return [int(n) for task in Path(f'/proc/{pid}/task').iterdir()
             for n in (task / 'children').read_text().split()]
 
@@ -52,7 +51,6 @@ class Started:
     log: Path
 
     def output(self) -> str:
-        """Read the output on stdout and stderr so far."""
         return self.log.read_text(encoding='utf-8', errors='replace')
 
     def wait_for(self, text: str, timeout_s: float = 20.0) -> None:
@@ -67,7 +65,6 @@ class Started:
         wait_until(seen, timeout_s, f'{self.name} printing {text!r}')
 
     def wait(self, timeout_s: float = 20.0) -> int:
-        """Wait until the process ends by itself and return its exit status."""
         wait_until(lambda: self.popen.poll() is not None, timeout_s, f'{self.name} ending')
         return self.popen.returncode
 
@@ -99,7 +96,6 @@ def executable(name: str) -> Path:
 
 
 def run_executable(name: str, *args: object, **options: object) -> subprocess.CompletedProcess:
-    """Run an installed executable to its end and capture its output."""
     return subprocess.run([executable(name), *map(str, args)], text=True, capture_output=True,
                           stdin=subprocess.DEVNULL, **{'timeout': PATIENCE * 120, **options})
 

@@ -34,12 +34,10 @@ class ScriptProcess:
         self.first_line = self.popen.stdout.readline().strip()  # Its first line on stdout
 
     def ask(self, line):
-        """Send a line and return the answer."""
         self.popen.stdin.write(line + '\n')
         return json.loads(self.popen.stdout.readline())
 
     def kill(self):
-        """Kill the process."""
         self.popen.kill()
         self.popen.wait()
         self.popen.stdin.close()
@@ -88,7 +86,6 @@ class DriverRig:
         self.end()
 
     def end(self):
-        """End the device."""
         raise NotImplementedError
 
     def identify(self, codes, stamps):
@@ -100,7 +97,6 @@ class DriverRig:
         raise NotImplementedError
 
     def collect(self):
-        """Identify the samples that have come."""
         if not self._raws:
             return
         stamps, accel = imu_table(self._raws)
@@ -115,7 +111,6 @@ class DriverRig:
         self.errors = np.concatenate([self.errors, (stamps - self.taken_ns(numbers)) * 1e-6])
 
     def diagnostic(self, key):
-        """Return a number of the newest diagnostics, 0 without any."""
         return float(self.graph.value('driver', key)) if 'driver' in self.graph.diagnostics else 0
 
     def wait_for_samples(self, count, timeout_s, purpose='samples'):
@@ -138,7 +133,6 @@ class DriverRig:
         self._estimated_before = self.diagnostic('missing_estimated')
 
     def report(self):
-        """Return the report since its beginning."""
         self._settle()
         expected = int(self.numbers[-1] - self.numbers[0]) + 1
         return SampleReport(
@@ -148,7 +142,6 @@ class DriverRig:
             float(np.abs(self.errors).max()))
 
     def _settle(self):
-        """Wait for diagnostics that include all published samples."""
         self.wait_for_samples(round(0.3 * self._rate_hz), 30)
         self.graph.diagnostics.clear()
         self.graph.spin_until(lambda: 'driver' in self.graph.diagnostics, 10, 'diagnostics')
@@ -186,12 +179,10 @@ class SerialRig(DriverRig):
         self._raws.clear()
 
     def driver_parameters(self):
-        """Return the arguments of a driver that reads this board."""
         return ['-p', 'link.type:=serial', '-p', f'link.port:={self.path}', '-p',
                 'link.channels:=x,y,supply']
 
     def identify(self, codes, stamps):
-        """Return the numbers of samples by codes and stamps, and how many codes are wrong."""
         remainder = np.rint(codes[:, 0]).astype(np.int64) - 1
         estimate = (stamps - self.taken_ns(np.array([0]))) * 1e-9 * self._rate_hz
         numbers = remainder + np.rint((estimate - remainder) / CODES).astype(np.int64) * CODES
@@ -200,7 +191,6 @@ class SerialRig(DriverRig):
         return numbers, int(wrong.sum())
 
     def taken_ns(self, numbers):
-        """Return the ROS times at which the board took samples, ns."""
         halted_ns = sum(np.where(numbers >= first, ns, 0) for first, ns in self._halts)
         return (self._origin_ns + time.time_ns() - time.monotonic_ns() + halted_ns
                 + np.rint(numbers * self._period_ns).astype(np.int64))
@@ -226,27 +216,22 @@ class IioRig(DriverRig):
         self.start()
 
     def start(self):
-        """Start the server, on the same port as before."""
         self.server = ScriptProcess('iiod.py', json.dumps(self._options))
         self._options['port'] = int(self.server.first_line)
 
     def end(self):
-        """End the server."""
         self.server.kill()
 
     def driver_parameters(self):
-        """Return the arguments of a driver that reads this server."""
         return ['-p', 'link.type:=iio', '-p', f'link.uri:=ip:127.0.0.1:{self._options["port"]}',
                 '-p', 'link.device:=adc']
 
     def identify(self, codes, stamps):
-        """Return the numbers of samples by codes, and how many codes are wrong."""
         numbers = np.rint(codes[:, 0]).astype(np.int64) - 1
         wrong = iiod.code(numbers, 1, 16) != np.rint(codes[:, 1])
         return numbers, int(wrong.sum())
 
     def taken_ns(self, numbers):
-        """Return the ROS times at which the device took samples, ns."""
         return (self._options['began_ns'] + time.time_ns() - time.monotonic_ns()
                 + np.rint(numbers * 1e6).astype(np.int64))
 
@@ -260,6 +245,5 @@ def suspend(pid, duration_s, graph):
 
 
 def memory_mib(pid):
-    """Return the resident memory of a process, MiB."""
     text = Path(f'/proc/{pid}/status').read_text()
     return int(text.split('VmRSS:')[1].split()[0]) / 1024

@@ -9,7 +9,6 @@ import numpy as np
 
 
 def same_partition(first, second):
-    """Return whether two lists of numbers put the same poses together."""
     pairs = set(zip(first, second))
     return len(pairs) == len(set(first)) == len(set(second))
 

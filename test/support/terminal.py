@@ -52,19 +52,16 @@ class Terminal:
                 self._stream.feed(data)
 
     def resize(self, lines, columns):
-        """Change the size of the window, as a user does."""
         with self._lock:
             self.screen.resize(lines, columns)
         self._size(lines, columns)
         os.killpg(os.tcgetpgrp(self._master), signal.SIGWINCH)
 
     def text(self):
-        """Return the text of the screen."""
         with self._lock:
             return '\n'.join(line.rstrip() for line in self.screen.display)
 
     def press(self, key):
-        """Press a key, or a control character such as that of Ctrl-C."""
         os.write(self._master, key.encode())
 
     def wait_for(self, *texts, timeout_s=30.0):
@@ -83,7 +80,6 @@ class Terminal:
             time.sleep(0.05)
 
     def wait(self, timeout_s=20.0):
-        """Wait until the program ends by itself and return its exit status."""
         return self.popen.wait(PATIENCE * timeout_s)
 
     def restored(self):
@@ -95,7 +91,6 @@ class Terminal:
         return left_alternate and not hidden and termios.tcgetattr(self.slave) == self.before
 
     def close(self):
-        """End the program if it is still running."""
         if self.popen.poll() is None:
             os.killpg(self.popen.pid, signal.SIGKILL)
             self.popen.wait()

@@ -22,7 +22,6 @@ PLANES_RAD = np.radians([30, 60, 90, 120, 150])
 
 
 def nominal(axes='xy', **changes):
-    """Return the nominal ADXL203 with the given axes."""
     sensor = parameter_file.load(NOMINAL)
     count = len(axes)
     arrays = {name: np.full(count, getattr(sensor, name)[0]) for name in (

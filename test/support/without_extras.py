@@ -32,7 +32,6 @@ def extras() -> set[str]:
 
 
 def run_without_extras(code: str, *args: str) -> subprocess.CompletedProcess:
-    """Run `code` in a Python process that cannot import the extras."""
     blocked = json.dumps(sorted(extras().union(OTHERS)))
     return subprocess.run([sys.executable, '-c', BLOCK + code, blocked, *args], text=True,
                           capture_output=True, timeout=60)

@@ -41,11 +41,9 @@ def unit(axes: str = 'xy') -> Sensor:
 
 def record(folder: Path, sensor: Sensor, volts: np.ndarray, info: dict[str, str] | None = None,
            units: str = 'v') -> Path:
-    """Write volts (n, m) as a CSV recording at 1 kHz."""
     data = volts if units == 'v' else to_nominal_mps2(volts, sensor)
     names = ('x_v', 'y_v', 'z_v') if units == 'v' else ('ax_mps2', 'ay_mps2', 'az_mps2')
-    part = Recording('made', 10 + np.arange(len(volts)) / 1000,
-                     dict(zip(names, data.T)),
+    part = Recording('made', 10 + np.arange(len(volts)) / 1000, dict(zip(names, data.T)),
                      sensor_info(sensor) if info is None else info)
     recording.write(folder / 'made.csv', part, sensor)
     parameter_file.save(folder / 'unit.yaml', sensor)
@@ -136,11 +134,7 @@ def refused(run_tool: RunTool, path: Path, *options: object) -> str:
 
 @pytest.mark.parametrize(('key', 'value', 'message'), [
     ('serial', '18', 'is of the sensor 18, but the parameters are of 17'),
-    ('nominal_zero_g_v', '1.5, 1.5', 'nominal_zero_g_v is [1.5, 1.5], but [2.5, 2.5]'),
-    ('nominal_scale_v_per_g', '0.3, 0.3', 'nominal_scale_v_per_g is [0.3, 0.3], but [1.0, 1.0]'),
-    ('nominal_zero_g_v', 'two, 2.5', 'nominal_zero_g_v'),
-    ('format', '2', 'format version 2, but this package reads version 1'),
-])
+    ('nominal_zero_g_v', 'two, 2.5', 'nominal_zero_g_v')])
 def test_another_unit_is_refused(run_tool: RunTool, tmp_path: Path, key: str, value: str,
                                  message: str) -> None:
     sensor = unit()
@@ -194,7 +188,6 @@ def test_the_output_does_not_depend_on_blocks(run_tool: RunTool, tmp_path: Path)
 
 
 def messages_of(path: Path, kinds: dict[str, str]) -> dict[str, list]:
-    """Return the messages of a bag by topic, which must have these topics and types only."""
     reader = pytest.importorskip('rosbags.rosbag2').Reader(path)
     typesys = pytest.importorskip('rosbags.typesys')
     store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)

@@ -23,7 +23,6 @@ G = 9.80665
 
 
 def samples(seconds: float = 60.0) -> tuple[np.ndarray, np.ndarray]:
-    """Return stamps and a sensor that is turned from rest to rest every 5 s."""
     time_s = np.arange(int(seconds * RATE_HZ)) / RATE_HZ
     rng = np.random.default_rng(1)
     directions = rng.normal(size=(int(seconds // 5) + 2, 3))
@@ -47,7 +46,6 @@ def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
 
 
 def checked(folder: Path, *arguments: str) -> dict:
-    """Return the findings of one recording."""
     done = run(folder, *arguments, '--json')
     result, = json.loads(done.stdout)
     assert done.returncode == (0 if result['sound'] else 1)
@@ -73,44 +71,9 @@ def test_a_sound_recording(tmp_path: Path) -> None:
     assert 'stage angles' in result['can']['diagnose']['reason']
 
 
-def lost(time_s: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    kept = (time_s < 20) | (time_s > 23)
-    return time_s[kept], accel[kept]
-
-
-def repeated(time_s: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    time_s[100:103] = time_s[99]
-    return time_s, accel
-
-
-def stepped_back(time_s: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    time_s[1000:1005] -= 2.0
-    return time_s, accel
-
-
-def scattered(time_s: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(2)
-    return np.sort(time_s + rng.uniform(0, 0.02, len(time_s))), accel
-
-
-def stuck(time_s: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    accel[:, 1] = 0.0
-    return time_s, accel
-
-
 def clipped(time_s: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     shaken = 3 * G * np.sin(2 * np.pi * 2 * time_s) * ((time_s > 10) & (time_s < 20))
     accel[:, 0] = np.clip(accel[:, 0] + shaken, -2 * G, 2 * G)
-    return time_s, accel
-
-
-def held(time_s: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    accel[3000:3300] = accel[2999]
-    return time_s, accel
-
-
-def stuck_at_the_end(time_s: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    accel[4500:, 2] = accel[4499, 2]
     return time_s, accel
 
 
@@ -123,30 +86,28 @@ def clipped_slowly(time_s: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, n
     return time_s, accel
 
 
-def in_g(time_s: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return time_s, accel / G
+ROW = np.arange(6000)
 
 
-@pytest.mark.parametrize(('change', 'fault'), [
-    (lost, '301 samples are missing'),
-    (repeated, '3 samples have the stamp of the sample before'),
-    (stepped_back, '5 stamps go back'),
-    (scattered, 'stamps scatter by'),
-    (stuck, 'ay_mps2 never changes'),
-    (clipped, 'ax_mps2 stays at its extreme value'),
-    (clipped_slowly, 'ax_mps2 stays at its extreme value'),
-    (stuck_at_the_end, 'az_mps2 does not change for 15 s while other axes do'),
-    (held, 'no axis changes for 3 s'),
-    (in_g, 'seem to be in g'),
-], ids=lambda value: value.__name__ if callable(value) else '')
-def test_each_fault_is_named(
-        tmp_path: Path, fault: str,
-        change: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]) -> None:
+@pytest.mark.parametrize(('change', 'count', 'fault'), [
+    (lambda t, a: (t[abs(t - 21.5) > 1.5], a[abs(t - 21.5) > 1.5]), 1, '301 samples are missing'),
+    (lambda t, a: (t[np.where((ROW >= 100) & (ROW < 103), 99, ROW)], a), 1,
+     '3 samples have the stamp of the sample before'),
+    (lambda t, a: (t - 2.0 * ((ROW >= 1000) & (ROW < 1005)), a), 1, '5 stamps go back'),
+    (lambda t, a: (np.sort(t + np.random.default_rng(2).uniform(0, 0.02, len(t))), a), 1,
+     'stamps scatter by'), (lambda t, a: (t, a * [1, 0, 1]), None, 'ay_mps2 never changes'),
+    (clipped, 1, 'ax_mps2 stays at its extreme value'),
+    (clipped_slowly, 1, 'ax_mps2 stays at its extreme value'),
+    (lambda t, a: (t, np.c_[a[:, :2], a[np.minimum(ROW, 4499), 2]]), 1,
+     'az_mps2 does not change for 15 s while other axes do'),
+    (lambda t, a: (t, a[np.where(ROW // 300 == 10, 2999, ROW)]), 1, 'no axis changes for 3 s'),
+    (lambda t, a: (t, a / G), None, 'seem to be in g')])
+def test_each_fault_is_named(tmp_path: Path, change: Callable, count: int | None, fault: str
+                             ) -> None:
     write_csv(tmp_path / 'faulty.csv', *change(*samples()))
     faults = checked(tmp_path, 'faulty.csv')['faults']
     assert any(fault in text for text in faults), faults
-    if change not in (stuck, in_g):
-        assert len(faults) == 1, faults
+    assert count in (None, len(faults)), faults
 
 
 def test_a_coarse_sensor_at_rest_is_sound(tmp_path: Path) -> None:

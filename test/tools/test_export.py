@@ -28,6 +28,7 @@ import yaml
 COLUMNS = 79
 ARM_M = (0.01, -0.02, 0.03)
 OFFSET_V = np.array([0.03, -0.05])
+WALK_MPS2 = np.array([2e-5, 3e-5]) * G0_MPS2
 MISALIGNED_RAD = 0.01
 # Elements of SDFormat 1.9, noise.sdf.
 NOISE_ELEMENTS = {'mean', 'stddev', 'bias_mean', 'bias_stddev', 'dynamic_bias_stddev',
@@ -41,7 +42,7 @@ def unit():
         values={'bias': {'offset_v': OFFSET_V},
                 'misalignment': {'alpha_rad': np.zeros(2), 'beta_rad': np.full(2, MISALIGNED_RAD)},
                 'lever_arm': {f'{axis}_m': np.array(m) for axis, m in zip('xyz', ARM_M)},
-                'bias_walk': {'density_g_per_rts': np.array([2e-5, 3e-5])}})
+                'bias_walk': {'density_g_per_rts': WALK_MPS2 / G0_MPS2}})
 
 
 @pytest.fixture(scope='module')
@@ -49,22 +50,20 @@ def exported(tmp_path_factory):
     """Export the unit in all formats, and return the texts of the files and of the screens."""
     folder = tmp_path_factory.mktemp('export')
     parameter_file.save(folder / 'unit.yaml', unit())
-    results = {}
-    for name in FORMATS:
-        done = run_in_process('export', 'unit.yaml', '--to', name, '-o', f'out.{name}', cwd=folder)
-        assert done.returncode == 0, done.stderr
-        path = folder / f'out.{name}'
-        results[name] = SimpleNamespace(path=path, text=path.read_text(), screen=done.stdout)
-    return results
+    return {name: export(folder, name) for name in FORMATS}
 
 
-def zero_g_mps2(sensor):
-    return sensor.values['bias']['offset_v'] / sensor.nominal_scale_v_per_g * G0_MPS2
+def export(folder, name, sensor=None):
+    if sensor is not None:
+        parameter_file.save(folder / 'unit.yaml', sensor)
+    done = run_in_process('export', 'unit.yaml', '--to', name, '-o', f'out.{name}', cwd=folder)
+    assert done.returncode == 0, done.stderr
+    path = folder / f'out.{name}'
+    return SimpleNamespace(path=path, text=path.read_text(), screen=done.stdout)
 
 
-def test_the_formats_are_there():
-    assert list(FORMATS) == ['broadcaster', 'fusioncore', 'genesis', 'isaaclab', 'json', 'kalibr',
-                             'mjlab', 'mujoco', 'okvis2', 'point_lio', 'sdf']
+def mps2(volts):
+    return volts / unit().nominal_scale_v_per_g * G0_MPS2
 
 
 @pytest.mark.parametrize('name', sorted({*FORMATS} - {'json', 'genesis'}))
@@ -78,8 +77,7 @@ def test_the_head_says_what_the_format_cannot_hold(exported, name):
     assert 0.2e3 * MISALIGNED_RAD < float(sizes['misalignment']) < 1e3 * MISALIGNED_RAD
     bias_mg = 1e3 * np.sqrt(np.mean((OFFSET_V / unit().nominal_scale_v_per_g) ** 2))
     assert float(sizes['bias']) == pytest.approx(bias_mg, rel=0.01)
-    assert (places['bias'] == 'not held') == (
-        name not in ('sdf', 'isaaclab', 'mjlab', 'okvis2'))
+    assert (places['bias'] == 'not held') == (name not in ('sdf', 'isaaclab', 'mjlab', 'okvis2'))
     assert 'no z' in exported[name].text
     assert all(len(line) <= COLUMNS for line in lines if line.startswith('#'))
     assert max(map(len, exported[name].screen.splitlines())) <= COLUMNS
@@ -107,35 +105,27 @@ def test_sdf(exported):
         assert element.get('type') == 'gaussian_quantized'
         values = {child.tag: float(child.text) for child in element}
         assert set(values) == NOISE_ELEMENTS
-        scale = G0_MPS2 / unit().nominal_scale_v_per_g[d]
-        assert values['mean'] == pytest.approx(zero_g_mps2(unit())[d])
-        assert values['stddev'] == pytest.approx(noise.analog_std_v(unit())[d] * scale)
-        assert values['precision'] == pytest.approx(unit().lsb_v * scale)
-        walk = unit().values['bias_walk']['density_g_per_rts'][d] * G0_MPS2
-        assert values['dynamic_bias_stddev'] == pytest.approx(walk)
+        assert values['mean'] == pytest.approx(mps2(OFFSET_V)[d])
+        assert values['stddev'] == pytest.approx(mps2(noise.analog_std_v(unit()))[d])
+        assert values['precision'] == pytest.approx(mps2(unit().lsb_v)[d])
+        assert values['dynamic_bias_stddev'] == pytest.approx(WALK_MPS2[d])
         assert (values['bias_mean'], values['bias_stddev']) == (0.0, 0.0)
 
 
-def test_mujoco(exported):
+def test_mujoco(exported, monkeypatch):
+    """The lines of Python in the head apply the whole chain to mjData."""
     mujoco = pytest.importorskip('mujoco', reason='mujoco is not installed: pip install mujoco')
     model = mujoco.MjModel.from_xml_path(str(exported['mujoco'].path))
     assert model.site('SN-7').pos == pytest.approx(ARM_M)
     assert model.sensor('SN-7').type[0] == mujoco.mjtSensor.mjSENS_ACCELEROMETER
-    std_mps2 = noise.analog_std_v(unit()) / unit().nominal_scale_v_per_g * G0_MPS2
-    assert model.sensor_noise[0] == pytest.approx(std_mps2.max())
-
-
-def test_the_head_for_mujoco_runs(exported, monkeypatch):
-    """The lines of Python in the head apply the whole chain to mjData."""
-    mujoco = pytest.importorskip('mujoco', reason='mujoco is not installed: pip install mujoco')
-    model = mujoco.MjModel.from_xml_path(str(exported['mujoco'].path))
+    assert model.sensor_noise[0] == pytest.approx(mps2(noise.analog_std_v(unit())).max())
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data)
     monkeypatch.chdir(exported['mujoco'].path.parent)
     lines = exported['mujoco'].text.split('after each mj_step:')[1].split('-->')[0]
     names = {'model': model, 'data': data}
     exec('\n'.join(line.strip() for line in lines.splitlines()), names)
-    assert names['reading'][:2] == pytest.approx(zero_g_mps2(unit()), abs=0.3)
+    assert names['reading'][:2] == pytest.approx(mps2(OFFSET_V), abs=0.3)
 
 
 class NoiseModel:
@@ -161,7 +151,6 @@ class MjlabNoiseModelCfg:
 
 
 def run_module(exported, name, monkeypatch, contents):
-    """Run an exported module of Python on modules with those contents; return its names."""
     for package, members in contents.items():
         module = ModuleType(package)
         vars(module).update(members)
@@ -173,12 +162,10 @@ def run_module(exported, name, monkeypatch, contents):
 
 
 def check_noise(values):
-    """Compare the noise of a module, and its whole chain, with the unit."""
     acceleration = values['ACCELERATION_NOISE']
     assert acceleration.operation == 'add'
-    assert acceleration.mean == pytest.approx([*zero_g_mps2(unit()), 0.0])
-    std_mps2 = noise.analog_std_v(unit()) / unit().nominal_scale_v_per_g * G0_MPS2
-    assert acceleration.std == pytest.approx([*std_mps2, 0.0])
+    assert acceleration.mean == pytest.approx([*mps2(OFFSET_V), 0.0])
+    assert acceleration.std == pytest.approx([*mps2(noise.analog_std_v(unit())), 0.0])
     chain = values['WHOLE_CHAIN']
     assert chain.noise_cfg is acceleration
     assert issubclass(chain.class_type, NoiseModel)
@@ -199,8 +186,7 @@ def test_isaaclab(exported, monkeypatch, version):
     values = run_module(exported, 'isaaclab', monkeypatch, {
         'isaaclab': {}, 'isaaclab.utils': {}, 'torch': {'tensor': np.array},
         'isaaclab.sensors': {'ImuCfg': SimpleNamespace(OffsetCfg=offset)},
-        'isaaclab.utils.noise': {},
-        'isaaclab.utils.noise.noise_model': {'NoiseModel': NoiseModel},
+        'isaaclab.utils.noise': {}, 'isaaclab.utils.noise.noise_model': {'NoiseModel': NoiseModel},
         'isaaclab.utils.noise.noise_cfg': {
             'GaussianNoiseCfg': Gaussian,
             'NoiseModelCfg': make_dataclass('NoiseModelCfg', ['class_type', 'noise_cfg'])}})
@@ -264,32 +250,27 @@ def test_genesis(exported, monkeypatch, tmp_path):
     quiet = replace(unit(), noise_density_g_per_rthz=np.zeros(2), effects=('bias', 'misalignment'))
     reading = SensorModel(quiet)(force, values['DT_S'])
     assert reading[:2] == pytest.approx(np.round(biased[:2] / step) * step, abs=1.01 * step)
-    std_mps2 = noise.analog_std_v(unit()) / unit().nominal_scale_v_per_g * G0_MPS2
-    assert options.acc_noise == pytest.approx([*std_mps2, 0.0])
+    assert options.acc_noise == pytest.approx([*mps2(noise.analog_std_v(unit())), 0.0])
     # It adds one draw a step: after 1 s the walk has the density of the unit.
     assert np.array(options.acc_random_walk)[:2] * np.sqrt(unit().rate_hz) == pytest.approx(
-        unit().values['bias_walk']['density_g_per_rts'] * G0_MPS2)
+        WALK_MPS2)
     rows = [line.split() for line in exported['genesis'].text.splitlines()]
     assert [row[1] for row in rows if row[-2:] == ['not', 'held']] == ['RC']
 
 
 @pytest.mark.parametrize('offset_s', [0.02, -0.02])
 def test_genesis_holds_a_delay_but_no_lead(tmp_path, offset_s):
-    parameter_file.save(tmp_path / 'unit.yaml', replace(
-        nominal('x'), effects=('time_offset',), values={'time_offset': {
-            'offset_s': np.array(offset_s)}}))
-    done = run_in_process('export', 'unit.yaml', '--to', 'genesis', '-o', 'out.py', cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    row = next(line for line in (tmp_path / 'out.py').read_text().splitlines()
-               if line.startswith('# time_offset'))
-    values = {}
-    exec((tmp_path / 'out.py').read_text(), values)
+    sensor = nominal('x', effects=('time_offset',),
+                     values={'time_offset': {'offset_s': np.array(offset_s)}})
+    text, values = export(tmp_path, 'genesis', sensor).text, {}
+    row = next(line for line in text.splitlines() if line.startswith('# time_offset'))
+    exec(text, values)
     assert values['ACCELEROMETER']['delay'] == max(offset_s, 0.0)
     assert row.endswith('delay' if offset_s > 0 else 'not held')
 
 
 def sample_variance():
-    return ((noise.sample_std_v(unit()) / unit().nominal_scale_v_per_g * G0_MPS2) ** 2).max()
+    return (mps2(noise.sample_std_v(unit())) ** 2).max()
 
 
 def test_okvis2(exported):
@@ -302,7 +283,7 @@ def test_okvis2(exported):
     kalibr = yaml.safe_load(exported['kalibr'].text)
     assert own['sigma_a_c'] == kalibr['accelerometer_noise_density']
     assert own['sigma_aw_c'] == kalibr['accelerometer_random_walk']
-    assert own['a0'] == pytest.approx([*zero_g_mps2(unit()), 0.0])
+    assert own['a0'] == pytest.approx([*mps2(OFFSET_V), 0.0])
     assert own['a_max'] == pytest.approx(unit().range_g * G0_MPS2)
     assert own['g'] == unit().local_gravity_mps2
     assert all(isinstance(value, float) for value in [*own.pop('a0'), *own.values()])
@@ -336,14 +317,11 @@ def test_point_lio(exported):
     assert own['b_acc_cov'] * dt_s ** 2 == pytest.approx((3e-5 * G0_MPS2) ** 2 * dt_s)
 
 
-@pytest.mark.parametrize(('effects', 'values', 'limit_g'), [
-    ((), {}, 1.7), (('saturation',), {'saturation': {'limit_g': np.array([1.2, 1.5])}}, 1.2)])
-def test_an_estimator_learns_the_first_limit(tmp_path, effects, values, limit_g):
-    parameter_file.save(tmp_path / 'unit.yaml', nominal('xy', effects=effects, values=values))
-    done = run_in_process('export', 'unit.yaml', '--to', 'okvis2', '-o', 'o.yaml', cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    own = yaml.safe_load((tmp_path / 'o.yaml').read_text())['imu_parameters']
-    assert own['a_max'] == pytest.approx(limit_g * G0_MPS2)
+def test_an_estimator_learns_the_first_limit(tmp_path):
+    sensor = nominal('xy', effects=('saturation',),
+                     values={'saturation': {'limit_g': np.array([1.2, 1.5])}})
+    own = yaml.safe_load(export(tmp_path, 'okvis2', sensor).text)['imu_parameters']
+    assert own['a_max'] == pytest.approx(1.2 * G0_MPS2)
 
 
 def test_kalibr(exported):
@@ -366,17 +344,16 @@ def test_broadcaster(exported):
         'imu_sensor_broadcaster']['ros__parameters']
     covariance = parameters['static_covariance_linear_acceleration']
     assert all(isinstance(value, float) for value in covariance)
-    std_mps2 = noise.sample_std_v(unit()) / unit().nominal_scale_v_per_g * G0_MPS2
-    assert np.reshape(covariance, (3, 3)) == pytest.approx(np.diag([*std_mps2 ** 2, 1e6]))
+    assert np.reshape(covariance, (3, 3)) == pytest.approx(
+        np.diag([*mps2(noise.sample_std_v(unit())) ** 2, 1e6]))
     for absent in ('orientation', 'angular_velocity'):
         assert parameters[f'static_covariance_{absent}'] == [-1.0] + 8 * [0.0]
 
 
 def test_json(exported, tmp_path):
-    """It has the linear response, and the parameter file with every digit."""
     content = json.loads(exported['json'].text)
     assert [axis['zero_g_mps2'] for axis in content['axes']] == pytest.approx(
-        zero_g_mps2(unit()).tolist())
+        mps2(OFFSET_V).tolist())
     c, s = np.cos(MISALIGNED_RAD), np.sin(MISALIGNED_RAD)
     assert np.array(content['gain']) == pytest.approx(np.array([[c, s, 0], [-s, c, 0]]), abs=1e-6)
     assert content['position_m'] == list(ARM_M)

@@ -198,7 +198,6 @@ def test_what_cannot_be_reached_or_read_is_a_row(run_tool, tmp_path):
 
 
 def test_kills_lose_and_repeat_nothing(tmp_path):
-    """Clients and workers are killed again and again; what was written stays as it was."""
     chance = random.Random(5)
     write_fleet(tmp_path / 'day', 6, 12)
     words = ('day', '--do', 'check', '-o', 'out', '--jobs', 2, '--retries', 20)

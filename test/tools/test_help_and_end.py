@@ -22,7 +22,6 @@ COLOUR = '\x1b['
 
 @cache
 def help_of(name: str) -> str:
-    """Return the help text of a tool."""
     return run_executable(name, '--help').stdout
 
 
@@ -50,7 +49,6 @@ def test_help_lists_the_effects(name: str) -> None:
 
 
 def end_of(text: str) -> tuple[str, str]:
-    """Return the files and the next command at the end of a text of at most 79 columns."""
     assert max(map(len, text.splitlines())) <= COLUMNS, text
     assert COLOUR not in text
     end = re.search(r'^ wrote  (.*?)^ next   (.*)\Z', text, re.DOTALL | re.MULTILINE)
@@ -108,8 +106,7 @@ def test_an_error_wraps_between_words_in_a_terminal_only(tmp_path: Path) -> None
     words = ('apply', f'{name}.csv', '--params', f'{name}.yaml', '-o', 'out.csv')
     done = run_executable(*words, cwd=tmp_path)
     assert len(done.stderr.splitlines()) == 1 and len(done.stderr) > COLUMNS
-    terminal = Terminal([executable(words[0]), *words[1:]], dict(os.environ), tmp_path,
-                        columns=80)
+    terminal = Terminal([executable(words[0]), *words[1:]], dict(os.environ), tmp_path, columns=80)
     try:
         screen = terminal.wait_for(' '.join(done.stderr.split()))
         assert terminal.wait(30.0) == 1

@@ -132,7 +132,6 @@ def matrix_of(unit) -> np.ndarray:
 
 
 def test_six_known_faces_determine_twelve_coefficients(run_tool, tmp_path) -> None:
-    """Zero-g, scale factor and misalignment of each axis, each within its interval."""
     path = faces(tmp_path / 'six.csv', list(FACES_DEG))
     done = run_tool('fit', path, '-o', tmp_path / 'unit.yaml')
     assert done.returncode == 0, done.stderr

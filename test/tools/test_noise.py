@@ -23,7 +23,6 @@ G = 9.80665
 
 def samples(seconds: float, seed: int = 1, terms: tuple[float, float, float] = (N, B, K)
             ) -> tuple[np.ndarray, np.ndarray]:
-    """Return stamps and three axes at rest with z up."""
     rng, count = np.random.default_rng(seed), int(seconds * RATE_HZ)
     axes = [still_samples(rng, count, RATE_HZ, *terms) for _ in range(3)]
     return np.arange(count) / RATE_HZ, np.column_stack(axes) + [0.0, 0.0, G]

@@ -31,13 +31,11 @@ def population(shift_v=0.0):
 
 
 def drawn(rng):
-    """Draw a unit of the population."""
     return put(with_neutral(nominal(), ['bias', 'scale_factor']), NAMES,
                MEAN + STD * rng.normal(size=4))
 
 
 def test_an_open_axis_takes_the_population(run_tool, tmp_path):
-    """Poses about one axis do not determine the other one, unless a fleet does."""
     truth = replace(drawn(np.random.default_rng(1)), serial='N1')
     parameter_file.save(tmp_path / 'truth.yaml', truth)
     population_file.write(tmp_path / 'population.yaml', population(), [])

@@ -51,7 +51,6 @@ def test_ninety_percent_intervals_cover_ninety_percent(axes, units, per_setting)
 
 @pytest.mark.parametrize('eccentric', [False, True])
 def test_an_eccentric_stage_is_identified_and_a_sound_one_has_no_such_term(eccentric):
-    """An eccentricity of 20 µm is identified, and no other."""
     for seed in range(4):
         rng = np.random.default_rng(seed)
         truth = drawn(rng, nominal(), (*TERMS, 'stage_eccentricity'))
@@ -93,7 +92,6 @@ def test_the_gauge_is_fixed_where_only_the_sum_is_identifiable():
 
 
 def test_outliers_are_named_and_excluded():
-    """Three poses with a knock do not change the coefficients."""
     sensor, truth, poses = swept_unit(5, check_poses=0)
     bad = [7, 40, 90]
     volts = poses.volts.copy()
@@ -107,7 +105,6 @@ def test_outliers_are_named_and_excluded():
 
 
 def test_a_change_of_temperature_is_reported_and_fitted():
-    """A change by 15 °C during the sweep is reported, or fitted by its term."""
     sensor, truth, poses = swept_unit(10, check_poses=0)
     warm = replace(poses, temperature_c=np.linspace(20, 35, len(poses)))
     fit, terms = term_selection.fit_selected(sensor, warm)
@@ -123,7 +120,6 @@ def test_a_change_of_temperature_is_reported_and_fitted():
 @pytest.mark.parametrize('planes_deg, lost', [
     ([90], 'cross_axis_z.quadratic_per_g'), ([90, 60], 'scale_factor_z')])
 def test_poses_of_too_few_planes_are_refused(planes_deg, lost):
-    """The message names the undetermined terms and the poses to add."""
     sensor, _, poses = swept_unit(1, planes_rad=np.radians(planes_deg), check_poses=0)
     with pytest.raises(UserError,
                        match=rf'do not determine .*{lost}.*add poses \(alpha, beta\) = '):
@@ -131,7 +127,6 @@ def test_poses_of_too_few_planes_are_refused(planes_deg, lost):
 
 
 def test_a_simpler_model_is_fitted_if_the_full_one_is_not_determined():
-    """Without a chosen model, `calibrate` fits the richest model that the poses determine."""
     sensor, _, poses = swept_unit(1, planes_rad=PLANES_RAD[2:3], check_poses=0)
     fit = calibration.calibrate(sensor, [calibration.RecordedPoses('made', poses)])
     assert fit.fitted.model == 'linear'
@@ -146,7 +141,6 @@ def test_a_simpler_model_is_fitted_if_the_full_one_is_not_determined():
     (lambda truth: put(truth, [Coefficient('bias', 'offset_v', 'x')],
                        truth.values['bias']['offset_v'][:1] + 0.08), 'zero-g of x is shifted by')])
 def test_recordings_that_contradict_each_other_are_refused(change, words):
-    """The message has the difference and its significance for another mounting or unit."""
     rng = np.random.default_rng(13)
     truth = drawn(rng, nominal(), TERMS)
     parts = [swept(rng, unit, check_poses=0) for unit in (truth, truth, change(truth))]
@@ -167,7 +161,6 @@ def test_six_hundred_poses_of_three_axes_take_two_seconds():
 
 
 def test_the_noise_determines_the_filter_time_constant(run_tool, tmp_path):
-    """`fit` on a simulated sweep estimates the resistor of the filter, and writes it."""
     run_tool('simulate', 'sweep', '--params', NOMINAL, '--effect',
              'bandwidth:resistance_ratio.x=0.2,resistance_ratio.y=-0.15', '--effect',
              'misalignment', '-o', tmp_path / 'sweep.csv')

@@ -34,7 +34,6 @@ def test_equations_1_to_3():
 
 @pytest.mark.parametrize('axes', ['xy', 'xyz'])
 def test_physical_recovers_the_unit(axes):
-    """Coefficients are within their intervals, and tilt is right to 0.1° on average."""
     rng = np.random.default_rng(7)
     sensor = nominal(axes)
     inside, alpha_deg = [], []
@@ -61,7 +60,6 @@ def test_physical_recovers_the_unit(axes):
 
 
 def test_physical_reduces_the_tilt_error_as_the_paper_does():
-    """Held-out alpha error falls by more than the paper's 88.9 %."""
     rng = np.random.default_rng(11)
     sensor = nominal()
     ratios = []
@@ -75,7 +73,6 @@ def test_physical_reduces_the_tilt_error_as_the_paper_does():
 
 @pytest.mark.perf
 def test_physical_takes_less_than_a_second():
-    """The time includes the uncertainties."""
     rng = np.random.default_rng(1)
     poses = swept(rng, drawn(rng, nominal()))
     with within(1.0):
@@ -86,7 +83,6 @@ def test_physical_takes_less_than_a_second():
     ([30, 60], 'alpha = 90 deg'), ([90], 'planes alpha = 30, 60, 120 and 150'),
     ([90, 60], 'planes alpha = 30, 60, 120 and 150')])
 def test_physical_names_the_missing_planes(planes_deg, missing):
-    """A sweep of too few planes is refused, and the message names the planes to add."""
     rng = np.random.default_rng(1)
     poses = swept(rng, drawn(rng, nominal()), np.radians(planes_deg), 0)
     with pytest.raises(UserError, match=missing):
@@ -97,7 +93,6 @@ def test_physical_names_the_missing_planes(planes_deg, missing):
     (lambda v: v * [-1, 1] + [5, 0], 'x reads against its reference'),
     (lambda v: v[:, ::-1], 'axes are swapped')])
 def test_wrong_polarity_is_named(change, words):
-    """An inverted or swapped axis is named before the fit."""
     rng = np.random.default_rng(4)
     poses = swept(rng, nominal())
     with pytest.raises(UserError, match=words):
@@ -106,7 +101,6 @@ def test_wrong_polarity_is_named(change, words):
 
 
 def test_without_check_poses_folds_are_held_out():
-    """Without check poses the held-out errors are those of fits without a fifth of the poses."""
     rng = np.random.default_rng(6)
     poses = swept(rng, drawn(rng, nominal()), check_poses=0)
     result = calibration.calibrate(nominal(), [calibration.RecordedPoses('made', poses)])

@@ -35,43 +35,34 @@ class Rig:
         self.controller = Controller(replace(settings, **changes), UNIT, resume, self, self)
 
     def log(self, severity, text):
-        """Keep a line of the log."""
         self.log_lines.append((severity, text))
 
     def answer_captures(self, answer):
-        """Keep an answer to those who wait for a capture."""
         self.answers.append(answer)
 
     def announce(self, pose):
-        """Keep the announced pose."""
         self.pose = pose
 
     def withdraw_pose(self, reason):
-        """Withdraw the announced pose."""
         self.pose = None
         self.withdrawn.append(reason)
 
     def show_fit(self, text):
-        """Check the line of the fit."""
         assert text.startswith('fitting ')
 
     def take(self, unit):
-        """Pass the waiting samples."""
         batch, self._waiting = self._waiting, []
         if not batch:
             return np.zeros(0, np.int64), np.zeros((0, len(unit.axes)))
         return tuple(np.concatenate(part) for part in zip(*batch))
 
     def restart_silence(self):
-        """Begin to measure the silence."""
         self.silence_text = ''
 
     def silence(self):
-        """Return the stated silence, s."""
         return self.silence_text
 
     def clear(self):
-        """Drop the waiting samples."""
         self._waiting.clear()
 
     def waiting(self):
@@ -82,17 +73,14 @@ class Rig:
         """Keep all waiting samples, as there are few."""
 
     def say_info(self, **changes):
-        """State the sensor, as the driver does."""
         info = {**sensor_info(UNIT), **changes}
         self.controller.read_sensor_info(StreamInfo(info, 'sensor_info'))
 
     def read_encoder(self):
-        """Give the guide the angles of the stage, as the node does."""
         if self.controller.session is not None:
             self.controller.session.stage.read_encoder(self.now_ns, *self.angles_rad)
 
     def close(self):
-        """Close the journal, as the node does at its end."""
         if self.controller.session is not None:
             self.controller.session.journal.close()
 
@@ -111,7 +99,6 @@ class Rig:
             self.controller.poll()
 
     def turn_until(self, condition, seconds=60.0):
-        """Advance the time until a condition holds."""
         for _ in range(round(seconds / 0.05)):
             if condition():
                 return
@@ -119,7 +106,6 @@ class Rig:
         pytest.fail(f'{condition} has not come: {self.controller.status()}')
 
     def lines(self, severity=None):
-        """Return the lines of the log, of one severity or all."""
         return [text for kind, text in self.log_lines if severity in (None, kind)]
 
 
@@ -138,7 +124,6 @@ def rig(tmp_path):
 
 
 def test_a_sweep_goes_from_the_wait_for_its_sensor_to_its_file(rig, tmp_path):
-    """The states are idle, waiting, running, idle, with their log, announcements and values."""
     bench = rig()
     controller = bench.controller
     assert controller.start() == (
@@ -171,7 +156,6 @@ def test_a_sweep_goes_from_the_wait_for_its_sensor_to_its_file(rig, tmp_path):
 
 
 def test_an_operator_at_a_screen_has_a_choice_and_others_resume(rig, tmp_path):
-    """An interrupted calibration asks a question at a screen, and resumes without a screen."""
     bench = rig()
     bench.say_info()
     assert bench.controller.start().success
@@ -207,7 +191,6 @@ def test_an_operator_at_a_screen_has_a_choice_and_others_resume(rig, tmp_path):
 
 
 def test_a_fit_that_fails_at_the_end_waits_for_a_decision(rig, tmp_path, monkeypatch):
-    """After all poses, redo continues, and a successful finish ends the session."""
     bench = rig(planes_rad=(np.pi / 2,), check_poses=0)
     bench.say_info()
     bench.controller.start()
@@ -232,7 +215,6 @@ def test_a_fit_that_fails_at_the_end_waits_for_a_decision(rig, tmp_path, monkeyp
 
 
 def test_a_capture_has_its_answer_when_its_pose_is_on_disk_or_refused(rig):
-    """An operator captures at a wrong angle, at the right one, and skips a pose."""
     bench = rig(StageMode.ENCODER)
     bench.say_info()
     bench.controller.start()

@@ -20,14 +20,12 @@ NEXT = Target(np.pi / 2, np.pi / 6)
 
 
 def bench(mode='commanded', targets=(UP, NEXT), sensor=None, accepted=(), **settings):
-    """Return a stage with a sensor, and poses of 1 s."""
     sensor = sensor or nominal()
     chosen = CaptureSettings(1.0, np.radians(0.2), 20.0, StageMode(mode), **settings)
     return Bench(StageGuide(nominal(sensor.axes), targets, chosen, accepted), sensor)
 
 
 def refusal(rig):
-    """Return the reason for which the sweep refuses a pose."""
     state = rig.sweep.status()
     assert state.phase is Phase.REFUSED and state.late
     assert state.text == rig.sweep.new_refusal()
@@ -46,7 +44,6 @@ def test_a_stage_turned_by_hand_is_captured_near_its_target():
 
 
 def test_a_silent_encoder_is_reported_and_gives_no_pose():
-    """Before the capture and during the dwell, no pose is taken without the encoder."""
     dead = bench('encoder')
     dead.run(0.5, np.pi / 2, 0.0)
     dead.run(4, np.pi / 2, 0.0, encoder=False)
@@ -73,7 +70,6 @@ def test_a_silent_encoder_is_reported_and_gives_no_pose():
     (-np.pi / 2, 'y reads +1.00 g where +0.00 g was expected: axis inverted or swapped'),
     (0.5, 'by the sensor, beta is 28.6° from the target 0°')])
 def test_the_first_pose_shows_inverted_or_swapped_axes(turned, words):
-    """The stage is at its target, but the sensor measures another direction."""
     wrong = bench('manual', [Target(np.pi / 2, 0.0)])
     wrong.run(0.2, np.pi / 2, turned, encoder=False)
     wrong.sweep.capture()
@@ -102,7 +98,6 @@ def test_a_wrong_pose_is_refused_once_the_unit_is_estimated():
 
 @pytest.mark.long
 def test_units_at_the_edge_of_the_datasheet_are_never_refused():
-    """No pose of 8 units with departures up to twice the datasheet's limits is refused."""
     rng = np.random.default_rng(7)
     for _ in range(8):
         truth = drawn(rng, nominal('xyz'))
@@ -126,7 +121,6 @@ def _edge(name, value):
 
 
 def test_a_change_of_temperature_is_refused():
-    """4 °C above the first pose is refused, and accepted after the temperature is back."""
     warm = bench()
     warm.sweep.readings['temperature'].add(warm.now_ns, 23.0)
     first = warm.run(5, np.pi / 2, 0.0)
@@ -142,7 +136,6 @@ def test_a_change_of_temperature_is_refused():
 @pytest.mark.parametrize('ahead_s, words', [
     (-40.0, 'stamped 40.0 s behind imu/data_raw'), (7200.0, 'stamped 2 h ahead of imu/data_raw')])
 def test_a_stage_on_another_clock_is_reported(ahead_s, words):
-    """The message names the clock, and no pose is taken."""
     apart = bench()
     for _ in range(80):
         apart.sweep.read_encoder(int(apart.now_ns + ahead_s * 1e9), np.pi / 2, 0.0)
@@ -154,7 +147,6 @@ def test_a_stage_on_another_clock_is_reported(ahead_s, words):
 @pytest.mark.parametrize('by_rad, words', [
     (0.0, ''), (np.radians(3), 'mounting changed: in pose 1 y reads')])
 def test_the_mounting_is_verified_after_an_interruption(by_rad, words):
-    """The last pose is repeated first, and a different reading stops the calibration."""
     before = bench()
     entry = before.run(5, np.pi / 2, 0.0)
     after = bench(accepted=[entry])

@@ -13,7 +13,6 @@ STEP = np.radians(30)
 
 
 def expected_error_deg(axes, targets, resolution_deg=5 / 60):
-    """Return the expected tilt error, deg."""
     sensor = nominal(axes, stage_resolution_rad=np.radians(resolution_deg))
     return np.degrees(running_estimate.expected_tilt_error_rad(sensor, 5.0, targets))
 
@@ -31,7 +30,6 @@ def test_the_guided_order_has_smaller_errors_on_a_stage_with_errors_by_setting(a
 @pytest.mark.parametrize('axes', ['xy', 'xyz'])
 @pytest.mark.parametrize('kind', pose_plan.KINDS)
 def test_fits_have_the_standard_deviations_that_a_plan_predicts(axes, kind):
-    """On average the standard deviations of the coefficients are the predicted ones."""
     sensor = nominal(axes)
     targets = pose_plan.guided(pose_plan.default_planes_rad(axes), STEP, 0) \
         if kind == 'full' else running_estimate.quick(sensor, 5.0, np.radians(0.1), 0)

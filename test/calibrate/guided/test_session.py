@@ -37,7 +37,6 @@ def begin(tmp_path):
 
 
 def take(session, count, off_v=0.0):
-    """Take poses as `Session.take_poses` does."""
     for _ in range(count):
         guide = session.guide
         target, index = guide.course.target, guide.course.index
@@ -52,13 +51,11 @@ def take(session, count, off_v=0.0):
 
 
 def poses_on_disk(session):
-    """Return the numbers of the poses on disk."""
     return [e.pose for e in sweep_journal.accepted_poses(
         sweep_journal.read(session.journal.path)[1])]
 
 
 def test_a_pose_to_be_repeated_is_neither_fitted_nor_resumed(begin):
-    """After `redo` the pose is neither in the fit nor in a resumed session."""
     session = begin()
     take(session, 2)
     take(session, 1, 0.3)
@@ -95,7 +92,6 @@ def _full(_):
 
 
 def test_incomplete_files_of_a_killed_process_are_removed(begin, tmp_path):
-    """Hidden folders of a killed write are removed at the next start, those in use are kept."""
     for name in ('unit.yaml', 'unit.yaml.previous', 'journal.previous'):
         (tmp_path / f'.{name}.abcd1234.part').mkdir()
         (tmp_path / f'.{name}.abcd1234.part' / name).write_text('half')
@@ -112,7 +108,6 @@ def test_incomplete_files_of_a_killed_process_are_removed(begin, tmp_path):
 
 @pytest.mark.parametrize('count', [1, 2, 3, 5, 8])
 def test_few_poses_are_fitted_or_refused(begin, count):
-    """An early finish never causes a traceback."""
     session = begin()
     take(session, count)
     session.guide.course.skipped.update(range(count, 20))
@@ -125,7 +120,6 @@ def test_few_poses_are_fitted_or_refused(begin, count):
 
 @pytest.mark.parametrize('mode', ['stage', 'gravity'])
 def test_a_calibration_resumes_only_with_equal_values_and_settings(begin, mode):
-    """The head contains all that changes poses or fit, and the message names the difference."""
     settings, unit = replace(begin().settings, mode=mode), nominal('xyz')
     changed = [(settings, replace(unit, **{name: np.asarray(getattr(unit, name)) * 2}))
                for name in ('noise_density_g_per_rthz', 'rc_capacitance_f', 'adc_vref_v',

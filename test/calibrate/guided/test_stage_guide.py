@@ -31,7 +31,6 @@ def test_a_pose_keeps_its_full_dwell():
 
 
 def test_no_pose_is_accepted_before_arrival_and_the_distance_is_stated():
-    """The guide waits for a stage with an error of 3°, and states the time after the time-out."""
     bench = _bench()
     assert bench.run(3, np.pi / 2, np.radians(3)) is None
     state = bench.sweep.status()
@@ -45,7 +44,6 @@ def test_no_pose_is_accepted_before_arrival_and_the_distance_is_stated():
 
 @pytest.mark.parametrize('mode, beta', [('encoder', 0.02), ('manual', 0.0)])
 def test_a_pose_is_taken_after_the_capture_of_the_operator(mode, beta):
-    """No pose is taken before the capture. The mode decides which angle counts."""
     bench = _bench(mode)
     assert bench.run(7, np.pi / 2, 0.02, encoder=mode == 'encoder') is None
     assert bench.sweep.status().phase is Phase.OPERATOR
@@ -70,7 +68,6 @@ def test_the_plan_of_the_paper_and_refused_settings():
 
 
 def test_the_guided_order_saves_travel_and_reaches_angles_from_both_sides():
-    """The poses are those of the paper, with less travel and both directions of each joint."""
     planes = np.radians([90, 30, 150, 60, 120])
     targets = guided(planes, np.radians(30), 16)
     paper = plan_sweep(sorted(planes), np.radians(30), 16)

@@ -29,7 +29,6 @@ class Ramp:
         self.times_s, self.values_c = times_s, values_c
 
     def __call__(self, time_s, order=0):
-        """Return the temperature, °C."""
         return np.interp(time_s, self.times_s, self.values_c)
 
 
@@ -38,7 +37,6 @@ CYCLE = Ramp([0, 300, 360, 660, 720, 800, 860, 940], [5, 45, 45, 5, 5, 45, 45, 5
 
 
 def base():
-    """Return a unit that was calibrated at 30 °C."""
     names = tuple(Coefficient('bias', 'offset_v', axis) for axis in 'xyz')
     unit = with_neutral(UNIT, ['bias'])
     return replace(unit, model='linear', covariance_names=names, covariance=np.eye(3) * 1e-8,
@@ -47,7 +45,6 @@ def base():
 
 @pytest.fixture
 def begin(tmp_path):
-    """Give a function that begins or resumes a calibration over a range of temperature."""
     begun = []
 
     def begin(high_c=40.0):
@@ -73,7 +70,6 @@ def recorded(*effects, seconds=940.0):
 
 
 def play(session, stamps_ns, volts, temperatures_c):
-    """Feed a session as its node does, until it is over."""
     for first in range(0, len(stamps_ns), 20):
         part = slice(first, first + 20)
         readings = session.guide.readings['temperature']
@@ -86,7 +82,6 @@ def play(session, stamps_ns, volts, temperatures_c):
 
 
 def test_the_range_is_covered_in_both_directions_and_the_file_has_the_slopes(begin):
-    """It ends by itself, and the zero-g at the temperature of the calibration stays."""
     session = begin()
     assert session.guide.destination() == 'warm it to 40 °C'
     assert session.guide.estimate_contents().range_error == 'not known yet over 10 to 40 °C'
@@ -116,7 +111,6 @@ def test_the_range_is_covered_in_both_directions_and_the_file_has_the_slopes(beg
     ('thermal_lag:per_k=4e-4,tau_s=20', 'tau_s', 20.0),
     ('thermal_hysteresis:half_width_g=3e-3,reach_k=4', 'reach_k', 4.0)])
 def test_a_loop_is_fitted_where_warming_and_cooling_differ(begin, option, parameter, value):
-    """The effect that the blocks support is in the file, with its shape."""
     session = begin(80.0)
     play(session, *recorded('temperature_bias:per_k=4e-4', option))
     fitted = session.finish().fitted
@@ -126,7 +120,6 @@ def test_a_loop_is_fitted_where_warming_and_cooling_differ(begin, option, parame
 
 
 def test_an_interrupted_calibration_keeps_its_blocks(begin):
-    """Each block is on disk, and the next start goes on with all of them."""
     session = begin()
     stamps_ns, volts, temperatures_c = recorded('temperature_bias:per_k=4e-4', seconds=200.0)
     play(session, stamps_ns, volts, temperatures_c)

@@ -19,7 +19,6 @@ pytestmark = [pytest.mark.long, NEEDS_CHROMIUM]
 
 @pytest.fixture
 def report_folder(made_once):
-    """Return the folder of a report of a unit that has drifted since its last calibration."""
     return made_once('reported', fill_report)
 
 
@@ -47,7 +46,6 @@ def fill_report(folder):
 
 
 def test_the_report_has_its_contents(opened, report_folder):
-    """It has acceptance by model, coefficients with the datasheet, drift and plots, offline."""
     page, messages = opened(report_folder / 'report' / 'report.html')
     wait_until_drawn(page)
     assert messages == []
@@ -129,6 +127,5 @@ def test_the_sphere_turns(opened, report_folder):
         page.mouse.move(box['x'] + x, box['y'] + y)
         if pose_text.inner_text().startswith('pose'):
             break
-    assert re.match(r'pose \d+, alpha [\d.]+°, beta [\d.]+°: -?[\d.]+ mg',
-                    pose_text.inner_text())
+    assert re.match(r'pose \d+, alpha [\d.]+°, beta [\d.]+°: -?[\d.]+ mg', pose_text.inner_text())
     assert messages == []

@@ -28,19 +28,16 @@ IMPORTS = {'https://ptb.de/si/v2.1.0/SI_Format.xsd': 'SI_Format.xsd',
 
 
 def calibrated(seed, axes='xy', model=None, gravity_mps2=GRAVITY_MPS2):
-    """Calibrate a drawn unit whose true gravity differs from the stated one."""
     rng = np.random.default_rng([seed, 17])
     sensor = nominal(axes, serial='<7 & 8>', local_gravity_mps2=gravity_mps2)
     truth = replace(drawn(rng, sensor, TERMS),
                     local_gravity_mps2=gravity_mps2 + GRAVITY_STD_MPS2 * rng.normal())
     poses = swept(rng, truth)
-    return truth, calibration.calibrate(
-        sensor, [calibration.RecordedPoses('made', poses)], model)
+    return truth, calibration.calibrate(sensor, [calibration.RecordedPoses('made', poses)], model)
 
 
 @pytest.fixture(scope='module')
 def found():
-    """Return a calibration and its uncertainty."""
     _, result = calibrated(1)
     return result, gum.uncertainty(result, {'gravity_std_mps2': GRAVITY_STD_MPS2})
 

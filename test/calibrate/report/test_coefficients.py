@@ -21,7 +21,6 @@ STD = 1e-3
 
 
 def fitted_of(truth, names, error=0.0):
-    """Return the unit as a fit of some coefficients, each with the same error."""
     unit = with_neutral(truth, [name.effect for name in names])
     return replace(put(unit, names, get(unit, names) + error), model='full',
                    covariance_names=names, covariance=STD ** 2 * np.eye(len(names)))
@@ -89,8 +88,7 @@ def test_table_of_errors() -> None:
     errors = held_out.PoseErrors(*np.zeros((2, 3)), np.full((3, 2), 0.45),
                                  np.radians(np.full(3, 7.2)), np.zeros((3, 3)))
     fitted = replace(errors, accel_mps2=errors.accel_mps2 / 100, tilt_rad=np.full(3, np.nan))
-    models = [held_out.summarise('nominal', errors),
-              held_out.summarise('full', fitted)]
+    models = [held_out.summarise('nominal', errors), held_out.summarise('full', fitted)]
     lines = error_table(models)
     assert lines[1].split() == ['nominal', '7.200/7.200', '45.887/45.887']
     assert lines[2].split() == ['full', '-', '0.459/0.459']
@@ -103,8 +101,7 @@ def test_table_of_errors() -> None:
     ('FAIL', 'PASS', [' FAIL  calibration error 0.20 mg; the datasheet allows 3.4 mg',
                       'do not use']),
     ('PASS', 'FAIL', [' FAIL  tilt error 0.33°, more than 3.4 mg causes', 'do not use']),
-    ('PASS', 'NOT SHOWN', [' NOT SHOWN  calibration error 0.20 mg', 'too few']),
-])
+    ('PASS', 'NOT SHOWN', [' NOT SHOWN  calibration error 0.20 mg', 'too few'])])
 def test_acceptance(accel: str, tilt: str, begin: list[str]) -> None:
     provenance = {'own_accel_mg': '0.201', 'own_tilt_deg': '0.3251', 'verdict_datasheet': accel,
                   'verdict_tilt_datasheet': tilt}

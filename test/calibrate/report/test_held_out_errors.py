@@ -26,8 +26,7 @@ def calibrated(seed, model=None, axes='xy', check=16, stage_rad=None, effects=TE
     truth = drawn(rng, sensor, effects)
     on = truth if stage_rad is None else replace(truth, stage_resolution_rad=stage_rad)
     poses = swept(rng, on, check_poses=check)
-    return truth, calibration.calibrate(
-        sensor, [calibration.RecordedPoses('made', poses)], model)
+    return truth, calibration.calibrate(sensor, [calibration.RecordedPoses('made', poses)], model)
 
 
 def true_errors(truth, result):
@@ -51,7 +50,6 @@ def true_errors(truth, result):
 @pytest.mark.parametrize(('check', 'units', 'within'), [(16, 4, 0.35), (0, 2, 0.5)],
                          ids=['check poses', 'folds'])
 def test_the_stated_calibration_error_is_right(check, units, within):
-    """The stated error is the rms over units without noise and stage error."""
     estimated, true, measured = [], [], []
     for seed in range(units):
         truth, result = calibrated(seed, 'full', check=check)
@@ -74,8 +72,7 @@ CASES = {
     'a fine stage': ('noise', {'stage_resolution_rad': 0.0}),
     'a stage as stated': ('stage', {}),
     'a stage worse than stated': ('stage', {'stage_rad': np.radians(2.0)}),
-    'a model that lacks terms': ('model', {'model': 'linear'}),
-}
+    'a model that lacks terms': ('model', {'model': 'linear'})}
 
 
 @pytest.mark.parametrize('name', CASES)
@@ -87,7 +84,6 @@ def test_the_limiting_part_of_the_error_is_named(name):
 
 
 def test_a_linear_model_fails_because_of_its_model():
-    """The unit has the terms of the paper, and the full model of the same poses passes."""
     _, result = calibrated(1)
     outcomes = {row.model: (row.accel_datasheet, row.accel_noise, row.limited_by)
                 for row in result.assessments}
