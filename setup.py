@@ -43,8 +43,8 @@ setup(
     ],
     python_requires='>=3.10',
     install_requires=['setuptools', *requirements('core')],
-    extras_require={name: requirements(name) for name in ('extras', 'fleet', 'robot',
-                                                             'test')},
+    extras_require={name: requirements(name)
+                    for name in ('extras', 'fleet', 'robot', 'test')},
     zip_safe=True,
     maintainer='the adxl_ros authors',
     maintainer_email='adxl-ros-maintainers@users.noreply.github.com',

@@ -82,7 +82,7 @@ def _check(options: argparse.Namespace, folder: Path) -> int:
             else:
                 with progress('draw') as show:
                     digest = check.seal(folder, options.seed, options.trials, trials.plans,
-                                          trials.draw_trial, pool, show)
+                                        trials.draw_trial, pool, show)
             print(f'SHA-256 of salt and labels: {digest}', flush=True)
         if options.seal:
             print_end([], [folder], command(PROG, f'--open {quoted(folder)}'))

@@ -83,6 +83,7 @@ TILTING = Scene(Motion(18.0, turning(0.0).beta, Held(np.radians(30))), 'alpha_ra
                 'alpha at beta = 30°, deg', 180 / np.pi)
 CARRIED_S = np.arange(0.0, 4.0, 0.01)
 
+
 class Arm(ForcePath):
     """The end of an arm of 0.5 m that swings about its y, with the errors of a robot."""
 

@@ -439,8 +439,8 @@ def _statistics(comparison: BaselineComparison, detection: Detection, volts: np.
         yield 'white noise', 'm/s^2', white_noise_v(noise_v, sensor) / scale
     elif detector is Detector.ISOLATED_SAMPLES:
         spikes = isolated_samples(volts, time_s, finite, sensor)[1]
-        values = spikes[0].values if spikes else {'rate_hz': np.zeros(1),
-                                               'amplitude_v': np.zeros(len(scale))}
+        values = spikes[0].values if spikes else {
+            'rate_hz': np.zeros(1), 'amplitude_v': np.zeros(len(scale))}
         yield 'spikes per second and axis', '1/s', np.atleast_1d(values['rate_hz'])
         yield 'size of a spike', 'm/s^2', values['amplitude_v'] / scale
     elif detector is Detector.REPEATED_SAMPLES:

@@ -316,7 +316,7 @@ class _Converter:
         if assumed:
             self._remarks.append(f'{self._path}: columns without a unit are read as '
                                  f'{", ".join(assumed)}')
-        bursts = describe_bursts(time_s)
+        bursts = describe_bursts(time_s) if len(time_s) > _FEWEST_STAMPS else ''
         if bursts:
             self._remarks.append(f'{self._path}: {bursts.removeprefix("; ")}; this rate is '
                                  'used, and --rate HZ stamps by index')

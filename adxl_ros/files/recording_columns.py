@@ -295,7 +295,7 @@ class StampCheck:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What was left out, for people."""
+        """Return what was left out, for people."""
         kinds = ('samples with the stamp of the one before', 'samples whose stamp steps back')
         return tuple(f'{self._path}: left out, {kind}: {count}'
                      for kind, count in zip(kinds, self.bad) if count)

@@ -45,6 +45,7 @@ OUTCOMES = ('done', 'refused', 'crashed')
 """Values of `outcome`: the tasks gave results; the recording was refused, and `refusal` has the
 reason; the worker ended or failed at each attempt."""
 
+
 @dataclass(frozen=True)
 class Column:
     """One column of the table."""

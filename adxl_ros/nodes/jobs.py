@@ -103,6 +103,7 @@ _TEXT_WIDTH = 16
 _LINE_WIDTH = 69
 """Columns of a line without a bar, before its time."""
 
+
 def drawable() -> bool:
     """Return whether stdout is a terminal that can draw, and rich is installed."""
     if not sys.stdout.isatty() or os.environ.get('TERM') == 'dumb':

@@ -326,13 +326,13 @@ class RobotPath(ForcePath):
 
     @cached_property
     def smoothing_mps2(self) -> np.ndarray:
-        """What smoothing once more would change, m/s², at `time_s`, (n, 3): moves too abrupt."""
+        """Return what smoothing once more would change, m/s², at `time_s`, (n, 3)."""
         return self._moved(self._paths(self._read_again(False)))[0] - self.motion[0]
 
     @cached_property
     def rounding_mps2(self) -> np.ndarray:
         """
-        A draw of the error that the steps of the encoders leave, m/s², at `time_s`, (n, 3).
+        Draw the error that the steps of the encoders leave, m/s², at `time_s`, (n, 3).
 
         The smoothed motion is read by encoders whose steps lie elsewhere, and smoothed again.
         """

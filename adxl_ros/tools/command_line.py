@@ -133,8 +133,8 @@ def add_recording_options(parse: argparse.ArgumentParser) -> None:
 def add_robot_options(parse: argparse.ArgumentParser) -> None:
     """Add the options of a robot that carries the sensor, in place of a stage."""
     group = parse.add_argument_group(
-        'a robot as the stage', 'The recording also has sensor_msgs/JointState, and odom or tf '
-        'where the base moves.')
+        'a robot as the stage',
+        'joints from the recording (sensor_msgs/JointState), a moving base from odom')
     group.add_argument('--urdf', metavar='FILE', help='the robot; needs pinocchio')
     group.add_argument('--frame', metavar='NAME', default='imu_link',
                        help='its frame that carries the sensor (default: imu_link)')

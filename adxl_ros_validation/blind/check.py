@@ -86,8 +86,6 @@ def seal(folder: Path, seed: int | None, count: int, plan_all: Callable[[int, in
     return digest
 
 
-
-
 def published_hash(folder: Path) -> str | None:
     """Return the published hash of a folder's labels; None before it is published."""
     path = folder / 'seal.json'

@@ -364,7 +364,7 @@ def seal(folder: Path, source: Path, seed: int | None, count: int, pool: Pool, s
         halves, left_out = prepare(source)
     with show('draw') as advance:
         digest = check.seal(folder, seed, count, partial(plans, halves), partial(draw, halves),
-                              pool, advance)
+                            pool, advance)
     write(folder / 'left_out.json', json.dumps(left_out).encode())
     make_folder(base)
     for half in halves:

@@ -134,7 +134,7 @@ def test_a_recorded_specific_force_passes_through_the_chain(run_tool, tmp_path):
     (('rich', '--effect', 'lever_am'), 'did you mean lever_arm?'),
     (('rich', '--effect', 'lever_arm:zm=1'), 'did you mean z_m?'),
     (('rich', '--effect', 'lever_arm:z_m=3'), '3 m is outside -2 to 2 m'),
-    (('rich', '--effect', 'lever_arm:z_m.x=1'), 'one number without axes'),
+    (('rich', '--effect', 'lever_arm:z_m.x=1'), 'it is one number'),
     (('rich', '--effect', 'temperature_bias:per_k=0.1mg/K'), 'is in g/K'),
     (('rich', '--effect', 'bias:offset_v=0.1', '--effect', 'bias:offset_v=0.2'), 'stated twice'),
     (('rich', '--effect', 'bias:offset_v=nine'), "'nine' is not a number"),

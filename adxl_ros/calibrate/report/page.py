@@ -366,8 +366,8 @@ def _sweep(sensor: Sensor, fitted: Sensor, poses: Poses, panels: Sequence[int] =
     force_g = np.column_stack(reference) / G0_MPS2
     predicted = np.column_stack(signal_chain.static_response(fitted)(
         reference, swept.environment))
-    figure, grid = figures.pyplot().subplots(2, len(panels), figsize=(4.4 * len(panels), 9),
-                                     layout='constrained', squeeze=False)
+    figure, grid = figures.pyplot().subplots(
+        2, len(panels), figsize=(4.4 * len(panels), 9), layout='constrained', squeeze=False)
     for d, row in enumerate(grid):
         linear_v = line.zero_g_v[d] + line.scale_v_per_g[d] * force_g[:, d]
         deviation_mv, model_mv = (1e3 * (volts[:, d] - linear_v)
