@@ -8,7 +8,7 @@ from adxl_ros.files import parameter_file, recording
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import put, typical, with_neutral
 from adxl_ros.model.effects import library
-from adxl_ros.model.effects.base import ActsOn, Coefficient
+from adxl_ros.model.effects.base import ActsOn, Coefficient, Need
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import simulate
 from adxl_ros.simulate.trajectories import rich, TRAJECTORIES
@@ -25,7 +25,8 @@ CLEAN = {'noise_density_g_per_rthz': np.zeros(3), 'adc_bits': 0}
 
 
 def with_all(sensor, acts_on=tuple(ActsOn)):
-    names = [name for name, e in library().items() if e.acts_on in acts_on]
+    names = [name for name, e in library().items()
+             if e.acts_on in acts_on and Need.ROBOT not in e.needs]
     values = {name: typical(library()[name], sensor.axes) for name in names}
     return replace(sensor, effects=tuple(names), values=values)
 
