@@ -19,7 +19,7 @@ from adxl_ros.calibrate.fits import gravity_fit, linear
 from adxl_ros.calibrate.guided import pose_plan
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import acceptance, held_out as unseen
-from adxl_ros.calibrate.report.acceptance import acceptance_lines, error_table
+from adxl_ros.calibrate.report.acceptance import acceptance_lines, screen_table
 from adxl_ros.calibrate.report.coefficients import added_effect_lines, compare, truth_table
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording, sweep_journal
@@ -222,7 +222,7 @@ def _run_sweep(folder: Path, speed: float, seed: int) -> None:
             'sweep.check_poses': _CHECK_POSES})
         poses = _show_sweep(graph, output)
     fitted = parameter_file.load(output)
-    _print('', *error_table(_held_out_errors(sensor, fitted, poses)), '',
+    _print('', *screen_table(_held_out_errors(sensor, fitted, poses)), '',
            *truth_table(compare(fitted, truth)), '', *acceptance_lines(fitted),
            *added_effect_lines(fitted, truth), '',
            *file_lines({'Page': report / 'report.html', 'Calibration': output}))

@@ -188,14 +188,14 @@ def _result_lines(result: calibration.CalibrationResult) -> list[str]:
     if result.held_out:
         count = result.held_out[-1].pose_count
         folds = ': a fifth is left out at a time' if count >= len(result.inliers) else ''
-        lines += ['', f'on {count} poses that the fit has not seen{folds}',
-                  *acceptance.error_table(result.held_out, result.assessments)]
+        lines += ['', f' on {count} poses that the fit has not seen{folds}',
+                  *acceptance.screen_table(result.held_out)]
     elif result.gravity_fit is not None:
         lines += ['', *acceptance.gravity_lines(result.gravity_fit, result.poses.time_s[:, 0])]
     if result.assessments:
         assessment = result.assessments[-1]
-        lines += ['', *acceptance.explanation(assessment, fitted),
-                  f'limited by {_LIMITS[assessment.limited_by]}']
+        lines += ['', *acceptance.limit_table(assessment, fitted),
+                  f' limited by               {_LIMITS[assessment.limited_by]}']
     return lines + [*acceptance.unit_line(fitted), *result.warnings]
 
 

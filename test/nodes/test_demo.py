@@ -73,8 +73,8 @@ def test_live(ros_env, tmp_path) -> None:
     assert re.search(r'1/3 sweep +146 of 146 poses +━+ +100 %', screen)
     assert re.search(r'2/3 fit +130 poses, full model', screen)
     assert re.search(r'3/3 check +16 poses that the fit has not seen', screen)
-    for model in ('nominal', 'linear', 'full'):
-        assert re.search(rf'{model} +[\d.]+/[\d.]+ +[\d.]+/[\d.]+', screen)
+    for model in ('datasheet values', 'linear calibration', 'full calibration'):
+        assert re.search(rf'{model} +[\d.]+ +° +[\d.]+ +mg', screen)
     rows = [line for line in lines if line.endswith(('  ok', '  MISSED'))]
     assert len(rows) >= 18 and all('±' in row for row in rows)
     assert f'of {len(rows)} inside their 90 % intervals' in screen

@@ -232,6 +232,45 @@ def error_table(models: Sequence[HeldOutErrors], assessments: Sequence[Assessmen
     return lines
 
 
+def screen_table(models: Sequence[HeldOutErrors]) -> list[str]:
+    """Lay out the errors of the models on held-out poses for people; the last one is saved."""
+    lines = [f' {"":24}tilt error     acceleration error     (rms)']
+    lines += [f' {_MODELS[errors.model]:22} {_three_digits(errors.tilt_deg.rms):>9} ° '
+              f'{_three_digits(errors.accel_mg.rms):>18} mg' for errors in models]
+    lines[-1] += '           <- saved'
+    return lines
+
+
+_MODELS = {'nominal': 'datasheet values', 'linear': 'linear calibration',
+           'physical': 'physical calibration', 'full': 'full calibration'}
+"""Models in words."""
+
+
+def _three_digits(value: float) -> str:
+    """Write a value so that the decimal points of a right-aligned column stand in one line."""
+    if np.isnan(value):
+        return '-   '
+    decimals = 1 if value >= 10 else 2 if value >= 1 else 3
+    return f'{value:.{decimals}f}'.ljust(len(f'{value:.3f}'))
+
+
+def limit_table(assessment: Assessment, sensor: Sensor) -> list[str]:
+    """Lay out the error of the calibration below its limits, with one outcome for each figure."""
+    rows = [('calibration error', 1e3 * assessment.accel.calibration ** 0.5 / G0_MPS2,
+             assessment.error_deg, '', '')]
+    for name, limit_mps2, accel, tilt in (
+            ('limit by the datasheet', nonlinearity_mps2(sensor), assessment.accel_datasheet,
+             assessment.tilt_datasheet),
+            ('noise of one sample', held_out.sample_noise_mps2(sensor), assessment.accel_noise,
+             assessment.tilt_noise)):
+        if accel:
+            rows.append((name, 1e3 * limit_mps2 / G0_MPS2, float(np.degrees(
+                limit_mps2 * np.sqrt(assessment.tilt.tilt_per_axis))), accel, tilt))
+    return [f' {name:24} {"-" if np.isnan(value_deg) else f"{value_deg:#.2g}":>7} ° {tilt:9} '
+            f'{value_mg:#8.2g} mg {accel}'.rstrip()
+            for name, value_mg, value_deg, accel, tilt in rows]
+
+
 def _cell(statistic: held_out.ErrorStatistic, datasheet: str, noise: str) -> str:
     cell = '-' if np.isnan(statistic.rms) else f'{statistic.rms:.3f}/{statistic.largest:.3f}'
     return f'{cell:>14} {datasheet:9} {noise:9}'
