@@ -136,16 +136,18 @@ class Dwell:
                                   learn=False)
         self._stamps: list[np.ndarray] = []
         self._volts: list[np.ndarray] = []
+        self._count = 0
 
     def __len__(self) -> int:
         """Return the number of samples since the arrival."""
-        return sum(map(len, self._stamps))
+        return self._count
 
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
         """Take samples: their stamps, ns, (n,), and volts, (n, m)."""
         new = stamps_ns >= self.arrived_ns
         self._stamps.append(stamps_ns[new])
         self._volts.append(volts[new])
+        self._count += int(new.sum())
         # From the arrival: float64 seconds since 1970 resolve only 0.2 µs.
         self._finder.feed((stamps_ns[new] - self.arrived_ns) * 1e-9, volts[new])
 
