@@ -54,10 +54,10 @@ def test_live(ros_env, tmp_path) -> None:
     """
     In a terminal of 80 columns no line of steps, tables, acceptance and files wraps.
 
-    No sample of a pose is lost, although the calibration is stopped for 12 s of sensor time. The
+    No sample of a pose is lost, although the calibration is stopped for 7 s of sensor time. The
     speed leaves a busy machine time to send again what was lost meanwhile.
     """
-    terminal = Terminal([executable('demo'), '--speed', '25'], ros_env, tmp_path, lines=60,
+    terminal = Terminal([executable('demo'), '--speed', '15'], ros_env, tmp_path, lines=60,
                         columns=80)
     try:
         terminal.wait_for('1/3 sweep', 'of 146 poses', '━', timeout_s=60.0)
