@@ -29,6 +29,7 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.report import figures as plots, page as html_page
 from adxl_ros.report.figures import Figure, figure, line, rounded
 from adxl_ros.report.quantities import (
+    decimals,
     mg,
     mg_text,
     percent,
@@ -147,8 +148,9 @@ def _cell(cell: ResidualCell) -> list[str]:
     name, unit, factor = cell.dimension, cell.dimension.rpartition('_')[2], 1.0
     if 'rad' in name:
         unit, factor = '°/s' if 'rate' in name else '°', float(np.degrees(1.0))
+    places = decimals(factor * (cell.high - cell.low))
     return [name.split('_rad')[0].replace('_', ' '),
-            f'{factor * cell.low:.4g} to {factor * cell.high:.4g} {unit}', cell.axis,
+            f'{factor * cell.low:.{places}f} to {factor * cell.high:.{places}f} {unit}', cell.axis,
             mg_text(cell.mean_mps2), percent(cell.share)]
 
 
