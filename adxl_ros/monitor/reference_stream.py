@@ -256,7 +256,8 @@ class RobotForce:
         stamp_ns, rows = self._joints.between(newest_ns - _HISTORY_NS, newest_ns + 1)
         begin_ns = max(self._given_ns if self._given_ns < newest_ns else 0,
                        int(stamp_ns[0]) + _MARGIN_NS)
-        at_ns = np.arange(-(-begin_ns // _GRID_NS), (newest_ns - _MARGIN_NS) // _GRID_NS) * _GRID_NS
+        at_ns = _GRID_NS * np.arange(
+            -(-begin_ns // _GRID_NS), (newest_ns - _MARGIN_NS) // _GRID_NS)
         if len(at_ns) * _GRID_NS < _ROBOT_NS:
             return
         time_s = (stamp_ns - begin_ns) * 1e-9

@@ -83,7 +83,8 @@ class Robot:
                             f'{install_hint("pin")}') from None
         self._pin: Any = pinocchio
         if not os.path.isfile(urdf):
-            raise UserError(f'{urdf or "urdf"}: no such file; give the URDF (xacro FILE > robot.urdf)')
+            raise UserError(f'{urdf or "urdf"}: no such file; give the URDF '
+                            '(xacro FILE > robot.urdf)')
         try:
             free = (pinocchio.JointModelFreeFlyer(),) if moves else ()
             model = pinocchio.buildModelFromUrdf(str(urdf), *free)
