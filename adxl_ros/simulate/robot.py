@@ -228,9 +228,10 @@ class RobotPath(ForcePath):
         self._rotation = CubicSpline(self._grid_s, np.hstack(list(self.motion[1:3])))
         self.joints = robot.joints
 
-    def _paths(self, tracks: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Path]:
+    def _paths(self, tracks: Sequence[tuple[np.ndarray, np.ndarray]], wider: float = 1.0
+               ) -> list[Path]:
         """Smooth the tracks."""
-        return [SmoothedPath(times, values, step, is_seen=True, knot_s=min(
+        return [SmoothedPath(times, values, step, is_seen=True, knot_s=wider * min(
             KNOT_S, _KNOT_READINGS * float(np.median(np.diff(times))))) if np.ptp(values)
             else Held(float(values[0])) for (times, values), step in zip(tracks, self._steps)]
 
@@ -320,21 +321,27 @@ class RobotPath(ForcePath):
         """
         Return what is to be expected of the error of one component, m/s², at times, s, (n,).
 
-        Standard deviation and memory are those of rounding and smoothing around each time.
+        Standard deviation and memory are those of rounding and smoothing around each time. The
+        error forgets its past at the rate by which it changes, divided by its size: the
+        correlation of neighbours on a grid that is finer than the changes would say far less.
         """
         error = self.rounding_mps2[:, component] + 2 * self.smoothing_mps2[:, component]
-        step_s = self._grid_s[1] - self._grid_s[0]
-        around = max(round(_AROUND_S / step_s), 3)
-        square, product = (uniform_filter1d(v, around) for v in (
-            error ** 2, error * np.append(error[1:], error[-1])))
-        memory = np.clip(product / np.maximum(square, _SMALLEST_STEP ** 2), 1e-3, 1.0)
-        return PathErrors(np.interp(time_s, self._grid_s, np.sqrt(square)),
-                          np.interp(time_s, self._grid_s, -np.log(memory) / step_s))
+        around = max(round(_AROUND_S / (self._grid_s[1] - self._grid_s[0])), 3)
+        size, rate = (np.sqrt(np.maximum(uniform_filter1d(v ** 2, around), 0.0)) for v in (
+            error, np.gradient(error, self._grid_s)))
+        return PathErrors(np.interp(time_s, self._grid_s, size), np.interp(
+            time_s, self._grid_s, rate / np.maximum(size, _SMALLEST_STEP)))
 
     @cached_property
     def smoothing_mps2(self) -> np.ndarray:
-        """Return what smoothing once more would change, m/s², at `time_s`, (n, 3)."""
-        return self._force_read_again(False) - self.motion[0]
+        """
+        Return what the smoothing may have changed, m/s², at `time_s`, (n, 3).
+
+        It is the larger of what smoothing once more would change, and knots at twice the distance.
+        """
+        by_penalty = self._exact_again - self.motion[0]
+        by_knots = self._moved(self._on_grid(self._paths(self._tracks, 2.0)))[0] - self.motion[0]
+        return np.where(np.abs(by_penalty) > np.abs(by_knots), by_penalty, by_knots)
 
     @cached_property
     def rounding_mps2(self) -> np.ndarray:
@@ -343,10 +350,13 @@ class RobotPath(ForcePath):
 
         The smoothed motion is read by encoders whose steps lie elsewhere, and smoothed again.
         """
-        return self._force_read_again(True) - self.motion[0] \
-            - self.smoothing_mps2
+        return self._read_again(True) - self._exact_again
 
-    def _force_read_again(self, is_rounded: bool) -> np.ndarray:
+    @cached_property
+    def _exact_again(self) -> np.ndarray:
+        return self._read_again(False)
+
+    def _read_again(self, is_rounded: bool) -> np.ndarray:
         """Return the force by readings of the smoothed motion, exact or of the same encoders."""
         rng, tracks = np.random.default_rng(0), []
         for (times, values), step, path in zip(self._tracks, self._steps, self._splines):
