@@ -20,8 +20,7 @@ from pathlib import Path
 import sys
 from typing import Any, NamedTuple
 
-from adxl_ros.errors import UserError
-from adxl_ros.tools.command_line import argument_parser, run
+from adxl_ros.tools.command_line import argument_parser, check_least, run
 from adxl_ros.workers import for_each, make_folder, open_pool, write
 from adxl_ros_validation import working_world as world
 from adxl_ros_validation.blind import diagnosis_runs, grading, scores, trials
@@ -238,8 +237,7 @@ def parser() -> argparse.ArgumentParser:
 
 def working(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
-    if min(options.count, options.jobs) < 1 or min(options.first, options.seed) < 0:
-        raise UserError('--count and --jobs must be at least 1, --first and --seed at least 0')
+    check_least(options, count=1, jobs=1, first=0, seed=0)
     folder, rows = make_folder(Path(options.output)), []
     numbers = range(options.first, options.first + options.count)
 

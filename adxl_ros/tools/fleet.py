@@ -126,10 +126,7 @@ def _worked(options: argparse.Namespace, recipe: Recipe, results: Results, to_do
 
 
 def _check(options: argparse.Namespace) -> None:
-    for name, lowest in (('jobs', 1), ('retries', 0), ('limit', 1)):
-        value = getattr(options, name)
-        if value is not None and value < lowest:
-            raise UserError(f'--{name} {value}: at least {lowest} is needed')
+    cli.check_least(options, jobs=1, retries=0, limit=1)
     try:
         import fsspec  # noqa: F401
         import pyarrow  # noqa: F401

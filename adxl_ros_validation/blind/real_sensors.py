@@ -22,7 +22,6 @@ from typing import Any
 from adxl_ros.errors import UserError
 from adxl_ros.workers import make_folder, Pool, write
 from adxl_ros_validation.blind import (
-    check,
     diagnosis_runs,
     grading,
     report_html,
@@ -357,14 +356,14 @@ def _with_fault(half: Half, seed: tuple[int, ...], fault: Fault) -> tuple[float,
 def seal(folder: Path, source: Path, seed: int | None, count: int, pool: Pool, show: Show
          ) -> str:
     """Draw the trials of a folder or manifest into a folder; return the published hash."""
-    base, digest = folder / 'baseline' / 'recordings', check.published_hash(folder)
-    if digest is not None and base.exists():
-        return digest
+    base = folder / 'baseline' / 'recordings'
+    if base.exists():
+        return trials.published_hash(folder)
     with show('first parts'):
         halves, left_out = prepare(source)
     with show('draw') as advance:
-        digest = check.seal(folder, seed, count, partial(plans, halves), partial(draw, halves),
-                            pool, advance)
+        digest = trials.seal(folder, seed, count, partial(plans, halves), partial(draw, halves),
+                             pool, advance)
     write(folder / 'left_out.json', json.dumps(left_out).encode())
     make_folder(base)
     for half in halves:
@@ -400,7 +399,7 @@ def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
         untouched = diagnosis_runs.diagnose_all(folder / 'baseline', pool, advance)
     with show('diagnose') as advance:
         results = diagnosis_runs.diagnose_all(folder, pool, advance)
-    setup, labels = check.committed_labels(folder)
+    setup, labels = trials.committed_labels(folder)
     base = {name: grading.answer(result) for name, result in untouched.items()}
     rows = []
     for label in labels:
@@ -419,7 +418,7 @@ def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
                      'probability': answer.probability, 'seconds': answer.seconds,
                      'error': results[label.name]['error'],
                      'by_chance': float(np.mean(by_chance or [False]))})
-    return {'hash': check.published_hash(folder), 'seed': setup.seed,
+    return {'hash': trials.published_hash(folder), 'seed': setup.seed,
             'trials': len(rows), 'diagnose_code': (folder / 'reports' / 'version.txt').read_text(),
             'left_out': json.loads((folder / 'left_out.json').read_text()), 'rows': rows,
             'baseline': {name: [answer.status, sorted(answer.named)]

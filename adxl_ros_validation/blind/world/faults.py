@@ -324,3 +324,5 @@ KINDS = {kind.name: kind for kind in (*_STAGE, *_ELEMENT, *_NOISE, *_UNLISTED)}
 """All kinds by name. Their order is part of a seed: do not change it."""
 KNOWN = tuple(name for name in KINDS if name not in UNLISTED)
 """Kinds of which the package's library has an effect of the same name."""
+NOISE_LIKE = frozenset(name for name, kind in KINDS.items() if kind.random)
+"""Kinds that differ from run to run."""
