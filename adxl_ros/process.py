@@ -4,6 +4,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+import hashlib
 from importlib.metadata import PackageNotFoundError, version
 import os
 from pathlib import Path
@@ -21,6 +22,14 @@ def package_version() -> str:
         return version('adxl_ros')
     except PackageNotFoundError:
         return 'unknown'
+
+
+def code_version() -> str:
+    """Return the SHA-256 of version and code of this package."""
+    hashed = hashlib.sha256(package_version().encode())
+    for path in sorted(Path(__file__).parent.rglob('*.py')):
+        hashed.update(path.name.encode() + path.read_bytes())
+    return hashed.hexdigest()
 
 
 def use_one_thread() -> None:

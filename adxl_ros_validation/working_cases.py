@@ -23,11 +23,17 @@ from typing import Any, NamedTuple
 from adxl_ros.tools.command_line import argument_parser, check_least, run
 from adxl_ros.workers import for_each, make_folder, open_pool, write
 from adxl_ros_validation import working_world as world
-from adxl_ros_validation.blind import diagnosis_runs, grading, scores, trials
+from adxl_ros_validation.blind import (
+    diagnosis_runs,
+    grading,
+    ideal_observer,
+    scores,
+    simulator,
+    trials,
+)
 from adxl_ros_validation.blind.grading import Answer
+from adxl_ros_validation.blind.simulator import Fault, G0, Scene
 from adxl_ros_validation.blind.trials import Label
-from adxl_ros_validation.blind.world import ideal_observer, simulator
-from adxl_ros_validation.blind.world.simulator import Fault, G0, Scene
 import numpy as np
 
 GROUPS = ('null', 'single', 'pair', 'outside')

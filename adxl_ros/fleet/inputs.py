@@ -21,7 +21,7 @@ import re
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
-from adxl_ros.errors import install_hint, one_line, UserError
+from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import recording
 from adxl_ros.files.calibration_store import date_in
 from adxl_ros.files.recording_columns import Recording
@@ -85,11 +85,8 @@ class Source:
 
 def file_system(url: str, secret: str = '') -> tuple[Any, str]:
     """Return the file system of a URL, and the path in it."""
-    try:
-        from fsspec.core import url_to_fs
-        from fsspec.implementations.local import LocalFileSystem
-    except ImportError:
-        raise UserError(f'fleet needs fsspec; {install_hint("adxl_ros[fleet]")}') from None
+    from fsspec.core import url_to_fs
+    from fsspec.implementations.local import LocalFileSystem
     address = secret if _is_web(secret) else url
     # A path of this machine may have two colons, which join addresses.
     if '://' not in address or address.startswith('file://'):

@@ -70,8 +70,7 @@ class StageLimits:
 
     def excess_rad(self, pose: Pose) -> float:
         """Return how far the worse angle of a pose is beyond the limits, rad; 0 within them."""
-        nearest = self.nearest(*pose)
-        return max(abs(pose.alpha_rad - nearest.alpha_rad), abs(pose.beta_rad - nearest.beta_rad))
+        return max(abs(angle - near) for angle, near in zip(pose, self.nearest(*pose)))
 
 
 class Path:
@@ -85,28 +84,21 @@ class Path:
         self._script.rest(0.5)
 
     def rest(self, alpha_deg: float, beta_deg: float, seconds: float = _REST_S) -> None:
-        """
-        Move to a pose and rest there.
-
-        seconds: time at rest, s.
-        """
+        """Move to a pose and rest there for some seconds."""
         pose = self.limits.nearest(np.radians(alpha_deg), np.radians(beta_deg))
-        if max(abs(pose.alpha_rad - self._script.alpha),
-               abs(pose.beta_rad - self._script.beta)) > 0:
+        if pose != self.end():
             self._script.go(*pose)
         self._script.rest(seconds)
 
     def turn(self, joint: str, to_rad: float, share: float = 1.0) -> None:
         """Turn one joint at a constant rate, and rest for a second."""
-        angles = {'alpha': self._script.alpha, 'beta': self._script.beta, joint: to_rad}
-        pose = self.limits.nearest(angles['alpha'], angles['beta'])
-        to_rad = pose.alpha_rad if joint == 'alpha' else pose.beta_rad
+        to_rad = float(np.clip(to_rad, *self.limits.of(joint)))
         rate_rad_s = share * self.limits.rate_rad_s
         distance_rad = abs(to_rad - getattr(self._script, joint))
         if distance_rad > rate_rad_s * RUN_UP_S:
             self._script.run(joint, to_rad, rate_rad_s)
         elif distance_rad > 0:
-            self._script.go(*pose)
+            self._script.go(*self.end()._replace(**{f'{joint}_rad': to_rad}))
         self._script.rest(1.0)
 
     def swing(self, joint: str, share: float = 1.0) -> None:

@@ -8,6 +8,7 @@ import argparse
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
+from importlib.util import find_spec
 from pathlib import Path
 import shlex
 from time import monotonic
@@ -127,11 +128,9 @@ def _worked(options: argparse.Namespace, recipe: Recipe, results: Results, to_do
 
 def _check(options: argparse.Namespace) -> None:
     cli.check_least(options, jobs=1, retries=0, limit=1)
-    try:
-        import fsspec  # noqa: F401
-        import pyarrow  # noqa: F401
-    except ImportError as error:
-        raise UserError(f'{PROG} needs {error.name}; {install_hint(str(error.name))}') from None
+    missing = [name for name in ('fsspec', 'pyarrow') if find_spec(name) is None]
+    if missing:
+        raise UserError(f'{PROG} needs {" and ".join(missing)}; {install_hint(*missing)}')
 
 
 def _warn_of_replaced(to_do: Plan, results: Results, tasks: Sequence[str]) -> None:

@@ -8,7 +8,6 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from datetime import date
 from functools import partial
-import hashlib
 import json
 import os
 from pathlib import Path
@@ -19,15 +18,13 @@ import tempfile
 import time
 from typing import Any
 
-import adxl_ros
 from adxl_ros.errors import UserError
-from adxl_ros.process import package_version
+from adxl_ros.process import code_version, package_version
 from adxl_ros.workers import for_each, make_folder, Pool, write
-from adxl_ros_validation.blind import grading, scores, trials
+from adxl_ros_validation.blind import grading, ideal_observer, scores, trials
+from adxl_ros_validation.blind.faults import NOISE_LIKE
+from adxl_ros_validation.blind.simulator import Fault, Scene
 from adxl_ros_validation.blind.trials import Label
-from adxl_ros_validation.blind.world import ideal_observer
-from adxl_ros_validation.blind.world.faults import NOISE_LIKE
-from adxl_ros_validation.blind.world.simulator import Fault, Scene
 import numpy as np
 import pandas as pd
 import yaml
@@ -127,14 +124,6 @@ def kept(folder: Path, names: Sequence[str], work: Callable[..., tuple[str, Any]
     for_each(pool, work, [partial(job, name) for name in todo], keep, show,
              len(names) - len(todo))
     return {name: json.loads((folder / f'{name}.json').read_bytes()) for name in names}
-
-
-def code_version() -> str:
-    """Hash the code of the diagnosis."""
-    hashed = hashlib.sha256()
-    for path in sorted(Path(adxl_ros.__file__).parent.rglob('*.py')):
-        hashed.update(path.name.encode() + path.read_bytes())
-    return hashed.hexdigest()
 
 
 _BLOCK_S = 5.0

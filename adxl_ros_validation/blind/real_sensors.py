@@ -24,16 +24,15 @@ from adxl_ros.workers import make_folder, Pool, write
 from adxl_ros_validation.blind import (
     diagnosis_runs,
     grading,
+    ideal_observer,
     report_html,
     scores,
     trials,
 )
 from adxl_ros_validation.blind.diagnosis_runs import Show
+from adxl_ros_validation.blind.faults import KINDS, KNOWN
 from adxl_ros_validation.blind.grading import Answer, UNKNOWN
-from adxl_ros_validation.blind.trials import Drawn, Label, Plan
-from adxl_ros_validation.blind.world import ideal_observer
-from adxl_ros_validation.blind.world.faults import KINDS, KNOWN
-from adxl_ros_validation.blind.world.simulator import (
+from adxl_ros_validation.blind.simulator import (
     csv_text,
     Fault,
     G0,
@@ -42,6 +41,7 @@ from adxl_ros_validation.blind.world.simulator import (
     Run,
     Unit,
 )
+from adxl_ros_validation.blind.trials import Drawn, Label, Plan
 import numpy as np
 import pandas as pd
 import scipy

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from adxl_ros_validation.blind import grading
+from adxl_ros_validation.blind.faults import NOISE_LIKE
 from adxl_ros_validation.blind.grading import Answer, UNKNOWN
 from adxl_ros_validation.blind.trials import Label
-from adxl_ros_validation.blind.world.faults import NOISE_LIKE
 import numpy as np
 import scipy
 

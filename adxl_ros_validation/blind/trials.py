@@ -23,10 +23,10 @@ from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.workers import for_each, make_folder, Pool, write
-from adxl_ros_validation.blind.world import ideal_observer, motion, simulator
-from adxl_ros_validation.blind.world.faults import KINDS, KNOWN, UNLISTED
-from adxl_ros_validation.blind.world.ideal_observer import IdealObserver
-from adxl_ros_validation.blind.world.simulator import Fault, G0, Scene
+from adxl_ros_validation.blind import ideal_observer, motion, simulator
+from adxl_ros_validation.blind.faults import KINDS, KNOWN, UNLISTED
+from adxl_ros_validation.blind.ideal_observer import IdealObserver
+from adxl_ros_validation.blind.simulator import Fault, G0, Scene
 import numpy as np
 
 STRENGTHS_MPS2 = (0.02e-3 * G0, 15e-3 * G0)

@@ -9,9 +9,18 @@ import shutil
 import sys
 
 from adxl_ros.workers import open_pool, Pool
-from adxl_ros_validation.blind import diagnosis_runs, grading, report_html, scores, trials
+from adxl_ros_validation.blind import (
+    diagnosis_runs,
+    faults,
+    grading,
+    ideal_observer,
+    motion,
+    report_html,
+    scores,
+    simulator,
+    trials,
+)
 from adxl_ros_validation.blind.trials import Label, plans
-from adxl_ros_validation.blind.world import faults, ideal_observer, motion, simulator
 import numpy as np
 import pytest
 

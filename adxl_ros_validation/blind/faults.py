@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import math
 
-from adxl_ros_validation.blind.world import simulator as sim
-from adxl_ros_validation.blind.world.motion import low_pass
-from adxl_ros_validation.blind.world.simulator import G0, Kind, Place, Run, Shape
+from adxl_ros_validation.blind import simulator as sim
+from adxl_ros_validation.blind.motion import low_pass
+from adxl_ros_validation.blind.simulator import G0, Kind, Place, Run, Shape
 import numpy as np
 import scipy
 
