@@ -26,10 +26,9 @@ def package_version() -> str:
 
 def code_version() -> str:
     """Return the SHA-256 of version and code of this package."""
-    hashed = hashlib.sha256(package_version().encode())
-    for path in sorted(Path(__file__).parent.rglob('*.py')):
-        hashed.update(path.name.encode() + path.read_bytes())
-    return hashed.hexdigest()
+    code = [path.name.encode() + path.read_bytes()
+            for path in sorted(Path(__file__).parent.rglob('*.py'))]
+    return hashlib.sha256(package_version().encode() + b''.join(code)).hexdigest()
 
 
 def use_one_thread() -> None:

@@ -9,11 +9,9 @@ uniform (Talts et al. 2018, arXiv:1804.06788). 90 % intervals must contain it in
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
-import os
 
 from adxl_ros.calibrate.fits import full_model, term_selection
 from adxl_ros.calibrate.fits.linearisation import StageError
@@ -68,12 +66,8 @@ def draw_all(nominal: Sensor, draws: int, seed: int, show: Callable[[float], Non
              ) -> list[Draw]:
     """Draw and fit units on all kinds of stage, over the cores."""
     kinds = list(product(STAGES, AXES, pose_plan.KINDS))
-    finished = []
-    with ProcessPoolExecutor(os.cpu_count()) as pool:
-        for result in pool.map(partial(draw, nominal, kinds=kinds, seed=seed), range(draws)):
-            finished.append(result)
-            show(len(finished) / draws)
-    return finished
+    return experiments.in_parallel(partial(draw, nominal, kinds=kinds, seed=seed), show,
+                                   range(draws))
 
 
 def draw(nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], seed: int) -> Draw:

@@ -21,7 +21,7 @@ import sys
 from typing import Any, NamedTuple
 
 from adxl_ros.tools.command_line import argument_parser, check_least, run
-from adxl_ros.workers import for_each, make_folder, open_pool, write
+from adxl_ros.workers import for_each, open_pool, write
 from adxl_ros_validation import working_world as world
 from adxl_ros_validation.blind import (
     diagnosis_runs,
@@ -152,7 +152,7 @@ class Row(NamedTuple):
 def diagnosed(seed: int, number: int, only: str | None, folder: Path) -> tuple[Row]:
     """Draw a case, keep its files, diagnose it and measure the harm."""
     case = draw(seed, number, only)
-    place = make_folder(folder / case.label.name)
+    place = folder / case.label.name
     for suffix, text in (('csv', case.recording), ('yaml', case.parameters),
                          ('json', json.dumps(asdict(case.label), indent=1))):
         write(place / f'{case.label.name}.{suffix}', text.encode())
@@ -244,7 +244,7 @@ def parser() -> argparse.ArgumentParser:
 def working(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     check_least(options, count=1, jobs=1, first=0, seed=0)
-    folder, rows = make_folder(Path(options.output)), []
+    folder, rows = Path(options.output), []
     numbers = range(options.first, options.first + options.count)
 
     def keep(row: Row) -> None:

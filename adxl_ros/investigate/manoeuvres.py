@@ -34,9 +34,8 @@ _SWINGS = 4
 """Number of swings forth and back. Chosen: their reversals are averaged."""
 LONGEST_STEP_S = 0.2
 """Longest time of a manoeuvre between two commands, s. Chosen: the stage then comes to rest within
-a fifth of a second at the limit of rate where the commands end."""
-_AHEAD_S = LONGEST_STEP_S
-"""Time by which a command is ahead of the stage, s. Chosen: no command is later."""
+a fifth of a second at the limit of rate where the commands end. A command is ahead of the stage by
+this time, so that none is late."""
 LARGEST_LAG_RAD = 0.15
 """Distance of the stage from where it should be, rad, at which the command waits. Chosen: a
 controller lags by some tenths of a second."""
@@ -265,7 +264,7 @@ class CommandStream:
         self._elapsed_s += elapsed_s
         motion = self._manoeuvre.motion
         ahead_s = np.array([self._manoeuvre.begin_s
-                            + min(self._elapsed_s + _AHEAD_S, motion.duration_s)])
+                            + min(self._elapsed_s + LONGEST_STEP_S, motion.duration_s)])
         goal = self._limits.nearest(float(motion.alpha(ahead_s)[0]),
                                     float(motion.beta(ahead_s)[0]))
         rate_rad_s = self._limits.rate_rad_s
@@ -273,8 +272,9 @@ class CommandStream:
         self.command = _moved(self.command, goal, largest_rad, largest_rad)
         # A stage that came to rest for want of commands starts as softly as a manoeuvre.
         faster = rate_rad_s * elapsed_s / RUN_UP_S
-        self.speed = Pose(*(min(abs(c - e) / _AHEAD_S, speed + faster, rate_rad_s) for c, e, speed
-                            in zip(self.command, self._expected, self.speed)))
+        self.speed = Pose(*(
+            min(abs(c - e) / LONGEST_STEP_S, speed + faster, rate_rad_s)
+            for c, e, speed in zip(self.command, self._expected, self.speed)))
         return self.command
 
 

@@ -92,6 +92,8 @@ def fleet(options: argparse.Namespace) -> int:
     recipe = make_recipe(tasks, options.params, (source.params for source in sources),
                          options.store, cli.reading_options(options))
     folder = Path(options.output)
+    if not options.dry_run:
+        cli.make_folder(folder)
     with nullcontext() if options.dry_run else only_client(folder):
         results = Results(folder)
         to_do = plan(sources, recipe, results, selection)
@@ -160,7 +162,7 @@ def _written(folder: Path, results: Results) -> list[Path]:
 def _plan_lines(to_do: Plan, count: int) -> list[str]:
     stated = iter(stated_by([source for source, serial in zip(to_do.todo, to_do.serials)
                              if not serial]))
-    by_unit = Counter(serial or next(stated).serial for serial in to_do.serials)
+    by_unit = Counter(serial or next(stated)[0] for serial in to_do.serials)
     unknown = by_unit.pop('', 0) + by_unit.pop(NO_UNIT, 0)
     largest = ', '.join(f'{serial} ({number})' for serial, number in by_unit.most_common(_UNITS))
     rows = {'found': f'{counted(count, "recording")}', 'done already': f'{to_do.done}',

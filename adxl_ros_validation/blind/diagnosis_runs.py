@@ -20,7 +20,7 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.process import code_version, package_version
-from adxl_ros.workers import for_each, make_folder, Pool, write
+from adxl_ros.workers import for_each, Pool, write
 from adxl_ros_validation.blind import grading, ideal_observer, scores, trials
 from adxl_ros_validation.blind.faults import NOISE_LIKE
 from adxl_ros_validation.blind.simulator import Fault, Scene
@@ -90,7 +90,7 @@ def diagnose(name: str, recording: bytes, parameters: bytes, sim: bytes | None =
 def diagnose_all(folder: Path, pool: Pool, show: Callable[[float], None]
                  ) -> dict[str, Result]:
     """Diagnose all recordings of a folder that have no report yet."""
-    reports, recordings = make_folder(folder / 'reports'), folder / 'recordings'
+    reports, recordings = folder / 'reports', folder / 'recordings'
     code = code_version()
     stamp = reports / 'version.txt'
     if stamp.exists() and stamp.read_text() != code:
@@ -245,8 +245,7 @@ def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
         return by_name[name], stated, results[name]['parameters']
 
     with show('held out') as advance:
-        held_out = kept(make_folder(folder / 'labels' / 'held'), list(by_name), evaluate, job,
-                        pool, advance)
+        held_out = kept(folder / 'labels' / 'held', list(by_name), evaluate, job, pool, advance)
     graded = [scores.Trial(label, grading.answer(results[label.name]), held_out[label.name])
               for label in labels]
     made = scores.scores(graded)

@@ -20,7 +20,7 @@ import tempfile
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.workers import make_folder, Pool, write
+from adxl_ros.workers import Pool, write
 from adxl_ros_validation.blind import (
     diagnosis_runs,
     grading,
@@ -274,7 +274,7 @@ def _noise(half: Half) -> float:
 def plans(halves: Sequence[Half], seed: int, count: int) -> list[Plan]:
     """Plan trials: recordings and defects in turn, a quarter without any."""
     rng = np.random.default_rng([seed, 3])
-    rows: list[tuple[int, str, int, tuple[str, ...]]] = []
+    rows: list[tuple[str, tuple[str, ...], tuple[int, ...]]] = []
     used = dict.fromkeys(KINDS, 0)
     for k in range(count):
         half = k % len(halves)
@@ -282,15 +282,13 @@ def plans(halves: Sequence[Half], seed: int, count: int) -> list[Plan]:
         names = [name for name in halves[half].kinds()
                  if (name in KNOWN) == (group == 'single')]
         if group == 'none' or not names:
-            rows.append((k, 'none', half, ()))
+            rows.append(('none', (), (seed, 4, k, half)))
             continue
         fewest = min(used[name] for name in names)
         name = str(rng.choice([name for name in names if used[name] == fewest]))
         used[name] += 1
-        rows.append((k, group, half, (name,)))
-    drawn = [rows[k] for k in rng.permutation(count)]
-    return [Plan(f'r{i:04d}', group, effects, (seed, 4, k, half))
-            for i, (k, group, half, effects) in enumerate(drawn)]
+        rows.append((group, (name,), (seed, 4, k, half)))
+    return [Plan(f'r{i:04d}', *rows[k]) for i, k in enumerate(rng.permutation(count))]
 
 
 def draw(halves: Sequence[Half], plan: Plan) -> Drawn:
@@ -365,7 +363,6 @@ def seal(folder: Path, source: Path, seed: int | None, count: int, pool: Pool, s
         digest = trials.seal(folder, seed, count, partial(plans, halves), partial(draw, halves),
                              pool, advance)
     write(folder / 'left_out.json', json.dumps(left_out).encode())
-    make_folder(base)
     for half in halves:
         for suffix, text in zip(('csv', 'yaml', 'sim'), half.texts()):
             if text is not None:

@@ -22,7 +22,7 @@ import shutil
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
-from adxl_ros.workers import for_each, make_folder, Pool, write
+from adxl_ros.workers import for_each, Pool, write
 from adxl_ros_validation.blind import ideal_observer, motion, simulator
 from adxl_ros_validation.blind.faults import KINDS, KNOWN, UNLISTED
 from adxl_ros_validation.blind.ideal_observer import IdealObserver
@@ -269,13 +269,12 @@ def seal(folder: Path, seed: int | None, count: int, plan_all: Callable[[int, in
 def _draw(folder: Path, drawn: Path, setup: Setup, plans: list[Plan],
           make: Callable[[Plan], Drawn], pool: Pool, show: Callable[[float], None]) -> None:
     """Draw what is not drawn yet, then write all labels and publish their hash."""
-    write(make_folder(drawn) / 'setup', json.dumps(setup).encode())
-    recordings = make_folder(folder / 'recordings')
+    write(drawn / 'setup', json.dumps(setup).encode())
 
     def keep(label: Label, *texts: str | None) -> None:
         for suffix, text in zip(('csv', 'yaml', 'sim'), texts):
             if text is not None:
-                path = recordings / f'{label.name}.{suffix}'
+                path = folder / 'recordings' / f'{label.name}.{suffix}'
                 write(path, text.encode())
                 # The time of writing would show how long the label took to draw.
                 os.utime(path, (0, 0))
