@@ -83,7 +83,10 @@ def parser() -> argparse.ArgumentParser:
 
 def fleet(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
-    _check(options)
+    cli.check_least(options, jobs=1, retries=0, limit=1)
+    missing = [name for name in ('fsspec', 'pyarrow') if find_spec(name) is None]
+    if missing:
+        raise UserError(f'{PROG} needs {" and ".join(missing)}; {install_hint(*missing)}')
     begin_s = monotonic()
     selection = Selection(options.only_failed, options.since and since_text(options.since),
                           options.limit)
@@ -126,13 +129,6 @@ def _worked(options: argparse.Namespace, recipe: Recipe, results: Results, to_do
     cli.print_end([*_result_lines(rows, to_do, took_s), ''], files,
                   _command(options, True) if is_repeated else '', took_s)
     return 1 if rows and not any(row['outcome'] == 'done' for row in rows) else 0
-
-
-def _check(options: argparse.Namespace) -> None:
-    cli.check_least(options, jobs=1, retries=0, limit=1)
-    missing = [name for name in ('fsspec', 'pyarrow') if find_spec(name) is None]
-    if missing:
-        raise UserError(f'{PROG} needs {" and ".join(missing)}; {install_hint(*missing)}')
 
 
 def _warn_of_replaced(to_do: Plan, results: Results, tasks: Sequence[str]) -> None:
@@ -192,11 +188,10 @@ def _result_lines(rows: Sequence[Row], to_do: Plan, took_s: float) -> list[str]:
              + (f'; {to_do.done} had their row before' if to_do.done else ''), '']
     worked_s = sum(row['seconds'] or 0.0 for row in rows)
     statuses = Counter(row['status'] for row in rows if row['status'])
-    unsound = sum(row['is_sound'] is False for row in rows)
     figures = {
         'units': str(len({row['serial'] for row in rows if row['serial']})),
         'recorded': duration(sum(row['duration_s'] or 0.0 for row in rows)),
-        'not sound': str(unsound),
+        'not sound': str(sum(row['is_sound'] is False for row in rows)),
         'left out': _left_out(to_do),
         'verdicts': ', '.join(f'{count} {name}' for name, count in statuses.most_common()),
         'computed': f'{duration(worked_s)} of workers in {duration(took_s)}'}
