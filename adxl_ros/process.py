@@ -4,6 +4,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+import hashlib
 from importlib.metadata import PackageNotFoundError, version
 import os
 from pathlib import Path
@@ -21,6 +22,13 @@ def package_version() -> str:
         return version('adxl_ros')
     except PackageNotFoundError:
         return 'unknown'
+
+
+def code_version() -> str:
+    """Return the SHA-256 of version and code of this package."""
+    code = [path.name.encode() + path.read_bytes()
+            for path in sorted(Path(__file__).parent.rglob('*.py'))]
+    return hashlib.sha256(package_version().encode() + b''.join(code)).hexdigest()
 
 
 def use_one_thread() -> None:

@@ -19,7 +19,6 @@ import logging
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection
 from multiprocessing.pool import ExceptionWithTraceback  # type: ignore[attr-defined]
-from multiprocessing.process import BaseProcess
 import os
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -180,7 +179,7 @@ def _work(pipe: Connection, shared: tuple) -> None:
     files and its own processes. A worker ends with its parent, however that ended.
     """
     def end_with_parent() -> None:
-        cast(BaseProcess, parent_process()).join()
+        cast(Any, parent_process()).join()
         os.kill(os.getpid(), signal.SIGTERM)
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -341,20 +340,17 @@ def for_each(pool: Pool, work: Callable[..., Any], jobs: Iterable[Callable[[], t
 
 
 def write(path: Path, data: bytes) -> None:
-    """Write a file as a whole or not at all; several processes may write the same one at once."""
+    """
+    Write a file as a whole or not at all, in a folder that is made.
+
+    Several processes may write the same one at once.
+    """
     temporary = path.with_name(f'.{path.name}.{os.uname().nodename}.{os.getpid()}')
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         temporary.write_bytes(data)
         os.replace(temporary, path)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink()
         raise UserError(f'{path}: cannot be written: {error.strerror}') from None
-
-
-def make_folder(folder: Path) -> Path:
-    """Make a folder and return it."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f'{folder}: cannot be made: {error.strerror}') from None
-    return folder

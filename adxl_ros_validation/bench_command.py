@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, ExitStack, suppress
 import os
@@ -17,9 +18,8 @@ from typing import NamedTuple
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.nodes.jobs import cpu_time_s, executable, running, use_own_graph
-from adxl_ros.nodes.run_node import program_parser
 from adxl_ros.nodes.topics import Inbox
-from adxl_ros.process import ended_by_closed_output
+from adxl_ros.tools.command_line import argument_parser, check_least, run
 from adxl_ros_validation.bench_jobs import offline_jobs, print_table, spread
 import numpy as np
 import rclpy
@@ -272,28 +272,31 @@ _EXAMPLES = {'all measurements, ten minutes': '',
 """Examples of arguments, by their purpose."""
 
 
-@ended_by_closed_output()
-def main() -> int:
-    """Run the benchmark; return the exit status."""
-    parser = program_parser('bench', __doc__, _EXAMPLES)
-    parser.add_argument('--seconds', type=float, default=10.0,
-                        help='duration of each live measurement, s (default 10)')
-    parser.add_argument('--rounds', type=int, default=3,
-                        help='measurements of each row (default 3)')
-    parser.add_argument('--hours', type=float, default=8.0,
-                        help='duration of the recordings of the rows "apply, … h" (default 8: '
-                             '30 GB of disk)')
-    parser.add_argument('--live', action='store_true', help='measure only the live nodes')
-    parser.add_argument('--iiod', metavar='FILE', help="the tests' IIOD, for the link iio")
-    options = parser.parse_args()
+def parser() -> argparse.ArgumentParser:
+    """Describe the command line."""
+    parse = argument_parser('bench', __doc__, _EXAMPLES)
+    parse.add_argument('--seconds', type=float, default=10.0,
+                       help='duration of each live measurement, s (default 10)')
+    parse.add_argument('--rounds', type=int, default=3,
+                       help='measurements of each row (default 3)')
+    parse.add_argument('--hours', type=float, default=8.0,
+                       help='duration of the recordings of the rows "apply, … h" (default 8: '
+                            '30 GB of disk)')
+    parse.add_argument('--live', action='store_true', help='measure only the live nodes')
+    parse.add_argument('--iiod', metavar='FILE', help="the tests' IIOD, for the link iio")
+    return parse
+
+
+def bench(options: argparse.Namespace) -> int:
+    """Run the benchmark; see `parser`."""
+    check_least(options, seconds=0.1, rounds=1, hours=0.01)
     use_own_graph()
-    try:
-        measure_live(options.seconds, options.rounds, options.iiod)
-        if not options.live:
-            print_table(offline_jobs(options.hours), options.rounds)
-    except UserError as error:
-        print(f'bench: {error}', file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        return 130
+    measure_live(options.seconds, options.rounds, options.iiod)
+    if not options.live:
+        print_table(offline_jobs(options.hours), options.rounds)
     return 0
+
+
+def main() -> int:
+    """Run the tool on the command line."""
+    return run(parser(), bench)

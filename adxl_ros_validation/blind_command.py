@@ -7,10 +7,10 @@ import argparse
 import json
 from pathlib import Path
 
-from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.tools.command_line import (
     argument_parser,
+    check_least,
     command,
     make_folder,
     note,
@@ -20,7 +20,7 @@ from adxl_ros.tools.command_line import (
     run,
 )
 from adxl_ros.workers import open_pool
-from adxl_ros_validation.blind import check, real_sensors, report_html, trials
+from adxl_ros_validation.blind import diagnosis_runs, real_sensors, report_html, trials
 
 PROG = 'blind'
 """Name of the command, for messages."""
@@ -58,10 +58,7 @@ def parser() -> argparse.ArgumentParser:
 
 def blind(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
-    for name, least in (('trials', 1), ('jobs', 1), ('seed', 0)):
-        value = getattr(options, name)
-        if value is not None and value < least:
-            raise UserError(f'--{name} {value}: must be at least {least}')
+    check_least(options, trials=1, jobs=1, seed=0)
     folder = Path(options.output or options.seal or options.open)
     try:
         return _check(options, folder)
@@ -81,8 +78,8 @@ def _check(options: argparse.Namespace, folder: Path) -> int:
                                            options.trials, pool, progress)
             else:
                 with progress('draw') as show:
-                    digest = check.seal(folder, options.seed, options.trials, trials.plans,
-                                        trials.draw_trial, pool, show)
+                    digest = trials.seal(folder, options.seed, options.trials, trials.plans,
+                                         trials.draw_trial, pool, show)
             print(f'SHA-256 of salt and labels: {digest}', flush=True)
         if options.seal:
             print_end([], [folder], command(PROG, f'--open {quoted(folder)}'))
@@ -94,7 +91,7 @@ def _check(options: argparse.Namespace, folder: Path) -> int:
             page = report_html.tables_as_page('Blind check on real sensors', said, tables)
             screen = report_html.terminal_table(tables['Result'])
         else:
-            made = check.score(folder, pool, progress)
+            made = diagnosis_runs.score(folder, pool, progress)
             markdown, page = report_html.markdown(made), report_html.page(made)
             screen = report_html.summary(made).splitlines()
     write_text(folder / 'blind.json', json.dumps(made, indent=1, allow_nan=False) + '\n')

@@ -9,11 +9,9 @@ uniform (Talts et al. 2018, arXiv:1804.06788). 90 % intervals must contain it in
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
-import os
 
 from adxl_ros.calibrate.fits import full_model, term_selection
 from adxl_ros.calibrate.fits.linearisation import StageError
@@ -26,7 +24,6 @@ from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros_validation import experiments
 from adxl_ros_validation.blind.report_html import markdown_table
-from adxl_ros_validation.reproduction_report import mean_with_interval
 import numpy as np
 import scipy
 
@@ -69,12 +66,8 @@ def draw_all(nominal: Sensor, draws: int, seed: int, show: Callable[[float], Non
              ) -> list[Draw]:
     """Draw and fit units on all kinds of stage, over the cores."""
     kinds = list(product(STAGES, AXES, pose_plan.KINDS))
-    finished = []
-    with ProcessPoolExecutor(os.cpu_count()) as pool:
-        for result in pool.map(partial(draw, nominal, kinds=kinds, seed=seed), range(draws)):
-            finished.append(result)
-            show(len(finished) / draws)
-    return finished
+    return experiments.in_parallel(partial(draw, nominal, kinds=kinds, seed=seed), show,
+                                   range(draws))
 
 
 def draw(nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], seed: int) -> Draw:
@@ -188,6 +181,15 @@ def screen_lines(draws: Sequence[Draw]) -> list[str]:
         share, low, high = _coverage(z_of_draws)
         lines.append(f' {label:28}{100 * share:15.1f} %   ({100 * low:.1f} to {100 * high:.1f})')
     return lines
+
+
+def mean_with_interval(parts: Sequence[tuple[float, int]]) -> tuple[float, float, float]:
+    """Return the mean of sums over counts, and its 90 % interval by bootstrap over the parts."""
+    sums = np.array(parts, float)
+    drawn = sums[np.random.default_rng(0).integers(0, len(sums), (1000, len(sums)))].sum(axis=1)
+    total = sums.sum(axis=0)
+    low, high = np.quantile(drawn[:, 0] / drawn[:, 1], [0.05, 0.95])
+    return float(total[0] / total[1]), float(low), float(high)
 
 
 def _coverage(parts: Sequence[np.ndarray]) -> tuple[float, float, float]:

@@ -8,7 +8,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 import os
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from adxl_ros.calibrate import pose_extraction
 from adxl_ros.calibrate.fits import full_model, linear, term_selection
@@ -376,11 +376,18 @@ def evaluate(nominal: Sensor, stage: Stage, seed: int) -> Unit:
 def evaluate_all(nominal: Sensor, units: int, seed: int, show: Callable[[float], None]
                  ) -> dict[str, list[Unit]]:
     """Evaluate several units on each stage, in parallel."""
-    results: dict[str, list[Unit]] = {name: [] for name in STAGES}
+    seeds = [*range(1000 * seed, 1000 * seed + units)]
+    stages = [stage for stage in STAGES.values() for _ in seeds]
+    found = in_parallel(partial(evaluate, nominal), show, stages, seeds * len(STAGES))
+    return {name: found[i * units:(i + 1) * units] for i, name in enumerate(STAGES)}
+
+
+def in_parallel(work: Callable[..., Any], show: Callable[[float], None], *arguments: Sequence[Any]
+                ) -> list[Any]:
+    """Return the results of a function for sequences of its arguments, over the cores."""
+    results = []
     with ProcessPoolExecutor(os.cpu_count()) as pool:
-        for i, (name, stage) in enumerate(STAGES.items()):
-            seeds = range(1000 * seed, 1000 * seed + units)
-            for unit in pool.map(partial(evaluate, nominal, stage), seeds):
-                results[name].append(unit)
-                show((i + len(results[name]) / units) / len(STAGES))
+        for result in pool.map(work, *arguments):
+            results.append(result)
+            show(len(results) / len(arguments[0]))
     return results

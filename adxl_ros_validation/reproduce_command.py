@@ -4,32 +4,29 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import date
+import os
 from pathlib import Path
-from typing import NamedTuple
+import textwrap
+from typing import Any
 
 from adxl_ros.calibrate import calibration, pose_extraction
 from adxl_ros.calibrate.report import acceptance, page as unit_page
 from adxl_ros.errors import UserError
-from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files import parameter_file
+from adxl_ros.files.atomic_write import write_bytes, write_text
 from adxl_ros.files.recording_columns import recorded_unit
+from adxl_ros.model import signal_chain
+from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import package_version
-from adxl_ros.tools.command_line import (
-    argument_parser,
-    command,
-    make_folder,
-    print_end,
-    progress,
-    quoted,
-    report_reading,
-    run,
-)
-from adxl_ros_validation import coverage, experiments, reproduction_report as report
-from adxl_ros_validation.reproduction_report import FIGURES
+from adxl_ros.report.figures import png, pyplot
+from adxl_ros.tools import command_line as cli
+from adxl_ros_validation import coverage, experiments
+from adxl_ros_validation.blind.report_html import markdown_table
+from adxl_ros_validation.experiments import DirectionSearch, ModelErrors, MODELS, RUNS, Unit
 import numpy as np
 
 _EXAMPLES = {
@@ -41,7 +38,7 @@ _EXAMPLES = {
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = argument_parser('reproduce', __doc__, _EXAMPLES)
+    parse = cli.argument_parser('reproduce', __doc__, _EXAMPLES)
     parse.add_argument('recording', nargs='*',
                        help='sweeps of one unit; without any, units are simulated')
     parse.add_argument('--params', metavar='FILE', default=None,
@@ -59,90 +56,339 @@ def parser() -> argparse.ArgumentParser:
 
 def reproduce(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
-    for name, least in (('draws', 0), ('seed', 0), ('units', 0 if options.draws else 1)):
-        if getattr(options, name) < least:
-            raise UserError(f'--{name} {getattr(options, name)}: must be at least {least}')
+    cli.check_least(options, draws=0, seed=0, units=0 if options.draws else 1)
     sensor = parameter_file.load(options.params or parameter_file.nominal_path())
     folder = Path(options.output)
-    make_folder(folder / FIGURES)
-    made = _of_recordings(sensor, options.recording, folder) if options.recording \
+    page, screen = _of_recordings(sensor, options.recording, folder) if options.recording \
         else _simulated(sensor, options, folder)
-    write_text(folder / 'reproduction.md', made.page)
-    print_end([*made.screen, ''], [folder / 'reproduction.md', folder / FIGURES],
-              command('reproduce', f'--draws 300 --units 0 -o {quoted(f"{folder}_coverage")}')
-              if not options.draws else '')
+    cli.make_folder(folder)
+    write_text(folder / 'reproduction.md', page)
+    further = cli.quoted(f'{folder}_coverage')
+    cli.print_end([*screen, ''], [folder / 'reproduction.md', folder / FIGURES], '' if
+                  options.draws else cli.command('reproduce',
+                                                 f'--draws 300 --units 0 -o {further}'))
     return 0
 
 
-class _Reproduction(NamedTuple):
-    """What a reproduction shows."""
-
-    page: str  # the page, Markdown
-    screen: list[str]  # the most important of it as lines for a terminal
+_Reproduction = tuple[str, list[str]]
+"""The page, Markdown, and the most important of it as lines for a terminal."""
 
 
 def _of_recordings(sensor: Sensor, paths: Sequence[str], folder: Path) -> _Reproduction:
     """Calibrate from recordings."""
     unit, recordings = sensor, []
     for path in paths:
-        read = recording.read(path)
-        report_reading('reproduce', read)
+        read = cli.read('reproduce', path)
         unit = recorded_unit(unit, read)
         recordings.append(calibration.RecordedPoses(
             Path(path).name, pose_extraction.extract_poses(read, unit)))
     result = calibration.calibrate(unit, recordings, 'full')
+    cli.make_folder(folder / FIGURES)
     unit_page.draw(folder / FIGURES / 'sweep.png', result)
     lines = '\n'.join(result.comments())
-    paper = (f'The paper: alpha {report.in_words("alpha")}; '
-             f'beta {report.in_words("beta")}.')
+    paper = f'The paper: alpha {in_words("alpha")}; beta {in_words("beta")}.'
     page = (f"# The paper's calibration of {', '.join(paths)}\n\n```\n{lines}\n```\n\n{paper}\n\n"
             f'## Figures\n\n![Figures 2 to 8]({FIGURES}/sweep.png)\n')
-    return _Reproduction(page, [*acceptance.error_table(result.held_out), f' {paper}'])
+    return page, [*acceptance.error_table(result.held_out), f' {paper}']
 
 
-def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path
-               ) -> _Reproduction:
+def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> _Reproduction:
     """Repeat the experiments on simulated units and draw the figures."""
     if not sensor.axes.startswith('xy'):
         raise UserError(f'the paper has a sensor of the axes x and y, not {sensor.axes}')
-    intervals = _coverage(sensor, options) if options.draws else _Reproduction('', [])
+    coverage_page, coverage_lines = _coverage(sensor, options) if options.draws else ('', [])
     if not options.units:
-        return intervals
-    with progress('reproduce') as show:
+        return coverage_page, coverage_lines
+    with cli.progress('reproduce') as show:
         results = experiments.evaluate_all(sensor, options.units, options.seed, show)
     first = 1000 * options.seed
     truth = experiments.draw(sensor, experiments.STAGES['paper'],
                              np.random.default_rng([first, 0]))
     unit = experiments.calibrated(truth, first)
     pictures = folder / FIGURES
+    cli.make_folder(pictures)
     unit_page.draw_sweep(pictures / 'sweep.png', experiments.bare(truth),
                          unit.fitted['physical'], unit.poses)
-    report.draw_misalignment(pictures / 'misalignment.png', results['paper'][0].directions)
-    report.draw_tilt(pictures / 'tilt.png', results['paper'][0])
-    report.draw_motion(pictures / 'motion.png', unit.fitted, experiments.shaken(truth, first))
-    report.draw_components(pictures / 'components.png', truth, unit.fitted['physical'],
-                           unit.fitted['linear'])
+    draw_misalignment(pictures / 'misalignment.png', results['paper'][0].directions)
+    draw_tilt(pictures / 'tilt.png', results['paper'][0])
+    draw_motion(pictures / 'motion.png', unit.fitted, experiments.shaken(truth, first))
+    draw_components(pictures / 'components.png', truth, unit.fitted['physical'],
+                    unit.fitted['linear'])
     drawn = 'one unit' if sensor.effects else f'{options.units} units'
     made = (f'adxl_ros {package_version()}, {date.today()}, {drawn} on each stage, '
             f'seed {options.seed}.')
     bound_mmps2 = experiments.motion_bound_mmps2(sensor)
-    page = report.page(results, bound_mmps2, made, intervals.page)
-    screen = [f"The paper's experiments, {drawn} on each stage, seed {options.seed}", '',
-              *report.screen_lines(results, bound_mmps2)]
-    return _Reproduction(report.wrap_prose(page),
-                         screen + (['', *intervals.screen] if intervals.screen else []))
+    return wrap_prose(_page(results, bound_mmps2, made, coverage_page)), [
+        f"The paper's experiments, {drawn} on each stage, seed {options.seed}", '',
+        *screen_lines(results, bound_mmps2), *[''] * bool(coverage_lines), *coverage_lines]
 
 
 def _coverage(sensor: Sensor, options: argparse.Namespace) -> _Reproduction:
     """Count how often the intervals hold the truth."""
-    with progress('coverage') as show:
+    with cli.progress('coverage') as show:
         draws = coverage.draw_all(replace(sensor, effects=(), values={}), options.draws,
                                   options.seed, show)
     page = coverage.page(draws, f'adxl_ros {package_version()}, {date.today()}, seed '
                                 f'{options.seed}; `make coverage`.')
-    return _Reproduction(report.wrap_prose(page), coverage.screen_lines(draws))
+    return wrap_prose(page), coverage.screen_lines(draws)
+
+
+_COLOURS = {'linear': 'tab:red', 'physical': 'tab:orange', 'full': 'tab:green'}
+_SHOWN_S = (2.0, 2.5)
+"""Interval of figure 12, s; chosen."""
+
+
+def draw_misalignment(path: str | os.PathLike, search: DirectionSearch) -> None:
+    """Draw the search for β_x of (18) and the results of its three methods, as figure 9."""
+    figure, axis = pyplot().subplots(figsize=(7, 4.5), layout='constrained')
+    turned = np.degrees(search.turned_rad)
+    axis.plot(turned, 1e3 * (search.output_g - search.output_g.max()), 'o', ms=4,
+              label='output, means of 5 s')
+    for value, colour, label in (
+            (search.truth_rad, 'k', 'truth'), (search.largest_rad, 'tab:red', 'largest output'),
+            (search.parabola_rad, 'tab:orange', 'parabola through the outputs'),
+            (search.null_rad, 'tab:green', 'null crossings at ±90°')):
+        axis.axvline(-np.degrees(value), color=colour, lw=1,
+                     label=f'{label}: {-np.degrees(value):+.2f}°')
+    axis.set(xlabel='beta of the stage, °', ylabel='x output minus its largest, mg',
+             title='Direction of the x axis (18): the maximum is flat')
+    axis.legend(fontsize=8)
+    write_bytes(path, png(figure))
+
+
+def draw_tilt(path: str | os.PathLike, unit: Unit) -> None:
+    """Draw figure 10: errors of alpha and beta in the three tilt experiments."""
+    figure, grid = pyplot().subplots(2, 3, figsize=(16, 8), layout='constrained', sharex=True)
+    for column, (run, asked_deg) in enumerate(RUNS.items()):
+        turned = asked_deg[:, 1 if run == 'beta' else 0]
+        for row, angle in enumerate(('alpha', 'beta')):
+            axis = grid[row, column]
+            for name, errors in unit.models.items():
+                angles = errors.runs[run]
+                counts = angles.determined[:, row]
+                error = np.where(counts, np.degrees(angles.error[:, row]), np.nan)
+                axis.plot(turned, error, 'o-', ms=4, lw=1, color=_COLOURS[name], label=name)
+            bound = np.where(counts, np.degrees(angles.bound[:, row]), np.nan)
+            axis.fill_between(turned, -Z_90 * bound, Z_90 * bound, color='0.8',
+                              label='90 % by the bound')
+            axis.axhline(0, color='0.5', lw=0.8)
+            axis.set_yscale('symlog', linthresh=0.1)
+            axis.set(ylabel=f'error of {angle}, °',
+                     title=f'fig. 10 ({"abc"[column]}): {run} turned' if not row else '')
+        grid[1, column].set(xlabel='turned angle, °')
+    grid[0, 0].legend(fontsize=8)
+    figure.suptitle('Tilt; gaps are poses whose bound exceeds 1° '
+                    '(linear scale within ±0.1°, logarithmic beyond)')
+    write_bytes(path, png(figure))
+
+
+def draw_motion(path: str | os.PathLike, fitted: dict[str, Sensor],
+                shaken: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
+    """
+    Draw figure 12: the acceleration of the shaken sensor and of the interferometer.
+
+    shaken: stamps, s, (n,); volts, (n, m); acceleration along x, m/s², (n,).
+    """
+    figure, row = pyplot().subplots(1, len(fitted), figsize=(16, 4.5), layout='constrained',
+                                    sharey=True)
+    time_s = shaken[0]
+    part = (time_s >= _SHOWN_S[0]) & (time_s <= _SHOWN_S[1])
+    for axis, (name, unit) in zip(row, fitted.items()):
+        (rmse, offset), estimate, reference = experiments.motion_errors(unit, *shaken)
+        axis.plot(time_s[part], 1e3 * reference[part], ':', color='k', label='interferometer')
+        axis.plot(time_s[part], 1e3 * estimate[part], color=_COLOURS[name], label=name)
+        axis.set(xlabel='time, s', title=f'fig. 12, {name}: rmse {rmse:.1f} mm/s² '
+                                         f'about an offset of {offset:.1f}')
+        axis.legend(fontsize=8, loc='upper right')
+    row[0].set(ylabel='acceleration along x, mm/s²')
+    write_bytes(path, png(figure))
+
+
+def draw_components(path: str | os.PathLike, truth: Sensor, fitted: Sensor,
+                    linear: Sensor) -> None:
+    """Draw figure 13: what each part of the model does to the response at alpha 45°, beta 90°."""
+    reach = np.linspace(-0.4, 0.4, 81)
+    pose = [reach * G0_MPS2, np.full(81, -np.sqrt(0.5) * truth.local_gravity_mps2),
+            np.full(81, np.sqrt(0.5) * truth.local_gravity_mps2)]
+    bias = ('bias', 'scale_factor', 'cross_axis', 'cross_axis_z')
+    steps = (('linear model', linear, linear.effects), ('+ bias (10 to 13)', fitted, bias),
+             ('+ scale factor (15)', fitted, (*bias, 'scale_factor_z')),
+             ('+ misalignment (18)', fitted, fitted.effects),
+             ('actual response', truth, truth.effects))
+    actual = signal_chain.static_response(truth)(pose)[0]
+    figure, (response, difference) = pyplot().subplots(1, 2, figsize=(14, 5), layout='constrained')
+    for label, unit, effects in steps:
+        part = replace(unit, effects=effects, values={e: unit.values[e] for e in effects})
+        volts = signal_chain.static_response(part)(pose)[0]
+        style: dict[str, Any] = {'color': 'k', 'ls': ':'} if unit is truth else {}
+        response.plot(reach, volts, label=label, **style)
+        difference.plot(reach, 1e3 * (volts - actual), label=label, **style)
+    response.set(xlabel='acceleration along x, g', ylabel='x output, V',
+                 title='fig. 13: response at alpha = 45°, beta = 90°')
+    difference.set(xlabel='acceleration along x, g', ylabel='minus the actual response, mV',
+                   title='the same, minus the actual response')
+    response.legend(fontsize=8)
+    write_bytes(path, png(figure))
+
+
+TABLE_I = {('alpha', 'linear'): (2.88, 3.95), ('alpha', 'physical'): (0.32, 0.82),
+           ('beta', 'linear'): (1.64, 2.36), ('beta', 'physical'): (0.60, 0.82)}
+"""The paper's rms and largest error, deg."""
+MOTION_MMPS2 = {'linear': 299.8, 'physical': 20.8}
+"""The paper's residuals of the motion experiment, mm/s²."""
+_STAGE_NAMES = {'perfect': 'perfect stage', 'paper': "the paper's stage"}
+_STAGE_TITLES = {
+    'perfect': 'Perfect stage',
+    'paper': "The paper's stage (5 arcmin, a new error with each move of a joint, level 0.1°)"}
+_FIGURE_TITLES = {
+    'sweep': 'Figures 2 to 8: deviation from the linear model, and the physical model',
+    'misalignment': 'Figure 9: the direction of the x axis', 'tilt': 'Figure 10: errors of tilt',
+    'motion': 'Figure 12: motion', 'components': 'Figure 13: what each part of the model does'}
+FIGURES = 'reproduction'
+"""Folder of the plots, in the folder of the page."""
+
+
+def _page(results: dict[str, list[Unit]], bound_mmps2: float, made: str, intervals: str) -> str:
+    """Lay out the page, Markdown."""
+    parts = ["# The paper's experiments, on simulated units", made,
+             'W. T. Ang, P. K. Khosla, C. N. Riviere, "Nonlinear Regression Model of a Low-g MEMS '
+             'Accelerometer", IEEE Sensors Journal, 2007, doi 10.1109/JSEN.2006.886995. In '
+             'brackets: 90 % intervals over units, by bootstrap.']
+    for stage, units in results.items():
+        parts += [f'## {_STAGE_TITLES[stage]}', _tilt(units), _to_reach(units),
+                  _motion(units, bound_mmps2)]
+    parts += [intervals, '## Direction of the x axis by (18)', _directions(results['paper']),
+              '## Figures',
+              *(f'![{title}]({FIGURES}/{name}.png)' for name, title in _FIGURE_TITLES.items()),
+              '## What differs from the paper, and why', 'See docs/maintain/reproduction.md.']
+    return '\n\n'.join(part.strip('\n') for part in parts if part) + '\n'
+
+
+def screen_lines(results: dict[str, list[Unit]], bound_mmps2: float) -> list[str]:
+    """Return Table I and the motion experiment as lines for a terminal."""
+    rows: list[tuple[str, str, list[float]]] = []
+    for stage, units in results.items():
+        for row, angle in enumerate(('alpha', 'beta')):
+            paper = ' / '.join(f'{rms:.2f}' for (a, _), (rms, _) in TABLE_I.items() if a == angle)
+            errors = [*(_errors(units, name, row) for name in MODELS), _bounds(units, row)]
+            rows.append((f'{_STAGE_NAMES[stage]}, {angle}', paper,
+                         [np.degrees(_rms(e)) for e in errors]))
+    paper = ' / '.join(f'{value:.1f}' for value in MOTION_MMPS2.values())
+    for stage, units in results.items():
+        both = [_rms(np.hypot(*_motion_errors(units, name))) for name in MODELS]
+        rows.append((f'{_STAGE_NAMES[stage]}, motion', paper, [*both, bound_mmps2]))
+    return [f' {"Table I, rms error of":28}{"paper":>15}'
+            + ''.join(f'{name:>9}' for name in MODELS) + f'{"bound":>8}',
+            *(f' {label:28}{paper:>15}' + ''.join(
+                f'{value:9.3g}' for value in values[:-1]) + f'{values[-1]:8.3g}'
+              for label, paper, values in rows),
+            ' tilt in °, motion in mm/s²; paper: linear / physical; bound: Cramér-Rao,',
+            ' or the noise floor']
+
+
+def in_words(angle: str) -> str:
+    """Return the paper's rms and largest error of an angle by model."""
+    return ', '.join(f'{name} {rms} / {largest}°' for (a, name), (rms, largest)
+                     in TABLE_I.items() if a == angle)
+
+
+def _errors(units: Sequence[Unit], model: str, row: int, what: str = 'error') -> np.ndarray:
+    """Return the errors of alpha (0) or beta (1) that count, of all units and runs."""
+    return np.concatenate([getattr(a, what)[a.determined[:, row], row] for unit in units
+                           for a in unit.models[model].runs.values()])
+
+
+def _bounds(units: Sequence[Unit], row: int) -> np.ndarray:
+    return _errors(units, 'full', row, 'bound')
+
+
+def _motion_errors(units: Sequence[Unit], model: str) -> np.ndarray:
+    """Return rms and mean of the residual of each unit in motion, mm/s², (2, units)."""
+    return np.array([unit.models[model].motion for unit in units]).T
+
+
+def _tilt(units: Sequence[Unit]) -> str:
+    rows = []
+    for row, angle in enumerate(('alpha', 'beta')):
+        errors = [np.degrees(_errors(units, name, row)) for name in MODELS]
+        rows.append([angle, in_words(angle),
+                     *(f'{_rms(e):.3f} / {np.abs(e).max():.3f}' for e in errors),
+                     f'{np.degrees(_rms(_bounds(units, row))):.4f}'])
+    return ('Table I: rms / largest error of tilt, °, over the three runs of figure 10; poses '
+            'whose bound exceeds 1° do not count.\n\n'
+            + markdown_table(['', 'paper', *MODELS, 'Cramér-Rao bound, rms'], rows))
+
+
+def _to_reach(units: Sequence[Unit]) -> str:
+    def over(function: Callable[[ModelErrors], np.ndarray]) -> list[list[np.ndarray]]:
+        return [[function(unit.models[name]) for unit in units] for name in MODELS]
+
+    def flat(errors: ModelErrors) -> np.ndarray:
+        return np.concatenate([a.error[a.determined[:, 0] & ~a.near_vertical, 0]
+                               for a in errors.all_angles()])
+
+    def ratio(pose_only: bool) -> Callable[[ModelErrors], np.ndarray]:
+        return lambda errors: np.concatenate([a.ratio(pose_only) for a in errors.all_angles()])
+
+    rows = [[f'tilt error ÷ bound {text}, rms', *map(_interval, over(ratio(pose_only)))]
+            for pose_only, text in ((True, 'of the noise of one pose'),
+                                    (False, 'of pose and calibration'))]
+    before, *after = (_rms(np.concatenate(parts)) for parts in over(flat))
+    rows.append(['reduction of the rms error of alpha, 15° and more from ±90°, %', '–',
+                 *(f'{100 * (1 - rms / before):.2f}' for rms in after)])
+    for text, z_of in (('acceleration', lambda errors: np.ravel(errors.force_z)),
+                       ('coefficients', lambda errors: errors.coefficient_z)):
+        zs = [np.concatenate(parts) for parts in over(z_of)]
+        rows.append([f'coverage of 90 % intervals, {text}, %', *(
+            f'{100 * np.mean(np.abs(z) < Z_90):.1f} (of {len(z)})' if len(z) else '–'
+            for z in zs)])
+    determined = np.concatenate([a.determined[:, 0] for unit in units
+                                 for a in unit.models['full'].all_angles()])
+    return (markdown_table(['random poses and the three runs, none fitted', *MODELS], rows)
+            + f'\n\nOf {len(determined)} poses {np.sum(~determined)} determine alpha worse than '
+              '1° and do not count.')
+
+
+def _motion(units: Sequence[Unit], bound_mmps2: float) -> str:
+    errors = [_motion_errors(units, name) for name in MODELS]
+    paper = ', '.join(f'{name} {value}' for name, value in MOTION_MMPS2.items())
+    bound = f'{bound_mmps2:.2f}'
+    return markdown_table(['motion, mm/s²', 'paper', *MODELS, 'bound'], [
+        ['rmse about the offset', '–', *(_interval(rmse[:, None]) for rmse, _ in errors), bound],
+        ["offset, rms, the stage's part included", '–',
+         *(f'{_rms(offset):.1f}' for _, offset in errors), '–'],
+        ['both together', paper, *(f'{_rms(np.hypot(*both)):.1f}' for both in errors), bound]])
+
+
+def _directions(units: Sequence[Unit]) -> str:
+    step = np.degrees(experiments.SEARCH_RAD[1] - experiments.SEARCH_RAD[0])
+    errors = [np.array([getattr(unit.directions, name) - unit.directions.truth_rad
+                        for unit in units])
+              for name in ('largest_rad', 'parabola_rad', 'null_rad')]
+    return (f'Error of β_x, ° rms over units, base level to 0.1° (steps of {step:g}°):\n\n'
+            + markdown_table(['largest output', 'parabola through the outputs', 'null crossings'],
+                             [[f'{np.degrees(_rms(error)):.3f}' for error in errors]]))
+
+
+def _interval(parts: Sequence[np.ndarray] | np.ndarray) -> str:
+    """Write the rms over all with its 90 % interval by bootstrap over units."""
+    squares = [(float(np.sum(part ** 2)), len(part)) for part in parts]
+    mean, low, high = np.sqrt(coverage.mean_with_interval(squares))
+    return f'{mean:.3f} ({low:.3f} to {high:.3f})'
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values ** 2)))
+
+
+def wrap_prose(markdown: str) -> str:
+    """Wrap the lines of prose of a Markdown page; tables, headings and lists stay as they are."""
+    return '\n'.join(
+        line if line.startswith(('|', '#', '!', '-', ' ', '`'))
+        else textwrap.fill(line, 99, break_on_hyphens=False, break_long_words=False)
+        for line in markdown.split('\n'))
 
 
 def main() -> int:
     """Run the tool on the command line."""
-    return run(parser(), reproduce)
+    return cli.run(parser(), reproduce)

@@ -20,15 +20,20 @@ from pathlib import Path
 import sys
 from typing import Any, NamedTuple
 
-from adxl_ros.errors import UserError
-from adxl_ros.tools.command_line import argument_parser, run
-from adxl_ros.workers import for_each, make_folder, open_pool, write
+from adxl_ros.tools.command_line import argument_parser, check_least, run
+from adxl_ros.workers import for_each, open_pool, write
 from adxl_ros_validation import working_world as world
-from adxl_ros_validation.blind import diagnosis_runs, grading, scores, trials
+from adxl_ros_validation.blind import (
+    diagnosis_runs,
+    grading,
+    ideal_observer,
+    scores,
+    simulator,
+    trials,
+)
 from adxl_ros_validation.blind.grading import Answer
+from adxl_ros_validation.blind.simulator import Fault, G0, Scene
 from adxl_ros_validation.blind.trials import Label
-from adxl_ros_validation.blind.world import ideal_observer, simulator
-from adxl_ros_validation.blind.world.simulator import Fault, G0, Scene
 import numpy as np
 
 GROUPS = ('null', 'single', 'pair', 'outside')
@@ -147,7 +152,7 @@ class Row(NamedTuple):
 def diagnosed(seed: int, number: int, only: str | None, folder: Path) -> tuple[Row]:
     """Draw a case, keep its files, diagnose it and measure the harm."""
     case = draw(seed, number, only)
-    place = make_folder(folder / case.label.name)
+    place = folder / case.label.name
     for suffix, text in (('csv', case.recording), ('yaml', case.parameters),
                          ('json', json.dumps(asdict(case.label), indent=1))):
         write(place / f'{case.label.name}.{suffix}', text.encode())
@@ -238,9 +243,8 @@ def parser() -> argparse.ArgumentParser:
 
 def working(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
-    if min(options.count, options.jobs) < 1 or min(options.first, options.seed) < 0:
-        raise UserError('--count and --jobs must be at least 1, --first and --seed at least 0')
-    folder, rows = make_folder(Path(options.output)), []
+    check_least(options, count=1, jobs=1, first=0, seed=0)
+    folder, rows = Path(options.output), []
     numbers = range(options.first, options.first + options.count)
 
     def keep(row: Row) -> None:

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 import math
 
-from adxl_ros_validation.blind.world import faults, ideal_observer, simulator as sim
-from adxl_ros_validation.blind.world.motion import low_pass, Manoeuvre
-from adxl_ros_validation.blind.world.simulator import Fault, G0, Place, Run, Scene, Shape, Unit
+from adxl_ros_validation.blind import faults, ideal_observer, simulator as sim
+from adxl_ros_validation.blind.motion import low_pass, Manoeuvre
+from adxl_ros_validation.blind.simulator import Fault, G0, Place, Run, Scene, Shape, Unit
 import numpy as np
 import scipy
 

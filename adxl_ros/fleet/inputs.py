@@ -18,7 +18,7 @@ import hashlib
 import os
 from pathlib import Path, PurePosixPath
 import re
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import urlsplit
 
 from adxl_ros.errors import install_hint, one_line, UserError
@@ -85,11 +85,8 @@ class Source:
 
 def file_system(url: str, secret: str = '') -> tuple[Any, str]:
     """Return the file system of a URL, and the path in it."""
-    try:
-        from fsspec.core import url_to_fs
-        from fsspec.implementations.local import LocalFileSystem
-    except ImportError:
-        raise UserError(f'fleet needs fsspec; {install_hint("adxl_ros[fleet]")}') from None
+    from fsspec.core import url_to_fs
+    from fsspec.implementations.local import LocalFileSystem
     address = secret if _is_web(secret) else url
     # A path of this machine may have two colons, which join addresses.
     if '://' not in address or address.startswith('file://'):
@@ -107,7 +104,10 @@ def file_system(url: str, secret: str = '') -> tuple[Any, str]:
             options = {'password': secret}
         return url_to_fs(address, **options)
     except (ImportError, ValueError) as error:
-        raise UserError(without_secrets(f'{url}: {one_line(error)}')) from None
+        # fsspec itself says what to install.
+        name = getattr(error, 'name', None)
+        hint = f'; {install_hint(name)}' if name else ''
+        raise UserError(without_secrets(f'{url}: {one_line(error)}{hint}')) from None
     except Exception as error:
         raise Unreachable(
             without_secrets(f'{url}: cannot be opened: {one_line(error)}')) from None
@@ -407,38 +407,35 @@ def is_manifest(path: Path) -> bool:
         return True
 
 
-class Stated(NamedTuple):
-    """What a recording states of itself at its begin; empty for nothing."""
+def stated_by(sources: Iterable[Source]) -> list[tuple[str, str]]:
+    """
+    Return what recordings state at their begin, as far as it takes a few bytes to see.
 
-    serial: str = ''  # Serial number of its unit
-    date: str = ''  # Its begin, ISO 8601, UTC
-
-
-def stated_by(sources: Iterable[Source]) -> list[Stated]:
-    """Return what recordings state at their begin, as far as it takes a few bytes to see."""
+    It is the serial number of the unit, and the date, ISO 8601 in UTC; empty for nothing.
+    """
     with ThreadPoolExecutor(_THREADS) as pool:
         return list(pool.map(_stated, sources))
 
 
-def _stated(source: Source) -> Stated:
+def _stated(source: Source) -> tuple[str, str]:
     """Return what a recording states: one of this machine, or a CSV file in its comments."""
+    serial, date = '', ''
     if source.fault:
         # A pipe would be waited for.
-        return Stated()
+        return serial, date
     try:
         fs, path = file_system(source.url, source.secret)
-        stated = Stated()
         if path.lower().endswith('.csv'):
             head = fs.cat_file(path, 0, _HEAD_BYTES).decode('utf-8', 'replace')
             texts = dict(_COMMENT.findall(head))
-            stated = Stated(texts.get('serial', ''), as_date(texts.get('date', '')))
-        if not all(stated) and '://' not in source.url:
+            serial, date = texts.get('serial', ''), as_date(texts.get('date', ''))
+        if not (serial and date) and '://' not in source.url:
             first = next(recording.blocks(path, 1))
-            stated = Stated(first.stream_info.texts.get('serial', ''), begin_of(first)[0])
-        return stated
+            serial, date = first.stream_info.texts.get('serial', ''), begin_of(first)[0]
     except Exception:
         # Whatever it is, the task of this recording reports it.
-        return Stated()
+        serial, date = '', ''
+    return serial, date
 
 
 def begin_of(first: Recording) -> tuple[str, str]:

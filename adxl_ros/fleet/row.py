@@ -21,12 +21,12 @@ from pathlib import Path
 import re
 from typing import Any, NamedTuple
 
+from adxl_ros import process
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
 from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.model.constants import AXES
-from adxl_ros.process import package_version
 import yaml
 
 Row = dict[str, Any]
@@ -312,9 +312,5 @@ def _stored_parameters(name: str, text: str) -> tuple[str, ParameterText] | None
 @lru_cache(maxsize=1)
 def code_version() -> str:
     """Return the SHA-256 of version and code of the package, and of its default sensors."""
-    root = Path(__file__).resolve().parents[1]
-    hashed = hashlib.sha256(package_version().encode())
-    for path in (*sorted(root.rglob('*.py')), parameter_file.nominal_path(),
-                 parameter_file.any_imu_path()):
-        hashed.update(path.name.encode() + path.read_bytes())
-    return hashed.hexdigest()
+    return sha256_of(process.code_version(), parameter_file.nominal_path().read_text('utf-8'),
+                     parameter_file.any_imu_path().read_text('utf-8'))

@@ -27,7 +27,7 @@ from adxl_ros.fleet.inputs import as_date, Source, stated_by
 from adxl_ros.fleet.row import arrow_schema, as_table, Recipe, Row, TABLE
 from adxl_ros.fleet.staging import StagingError
 from adxl_ros.fleet.task import make_row, refused, Result, TaskCrashed
-from adxl_ros.workers import Finished, finished_tasks, make_folder, Pool, write
+from adxl_ros.workers import Finished, finished_tasks, Pool, write
 
 _ROWS = 'rows'
 """Folder of the rows."""
@@ -53,7 +53,7 @@ cost of its tasks, by which a further run is estimated."""
 @contextmanager
 def only_client(folder: Path) -> Iterator[None]:
     """Lock a folder as long as the block, or this process, lasts; say who holds the lock."""
-    with open(make_folder(folder) / _LOCK, 'a+', encoding='utf-8') as file:
+    with open(folder / _LOCK, 'a+', encoding='utf-8') as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -109,13 +109,12 @@ class Results:
                'written': datetime.now(timezone.utc).isoformat()}
         if result.files:
             row['report'] = f'{_REPORTS}/{row["key"][:_NAME_DIGITS]}'
-            folder = make_folder(self.folder / row['report'])
             for file, data in result.files.items():
-                write(folder / file, data)
+                write(self.folder / row['report'] / file, data)
         of_url = hashlib.sha256(row['url'].encode()).hexdigest()[:_NAME_DIGITS]
         name = f'{row["key"]}-{of_url}.json'
         content = {'stamp': result.stamp, 'digest': result.digest, 'row': row}
-        write(make_folder(self.folder / _ROWS) / name,
+        write(self.folder / _ROWS / name,
               json.dumps(content, allow_nan=False, ensure_ascii=False).encode())
         self._add(name, content)
         return row
@@ -191,7 +190,7 @@ def _since(sources: Sequence[Source], since: str, results: Results) -> list[Sour
     # The server of an object states truly when it was written, which is after it began.
     unread = [source for source in sources if not (source.date or dates.get(source.url))
               and ('://' not in source.url or (source.modified or since) >= since)]
-    dates |= {source.url: stated.date for source, stated in zip(unread, stated_by(unread))}
+    dates |= {source.url: date for source, (_, date) in zip(unread, stated_by(unread))}
     return [source for source in sources
             if (source.date or dates.get(source.url) or source.modified or since) >= since]
 

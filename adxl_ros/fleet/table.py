@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import os
 from typing import NamedTuple
 
-from adxl_ros.errors import install_hint, UserError
+from adxl_ros.errors import UserError
 from adxl_ros.fleet.populations import (
     bad_batch,
     BadBatch,
@@ -100,11 +100,8 @@ class FleetTable:
 
 def read(path: str | os.PathLike) -> FleetTable:
     """Read the columns of a table that the page uses."""
-    try:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-    except ImportError:
-        raise UserError(f'{path}: Parquet needs pyarrow; {install_hint("pyarrow")}') from None
+    import pyarrow as pa
+    import pyarrow.parquet as pq
     numbers = [name for quantity in quantities(None)
                for name in (quantity.column, *quantity.error_columns)]
     try:

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file, recording
+from adxl_ros.files.csv_file import NoNumbers
 from adxl_ros.files.recording_columns import recorded_unit, Recording
 from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.fleet.inputs import begin_of, is_manifest, Source
@@ -109,6 +110,8 @@ def _in_folder(recipe: Recipe, source: Source, earlier: frozenset[str], folder: 
     try:
         first = next(recording.blocks(
             staged.path, 1, replace(recipe.reading, drop_bad_stamps=True)), None)
+    except NoNumbers as error:
+        fault = f'{one_line(error)}; a manifest needs a column url'
     except UserError as error:
         fault = one_line(error)
     recorded = first.stream_info.serial if first else NO_UNIT

@@ -167,19 +167,15 @@ def rank(assessment: Assessment, sensor: Sensor, manoeuvres: Sequence[PlannedMan
         next_experiment.Experiment(m.name, m.begin_s, m.motion), sensor, needed, dimensions)
         for m in manoeuvres]
     excited = {effect for response in responses for effect in response.effects}
-    complete = _with_unseen(assessment, excited - seen, len(excited | seen))
+    # Effects that the samples could not show keep their prior odds over no gap.
+    weights = {h.effects: h.probability for h in assessment.hypotheses}
+    unseen = weights.get((), 0.0) * (1 / max(len(excited | seen), 1))
+    for effect in sorted(excited - seen):
+        weights.setdefault((effect,), unseen)
+    complete = Assessment(normalised(weights), diagnosis)
     worth = next_experiment.rank_responses(responses, complete.hypotheses, model, dimensions)
     on_the_mean = {e.name for e in candidates()}
     return Ranking(complete, worth, tuple(sorted(on_the_mean - excited - seen)))
-
-
-def _with_unseen(assessment: Assessment, effects: set[str], library_size: int) -> Assessment:
-    """Add effects that the samples could not show; they keep their prior odds over no gap."""
-    weights = {h.effects: h.probability for h in assessment.hypotheses}
-    odds = 1 / max(library_size, 1)
-    for effect in sorted(effects):
-        weights.setdefault((effect,), weights.get((), 0.0) * odds)
-    return Assessment(normalised(weights), assessment.diagnosis)
 
 
 def decide(ranking: Ranking, question: Question, has_time: bool) -> Answer:
@@ -195,13 +191,15 @@ def decide(ranking: Ranking, question: Question, has_time: bool) -> Answer:
     if verdict and verdict == question.verdict:
         kinds = {KIND_OF[name] for name in question.recorded}
         following = [w for w in following if KIND_OF[w.manoeuvre.name] not in kinds]
-    named = _with_90_percent(hypotheses)
+    totals = accumulate(hypothesis.probability for hypothesis in hypotheses)
+    # The fewest that together have 90 %
+    named = hypotheses[:next((i for i, total in enumerate(totals, 1) if total >= CERTAIN), None)]
     if best.effects and best.probability >= CERTAIN:
         outcome = Outcome.CERTAIN
     elif not following and not best.effects:
         # The samples prefer no gap to each of these effects, so that they do not show it.
         outcome = Outcome.NO_VISIBLE_GAP
-        named = [h for h in hypotheses if len(h.effects) < 2 and UNKNOWN not in h.effects]
+        named = tuple(h for h in hypotheses if len(h.effects) < 2 and UNKNOWN not in h.effects)
     elif not following:
         outcome = Outcome.INSEPARABLE
     elif not has_time:
@@ -211,13 +209,6 @@ def decide(ranking: Ranking, question: Question, has_time: bool) -> Answer:
                       following[0].per_minute, hidden=ranking.hidden, verdict=verdict)
     return Answer(hypotheses, outcome, _sentence(outcome, named), hidden=ranking.hidden,
                   verdict=verdict)
-
-
-def _with_90_percent(hypotheses: Sequence[WeightedHypothesis]) -> list[WeightedHypothesis]:
-    """Return the fewest hypotheses that together have 90 %."""
-    totals = accumulate(hypothesis.probability for hypothesis in hypotheses)
-    needed = next((i for i, total in enumerate(totals, 1) if total >= CERTAIN), None)
-    return list(hypotheses[:needed])
 
 
 def _sentence(outcome: Outcome, named: Sequence[WeightedHypothesis]) -> str:

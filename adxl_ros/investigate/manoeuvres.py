@@ -34,9 +34,8 @@ _SWINGS = 4
 """Number of swings forth and back. Chosen: their reversals are averaged."""
 LONGEST_STEP_S = 0.2
 """Longest time of a manoeuvre between two commands, s. Chosen: the stage then comes to rest within
-a fifth of a second at the limit of rate where the commands end."""
-_AHEAD_S = LONGEST_STEP_S
-"""Time by which a command is ahead of the stage, s. Chosen: no command is later."""
+a fifth of a second at the limit of rate where the commands end. A command is ahead of the stage by
+this time, so that none is late."""
 LARGEST_LAG_RAD = 0.15
 """Distance of the stage from where it should be, rad, at which the command waits. Chosen: a
 controller lags by some tenths of a second."""
@@ -70,8 +69,7 @@ class StageLimits:
 
     def excess_rad(self, pose: Pose) -> float:
         """Return how far the worse angle of a pose is beyond the limits, rad; 0 within them."""
-        nearest = self.nearest(*pose)
-        return max(abs(pose.alpha_rad - nearest.alpha_rad), abs(pose.beta_rad - nearest.beta_rad))
+        return max(abs(angle - near) for angle, near in zip(pose, self.nearest(*pose)))
 
 
 class Path:
@@ -85,28 +83,21 @@ class Path:
         self._script.rest(0.5)
 
     def rest(self, alpha_deg: float, beta_deg: float, seconds: float = _REST_S) -> None:
-        """
-        Move to a pose and rest there.
-
-        seconds: time at rest, s.
-        """
+        """Move to a pose and rest there for some seconds."""
         pose = self.limits.nearest(np.radians(alpha_deg), np.radians(beta_deg))
-        if max(abs(pose.alpha_rad - self._script.alpha),
-               abs(pose.beta_rad - self._script.beta)) > 0:
+        if pose != self.end():
             self._script.go(*pose)
         self._script.rest(seconds)
 
     def turn(self, joint: str, to_rad: float, share: float = 1.0) -> None:
         """Turn one joint at a constant rate, and rest for a second."""
-        angles = {'alpha': self._script.alpha, 'beta': self._script.beta, joint: to_rad}
-        pose = self.limits.nearest(angles['alpha'], angles['beta'])
-        to_rad = pose.alpha_rad if joint == 'alpha' else pose.beta_rad
+        to_rad = float(np.clip(to_rad, *self.limits.of(joint)))
         rate_rad_s = share * self.limits.rate_rad_s
         distance_rad = abs(to_rad - getattr(self._script, joint))
         if distance_rad > rate_rad_s * RUN_UP_S:
             self._script.run(joint, to_rad, rate_rad_s)
         elif distance_rad > 0:
-            self._script.go(*pose)
+            self._script.go(*self.end()._replace(**{f'{joint}_rad': to_rad}))
         self._script.rest(1.0)
 
     def swing(self, joint: str, share: float = 1.0) -> None:
@@ -273,7 +264,7 @@ class CommandStream:
         self._elapsed_s += elapsed_s
         motion = self._manoeuvre.motion
         ahead_s = np.array([self._manoeuvre.begin_s
-                            + min(self._elapsed_s + _AHEAD_S, motion.duration_s)])
+                            + min(self._elapsed_s + LONGEST_STEP_S, motion.duration_s)])
         goal = self._limits.nearest(float(motion.alpha(ahead_s)[0]),
                                     float(motion.beta(ahead_s)[0]))
         rate_rad_s = self._limits.rate_rad_s
@@ -281,8 +272,9 @@ class CommandStream:
         self.command = _moved(self.command, goal, largest_rad, largest_rad)
         # A stage that came to rest for want of commands starts as softly as a manoeuvre.
         faster = rate_rad_s * elapsed_s / RUN_UP_S
-        self.speed = Pose(*(min(abs(c - e) / _AHEAD_S, speed + faster, rate_rad_s) for c, e, speed
-                            in zip(self.command, self._expected, self.speed)))
+        self.speed = Pose(*(
+            min(abs(c - e) / LONGEST_STEP_S, speed + faster, rate_rad_s)
+            for c, e, speed in zip(self.command, self._expected, self.speed)))
         return self.command
 
 

@@ -292,6 +292,14 @@ def make_folder(folder: Path) -> None:
         raise UserError(f'{folder}: cannot be made: {error.strerror}') from None
 
 
+def check_least(options: argparse.Namespace, **least: float) -> None:
+    """Refuse numbers of options that are too small; an option that is not given has none."""
+    for name, lowest in least.items():
+        value = getattr(options, name)
+        if value is not None and not value >= lowest:
+            raise UserError(f'--{name} {value}: must be at least {lowest:g}')
+
+
 def refuse_same_file(output: str, source: str) -> None:
     """Refuse an output that is the input, which a tool reads while it writes."""
     if Path(output).resolve() == Path(source).resolve():

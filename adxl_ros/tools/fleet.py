@@ -8,6 +8,7 @@ import argparse
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
+from importlib.util import find_spec
 from pathlib import Path
 import shlex
 from time import monotonic
@@ -82,7 +83,10 @@ def parser() -> argparse.ArgumentParser:
 
 def fleet(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
-    _check(options)
+    cli.check_least(options, jobs=1, retries=0, limit=1)
+    missing = [name for name in ('fsspec', 'pyarrow') if find_spec(name) is None]
+    if missing:
+        raise UserError(f'{PROG} needs {" and ".join(missing)}; {install_hint(*missing)}')
     begin_s = monotonic()
     selection = Selection(options.only_failed, options.since and since_text(options.since),
                           options.limit)
@@ -91,6 +95,8 @@ def fleet(options: argparse.Namespace) -> int:
     recipe = make_recipe(tasks, options.params, (source.params for source in sources),
                          options.store, cli.reading_options(options))
     folder = Path(options.output)
+    if not options.dry_run:
+        cli.make_folder(folder)
     with nullcontext() if options.dry_run else only_client(folder):
         results = Results(folder)
         to_do = plan(sources, recipe, results, selection)
@@ -125,18 +131,6 @@ def _worked(options: argparse.Namespace, recipe: Recipe, results: Results, to_do
     return 1 if rows and not any(row['outcome'] == 'done' for row in rows) else 0
 
 
-def _check(options: argparse.Namespace) -> None:
-    for name, lowest in (('jobs', 1), ('retries', 0), ('limit', 1)):
-        value = getattr(options, name)
-        if value is not None and value < lowest:
-            raise UserError(f'--{name} {value}: at least {lowest} is needed')
-    try:
-        import fsspec  # noqa: F401
-        import pyarrow  # noqa: F401
-    except ImportError as error:
-        raise UserError(f'{PROG} needs {error.name}; {install_hint(str(error.name))}') from None
-
-
 def _warn_of_replaced(to_do: Plan, results: Results, tasks: Sequence[str]) -> None:
     """Warn where rows of other tasks leave table and page, as a recording has one row there."""
     before = [results.newest[source.url].row['tasks'] for source in to_do.todo
@@ -164,7 +158,7 @@ def _written(folder: Path, results: Results) -> list[Path]:
 def _plan_lines(to_do: Plan, count: int) -> list[str]:
     stated = iter(stated_by([source for source, serial in zip(to_do.todo, to_do.serials)
                              if not serial]))
-    by_unit = Counter(serial or next(stated).serial for serial in to_do.serials)
+    by_unit = Counter(serial or next(stated)[0] for serial in to_do.serials)
     unknown = by_unit.pop('', 0) + by_unit.pop(NO_UNIT, 0)
     largest = ', '.join(f'{serial} ({number})' for serial, number in by_unit.most_common(_UNITS))
     rows = {'found': f'{counted(count, "recording")}', 'done already': f'{to_do.done}',
@@ -194,11 +188,10 @@ def _result_lines(rows: Sequence[Row], to_do: Plan, took_s: float) -> list[str]:
              + (f'; {to_do.done} had their row before' if to_do.done else ''), '']
     worked_s = sum(row['seconds'] or 0.0 for row in rows)
     statuses = Counter(row['status'] for row in rows if row['status'])
-    unsound = sum(row['is_sound'] is False for row in rows)
     figures = {
         'units': str(len({row['serial'] for row in rows if row['serial']})),
         'recorded': duration(sum(row['duration_s'] or 0.0 for row in rows)),
-        'not sound': str(unsound),
+        'not sound': str(sum(row['is_sound'] is False for row in rows)),
         'left out': _left_out(to_do),
         'verdicts': ', '.join(f'{count} {name}' for name, count in statuses.most_common()),
         'computed': f'{duration(worked_s)} of workers in {duration(took_s)}'}

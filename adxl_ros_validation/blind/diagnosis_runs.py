@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The diagnosis of each recording in its own process, and its gap on a held-out recording."""
+"""The diagnosis of each recording in its own process, its gap held out, and the score of all."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from datetime import date
 from functools import partial
-import hashlib
 import json
 import os
 from pathlib import Path
@@ -18,14 +18,13 @@ import tempfile
 import time
 from typing import Any
 
-import adxl_ros
 from adxl_ros.errors import UserError
-from adxl_ros.workers import for_each, make_folder, Pool, write
-from adxl_ros_validation.blind import trials
+from adxl_ros.process import code_version, package_version
+from adxl_ros.workers import for_each, Pool, write
+from adxl_ros_validation.blind import grading, ideal_observer, scores, trials
+from adxl_ros_validation.blind.faults import NOISE_LIKE
+from adxl_ros_validation.blind.simulator import Fault, Scene
 from adxl_ros_validation.blind.trials import Label
-from adxl_ros_validation.blind.world import ideal_observer
-from adxl_ros_validation.blind.world.faults import KINDS
-from adxl_ros_validation.blind.world.simulator import Fault, Scene
 import numpy as np
 import pandas as pd
 import yaml
@@ -91,7 +90,7 @@ def diagnose(name: str, recording: bytes, parameters: bytes, sim: bytes | None =
 def diagnose_all(folder: Path, pool: Pool, show: Callable[[float], None]
                  ) -> dict[str, Result]:
     """Diagnose all recordings of a folder that have no report yet."""
-    reports, recordings = make_folder(folder / 'reports'), folder / 'recordings'
+    reports, recordings = folder / 'reports', folder / 'recordings'
     code = code_version()
     stamp = reports / 'version.txt'
     if stamp.exists() and stamp.read_text() != code:
@@ -127,16 +126,6 @@ def kept(folder: Path, names: Sequence[str], work: Callable[..., tuple[str, Any]
     return {name: json.loads((folder / f'{name}.json').read_bytes()) for name in names}
 
 
-def code_version() -> str:
-    """Hash the code of the diagnosis."""
-    hashed = hashlib.sha256()
-    for path in sorted(Path(adxl_ros.__file__).parent.rglob('*.py')):
-        hashed.update(path.name.encode() + path.read_bytes())
-    return hashed.hexdigest()
-
-
-NOISE_LIKE = frozenset(name for name, kind in KINDS.items() if kind.random)
-"""Effects that are removed before a recording is simulated again, as noise does not repeat."""
 _BLOCK_S = 5.0
 """Length of the blocks of the bootstrap, s; chosen."""
 _RESAMPLES = 400
@@ -236,3 +225,46 @@ def _fitted(label: Label, faults: list[Fault]) -> list[Fault]:
     sizes = np.linalg.lstsq(columns, gap, rcond=None)[0]
     return [replace(fault, size=fault.size * float(np.clip(size, 0, 2)))
             for fault, size in zip(faults, sizes)]
+
+
+def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
+    """Diagnose all recordings that have no report yet, read the labels and score."""
+    digest = trials.published_hash(folder)
+    # Labels may be on another machine: the diagnosis does not need them.
+    with show('diagnose') as advance:
+        results = diagnose_all(folder, pool, advance)
+    setup, labels = trials.committed_labels(folder)
+    missing = [label.name for label in labels if label.name not in results]
+    if missing:
+        raise UserError(f'{folder / "recordings"}: {missing[0]}.csv is missing, {len(missing)} '
+                        'of the committed recordings in all; a check needs all of them')
+    by_name = {label.name: label for label in labels}
+
+    def job(name: str) -> tuple:
+        stated = (folder / 'recordings' / f'{name}.yaml').read_text()
+        return by_name[name], stated, results[name]['parameters']
+
+    with show('held out') as advance:
+        held_out = kept(folder / 'labels' / 'held', list(by_name), evaluate, job, pool, advance)
+    graded = [scores.Trial(label, grading.answer(results[label.name]), held_out[label.name])
+              for label in labels]
+    made = scores.scores(graded)
+    negative = {'labels_permuted': scores.permuted(graded),
+                'metadata_only': scores.metadata(folder / 'recordings', labels),
+                'strength_zero': scores.strength_zero(graded)}
+    return {
+        'schema': 1, 'hash': digest, **setup._asdict(), 'cases': len(labels),
+        'date': str(date.today()), 'version': package_version(),
+        'diagnose_code': (folder / 'reports' / 'version.txt').read_text(),
+        'failed': {trial.label.name: results[trial.label.name]['error'] for trial in graded
+                   if trial.answer.status == 'failed'},
+        'bars': scores.bars(made), 'controls': negative,
+        'leaks': any(control['leaks'] for control in negative.values()),
+        'scores': made, 'rows': [{
+            **{name: [fault[name] for fault in label.faults]
+               for name in ('strength_mps2', 'power', 'told', 'inseparable')},
+            'name': label.name, 'group': label.group, 'effects': list(label.effects),
+            'flexible': label.flexible, 'manoeuvre': label.manoeuvre, 'axes': label.axes,
+            'status': answer.status, 'top': sorted(answer.top), 'named': sorted(answer.named),
+            'probability': answer.probability, 'right': grading.verdict_right(answer, label),
+            'seconds': answer.seconds, 'held': held} for label, answer, held in graded]}

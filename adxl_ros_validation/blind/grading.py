@@ -10,9 +10,9 @@ import math
 from typing import Any
 
 from adxl_ros_validation.blind import trials
+from adxl_ros_validation.blind.faults import KNOWN
+from adxl_ros_validation.blind.simulator import G0
 from adxl_ros_validation.blind.trials import Label
-from adxl_ros_validation.blind.world.faults import KNOWN
-from adxl_ros_validation.blind.world.simulator import G0
 import numpy as np
 
 UNKNOWN = 'unknown'

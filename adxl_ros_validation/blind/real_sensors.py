@@ -20,21 +20,19 @@ import tempfile
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.workers import make_folder, Pool, write
+from adxl_ros.workers import Pool, write
 from adxl_ros_validation.blind import (
-    check,
     diagnosis_runs,
     grading,
+    ideal_observer,
     report_html,
     scores,
     trials,
 )
 from adxl_ros_validation.blind.diagnosis_runs import Show
+from adxl_ros_validation.blind.faults import KINDS, KNOWN
 from adxl_ros_validation.blind.grading import Answer, UNKNOWN
-from adxl_ros_validation.blind.trials import Drawn, Label, Plan
-from adxl_ros_validation.blind.world import ideal_observer
-from adxl_ros_validation.blind.world.faults import KINDS, KNOWN
-from adxl_ros_validation.blind.world.simulator import (
+from adxl_ros_validation.blind.simulator import (
     csv_text,
     Fault,
     G0,
@@ -43,6 +41,7 @@ from adxl_ros_validation.blind.world.simulator import (
     Run,
     Unit,
 )
+from adxl_ros_validation.blind.trials import Drawn, Label, Plan
 import numpy as np
 import pandas as pd
 import scipy
@@ -275,7 +274,7 @@ def _noise(half: Half) -> float:
 def plans(halves: Sequence[Half], seed: int, count: int) -> list[Plan]:
     """Plan trials: recordings and defects in turn, a quarter without any."""
     rng = np.random.default_rng([seed, 3])
-    rows: list[tuple[int, str, int, tuple[str, ...]]] = []
+    rows: list[tuple[str, tuple[str, ...], tuple[int, ...]]] = []
     used = dict.fromkeys(KINDS, 0)
     for k in range(count):
         half = k % len(halves)
@@ -283,15 +282,13 @@ def plans(halves: Sequence[Half], seed: int, count: int) -> list[Plan]:
         names = [name for name in halves[half].kinds()
                  if (name in KNOWN) == (group == 'single')]
         if group == 'none' or not names:
-            rows.append((k, 'none', half, ()))
+            rows.append(('none', (), (seed, 4, k, half)))
             continue
         fewest = min(used[name] for name in names)
         name = str(rng.choice([name for name in names if used[name] == fewest]))
         used[name] += 1
-        rows.append((k, group, half, (name,)))
-    drawn = [rows[k] for k in rng.permutation(count)]
-    return [Plan(f'r{i:04d}', group, effects, (seed, 4, k, half))
-            for i, (k, group, half, effects) in enumerate(drawn)]
+        rows.append((group, (name,), (seed, 4, k, half)))
+    return [Plan(f'r{i:04d}', *rows[k]) for i, k in enumerate(rng.permutation(count))]
 
 
 def draw(halves: Sequence[Half], plan: Plan) -> Drawn:
@@ -357,16 +354,15 @@ def _with_fault(half: Half, seed: tuple[int, ...], fault: Fault) -> tuple[float,
 def seal(folder: Path, source: Path, seed: int | None, count: int, pool: Pool, show: Show
          ) -> str:
     """Draw the trials of a folder or manifest into a folder; return the published hash."""
-    base, digest = folder / 'baseline' / 'recordings', check.published_hash(folder)
-    if digest is not None and base.exists():
-        return digest
+    base = folder / 'baseline' / 'recordings'
+    if base.exists():
+        return trials.published_hash(folder)
     with show('first parts'):
         halves, left_out = prepare(source)
     with show('draw') as advance:
-        digest = check.seal(folder, seed, count, partial(plans, halves), partial(draw, halves),
-                            pool, advance)
+        digest = trials.seal(folder, seed, count, partial(plans, halves), partial(draw, halves),
+                             pool, advance)
     write(folder / 'left_out.json', json.dumps(left_out).encode())
-    make_folder(base)
     for half in halves:
         for suffix, text in zip(('csv', 'yaml', 'sim'), half.texts()):
             if text is not None:
@@ -400,7 +396,7 @@ def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
         untouched = diagnosis_runs.diagnose_all(folder / 'baseline', pool, advance)
     with show('diagnose') as advance:
         results = diagnosis_runs.diagnose_all(folder, pool, advance)
-    setup, labels = check.committed_labels(folder)
+    setup, labels = trials.committed_labels(folder)
     base = {name: grading.answer(result) for name, result in untouched.items()}
     rows = []
     for label in labels:
@@ -419,7 +415,7 @@ def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
                      'probability': answer.probability, 'seconds': answer.seconds,
                      'error': results[label.name]['error'],
                      'by_chance': float(np.mean(by_chance or [False]))})
-    return {'hash': check.published_hash(folder), 'seed': setup.seed,
+    return {'hash': trials.published_hash(folder), 'seed': setup.seed,
             'trials': len(rows), 'diagnose_code': (folder / 'reports' / 'version.txt').read_text(),
             'left_out': json.loads((folder / 'left_out.json').read_text()), 'rows': rows,
             'baseline': {name: [answer.status, sorted(answer.named)]

@@ -10,7 +10,7 @@ import textwrap
 from typing import Any
 
 from adxl_ros_validation.blind.scores import FEWEST_TRIALS, in_words
-from adxl_ros_validation.blind.world.simulator import G0
+from adxl_ros_validation.blind.simulator import G0
 
 _STYLE = """
 body{font:15px/1.45 system-ui,sans-serif;max-width:60em;margin:2em auto;padding:0 1em;color:#222}

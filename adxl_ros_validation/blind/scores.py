@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scores of a check with their intervals, and the bars that they should meet."""
+"""The scores of a check with their intervals, the bars that they should meet, and controls."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
 import math
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from adxl_ros_validation.blind import grading
-from adxl_ros_validation.blind.diagnosis_runs import NOISE_LIKE
+from adxl_ros_validation.blind.faults import NOISE_LIKE
 from adxl_ros_validation.blind.grading import Answer, UNKNOWN
 from adxl_ros_validation.blind.trials import Label
 import numpy as np
@@ -273,3 +274,83 @@ def _confusion(real: Sequence[Trial]) -> dict[str, dict[str, int]]:
             else 'none' if not top else 'several' if len(top) > 1 else next(iter(top))
         table.setdefault(row, Counter())[column] += 1
     return {name: dict(row) for name, row in sorted(table.items())}
+
+
+_CHANCE = 0.002
+"""Chance that one control reports a leak of a check that has none; chosen."""
+_SHUFFLES = 2000
+"""Number of permutations of the labels; chosen."""
+
+
+def permuted(trials: Sequence[Trial]) -> dict[str, Any]:
+    """
+    Score the answers against the labels of other trials.
+
+    The score by chance follows from the frequencies of answers and labels. A higher score uses
+    something besides the answers.
+    """
+    real = [trial for trial in trials if trial.label.group != 'zero']
+    accepted = [grading.right(trial.label) for trial in real]
+    right = np.array([[trial.answer.top in effects for effects in accepted]
+                      for trial in real], float)
+    rng, n = np.random.default_rng(0), len(real)
+    shuffled = np.array([right[np.arange(n), rng.permutation(n)].mean()
+                         for _ in range(_SHUFFLES)])
+    chance = float(right.mean())
+    low, high = (float(q) for q in np.quantile(shuffled, (_CHANCE / 2, 1 - _CHANCE / 2)))
+    return {'score': float(shuffled.mean()), 'chance': chance,
+            'labels_in_place': float(np.trace(right)) / n,
+            'by_chance_between': [low, high], 'leaks': not low <= chance <= high}
+
+
+def metadata(recordings: Path, labels: Sequence[Label]) -> dict[str, Any]:
+    """
+    Guess labels from sizes, lengths, times and names of files only.
+
+    The score is the share of the variance of a quantity's ranks that the labels explain (Kruskal
+    and Wallis), for the quantity that they explain best. At chance is the same with permuted
+    labels. Labels count in three ways: by group, by effect, and as some effect or none.
+    """
+    def facts_of(name: str) -> tuple[float, ...]:
+        csv, yaml = (recordings / f'{name}.{suffix}' for suffix in ('csv', 'yaml'))
+        data, size, about = csv.read_bytes(), csv.stat().st_size, yaml.stat()
+        rows, last = data.count(b'\n'), data.rstrip().rsplit(b'\n', 1)[-1]
+        return (size, rows, size - rows * len(last), csv.stat().st_mtime, about.st_size,
+                about.st_mtime, float(last.split(b',')[0]))
+
+    def explained_by(members: np.ndarray) -> float:
+        sums = members.T @ ranks
+        between = np.sum(sums ** 2 / members.sum(axis=0)[:, None], axis=0)
+        return float(np.max(between / np.maximum(np.sum(ranks ** 2, axis=0), 1e-12)))
+
+    facts = np.array([facts_of(label.name) for label in labels], float)
+    ranks = scipy.stats.rankdata(np.column_stack([facts, np.arange(len(labels))]), axis=0)
+    ranks -= ranks.mean(axis=0)
+    groupings = [[label.group for label in labels],
+                 ['+'.join(label.effects) for label in labels],
+                 ['something' if label.effects else 'nothing' for label in labels]]
+    rng, count = np.random.default_rng(0), len(labels)
+    explained, chance = [], []
+    for grouping in groupings:
+        index = np.unique(grouping, return_inverse=True)[1]
+        members = np.eye(index.max() + 1)[index]
+        explained.append(explained_by(members))
+        chance.append([explained_by(members[rng.permutation(count)]) for _ in range(_SHUFFLES)])
+    above = np.sum(np.array(chance) >= np.array(explained)[:, None] - 1e-12, axis=1)
+    p = float((1 + above.min()) / (1 + _SHUFFLES))
+    return {'score': explained[0], 'chance': float(np.mean(chance[0])), 'p': p,
+            'leaks': p < _CHANCE}
+
+
+def strength_zero(trials: Sequence[Trial]) -> dict[str, Any]:
+    """Compare trials whose effect has strength zero with trials without an effect."""
+    zero, none = ([trial.answer.gap for trial in trials if trial.label.group == group]
+                  for group in ('zero', 'none'))
+    named = sum(trial.label.effects[0] in trial.answer.named for trial in trials
+                if trial.label.group == 'zero')
+    if not zero or not none:
+        return {'score': None, 'chance': None, 'p': 1.0, 'leaks': False, 'named': named}
+    p = float(scipy.stats.fisher_exact([[sum(zero), len(zero) - sum(zero)],
+                                       [sum(none), len(none) - sum(none)]]).pvalue)
+    return {'score': sum(zero) / len(zero), 'chance': sum(none) / len(none), 'p': p,
+            'named': named, 'leaks': p < _CHANCE}

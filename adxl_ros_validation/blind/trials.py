@@ -1,18 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The trials of a check: what each is to be, its label, recording and parameter file."""
+"""
+The trials of a check: what each is to be, its label and recording, and the seal of all labels.
+
+A published hash commits to the labels. The folder of a check has the recordings, the labels, and
+reports as they are made.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
+from datetime import date
 from functools import partial
+import hashlib
+import json
 import math
+import os
+from pathlib import Path
+import secrets
+import shutil
 from typing import Any, NamedTuple
 
-from adxl_ros_validation.blind.world import ideal_observer, motion, simulator
-from adxl_ros_validation.blind.world.faults import KINDS, KNOWN, UNLISTED
-from adxl_ros_validation.blind.world.ideal_observer import IdealObserver
-from adxl_ros_validation.blind.world.simulator import Fault, G0, Scene
+from adxl_ros.errors import UserError
+from adxl_ros.workers import for_each, Pool, write
+from adxl_ros_validation.blind import ideal_observer, motion, simulator
+from adxl_ros_validation.blind.faults import KINDS, KNOWN, UNLISTED
+from adxl_ros_validation.blind.ideal_observer import IdealObserver
+from adxl_ros_validation.blind.simulator import Fault, G0, Scene
 import numpy as np
 
 STRENGTHS_MPS2 = (0.02e-3 * G0, 15e-3 * G0)
@@ -212,3 +226,99 @@ def _visibility(observer: IdealObserver, rivals: dict[str, np.ndarray], fault: F
             'told': ideal_observer.separation_probability(
                 visibility if separable else rest_of[rival]),
             'inseparable': sorted(inseparable)}
+
+
+_SEAL = 'seal.json'
+"""File with the published hash."""
+
+
+class Setup(NamedTuple):
+    """What determines the trials of a check."""
+
+    seed: int  # seed of all random numbers
+    trials: int  # number of trials, without those at strength zero
+
+
+def seal(folder: Path, seed: int | None, count: int, plan_all: Callable[[int, int], list[Plan]],
+         make: Callable[[Plan], Drawn], pool: Pool, show: Callable[[float], None]) -> str:
+    """
+    Draw trials into a folder and publish the hash of their labels.
+
+    A call on a folder that has them returns the hash; an interrupted one continues.
+    """
+    drawn, existing = folder / 'labels' / 'drawn', None
+    is_sealed = (folder / _SEAL).exists()
+    if is_sealed:
+        existing = committed_labels(folder)[0]
+    elif (drawn / 'setup').exists():
+        existing = Setup(*json.loads((drawn / 'setup').read_bytes()))
+    elif any(folder.glob('*')):
+        raise UserError(f'{folder}: is not empty and has no check; choose another folder')
+    if seed is None:
+        seed = existing.seed if existing else secrets.randbelow(2 ** 31)
+    setup = Setup(seed, count)
+    if existing not in (None, setup):
+        raise UserError(f'{folder}: has a check of another seed or number of trials; repeat the '
+                        'same options to continue it, or choose another folder')
+    if not is_sealed:
+        _draw(folder, drawn, setup, plan_all(*setup), make, pool, show)
+    shutil.rmtree(drawn, ignore_errors=True)
+    return published_hash(folder)
+
+
+def _draw(folder: Path, drawn: Path, setup: Setup, plans: list[Plan],
+          make: Callable[[Plan], Drawn], pool: Pool, show: Callable[[float], None]) -> None:
+    """Draw what is not drawn yet, then write all labels and publish their hash."""
+    write(drawn / 'setup', json.dumps(setup).encode())
+
+    def keep(label: Label, *texts: str | None) -> None:
+        for suffix, text in zip(('csv', 'yaml', 'sim'), texts):
+            if text is not None:
+                path = folder / 'recordings' / f'{label.name}.{suffix}'
+                write(path, text.encode())
+                # The time of writing would show how long the label took to draw.
+                os.utime(path, (0, 0))
+        write(drawn / f'{label.name}.json', json.dumps(asdict(label)).encode())
+
+    todo = [plan for plan in plans if not (drawn / f'{plan.name}.json').exists()]
+    for_each(pool, make, [partial(tuple, (plan,)) for plan in todo], keep, show,
+             len(plans) - len(todo))
+    rows = [json.loads(path.read_bytes()) for path in sorted(drawn.glob('*.json'))]
+    text = json.dumps({'salt': secrets.token_hex(16), **setup._asdict(), 'labels': rows},
+                      indent=1).encode()
+    write(folder / 'labels' / 'labels.json', text)
+    write(folder / _SEAL, json.dumps({
+        'sha256_of_salt_and_labels': hashlib.sha256(text).hexdigest(), 'cases': len(rows),
+        'date': str(date.today())}, indent=1).encode())
+
+
+def published_hash(folder: Path) -> str:
+    """Return the published hash of a folder's labels."""
+    path = folder / _SEAL
+    try:
+        return str(json.loads(path.read_bytes())['sha256_of_salt_and_labels'])
+    except FileNotFoundError:
+        raise UserError(f'{folder}: no labels are committed there; use --seal {folder} first'
+                        ) from None
+    except (ValueError, KeyError, TypeError):
+        raise UserError(f'{path}: has no hash; draw a new check into another folder') from None
+
+
+def committed_labels(folder: Path) -> tuple[Setup, list[Label]]:
+    """Read the labels and compare them with the published hash."""
+    digest, path = published_hash(folder), folder / 'labels' / 'labels.json'
+    try:
+        text = path.read_bytes()
+    except FileNotFoundError:
+        raise UserError(f'{path}: no such file; copy it from where the check was drawn') from None
+    if hashlib.sha256(text).hexdigest() != digest:
+        raise UserError(f'{path}: these are not the labels whose hash {digest} was published; '
+                        'they were changed since')
+    try:
+        content: dict[str, Any] = json.loads(text)
+        return Setup(content['seed'], content['trials']), [Label(**row | {
+            name: tuple(row[name]) for name in ('effects', 'seed', 'seconds')})
+            for row in content['labels']]
+    except (ValueError, KeyError, TypeError):
+        raise UserError(f'{path}: is of another version; draw a new check into another folder'
+                        ) from None

@@ -9,9 +9,18 @@ import shutil
 import sys
 
 from adxl_ros.workers import open_pool, Pool
-from adxl_ros_validation.blind import check, diagnosis_runs, grading, report_html, scores, trials
+from adxl_ros_validation.blind import (
+    diagnosis_runs,
+    faults,
+    grading,
+    ideal_observer,
+    motion,
+    report_html,
+    scores,
+    simulator,
+    trials,
+)
 from adxl_ros_validation.blind.trials import Label, plans
-from adxl_ros_validation.blind.world import faults, ideal_observer, motion, simulator
 import numpy as np
 import pytest
 
@@ -75,7 +84,7 @@ def scored(folder, body, pool):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(diagnosis_runs, 'executable', lambda name: [
             sys.executable, str(path)] if name == 'diagnose' else real(name))
-        return check.score(folder, pool, show)
+        return diagnosis_runs.score(folder, pool, show)
 
 
 class Threads(Pool, ThreadPoolExecutor):
@@ -94,7 +103,7 @@ def pool():
 def committed_check(tmp_path_factory):
     folder = tmp_path_factory.mktemp('check') / 'blind'
     with open_pool(None) as pool:
-        check.seal(folder, SEED, TRIALS, short_plans, trials.draw_trial, pool, no_progress)
+        trials.seal(folder, SEED, TRIALS, short_plans, trials.draw_trial, pool, no_progress)
     return folder
 
 
@@ -177,7 +186,7 @@ def answer(recording, parameters):
 
 def test_a_generator_that_leaks_labels_is_detected(null_check, tmp_path, pool):
     """The length of the recordings reveals which trials have an effect."""
-    folder, labels = tmp_path / 'blind', check.committed_labels(null_check[0])[1]
+    folder, labels = tmp_path / 'blind', trials.committed_labels(null_check[0])[1]
     recordings = null_check[0] / 'recordings'
 
     def leaking(plan):
@@ -186,7 +195,7 @@ def test_a_generator_that_leaks_labels_is_detected(null_check, tmp_path, pool):
                             for suffix in ('csv', 'yaml'))
         return trials.Drawn(label, padded(label, text), parameters)
 
-    check.seal(folder, SEED, TRIALS, short_plans, leaking, pool, no_progress)
+    trials.seal(folder, SEED, TRIALS, short_plans, leaking, pool, no_progress)
     shutil.copytree(null_check[0] / 'labels' / 'held', folder / 'labels' / 'held')
     made = scored(folder, PADDED, pool)
     assert made['controls']['metadata_only']['leaks'] and made['leaks']

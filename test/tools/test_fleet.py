@@ -232,6 +232,7 @@ def test_kills_lose_and_repeat_nothing(tmp_path):
 def test_a_folder_has_one_client_at_a_time(run_tool, tmp_path):
     write_fleet(tmp_path / 'day', 2, 2)
     words = ('day', '--do', 'check', '-o', 'out', '--jobs', 1)
+    (tmp_path / 'out').mkdir()
     with only_client(tmp_path / 'out'):
         second = run_tool('fleet', *words)
     assert second.returncode == 1

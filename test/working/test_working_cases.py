@@ -3,10 +3,10 @@
 
 from adxl_ros.model.effects import library
 from adxl_ros_validation import working_cases, working_world as world
+from adxl_ros_validation.blind.ideal_observer import rms
+from adxl_ros_validation.blind.motion import Manoeuvre
+from adxl_ros_validation.blind.simulator import Fault, Scene
 from adxl_ros_validation.blind.trials import Label
-from adxl_ros_validation.blind.world.ideal_observer import rms
-from adxl_ros_validation.blind.world.motion import Manoeuvre
-from adxl_ros_validation.blind.world.simulator import Fault, Scene
 import numpy as np
 import pytest
 

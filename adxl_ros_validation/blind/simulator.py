@@ -11,7 +11,7 @@ import math
 from typing import Any
 import zlib
 
-from adxl_ros_validation.blind.world.motion import Manoeuvre
+from adxl_ros_validation.blind.motion import Manoeuvre
 import numpy as np
 import scipy
 import yaml

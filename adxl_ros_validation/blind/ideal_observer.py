@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import math
 
-from adxl_ros_validation.blind.world import simulator as sim
-from adxl_ros_validation.blind.world.faults import KINDS, KNOWN
-from adxl_ros_validation.blind.world.simulator import Fault, G0, Kind, Scene, Unit
+from adxl_ros_validation.blind import simulator as sim
+from adxl_ros_validation.blind.faults import KINDS, KNOWN
+from adxl_ros_validation.blind.simulator import Fault, G0, Kind, Scene, Unit
 import numpy as np
 import scipy
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import math
 
-from adxl_ros_validation.blind.world import simulator as sim
-from adxl_ros_validation.blind.world.motion import low_pass
-from adxl_ros_validation.blind.world.simulator import G0, Kind, Place, Run, Shape
+from adxl_ros_validation.blind import simulator as sim
+from adxl_ros_validation.blind.motion import low_pass
+from adxl_ros_validation.blind.simulator import G0, Kind, Place, Run, Shape
 import numpy as np
 import scipy
 
@@ -324,3 +324,5 @@ KINDS = {kind.name: kind for kind in (*_STAGE, *_ELEMENT, *_NOISE, *_UNLISTED)}
 """All kinds by name. Their order is part of a seed: do not change it."""
 KNOWN = tuple(name for name in KINDS if name not in UNLISTED)
 """Kinds of which the package's library has an effect of the same name."""
+NOISE_LIKE = frozenset(name for name, kind in KINDS.items() if kind.random)
+"""Kinds that differ from run to run."""
