@@ -29,6 +29,8 @@ _EARTH_HALF_RANGE_MPS2 = 0.027
 """Half of the range of gravity at sea level, 9.780 to 9.832 m/s², about the standard gravity."""
 _LOCAL_STD_MPS2 = 5e-4
 """Uncertainty of a stated local gravity, m/s². Chosen: 50 mGal, the size of gravity anomalies."""
+_NOT_LOCAL_MPS2 = (G0_MPS2, 9.8, 9.81)
+"""Values of gravity that are those of no place in particular, m/s²."""
 _UNIFORM = np.sqrt(3)
 """Half-width of a uniform distribution divided by its standard deviation."""
 _SURROUNDINGS = {'temperature': ('temperature_c', 'temperature_std_k', 'K', MARGIN_K, 0.1),
@@ -163,7 +165,7 @@ def uncertainty(result: CalibrationResult, stated: Mapping[str, Any] | None = No
     gravity_std, gravity_kind = _LOCAL_STD_MPS2, 'B, anomalies of gravity'
     if 'gravity_std_mps2' in stated:
         gravity_std, gravity_kind = stated['gravity_std_mps2'], 'B, stated'
-    elif gravity == G0_MPS2:  # The standard value is that of no place in particular.
+    elif gravity in _NOT_LOCAL_MPS2:
         gravity_std, gravity_kind = _EARTH_HALF_RANGE_MPS2 / _UNIFORM, 'B, not local: anywhere'
     fit_freedom = error.shape[1] * int((~poses.check).sum()) - len(fitted.covariance_names)
     inputs = (
