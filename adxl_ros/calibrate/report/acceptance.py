@@ -354,8 +354,10 @@ def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
         lines.append(
             'One axis does not see the force across it: align it, or accept this error.'
             if len(fitted.axes) == 1 else
+            'More poses, or longer ones, reduce it.' if kind != 'datasheet' else
             'Sensor, stage or poses are worse than stated: do not use this file.'
-            if kind == 'datasheet' else 'More poses, or longer ones, reduce it.')
+            if 'cross_axis_z' in fitted.effects else
+            'A model with more terms may reduce it; it needs a sweep on a stage.')
     elif outcome == NOT_SHOWN:
         lines.append(_doubt(fitted))
     if 'span_s' in provenance:

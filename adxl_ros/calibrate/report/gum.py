@@ -57,7 +57,7 @@ MEANING = (
 RULE = (
     f'{PASS} if error + guard band is at most the limit; {FAIL} if the error exceeds it; '
     f'{NOT_SHOWN} in between, and where stage and model are inseparable. The guard band reaches '
-    'to the upper end of the 90 % interval; without one, this is simple acceptance. The risk is '
+    'to the upper end of the 90 % interval. The risk is '
     'the largest probability that a unit with such an error exceeds the limit. The error is that '
     'of coefficients and model; the other inputs belong to each use.')
 """The decision rule (ISO/IEC 17025, 7.8.6)."""
