@@ -220,6 +220,8 @@ def _richest_fit(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str
             fit = fits[name]()
             # The fit of the twelve coefficients states for itself what is open.
             return fit if name == 'affine' else replace(fit, notes=refusals)
+        except _ContradictionError:
+            raise
         except UserError as error:
             if name != 'affine':
                 refusals.append(f'not {name}: {error}')
@@ -282,6 +284,10 @@ _MIN_VARIANCE = 1e-30
 """Lower bound of the variance of a turn, rad², or shift, g², so that it can be a divisor."""
 
 
+class _ContradictionError(UserError):
+    """Recordings contradict each other, so that no model holds for all of them."""
+
+
 def _require_one_mounting(full: full_model.FullFit, recordings: Sequence[RecordedPoses]) -> None:
     """
     Refuse recordings if the mounting or the zero-g of one of them differs.
@@ -300,7 +306,7 @@ def _require_one_mounting(full: full_model.FullFit, recordings: Sequence[Recorde
         change = f'case is turned by {np.degrees(changes[worst]):.2f} deg about {AXES[worst]}' \
             if worst < 3 else \
             f'zero-g of {axes[worst - 3]} is shifted by {1e3 * changes[worst]:.2f} mg'
-        raise UserError(
+        raise _ContradictionError(
             f'{recording.source}: {change} from the fit of all recordings '
             f'({deviations[worst]:.0f} standard deviations): another unit or another '
             'mounting; fit this recording separately')

@@ -357,7 +357,7 @@ def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
             'More poses, or longer ones, reduce it.' if kind != 'datasheet' else
             'Sensor, stage or poses are worse than stated: do not use this file.'
             if 'cross_axis_z' in fitted.effects else
-            'A model with more terms may reduce it; it needs a sweep on a stage.')
+            'More terms may reduce it, which needs a sweep on a stage; or a pose is wrong.')
     elif outcome == NOT_SHOWN:
         lines.append(_doubt(fitted))
     if 'span_s' in provenance:
