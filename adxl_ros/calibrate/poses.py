@@ -172,7 +172,7 @@ samples were cut off there. Chosen: beyond it one sample of 700 is."""
 
 
 def at_a_rail(sensor: Sensor, poses: Poses) -> np.ndarray:
-    """Return the poses, (k,) bool, whose mean is false because samples are at a rail of the ADC."""
+    """Return the poses, (k,) bool, whose mean is false as samples are at a rail of the ADC."""
     rails_v = np.array([0.0, sensor.adc_vref_v - sensor.lsb_v])
     reach_v = (_RAIL_STDS * sample_std_v(sensor) + sensor.lsb_v) * bool(sensor.adc_bits)
     distance_v = np.abs(poses.volts[:, :, None] - rails_v).min(axis=2)

@@ -368,10 +368,10 @@ def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
 
 def _doubt(fitted: Sensor) -> str:
     """Return why an error within its limit does not suffice."""
-    if fitted.provenance.get('converged') == 'no':
-        return 'The fit did not converge, so that other poses may have a larger error.'
     if names := open_coefficients(fitted):
         return f'Other poses may have a larger error: {", ".join(map(str, names))} not determined.'
+    if fitted.provenance.get('converged') == 'no':
+        return 'The fit did not converge, so that other poses may have a larger error.'
     return 'The check poses are too few to show that the error is within it.'
 
 

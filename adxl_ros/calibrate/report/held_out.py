@@ -350,7 +350,7 @@ def error_budgets(errors: HeldOutErrors, poses: Poses, stage: Sensor | None = No
 def coefficient_spread(sensor: Sensor, force: Components,
                        environment: Environment = NOMINAL_ENVIRONMENT) -> float:
     """
-    Return the upper end of the 90 % interval of the mean square by the coefficients, over its mean.
+    Return how far the mean square by the coefficients may exceed its mean: the 95 % quantile.
 
     The error by the coefficients of one fit is drawn once, and few of its directions matter. Its
     mean square over the poses has the mean Σλ and the degrees of freedom (Σλ)²/Σλ² (Satterthwaite
