@@ -20,6 +20,7 @@ from adxl_ros.calibrate.result import CalibrationResult
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import MARGIN_K, Sensor
+from adxl_ros.report.quantities import number
 import numpy as np
 import scipy
 
@@ -232,20 +233,14 @@ def budget_rows(found: Uncertainty) -> list[list[str]]:
         std = float(np.broadcast_to(row.std, found.error_mps2.shape)[at])
         part_mg = 1e3 * float(row.contribution_mps2[at]) / G0_MPS2
         sensitivity = '1' if row.unit == 'mg' else \
-            f'{_digits(part_mg / std if std else 0.0)} mg per {row.unit}'
-        rows.append([row.name, f'{_digits(std)} {row.unit} ({row.kind})', sensitivity,
+            f'{number(part_mg / std if std else 0.0, digits=2)} mg per {row.unit}'
+        rows.append([row.name, f'{number(std, digits=2)} {row.unit} ({row.kind})', sensitivity,
                      f'{part_mg:.3f}', _freedom(row.freedom)])
     return rows
 
 
 def _freedom(value: float) -> str:
     return f'{value:.0f}' if value < _MANY else '∞'
-
-
-def _digits(value: float) -> str:
-    """Write a value with two digits, without an exponent."""
-    rounded = float(f'{value:.2g}') if value > 1e-9 else 0.0
-    return str(np.format_float_positional(rounded, trim='-'))
 
 
 def section(found: Uncertainty | None) -> dict[str, Any] | None:
@@ -257,7 +252,8 @@ def section(found: Uncertainty | None) -> dict[str, Any] | None:
     inside = np.abs(found.error_mps2) <= K * found.combined_mps2
     decisions = [[
         row.quantity, f'{row.error:.3f} + {row.guard_band:.3f} = '
-        f'{row.error + row.guard_band:.3f} {row.unit}', f'{_digits(row.limit)} {row.unit}',
+        f'{row.error + row.guard_band:.3f} {row.unit}',
+        f'{number(row.limit, digits=2)} {row.unit}',
         row.outcome, f'{100 * row.risk:.1f} %' if row.risk >= 1e-3 else '< 0.1 %']
         for row in found.decisions]
     return {
