@@ -130,16 +130,16 @@ def _decision(found: Uncertainty, row: gum.Decision) -> dict[str, Any]:
 def _results(fitted: Sensor, found: Uncertainty) -> dict[str, list[Any]]:
     """Return errors, coefficients, budget and conditions as quantities."""
     worst, axis = found.worst
-    errors = [[
-        _quantity('alpha', np.degrees(found.alpha_rad), r'\degree'),
-        _quantity('beta', np.degrees(found.beta_rad), r'\degree'),
-        _quantity(f'reference acceleration along {name}', found.reference_mps2[:, d],
-                  _ACCELERATION, kind='basic_referenceValue'),
-        _quantity(f'measured acceleration along {name}',
-                  (found.reference_mps2 + found.error_mps2)[:, d], _ACCELERATION,
-                  kind='basic_measuredValue'),
-        _quantity(f'error along {name}', found.error_mps2[:, d], _ACCELERATION,
-                  found.combined_mps2[:, d], kind='basic_measurementError')]
+    errors = [
+        [_quantity('alpha', np.degrees(found.alpha_rad), r'\degree'),
+         _quantity('beta', np.degrees(found.beta_rad), r'\degree'),
+         _quantity(f'reference acceleration along {name}', found.reference_mps2[:, d],
+                   _ACCELERATION, kind='basic_referenceValue'),
+         _quantity(f'measured acceleration along {name}',
+                   (found.reference_mps2 + found.error_mps2)[:, d], _ACCELERATION,
+                   kind='basic_measuredValue'),
+         _quantity(f'error along {name}', found.error_mps2[:, d], _ACCELERATION,
+                   found.combined_mps2[:, d], kind='basic_measurementError')]
         for d, name in enumerate(fitted.axes)]
     coefficients = [_quantity(f'{row.label} {row.axis}', factor * row.fitted, unit,
                               factor * row.half_width / Z_90, row.name)
