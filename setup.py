@@ -29,8 +29,9 @@ setup(
     packages=[*find_packages(include=[PACKAGE, f'{PACKAGE}.*', f'{PACKAGE}_validation*']),
               f'{PACKAGE}.params'],
     package_dir={f'{PACKAGE}.params': 'params'},
-    package_data={PACKAGE: ['calibrate/report/*.html', 'calibrate/report/*.js', 'diagnose/*.html',
-                            'report/page_templates/*', 'fleet/*.html', 'tools/*.html'],
+    package_data={PACKAGE: ['calibrate/report/*.html', 'calibrate/report/*.js',
+                            'calibrate/report/*.xml', 'diagnose/*.html', 'fleet/*.html',
+                            'report/page_templates/*', 'tools/*.html'],
                   f'{PACKAGE}.params': ['*.yaml']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),

@@ -10,14 +10,20 @@ from functools import partial
 
 from adxl_ros.calibrate.fits import full_model, gravity_fit, linear, term_selection, thermal_fit
 from adxl_ros.calibrate.fits.linearisation import volts_covariance
-from adxl_ros.calibrate.poses import check_polarity, Poses, predicted_volts, reference_force
+from adxl_ros.calibrate.poses import (
+    at_a_rail,
+    check_polarity,
+    Poses,
+    predicted_volts,
+    reference_force,
+)
 from adxl_ros.calibrate.report import acceptance, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment
 from adxl_ros.calibrate.report.held_out import HeldOutErrors, rms_mg
 from adxl_ros.calibrate.result import CalibrationResult, envelope, with_provenance
 from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
-from adxl_ros.model.coefficients import get, parameter_of
+from adxl_ros.model.coefficients import get
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.population import Population, posterior
@@ -75,9 +81,18 @@ def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | 
         The poses do not determine the model, or the recordings contradict each other.
 
     """
-    poses = _joined(recordings)
     source = ', '.join(recording.source for recording in recordings)
+    at_rail = at_a_rail(sensor, _joined(recordings))
     lines: list[str] = []
+    if at_rail.any():
+        starts_s = _joined(recordings).time_s[at_rail, 0]
+        text = f'ADC at a rail in {len(starts_s)} poses (the first one from {starts_s[0]:.1f} s)'
+        if at_rail.all():
+            raise UserError(f'{source}: {text}: no other is left; check supply and wiring')
+        lines = [f'{text}, left out: check supply and wiring']
+        recordings = [replace(recording, poses=recording.poses.subset(
+            ~at_a_rail(sensor, recording.poses))) for recording in recordings]
+    poses = _joined(recordings)
     if poses.has_angles.any():
         with_angles = [replace(recording, poses=recording.poses.subset(recording.poses.has_angles))
                        for recording in recordings]
@@ -85,8 +100,8 @@ def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | 
                                 effects, source, data_sha256, population)
         starts_s = poses.time_s[~poses.has_angles, 0]
         if len(starts_s):
-            lines = [f'rests without angles, left out: {len(starts_s)} (the first one from '
-                     f'{starts_s[0]:.1f} s)']
+            lines.append(f'rests without angles, left out: {len(starts_s)} (the first one from '
+                         f'{starts_s[0]:.1f} s)')
     elif model not in (None, 'full'):
         raise UserError(f'{source}: the {model} model is fitted against stage angles (alpha_rad '
                         'and beta_rad), which are missing; leave --model out to calibrate a '
@@ -129,6 +144,8 @@ def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: s
     errors, assessments = _assessed(
         sensor, poses.subset(~np.isin(np.arange(len(poses)), outliers)), fit)
     assessment = next((row for row in assessments if row.model == fitted.model), None)
+    if assessment is None:
+        errors, assessments = (), ()
     force = np.column_stack(reference_force(poses, fitted.local_gravity_mps2))
     residual_mg = ((poses.volts - predicted_volts(fitted, poses)) / fitted.scale_v_per_g
                    * 1e3)[fitting]
@@ -174,8 +191,11 @@ def _assessed(sensor: Sensor, inliers: Poses, fit: _StageFit
     errors = held_out.cross_validate(
         {'nominal': lambda sensor, _: sensor, **simpler, fit.fitted.model: fit.refit},
         sensor, inliers, stage)
+    is_certain = (fit.full is None or fit.full.converged) and \
+        not acceptance.open_coefficients(fit.fitted)
     return tuple(errors), tuple(
-        acceptance.assess(row.model, held_out.error_budgets(row, inliers, stage), sensor)
+        acceptance.assess(row.model, held_out.error_budgets(row, inliers, stage), sensor,
+                          is_certain or row.model != fit.fitted.model)
         for row in errors if row.model != 'nominal')
 
 
@@ -200,6 +220,8 @@ def _richest_fit(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str
             fit = fits[name]()
             # The fit of the twelve coefficients states for itself what is open.
             return fit if name == 'affine' else replace(fit, notes=refusals)
+        except _ContradictionError:
+            raise
         except UserError as error:
             if name != 'affine':
                 refusals.append(f'not {name}: {error}')
@@ -218,17 +240,18 @@ def _fit_full(sensor: Sensor, poses: Poses, recordings: Sequence[RecordedPoses],
 def _fit_affine(sensor: Sensor, poses: Poses) -> _StageFit:
     """Fit the twelve coefficients of a three-axis unit to poses that determine no more."""
     full = term_selection.fit_affine(sensor, poses)
-    std = np.sqrt(np.diag(np.linalg.inv(full.information)))
-    still_open = [name for name, value in zip(full.names, std)
-                  if not full_model.belongs_to_stage(name) and value > parameter_of(name).scale]
+    still_open = acceptance.open_coefficients(full.fitted)
     notes = [f'{len(poses)} poses determine zero-g, scale factor and misalignment, no further '
              'terms; more poses show those']
     if still_open:
         notes.append(f'open, by its prior alone: {", ".join(map(str, still_open))}; add poses '
                      'with this axis up and down')
-    return _StageFit(
-        full.fitted, lambda sensor, poses: term_selection.fit_affine(sensor, poses).fitted, full,
-        notes=notes)
+
+    def refit(sensor: Sensor, poses: Poses) -> Sensor:
+        # With more open coefficients it would be another fit, whose errors are not those of this.
+        return term_selection.fit_affine(sensor, poses, len(still_open)).fitted
+
+    return _StageFit(full.fitted, refit, full, notes=notes)
 
 
 def _fit_linear(sensor: Sensor, poses: Poses, population: Population | None) -> _StageFit:
@@ -261,6 +284,10 @@ _MIN_VARIANCE = 1e-30
 """Lower bound of the variance of a turn, rad², or shift, g², so that it can be a divisor."""
 
 
+class _ContradictionError(UserError):
+    """Recordings contradict each other, so that no model holds for all of them."""
+
+
 def _require_one_mounting(full: full_model.FullFit, recordings: Sequence[RecordedPoses]) -> None:
     """
     Refuse recordings if the mounting or the zero-g of one of them differs.
@@ -279,7 +306,7 @@ def _require_one_mounting(full: full_model.FullFit, recordings: Sequence[Recorde
         change = f'case is turned by {np.degrees(changes[worst]):.2f} deg about {AXES[worst]}' \
             if worst < 3 else \
             f'zero-g of {axes[worst - 3]} is shifted by {1e3 * changes[worst]:.2f} mg'
-        raise UserError(
+        raise _ContradictionError(
             f'{recording.source}: {change} from the fit of all recordings '
             f'({deviations[worst]:.0f} standard deviations): another unit or another '
             'mounting; fit this recording separately')
@@ -317,7 +344,7 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, d
         warnings.append(f'prior: {combined.line}')
     force = np.column_stack(signal_chain.inverse(fitted)(list(poses.volts.T), poses.environment))
     budgets = acceptance.gravity_error_budgets(fit, fitted, force, kept)
-    assessment = acceptance.assess('gravity', budgets, fitted)
+    assessment = acceptance.assess('gravity', budgets, fitted, fit.converged)
     fitted = replace(fitted, envelope=envelope(fitted, force[kept], poses,
                                                float(np.sqrt(budgets.accel.model))))
     fitted = with_provenance(fitted, source, poses, data_sha256, {

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Sequence
-from itertools import pairwise
+from typing import Any
 
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
@@ -40,16 +40,21 @@ def angle_tolerance_rad(sensor: Sensor) -> float:
     return max(ENCODER_STEPS * sensor.stage_resolution_rad, SAME_ANGLE_RAD)
 
 
-def _encoder_moved(low_rad: np.ndarray, high_rad: np.ndarray, mean_rad: np.ndarray,
-                   tolerance_rad: float) -> np.ndarray:
-    """Return whether the encoder has moved between poses; False without readings."""
-    return np.fmax(high_rad - mean_rad, mean_rad - low_rad) > tolerance_rad
+def _moved(readings_rad: np.ndarray, before_rad: Any, commands_rad: np.ndarray, held_rad: Any,
+           tolerance_rad: float) -> Any:
+    """
+    Return whether joints have moved from one pose to the next, by their encoder or their command.
 
-
-def _command_moved(low_rad: np.ndarray, high_rad: np.ndarray, held_rad: np.ndarray) -> np.ndarray:
-    """Return whether the command has moved between poses."""
-    changed = np.fmax(high_rad - held_rad, held_rad - low_rad) > COMMAND_RAD
-    return changed | (np.isnan(held_rad) & np.isfinite(high_rad))
+    readings_rad, before_rad: readings between the poses and the mean of the second one, rad, (n,)
+    or (n, joints), and the mean of the first one; commands_rad, held_rad: commands between the
+    poses, and the one before. NaN where there is none.
+    """
+    low, high = (extreme(readings_rad, axis=0) for extreme in (np.fmin.reduce, np.fmax.reduce))
+    first, last = (extreme(commands_rad, axis=0, initial=np.nan)
+                   for extreme in (np.fmin.reduce, np.fmax.reduce))
+    return ((np.fmax(high - before_rad, before_rad - low) > tolerance_rad)
+            | (np.fmax(last - held_rad, held_rad - first) > COMMAND_RAD)
+            | (np.isnan(held_rad) & np.isfinite(last)))
 
 
 def recorded_settings(rests: np.ndarray, readings_rad: np.ndarray | None,
@@ -62,34 +67,24 @@ def recorded_settings(rests: np.ndarray, readings_rad: np.ndarray | None,
     a joint without them. A command stays in force until the next one.; returns: numbers from 0 in
     the order of time, (k,) int.
     """
-    order = np.argsort(rests[:, 0], kind='stable')
-    start, stop = rests[order].T
-    moved = np.zeros(max(len(start) - 1, 0), bool)
-    if readings_rad is not None and len(moved):
-        mean = np.array([_mean_of_finite(readings_rad[a:b]) for a, b in zip(start, stop)])
-        low, high = _extremes(readings_rad, (start + stop) // 2)
-        moved |= _encoder_moved(np.fmin(low, mean[1:]), np.fmax(high, mean[1:]),
-                                _last_finite(mean)[:-1], tolerance_rad)
-    if commands_rad is not None and len(moved):
-        commands = np.where(np.isfinite(commands_rad), commands_rad, np.nan)
-        moved |= _command_moved(*_extremes(commands, start + 1),
-                                _last_finite(commands)[start[:-1]])
-    settings = np.zeros(len(start), int)
-    settings[order[1:]] = np.cumsum(moved)
+    missing = np.full(int(rests.max(initial=0)), np.nan)
+    readings = missing if readings_rad is None else readings_rad
+    commands = missing if commands_rad is None else commands_rad
+    settings, number = np.zeros(len(rests), int), 0
+    before_rad = held_rad = np.nan
+    middle, begin = None, -1
+    for i in np.argsort(rests[:, 0], kind='stable'):
+        start, stop = rests[i]
+        mean_rad = _mean_of_finite(readings[start:stop])
+        given = commands[begin + 1:start + 1]
+        given = given[np.isfinite(given)]
+        if middle is not None:
+            number += int(_moved(np.append(readings[middle:(start + stop) // 2], mean_rad),
+                                 before_rad, given, held_rad, tolerance_rad))
+        settings[i], middle, begin = number, (start + stop) // 2, start
+        before_rad = mean_rad if np.isfinite(mean_rad) else before_rad
+        held_rad = given[-1] if len(given) else held_rad
     return settings
-
-
-def _extremes(values: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least and the greatest value from each row to the next, (k - 1,) each."""
-    parts = [values[first:stop] for first, stop in pairwise(rows)]
-    return (np.array([np.fmin.reduce(part, initial=np.nan) for part in parts]),
-            np.array([np.fmax.reduce(part, initial=np.nan) for part in parts]))
-
-
-def _last_finite(values: np.ndarray) -> np.ndarray:
-    """Replace each NaN by the last finite value before it; NaN stays where there is none."""
-    last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), -1))
-    return np.where(last < 0, np.nan, values[last])
 
 
 def _mean_of_finite(values: np.ndarray) -> float:
@@ -143,10 +138,8 @@ class SettingTracker:
             seen = _between(self._readings, sum(self._newest_ns) // 2, (start_ns + stop_ns) // 2)
             seen = np.vstack([seen, (alpha_rad, beta_rad)])
             held = np.vstack([(np.nan, np.nan), _between(self._commands, -np.inf, first_ns)])[-1]
-            given = np.vstack([held, _between(self._commands, first_ns, start_ns)])
-            moved = _encoder_moved(np.fmin.reduce(seen), np.fmax.reduce(seen), self._mean_rad,
-                                   self._tolerance_rad)
-            moved |= _command_moved(np.fmin.reduce(given), np.fmax.reduce(given), held)
+            moved = _moved(seen, self._mean_rad, _between(self._commands, first_ns, start_ns),
+                           held, self._tolerance_rad)
         alpha, beta = self._settings + moved
         return int(alpha), int(beta)
 

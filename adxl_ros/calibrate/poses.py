@@ -21,6 +21,7 @@ from adxl_ros.model.constants import AXES
 from adxl_ros.model.effects import base
 from adxl_ros.model.effects.base import Coefficient, Components, Environment, NOMINAL_ENVIRONMENT
 from adxl_ros.model.kinematics import specific_force, UPRIGHT
+from adxl_ros.model.noise import sample_std_v
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.recorded_sensor import CERTAIN_CORRELATION, find_polarity_fault
 from adxl_ros.signals.rest_detection import SAME_ANGLE_RAD
@@ -139,7 +140,7 @@ def planes(alpha_rad: np.ndarray) -> list[np.ndarray]:
     """Group poses by plane: indices of those whose alpha agree within 1°."""
     order = np.argsort(alpha_rad, kind='stable')
     cuts = np.flatnonzero(np.diff(alpha_rad[order]) > _SAME_PLANE_RAD) + 1
-    return np.split(order, cuts)
+    return np.split(order, cuts) if len(order) else []
 
 
 def reference_force(poses: Poses, gravity_mps2: float) -> Components:
@@ -163,6 +164,19 @@ def check_polarity(sensor: Sensor, poses: Poses) -> None:
                                 CERTAIN_CORRELATION)
     if fault is not None:
         raise UserError(fault.describe(sensor.axes[fault.axis], AXES[fault.follows]))
+
+
+_RAIL_STDS = 3.0
+"""Distance of a mean from a rail of the ADC, in standard deviations of a sample, up to which its
+samples were cut off there. Chosen: beyond it one sample of 700 is."""
+
+
+def at_a_rail(sensor: Sensor, poses: Poses) -> np.ndarray:
+    """Return the poses, (k,) bool, whose mean is false as samples are at a rail of the ADC."""
+    rails_v = np.array([0.0, sensor.adc_vref_v - sensor.lsb_v])
+    reach_v = (_RAIL_STDS * sample_std_v(sensor) + sensor.lsb_v) * bool(sensor.adc_bits)
+    distance_v = np.abs(poses.volts[:, :, None] - rails_v).min(axis=2)
+    return (distance_v < reach_v).any(axis=1)
 
 
 _SHARE = 0.5

@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from datetime import datetime, timezone
 import hashlib
-from itertools import groupby
 import os
 
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
@@ -113,12 +112,13 @@ class CalibrationResult:
 
 def coefficient_lines(sensor: Sensor) -> list[str]:
     """Return the fitted coefficients with their 90 % intervals as text."""
-    lines = [f'{sensor.serial}: {sensor.model} model, coefficient +- half of its 90 % interval']
-    for name, rows in groupby(compare(sensor, sensor), lambda row: row.name):
-        by_axis = [f'{row.axis} {row.fitted:.6g} +- {row.half_width:.2g} {row.unit}'.strip()
-                   for row in rows]
-        lines.append(f'  {name:34} {"   ".join(by_axis)}')
-    return lines
+    by_name: dict[str, list[str]] = {}
+    for row in compare(sensor, sensor):
+        # After a comma stands the other axis, which differs from axis to axis.
+        by_name.setdefault(row.name if ', ' in row.label else row.label, []).append(
+            f'{row.axis} {row.fitted:.6g} +- {row.half_width:.2g} {row.unit}'.strip())
+    return [f'{sensor.serial}: {sensor.model} model, coefficient +- half of its 90 % interval',
+            *(f'  {name:34} {"   ".join(by_axis)}' for name, by_axis in by_name.items())]
 
 
 def with_provenance(fitted: Sensor, source: str, poses: Poses, data_sha256: str,

@@ -253,14 +253,10 @@ class ImuFields:
 
     def _held(self, angles_rad: np.ndarray) -> np.ndarray:
         """Return angles, rad, (3, n), with the last known value in place of NaN."""
-        if angles_rad.size and not np.isnan(angles_rad).any():
-            self._last_rad = angles_rad[:, -1]
-            return angles_rad
-        angles_rad = np.concatenate([self._last_rad[:, None], angles_rad], axis=1)
-        rows = np.where(np.isnan(angles_rad), 0, np.arange(angles_rad.shape[1]))
-        held = np.take_along_axis(angles_rad, np.maximum.accumulate(rows, axis=1), axis=1)
-        self._last_rad = held[:, -1]
-        return held[:, 1:]
+        import pandas  # It would slow down the start of a node
+        held = pandas.DataFrame(np.vstack([self._last_rad, angles_rad.T])).ffill().to_numpy()
+        self._last_rad = held[-1]
+        return held[1:].T
 
 
 def _orientation_covariance(force: np.ndarray, covariance: np.ndarray, roll_rad2: np.ndarray,

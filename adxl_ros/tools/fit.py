@@ -94,7 +94,7 @@ def fit(options: argparse.Namespace) -> int:
     if options.journal and len(options.recording) != 1:
         raise UserError(f'--journal {options.journal}: names the rests of one recording, but '
                         f'{len(options.recording)} are given')
-    if options.report:
+    if options.report or options.dcc:
         html_page.check_libraries()
     if options.poses and (options.journal or len(options.recording) != 1):
         raise UserError(f'--poses {options.poses}: goes with one recording, and without --journal')

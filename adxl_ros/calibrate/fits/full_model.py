@@ -466,9 +466,11 @@ def require_determined(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
         return
     reason = f'they do not determine {", ".join(map(str, undetermined))}' if undetermined else \
         f'they have {poses.volts.size} values for {len(names)} coefficients'
-    raise UserError(
-        f'the full model is not determined by {len(poses)} poses: {reason}; add poses (alpha, '
-        f'beta) = {next_poses(unit, poses, names, stage)} deg, or fit --model physical or linear')
+    follows = {quantity for name in undetermined for quantity in effect_named(name.effect).follows}
+    advice = f'poses with other values of {" and ".join(sorted(follows))}' if follows else \
+        f'poses (alpha, beta) = {next_poses(unit, poses, names, stage)} deg'
+    raise UserError(f'the full model is not determined by {len(poses)} poses: {reason}; add '
+                    f'{advice}, or fit --model physical or linear')
 
 
 def next_poses(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError) -> str:

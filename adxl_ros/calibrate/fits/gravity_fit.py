@@ -32,11 +32,6 @@ _UNSCALED = np.ones(len(NAMES))
 """Weights of the parameters in the trust region of `leastsq`: none."""
 _CONVERGED = (1, 2, 3, 4)
 """States of `leastsq` in which it has converged (MINPACK, lmder)."""
-_NEARBY_STEPS = 8
-"""Gauss-Newton steps from a fit to a similar one, such as that without a rest; chosen: three
-suffice."""
-_NEARBY_STEP = 1e-10
-"""Largest component of a last step, after which the next one is below rounding."""
 STRETCHES = 5
 """Stretches of time that are held out in turn. Chosen: the usual number of folds."""
 _MAX_ROUNDS = 20
@@ -181,18 +176,13 @@ def _fit(rests: NominalRests) -> _Estimate:
     """Fit the parameters, and the excess variance that makes χ² equal its degrees of freedom."""
     parameters, excess_g2 = np.zeros(len(NAMES)), 0.0
     freedom = len(rests.mean) - len(NAMES)
-    for number in range(_MAX_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         variance = magnitude_variance(rests, parameters)
-        start, converged, weights = parameters, False, 1 / (variance + excess_g2)
-        if number:
-            # Near the solution plain Gauss-Newton steps suffice.
-            (parameters,), (converged,) = _nearby(rests, start[None], weights[None])
-        if not converged:
-            parameters, converged = _solve(rests, start, 1 / weights)
+        parameters, converged = _solve(rests, parameters, variance + excess_g2)
         squares = _residual(rests, parameters) ** 2
         before_g2, excess_g2 = excess_g2, _excess(squares, variance, freedom)
         if abs(excess_g2 - before_g2) <= _EXCESS_TOLERANCE * (excess_g2 + variance.min()):
-            return _Estimate(parameters, excess_g2, bool(converged))
+            return _Estimate(parameters, excess_g2, converged)
     return _Estimate(parameters, excess_g2, False)
 
 
@@ -300,39 +290,13 @@ def _held_out(rests: NominalRests, kept: np.ndarray, parameters: np.ndarray,
     count = len(used.mean)
     stretches = min(stretches, count)
     stretch = np.arange(count) * stretches // count
-    others = stretch != np.arange(stretches)[:, None]
-    without, converged = _nearby(used, np.tile(parameters, (stretches, 1)),
-                                 others / variance[kept])
-    for i in np.flatnonzero(~converged):
+    for number in range(stretches):
+        others = stretch != number
         # Of nine rests the other eight determine no fit.
-        without[i] = parameters if others[i].sum() < len(NAMES) else _solve(
-            used[others[i]], parameters, variance[kept][others[i]])[0]
-    errors[kept] = _residual(used, without)[stretch, np.arange(count)]
+        without = parameters if others.sum() < len(NAMES) else _solve(
+            used[others], parameters, variance[kept][others])[0]
+        errors[np.flatnonzero(kept)[~others]] = _residual(used[~others], without)
     return errors
-
-
-def _nearby(rests: NominalRests, starts: np.ndarray, weights: np.ndarray
-            ) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Take plain Gauss-Newton steps for several fits side by side.
-
-    starts: first values of the parameters, (s, 9); weights: weights of the rests in each fit,
-    1/g², (s, k); returns: parameters, (s, 9), and which of them have converged, (s,) bool.
-    """
-    parameters, converged = starts, np.zeros(len(starts), bool)
-    for _ in range(_NEARBY_STEPS):
-        length, _, rows = gravity_model.linearised(rests.mean, parameters)
-        weighted = np.swapaxes(rows * weights[..., None], -1, -2)
-        try:
-            steps = np.linalg.solve(weighted @ rows,
-                                    weighted @ (rests.gravity_g - length)[..., None])[..., 0]
-        except np.linalg.LinAlgError:
-            break  # without a stretch, the others do not determine the parameters
-        parameters = parameters + steps
-        converged = np.abs(steps).max(axis=1) < _NEARBY_STEP
-        if converged.all():
-            break
-    return parameters, converged
 
 
 def _require_determined(rests: NominalRests, parameters: np.ndarray, excess_g2: float) -> None:

@@ -244,6 +244,9 @@ def _assemble(sensor: Sensor, poses: Poses, regressions: list[AxisRegression]) -
     alpha, beta, p2, q2, r1, r2 = (np.zeros(count) for _ in range(6))
     for d, axis in enumerate(regressions):
         slope = axis.r[0]
+        if max(abs(axis.p[1]), abs(axis.q[1])) >= abs(slope):
+            raise UserError(f'the physical model does not hold: {sensor.axes[d]} follows another '
+                            'axis more than its own; check wiring, mounting and poses')
         turn, tilt = np.arcsin(axis.p[1] / slope), np.arcsin(axis.q[1] / slope)
         beta[d], alpha[d] = (turn, -tilt) if d == 0 else (-turn, tilt)       # (18), (19)
         zero[d] = axis.zero_g_v + axis.p[0] + axis.q[0]

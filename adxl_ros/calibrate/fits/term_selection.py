@@ -81,13 +81,13 @@ def fit(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()) -> Sensor:
     return fit_selected(sensor, poses, effects).full.fitted
 
 
-def fit_affine(sensor: Sensor, poses: Poses) -> full_model.FullFit:
+def fit_affine(sensor: Sensor, poses: Poses, max_open: int = _MAX_OPEN) -> full_model.FullFit:
     """
     Fit zero-g, scale factor and misalignment alone, for poses that do not determine more.
 
-    The poses may leave three coefficients to their priors.
+    max_open: number of coefficients that the poses may leave to their priors.
     """
-    return full_model.fit_full(sensor, poses, AFFINE, _MAX_OPEN)
+    return full_model.fit_full(sensor, poses, AFFINE, max_open)
 
 
 def fit_selected(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()) -> SelectedFit:

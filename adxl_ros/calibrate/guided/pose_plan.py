@@ -236,6 +236,16 @@ def motion_fault(readings_rad: np.ndarray, tolerance_rad: float) -> str:
     return ''
 
 
+def turn_fault(sensor: Sensor, change_v: np.ndarray, near_rad: float) -> str:
+    """Refuse a mean that differs from that of the capture by a change, V, (m,)."""
+    change_g = np.abs(change_v) / sensor.nominal_scale_v_per_g
+    axis = int(change_g.argmax())
+    if change_g[axis] < np.sin(near_rad):
+        return ''
+    return (f'the pose changed after the capture: {sensor.axes[axis]} moved by '
+            f'{change_g[axis]:.2f} g; hold the stage still until the pose is taken')
+
+
 def saturation_fault(sensor: Sensor, volts: np.ndarray) -> str:
     """Refuse samples, V, (n, m), at a rail of the ADC or beyond the range of the sensor."""
     rows, columns = np.nonzero(sensor.saturated(volts))

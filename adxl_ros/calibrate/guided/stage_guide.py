@@ -221,6 +221,11 @@ def _fault(sweep: StageSweep, record: PoseRecord, rest: Rest) -> str:
             sweep.course.targets[record.pose], *now_rad, settings.near_rad) or \
             pose_plan.motion_fault(sweep.encoder.between(record.start_ns, record.stop_ns),
                                    settings.tolerance_rad)
+    elif settings.stage_mode is StageMode.MANUAL:
+        # Without an encoder the first rest shows where the operator captured.
+        first_v = sweep.dwell.volts(sweep.dwell.rests()[0]).mean(axis=0)
+        fault = pose_plan.turn_fault(sweep.sensor, np.array(record.mean_v) - first_v,
+                                     settings.near_rad)
     fault = fault or pose_plan.saturation_fault(
         sweep.sensor, sweep.dwell.volts(rest)) or sweep.temperature_fault(
             record.temperature_c, settings.temperature_span_c)

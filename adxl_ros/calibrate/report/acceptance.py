@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
+from adxl_ros.calibrate.fits.term_selection import AFFINE
 from adxl_ros.calibrate.report import held_out
 from adxl_ros.calibrate.report.held_out import ErrorBudget, ErrorBudgets, HeldOutErrors, rms_mg
 from adxl_ros.model.coefficients import get, parameter_of
@@ -82,19 +83,27 @@ def _worse(*outcomes: str) -> str:
     return next((outcome for outcome in (FAIL, NOT_SHOWN, PASS) if outcome in outcomes), '')
 
 
-def assess(model: str, budgets: ErrorBudgets, sensor: Sensor) -> Assessment:
+def assess(model: str, budgets: ErrorBudgets, sensor: Sensor, is_certain: bool = True
+           ) -> Assessment:
     """
     Compare the calibration error of one model, without noise and stage error, with its limits.
 
     The limit by the datasheet is the typical nonlinearity at full scale, the only error that the
     manufacturer's own calibration leaves. The limit by the noise is the noise of one sample, rms
     over the axes. The limits of tilt are the tilt errors that such errors of each axis cause.
+
+    is_certain: whether the fit has converged and determines its coefficients. Else its errors at
+    the held-out poses show nothing of others, so that it cannot pass.
     """
+    def outcome(budget: ErrorBudget, limit: float) -> str:
+        found = _outcome(budget, limit)
+        return found if is_certain or found != PASS else NOT_SHOWN
+
     datasheet, noise = nonlinearity_mps2(sensor) ** 2, held_out.sample_noise_mps2(sensor) ** 2
     accel, tilt = budgets
-    return Assessment(model, accel, tilt, _outcome(accel, datasheet), _outcome(accel, noise),
-                      _outcome(tilt, datasheet * tilt.tilt_per_axis),
-                      _outcome(tilt, noise * tilt.tilt_per_axis))
+    return Assessment(model, accel, tilt, outcome(accel, datasheet), outcome(accel, noise),
+                      outcome(tilt, datasheet * tilt.tilt_per_axis),
+                      outcome(tilt, noise * tilt.tilt_per_axis))
 
 
 def _outcome(budget: ErrorBudget, limit: float) -> str:
@@ -128,11 +137,12 @@ def gravity_error_budgets(fit: GravityFit, fitted: Sensor, force: np.ndarray, ke
     upper = max(measured * nu / quantile - by_noise, excess)
     accel = held_out.axis_variance(covariance, [0, 1, 2], used)
     tilt = held_out.tilt_variance(covariance, force[kept], gravity, used)
+    spread = held_out.coefficient_spread(fitted, list(force[kept].T))
     # Each of three axes has the error of a magnitude; two of the three turn the vertical.
     return ErrorBudgets(
-        ErrorBudget(measured, by_noise, 0.0, accel, excess, accel + upper),
+        ErrorBudget(measured, by_noise, 0.0, accel, excess, spread * accel + upper),
         ErrorBudget(3 * measured / gravity ** 2, 2 * by_noise / gravity ** 2, 0.0, tilt,
-                    2 * excess / gravity ** 2, tilt + 2 * upper / gravity ** 2,
+                    2 * excess / gravity ** 2, spread * tilt + 2 * upper / gravity ** 2,
                     tilt_per_axis=2 / gravity ** 2))
 
 
@@ -266,8 +276,8 @@ def limit_table(assessment: Assessment, sensor: Sensor) -> list[str]:
         if accel:
             rows.append((name, 1e3 * limit_mps2 / G0_MPS2, float(np.degrees(
                 limit_mps2 * np.sqrt(assessment.tilt.tilt_per_axis))), accel, tilt))
-    return [f' {name:24} {"-" if np.isnan(value_deg) else f"{value_deg:#.2g}":>7} ° {tilt:9} '
-            f'{value_mg:#8.2g} mg {accel}'.rstrip()
+    return [f' {name:24} {"-" if np.isnan(value_deg) else _two_digits(value_deg):>7} ° {tilt:9} '
+            f'{_two_digits(value_mg):>8} mg {accel}'.rstrip()
             for name, value_mg, value_deg, accel, tilt in rows]
 
 
@@ -344,14 +354,31 @@ def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
         lines.append(
             'One axis does not see the force across it: align it, or accept this error.'
             if len(fitted.axes) == 1 else
-            'The sensor is worse than its datasheet states: do not use this file.'
-            if kind == 'datasheet' else 'More poses, or longer ones, reduce it.')
+            'More poses, or longer ones, reduce it.' if kind != 'datasheet' else
+            'Sensor, stage or poses are worse than stated: do not use this file.'
+            if 'cross_axis_z' in fitted.effects else
+            'More terms may reduce it, which needs a sweep on a stage; or a pose is wrong.')
     elif outcome == NOT_SHOWN:
-        lines.append('The check poses are too few to show that the error is within it.')
+        lines.append(_doubt(fitted))
     if 'span_s' in provenance:
         lines.append(f'By rests within {duration(float(provenance["span_s"]))}; a longer drift is '
                      'not in this figure.')
     return outcome, lines
+
+
+def _doubt(fitted: Sensor) -> str:
+    """Return why an error within its limit does not suffice."""
+    if names := open_coefficients(fitted):
+        return f'Other poses may have a larger error: {", ".join(map(str, names))} not determined.'
+    if fitted.provenance.get('converged') == 'no':
+        return 'The fit did not converge, so that other poses may have a larger error.'
+    return 'The check poses are too few to show that the error is within it.'
+
+
+def open_coefficients(fitted: Sensor) -> list[Coefficient]:
+    """Return zero-g, scale factors and misalignments that are known by their prior alone."""
+    return [name for name, variance in zip(fitted.covariance_names, np.diag(fitted.covariance))
+            if name.effect in AFFINE and variance > parameter_of(name).scale ** 2]
 
 
 def acceptance_lines(fitted: Sensor) -> list[str]:

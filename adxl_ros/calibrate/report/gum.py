@@ -20,6 +20,7 @@ from adxl_ros.calibrate.result import CalibrationResult
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import MARGIN_K, Sensor
+from adxl_ros.report.quantities import number
 import numpy as np
 import scipy
 
@@ -29,6 +30,8 @@ _EARTH_HALF_RANGE_MPS2 = 0.027
 """Half of the range of gravity at sea level, 9.780 to 9.832 m/s², about the standard gravity."""
 _LOCAL_STD_MPS2 = 5e-4
 """Uncertainty of a stated local gravity, m/s². Chosen: 50 mGal, the size of gravity anomalies."""
+_NOT_LOCAL_MPS2 = (G0_MPS2, 9.8, 9.81)
+"""Values of gravity that are those of no place in particular, m/s²."""
 _UNIFORM = np.sqrt(3)
 """Half-width of a uniform distribution divided by its standard deviation."""
 _SURROUNDINGS = {'temperature': ('temperature_c', 'temperature_std_k', 'K', MARGIN_K, 0.1),
@@ -55,7 +58,7 @@ MEANING = (
 RULE = (
     f'{PASS} if error + guard band is at most the limit; {FAIL} if the error exceeds it; '
     f'{NOT_SHOWN} in between, and where stage and model are inseparable. The guard band reaches '
-    'to the upper end of the 90 % interval; without one, this is simple acceptance. The risk is '
+    'to the upper end of the 90 % interval. The risk is '
     'the largest probability that a unit with such an error exceeds the limit. The error is that '
     'of coefficients and model; the other inputs belong to each use.')
 """The decision rule (ISO/IEC 17025, 7.8.6)."""
@@ -163,7 +166,7 @@ def uncertainty(result: CalibrationResult, stated: Mapping[str, Any] | None = No
     gravity_std, gravity_kind = _LOCAL_STD_MPS2, 'B, anomalies of gravity'
     if 'gravity_std_mps2' in stated:
         gravity_std, gravity_kind = stated['gravity_std_mps2'], 'B, stated'
-    elif gravity == G0_MPS2:  # The standard value is that of no place in particular.
+    elif gravity in _NOT_LOCAL_MPS2:
         gravity_std, gravity_kind = _EARTH_HALF_RANGE_MPS2 / _UNIFORM, 'B, not local: anywhere'
     fit_freedom = error.shape[1] * int((~poses.check).sum()) - len(fitted.covariance_names)
     inputs = (
@@ -230,20 +233,14 @@ def budget_rows(found: Uncertainty) -> list[list[str]]:
         std = float(np.broadcast_to(row.std, found.error_mps2.shape)[at])
         part_mg = 1e3 * float(row.contribution_mps2[at]) / G0_MPS2
         sensitivity = '1' if row.unit == 'mg' else \
-            f'{_digits(part_mg / std if std else 0.0)} mg per {row.unit}'
-        rows.append([row.name, f'{_digits(std)} {row.unit} ({row.kind})', sensitivity,
+            f'{number(part_mg / std if std else 0.0, digits=2)} mg per {row.unit}'
+        rows.append([row.name, f'{number(std, digits=2)} {row.unit} ({row.kind})', sensitivity,
                      f'{part_mg:.3f}', _freedom(row.freedom)])
     return rows
 
 
 def _freedom(value: float) -> str:
     return f'{value:.0f}' if value < _MANY else '∞'
-
-
-def _digits(value: float) -> str:
-    """Write a value with two digits, without an exponent."""
-    rounded = float(f'{value:.2g}') if value > 1e-9 else 0.0
-    return str(np.format_float_positional(rounded, trim='-'))
 
 
 def section(found: Uncertainty | None) -> dict[str, Any] | None:
@@ -255,7 +252,8 @@ def section(found: Uncertainty | None) -> dict[str, Any] | None:
     inside = np.abs(found.error_mps2) <= K * found.combined_mps2
     decisions = [[
         row.quantity, f'{row.error:.3f} + {row.guard_band:.3f} = '
-        f'{row.error + row.guard_band:.3f} {row.unit}', f'{_digits(row.limit)} {row.unit}',
+        f'{row.error + row.guard_band:.3f} {row.unit}',
+        f'{number(row.limit, digits=2)} {row.unit}',
         row.outcome, f'{100 * row.risk:.1f} %' if row.risk >= 1e-3 else '< 0.1 %']
         for row in found.decisions]
     return {

@@ -31,7 +31,8 @@ from adxl_ros.calibrate.poses import Poses, reference_force, stage_force
 from adxl_ros.errors import UserError
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
-from adxl_ros.model.covariance import force_covariance
+from adxl_ros.model.covariance import coefficient_tangent, force_covariance
+from adxl_ros.model.effects.base import Components, Environment, NOMINAL_ENVIRONMENT
 from adxl_ros.model.kinematics import tilt
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -275,7 +276,9 @@ class ErrorBudget:
     stage: float
     coefficients: float
     model: float
-    calibration_high: float  # Upper end of the 90 % interval of `coefficients + model`
+    # Upper end of the 90 % interval of the error of this calibration, of which
+    # `coefficients + model` is the mean over many calibrations
+    calibration_high: float
     separable: bool = True  # Whether the poses separate stage and model
     # Mean square of tilt that a mean square of 1 (m/s²)² on each measured axis causes; NaN for
     # acceleration
@@ -326,31 +329,52 @@ def error_budgets(errors: HeldOutErrors, poses: Poses, stage: Sensor | None = No
     axes = [AXES.index(axis) for axis in sensor.axes]
     *by_cause, probe = covariances(errors, held, reference)
     accel_scatter, tilt_scatter, has_noise = _scatter(sensor, poses.subset(~poses.check))
+    spread = coefficient_spread(sensor, list(reference.T), held.environment)
     accel = tilt = _NO_BUDGET
     if used.any():
         parts = [axis_variance(covariance, axes, used) for covariance in by_cause]
         accel = _budget((measured.force_mps2 - corrected)[used][:, axes],
                         float(np.mean(measured.accel_mps2[used] ** 2)), parts,
-                        accel_scatter - parts[0] * has_noise)
+                        accel_scatter - parts[0] * has_noise, spread)
     if has_tilt.any():
         parts = [tilt_variance(covariance, reference, gravity, has_tilt)
                  for covariance in by_cause]
         tilt = _budget(angle_between(measured.force_mps2, corrected)[has_tilt],
                        float(np.mean(measured.tilt_rad[has_tilt] ** 2)), parts,
-                       tilt_scatter - parts[0] * has_noise)
+                       tilt_scatter - parts[0] * has_noise, spread)
         tilt = replace(tilt, tilt_per_axis=tilt_variance(
             probe, reference, gravity, has_tilt) / _PROBE_MPS2 ** 2)
     return ErrorBudgets(accel, tilt)
 
 
-def _budget(errors: np.ndarray, measured: float, predicted: Sequence[float], unexplainable: float
-            ) -> ErrorBudget:
+def coefficient_spread(sensor: Sensor, force: Components,
+                       environment: Environment = NOMINAL_ENVIRONMENT) -> float:
+    """
+    Return how far the mean square by the coefficients may exceed its mean: the 95 % quantile.
+
+    The error by the coefficients of one fit is drawn once, and few of its directions matter. Its
+    mean square over the poses has the mean Σλ and the degrees of freedom (Σλ)²/Σλ² (Satterthwaite
+    1946), with the eigenvalues λ of its covariance.
+    """
+    if not sensor.covariance_names:
+        return 1.0
+    tangent = signal_chain.tangent(signal_chain.analog_response(sensor), sensor.axes, force,
+                                   environment)
+    slope = np.einsum('iak,apk->ipk', np.array(tangent.back),
+                      coefficient_tangent(sensor)(force, environment))
+    product = np.einsum('ipk,iqk->pq', slope, slope) @ sensor.covariance
+    nu = float(np.trace(product) ** 2 / np.trace(product @ product))
+    return float(scipy.special.chdtri(nu, 1 - _UPPER_QUANTILE)) / nu
+
+
+def _budget(errors: np.ndarray, measured: float, predicted: Sequence[float], unexplainable: float,
+            spread: float) -> ErrorBudget:
     """
     Split a mean square of errors against the corrected reference.
 
     errors: the errors, (k,) or (k, m), in the order of the visit; predicted: the parts by noise,
     coefficients and stated stage error; unexplainable: mean square that no model explains, without
-    noise; NaN where it is unknown.
+    noise; NaN where it is unknown; spread: see `coefficient_spread`.
     """
     by_noise, by_coefficients, by_stated_stage = predicted
     mean_square, nu = float(np.mean(errors ** 2)), degrees_of_freedom(errors)
@@ -362,7 +386,7 @@ def _budget(errors: np.ndarray, measured: float, predicted: Sequence[float], une
     stage = min(max(mean_square - by_noise - by_coefficients, 0.0), largest_stage)
     return ErrorBudget(
         measured, by_noise, max(measured - mean_square, 0.0) + stage, by_coefficients, model,
-        by_coefficients + max(upper - explained, 0.0), bool(np.isfinite(unexplainable)))
+        spread * by_coefficients + max(upper - explained, 0.0), bool(np.isfinite(unexplainable)))
 
 
 def covariances(errors: HeldOutErrors, held: Poses, reference: np.ndarray) -> list[np.ndarray]:

@@ -43,6 +43,15 @@ def test_a_stage_turned_by_hand_is_captured_near_its_target():
     assert by_hand.run(4, np.pi / 2, np.radians(31)).beta_rad == pytest.approx(np.radians(31))
 
 
+def test_a_stage_without_encoder_must_stay_where_it_was_captured():
+    by_hand = bench('manual')
+    by_hand.run(0.2, np.pi / 2, 0.0)
+    assert by_hand.sweep.capture() == ''
+    by_hand.run(0.8, np.pi / 2, 0.0)
+    assert by_hand.run(3, np.pi / 2, np.radians(4)) is None
+    assert 'the pose changed after the capture: y moved by 0.07 g' in refusal(by_hand)
+
+
 def test_a_silent_encoder_is_reported_and_gives_no_pose():
     dead = bench('encoder')
     dead.run(0.5, np.pi / 2, 0.0)

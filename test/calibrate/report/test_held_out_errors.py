@@ -6,8 +6,10 @@ from dataclasses import replace
 
 from adxl_ros.calibrate import calibration
 from adxl_ros.calibrate.fits.full_model import TERMS
+from adxl_ros.calibrate.guided.pose_plan import Target
 from adxl_ros.calibrate.report import acceptance, held_out
 from adxl_ros.calibrate.report.held_out import ErrorBudget, ErrorBudgets
+from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects.base import Coefficient
@@ -45,6 +47,21 @@ def true_errors(truth, result):
     mg = (got - force)[finite, :len(truth.axes)] / G0_MPS2 * 1e3
     return (np.sqrt(np.mean(mg ** 2)),
             np.degrees(np.sqrt(np.mean(held_out.angle_between(got, force)[finite] ** 2))))
+
+
+def test_poses_at_a_rail_are_left_out_and_an_open_scale_factor_does_not_pass():
+    rng = np.random.default_rng(6)
+    sensor = nominal('xyz')
+    poses = swept(rng, drawn(rng, sensor, ('bias', 'scale_factor')), check_poses=0,
+                  targets=[Target(np.radians(alpha), 0.0) for alpha in (0, 40, 80, 120, 160, 180)])
+    poses.volts[1, 0] = sensor.adc_vref_v - sensor.lsb_v
+    result = calibration.calibrate(sensor, [calibration.RecordedPoses('made', poses)])
+    assert len(result.poses) == 5 and 'ADC at a rail in 1 poses' in ' '.join(result.warnings)
+    outcome, lines = acceptance.acceptance(result.fitted)
+    assert outcome == acceptance.NOT_SHOWN and 'scale_factor.offset_v_per_g.y' in lines[-1]
+    poses.volts[:, 2] = 0.0
+    with pytest.raises(UserError, match='made: ADC at a rail in 6 poses .*check supply'):
+        calibration.calibrate(sensor, [calibration.RecordedPoses('made', poses)])
 
 
 @pytest.mark.parametrize(('check', 'units', 'within'), [(16, 4, 0.35), (0, 2, 0.5)],
