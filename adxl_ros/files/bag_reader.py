@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 import itertools
 import os
-from pathlib import Path
 from typing import Any
 
 from adxl_ros.errors import UserError
@@ -71,7 +70,7 @@ def blocks(path: str | os.PathLike, rows: int, ideal: bool = False,
             for topic, parts in messages.items():
                 _add_references(f'{bag.path}: topic {topic}', _REFERENCES[kinds[topic]], parts,
                                 tracks)
-            ready = len(samples.stamp_ns) if is_last else samples.ready(tracks)
+            ready = len(samples.stamp_ns) if is_last else samples.ready(tracks) // rows * rows
             for start in range(0, ready, rows):
                 yield _block(bag, samples, tracks, commands, info,
                              slice(start, min(start + rows, ready)))
@@ -90,13 +89,12 @@ def _refuse_mapping(bag: Bag, reading: ReadingOptions) -> None:
 
 
 def _batches(bag: Bag, topics: Topics, rows: int) -> Iterator[tuple[list[Piece], bool]]:
-    """Yield pieces with `rows` samples of the sensor together, and whether they are the last."""
+    """Yield pieces with some `rows` samples of the sensor, and whether they are the last."""
     batch: list[Piece] = []
     count = 0
     for piece in bag.pieces(topics.sampled()):
-        while count + len(piece.places.get(topics.imu, ())) >= rows:
-            head, piece = piece.split(topics.imu, rows - count)
-            yield [*batch, head], False
+        if count >= rows:
+            yield batch, False
             batch, count = [], 0
         batch.append(piece)
         count += len(piece.places.get(topics.imu, ()))
@@ -309,11 +307,6 @@ def drop_unsampled(recording: Recording) -> None:
 
 _ROWS = 65536
 """Messages of a block (chosen: some MB)."""
-
-
-def has_log_times(path: str | os.PathLike) -> bool:
-    """Return whether a recording is a bag."""
-    return Path(path).is_dir() or Path(path).suffix in ('.mcap', '.db3')
 
 
 def log_times(path: str | os.PathLike, topic: str) -> Iterator[np.ndarray]:

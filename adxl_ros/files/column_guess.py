@@ -63,7 +63,7 @@ _VOLT_NAMES = re.compile(r'(?i)volt|adc|analog|^a\d|(?<![a-z])m?v(?![a-z])|^v_?[
 """Names of volts."""
 
 _AXIS_WORD = re.compile(
-    r'(?i)(a|acc|accel|g_?f|f|ad|gf|v)([xyz])|([xyz])(acc|accel|adc|v)')
+    r'(?i)(a|acc|accel|g_?f|f|ad|adc|raw|gf|v)([xyz])|([xyz])(acc|accel|adc|raw|v)')
 """A word in which x, y or z is the axis."""
 
 _REFERENCES = {

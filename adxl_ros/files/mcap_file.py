@@ -74,17 +74,6 @@ class Piece:
     # Where each of them stands in the order of all, by topic, (n,), ascending
     places: Mapping[str, np.ndarray]
 
-    def split(self, topic: str, count: int) -> tuple[Piece, Piece]:
-        """Split behind a message."""
-        last = self.places[topic][count - 1]
-        cuts = {name: int(np.searchsorted(places, last, 'right'))
-                for name, places in self.places.items()}
-        head, tail = (
-            Piece({name: raws[part(cuts[name])] for name, raws in self.messages.items()},
-                  {name: places[part(cuts[name])] for name, places in self.places.items()})
-            for part in (lambda cut: slice(cut), lambda cut: slice(cut, None)))
-        return head, tail
-
 
 def collected_pieces(messages: Iterable[tuple[str, bytes, int]]) -> Iterator[Piece]:
     """Collect messages with topic and log time, ns, to pieces."""
