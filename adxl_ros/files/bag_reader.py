@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-import itertools
 import os
 from typing import Any
 
@@ -58,7 +57,7 @@ def blocks(path: str | os.PathLike, rows: int, ideal: bool = False,
                            reading)
         tracks, kinds = _tracks(bag, topics), dict(bag.types)
         commands = {column: Command() for column in COMMANDS.values() if topics.command}
-        for pieces, is_last in _batches(bag, topics, rows):
+        for pieces, is_last in _batches(bag, topics, rows, samples):
             messages = {topic: [piece.messages[topic] for piece in pieces
                                 if len(piece.messages.get(topic, ()))]
                         for topic in topics.sampled()}
@@ -88,12 +87,13 @@ def _refuse_mapping(bag: Bag, reading: ReadingOptions) -> None:
         raise UserError(f'--lsb-per-g: {bag.path} is a bag, whose readings are in m/s²')
 
 
-def _batches(bag: Bag, topics: Topics, rows: int) -> Iterator[tuple[list[Piece], bool]]:
-    """Yield pieces with some `rows` samples of the sensor, and whether they are the last."""
+def _batches(bag: Bag, topics: Topics, rows: int, samples: _Samples
+             ) -> Iterator[tuple[list[Piece], bool]]:
+    """Yield pieces that make a block with the waiting samples, and whether they are the last."""
     batch: list[Piece] = []
     count = 0
     for piece in bag.pieces(topics.sampled()):
-        if count >= rows:
+        if len(samples.stamp_ns) % rows + count > rows:
             yield batch, False
             batch, count = [], 0
         batch.append(piece)
@@ -305,18 +305,11 @@ def drop_unsampled(recording: Recording) -> None:
             recording.alignments.pop(column, None)
 
 
-_ROWS = 65536
-"""Messages of a block (chosen: some MB)."""
-
-
 def log_times(path: str | os.PathLike, topic: str) -> Iterator[np.ndarray]:
     """Yield header stamp and log time of the samples of a bag, ns, (k, 2), in blocks."""
     with open_bag(path) as bag:
         imu = find_topics(bag, topic).imu
-        messages = bag.logged_messages([imu])
-        while block := list(itertools.islice(messages, _ROWS)):
-            stamp_ns = np.empty(len(block), np.int64)
-            for table in _tables(f'{bag.path}: topic {imu}', [[raw for _, raw, _ in block]],
-                                 cdr.header):
-                stamp_ns[table.rows] = table.stamp_ns()
-            yield np.column_stack([stamp_ns, [log_ns for _, _, log_ns in block]])
+        for piece in bag.pieces([imu]):
+            stamp_ns, _ = _columns(f'{bag.path}: topic {imu}', [piece.messages[imu]], cdr.header,
+                                   (), lambda table: {})
+            yield np.column_stack([stamp_ns, piece.log_ns[imu]])

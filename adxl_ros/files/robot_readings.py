@@ -108,7 +108,7 @@ def _topic(bag: Bag, topic: str) -> str:
 def _joints(bag: Bag, topic: str, epoch_ns: int) -> dict[str, Track]:
     """Return the readings of all joints of a topic."""
     readings: dict[str, tuple[list[np.ndarray], list[np.ndarray]]] = {}
-    parts = [piece.messages[topic] for piece in bag.pieces([topic]) if topic in piece.messages]
+    parts = [piece.messages[topic] for piece in bag.pieces([topic])]
     try:
         for table in cdr.joined_tables(parts, cdr.joint_state):
             names = [text for key, text in table.layout.texts.items() if key != 'frame_id']
@@ -137,7 +137,7 @@ def _base(bag: Bag, root: str, epoch_ns: int) -> Track | None:
     topics = odometry[:1] or [topic for topic, kind in kinds.items()
                               if kind == _TRANSFORMS and topic.endswith('tf')]
     stamps, poses = [], []
-    for topic, raw in bag.messages(topics):
+    for topic, raw in ((name, raw) for name in topics for raw in bag.messages(name)):
         message = store.deserialize_cdr(raw, kinds[topic])
         for header, place, turn in [(
                 message.header, message.pose.pose.position, message.pose.pose.orientation)] \

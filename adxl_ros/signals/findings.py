@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import recording
 from adxl_ros.files.bag_reader import log_times
-from adxl_ros.files.column_mapping import ReadingOptions
+from adxl_ros.files.column_mapping import likely_unit, ReadingOptions
 from adxl_ros.files.recording_columns import Recording, uncalibrated
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import Sensor
@@ -143,10 +143,9 @@ def _sample_faults(contents: RecordingContents) -> list[str]:
 
 def _unit_hint(length_g: float) -> str:
     """Return which unit the readings seem to have; empty where none fits."""
-    for unit, factor in (('g', 1 / G0_MPS2), ('mg', 1e3 / G0_MPS2)):
-        if _LENGTHS_G[0] < length_g / factor < _LENGTHS_G[1]:
-            return f'; the readings seem to be in {unit}: state it by --columns'
-    return '; check unit and scale factor'
+    unit = likely_unit(length_g * G0_MPS2)
+    return f'; the readings seem to be in {unit}: state it by --columns' if unit else \
+        '; check unit and scale factor'
 
 
 def _remarks(contents: RecordingContents) -> list[str]:
