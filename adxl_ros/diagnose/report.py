@@ -384,7 +384,8 @@ def shows_row(row: CouldShow, scale_v_per_g: float) -> tuple[str, str, str, str]
     effect, _, smallest, typical, manoeuvre = shown_row(row, scale_v_per_g)
     of_reference = effect_named(effect).concern is Concern.REFERENCE
     return effect, smallest, typical, '' if row.shows else \
-        'needs --sim' if of_reference else f'needs: {manoeuvre}'
+        'needs --sim' if of_reference else \
+        f'needs: {manoeuvre}' if manoeuvre else 'no manoeuvre shows it'
 
 
 _BADGE_COLUMNS, _GAP_COLUMNS, _LABEL_COLUMNS = 29, 24, 9

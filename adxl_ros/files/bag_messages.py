@@ -53,19 +53,6 @@ class Bag:
             return 1.0
         return (self._read + self._parts[self._read].done) / len(self._parts)
 
-    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, bytes]]:
-        """Yield topic and CDR of each message of some topics, in the order of recording."""
-        for topic, raw, _ in self.logged_messages(topics):
-            yield topic, raw
-
-    def logged_messages(self, topics: Collection[str]) -> Iterator[tuple[str, bytes, int]]:
-        """Yield topic, CDR and log time, ns, of each message, in the order of recording."""
-        self._read = 0
-        for part in self._parts:
-            for topic, raw, log_ns in part.messages(topics):
-                yield topic, self._unpacked(topic, raw), log_ns
-            self._read += 1
-
     def pieces(self, topics: Collection[str]) -> Iterator[Piece]:
         """Yield the messages of some topics in pieces, in the order of recording."""
         self._read = 0
@@ -74,6 +61,11 @@ class Bag:
                 yield replace(piece, messages={topic: self._all_unpacked(topic, raws)
                                                for topic, raws in piece.messages.items()})
             self._read += 1
+
+    def messages(self, topic: str) -> Iterator[bytes]:
+        """Yield the CDR of each message of a topic, in the order of recording."""
+        for piece in self.pieces([topic]):
+            yield from map(bytes, piece.messages.get(topic, ()))
 
     def _all_unpacked(self, topic: str, raws: Raws) -> Raws:
         if isinstance(raws, np.ndarray):
@@ -218,7 +210,8 @@ def _files(path: Path) -> list[Path]:
                             'expected a rosbag2 recording')
         return files
     try:
-        content = yaml.safe_load(metadata.read_bytes())
+        with metadata.open('rb') as file:  # so that an error names it
+            content = yaml.safe_load(file)
         names = content['rosbag2_bagfile_information']['relative_file_paths']
         files = [path / Path(name).name for name in names]
     except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError) as error:
@@ -357,7 +350,7 @@ def read_info(bag: Bag, topic: str | None) -> dict[str, str]:
     if topic is None:
         return info
     types = typestore()
-    for _, raw in bag.messages([topic]):
+    for raw in bag.messages(topic):
         try:
             message = types.deserialize_cdr(raw, DIAGNOSTIC_STATUS)
         except Exception as error:

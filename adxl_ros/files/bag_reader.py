@@ -5,9 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-import itertools
 import os
-from pathlib import Path
 from typing import Any
 
 from adxl_ros.errors import UserError
@@ -59,7 +57,7 @@ def blocks(path: str | os.PathLike, rows: int, ideal: bool = False,
                            reading)
         tracks, kinds = _tracks(bag, topics), dict(bag.types)
         commands = {column: Command() for column in COMMANDS.values() if topics.command}
-        for pieces, is_last in _batches(bag, topics, rows):
+        for pieces, is_last in _batches(bag, topics, rows, samples):
             messages = {topic: [piece.messages[topic] for piece in pieces
                                 if len(piece.messages.get(topic, ()))]
                         for topic in topics.sampled()}
@@ -71,7 +69,7 @@ def blocks(path: str | os.PathLike, rows: int, ideal: bool = False,
             for topic, parts in messages.items():
                 _add_references(f'{bag.path}: topic {topic}', _REFERENCES[kinds[topic]], parts,
                                 tracks)
-            ready = len(samples.stamp_ns) if is_last else samples.ready(tracks)
+            ready = len(samples.stamp_ns) if is_last else samples.ready(tracks) // rows * rows
             for start in range(0, ready, rows):
                 yield _block(bag, samples, tracks, commands, info,
                              slice(start, min(start + rows, ready)))
@@ -89,14 +87,14 @@ def _refuse_mapping(bag: Bag, reading: ReadingOptions) -> None:
         raise UserError(f'--lsb-per-g: {bag.path} is a bag, whose readings are in m/s²')
 
 
-def _batches(bag: Bag, topics: Topics, rows: int) -> Iterator[tuple[list[Piece], bool]]:
-    """Yield pieces with `rows` samples of the sensor together, and whether they are the last."""
+def _batches(bag: Bag, topics: Topics, rows: int, samples: _Samples
+             ) -> Iterator[tuple[list[Piece], bool]]:
+    """Yield pieces that make a block with the waiting samples, and whether they are the last."""
     batch: list[Piece] = []
     count = 0
     for piece in bag.pieces(topics.sampled()):
-        while count + len(piece.places.get(topics.imu, ())) >= rows:
-            head, piece = piece.split(topics.imu, rows - count)
-            yield [*batch, head], False
+        if len(samples.stamp_ns) % rows + count > rows:
+            yield batch, False
             batch, count = [], 0
         batch.append(piece)
         count += len(piece.places.get(topics.imu, ()))
@@ -307,23 +305,11 @@ def drop_unsampled(recording: Recording) -> None:
             recording.alignments.pop(column, None)
 
 
-_ROWS = 65536
-"""Messages of a block (chosen: some MB)."""
-
-
-def has_log_times(path: str | os.PathLike) -> bool:
-    """Return whether a recording is a bag."""
-    return Path(path).is_dir() or Path(path).suffix in ('.mcap', '.db3')
-
-
 def log_times(path: str | os.PathLike, topic: str) -> Iterator[np.ndarray]:
     """Yield header stamp and log time of the samples of a bag, ns, (k, 2), in blocks."""
     with open_bag(path) as bag:
         imu = find_topics(bag, topic).imu
-        messages = bag.logged_messages([imu])
-        while block := list(itertools.islice(messages, _ROWS)):
-            stamp_ns = np.empty(len(block), np.int64)
-            for table in _tables(f'{bag.path}: topic {imu}', [[raw for _, raw, _ in block]],
-                                 cdr.header):
-                stamp_ns[table.rows] = table.stamp_ns()
-            yield np.column_stack([stamp_ns, [log_ns for _, _, log_ns in block]])
+        for piece in bag.pieces([imu]):
+            stamp_ns, _ = _columns(f'{bag.path}: topic {imu}', [piece.messages[imu]], cdr.header,
+                                   (), lambda table: {})
+            yield np.column_stack([stamp_ns, piece.log_ns[imu]])

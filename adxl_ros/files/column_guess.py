@@ -10,6 +10,7 @@ import re
 
 from adxl_ros.files.column_mapping import (
     ColumnMapping,
+    GRAVITY,
     is_sensor_step,
     likely_unit,
     listed,
@@ -26,7 +27,7 @@ from adxl_ros.files.column_mapping import (
     UNSIGNED,
 )
 from adxl_ros.files.recording_columns import burst_samples, stamped_rate_hz
-from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.constants import AXES
 import numpy as np
 
 _TIME_NAMES = re.compile(
@@ -45,9 +46,6 @@ _OTHER_SENSORS = re.compile(
     r'\brad\b|dps|(deg|°)\s?/\s?s|angle')
 """Names of columns of other sensors."""
 
-_ACCEL_UNITS = ('g', 'mg', 'mps2')
-"""Units that only acceleration has."""
-
 _ACCEL_NAMES = (
     re.compile(r'(?i)^acc(el(eration|erometer)?)?\b|acc'),
     re.compile(r'(?i)^(a|f|g_?f|ad)_?[xyz]'),
@@ -63,7 +61,7 @@ _VOLT_NAMES = re.compile(r'(?i)volt|adc|analog|^a\d|(?<![a-z])m?v(?![a-z])|^v_?[
 """Names of volts."""
 
 _AXIS_WORD = re.compile(
-    r'(?i)(a|acc|accel|g_?f|f|ad|gf|v)([xyz])|([xyz])(acc|accel|adc|v)')
+    r'(?i)(a|acc|accel|g_?f|f|ad|adc|raw|gf|v)([xyz])|([xyz])(acc|accel|adc|raw|v)')
 """A word in which x, y or z is the axis."""
 
 _REFERENCES = {
@@ -238,7 +236,7 @@ def _outputs(table: Table, values: Mapping[str, np.ndarray]) -> list[str]:
     if table.has_names:
         names = [name for name in values if not _OTHER_SENSORS.search(name)]
         stated = [name for name in names
-                  if unit_in_name(name, Quantity.OUTPUT) in _ACCEL_UNITS]
+                  if unit_in_name(name, Quantity.OUTPUT) in GRAVITY]
         groups = [stated, *([name for name in names if pattern.search(name)]
                             for pattern in _ACCEL_NAMES)]
         outputs = next(filter(None, map(_by_axis, groups)), None)
@@ -330,10 +328,9 @@ def _is_gravity(readings: np.ndarray, unit: str, zero: float, length: float) -> 
     lengths = np.linalg.norm(_at_rest(values) - zero, axis=1)
     if np.median(np.abs(lengths - length)) > _CONSTANT * length:
         return False
-    if unit not in _ACCEL_UNITS:
+    if unit not in GRAVITY:
         return True
-    length_g = float(UNITS[Quantity.OUTPUT][unit].convert(np.array(length))) / G0_MPS2
-    return _LENGTHS_G[0] < length_g < _LENGTHS_G[1]
+    return _LENGTHS_G[0] < length / GRAVITY[unit] < _LENGTHS_G[1]
 
 
 def _has_lost_sign(readings: np.ndarray) -> bool:

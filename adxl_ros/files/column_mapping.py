@@ -252,6 +252,11 @@ UNITS: Mapping[Quantity, Mapping[str, Unit]] = {
 }
 """Units by quantity and name."""
 
+GRAVITY = {name: G0_MPS2 * unit.divisor / unit.factor
+           for name, unit in UNITS[Quantity.OUTPUT].items()
+           if name not in (LSB, UNSIGNED) and not unit.is_volts}
+"""Length of gravity in each unit of acceleration."""
+
 _SPELLINGS = {
     's': 'sec secs second seconds', 'ms': 'msec millis milliseconds',
     'us': 'µs μs usec micros microseconds', 'ns': 'nsec nanoseconds', 'epoch': 'unix posix',
@@ -330,8 +335,7 @@ def listed(names: Sequence[str]) -> str:
 
 def likely_unit(length: float) -> str:
     """Return the unit in which readings have the length of gravity; empty where none fits."""
-    lengths = {'g': 1.0, 'mps2': G0_MPS2, 'mg': 1e3}
-    return next((unit for unit, gravity in lengths.items()
+    return next((unit for unit, gravity in GRAVITY.items()
                  if abs(np.log(max(length, 1e-12) / gravity)) < _NEAR), '')
 
 

@@ -112,7 +112,6 @@ class _Lines:
     numbers: Sequence[int]  # Their numbers in the file, from 1
     done: float  # Fraction of the file that has been read at their end
     is_open_ended: bool  # Whether the last one has no newline in the file
-    marks: bytes  # The lines without `_NO_MARKS`; empty where that is not known
 
     def rows(self) -> list[list[str]]:
         """Return the fields of all lines."""
@@ -178,11 +177,10 @@ def _read_lines(path: str, form: Form, info: dict[str, str]) -> Iterator[_Lines]
                 rows = [(line, number) for line, number in zip(data.split(b'\n'), numbers)
                         if line.strip() and not _add_info(line, info)]
                 data = b''.join(line + b'\n' for line, _ in rows)
-                numbers, marks = [number for _, number in rows], b''
-            if form.is_worded or form.delimiter != ',':
-                data, marks = form.rewritten(data), b''
+                numbers = [number for _, number in rows]
             if data:
-                yield _Lines(path, data, numbers, file.tell() / size, is_open_ended, marks)
+                yield _Lines(path, form.rewritten(data), numbers, file.tell() / size,
+                             is_open_ended)
 
 
 def _add_info(line: bytes, info: dict[str, str]) -> bool:
@@ -230,7 +228,7 @@ def _by_pandas(lines: _Lines, names: Sequence[str], used: Sequence[str]
                ) -> dict[str, np.ndarray] | None:
     """Parse all lines at once; None where one of them must be parsed field by field."""
     # Pandas would fill a short line, and cut a long one.
-    marks = lines.marks or lines.data.translate(None, _NO_MARKS)
+    marks = lines.data.translate(None, _NO_MARKS)
     if marks != (b',' * (len(names) - 1) + b'\n') * len(lines.numbers):
         return None
     import pandas

@@ -102,12 +102,13 @@ def native_mapping(table: Table, output: tuple[str, ...] = ()) -> ColumnMapping:
                    (*VOLTS, *ACCEL))
     roles = {**_NATIVE, **{column: AXES[i % len(AXES)] for i, column in enumerate(outputs)}}
     for column, role in roles.items():
-        other = None if column in names else _in_other_unit(names, column, role)
+        if column in names:
+            continue
+        other = _in_other_unit(names, column, role)
         if other is not None:
             raise NotNativeError(f'{table.header}:{other + 1}: column {names[other]} is in '
                                  f'another unit; expected the column {column}')
-    for column in (TIME, *output):
-        if column not in names:
+        if column in (TIME, *output):
             raise NotNativeError(f'{table.header}: no column {column}'
                                  + f'; the columns are {listed(names)}' * bool(output))
     try:

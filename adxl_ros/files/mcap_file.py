@@ -73,29 +73,18 @@ class Piece:
     messages: Mapping[str, Raws]  # The messages by topic, in the order of recording
     # Where each of them stands in the order of all, by topic, (n,), ascending
     places: Mapping[str, np.ndarray]
-
-    def split(self, topic: str, count: int) -> tuple[Piece, Piece]:
-        """Split behind a message."""
-        last = self.places[topic][count - 1]
-        cuts = {name: int(np.searchsorted(places, last, 'right'))
-                for name, places in self.places.items()}
-        head, tail = (
-            Piece({name: raws[part(cuts[name])] for name, raws in self.messages.items()},
-                  {name: places[part(cuts[name])] for name, places in self.places.items()})
-            for part in (lambda cut: slice(cut), lambda cut: slice(cut, None)))
-        return head, tail
+    log_ns: Mapping[str, np.ndarray]  # Their log times by topic, ns, (n,)
 
 
 def collected_pieces(messages: Iterable[tuple[str, bytes, int]]) -> Iterator[Piece]:
     """Collect messages with topic and log time, ns, to pieces."""
     iterator = iter(messages)
     while batch := list(islice(iterator, _PIECE_MESSAGES)):
-        raws: dict[str, list[bytes]] = {topic: [] for topic, _, _ in batch}
-        places: dict[str, list[int]] = {topic: [] for topic in raws}
-        for place, (topic, raw, _) in enumerate(batch):
-            raws[topic].append(raw)
-            places[topic].append(place)
-        yield Piece(raws, {topic: np.array(numbers) for topic, numbers in places.items()})
+        topics = np.array([topic for topic, _, _ in batch])
+        logged = np.array([log_ns for _, _, log_ns in batch])
+        places = {str(topic): np.flatnonzero(topics == topic) for topic in np.unique(topics)}
+        yield Piece({topic: [batch[i][1] for i in rows] for topic, rows in places.items()}, places,
+                    {topic: logged[rows] for topic, rows in places.items()})
 
 
 def in_order(storage: Any, topics: Mapping[int, str]) -> list[Any]:
@@ -127,7 +116,8 @@ def read_chunk(file: Any, chunk: Any, topics: Mapping[int, str]) -> Piece:
     places = np.empty(len(entries), np.int64)
     places[np.lexsort((entries['offset'], entries['log_ns']))] = np.arange(len(entries))
     bounds = np.cumsum([len(index) for index in indices.values()])[:-1]
-    return Piece(raws, dict(zip(raws, np.split(places, bounds))))
+    return Piece(raws, dict(zip(raws, np.split(places, bounds))), {
+        topics[channel]: index['log_ns'].astype(np.int64) for channel, index in indices.items()})
 
 
 def _index(file: Any, chunk: Any, channel: int) -> np.ndarray:

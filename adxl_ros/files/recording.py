@@ -61,7 +61,7 @@ def read(path: str | os.PathLike, reading: ReadingOptions = AS_IT_IS) -> Recordi
 
     """
     recording = concatenate(blocks(path, _BLOCK_ROWS, reading))
-    if _is_bag(path):
+    if is_bag(path):
         bag_reader.drop_unsampled(recording)
     return recording
 
@@ -74,7 +74,7 @@ def blocks(path: str | os.PathLike, rows: int, reading: ReadingOptions = AS_IT_I
     All blocks have the same columns, except for a CSV column that turns out to be text further
     down. Alignments, cut and remarks of a block are those up to its end.
     """
-    read_blocks = bag_reader.blocks(path, rows, reading=reading) if _is_bag(path) else \
+    read_blocks = bag_reader.blocks(path, rows, reading=reading) if is_bag(path) else \
         _table_blocks(path, rows, reading)
     return _mounted(read_blocks, reading.mounting) if reading.mounting else read_blocks
 
@@ -140,7 +140,7 @@ def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> Recording:
         The file cannot be read, or an axis is missing.
 
     """
-    parts = (bag_reader.blocks(path, _BLOCK_ROWS, ideal=True) if _is_bag(path)
+    parts = (bag_reader.blocks(path, _BLOCK_ROWS, ideal=True) if is_bag(path)
              else mapped_recording.blocks(open_table(path), None, AS_IT_IS, _BLOCK_ROWS, ACCEL))
     ideal = concatenate(parts)
     return replace(ideal, time_s=ideal.time_s + (ideal.epoch_ns - epoch_ns) / 1e9,
@@ -192,7 +192,7 @@ def write(path: str | os.PathLike, recording: Recording, sensor: Sensor) -> None
         append(recording)
 
 
-def _is_bag(path: str | os.PathLike) -> bool:
+def is_bag(path: str | os.PathLike) -> bool:
     """Return whether a recording is a bag; refuse bags that cannot be read under their name."""
     file_path = Path(path)
     if file_path.is_dir():

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.stream_info import FORMAT, NO_UNIT, StreamInfo
+from adxl_ros.files.stream_info import FORMAT, NO_UNIT, NOMINAL_KEYS, StreamInfo
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2, to_volts, with_axes
 import numpy as np
@@ -138,7 +138,8 @@ class Recording:
     def accel_mps2(self, sensor: Sensor) -> np.ndarray:
         """Return the specific force by the nominal values of `sensor`, m/s², (n, m)."""
         names, data = self._output(sensor)
-        if names[0] in ACCEL and _has_same_nominal_values(self._nominal(sensor), sensor):
+        if names[0] in ACCEL and all(np.array_equal(getattr(self._nominal(sensor), key),
+                                                    getattr(sensor, key)) for key in NOMINAL_KEYS):
             return data
         return to_nominal_mps2(self.volts(sensor), sensor)
 
@@ -155,11 +156,6 @@ class Recording:
             name: values[:len(sensor.axes)]
             for name, values in self.stream_info.nominal_values(self.axes).items()}
         return replace(sensor, **stated)
-
-
-def _has_same_nominal_values(first: Sensor, second: Sensor) -> bool:
-    return (np.array_equal(first.nominal_zero_g_v, second.nominal_zero_g_v)
-            and np.array_equal(first.nominal_scale_v_per_g, second.nominal_scale_v_per_g))
 
 
 def sensor_columns(names: Iterable[str], where: str) -> tuple[str, ...]:

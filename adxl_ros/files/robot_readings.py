@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Readings of a robot's joints, and of its base, from a bag or a CSV file."""
+"""Readings of a robot's joints, and of its base, from a bag or a table."""
 
 from __future__ import annotations
 
@@ -11,13 +11,15 @@ from typing import NamedTuple
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.files.bag_messages import Bag, open_bag, typestore
+from adxl_ros.files.recording import is_bag
+from adxl_ros.files.tables import open_table
 import numpy as np
 
 _JOINT_STATE = 'sensor_msgs/msg/JointState'
 _ODOMETRY = 'nav_msgs/msg/Odometry'
 _TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 _BASE = ('x_m', 'y_m', 'z_m', 'qx', 'qy', 'qz', 'qw')
-"""Columns of the pose of the base in a CSV file, behind `base_`."""
+"""Columns of the pose of the base in a table, behind `base_`."""
 
 Track = tuple[np.ndarray, np.ndarray]
 """Time, s, (k,), and values, (k,) or (k, 7)."""
@@ -42,7 +44,7 @@ def read(path: str | os.PathLike, epoch_ns: int, topic: str = '', root: str = ''
     ----------
     path
         A bag with `sensor_msgs/JointState`, and `nav_msgs/Odometry` or tf where the base moves; or
-        a CSV file with `time_s`, columns NAME_rad or NAME_m, and base_x_m ... base_qw.
+        a table with `time_s`, columns NAME_rad or NAME_m, and base_x_m ... base_qw.
     epoch_ns
         Stamp of time 0, ns.
     topic
@@ -63,33 +65,31 @@ def read(path: str | os.PathLike, epoch_ns: int, topic: str = '', root: str = ''
         There are no joints, or several topics of them.
 
     """
-    if os.path.splitext(path)[1] == '.csv':
-        return _from_csv(str(path))
+    if not is_bag(path):
+        return _from_table(str(path))
     with open_bag(path) as bag:
         joints = _joints(bag, _topic(bag, topic), epoch_ns) if needs_joints else {}
         return Readings(str(path), joints, _base(bag, root, epoch_ns))
 
 
-def _from_csv(path: str) -> Readings:
-    import pandas
-    table = pandas.read_csv(path, comment='#')
-    if 'time_s' not in table:
+def _from_table(path: str) -> Readings:
+    table = open_table(path)
+    if 'time_s' not in table.names:
         raise UserError(f'{path}: no column time_s beside the joints of a robot')
-    time_s = table['time_s'].to_numpy(float)
-
-    def track(columns: list[str]) -> Track:
-        values = table[columns].to_numpy(float)
-        known = np.isfinite(values).all(axis=1)
-        return time_s[known], values[known]
-
-    joints = {}
-    for column in table.columns:
-        name, _, unit = column.rpartition('_')
-        if unit in ('rad', 'm') and not column.startswith('base_'):
-            times, values = track([column])
-            joints[name] = times, values[:, 0]
+    joints = {name: name.rpartition('_')[0] for name in table.names
+              if name.endswith(('_rad', '_m')) and not name.startswith('base_')}
     base = [f'base_{name}' for name in _BASE]
-    return Readings(path, joints, track(base) if set(base) <= set(table.columns) else None)
+    base = base if set(base) <= set(table.names) else []
+    names = ['time_s', *joints, *base]
+    blocks = list(table.blocks(names, names))
+    columns = {name: np.concatenate([block.columns[name] for block in blocks]) for name in names}
+
+    def track(values: np.ndarray) -> Track:
+        known = np.isfinite(values).reshape(len(values), -1).all(axis=1)
+        return columns['time_s'][known], values[known]
+
+    return Readings(path, {joint: track(columns[name]) for name, joint in joints.items()},
+                    track(np.column_stack([columns[name] for name in base])) if base else None)
 
 
 def _topic(bag: Bag, topic: str) -> str:
@@ -108,7 +108,7 @@ def _topic(bag: Bag, topic: str) -> str:
 def _joints(bag: Bag, topic: str, epoch_ns: int) -> dict[str, Track]:
     """Return the readings of all joints of a topic."""
     readings: dict[str, tuple[list[np.ndarray], list[np.ndarray]]] = {}
-    parts = [piece.messages[topic] for piece in bag.pieces([topic]) if topic in piece.messages]
+    parts = [piece.messages[topic] for piece in bag.pieces([topic])]
     try:
         for table in cdr.joined_tables(parts, cdr.joint_state):
             names = [text for key, text in table.layout.texts.items() if key != 'frame_id']
@@ -137,7 +137,7 @@ def _base(bag: Bag, root: str, epoch_ns: int) -> Track | None:
     topics = odometry[:1] or [topic for topic, kind in kinds.items()
                               if kind == _TRANSFORMS and topic.endswith('tf')]
     stamps, poses = [], []
-    for topic, raw in bag.messages(topics):
+    for topic, raw in ((name, raw) for name in topics for raw in bag.messages(name)):
         message = store.deserialize_cdr(raw, kinds[topic])
         for header, place, turn in [(
                 message.header, message.pose.pose.position, message.pose.pose.orientation)] \

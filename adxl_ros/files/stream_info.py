@@ -18,7 +18,7 @@ FORMAT = '1'
 NO_UNIT = 'nominal'
 """Serial number that stands for no particular unit."""
 
-_NOMINAL_KEYS = ('nominal_zero_g_v', 'nominal_scale_v_per_g')
+NOMINAL_KEYS = ('nominal_zero_g_v', 'nominal_scale_v_per_g')
 """Keys of the nominal values, V and V/g; each is a field of `Sensor`, too."""
 
 _HIGHEST_RATE_HZ = 1e6
@@ -72,7 +72,7 @@ class StreamInfo:
         returns: arrays (m,) by the name of the field of `Sensor`.
         """
         values = {}
-        for key in _NOMINAL_KEYS:
+        for key in NOMINAL_KEYS:
             if key in self.texts:
                 numbers = _numbers(self.texts[key])
                 if len(numbers) != len(axes) or not np.isfinite(numbers).all():

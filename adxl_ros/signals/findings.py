@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import recording
-from adxl_ros.files.bag_reader import has_log_times, log_times
-from adxl_ros.files.column_mapping import ReadingOptions
+from adxl_ros.files.bag_reader import log_times
+from adxl_ros.files.column_mapping import likely_unit, ReadingOptions
 from adxl_ros.files.recording_columns import Recording, uncalibrated
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import Sensor
@@ -101,11 +101,11 @@ def _stamp_faults(contents: RecordingContents) -> list[str]:
     faults = []
     duplicates, backward = contents.bad_stamps
     if duplicates:
-        faults.append(f'{duplicates} samples have the stamp of the sample before; '
-                      '--drop-bad-stamps leaves them out')
+        faults.append(f'samples with the stamp of the one before: {duplicates}; --drop-bad-stamps '
+                      'leaves them out')
     if backward:
-        faults.append(f'{counted(backward, "stamp")} {"goes" if backward == 1 else "go"} back; '
-                      '--drop-bad-stamps leaves such samples out')
+        faults.append(f'samples whose stamp steps back: {backward}; --drop-bad-stamps leaves them '
+                      'out')
     if _has_wide_gaps(contents):
         faults.append(f'{_missing(contents)}; record again, or use the parts')
     period_s = 1 / contents.rate_hz
@@ -143,10 +143,9 @@ def _sample_faults(contents: RecordingContents) -> list[str]:
 
 def _unit_hint(length_g: float) -> str:
     """Return which unit the readings seem to have; empty where none fits."""
-    for unit, factor in (('g', 1 / G0_MPS2), ('mg', 1e3 / G0_MPS2)):
-        if _LENGTHS_G[0] < length_g / factor < _LENGTHS_G[1]:
-            return f'; the readings seem to be in {unit}: state it by --columns'
-    return '; check unit and scale factor'
+    unit = likely_unit(length_g * G0_MPS2)
+    return f'; the readings seem to be in {unit}: state it by --columns' if unit else \
+        '; check unit and scale factor'
 
 
 def _remarks(contents: RecordingContents) -> list[str]:
@@ -223,7 +222,7 @@ def check_recording(path: str, params: str | None, reading: ReadingOptions,
     """Return the findings of a recording; one that cannot be read is not sound."""
     try:
         delay = None
-        if has_log_times(path) and reading.rate_hz is None:
+        if reading.rate_hz is None and recording.is_bag(path):
             delay = log_delay(log_times(path, reading.topic))
 
         def unit_of(block: Recording) -> Sensor:

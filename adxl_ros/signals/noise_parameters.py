@@ -53,6 +53,9 @@ _MARGIN_OCTAVES = 2
 """Octaves below a filter's effect that are left out. Chosen: the effect falls by 16 in power."""
 _FEWEST = 32
 """Fewest coefficients of a fit. Chosen: white noise is then known within 20 %."""
+_SEEN = 2.0
+"""Standard deviations of its square by which a term must differ from 0 to be seen. Chosen: it
+gives the rate at which 90 % intervals exclude 0."""
 
 FLOOR = float(np.sqrt(2 * np.log(2) / np.pi))
 """Allan deviation of bias instability divided by B: 0.664 (IEEE Std 952, equation C.15)."""
@@ -90,6 +93,7 @@ class NoiseFit:
     highest: int  # Number of cosine coefficients of the fit, from the lowest
     highest_hz: float  # Frequency of the last one, Hz
     kept: np.ndarray  # Groups of coefficients without lines, bool
+    lines_hz: np.ndarray  # Frequencies of sure lines among the others, Hz, (j,)
     log_likelihood: float  # Largest log likelihood, up to a constant
 
     @property
@@ -100,6 +104,27 @@ class NoiseFit:
     def allan_deviation(self, tau_s: np.ndarray) -> np.ndarray:
         """Return the Allan deviation of the fitted terms at times, s, (k,), in u."""
         return np.sqrt(np.sum(np.square(self.lines(tau_s)), axis=0))
+
+    def needed_s(self, term: int) -> float:
+        """
+        Return how long a recording must be to show half of the upper limit of N, B or K, s.
+
+        The Fisher information of the cosine coefficients tells when its interval excludes 0. It
+        is inf beyond a thousand times the recording: the other terms hide it.
+        """
+        squares = self.squares
+        squares[term] = ((self.white, self.instability, self.walk)[term].high / 2) ** 2
+        present = np.flatnonzero(squares)
+        for time_s in self.highest / (2 * self.highest_hz) * 2.0 ** np.arange(0, 10.25, 0.25):
+            k = np.unique(np.geomspace(1, 2 * time_s * self.highest_hz, 400).astype(int))
+            omega = np.pi * k / time_s
+            parts = np.column_stack([np.ones(len(k)), 1 / omega, omega ** -2.0]) * squares
+            design = (parts / parts.sum(axis=1, keepdims=True))[:, present]
+            information = design.T @ (design * np.gradient(k)[:, None] / 2)
+            variance = np.linalg.inv(information)[present == term, present == term]
+            if variance < _SEEN ** -2:
+                return float(time_s)
+        return np.inf
 
     def lines(self, tau_s: np.ndarray) -> np.ndarray:
         """Return the Allan deviations of N, B and K at times, s, (k,), in u, (3, k)."""
@@ -214,8 +239,12 @@ def fit_noise(means: np.ndarray, step_s: float, variances: np.ndarray | None = N
     models, correlation = _walks(used, span_s, highest)
     theta, likelihood = _best(models)
     white, instability, walk = (_interval(models, theta, likelihood, term) for term in range(3))
+    excess = everything.count * everything.power / (everything.shapes @ theta)
+    is_line = ~kept & (scipy.stats.chi2.sf(excess, everything.count)
+                       < _OCTAVE_PROBABILITY / len(kept))
+    lines_hz = (everything.first + everything.count / 2)[is_line] / (2 * span_s)
     return NoiseFit(white, instability, walk, correlation, highest, highest / (2 * span_s), kept,
-                    likelihood)
+                    lines_hz, likelihood)
 
 
 def _walks(groups: _Groups, span_s: float, highest: int

@@ -43,7 +43,7 @@ def measure_unstated(sensor: Sensor, read: Recording) -> tuple[Sensor, list[str]
     unit = sensor if sensor.effects else with_axes(sensor, read.axes)
     if 'noise_density_g_per_rthz' in sensor.unstated:
         unit = replace(unit, provenance={**unit.provenance, 'noise_from': name})
-    return _measured(unit, read.time_s, read.volts(unit))
+    return _measured(unit, read.time_s, read.volts(unit), f'{read.path}: ')
 
 
 def listed(measured: list[str]) -> list[str]:
@@ -90,20 +90,21 @@ _RESISTANCE_OHM = 1.0e4
 """Resistor that a measured filter is written with, Ω: only its product with C has a meaning."""
 
 
-def _measured(unit: Sensor, time_s: np.ndarray, volts: np.ndarray) -> tuple[Sensor, list[str]]:
+def _measured(unit: Sensor, time_s: np.ndarray, volts: np.ndarray, where: str = ''
+              ) -> tuple[Sensor, list[str]]:
     """
     Fill in what a parameter file leaves out; return the unit, and what is measured, for people.
 
     The noise is that of the quietest quarter seconds, so that the samples may hold motion.
 
-    time_s: stamps, s, (n,); volts: samples, V, (n, m).
+    time_s: stamps, s, (n,); volts: samples, V, (n, m); where: begin of messages.
     """
     scale_v_per_g, spans = unit.nominal_scale_v_per_g, Spans(unit.rate_hz)
     blocks = stats.BlockCutter(unit.rate_hz, len(unit.axes)).feed(time_s, volts)
     windows = stats.window_variance(blocks, spans)
     if len(time_s) < _FEWEST_SAMPLES or not np.isfinite(windows).any():
-        raise UserError(f'{len(time_s)} samples at {unit.rate_hz:g} Hz do not show the noise of '
-                        f'the sensor; record at least {SHORTEST_S:g} s, or state '
+        raise UserError(f'{where}{len(time_s)} samples at {unit.rate_hz:g} Hz do not show the '
+                        f'noise of the sensor; record at least {SHORTEST_S:g} s, or state '
                         'sensor.noise_density_g_per_rthz in the parameter file')
     step_v = stats.adc_step(blocks)
     variance_v2, limit_v2 = stats.quiet_variance(blocks, windows, step_v)

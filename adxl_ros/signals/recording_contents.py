@@ -172,7 +172,7 @@ def examine(blocks: Iterable[Recording], unit_of: Callable[[Recording], Sensor],
 def log_delay(times_ns: Iterable[np.ndarray]) -> LogDelay | None:
     """Compare log times with header stamps, ns, (k, 2) by block; None without messages."""
     # A few messages of each block are enough, whatever the length of the recording.
-    parts = [block[::max(len(block) // 512, 1)] for block in times_ns]
+    parts = [block[::max(len(block) // 128, 1)] for block in times_ns]
     if not parts:
         return None
     times = np.concatenate(parts)

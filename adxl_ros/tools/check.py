@@ -21,7 +21,7 @@ from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.report import page as html_page
 from adxl_ros.report.quantities import column_unit, duration, short_time
-from adxl_ros.report.screen import COLUMNS, row
+from adxl_ros.report.screen import COLUMNS, row, wrapped
 from adxl_ros.signals.findings import check_recording, Findings
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
 from adxl_ros.signals.recording_contents import RecordingContents
@@ -32,7 +32,7 @@ _NAME_COLUMNS = 20
 _HEAD = ('recording', 'length', 'rate', 'missing', 'rest', 'axes', 'verdict')
 _COLUMNS = (_NAME_COLUMNS, '>13', '>10', '>9', '>8', '>6', 11)
 _SHOWS_HEAD = ('effect', 'from', 'typical', '')
-_SHOWS_COLUMNS = (24, 16, 14, 0)
+_SHOWS_COLUMNS = (24, 16, 14)
 _MOST_SHOWN = 1_000_000
 """Samples up to which it is listed what `diagnose` could show. Chosen: a minute, and 1 GB."""
 _MOST_DETAILED = 3
@@ -52,10 +52,16 @@ def _lines(results: list[Findings]) -> list[str]:
     for result in detailed:
         rows += ['', result.path, *_details(result)]
         if result.shows:
-            count = sum(not missing for *_, missing in result.shows)
-            rows += ['', f'  {count} of {len(result.shows)} effects could show to diagnose',
-                     *('  ' + row(cells, _SHOWS_COLUMNS)
-                       for cells in (_SHOWS_HEAD, *result.shows))]
+            shown = [cells[:3] for cells in result.shows if not cells[3]]
+            rows += ['', f'  {len(shown)} of {len(result.shows)} effects could show to diagnose',
+                     *('  ' + row(cells, _SHOWS_COLUMNS) for cells in (_SHOWS_HEAD[:3], *shown))]
+            hidden: dict[str, list[str]] = {}
+            for effect, _, _, missing in result.shows:
+                hidden.setdefault(missing, []).append(effect)
+            hidden.pop('', None)
+            rows += ['', '  the others cannot show'] * bool(hidden)
+            for missing, effects in hidden.items():
+                rows += [*wrapped(f'  {missing}', 2), *wrapped(f'    {", ".join(effects)}', 4)]
     if len(detailed) < len(results):
         rows += ['', '--report DIR and --json have the details of all recordings.']
     return [*rows, '']

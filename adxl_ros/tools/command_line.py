@@ -9,16 +9,16 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from difflib import get_close_matches
+from functools import partial
 import math
 import os
 from pathlib import Path
 import shlex
-import shutil
 import signal
 import sys
 import textwrap
 from types import FrameType
-from typing import Any, Protocol, TYPE_CHECKING
+from typing import Protocol, TYPE_CHECKING
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
@@ -33,7 +33,7 @@ from adxl_ros.model import coefficients
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Effect
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import ended_by_closed_output
+from adxl_ros.process import ended_by_closed_output, package_version
 from adxl_ros.report.quantities import column_unit
 from adxl_ros.report.screen import COLUMNS, end_lines, entry_list, NextStep
 import numpy as np
@@ -43,26 +43,6 @@ if TYPE_CHECKING:
 
 _BAR_COLUMNS = 24
 """Columns of a progress bar: names of stages and times stand beside it in 80 columns."""
-
-
-class _HelpFormatter(argparse.RawDescriptionHelpFormatter):
-    """Keeps the lines of the epilog, and all lines within `COLUMNS`."""
-
-    def __init__(self, prog: str) -> None:
-        super().__init__(prog, width=min(shutil.get_terminal_size().columns - 2, COLUMNS))
-
-
-class _ShowVersion(argparse.Action):
-    """Prints the version and ends; only then it is looked up, which takes its time."""
-
-    def __init__(self, option_strings: list[str], dest: str, **options: Any) -> None:
-        super().__init__(option_strings, argparse.SUPPRESS, nargs=0, **options)
-
-    def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
-                 values: Any, option_string: str | None = None) -> None:
-        from adxl_ros.process import package_version
-        print(f'adxl_ros {package_version()}')
-        parser.exit()
 
 
 class _Parser(argparse.ArgumentParser):
@@ -83,9 +63,11 @@ def argument_parser(tool: str, description: str | None, examples: Mapping[str, s
              for purpose, arguments in examples.items()]
     parse = _Parser(
         prog=tool, description=textwrap.fill(' '.join((description or '').split()), COLUMNS),
-        formatter_class=_HelpFormatter, epilog='\n'.join(['examples:', *lines]))
+        formatter_class=partial(argparse.RawDescriptionHelpFormatter, width=COLUMNS),
+        epilog='\n'.join(['examples:', *lines]))
     parse.details = details
-    parse.add_argument('--version', action=_ShowVersion, help='show the version and exit')
+    parse.add_argument('--version', action='version', version=f'adxl_ros {package_version()}',
+                       help='show the version and exit')
     return parse
 
 
@@ -356,17 +338,3 @@ def progress(title: str) -> Iterator[ShowDone]:
                        description=stage or title)
 
         yield show
-
-
-@contextmanager
-def staged_progress(work: Mapping[str, float]) -> Iterator[Callable[[str, float], None]]:
-    """Show a progress bar over stages of different length, as `progress` does."""
-    names, total = list(work), sum(work.values())
-    with progress(f'1/{len(names)} {names[0]}') as show:
-        def show_stage(stage: str, share: float = 0.0) -> None:
-            number = names.index(stage)
-            before = sum(work[name] for name in names[:number])
-            show((before + share * work[stage]) / total,
-                 f'{number + 1}/{len(names)} {stage}')
-
-        yield show_stage

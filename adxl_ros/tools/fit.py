@@ -38,8 +38,6 @@ _LIMITS = {
     'model': 'the model, which does not have the form of this unit',
     'stage or model': 'the stage or the model; poses that are visited twice separate them'}
 """What limits a calibration, and what helps, by cause."""
-_WORK = {'reading': 3.2, 'fit': 3.1, 'report': 4.5}
-"""Usual duration of the stages, s. Measured: a sweep of 14 minutes at 1 kHz."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -106,8 +104,7 @@ def fit(options: argparse.Namespace) -> int:
     recordings: list[calibration.RecordedPoses] = []
     thermal: Poses | None = None
     reading = cli.reading_options(options)
-    work = {name: seconds for name, seconds in _WORK.items() if options.report or name != 'report'}
-    with cli.staged_progress(work) as show:
+    with cli.progress('fit') as show:
         for number, path in enumerate(options.recording):
             read = cli.read('fit', path, reading)
             if unit is None:
@@ -120,7 +117,7 @@ def fit(options: argparse.Namespace) -> int:
                 unit = replace(unit, stage_resolution_rad=max(
                     unit.stage_resolution_rad, robot.step_rad))
             _report_range(read, unit)
-            show('reading', (number + 0.5) / len(options.recording))
+            show(0.3 * (number + 0.5) / len(options.recording), 'reading')
             thermal = _thermal_blocks(options, read, unit)
             if thermal is not None:
                 if population is not None:
@@ -133,7 +130,7 @@ def fit(options: argparse.Namespace) -> int:
             recordings.append(calibration.RecordedPoses(
                 Path(path).name, poses, pose_extraction.estimate_filters(read, unit, poses)))
         assert unit is not None, 'argparse asks for a recording'
-        show('fit', 0.0)
+        show(0.3, 'fit')
         sha = sha256(options.recording)
         result = calibration.calibrate(unit, recordings, options.model, options.effect, sha,
                                        population) \
@@ -143,7 +140,7 @@ def fit(options: argparse.Namespace) -> int:
         if options.dcc:
             dcc.write(options.dcc, result, laboratory)
         if options.report:
-            show('report', 0.0)
+            show(0.6, 'report')
             cli.make_folder(Path(options.report))
             page.write(options.report, result, options.store, laboratory)
     result.save(options.output)

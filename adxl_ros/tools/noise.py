@@ -130,6 +130,10 @@ def _warnings(result: RecordingNoise) -> list[str]:
             texts.append(f'{noise.axis}: samples change in steps of '
                          f'{noise.resolution * MICRO_G:.3g} µg, which hide the noise. N, B and K '
                          'are upper limits. Choose a smaller range.')
+        if len(noise.fit.lines_hz):
+            band = dict.fromkeys(f'{hz:.3g}' for hz in noise.fit.lines_hz[[0, -1]])
+            texts.append(f'{noise.axis}: the power at {" to ".join(band)} Hz is that of a line, '
+                         'and left out. Look for a fan, mains or a person nearby.')
         if not noise.fit.white.is_seen:
             texts.append(f'{noise.axis}: N is not determined. A parameter file keeps the figure '
                          'of --params, or states no white noise.')
@@ -148,12 +152,18 @@ def _motion(rest: StillStretch) -> str:
 
 
 def _too_short(result: RecordingNoise) -> list[str]:
+    """Return which terms the time does not show, and how long it must be."""
     texts = []
-    for name in TERMS:
-        axes = [noise.axis for noise in result.axes if not getattr(noise.fit, name).is_seen]
-        if axes:
+    for term, name in enumerate(TERMS):
+        needed_s = {noise.axis: noise.fit.needed_s(term) for noise in result.axes
+                    if not (noise.estimates[term].is_seen or noise.is_coarse)}
+        if needed_s:
+            longest_s = max(needed_s.values())
+            advice = 'The other terms hide it, in longer recordings, too.' \
+                if longest_s == np.inf else 'To see half of the limit above, record about ' \
+                f'{duration(60 * np.ceil(longest_s / 60))}.'
             texts.append(f'{duration(result.rest.span_s)} is too short to see the {NAMES[name]} '
-                         f'of {", ".join(axes)}. Record for longer.')
+                         f'of {", ".join(needed_s)}. {advice}')
     return texts
 
 

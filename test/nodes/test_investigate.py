@@ -92,7 +92,7 @@ def laboratory(start, tmp_path):
 
 def messages_of(bag):
     with open_bag(bag) as opened:
-        return sum(1 for _ in opened.messages(('/imu/data_raw',)))
+        return sum(1 for _ in opened.messages('/imu/data_raw'))
 
 
 def test_an_investigation_ends_with_the_effect_of_the_unit(laboratory, tmp_path):

@@ -92,8 +92,9 @@ ROW = np.arange(6000)
 @pytest.mark.parametrize(('change', 'count', 'fault'), [
     (lambda t, a: (t[abs(t - 21.5) > 1.5], a[abs(t - 21.5) > 1.5]), 1, '301 samples are missing'),
     (lambda t, a: (t[np.where((ROW >= 100) & (ROW < 103), 99, ROW)], a), 1,
-     '3 samples have the stamp of the sample before'),
-    (lambda t, a: (t - 2.0 * ((ROW >= 1000) & (ROW < 1005)), a), 1, '5 stamps go back'),
+     'samples with the stamp of the one before: 3'),
+    (lambda t, a: (t - 2.0 * ((ROW >= 1000) & (ROW < 1005)), a), 1,
+     'samples whose stamp steps back: 5'),
     (lambda t, a: (np.sort(t + np.random.default_rng(2).uniform(0, 0.02, len(t))), a), 1,
      'stamps scatter by'), (lambda t, a: (t, a * [1, 0, 1]), None, 'ay_mps2 never changes'),
     (clipped, 1, 'ax_mps2 stays at its extreme value'),

@@ -90,7 +90,7 @@ def test_a_short_recording_is_named(tmp_path: Path) -> None:
     assert result['axes']['x']['walk']['ci'][1] > 0
     warning = next(text for text in result['warnings'] if 'random walk K' in text)
     assert 'too short' in warning
-    assert 'Record for longer' in warning
+    assert 'record about' in warning
 
 
 def test_noise_that_rounding_hides_is_not_written(tmp_path: Path) -> None:
