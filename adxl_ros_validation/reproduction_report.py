@@ -128,7 +128,8 @@ _STAGE_TITLES = {
     'paper': "The paper's stage (5 arcmin, a new error with each move of a joint, level 0.1°)"}
 _FIGURE_TITLES = {
     'sweep': 'Figures 2 to 8: deviation from the linear model, and the physical model',
-    'misalignment': 'Figure 9: the direction of the x axis', 'tilt': 'Figure 10: errors of alpha and beta',
+    'misalignment': 'Figure 9: the direction of the x axis',
+    'tilt': 'Figure 10: errors of alpha and beta',
     'motion': 'Figure 12: motion', 'components': 'Figure 13: what each part of the model does'}
 FIGURES = 'reproduction'
 """Folder of the plots, in the folder of the page."""
