@@ -128,8 +128,7 @@ _STAGE_TITLES = {
     'paper': "The paper's stage (5 arcmin, a new error with each move of a joint, level 0.1°)"}
 _FIGURE_TITLES = {
     'sweep': 'Figures 2 to 8: deviation from the linear model, and the physical model',
-    'misalignment': 'Figure 9: the direction of the x axis',
-    'tilt': 'Figure 10: errors of alpha and beta',
+    'misalignment': 'Figure 9: the direction of the x axis', 'tilt': 'Figure 10: angle errors',
     'motion': 'Figure 12: motion', 'components': 'Figure 13: what each part of the model does'}
 FIGURES = 'reproduction'
 """Folder of the plots, in the folder of the page."""
@@ -217,8 +216,7 @@ def _to_reach(units: Sequence[Unit]) -> str:
     def ratio(pose_only: bool) -> Callable[[ModelErrors], np.ndarray]:
         return lambda errors: np.concatenate([a.ratio(pose_only) for a in errors.all_angles()])
 
-    rows = [[f'error of alpha and beta ÷ bound {text}, rms',
-             *map(_interval, over(ratio(pose_only)))]
+    rows = [[f'angle error ÷ bound {text}, rms', *map(_interval, over(ratio(pose_only)))]
             for pose_only, text in ((True, 'of the noise of one pose'),
                                     (False, 'of pose and calibration'))]
     before, *after = (_rms(np.concatenate(parts)) for parts in over(flat))

@@ -190,17 +190,13 @@ def tilt_error_rad(sensor: Sensor, pose_std_v: np.ndarray) -> float:
     """
     alpha_rad, beta_rad = np.array([(target.alpha_rad, target.beta_rad)
                                     for target in pose_plan.spread(_EVALUATION_POSES)]).T
-    force_mps2 = specific_force(alpha_rad, beta_rad, sensor.local_gravity_mps2)
-
-    def covariance(unit: Sensor) -> np.ndarray:
-        return force_covariance(unit, force_mps2, pose_std_v ** 2)
-
-    by_noise = tilt(force_mps2, covariance(sensor.without_covariance()), 'z' in sensor.axes)
-    is_visible = by_noise.alpha_std < _VISIBLE_RAD
-    if not is_visible.any():
+    force = specific_force(alpha_rad, beta_rad, sensor.local_gravity_mps2)
+    by_noise, by_all = (force_covariance(unit, force, pose_std_v ** 2)
+                        for unit in (sensor.without_covariance(), sensor))
+    used = tilt(force, by_noise, 'z' in sensor.axes).alpha_std < _VISIBLE_RAD
+    if not used.any():
         return float('nan')
-    variance = held_out.tilt_variance(covariance(sensor), np.column_stack(force_mps2),
-                                      sensor.local_gravity_mps2, is_visible)
+    variance = held_out.tilt_variance(by_all, np.array(force).T, sensor.local_gravity_mps2, used)
     return min(math.sqrt(variance), np.pi / 2)
 
 
