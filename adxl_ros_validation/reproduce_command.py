@@ -242,7 +242,7 @@ _STAGE_TITLES = {
     'paper': "The paper's stage (5 arcmin, a new error with each move of a joint, level 0.1°)"}
 _FIGURE_TITLES = {
     'sweep': 'Figures 2 to 8: deviation from the linear model, and the physical model',
-    'misalignment': 'Figure 9: the direction of the x axis', 'tilt': 'Figure 10: errors of tilt',
+    'misalignment': 'Figure 9: the direction of the x axis', 'tilt': 'Figure 10: angle errors',
     'motion': 'Figure 12: motion', 'components': 'Figure 13: what each part of the model does'}
 FIGURES = 'reproduction'
 """Folder of the plots, in the folder of the page."""
@@ -314,7 +314,7 @@ def _tilt(units: Sequence[Unit]) -> str:
         rows.append([angle, in_words(angle),
                      *(f'{_rms(e):.3f} / {np.abs(e).max():.3f}' for e in errors),
                      f'{np.degrees(_rms(_bounds(units, row))):.4f}'])
-    return ('Table I: rms / largest error of tilt, °, over the three runs of figure 10; poses '
+    return ('Table I: rms / largest error, °, over the three runs of figure 10; poses '
             'whose bound exceeds 1° do not count.\n\n'
             + markdown_table(['', 'paper', *MODELS, 'Cramér-Rao bound, rms'], rows))
 
@@ -330,7 +330,7 @@ def _to_reach(units: Sequence[Unit]) -> str:
     def ratio(pose_only: bool) -> Callable[[ModelErrors], np.ndarray]:
         return lambda errors: np.concatenate([a.ratio(pose_only) for a in errors.all_angles()])
 
-    rows = [[f'tilt error ÷ bound {text}, rms', *map(_interval, over(ratio(pose_only)))]
+    rows = [[f'angle error ÷ bound {text}, rms', *map(_interval, over(ratio(pose_only)))]
             for pose_only, text in ((True, 'of the noise of one pose'),
                                     (False, 'of pose and calibration'))]
     before, *after = (_rms(np.concatenate(parts)) for parts in over(flat))

@@ -81,7 +81,7 @@ class Settings(base.DeviceSettings):
     # A list of strings, or one string with commas
     channels: str | Sequence[str] = base.option(
         (), 'ids or labels of x, y, z as the sensor has them, supply, temperature, or ROLE=ID; '
-        'empty: the channels with these labels, else the first voltages')
+        'empty: the channels with these labels, else the first voltages or accelerations')
 
 
 def open_link(sensor: Sensor, settings: Settings) -> IioLink:

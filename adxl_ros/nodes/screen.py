@@ -130,7 +130,7 @@ def _progress(progress: screen.Progress | None, estimate: screen.Estimate | None
     if estimate.range_error:
         yield 'error', estimate.range_error, ''
     elif estimate.tilt_error_deg is None:
-        yield 'tilt error', 'no pose shows both angles to one axis', ''
+        yield 'tilt error', 'one axis does not show the vertical', ''
     else:
         final = '' if estimate.final_tilt_error_deg is None else \
             f', {estimate.final_tilt_error_deg:.2g}° after all poses'

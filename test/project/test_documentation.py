@@ -158,6 +158,16 @@ def test_the_pages_by_hand_stay_short() -> None:
     assert sum(len(text.split()) for text in texts) <= MOST_WORDS
 
 
+def test_the_tilt_error_has_one_definition() -> None:
+    """The glossary defines it, and each page that states one links there."""
+    texts = {page: page.read_text('utf-8').lower() for page in BY_HAND}
+    glossary = DOCS / 'explain' / 'glossary.md'
+    assert [page for page, text in texts.items()
+            if re.search(r'angle\s+between\s+(the\s+)?true\s+and', text)] == [glossary]
+    assert not [name_of(page) for page, text in texts.items() if re.search(r'tilt\s+error', text)
+                and page != glossary and 'glossary.md#tilt-error' not in text]
+
+
 @pytest.mark.parametrize('page', BY_HAND, ids=name_of)
 def test_tables_are_narrow(page: Path) -> None:
     for line in re.sub('```.*?```', '', page.read_text('utf-8'), flags=re.DOTALL).splitlines():

@@ -36,7 +36,7 @@ _ROUNDS = 2
 _EVALUATION_POSES = 48
 """Poses at which the tilt error is predicted; chosen: even over the sphere, and quick."""
 _VISIBLE_RAD = np.radians(1.0)
-"""Largest standard deviation of an angle by noise alone, rad, at which a pose counts."""
+"""Largest standard deviation of alpha by noise alone, rad, at which a pose counts."""
 _LEAST_STD_V = 1e-7
 """Lower bound of the noise of a mean, V; chosen: below any ADC, so that no weight is infinite."""
 _MOST_DECIMALS = 6
@@ -184,22 +184,20 @@ def from_poses(sensor: Sensor, poses: Poses, dwell_s: float, stage_rad: float,
 
 def tilt_error_rad(sensor: Sensor, pose_std_v: np.ndarray) -> float:
     """
-    Predict the rms error of alpha and beta over the sphere.
+    Predict the rms angle between true and measured vertical over the sphere; NaN if unknown.
 
     pose_std_v: standard deviation of the readings, V, (m,).
     """
     alpha_rad, beta_rad = np.array([(target.alpha_rad, target.beta_rad)
                                     for target in pose_plan.spread(_EVALUATION_POSES)]).T
-    force_mps2 = specific_force(alpha_rad, beta_rad, sensor.local_gravity_mps2)
-
-    def tilt_stds_rad(unit: Sensor) -> np.ndarray:
-        covariance = force_covariance(unit, force_mps2, pose_std_v ** 2)
-        estimate = tilt(force_mps2, covariance, 'z' in unit.axes)
-        return np.column_stack([estimate.alpha_std, estimate.beta_std])
-
-    is_visible = tilt_stds_rad(sensor.without_covariance()) < _VISIBLE_RAD
-    errors_rad = np.minimum(tilt_stds_rad(sensor)[is_visible], np.pi / 2)
-    return float(np.sqrt(np.mean(errors_rad ** 2))) if errors_rad.size else float('nan')
+    force = specific_force(alpha_rad, beta_rad, sensor.local_gravity_mps2)
+    by_noise, by_all = (force_covariance(unit, force, pose_std_v ** 2)
+                        for unit in (sensor.without_covariance(), sensor))
+    used = tilt(force, by_noise, 'z' in sensor.axes).alpha_std < _VISIBLE_RAD
+    if not used.any():
+        return float('nan')
+    variance = held_out.tilt_variance(by_all, np.array(force).T, sensor.local_gravity_mps2, used)
+    return min(math.sqrt(variance), np.pi / 2)
 
 
 def degrees_or_none(angle_rad: float) -> float | None:
@@ -268,6 +266,6 @@ def datasheet_estimate(sensor: Sensor, dwell_s: float) -> RunningEstimate:
 
 
 def expected_tilt_error_rad(sensor: Sensor, dwell_s: float, targets: Sequence[Target]) -> float:
-    """Predict the rms error of alpha and beta after a pose plan."""
+    """Predict the tilt error after a pose plan."""
     fitted = [target for target in targets if not target.check]
     return datasheet_estimate(sensor, dwell_s).with_poses(fitted).tilt_error_rad()

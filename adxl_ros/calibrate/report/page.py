@@ -195,7 +195,7 @@ def _sphere(result: CalibrationResult) -> dict[str, Any]:
             of_unit = held_out.pose_errors(unit, poses)
             errors[model] = np.column_stack([np.degrees(of_unit.tilt_rad),
                                              1e3 * of_unit.accel_mps2 / G0_MPS2])
-        quantities = [['error of tilt', '°'], *([f'error of {a}', 'mg'] for a in fitted.axes)]
+        quantities = [['tilt error', '°'], *([f'error of {a}', 'mg'] for a in fitted.axes)]
         labels = [f'pose {i}, alpha {alpha:.1f}°, beta {beta:.1f}°' for i, (alpha, beta) in
                   enumerate(np.degrees([poses.alpha_rad, poses.beta_rad]).T, 1)]
     up = force / np.linalg.norm(force, axis=1, keepdims=True)
@@ -283,7 +283,7 @@ def _pose_errors(errors: held_out.HeldOutErrors, assessment: Assessment, poses: 
         return figures.figure(traces, 320, margin=_ROOM,
                               xaxis={'title': {'text': 'held-out pose'}},
                               yaxis={'title': {'text': 'acceleration, mg'}})
-    # The error of tilt has two components: 90 % of its lengths are within √(ln 10) of the rms.
+    # The tilt error has two components: 90 % of its lengths are within √(ln 10) of the rms.
     high_deg = float(np.degrees(np.sqrt(assessment.tilt.expected * np.log(10))))
     traces += [_band(len(number), 0.0, high_deg, 2),
                _dots(number, tilt_deg, 'tilt', '#6b46a8', labels, '°', 2)]
