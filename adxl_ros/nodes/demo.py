@@ -43,6 +43,9 @@ _SILENT_S = 60.0
 """Longest time without progress while poses are taken, s; chosen: a pose takes 1 s."""
 _SPEED = 40.0
 """Default sensor time per real time; chosen: two cores can follow."""
+_RATE_HZ = 250.0
+"""Rate of the simulated sensor, Hz. Chosen: its noise ends at 50 Hz, so that more samples would say
+no more, and many times real time leaves room to catch up."""
 _SWEEP_S = 1060.0
 """Sensor time of the sweep, s; measured."""
 _OVERHEAD_S = 15.0
@@ -144,7 +147,8 @@ class DemoGraph:
                 raise UserError(f'the node {ended[0]} has ended; see {self._log}')
             if message.startswith('cannot finish'):
                 raise UserError(f'{message}; see {self._log}')
-            if (news := (progress(), message)) != newest:
+            # The message counts seconds of silence, too, which are no progress.
+            if (news := progress() or message) != newest:
                 newest, changed_s = news, time.monotonic()
             if time.monotonic() - changed_s > silent_s:
                 raise UserError(f'no progress for {silent_s:g} s; the calibration reported: '
@@ -206,7 +210,8 @@ def main() -> int:
 def _run_sweep(folder: Path, speed: float, seed: int) -> None:
     """Sweep a simulated sensor whose coefficients are drawn at datasheet spread."""
     unit, nominal = folder / 'simulated_unit.yaml', folder / 'nominal.yaml'
-    sensor = replace(parameter_file.load(parameter_file.nominal_path()), serial='demo')
+    sensor = replace(parameter_file.load(parameter_file.nominal_path()), serial='demo',
+                     rate_hz=_RATE_HZ)
     truth = _draw_unit(sensor, seed)
     parameter_file.save(nominal, sensor)
     parameter_file.save(unit, truth, ['The truth of the simulated unit.'])
