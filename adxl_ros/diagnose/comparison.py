@@ -287,6 +287,13 @@ def time_since_move_s(time_s: np.ndarray, rates: Sequence[np.ndarray]) -> np.nda
     return np.minimum(time_s - last_s, _LONGEST_S)
 
 
+def code_step_v(volts: np.ndarray) -> np.ndarray:
+    """Return the smallest change of an output on each axis, V; 0 where it never changes."""
+    changes_v = np.abs(np.diff(volts, axis=0))
+    smallest = np.min(changes_v, axis=0, initial=np.inf, where=changes_v > 0)
+    return np.where(np.isfinite(smallest), smallest, 0.0)
+
+
 def gravity_slopes(alpha_rad: np.ndarray, beta_rad: np.ndarray) -> np.ndarray:
     """Return the derivatives of gravity's direction in the sensor by both angles, (2, 3, n)."""
     sin_alpha, cos_alpha = np.sin(alpha_rad), np.cos(alpha_rad)

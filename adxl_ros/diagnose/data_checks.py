@@ -18,6 +18,7 @@ from adxl_ros.diagnose import noise_effects, reference
 from adxl_ros.diagnose.comparison import (
     at_search_rate,
     BaselineComparison,
+    code_step_v,
     compare,
     Reference,
     SMALLEST_MOTION_G,
@@ -353,7 +354,7 @@ def _check_range(comparison: BaselineComparison, finite: np.ndarray) -> None:
     volts, simulated_v = (v[finite] for v in (comparison.volts, comparison.simulated_v(sensor)))
     lsb_v, range_v = max(sensor.lsb_v, _SMALLEST_STEP_V), np.ptp(volts, axis=0)
     railed = 0.0
-    for axis_v, expected_v, step_v in zip(volts.T, simulated_v.T, reference.code_step_v(volts)):
+    for axis_v, expected_v, step_v in zip(volts.T, simulated_v.T, code_step_v(volts)):
         for rail_v in (axis_v.max(), axis_v.min()) if np.ptp(axis_v) > _SMALLEST_RANGE_V else ():
             at_rail = np.abs(axis_v - rail_v) < lsb_v / 2
             # Coarse codes repeat in an extreme pose, so that the simulation must differ, too.

@@ -37,9 +37,9 @@ from adxl_ros.diagnose.linear_model import (
     filters_for,
     LinearModel,
 )
-from adxl_ros.diagnose.noise_effects import UNKNOWN
-from adxl_ros.diagnose.noise_model import expected_drift_g
-from adxl_ros.diagnose.verdict import Verdict, WeightedHypothesis
+from adxl_ros.diagnose.noise_model import expected_drift_g, whiteners
+from adxl_ros.diagnose.residual_map import flexible_bases
+from adxl_ros.diagnose.verdict import UNKNOWN, Verdict, WeightedHypothesis
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.coefficients import parameter_of, with_neutral
@@ -277,12 +277,13 @@ def predict(manoeuvre: Experiment, sensor: Sensor, effects: Sequence[str],
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     recording = Recording(manoeuvre.name, columns.pop('time_s'), columns)
     comparison = at_search_rate(compare(recording, at_rate))
-    model = build_linear_model([comparison], only=effects)
+    model = build_linear_model([comparison], whiteners([comparison]), only=effects)
     filters = filters_for(model.filters, sensor.effects)
+    bases = flexible_bases(comparison, model.baseline_v[0])
     places: dict[Key, int] = {}
     keys, blocks = _keys(model), []
     for number, channel in enumerate(model.columns):
-        functions = model.flexible_bases[0][number]
+        functions = bases[number]
         size_v = _UNKNOWN_G * float(comparison.sensor.scale_v_per_g[number])
         shown: dict[Key, np.ndarray] = {keys[c.number]: c.values for c in channel
                                         if c.number in keys}

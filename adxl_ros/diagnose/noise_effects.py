@@ -15,9 +15,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
-from adxl_ros.diagnose.comparison import at_search_rate, BaselineComparison
+from adxl_ros.diagnose.comparison import at_search_rate, BaselineComparison, code_step_v
 from adxl_ros.diagnose.evidence import bridged, drifts_among
-from adxl_ros.diagnose.reference import code_step_v
 from adxl_ros.model import noise
 from adxl_ros.model.constants import MAD_TO_STD
 from adxl_ros.model.diagnosis_hints import Detector
@@ -28,8 +27,6 @@ from adxl_ros.simulate.response import Response
 import numpy as np
 import scipy
 
-UNKNOWN = 'unknown'
-"""Name of what no effect of the library explains."""
 _MAINS_HZ, _MAINS_TOLERANCE_HZ = (50.0, 60.0), 0.6
 """Mains frequencies, Hz, and the largest deviation of a line. Chosen: 1 % of clock or mains."""
 _LINE_LOWEST_HZ, _LINE_FEWEST_ORDINATES, _LOCAL_ORDINATES = 1.0, 64, 201

@@ -263,8 +263,12 @@ def drift_effects() -> tuple[str, ...]:
     return tuple(e.name for e in library().values() if e.diagnosis.drift)
 
 
-def whiteners(comparison: BaselineComparison, axis: int) -> list[Whitener]:
-    """Return the filters that are tried for the noise of one axis of a recording."""
+def whiteners(comparisons: Sequence[BaselineComparison]) -> list[list[Whitener]]:
+    """Return the filters that are tried for the noise of each axis of each recording."""
+    return [_whiteners(c, axis) for c in comparisons for axis in range(len(c.sensor.axes))]
+
+
+def _whiteners(comparison: BaselineComparison, axis: int) -> list[Whitener]:
     sensor, dt_s, span_s = comparison.sensor, comparison.dt_s, comparison.span_s
     errors, scale = angle_error_filter(comparison, axis), float(sensor.scale_v_per_g[axis])
     a, std_v = _analog(comparison, axis)

@@ -15,6 +15,7 @@ from typing import Any
 
 from adxl_ros.diagnose.comparison import (
     BaselineComparison,
+    code_step_v,
     compare,
     Reference,
     SMALLEST_MOTION_G,
@@ -490,13 +491,6 @@ def _with_aliases(comparison: BaselineComparison, coarse: np.ndarray, noise_g: f
         if touched[begin:end].any():
             extended |= (part >= begin) & (part < end) & differs[part]
     return extended
-
-
-def code_step_v(volts: np.ndarray) -> np.ndarray:
-    """Return the smallest change of an output on each axis, V; 0 where it never changes."""
-    changes_v = np.abs(np.diff(volts, axis=0))
-    smallest = np.min(changes_v, axis=0, initial=np.inf, where=changes_v > 0)
-    return np.where(np.isfinite(smallest), smallest, 0.0)
 
 
 def fading_frequency_hz(comparison: BaselineComparison) -> float | None:

@@ -11,10 +11,9 @@ from typing import Any, NamedTuple
 from adxl_ros.diagnose.comparison import Reference
 from adxl_ros.diagnose.diagnosis import Diagnosis, Report
 from adxl_ros.diagnose.next_experiment import by_effect, CouldShow, MENU
-from adxl_ros.diagnose.noise_effects import UNKNOWN
 from adxl_ros.diagnose.residual_map import SIGNIFICANT_P
 from adxl_ros.diagnose.search import Hypothesis
-from adxl_ros.diagnose.verdict import Verdict
+from adxl_ros.diagnose.verdict import UNKNOWN, Verdict
 from adxl_ros.model.coefficients import fitted_of, get, parameter_of
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects import effect_named, library

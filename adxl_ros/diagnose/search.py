@@ -16,12 +16,18 @@ from itertools import chain, combinations
 from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence, linear_model as linear
-from adxl_ros.diagnose.evidence import LinearFit, Whitener
+from adxl_ros.diagnose.evidence import (
+    ChannelColumns,
+    LinearFit,
+    LinearisedHypothesis,
+    UNDETERMINED_SHARE,
+    Whitener,
+)
 from adxl_ros.diagnose.linear_model import LinearModel, Variant
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import fitted_of, get, parameter_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Coefficient, Role
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.gauss_newton import gauss_newton, Iterate
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -39,9 +45,6 @@ _FORM_ERROR = 0.03
 """Relative standard deviation of a coefficient because the form of its effect is not exact. Only
 geometry and clocks have exact forms. Tuned by hand on simulated recordings of the working seeds of
 the blind check."""
-_UNDETERMINED_SHARE, _UNDETERMINED_RATIO = 0.5, 3.0
-"""A coefficient is not determined if its posterior standard deviation exceeds this share of the
-prior's, nor by some blocks if it exceeds that of all blocks by this factor. Chosen."""
 _HEALTHY_STDS = 3.0
 """Largest departure of a healthy unit, in standard deviations: one unit in 400 exceeds it."""
 LARGEST_SET = 3
@@ -87,74 +90,6 @@ class Hypothesis:
         """Whitening filter of each channel."""
         return [filters[i] for filters, i in zip(self.linearised.filters,
                                                  self.fit.filter_indices)]
-
-
-class ChannelColumns(NamedTuple):
-    """The linear model of a hypothesis in one channel."""
-
-    places: np.ndarray  # Places of the k coefficients among all, (k,)
-    values: np.ndarray  # Residual at the prior mean, V, and sensitivities, V per unit, (n, k + 1)
-    # Products of the same divided by the scale factor and the root of the number of axes, by
-    # block, (m/s²)², (blocks, k + 1, k + 1)
-    plain: np.ndarray
-
-
-@dataclass(frozen=True)
-class LinearisedHypothesis:
-    """
-    A hypothesis linearised at values of its k coefficients.
-
-    The first j coefficients are those of the effects. The others are nuisance parameters, which
-    stay near the baseline and are linearised there.
-    """
-
-    effects: tuple[str, ...]  # Names of the effects
-    sensor: Sensor  # The sensor at the values
-    names: tuple[Coefficient, ...]  # Coefficients, those of the effects first, (k,)
-    prior_mean: np.ndarray  # Prior mean of the coefficients, (k,)
-    prior_std: np.ndarray  # Prior standard deviation of the coefficients, (k,)
-    reach: np.ndarray  # Largest departure of the nuisance parameters of a healthy unit, (k − j,)
-    values: np.ndarray  # Values of the coefficients of the effects, (j,)
-    # Whitened columns, and whitened residuals at the prior mean by the linear model
-    channels: list[evidence.WhitenedChannel]
-    columns: list[ChannelColumns]  # The same before whitening
-    filters: Sequence[Sequence[Whitener]]  # Whitening filters of each channel
-
-    def fit(self, blocks: np.ndarray | None = None, drifts: Sequence[str] = ()) -> LinearFit:
-        """Fit all coefficients to some blocks, (blocks,) bool, or to all."""
-        return evidence.fit_columns(self.channels, range(len(self.names)), self.prior_std, blocks,
-                                    drifts=(*drifts, *evidence.drifts_among(self.sensor.effects)))
-
-    def departures(self, fit: LinearFit, full_fit: LinearFit | None = None) -> np.ndarray:
-        """
-        Return the departures from the prior mean after a fit, (k,).
-
-        A limit or a shape keeps its value if the samples do not determine it, because its prior
-        mean is no better guess. It also keeps its value if only the blocks that are not fitted
-        determine it. A shape changes by a factor of two at most. In a fit to some blocks, zero-g,
-        scale factor, filter and latency stay within the tolerance of a healthy unit.
-        """
-        j = len(self.values)
-        parameters = [parameter_of(name) for name in self.names[:j]]
-        std = np.sqrt(np.diag(fit.covariance)[:j])
-        undetermined = std > _UNDETERMINED_SHARE * self.prior_std[:j]
-        if full_fit is not None:
-            undetermined |= std > _UNDETERMINED_RATIO * np.sqrt(np.diag(full_fit.covariance)[:j])
-        kept = np.array([not p.is_size or bool(linear.limits(effect_named(name.effect)))
-                         for p, name in zip(parameters, self.names)], bool)
-        is_shape = np.array([p.role is Role.SHAPE for p in parameters], bool)
-        fitted = self.prior_mean[:j] + fit.values[:j]
-        values = np.where(undetermined & kept, self.values, fitted)
-        values = np.where(is_shape, np.clip(values, *np.sort([self.values / 2, self.values * 2],
-                                                             axis=0)), values)
-        given = np.concatenate([values != fitted, np.zeros(len(self.reach), bool)])
-        target = np.concatenate([values - self.prior_mean[:j], np.zeros(len(self.reach))])
-        departures = fit.given(np.flatnonzero(given), target[given])
-        outside = np.abs(departures[j:]) > self.reach
-        if full_fit is None or not outside.any():
-            return departures
-        given[j:], target[j:] = outside, np.clip(departures[j:], -self.reach, self.reach)
-        return fit.given(np.flatnonzero(given), target[given])
 
 
 def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
@@ -216,7 +151,7 @@ def _fitted_names(linear_model: LinearModel, effects: Sequence[str]) -> list[Coe
     return [name for effect in effects
             for name in fitted_of(effect_named(effect), linear_model.baseline.axes)
             if not parameter_of(name).is_size or name in linear_model.names
-            or linear.limits(effect_named(effect))]
+            or effect_named(effect).limits]
 
 
 def _prior_mean(sensor: Sensor, names: Sequence[Coefficient]) -> np.ndarray:
@@ -288,7 +223,7 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
         tuple(effects), put(linearised.sensor, linearised.names, np.clip(fitted, low, high)),
         linearised.names[:j], at_values, np.sqrt(std ** 2 + form ** 2 + np.where(
             in_rad, linear_model.smallest_angle_rad(), 0.0) ** 2),
-        std > _UNDETERMINED_SHARE * np.maximum(linearised.prior_std[:j], np.abs(at_values)),
+        std > UNDETERMINED_SHARE * np.maximum(linearised.prior_std[:j], np.abs(at_values)),
         fit.log_evidence - fit.loss(at_values), fit, linearised,
         solution.converged and solution.last.fit.log_evidence >= lowest_log_evidence)
 
@@ -460,7 +395,7 @@ def _model_about(model: LinearModel, best: Hypothesis) -> LinearModel:
     comparisons = [replace(c, sensor=replace(best.sensor, values=values,
                                              rate_hz=c.sensor.rate_hz))
                    for c in model.comparisons]
-    return linear.build_linear_model(comparisons, filters=[[w] for w in best.whiteners])
+    return linear.build_linear_model(comparisons, [[w] for w in best.whiteners])
 
 
 def _stepped(variant: Variant) -> dict[Coefficient, float]:
