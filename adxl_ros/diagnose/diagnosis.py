@@ -162,13 +162,14 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     floor = noise_model.estimate([c.comparison for c in checked])
     counts = np.sum([used_by_block(c.used) for c in model.comparisons], axis=0)
     fits = _held_out(model, search, floor, max(counts.sum(), 1.0))
+    smallest_mps2 = material_mps2(model, floor, material_mg)
     evidence = rule.Evidence(
         {e: {d: f.figures for d, f in drifts.items()} for e, drifts in fits.items()},
-        counts, rule.block_weights(seed), material_mps2(model, floor, material_mg),
+        counts, rule.block_weights(seed), smallest_mps2,
         model.smallest_angle_rad() * G0_MPS2,
         any(c.fading_hz is not None for c in model.comparisons),
         np.inf if floor.source == 'assumed' else floor.rms_mps2)
-    detections = _detections(checked, search.best, model.baseline)
+    detections = _detections(checked, search.best, model.baseline, smallest_mps2)
     bases = [flexible_bases(c, v) for c, v in zip(compared, model.baseline_v)]
     verdict = rule.decide(
         evidence, lambda effects, drift: reproducible_rest(fits[effects][drift], bases),
@@ -224,10 +225,10 @@ def _held_out(model: LinearModel, search: Search, floor: NoiseFloor, count: floa
     return out
 
 
-def _detections(checked: Sequence[CheckedRecording], best: Hypothesis, baseline: Sensor
-                ) -> list[Detection]:
+def _detections(checked: Sequence[CheckedRecording], best: Hypothesis, baseline: Sensor,
+                smallest_mps2: float) -> list[Detection]:
     """
-    Return the noise-like effects of the recordings and of the residual, the strongest of each.
+    Return the material noise-like effects of recordings and residual, the strongest of each.
 
     Spikes count only where the residual of the best set shows them, too, and excess noise only
     where it exceeds that of the baseline, too: a filter also changes the noise.
@@ -243,8 +244,8 @@ def _detections(checked: Sequence[CheckedRecording], best: Hypothesis, baseline:
         found, of_baseline = (noise_effects.residual_detections(comparison, residual_v, s)
                               for s in (best.sensor, baseline))
         detections += [d for d in found if d.effect in {o.effect for o in of_baseline}]
-    ranked = sorted(detections, key=lambda d: d.log_bayes_factor)
-    return list({d.effect: d for d in ranked}.values())
+    material = [d for d in detections if d.power_mps2 > smallest_mps2 ** 2]
+    return list({d.effect: d for d in sorted(material, key=lambda d: d.power_mps2)}.values())
 
 
 def _could_show(comparison: BaselineComparison) -> bool:

@@ -143,7 +143,8 @@ def _noise_could_show(comparison: BaselineComparison, noise_v: np.ndarray, mater
     """Return the smallest sizes of effects that show in the noise of one recording."""
     sensor, count = comparison.sensor, len(comparison)
     level_v, rate_hz = float(noise_v.max()), sensor.rate_hz
-    line_v = level_v * np.sqrt(8 * (noise_effects.LINE_LOG_EXCESS + np.log(count)) / count)
+    line_v = max(level_v * np.sqrt(8 * (noise_effects.LINE_LOG_EXCESS + np.log(count)) / count),
+                 np.sqrt(2) * material_mps2 * float(comparison.scale_v_per_mps2.max()))
     sizes = {Detector.NOISE_LEVEL: ('ratio', noise_effects.NOISE_EXCESS - 1),
              Detector.MAINS_LINE: ('amplitude_v', line_v),
              Detector.ISOLATED_SAMPLES: ('amplitude_v', noise_effects.SPIKE_STDS * max(

@@ -190,7 +190,8 @@ def _candidates(report: Report) -> list[dict[str, Any]]:
             'effect': name, 'of': effect.concern.value,
             'probability': _rounded(min(sum(h.probability for h in sets), 1.0)),
             'closed': _rounded(report.closure.closed.value) if name in verdict.best else None,
-            'p': float(np.exp(-detected[name].log_bayes_factor)) if name in detected else None,
+            # The rule weighs held-out figures, and no effect has a p of its own.
+            'p': None,
             'parameters': parameters,
             'share': _rounded(shares[name]) if name in shares else None,
             'visibility': _rounded(shown[name].share) if name in shown else 1.0,

@@ -313,16 +313,16 @@ class RobotPath(ForcePath):
         """
         Return what is to be expected of the error of one component, m/s², at times, s, (n,).
 
-        Standard deviation and memory are those of rounding and smoothing around each time.
+        Standard deviation and memory are those of rounding and smoothing around each time. The
+        error forgets its past at the rate by which it changes, divided by its size: the
+        correlation of neighbours on a grid that is finer than the changes would say far less.
         """
         error = self.rounding_mps2[:, component] + 2 * self.smoothing_mps2[:, component]
-        step_s = self._grid_s[1] - self._grid_s[0]
-        around = max(round(_AROUND_S / step_s), 3)
-        square, product = (uniform_filter1d(v, around) for v in (
-            error ** 2, error * np.append(error[1:], error[-1])))
-        memory = np.clip(product / np.maximum(square, _SMALLEST_STEP ** 2), 1e-3, 1.0)
-        return PathErrors(np.interp(time_s, self._grid_s, np.sqrt(square)),
-                          np.interp(time_s, self._grid_s, -np.log(memory) / step_s))
+        around = max(round(_AROUND_S / (self._grid_s[1] - self._grid_s[0])), 3)
+        size, rate = (np.sqrt(np.maximum(uniform_filter1d(v ** 2, around), 0.0)) for v in (
+            error, np.gradient(error, self._grid_s)))
+        return PathErrors(np.interp(time_s, self._grid_s, size), np.interp(
+            time_s, self._grid_s, rate / np.maximum(size, _SMALLEST_STEP)))
 
     @cached_property
     def smoothing_mps2(self) -> np.ndarray:
