@@ -6,11 +6,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import cached_property
 from typing import Any
 
 from adxl_ros.files.recording_columns import JOINTS, Recording
 from adxl_ros.model import noise, signal_chain
-from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import ActsOn
 from adxl_ros.model.kinematics import specific_force
@@ -18,7 +19,7 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.rest_detection import find_rests
 from adxl_ros.simulate.motion import INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.response import ChainMemo, Response
-from adxl_ros.simulate.smoothed_paths import PathErrors, SmoothedPath
+from adxl_ros.simulate.smoothed_paths import ForcePath, PathErrors, SmoothedPath
 from adxl_ros.simulate.trajectories import environment_paths, motion_from_references
 import numpy as np
 import scipy
@@ -136,6 +137,16 @@ class BaselineComparison:
         at_rate = replace(sensor, rate_hz=self.sensor.rate_hz)
         noisy = Response(at_rate, self.motion, seed, float(self.time_s[0]))(self.time_s)
         return noisy - self.simulated_v(at_rate)
+
+    @cached_property
+    def robot_error_mps2(self) -> float:
+        """Rms over used samples and axes that the encoders of a robot leave open, m/s²."""
+        force = self.motion.force
+        if not isinstance(force, ForcePath):
+            return 0.0
+        return float(np.sqrt(np.mean([
+            np.square(force.errors(self.time_s, AXES.index(axis)).std[self.used])
+            for axis in self.sensor.axes])))
 
     def lost_motion_mps2(self) -> float:
         """Return the rms of the fast motion that a smooth reference lacks, m/s²."""

@@ -163,10 +163,11 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     counts = np.sum([used_by_block(c.used) for c in model.comparisons], axis=0)
     fits = _held_out(model, search, floor, max(counts.sum(), 1.0))
     smallest_mps2 = material_mps2(model, floor, material_mg)
+    robot_mps2 = max(c.robot_error_mps2 for c in model.comparisons)
     evidence = rule.Evidence(
         {e: {d: f.figures for d, f in drifts.items()} for e, drifts in fits.items()},
         counts, rule.block_weights(seed), smallest_mps2,
-        model.smallest_angle_rad() * G0_MPS2,
+        max(model.smallest_angle_rad() * G0_MPS2, robot_mps2), robot_mps2 > 0,
         any(c.fading_hz is not None for c in model.comparisons),
         np.inf if floor.source == 'assumed' else floor.rms_mps2)
     detections = _detections(checked, search.best, model.baseline, smallest_mps2)

@@ -159,6 +159,7 @@ class Evidence:
     material_mps2: float  # Material amplitude, m/s²
     # Rms error of the reference, m/s²: its steps return with each pose, as an effect would
     reference_mps2: float
+    errs_in_motion: bool  # Whether it errs in motion, too, as a robot does
     fades: bool  # Whether the reference lacks motion
     floor_mps2: float  # Noise floor, m/s²; infinite where it is assumed
 
@@ -169,7 +170,8 @@ class Evidence:
 
     def material_power(self, pose_share: float) -> float:
         """Return the power that a user would act on and that is not of the reference, (m/s²)²."""
-        return self.material_mps2 ** 2 + pose_share * self.reference_mps2 ** 2
+        share = 1.0 if self.errs_in_motion else pose_share
+        return self.material_mps2 ** 2 + share * self.reference_mps2 ** 2
 
     def mean(self, by_block: np.ndarray, rows: slice = _ALL) -> np.ndarray:
         """Return the mean over samples of sums by block."""

@@ -252,7 +252,7 @@ class RobotPath(ForcePath):
     def text(self) -> str:
         """Return what is known of the robot, for people."""
         error_mg = 1e3 / G0_MPS2 * np.sqrt(np.mean(
-            (self.rounding_mps2 + 2 * self.smoothing_mps2) ** 2))
+            (self.rounding_mps2 + self.smoothing_mps2) ** 2))
         return (f'{self._robot.frame} moves by {", ".join(self.joints) or "its base"}, from '
                 f'{self.time_s[0]:.3g} to {self.time_s[-1]:.3g} s; the encoders leave an error of '
                 f'{error_mg:.2g} mg rms')
@@ -317,7 +317,7 @@ class RobotPath(ForcePath):
         error forgets its past at the rate by which it changes, divided by its size: the
         correlation of neighbours on a grid that is finer than the changes would say far less.
         """
-        error = self.rounding_mps2[:, component] + 2 * self.smoothing_mps2[:, component]
+        error = self.rounding_mps2[:, component] + self.smoothing_mps2[:, component]
         around = max(round(_AROUND_S / (self._grid_s[1] - self._grid_s[0])), 3)
         size, rate = (np.sqrt(np.maximum(uniform_filter1d(v ** 2, around), 0.0)) for v in (
             error, np.gradient(error, self._grid_s)))
@@ -326,8 +326,13 @@ class RobotPath(ForcePath):
 
     @cached_property
     def smoothing_mps2(self) -> np.ndarray:
-        """Return what smoothing once more would change, m/s², at `time_s`, (n, 3)."""
-        return self._moved(self._paths(self._read_again(False)))[0] - self.motion[0]
+        """
+        Return what half of the readings would change, m/s², at `time_s`, (n, 3).
+
+        A spline through every second reading of the smoothed motion lacks what jerks within a
+        few readings, as the motion itself does.
+        """
+        return self._moved(self._paths(self._read_again(2)))[0] - self.motion[0]
 
     @cached_property
     def rounding_mps2(self) -> np.ndarray:
@@ -336,19 +341,18 @@ class RobotPath(ForcePath):
 
         The smoothed motion is read by encoders whose steps lie elsewhere, and smoothed again.
         """
-        return self._moved(self._paths(self._read_again(True)))[0] - self.motion[0] \
-            - self.smoothing_mps2
+        return self._moved(self._paths(self._read_again(1)))[0] - self.motion[0]
 
-    def _read_again(self, is_rounded: bool) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return readings of the smoothed motion, exact or by encoders of the same steps."""
+    def _read_again(self, every: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return readings of the smoothed motion: by the same encoders, or exact ones of some."""
         rng, tracks = np.random.default_rng(0), []
         for (times, values), step, smooth in zip(self._tracks, self._steps, self._smoothed[0].T):
             read = CubicSpline(self._grid_s, smooth)(np.clip(
                 times, self._grid_s[0], self._grid_s[-1]))
             offset = step * rng.random()
-            if is_rounded and step and np.ptp(values):
+            if every == 1 and step and np.ptp(values):
                 read = np.rint((read + offset) / step) * step - offset
-            tracks.append((times, read))
+            tracks.append((times[::every], read[::every]))
         return tracks
 
 

@@ -100,17 +100,6 @@ class SweptSine:
 
 
 @dataclass(frozen=True)
-class Sum:
-    """A sum of paths."""
-
-    parts: tuple[Path, ...]  # The paths
-
-    def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
-        """Return a derivative; see `motion.Path`."""
-        return np.sum([part(time_s, order) for part in self.parts], axis=0)
-
-
-@dataclass(frozen=True)
 class Steps:
     """Steps to levels, each approached exponentially."""
 
@@ -235,7 +224,8 @@ def shaker(_: np.random.Generator) -> Motion:
         script.go(np.pi / 2, beta)
         shakes.append(_shake(script))
     alpha, beta_path = script.joints()
-    return Motion(script.now, alpha, beta_path, Sum(tuple(shakes)))
+    return Motion(script.now, alpha, beta_path, lambda time_s, order=0: np.sum(
+        [shake(time_s, order) for shake in shakes], axis=0))
 
 
 def soak(_: np.random.Generator) -> Motion:
