@@ -66,7 +66,7 @@ class BaselineComparison:
     # The baseline: datasheet values and effects of the parameter file, at this sample rate
     sensor: Sensor
     reference: Reference  # What determines the motion
-    has_stage_angles: bool  # Whether the recording holds stage angles, even if they never change
+    stage_angles: tuple[str, ...]  # Stage angles that the recording holds, even constant ones
     at_rest: np.ndarray  # Samples at which nothing moves, (n,) bool
     # Samples that are used, (n,) bool; the others are missing, repeated or outliers, or their
     # reference is not known
@@ -223,7 +223,8 @@ def compare(recording: Recording, sensor: Sensor, sim: Motion | None = None
         # Where another simulator moves from its first sample on, the filter has not settled.
         used = at_rest | (time_s > time_s[0] + SETTLING_S)
     return BaselineComparison(recording.path, time_s, volts, motion, sensor, reference,
-                              'alpha_rad' in recording.columns, at_rest, used)
+                              tuple(name for name in ('alpha_rad', 'beta_rad') if np.isfinite(
+                                  recording.columns.get(name, np.nan)).any()), at_rest, used)
 
 
 def _most_hz(time_s: np.ndarray) -> float:

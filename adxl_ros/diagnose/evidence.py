@@ -324,7 +324,7 @@ class LinearisedHypothesis:
     def fit(self, blocks: np.ndarray | None = None, drifts: Sequence[str] = ()) -> LinearFit:
         """Fit all coefficients to some blocks, (blocks,) bool, or to all."""
         return fit_columns(self.channels, range(len(self.names)), self.prior_std, blocks,
-                                    drifts=(*drifts, *drifts_among(self.sensor.effects)))
+                           drifts=(*drifts, *drifts_among(self.sensor.effects)))
 
     def departures(self, fit: LinearFit, full_fit: LinearFit | None = None) -> np.ndarray:
         """

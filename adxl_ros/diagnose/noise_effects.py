@@ -236,8 +236,8 @@ def _excess(residual_v: np.ndarray, simulated_v: np.ndarray, sensor: Sensor, row
         recorded_v, drawn_v = (np.std(v[rows], axis=0) for v in (residual_v, simulated_v))
         ratio = np.minimum(ratio, recorded_v / np.where(drawn_v > 0, drawn_v, np.inf))
     return None if np.max(ratio) <= NOISE_EXCESS else _detection(
-        Detector.NOISE_LEVEL, (ratio ** 2 - 1) * noise.analog_std_v(sensor) ** 2, sensor,
-        ratio=ratio - 1)
+        Detector.NOISE_LEVEL, np.maximum(ratio ** 2 - 1, 0.0) * noise.analog_std_v(sensor) ** 2,
+        sensor, ratio=ratio - 1)
 
 
 def white_noise_v(noise_v: np.ndarray, sensor: Sensor, rows: np.ndarray | None = None

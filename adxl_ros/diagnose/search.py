@@ -16,13 +16,7 @@ from itertools import chain, combinations
 from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence, linear_model as linear
-from adxl_ros.diagnose.evidence import (
-    ChannelColumns,
-    LinearFit,
-    LinearisedHypothesis,
-    UNDETERMINED_SHARE,
-    Whitener,
-)
+from adxl_ros.diagnose.evidence import LinearFit, LinearisedHypothesis, Whitener
 from adxl_ros.diagnose.linear_model import LinearModel, Variant
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import fitted_of, get, parameter_of, put, with_neutral
@@ -111,7 +105,7 @@ def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
     without = replace(sensor, values={**sensor.values, **{
         e: start.values[e] for e in effects if linear.calibration_takes_up(e)}})
     channels: list[evidence.WhitenedChannel] = []
-    columns: list[ChannelColumns] = []
+    columns: list[evidence.ChannelColumns] = []
     changes: list[list[linear.Column]] = []
     for comparison in linear_model.comparisons:
         at_rate = replace(sensor, rate_hz=comparison.sensor.rate_hz)
@@ -129,8 +123,9 @@ def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
             ids = np.array([*places, *map(all_names.index, own)], int)
             stacked = np.column_stack([residual_v, design, *(on_channel[n] for n in own)])
             scale = float(comparison.scale_v_per_mps2[d]) * len(start.axes) ** 0.5
-            columns.append(ChannelColumns(ids, stacked.astype(np.float32), evidence.plain_grams(
-                stacked / scale, comparison.used)))
+            columns.append(evidence.ChannelColumns(
+                ids, stacked.astype(np.float32), evidence.plain_grams(
+                    stacked / scale, comparison.used)))
             channels.append(evidence.whiten_channel(stacked[:, 0], stacked[:, 1:], ids,
                                                     comparison.used, filters[len(channels)]))
             changes.append([linear.Column(0, change_v[:, d])])
@@ -223,7 +218,8 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
         tuple(effects), put(linearised.sensor, linearised.names, np.clip(fitted, low, high)),
         linearised.names[:j], at_values, np.sqrt(std ** 2 + form ** 2 + np.where(
             in_rad, linear_model.smallest_angle_rad(), 0.0) ** 2),
-        std > UNDETERMINED_SHARE * np.maximum(linearised.prior_std[:j], np.abs(at_values)),
+        std > evidence.UNDETERMINED_SHARE * np.maximum(linearised.prior_std[:j],
+                                                       np.abs(at_values)),
         fit.log_evidence - fit.loss(at_values), fit, linearised,
         solution.converged and solution.last.fit.log_evidence >= lowest_log_evidence)
 
@@ -367,7 +363,13 @@ class Search:
         with suppress(UserError, np.linalg.LinAlgError):
             fitted = fit_hypothesis(self.model, tuple(effects), start, shapes,
                                     self._lowest if lowest is None else lowest)
-        if fitted is None or not _shows_time_constants(self.model, fitted):
+        if fitted is None:
+            return None
+        # Recordings that are not much longer than a time constant do not show it.
+        longest_s = max(c.span_s for c in self.model.comparisons)
+        values = dict(zip(fitted.names, fitted.values))
+        if any(longest_s < _TIME_CONSTANTS * values.get(Coefficient(
+                e, effect_named(e).diagnosis.time_constant), 0.0) for e in fitted.effects):
             return None
         if key not in self.found or fitted.log_evidence > self.found[key].log_evidence:
             self.found[key] = fitted
@@ -413,11 +415,3 @@ def _start_loss(model: LinearModel, ranked: _Ranked) -> float:
     return sum(0.5 * float((fit.values[k] - stepped[name]) ** 2 / fit.covariance[k, k])
                for k, i in enumerate(fit.column_ids if stepped else ())
                if (name := model.names[i]) in stepped)
-
-
-def _shows_time_constants(model: LinearModel, hypothesis: Hypothesis) -> bool:
-    """Determine whether the longest recording shows the time constants of the effects."""
-    longest_s = max(c.span_s for c in model.comparisons)
-    values = dict(zip(hypothesis.names, hypothesis.values))
-    names = [Coefficient(e, effect_named(e).diagnosis.time_constant) for e in hypothesis.effects]
-    return all(longest_s >= _TIME_CONSTANTS * values[name] for name in names if name in values)
