@@ -216,7 +216,9 @@ def is_needed(evidence: Evidence, effects: frozenset[str], effect: str, rows: sl
     shares_form = any({*hints.form} & {*effect_named(e).diagnosis.form} for e in rest)
     share = _SHARE_OF_FORM if shares_form else _SHARE_OF_SET
     explained = float(evidence.gain(effects, _NOTHING, rows)[0])
-    by_pose = bool(hints.proof) and {*hints.proof} <= _SHOWN_BY_POSE
+    # A branch of a loop differs in one pose.
+    by_pose = bool(hints.proof) and {*hints.proof} <= _SHOWN_BY_POSE \
+        and {d.value for d in hints.form} <= _POSE
     return float(lost[0]) > max(evidence.material_power(float(by_pose)), share * explained)
 
 
