@@ -15,13 +15,8 @@ from dataclasses import dataclass
 from functools import cached_property
 import warnings
 
-from adxl_ros.diagnose.evidence import (
-    BLOCKS,
-    LinearFit,
-    LinearisedHypothesis,
-    plain_grams,
-    whiten_channel,
-)
+from adxl_ros.diagnose import evidence
+from adxl_ros.diagnose.evidence import BLOCKS, LinearFit, LinearisedHypothesis
 from adxl_ros.diagnose.linear_model import LinearModel
 from adxl_ros.diagnose.noise_model import expected_drift_g
 from adxl_ros.diagnose.residual_map import Basis
@@ -127,11 +122,11 @@ def reproducible_rest(fits: HeldOutFits, bases: Sequence[Sequence[Basis]]) -> Re
             continue
         unit_v = _FIRST_LEVEL_G * float(comparison.sensor.scale_v_per_g[axis])
         design = np.concatenate([columns.values, *(unit_v * b for b in basis.values())], axis=1)
-        white = whiten_channel(
+        white = evidence.whiten_channel(
             design[:, 0], design[:, 1:], np.arange(design.shape[1] - 1), comparison.used,
             [filters[fits.full.filter_indices[number]]]).block_grams[0]
         scale = float(comparison.scale_v_per_mps2[axis]) * len(comparison.sensor.axes) ** 0.5
-        plain = plain_grams(design / scale, comparison.used)
+        plain = evidence.plain_grams(design / scale, comparison.used)
         variance = float(fits.full.innovation_variance_v2[number])
         names = np.repeat([d.value for d in basis], [b.shape[1] for b in basis.values()])
         choices = {name: names == name for name in every if name in names}

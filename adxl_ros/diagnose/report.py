@@ -484,21 +484,17 @@ def size_lines(report: Report, candidate: dict[str, Any]) -> list[str]:
     """Return one line for each parameter; those that may be 0 share the last line."""
     parameters = candidate['parameters']
     is_single = len({key.partition('.')[0] for key in parameters}) == 1
-    lines, zeros = [], []
+    lines, zeros, all_v_per_g = [], [], report.baseline.scale_v_per_g
     for key, parameter in parameters.items():
         label, ci = parameter_label(key, is_single), parameter.get('ci')
         if ci and ci[0] <= 0 <= ci[1]:
             zeros.append(label)
         else:
-            lines.append(f'{label} {parameter_text(parameter, axis_scale(report, key))}'.strip())
+            scale = dict(zip(report.baseline.axes, all_v_per_g)).get(
+                key.partition('.')[2], all_v_per_g.mean())
+            lines.append(f'{label} {parameter_text(parameter, float(scale))}'.strip())
     return lines + ([f'{", ".join(zeros)}: not different from 0'.removeprefix(': ')]
                     if zeros else [])
-
-
-def axis_scale(report: Report, key: str) -> float:
-    """Return the scale factor, V/g, of the axis of a parameter; the mean one without an axis."""
-    scales = dict(zip(report.baseline.axes, report.baseline.scale_v_per_g))
-    return float(scales.get(key.partition('.')[2], report.baseline.scale_v_per_g.mean()))
 
 
 def _row_lines(label: str, text: str, indent: int = _LABEL_COLUMNS) -> list[str]:
