@@ -90,7 +90,7 @@ REPORT = {
     'where': 'cells of the residual that noise does not explain, with share of the gap and p',
     'not_covered': 'what the recordings do not vary', 'notes': 'what was left out or corrected',
     'could_show': 'by parameter: the smallest size that would have shown; null where none',
-    'candidates': 'by effect: probability, closed share, p, visibility, rivals, parameters',
+    'candidates': 'by effect: probability, closed share, visibility, rivals, parameters',
     'candidates.parameters': 'value, 90 % interval, unit; null and not `determined` if not seen',
     'noise_remainders': 'by noise-like effect: a statistic recorded, simulated and left',
     'next_experiment': 'manoeuvre, why and command of what to record next; or null'}

@@ -6,11 +6,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import cached_property
 from typing import Any
 
 from adxl_ros.files.recording_columns import JOINTS, Recording
 from adxl_ros.model import noise, signal_chain
-from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import ActsOn
 from adxl_ros.model.kinematics import specific_force
@@ -18,7 +19,7 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.rest_detection import find_rests
 from adxl_ros.simulate.motion import INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.response import ChainMemo, Response
-from adxl_ros.simulate.smoothed_paths import PathErrors, SmoothedPath
+from adxl_ros.simulate.smoothed_paths import ForcePath, PathErrors, SmoothedPath
 from adxl_ros.simulate.trajectories import environment_paths, motion_from_references
 import numpy as np
 import scipy
@@ -65,7 +66,7 @@ class BaselineComparison:
     # The baseline: datasheet values and effects of the parameter file, at this sample rate
     sensor: Sensor
     reference: Reference  # What determines the motion
-    has_stage_angles: bool  # Whether the recording holds stage angles, even if they never change
+    stage_angles: tuple[str, ...]  # Stage angles that the recording holds, even constant ones
     at_rest: np.ndarray  # Samples at which nothing moves, (n,) bool
     # Samples that are used, (n,) bool; the others are missing, repeated or outliers, or their
     # reference is not known
@@ -136,6 +137,16 @@ class BaselineComparison:
         at_rate = replace(sensor, rate_hz=self.sensor.rate_hz)
         noisy = Response(at_rate, self.motion, seed, float(self.time_s[0]))(self.time_s)
         return noisy - self.simulated_v(at_rate)
+
+    @cached_property
+    def robot_error_mps2(self) -> float:
+        """Rms over used samples and axes that the encoders of a robot leave open, m/s²."""
+        force = self.motion.force
+        if not isinstance(force, ForcePath):
+            return 0.0
+        return float(np.sqrt(np.mean([
+            np.square(force.errors(self.time_s, AXES.index(axis)).std[self.used])
+            for axis in self.sensor.axes])))
 
     def lost_motion_mps2(self) -> float:
         """Return the rms of the fast motion that a smooth reference lacks, m/s²."""
@@ -212,7 +223,8 @@ def compare(recording: Recording, sensor: Sensor, sim: Motion | None = None
         # Where another simulator moves from its first sample on, the filter has not settled.
         used = at_rest | (time_s > time_s[0] + SETTLING_S)
     return BaselineComparison(recording.path, time_s, volts, motion, sensor, reference,
-                              'alpha_rad' in recording.columns, at_rest, used)
+                              tuple(name for name in ('alpha_rad', 'beta_rad') if np.isfinite(
+                                  recording.columns.get(name, np.nan)).any()), at_rest, used)
 
 
 def _most_hz(time_s: np.ndarray) -> float:
@@ -285,6 +297,13 @@ def time_since_move_s(time_s: np.ndarray, rates: Sequence[np.ndarray]) -> np.nda
     moving = np.any(np.abs(np.array(rates)) > _REST_RATE, axis=0)
     last_s = np.maximum.accumulate(np.where(moving, time_s, -np.inf))
     return np.minimum(time_s - last_s, _LONGEST_S)
+
+
+def code_step_v(volts: np.ndarray) -> np.ndarray:
+    """Return the smallest change of an output on each axis, V; 0 where it never changes."""
+    changes_v = np.abs(np.diff(volts, axis=0))
+    smallest = np.min(changes_v, axis=0, initial=np.inf, where=changes_v > 0)
+    return np.where(np.isfinite(smallest), smallest, 0.0)
 
 
 def gravity_slopes(alpha_rad: np.ndarray, beta_rad: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ from adxl_ros.diagnose import noise_effects, reference
 from adxl_ros.diagnose.comparison import (
     at_search_rate,
     BaselineComparison,
+    code_step_v,
     compare,
     Reference,
     SMALLEST_MOTION_G,
@@ -96,7 +97,7 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
 
     Raise DataFault where that is meaningless.
     """
-    notes: list[str] = []
+    sensor, notes = replace(sensor, rate_hz=recording.rate_hz), list[str]()
     even = even_stamps(recording.time_s)
     if even is not None and even.certain:
         recording, notes = replace(recording, time_s=even.time_s), even.notes
@@ -353,7 +354,7 @@ def _check_range(comparison: BaselineComparison, finite: np.ndarray) -> None:
     volts, simulated_v = (v[finite] for v in (comparison.volts, comparison.simulated_v(sensor)))
     lsb_v, range_v = max(sensor.lsb_v, _SMALLEST_STEP_V), np.ptp(volts, axis=0)
     railed = 0.0
-    for axis_v, expected_v, step_v in zip(volts.T, simulated_v.T, reference.code_step_v(volts)):
+    for axis_v, expected_v, step_v in zip(volts.T, simulated_v.T, code_step_v(volts)):
         for rail_v in (axis_v.max(), axis_v.min()) if np.ptp(axis_v) > _SMALLEST_RANGE_V else ():
             at_rail = np.abs(axis_v - rail_v) < lsb_v / 2
             # Coarse codes repeat in an extreme pose, so that the simulation must differ, too.
@@ -380,8 +381,10 @@ def _check_rest(comparison: BaselineComparison, finite: np.ndarray) -> None:
     range_g = np.subtract(*np.quantile(force_g, _RANGE_QUANTILES[::-1], axis=0))
     worst = int(np.argmax(range_g))
     if range_g[worst] >= _LARGEST_UNEXPLAINED_MOTION_G and step_g[worst] <= range_g[worst]:
-        angles = 'its stage angles do not change' if comparison.has_stage_angles else \
-            'it has no stage angles'
+        missing = [name for name in JOINTS.values()
+                   if name != 'shift_m' and name not in comparison.stage_angles]
+        angles = 'it has no stage angles' if len(missing) > 1 else \
+            f'it has no {missing[0]}' if missing else 'its stage angles do not change'
         raise DataFault('reference', f'{comparison.sensor.axes[worst]} moves by '
                         f'{range_g[worst]:.2f} g, but {angles}; give the angles, or --sim with '
                         'the specific force of the same manoeuvre')

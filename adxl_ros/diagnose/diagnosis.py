@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import NamedTuple
 
 from adxl_ros.diagnose import (
@@ -23,14 +22,20 @@ from adxl_ros.diagnose import (
 from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
 from adxl_ros.diagnose.data_checks import CheckedRecording, compare_checked
 from adxl_ros.diagnose.evidence import used_by_block
+from adxl_ros.diagnose.held_out import HeldOutFits, reproducible_rest
 from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
 from adxl_ros.diagnose.next_experiment import CouldShow, NextExperiment
 from adxl_ros.diagnose.noise_effects import Detection, NoiseComparison, NoiseRemainder
 from adxl_ros.diagnose.noise_model import drift_effects, NoiseFloor
 from adxl_ros.diagnose.reference import DataFault
-from adxl_ros.diagnose.residual_map import not_covered, residual_map, ResidualCell
+from adxl_ros.diagnose.residual_map import (
+    flexible_bases,
+    not_covered,
+    residual_map,
+    ResidualCell,
+)
 from adxl_ros.diagnose.search import Hypothesis, linearise, Search
-from adxl_ros.diagnose.verdict import HEALTHY, HeldOutFits, MATERIAL_MG, Verdict
+from adxl_ros.diagnose.verdict import HEALTHY, MATERIAL_MG, Verdict
 from adxl_ros.files.recording_columns import check_unit, Recording
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
@@ -148,7 +153,8 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
         checked = check(recordings, sensor, sim, align)
     except DataFault as fault:
         return Diagnosis(fault.comparisons, fault=fault)
-    model = build_linear_model([c.search_comparison for c in checked],
+    compared = [c.search_comparison for c in checked]
+    model = build_linear_model(compared, noise_model.whiteners(compared),
                                lambda share: show('library of effects', share))
     search = Search(model)
     search.run(lambda share: show('effects', share))
@@ -156,15 +162,18 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     floor = noise_model.estimate([c.comparison for c in checked])
     counts = np.sum([used_by_block(c.used) for c in model.comparisons], axis=0)
     fits = _held_out(model, search, floor, max(counts.sum(), 1.0))
+    smallest_mps2 = material_mps2(model, floor, material_mg)
+    robot_mps2 = max(c.robot_error_mps2 for c in model.comparisons)
     evidence = rule.Evidence(
         {e: {d: f.figures for d, f in drifts.items()} for e, drifts in fits.items()},
-        counts, rule.block_weights(seed), material_mps2(model, floor, material_mg),
-        model.smallest_angle_rad() * G0_MPS2,
+        counts, rule.block_weights(seed), smallest_mps2,
+        max(model.smallest_angle_rad() * G0_MPS2, robot_mps2), robot_mps2 > 0,
         any(c.fading_hz is not None for c in model.comparisons),
         np.inf if floor.source == 'assumed' else floor.rms_mps2)
-    detections = _detections(checked, search.best, model.baseline)
+    detections = _detections(checked, search.best, model.baseline, smallest_mps2)
+    bases = [flexible_bases(c, v) for c, v in zip(compared, model.baseline_v)]
     verdict = rule.decide(
-        evidence, cache(lambda effects, drift: rule.reproducible_rest(fits[effects][drift])),
+        evidence, lambda effects, drift: reproducible_rest(fits[effects][drift], bases),
         [d.effect for d in detections])
     show('report', 0.0)
     if verdict.status == 'no_gap' and not any(map(_could_show, model.comparisons)):
@@ -217,10 +226,10 @@ def _held_out(model: LinearModel, search: Search, floor: NoiseFloor, count: floa
     return out
 
 
-def _detections(checked: Sequence[CheckedRecording], best: Hypothesis, baseline: Sensor
-                ) -> list[Detection]:
+def _detections(checked: Sequence[CheckedRecording], best: Hypothesis, baseline: Sensor,
+                smallest_mps2: float) -> list[Detection]:
     """
-    Return the noise-like effects of the recordings and of the residual, the strongest of each.
+    Return the material noise-like effects of recordings and residual, the strongest of each.
 
     Spikes count only where the residual of the best set shows them, too, and excess noise only
     where it exceeds that of the baseline, too: a filter also changes the noise.
@@ -236,8 +245,8 @@ def _detections(checked: Sequence[CheckedRecording], best: Hypothesis, baseline:
         found, of_baseline = (noise_effects.residual_detections(comparison, residual_v, s)
                               for s in (best.sensor, baseline))
         detections += [d for d in found if d.effect in {o.effect for o in of_baseline}]
-    ranked = sorted(detections, key=lambda d: d.log_bayes_factor)
-    return list({d.effect: d for d in ranked}.values())
+    material = [d for d in detections if d.power_mps2 > smallest_mps2 ** 2]
+    return list({d.effect: d for d in sorted(material, key=lambda d: d.power_mps2)}.values())
 
 
 def _could_show(comparison: BaselineComparison) -> bool:
@@ -346,7 +355,8 @@ def what_shows(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | No
         checked = check(recordings, sensor, sim)
     except DataFault as fault:
         return fault
-    model = build_linear_model([c.search_comparison for c in checked])
+    compared = [c.search_comparison for c in checked]
+    model = build_linear_model(compared, noise_model.whiteners(compared))
     floor = noise_model.estimate([c.comparison for c in checked])
     return next_experiment.could_show(model, checked[0].comparison, floor.noise_v,
                                       material_mps2(model, floor))

@@ -13,9 +13,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
+from adxl_ros.model.coefficients import parameter_of
 from adxl_ros.model.diagnosis_hints import DriftSpectrum
 from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Coefficient, Role
+from adxl_ros.model.sensor import Sensor
 import numpy as np
 import scipy
 
@@ -30,6 +34,9 @@ _CACHED_VALUES = 100_000
 """Number of values that are filtered at once. Chosen: 0.8 MB stay in the cache of a processor."""
 _RIDGE = 1e-12
 """Ridge on the scaled precision. Chosen: columns that differ by a millionth are separable."""
+UNDETERMINED_SHARE, _UNDETERMINED_RATIO = 0.5, 3.0
+"""A coefficient is not determined if its posterior standard deviation exceeds this share of the
+prior's, nor by some blocks if it exceeds that of all blocks by this factor. Chosen."""
 _SERIES = 16
 """Series that are filtered together. Chosen: little memory beside all series."""
 
@@ -281,3 +288,71 @@ def fit_columns(channels: Sequence[WhitenedChannel], column_ids: Iterable[int],
     for (*_, count, log_scales, log_priors), variance, f in zip(selected, variance_v2, filters):
         log_evidence += float(-count / 2 * (np.log(variance) + 1) + log_scales[f] + log_priors[f])
     return LinearFit(ids, values, covariance, log_evidence, tuple(filters), variance_v2)
+
+
+class ChannelColumns(NamedTuple):
+    """The linear model of a hypothesis in one channel."""
+
+    places: np.ndarray  # Places of the k coefficients among all, (k,)
+    values: np.ndarray  # Residual at the prior mean, V, and sensitivities, V per unit, (n, k + 1)
+    # Products of the same divided by the scale factor and the root of the number of axes, by
+    # block, (m/s²)², (blocks, k + 1, k + 1)
+    plain: np.ndarray
+
+
+@dataclass(frozen=True)
+class LinearisedHypothesis:
+    """
+    A hypothesis linearised at values of its k coefficients.
+
+    The first j coefficients are those of the effects. The others are nuisance parameters, which
+    stay near the baseline and are linearised there.
+    """
+
+    effects: tuple[str, ...]  # Names of the effects
+    sensor: Sensor  # The sensor at the values
+    names: tuple[Coefficient, ...]  # Coefficients, those of the effects first, (k,)
+    prior_mean: np.ndarray  # Prior mean of the coefficients, (k,)
+    prior_std: np.ndarray  # Prior standard deviation of the coefficients, (k,)
+    reach: np.ndarray  # Largest departure of the nuisance parameters of a healthy unit, (k − j,)
+    values: np.ndarray  # Values of the coefficients of the effects, (j,)
+    # Whitened columns, and whitened residuals at the prior mean by the linear model
+    channels: list[WhitenedChannel]
+    columns: list[ChannelColumns]  # The same before whitening
+    filters: Sequence[Sequence[Whitener]]  # Whitening filters of each channel
+
+    def fit(self, blocks: np.ndarray | None = None, drifts: Sequence[str] = ()) -> LinearFit:
+        """Fit all coefficients to some blocks, (blocks,) bool, or to all."""
+        return fit_columns(self.channels, range(len(self.names)), self.prior_std, blocks,
+                           drifts=(*drifts, *drifts_among(self.sensor.effects)))
+
+    def departures(self, fit: LinearFit, full_fit: LinearFit | None = None) -> np.ndarray:
+        """
+        Return the departures from the prior mean after a fit, (k,).
+
+        A limit or a shape keeps its value if the samples do not determine it, because its prior
+        mean is no better guess. It also keeps its value if only the blocks that are not fitted
+        determine it. A shape changes by a factor of two at most. In a fit to some blocks, zero-g,
+        scale factor, filter and latency stay within the tolerance of a healthy unit.
+        """
+        j = len(self.values)
+        parameters = [parameter_of(name) for name in self.names[:j]]
+        std = np.sqrt(np.diag(fit.covariance)[:j])
+        undetermined = std > UNDETERMINED_SHARE * self.prior_std[:j]
+        if full_fit is not None:
+            undetermined |= std > _UNDETERMINED_RATIO * np.sqrt(np.diag(full_fit.covariance)[:j])
+        kept = np.array([not p.is_size or bool(effect_named(name.effect).limits)
+                         for p, name in zip(parameters, self.names)], bool)
+        is_shape = np.array([p.role is Role.SHAPE for p in parameters], bool)
+        fitted = self.prior_mean[:j] + fit.values[:j]
+        values = np.where(undetermined & kept, self.values, fitted)
+        values = np.where(is_shape, np.clip(values, *np.sort([self.values / 2, self.values * 2],
+                                                             axis=0)), values)
+        given = np.concatenate([values != fitted, np.zeros(len(self.reach), bool)])
+        target = np.concatenate([values - self.prior_mean[:j], np.zeros(len(self.reach))])
+        departures = fit.given(np.flatnonzero(given), target[given])
+        outside = np.abs(departures[j:]) > self.reach
+        if full_fit is None or not outside.any():
+            return departures
+        given[j:], target[j:] = outside, np.clip(departures[j:], -self.reach, self.reach)
+        return fit.given(np.flatnonzero(given), target[given])

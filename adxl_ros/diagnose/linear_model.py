@@ -23,8 +23,6 @@ from typing import NamedTuple
 from adxl_ros.diagnose import evidence
 from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
 from adxl_ros.diagnose.evidence import LinearFit, Whitener
-from adxl_ros.diagnose.noise_model import whiteners
-from adxl_ros.diagnose.residual_map import Basis, flexible_bases
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import names_of, parameter_of, put, with_neutral
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre, StraightLine
@@ -106,11 +104,6 @@ def candidates() -> list[Effect]:
     return [effect for effect in library().values() if effect.acts_on is ActsOn.MEAN]
 
 
-def limits(effect: Effect) -> list[Parameter]:
-    """Return the parameters that do nothing until the signal reaches them."""
-    return [p for p in effect.parameters if p.role is Role.LIMIT]
-
-
 def variants(comparison: BaselineComparison, effect: Effect, baseline_v: np.ndarray
              ) -> Iterator[Variant]:
     """
@@ -121,9 +114,9 @@ def variants(comparison: BaselineComparison, effect: Effect, baseline_v: np.ndar
     modelled = effect.name in comparison.sensor.effects
     if effect.concern is Concern.REFERENCE and comparison.reference is not Reference.SIMULATOR:
         return
-    if limits(effect):
+    if effect.limits:
         if not modelled:
-            yield from _limit_variants(comparison, effect, limits(effect)[0], baseline_v)
+            yield from _limit_variants(comparison, effect, effect.limits[0], baseline_v)
         return
     # An effect with a shape parameter is nearly linear in its sizes. An effect of the baseline
     # keeps its shape.
@@ -289,11 +282,6 @@ class LinearModel:
         return self.fit_variants([])
 
     @cached_property
-    def flexible_bases(self) -> list[list[Basis]]:
-        """Flexible functions of each axis of each recording about the baseline."""
-        return [flexible_bases(c, v) for c, v in zip(self.comparisons, self.baseline_v)]
-
-    @cached_property
     def nuisance_ids(self) -> list[int]:
         """Numbers of the columns of nuisance parameters, each for small departures."""
         first: dict[str, list[int]] = {}
@@ -363,10 +351,14 @@ def calibration_takes_up(effect: str) -> bool:
 
 
 def build_linear_model(comparisons: Sequence[BaselineComparison],
+                       filters: Sequence[list[Whitener]],
                        show_progress: Callable[[float], None] = lambda fraction: None,
-                       filters: Sequence[list[Whitener]] | None = None,
                        only: Sequence[str] | None = None) -> LinearModel:
-    """Differentiate the baseline by the whole library in all recordings."""
+    """
+    Differentiate the baseline by the whole library in all recordings.
+
+    filters: whitening filters of each channel.
+    """
     baseline_v = [c.simulated_v(c.sensor) for c in comparisons]
     # The same variant of several recordings, by the number of the recording.
     every: dict[tuple, dict[int, Variant]] = {}
@@ -396,8 +388,6 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
                       for name in own]
         column_ids.append(list(numbers.values()))
     by_channel = list(chain(*columns))
-    if filters is None:
-        filters = [whiteners(c, d) for c in comparisons for d in range(len(c.sensor.axes))]
     channels: list[evidence.WhitenedChannel] = []
     chosen = filters_for(filters, comparisons[0].sensor.effects)
     for comparison in comparisons:

@@ -23,7 +23,7 @@ from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
-from adxl_ros.diagnose import evidence, noise_effects
+from adxl_ros.diagnose import evidence, linear_model as linear, noise_effects
 from adxl_ros.diagnose.comparison import (
     at_search_rate,
     BaselineComparison,
@@ -31,15 +31,10 @@ from adxl_ros.diagnose.comparison import (
     Reference,
     with_values,
 )
-from adxl_ros.diagnose.linear_model import (
-    build_linear_model,
-    candidates,
-    filters_for,
-    LinearModel,
-)
-from adxl_ros.diagnose.noise_effects import UNKNOWN
-from adxl_ros.diagnose.noise_model import expected_drift_g
-from adxl_ros.diagnose.verdict import Verdict, WeightedHypothesis
+from adxl_ros.diagnose.linear_model import LinearModel
+from adxl_ros.diagnose.noise_model import expected_drift_g, whiteners
+from adxl_ros.diagnose.residual_map import flexible_bases
+from adxl_ros.diagnose.verdict import UNKNOWN, Verdict, WeightedHypothesis
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.coefficients import parameter_of, with_neutral
@@ -132,7 +127,7 @@ def could_show(model: LinearModel, comparison: BaselineComparison, noise_v: np.n
     seen = {row.effect for row in best.values()} | {
         v.effect for v in model.variants if v.limit_start}
     hidden = [CouldShow(Coefficient(e.name, e.parameters[0].name), np.inf, 0.0)
-              for e in candidates() if e.name not in seen]
+              for e in linear.candidates() if e.name not in seen]
     return sorted([*best.values(), *hidden, *_noise_could_show(comparison, noise_v,
                                                                material_mps2)],
                   key=lambda r: (r.effect, r.name.parameter, r.name.axis))
@@ -143,7 +138,8 @@ def _noise_could_show(comparison: BaselineComparison, noise_v: np.ndarray, mater
     """Return the smallest sizes of effects that show in the noise of one recording."""
     sensor, count = comparison.sensor, len(comparison)
     level_v, rate_hz = float(noise_v.max()), sensor.rate_hz
-    line_v = level_v * np.sqrt(8 * (noise_effects.LINE_LOG_EXCESS + np.log(count)) / count)
+    line_v = max(level_v * np.sqrt(8 * (noise_effects.LINE_LOG_EXCESS + np.log(count)) / count),
+                 np.sqrt(2) * material_mps2 * float(comparison.scale_v_per_mps2.max()))
     sizes = {Detector.NOISE_LEVEL: ('ratio', noise_effects.NOISE_EXCESS - 1),
              Detector.MAINS_LINE: ('amplitude_v', line_v),
              Detector.ISOLATED_SAMPLES: ('amplitude_v', noise_effects.SPIKE_STDS * max(
@@ -277,12 +273,13 @@ def predict(manoeuvre: Experiment, sensor: Sensor, effects: Sequence[str],
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     recording = Recording(manoeuvre.name, columns.pop('time_s'), columns)
     comparison = at_search_rate(compare(recording, at_rate))
-    model = build_linear_model([comparison], only=effects)
-    filters = filters_for(model.filters, sensor.effects)
+    model = linear.build_linear_model([comparison], whiteners([comparison]), only=effects)
+    filters = linear.filters_for(model.filters, sensor.effects)
+    bases = flexible_bases(comparison, model.baseline_v[0])
     places: dict[Key, int] = {}
     keys, blocks = _keys(model), []
     for number, channel in enumerate(model.columns):
-        functions = model.flexible_bases[0][number]
+        functions = bases[number]
         size_v = _UNKNOWN_G * float(comparison.sensor.scale_v_per_g[number])
         shown: dict[Key, np.ndarray] = {keys[c.number]: c.values for c in channel
                                         if c.number in keys}

@@ -15,11 +15,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
-from adxl_ros.diagnose.comparison import at_search_rate, BaselineComparison
+from adxl_ros.diagnose.comparison import at_search_rate, BaselineComparison, code_step_v
 from adxl_ros.diagnose.evidence import bridged, drifts_among
-from adxl_ros.diagnose.reference import code_step_v
 from adxl_ros.model import noise
-from adxl_ros.model.constants import MAD_TO_STD
+from adxl_ros.model.constants import G0_MPS2, MAD_TO_STD
 from adxl_ros.model.diagnosis_hints import Detector
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.sensor import Sensor
@@ -28,8 +27,6 @@ from adxl_ros.simulate.response import Response
 import numpy as np
 import scipy
 
-UNKNOWN = 'unknown'
-"""Name of what no effect of the library explains."""
 _MAINS_HZ, _MAINS_TOLERANCE_HZ = (50.0, 60.0), 0.6
 """Mains frequencies, Hz, and the largest deviation of a line. Chosen: 1 % of clock or mains."""
 _LINE_LOWEST_HZ, _LINE_FEWEST_ORDINATES, _LOCAL_ORDINATES = 1.0, 64, 201
@@ -66,9 +63,6 @@ samples. Chosen: two may be equal by rounding."""
 _REPEAT_PROBABILITIES = (0.05, 1e-3, 0.5)
 """Smallest assumed probability that a sample equals the last one on one axis, and on all of
 several axes; the largest one. Chosen: in 10⁵ samples, chance explains runs of 7, 3 and 30."""
-_LOG_BAYES_FACTORS = {Detector.ISOLATED_SAMPLES: 10.0, Detector.REPEATED_SAMPLES: 5.0,
-                      Detector.COARSE_CODES: 1e3}
-"""Log Bayes factor of one event, rough: it only ranks detections."""
 _BANDS, _LOWEST_EDGE_HZ, _TIMES_S, _SEGMENT_S = 5, 0.05, (0.1, 1.0, 10.0), 16.0
 """Bands of frequency, smallest edge, Hz, averaging times of the Allan deviation, and segments of
 the simulated spectrum, s. Chosen: half a decade each; a period of 20 s; ten segments."""
@@ -85,14 +79,17 @@ class Detection:
 
     effect: str  # Name of the effect
     values: dict[str, np.ndarray]  # Parameters of the effect by name, (m,) or () each
-    log_bayes_factor: float  # Approximate log Bayes factor of the effect
+    # Mean square over samples and axes that the effect adds, (m/s²)²; infinite for repeated
+    # samples, because nobody knows what they hide
+    power_mps2: float
 
 
-def _detection(detector: Detector, count: float, **values: np.ndarray | float) -> Detection:
-    """Return the detection of a detector's effect, by the number of events or its log factor."""
+def _detection(detector: Detector, power_v2: np.ndarray | float, sensor: Sensor,
+               **values: np.ndarray | float) -> Detection:
+    """Return the detection of a detector's effect, with its mean square, V², (m,) or ()."""
     name = next(e.name for e in library().values() if e.diagnosis.detector is detector)
     return Detection(name, {key: np.asarray(value) for key, value in values.items()},
-                     _LOG_BAYES_FACTORS.get(detector, 1.0) * count)
+                     float(np.mean(power_v2 * (G0_MPS2 / sensor.scale_v_per_g) ** 2)))
 
 
 def repeated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, sensor: Sensor
@@ -110,7 +107,7 @@ def repeated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, se
         return used, []
     duration_s = float(np.median([time_s[end - 1] - time_s[begin] for begin, end in repeats]))
     return used & ~repeated, [_detection(
-        Detector.REPEATED_SAMPLES, len(repeats), rate_hz=len(repeats) / np.ptp(time_s),
+        Detector.REPEATED_SAMPLES, np.inf, sensor, rate_hz=len(repeats) / np.ptp(time_s),
         duration_s=duration_s + 1 / sensor.rate_hz)]
 
 
@@ -128,12 +125,12 @@ def isolated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, se
                      ) -> tuple[np.ndarray, list[Detection]]:
     """Find single samples that deviate from the straight line between their neighbours."""
     spikes, size_v = _spikes(volts, used, sensor)
-    count = int(spikes.any(axis=1).sum())
-    if not count:
+    if not spikes.any():
         return used, []
     rate_hz = spikes.sum() / len(sensor.axes) / float(time_s[-1] - time_s[0])
     return used & ~spikes.any(axis=1), [_detection(
-        Detector.ISOLATED_SAMPLES, count, rate_hz=rate_hz, amplitude_v=size_v)]
+        Detector.ISOLATED_SAMPLES, spikes.mean(axis=0) * size_v ** 2, sensor, rate_hz=rate_hz,
+        amplitude_v=size_v)]
 
 
 def residual_shows_spikes(spikes: Detection, residual_v: np.ndarray, used: np.ndarray,
@@ -187,8 +184,8 @@ def coarse_codes(volts: np.ndarray, sensor: Sensor) -> Detection | None:
         common = float(np.nanmedian(bits) if np.nanmax(bits) - np.nanmin(bits) < threshold
                        else np.nanmin(bits))
     return _detection(
-        Detector.COARSE_CODES, 1, lost_bits=common,
-        axis_lost_bits=np.where(bits - common >= threshold, bits - common, 0.0))
+        Detector.COARSE_CODES, (sensor.lsb_v * 2 ** np.nan_to_num(bits)) ** 2 / 12, sensor,
+        lost_bits=common, axis_lost_bits=np.where(bits - common >= threshold, bits - common, 0.0))
 
 
 def _lost_bits(volts: np.ndarray, sensor: Sensor) -> float:
@@ -238,9 +235,9 @@ def _excess(residual_v: np.ndarray, simulated_v: np.ndarray, sensor: Sensor, row
         # Noise past the RC filter looks excessive in the innovations, but not in the samples.
         recorded_v, drawn_v = (np.std(v[rows], axis=0) for v in (residual_v, simulated_v))
         ratio = np.minimum(ratio, recorded_v / np.where(drawn_v > 0, drawn_v, np.inf))
-    largest = np.max(ratio)
-    return None if largest <= NOISE_EXCESS else _detection(
-        Detector.NOISE_LEVEL, len(rows) * float(np.log(largest) ** 2), ratio=ratio - 1)
+    return None if np.max(ratio) <= NOISE_EXCESS else _detection(
+        Detector.NOISE_LEVEL, np.maximum(ratio ** 2 - 1, 0.0) * noise.analog_std_v(sensor) ** 2,
+        sensor, ratio=ratio - 1)
 
 
 def white_noise_v(noise_v: np.ndarray, sensor: Sensor, rows: np.ndarray | None = None
@@ -279,8 +276,9 @@ def _line(white: np.ndarray, residual_v: np.ndarray, time_s: np.ndarray, sensor:
     mains_hz = _mains_frequency_hz(float(frequency_hz[best]), sensor.rate_hz)
     if not log_excess >= LINE_LOG_EXCESS or mains_hz is None:
         return None
-    return _detection(Detector.MAINS_LINE, log_excess, amplitude_v=line_amplitude_v(
-        residual_v, time_s, mains_hz), frequency_hz=mains_hz, phase_rad=0.0)
+    amplitude_v = line_amplitude_v(residual_v, time_s, mains_hz)
+    return _detection(Detector.MAINS_LINE, amplitude_v ** 2 / 2, sensor, amplitude_v=amplitude_v,
+                      frequency_hz=mains_hz, phase_rad=0.0)
 
 
 def line_amplitude_v(values_v: np.ndarray, time_s: np.ndarray, line_hz: float) -> np.ndarray:

@@ -101,7 +101,7 @@ def estimate(comparisons: Sequence[BaselineComparison]) -> NoiseFloor:
     Estimate the noise floor from rests, else from repeats, else from the parameter file.
 
     The noise at rest is that about the mean of each second. The mean square of the encoder's steps
-    is added: step²/12 times the squared slope of gravity.
+    is added: step²/12 times the squared slope of gravity, or what they leave open of a robot.
     """
     sums: Squares = [part for c in comparisons for part in squares_at_rest(
         c.volts, c.at_rest & c.used, c.sensor)]
@@ -113,7 +113,7 @@ def estimate(comparisons: Sequence[BaselineComparison]) -> NoiseFloor:
         sums, noise_v, source = [], noise.sample_std_v(comparisons[0].sensor), 'assumed'
     else:
         noise_v = np.sqrt(np.sum([squares_v2 for squares_v2, _ in sums], axis=0) / count)
-    encoder = 0.0
+    encoder = float(np.mean([c.robot_error_mps2 ** 2 for c in comparisons]))
     for c in comparisons:
         if c.joints:
             slopes = gravity_slopes(*(joint(c.time_s)[c.used] for joint in c.joints))
@@ -263,8 +263,12 @@ def drift_effects() -> tuple[str, ...]:
     return tuple(e.name for e in library().values() if e.diagnosis.drift)
 
 
-def whiteners(comparison: BaselineComparison, axis: int) -> list[Whitener]:
-    """Return the filters that are tried for the noise of one axis of a recording."""
+def whiteners(comparisons: Sequence[BaselineComparison]) -> list[list[Whitener]]:
+    """Return the filters that are tried for the noise of each axis of each recording."""
+    return [_whiteners(c, axis) for c in comparisons for axis in range(len(c.sensor.axes))]
+
+
+def _whiteners(comparison: BaselineComparison, axis: int) -> list[Whitener]:
     sensor, dt_s, span_s = comparison.sensor, comparison.dt_s, comparison.span_s
     errors, scale = angle_error_filter(comparison, axis), float(sensor.scale_v_per_g[axis])
     a, std_v = _analog(comparison, axis)

@@ -28,12 +28,7 @@ from adxl_ros.model.filters import low_pass
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report import figures as plots, page as html_page
 from adxl_ros.report.figures import Figure, figure, line, rounded
-from adxl_ros.report.quantities import (
-    decimals,
-    mg,
-    mg_text,
-    percent,
-)
+from adxl_ros.report.quantities import decimals, mg, mg_text, percent
 import numpy as np
 import scipy
 
@@ -129,7 +124,11 @@ def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> 
                     **{f'proof-{name}': drawn for name, (drawn, _) in proofs.items()}},
         'tiles': rows[:3] + [r for r in rows[3:] if r.label in (
             'upper limit', 'explained', 'repeats, not explained')][:4 - len(rows[:3])],
-        'effects': [_effect(c, report) for c in shown],
+        'effects': [{
+            'name': c['effect'], 'sure': percent(c['probability']), 'cause': c['cause'],
+            'share': '' if c['share'] is None else f'{percent(c["share"])} of the gap',
+            'rivals': c['inseparable_from'], 'sizes': words.size_lines(report, c)}
+            for c in shown],
         'proofs': [{'effect': name, 'text': text} for name, (_, text) in proofs.items()],
         'figure_rows': rows, 'remainders': [row[:2] for row in words.remainder_rows(report)],
         'converged': best.converged,
@@ -152,15 +151,6 @@ def _cell(cell: ResidualCell) -> list[str]:
     return [name.split('_rad')[0].replace('_', ' '),
             f'{factor * cell.low:.{places}f} to {factor * cell.high:.{places}f} {unit}', cell.axis,
             mg_text(cell.mean_mps2), percent(cell.share)]
-
-
-def _effect(candidate: dict[str, Any], report: Report) -> dict[str, Any]:
-    """Return one effect with its sizes."""
-    share = candidate['share']
-    return {'name': candidate['effect'], 'sure': percent(candidate['probability']),
-            'share': '' if share is None else f'{percent(share)} of the gap',
-            'cause': candidate['cause'], 'rivals': candidate['inseparable_from'],
-            'sizes': words.size_lines(report, candidate)}
 
 
 def _proof(effect: str, comparison: BaselineComparison, full_rate: BaselineComparison,

@@ -15,6 +15,7 @@ from typing import Any
 
 from adxl_ros.diagnose.comparison import (
     BaselineComparison,
+    code_step_v,
     compare,
     Reference,
     SMALLEST_MOTION_G,
@@ -373,8 +374,10 @@ def seen_step_rad(recording: Recording, stated_rad: float) -> float:
     return largest_rad
 
 
-_JERK_S = 0.1
-"""Time around a jerk of a robot that is left out, s. Chosen: that of the splines' knots."""
+_JERK_S, _LARGEST_JERK = 0.1, 4.0
+"""Time around a jerk of a robot that is left out, s, and error of the force, divided by the noise,
+from which it is one. Chosen: that of the splines' knots; the error of what stays is below the
+noise, rms, and the filter for errors weighs it."""
 
 
 def _too_abrupt(comparison: BaselineComparison, force: Any, noise_g: float
@@ -382,7 +385,7 @@ def _too_abrupt(comparison: BaselineComparison, force: Any, noise_g: float
     """Find samples at which a robot jerks, so that its encoders do not show its acceleration."""
     error_g = np.abs(force.smoothing_mps2[:, :len(comparison.sensor.axes)]).max(axis=1) / G0_MPS2
     time_s = comparison.time_s
-    rows = np.interp(time_s, force.time_s, error_g) > noise_g
+    rows = np.interp(time_s, force.time_s, error_g) > _LARGEST_JERK * noise_g
     rows |= (time_s < force.time_s[0] + _JERK_S) | (time_s > force.time_s[-1] - _JERK_S)
     margin = round(_JERK_S * comparison.sensor.rate_hz)
     rows = np.convolve(rows, np.ones(2 * margin + 1), 'same') > 0.5
@@ -490,13 +493,6 @@ def _with_aliases(comparison: BaselineComparison, coarse: np.ndarray, noise_g: f
         if touched[begin:end].any():
             extended |= (part >= begin) & (part < end) & differs[part]
     return extended
-
-
-def code_step_v(volts: np.ndarray) -> np.ndarray:
-    """Return the smallest change of an output on each axis, V; 0 where it never changes."""
-    changes_v = np.abs(np.diff(volts, axis=0))
-    smallest = np.min(changes_v, axis=0, initial=np.inf, where=changes_v > 0)
-    return np.where(np.isfinite(smallest), smallest, 0.0)
 
 
 def fading_frequency_hz(comparison: BaselineComparison) -> float | None:

@@ -11,10 +11,9 @@ from typing import Any, NamedTuple
 from adxl_ros.diagnose.comparison import Reference
 from adxl_ros.diagnose.diagnosis import Diagnosis, Report
 from adxl_ros.diagnose.next_experiment import by_effect, CouldShow, MENU
-from adxl_ros.diagnose.noise_effects import UNKNOWN
 from adxl_ros.diagnose.residual_map import SIGNIFICANT_P
 from adxl_ros.diagnose.search import Hypothesis
-from adxl_ros.diagnose.verdict import Verdict
+from adxl_ros.diagnose.verdict import UNKNOWN, Verdict
 from adxl_ros.model.coefficients import fitted_of, get, parameter_of
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects import effect_named, library
@@ -191,7 +190,8 @@ def _candidates(report: Report) -> list[dict[str, Any]]:
             'effect': name, 'of': effect.concern.value,
             'probability': _rounded(min(sum(h.probability for h in sets), 1.0)),
             'closed': _rounded(report.closure.closed.value) if name in verdict.best else None,
-            'p': float(np.exp(-detected[name].log_bayes_factor)) if name in detected else None,
+            # The rule weighs held-out figures, and no effect has a p of its own.
+            'p': None,
             'parameters': parameters,
             'share': _rounded(shares[name]) if name in shares else None,
             'visibility': _rounded(shown[name].share) if name in shown else 1.0,
@@ -485,21 +485,17 @@ def size_lines(report: Report, candidate: dict[str, Any]) -> list[str]:
     """Return one line for each parameter; those that may be 0 share the last line."""
     parameters = candidate['parameters']
     is_single = len({key.partition('.')[0] for key in parameters}) == 1
-    lines, zeros = [], []
+    lines, zeros, all_v_per_g = [], [], report.baseline.scale_v_per_g
     for key, parameter in parameters.items():
         label, ci = parameter_label(key, is_single), parameter.get('ci')
         if ci and ci[0] <= 0 <= ci[1]:
             zeros.append(label)
         else:
-            lines.append(f'{label} {parameter_text(parameter, axis_scale(report, key))}'.strip())
+            scale = dict(zip(report.baseline.axes, all_v_per_g)).get(
+                key.partition('.')[2], all_v_per_g.mean())
+            lines.append(f'{label} {parameter_text(parameter, float(scale))}'.strip())
     return lines + ([f'{", ".join(zeros)}: not different from 0'.removeprefix(': ')]
                     if zeros else [])
-
-
-def axis_scale(report: Report, key: str) -> float:
-    """Return the scale factor, V/g, of the axis of a parameter; the mean one without an axis."""
-    scales = dict(zip(report.baseline.axes, report.baseline.scale_v_per_g))
-    return float(scales.get(key.partition('.')[2], report.baseline.scale_v_per_g.mean()))
 
 
 def _row_lines(label: str, text: str, indent: int = _LABEL_COLUMNS) -> list[str]:

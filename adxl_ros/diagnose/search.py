@@ -16,12 +16,12 @@ from itertools import chain, combinations
 from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence, linear_model as linear
-from adxl_ros.diagnose.evidence import LinearFit, Whitener
+from adxl_ros.diagnose.evidence import LinearFit, LinearisedHypothesis, Whitener
 from adxl_ros.diagnose.linear_model import LinearModel, Variant
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import fitted_of, get, parameter_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Coefficient, Role
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.gauss_newton import gauss_newton, Iterate
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -39,9 +39,6 @@ _FORM_ERROR = 0.03
 """Relative standard deviation of a coefficient because the form of its effect is not exact. Only
 geometry and clocks have exact forms. Tuned by hand on simulated recordings of the working seeds of
 the blind check."""
-_UNDETERMINED_SHARE, _UNDETERMINED_RATIO = 0.5, 3.0
-"""A coefficient is not determined if its posterior standard deviation exceeds this share of the
-prior's, nor by some blocks if it exceeds that of all blocks by this factor. Chosen."""
 _HEALTHY_STDS = 3.0
 """Largest departure of a healthy unit, in standard deviations: one unit in 400 exceeds it."""
 LARGEST_SET = 3
@@ -89,74 +86,6 @@ class Hypothesis:
                                                  self.fit.filter_indices)]
 
 
-class ChannelColumns(NamedTuple):
-    """The linear model of a hypothesis in one channel."""
-
-    places: np.ndarray  # Places of the k coefficients among all, (k,)
-    values: np.ndarray  # Residual at the prior mean, V, and sensitivities, V per unit, (n, k + 1)
-    # Products of the same divided by the scale factor and the root of the number of axes, by
-    # block, (m/s²)², (blocks, k + 1, k + 1)
-    plain: np.ndarray
-
-
-@dataclass(frozen=True)
-class LinearisedHypothesis:
-    """
-    A hypothesis linearised at values of its k coefficients.
-
-    The first j coefficients are those of the effects. The others are nuisance parameters, which
-    stay near the baseline and are linearised there.
-    """
-
-    effects: tuple[str, ...]  # Names of the effects
-    sensor: Sensor  # The sensor at the values
-    names: tuple[Coefficient, ...]  # Coefficients, those of the effects first, (k,)
-    prior_mean: np.ndarray  # Prior mean of the coefficients, (k,)
-    prior_std: np.ndarray  # Prior standard deviation of the coefficients, (k,)
-    reach: np.ndarray  # Largest departure of the nuisance parameters of a healthy unit, (k − j,)
-    values: np.ndarray  # Values of the coefficients of the effects, (j,)
-    # Whitened columns, and whitened residuals at the prior mean by the linear model
-    channels: list[evidence.WhitenedChannel]
-    columns: list[ChannelColumns]  # The same before whitening
-    filters: Sequence[Sequence[Whitener]]  # Whitening filters of each channel
-
-    def fit(self, blocks: np.ndarray | None = None, drifts: Sequence[str] = ()) -> LinearFit:
-        """Fit all coefficients to some blocks, (blocks,) bool, or to all."""
-        return evidence.fit_columns(self.channels, range(len(self.names)), self.prior_std, blocks,
-                                    drifts=(*drifts, *evidence.drifts_among(self.sensor.effects)))
-
-    def departures(self, fit: LinearFit, full_fit: LinearFit | None = None) -> np.ndarray:
-        """
-        Return the departures from the prior mean after a fit, (k,).
-
-        A limit or a shape keeps its value if the samples do not determine it, because its prior
-        mean is no better guess. It also keeps its value if only the blocks that are not fitted
-        determine it. A shape changes by a factor of two at most. In a fit to some blocks, zero-g,
-        scale factor, filter and latency stay within the tolerance of a healthy unit.
-        """
-        j = len(self.values)
-        parameters = [parameter_of(name) for name in self.names[:j]]
-        std = np.sqrt(np.diag(fit.covariance)[:j])
-        undetermined = std > _UNDETERMINED_SHARE * self.prior_std[:j]
-        if full_fit is not None:
-            undetermined |= std > _UNDETERMINED_RATIO * np.sqrt(np.diag(full_fit.covariance)[:j])
-        kept = np.array([not p.is_size or bool(linear.limits(effect_named(name.effect)))
-                         for p, name in zip(parameters, self.names)], bool)
-        is_shape = np.array([p.role is Role.SHAPE for p in parameters], bool)
-        fitted = self.prior_mean[:j] + fit.values[:j]
-        values = np.where(undetermined & kept, self.values, fitted)
-        values = np.where(is_shape, np.clip(values, *np.sort([self.values / 2, self.values * 2],
-                                                             axis=0)), values)
-        given = np.concatenate([values != fitted, np.zeros(len(self.reach), bool)])
-        target = np.concatenate([values - self.prior_mean[:j], np.zeros(len(self.reach))])
-        departures = fit.given(np.flatnonzero(given), target[given])
-        outside = np.abs(departures[j:]) > self.reach
-        if full_fit is None or not outside.any():
-            return departures
-        given[j:], target[j:] = outside, np.clip(departures[j:], -self.reach, self.reach)
-        return fit.given(np.flatnonzero(given), target[given])
-
-
 def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
               filters: Sequence[Sequence[Whitener]] | None = None) -> LinearisedHypothesis:
     """Linearise a hypothesis at the coefficients of a sensor."""
@@ -176,7 +105,7 @@ def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
     without = replace(sensor, values={**sensor.values, **{
         e: start.values[e] for e in effects if linear.calibration_takes_up(e)}})
     channels: list[evidence.WhitenedChannel] = []
-    columns: list[ChannelColumns] = []
+    columns: list[evidence.ChannelColumns] = []
     changes: list[list[linear.Column]] = []
     for comparison in linear_model.comparisons:
         at_rate = replace(sensor, rate_hz=comparison.sensor.rate_hz)
@@ -194,8 +123,9 @@ def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
             ids = np.array([*places, *map(all_names.index, own)], int)
             stacked = np.column_stack([residual_v, design, *(on_channel[n] for n in own)])
             scale = float(comparison.scale_v_per_mps2[d]) * len(start.axes) ** 0.5
-            columns.append(ChannelColumns(ids, stacked.astype(np.float32), evidence.plain_grams(
-                stacked / scale, comparison.used)))
+            columns.append(evidence.ChannelColumns(
+                ids, stacked.astype(np.float32), evidence.plain_grams(
+                    stacked / scale, comparison.used)))
             channels.append(evidence.whiten_channel(stacked[:, 0], stacked[:, 1:], ids,
                                                     comparison.used, filters[len(channels)]))
             changes.append([linear.Column(0, change_v[:, d])])
@@ -216,7 +146,7 @@ def _fitted_names(linear_model: LinearModel, effects: Sequence[str]) -> list[Coe
     return [name for effect in effects
             for name in fitted_of(effect_named(effect), linear_model.baseline.axes)
             if not parameter_of(name).is_size or name in linear_model.names
-            or linear.limits(effect_named(effect))]
+            or effect_named(effect).limits]
 
 
 def _prior_mean(sensor: Sensor, names: Sequence[Coefficient]) -> np.ndarray:
@@ -288,7 +218,8 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
         tuple(effects), put(linearised.sensor, linearised.names, np.clip(fitted, low, high)),
         linearised.names[:j], at_values, np.sqrt(std ** 2 + form ** 2 + np.where(
             in_rad, linear_model.smallest_angle_rad(), 0.0) ** 2),
-        std > _UNDETERMINED_SHARE * np.maximum(linearised.prior_std[:j], np.abs(at_values)),
+        std > evidence.UNDETERMINED_SHARE * np.maximum(linearised.prior_std[:j],
+                                                       np.abs(at_values)),
         fit.log_evidence - fit.loss(at_values), fit, linearised,
         solution.converged and solution.last.fit.log_evidence >= lowest_log_evidence)
 
@@ -432,7 +363,13 @@ class Search:
         with suppress(UserError, np.linalg.LinAlgError):
             fitted = fit_hypothesis(self.model, tuple(effects), start, shapes,
                                     self._lowest if lowest is None else lowest)
-        if fitted is None or not _shows_time_constants(self.model, fitted):
+        if fitted is None:
+            return None
+        # Recordings that are not much longer than a time constant do not show it.
+        longest_s = max(c.span_s for c in self.model.comparisons)
+        values = dict(zip(fitted.names, fitted.values))
+        if any(longest_s < _TIME_CONSTANTS * values.get(Coefficient(
+                e, effect_named(e).diagnosis.time_constant), 0.0) for e in fitted.effects):
             return None
         if key not in self.found or fitted.log_evidence > self.found[key].log_evidence:
             self.found[key] = fitted
@@ -460,7 +397,7 @@ def _model_about(model: LinearModel, best: Hypothesis) -> LinearModel:
     comparisons = [replace(c, sensor=replace(best.sensor, values=values,
                                              rate_hz=c.sensor.rate_hz))
                    for c in model.comparisons]
-    return linear.build_linear_model(comparisons, filters=[[w] for w in best.whiteners])
+    return linear.build_linear_model(comparisons, [[w] for w in best.whiteners])
 
 
 def _stepped(variant: Variant) -> dict[Coefficient, float]:
@@ -478,11 +415,3 @@ def _start_loss(model: LinearModel, ranked: _Ranked) -> float:
     return sum(0.5 * float((fit.values[k] - stepped[name]) ** 2 / fit.covariance[k, k])
                for k, i in enumerate(fit.column_ids if stepped else ())
                if (name := model.names[i]) in stepped)
-
-
-def _shows_time_constants(model: LinearModel, hypothesis: Hypothesis) -> bool:
-    """Determine whether the longest recording shows the time constants of the effects."""
-    longest_s = max(c.span_s for c in model.comparisons)
-    values = dict(zip(hypothesis.names, hypothesis.values))
-    names = [Coefficient(e, effect_named(e).diagnosis.time_constant) for e in hypothesis.effects]
-    return all(longest_s >= _TIME_CONSTANTS * values[name] for name in names if name in values)

@@ -25,9 +25,8 @@ from typing import Any
 from adxl_ros.diagnose import next_experiment, page
 from adxl_ros.diagnose.diagnosis import diagnose, Diagnosis
 from adxl_ros.diagnose.linear_model import candidates
-from adxl_ros.diagnose.noise_effects import UNKNOWN
 from adxl_ros.diagnose.report import as_json, screen_lines
-from adxl_ros.diagnose.verdict import normalised, WeightedHypothesis
+from adxl_ros.diagnose.verdict import normalised, UNKNOWN, WeightedHypothesis
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file, recording as recording_files
 from adxl_ros.files.atomic_write import write_text

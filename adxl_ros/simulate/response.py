@@ -176,7 +176,14 @@ class Response:
                 return grid[index[0]:index[-1] + 1:every], signals
             return grid[index], signals
         key = (first, steps.tobytes())
-        index, weights = self._kept('weights', key, lambda: _interpolation(steps, first))
+
+        def between() -> tuple[np.ndarray, np.ndarray]:
+            """Return the steps that samples lie between, (n, points), and their weights."""
+            start = np.floor(steps).astype(np.intp) - (POINTS // 2 - 1)
+            return (np.clip(start[:, None] + np.arange(POINTS) - first, 0, None),
+                    lagrange_weights(steps - start))
+
+        index, weights = self._kept('weights', key, between)
         return np.column_stack([np.einsum('ij,ij->i', weights, v[index]) for v in grid.T]), signals
 
     def _advance(self, count: int) -> tuple[np.ndarray, Signals]:
@@ -266,13 +273,6 @@ class Response:
                                                     self._noise[d])
         self._noise = drawn[-1].copy()
         return drawn[np.cumsum(passed) - 1] * std_v
-
-
-def _interpolation(steps: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the steps from `first` on that samples lie between, (n, points), and weights."""
-    start = np.floor(steps).astype(np.intp) - (POINTS // 2 - 1)
-    index = np.clip(start[:, None] + np.arange(POINTS) - first, 0, None)
-    return index, lagrange_weights(steps - start)
 
 
 _KEPT = 3

@@ -228,10 +228,9 @@ class RobotPath(ForcePath):
         self._rotation = CubicSpline(self._grid_s, np.hstack(list(self.motion[1:3])))
         self.joints = robot.joints
 
-    def _paths(self, tracks: Sequence[tuple[np.ndarray, np.ndarray]], wider: float = 1.0
-               ) -> list[Path]:
+    def _paths(self, tracks: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Path]:
         """Smooth the tracks."""
-        return [SmoothedPath(times, values, step, is_seen=True, knot_s=wider * min(
+        return [SmoothedPath(times, values, step, is_seen=True, knot_s=min(
             KNOT_S, _KNOT_READINGS * float(np.median(np.diff(times))))) if np.ptp(values)
             else Held(float(values[0])) for (times, values), step in zip(tracks, self._steps)]
 
@@ -260,7 +259,7 @@ class RobotPath(ForcePath):
     def text(self) -> str:
         """Return what is known of the robot, for people."""
         error_mg = 1e3 / G0_MPS2 * np.sqrt(np.mean(
-            (self.rounding_mps2 + 2 * self.smoothing_mps2) ** 2))
+            (self.rounding_mps2 + self.smoothing_mps2) ** 2))
         return (f'{self._robot.frame} moves by {", ".join(self.joints) or "its base"}, from '
                 f'{self.time_s[0]:.3g} to {self.time_s[-1]:.3g} s; the encoders leave an error of '
                 f'{error_mg:.2g} mg rms')
@@ -325,7 +324,7 @@ class RobotPath(ForcePath):
         error forgets its past at the rate by which it changes, divided by its size: the
         correlation of neighbours on a grid that is finer than the changes would say far less.
         """
-        error = self.rounding_mps2[:, component] + 2 * self.smoothing_mps2[:, component]
+        error = self.rounding_mps2[:, component] + self.smoothing_mps2[:, component]
         around = max(round(_AROUND_S / (self._grid_s[1] - self._grid_s[0])), 3)
         size, rate = (np.sqrt(np.maximum(uniform_filter1d(v ** 2, around), 0.0)) for v in (
             error, np.gradient(error, self._grid_s)))
@@ -335,13 +334,12 @@ class RobotPath(ForcePath):
     @cached_property
     def smoothing_mps2(self) -> np.ndarray:
         """
-        Return what the smoothing may have changed, m/s², at `time_s`, (n, 3).
+        Return what half of the readings would change, m/s², at `time_s`, (n, 3).
 
-        It is the larger of what smoothing once more would change, and knots at twice the distance.
+        A spline through every second reading of the smoothed motion lacks what jerks within a
+        few readings, as the motion itself does.
         """
-        by_penalty = self._exact_again - self.motion[0]
-        by_knots = self._moved(self._on_grid(self._paths(self._tracks, 2.0)))[0] - self.motion[0]
-        return np.where(np.abs(by_penalty) > np.abs(by_knots), by_penalty, by_knots)
+        return self._moved(self._on_grid(self._paths(self._read_again(2))))[0] - self.motion[0]
 
     @cached_property
     def rounding_mps2(self) -> np.ndarray:
@@ -350,22 +348,18 @@ class RobotPath(ForcePath):
 
         The smoothed motion is read by encoders whose steps lie elsewhere, and smoothed again.
         """
-        return self._read_again(True) - self._exact_again
+        return self._moved(self._on_grid(self._paths(self._read_again(1))))[0] - self.motion[0]
 
-    @cached_property
-    def _exact_again(self) -> np.ndarray:
-        return self._read_again(False)
-
-    def _read_again(self, is_rounded: bool) -> np.ndarray:
-        """Return the force by readings of the smoothed motion, exact or of the same encoders."""
+    def _read_again(self, every: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return readings of the smoothed motion: by the same encoders, or exact ones of some."""
         rng, tracks = np.random.default_rng(0), []
         for (times, values), step, path in zip(self._tracks, self._steps, self._splines):
             read = path(times)
             offset = step * rng.random()
-            if is_rounded and step and np.ptp(values):
+            if every == 1 and step and np.ptp(values):
                 read = np.rint((read + offset) / step) * step - offset
-            tracks.append((times, read))
-        return self._moved(self._on_grid(self._paths(tracks)))[0]
+            tracks.append((times[::every], read[::every]))
+        return tracks
 
 
 def _tracks(robot: Robot, readings: Readings) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -16,7 +16,7 @@ from adxl_ros.model import noise
 from adxl_ros.model.coefficients import put, with_neutral
 from adxl_ros.model.constants import AXES, NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Concern, Effect, Environment, Place, Signals
+from adxl_ros.model.effects.base import Concern, Effect, Environment, Place
 from adxl_ros.model.filters import low_pass
 from adxl_ros.model.population import Population
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
@@ -178,7 +178,7 @@ class SensorModel:
         # Time is the first axis of the components, as in a recording; sensors are the second.
         now = Environment(self._steps[None] * self._dt_s, *environment)
         delayed = self._delayed(rows)
-        volts = self._digital_v(self._analog(now, [delayed[None, :, c] for c in range(3)]))
+        volts = self._volts(now, [delayed[None, :, c] for c in range(3)])
         self._steps = self._steps + 1
         readings = np.zeros((len(rows), 3))
         readings[:, [AXES.index(axis) for axis in self.sensor.axes]] = to_nominal_mps2(
@@ -228,32 +228,22 @@ class SensorModel:
         oldest = [self._past[i] for i in range(POINTS)]
         return sum(weight * past for weight, past in zip(self._past_weights, reversed(oldest)))
 
-    def _analog(self, now: Environment, force: list[np.ndarray]) -> Signals:
-        """Run the chain up to the filter; its volts are in `input_v`, (1, n) each."""
+    def _volts(self, now: Environment, force: list[np.ndarray]) -> np.ndarray:
+        """Run the chain, and add the noise behind the filter as `Response` does: V, (n, m)."""
         signals = self._chain.signals(now, time_s=now.time_s, dt_s=self._dt_s, force=force)
         self._chain(Place.FORCE, signals)
         analog_v = self._chain.volts(signals)
         signals.input_v = [low_pass(np.asarray(volts), rc_s, self._dt_s, memory)
                            for volts, rc_s, memory in zip(analog_v, signals.rc_s, self._filters)]
-        return signals
-
-    def _digital_v(self, signals: Signals) -> np.ndarray:
-        """Add noise, and run the chain through the ADC: volts, (n, m)."""
-        drawn_v = self._draw_noise(signals)
-        if drawn_v is not None:
-            signals.input_v = [volts + drawn_v[:, d] for d, volts in enumerate(signals.input_v)]
+        if self._std_v.any():
+            decay = np.array([np.exp(-self._dt_s / rc) if rc else 0.0 for rc in signals.rc_s])
+            drawn = self._white.standard_normal((force[0].shape[-1], len(decay)))
+            # The first sample is stationary.
+            self._noise = drawn if self._noise is None else \
+                decay * self._noise + np.sqrt(1 - decay ** 2) * drawn
+            signals.input_v = [v + n for v, n in zip(
+                signals.input_v, (self._noise * self._std_v).T)]
         return self._chain.convert(signals)[0]
-
-    def _draw_noise(self, signals: Signals) -> np.ndarray | None:
-        """Draw the noise behind the filter, V, (n, m), as `Response` does; None without any."""
-        if not self._std_v.any():
-            return None
-        decay = np.array([np.exp(-self._dt_s / rc_s) if rc_s else 0.0 for rc_s in signals.rc_s])
-        drawn = self._white.standard_normal((signals.force[0].shape[-1], len(decay)))
-        # The first sample is stationary.
-        self._noise = drawn if self._noise is None else \
-            decay * self._noise + np.sqrt(1 - decay ** 2) * drawn
-        return self._noise * self._std_v
 
 
 class SensorNoise:

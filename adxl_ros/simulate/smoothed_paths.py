@@ -148,7 +148,7 @@ class SmoothedPath:
         """Return a derivative; see `motion.Path`."""
         begin_s, end_s = self._time_s[0], self._time_s[-1]
         inside_s = np.clip(time_s, begin_s, end_s)
-        number = self._numbers(inside_s)
+        number = ((inside_s - begin_s) / _WINDOW_S).astype(int)
         values = np.empty(len(time_s))
         begins = np.flatnonzero(np.diff(number, prepend=-1))
         for begin, end in pairwise([*begins.tolist(), len(number)]):
@@ -183,10 +183,6 @@ class SmoothedPath:
         # four times the corner.
         return PathErrors(self._step * np.minimum(ratio, 1 / np.sqrt(12)),
                           np.minimum(4 * corner_hz, changes_hz))
-
-    def _numbers(self, time_s: np.ndarray) -> np.ndarray:
-        """Return the number of the window of each time, (n,)."""
-        return ((time_s - self._time_s[0]) / _WINDOW_S).astype(int)
 
     def _spline(self, window: int) -> scipy.interpolate.BSpline | scipy.interpolate.PPoly:
         if window not in self._windows:
@@ -257,7 +253,10 @@ def visible_step(reading: np.ndarray, step: float) -> float:
     """
     if not _is_interpolated(reading, step):
         return step
-    thinned = reading[::_samples_per_reading(reading, _SMALLEST_CHANGE * step)]
+    # The usual distance of the samples at which lines through readings bend.
+    bends = np.flatnonzero(np.abs(np.diff(reading, 2)) > _SMALLEST_CHANGE * step)
+    thinned = reading[::int(np.quantile(np.diff(bends), _READING_QUANTILE))
+                      if len(bends) > 1 else 1]
     if noise_step(thinned, _SMALLEST_CHANGE * step) > _FINER * step:
         return step
     finer = noise_step(reading, _SMALLEST_CHANGE * step)
@@ -289,12 +288,6 @@ def noise_step(reading: np.ndarray, smallest: float) -> float:
     """Return the encoder step that has as much noise as readings in motion, (n,), have."""
     moving = np.diff(reading, 5)[np.abs(np.diff(reading))[4:] > smallest]
     return float(np.sqrt(12 * np.mean(moving ** 2) / _FIFTH_DIFFERENCE)) if len(moving) else 0.0
-
-
-def _samples_per_reading(reading: np.ndarray, smallest: float) -> int:
-    """Return the usual distance of the samples at which lines through readings, (n,), bend."""
-    bends = np.flatnonzero(np.abs(np.diff(reading, 2)) > smallest)
-    return int(np.quantile(np.diff(bends), _READING_QUANTILE)) if len(bends) > 1 else 1
 
 
 def matched_strength(time_s: np.ndarray, reading: np.ndarray, step: float,

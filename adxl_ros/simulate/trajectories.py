@@ -48,19 +48,6 @@ _FADE_S = 2.0
 frequency."""
 
 
-@dataclass(frozen=True)
-class Sine:
-    """A sine from time 0 on."""
-
-    amplitude_m: float  # Amplitude, m
-    frequency_hz: float  # Frequency, Hz
-
-    def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
-        """Return a derivative; see `motion.Path`."""
-        omega = 2 * np.pi * self.frequency_hz
-        return self.amplitude_m * omega ** order * np.sin(omega * time_s + order * np.pi / 2)
-
-
 class SweptSine:
     """
     A sine of constant acceleration whose frequency grows exponentially, faded in and out.
@@ -97,17 +84,6 @@ class SweptSine:
             values[active] = ((e0 * omega ** 2 - e2) * sine
                               - (2 * e1 + k * e0) * omega * cosine)
         return values
-
-
-@dataclass(frozen=True)
-class Sum:
-    """A sum of paths."""
-
-    parts: tuple[Path, ...]  # The paths
-
-    def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
-        """Return a derivative; see `motion.Path`."""
-        return np.sum([part(time_s, order) for part in self.parts], axis=0)
 
 
 @dataclass(frozen=True)
@@ -225,7 +201,9 @@ def tilt_both(_: np.random.Generator) -> Motion:
 
 def motion(_: np.random.Generator) -> Motion:
     """Shake 60 µm p-p at 10 Hz along x at alpha 45°, beta 90° for 20 s (figures 11 and 12)."""
-    return Motion(20.0, Held(np.pi / 4), Held(np.pi / 2), Sine(30e-6, 10.0))
+    amplitude_m, omega = 30e-6, 2 * np.pi * 10.0
+    return Motion(20.0, Held(np.pi / 4), Held(np.pi / 2), lambda time_s, order=0: (
+        amplitude_m * omega ** order * np.sin(omega * time_s + order * np.pi / 2)))
 
 
 def shaker(_: np.random.Generator) -> Motion:
@@ -235,7 +213,8 @@ def shaker(_: np.random.Generator) -> Motion:
         script.go(np.pi / 2, beta)
         shakes.append(_shake(script))
     alpha, beta_path = script.joints()
-    return Motion(script.now, alpha, beta_path, Sum(tuple(shakes)))
+    return Motion(script.now, alpha, beta_path, lambda time_s, order=0: np.sum(
+        [shake(time_s, order) for shake in shakes], axis=0))
 
 
 def soak(_: np.random.Generator) -> Motion:

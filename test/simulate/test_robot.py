@@ -50,6 +50,20 @@ def test_force_of_a_pendulum(pendulum, rate_hz, step_rad):
     assert np.sqrt(np.mean(error ** 2)) < 3 * np.sqrt(np.mean(predicted ** 2)) + 1e-3
 
 
+@pytest.mark.parametrize(('rate_hz', 'step_rad'), [(100, 1e-3), (250, 1e-4), (500, 1e-3)])
+def test_memory_of_the_error(pendulum, rate_hz, step_rad):
+    """What the predicted memory does not explain of the error is no larger than predicted."""
+    path, step_s = path_of(pendulum, rate_hz, step_rad), 0.008
+    time_s = np.arange(2, 38, step_s)
+    error = np.array(path(time_s)).T - pendulum_force(*swing(time_s))
+    for component in (0, 2):
+        errors = path.errors(time_s, component)
+        scaled, memory = error[:, component] / errors.std, np.exp(
+            -errors.forgetting_per_s * step_s)[1:]
+        fresh = (scaled[1:] - memory * scaled[:-1]) / np.sqrt(1 - memory ** 2)
+        assert np.sqrt(np.mean(fresh ** 2)) < 1.5
+
+
 def test_errors_of_the_robot_change_the_force_as_they_say(pendulum):
     """An offset of the joint, and links that yield: against the closed form."""
     path, offset_rad, compliance_s2 = path_of(pendulum, 250, 0.0), 0.01, 1e-4

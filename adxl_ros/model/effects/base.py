@@ -283,6 +283,11 @@ class Effect:
         object.__setattr__(self, 'needs', tuple(map(Need, self.needs)))
 
     @property
+    def limits(self) -> list[Parameter]:
+        """Return the parameters that do nothing until the signal reaches them."""
+        return [p for p in self.parameters if p.role is Role.LIMIT]
+
+    @property
     def concern(self) -> Concern:
         """Return what it is an error of."""
         if self.place is Place.REFERENCE:

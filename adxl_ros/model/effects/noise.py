@@ -184,22 +184,17 @@ def bias_walk(signals: Signals, p: Parameters) -> None:
     assert signals.rng is not None
     density = np.array(p['density_g_per_rts'])
     drawn = signals.rng.standard_normal((*np.shape(signals.environment.time_s), len(density)))
-    if not density.any():
+    if not density.any() or not len(drawn):
         return
+    # scipy.signal takes 0.5 s to import.
+    from scipy.signal import lfilter
     last = signals.memory.get('walked', np.zeros(drawn.shape[1:]))
     returns = np.broadcast_to(p.get('return_per_s', 0.0), density.shape) * signals.dt_s
-    if returns.any():
-        # scipy.signal takes 0.5 s to import.
-        from scipy.signal import lfilter
-        shrink = -np.expm1(-2 * returns) / np.where(returns, 2 * returns, 1.0)
-        drawn *= density * np.sqrt(np.where(returns, shrink, 1.0) * signals.dt_s)
-        walk = np.stack([lfilter([1.0], [1.0, -a], drawn[..., d], 0, a * last[None, ..., d])[0]
-                         for d, a in enumerate(np.exp(-returns))], axis=-1)
-    else:
-        drawn *= density * np.sqrt(signals.dt_s)
-        drawn[:1] += last
-        walk = np.cumsum(drawn, axis=0)
-    signals.memory['walked'] = walk[-1] if len(walk) else drawn.sum(axis=0)
+    shrink = -np.expm1(-2 * returns) / np.where(returns, 2 * returns, 1.0)
+    drawn *= density * np.sqrt(np.where(returns, shrink, 1.0) * signals.dt_s)
+    walk = np.stack([lfilter([1.0], [1.0, -a], drawn[..., d], 0, a * last[None, ..., d])[0]
+                     for d, a in enumerate(np.exp(-returns))], axis=-1)
+    signals.memory['walked'] = walk[-1]
     for d, scale in enumerate(signals.nominal_scale_v_per_g):
         signals.volts[d] = signals.volts[d] + walk[..., d] * scale
 

@@ -12,6 +12,7 @@ from math import cos, sin
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import (
+    Components,
     effect,
     Joint,
     Need,
@@ -55,11 +56,18 @@ def base_tilt(signals: Signals, p: Parameters) -> None:
 
     Turn the vertical about the base's x, and then about its y, the axis of alpha.
     """
-    x, y, z = signals.up
-    c, s = cos(p['x_rad']), sin(p['x_rad'])
+    signals.up = _turned(signals.up, p['x_rad'], p['y_rad'])
+
+
+def _turned(vector: Components, x_rad: float, y_rad: float, z_rad: float = 0.0) -> Components:
+    """Turn a vector about x, then about y, then about z."""
+    x, y, z = vector
+    c, s = cos(x_rad), sin(x_rad)
     y, z = y * c - z * s, y * s + z * c
-    c, s = cos(p['y_rad']), sin(p['y_rad'])
-    signals.up = [x * c + z * s, y, z * c - x * s]
+    c, s = cos(y_rad), sin(y_rad)
+    x, z = x * c + z * s, z * c - x * s
+    c, s = cos(z_rad), sin(z_rad)
+    return [x * c - y * s, x * s + y * c, z]
 
 
 @effect(Place.STAGE,
@@ -172,13 +180,7 @@ def reference_frame(signals: Signals, p: Parameters) -> None:
 
     Turn the force of the reference about its x, then about y, then about z.
     """
-    x, y, z = signals.force
-    c, s = cos(p['x_rad']), sin(p['x_rad'])
-    y, z = y * c - z * s, y * s + z * c
-    c, s = cos(p['y_rad']), sin(p['y_rad'])
-    x, z = x * c + z * s, z * c - x * s
-    c, s = cos(p['z_rad']), sin(p['z_rad'])
-    signals.force = [x * c - y * s, x * s + y * c, z]
+    signals.force = _turned(signals.force, p['x_rad'], p['y_rad'], p['z_rad'])
 
 
 @effect(Place.REFERENCE,
@@ -215,16 +217,13 @@ def _restoring_gain(frequency_hz: np.ndarray, p: Parameters) -> np.ndarray:
     restoring = passed / (passed ** 2 + (p['lost_gain'] * (1 - passed)) ** 2)
     if not p['phase']:
         return restoring
-    return restoring * np.exp(-1j * p['phase'] * _smallest_phase(log_passed))
-
-
-def _smallest_phase(log_gain: np.ndarray) -> np.ndarray:
-    """Return the phase of a causal filter by the logarithm of its gain, rad, (k,)."""
-    cepstrum = np.fft.irfft(log_gain)
+    # The phase of a causal filter follows from the logarithm of its gain.
+    cepstrum = np.fft.irfft(log_passed)
     half = len(cepstrum) // 2
     cepstrum[1:half] *= 2
     cepstrum[half + 1:] = 0.0
-    return np.fft.rfft(cepstrum).imag[:len(log_gain)]
+    phase_rad = np.fft.rfft(cepstrum).imag[:len(log_passed)]
+    return restoring * np.exp(-1j * p['phase'] * phase_rad)
 
 
 @effect(Place.REFERENCE,
