@@ -44,8 +44,8 @@ _SILENT_S = 60.0
 _SPEED = 40.0
 """Default sensor time per real time; chosen: two cores can follow."""
 _RATE_HZ = 250.0
-"""Rate of the simulated sensor, Hz. Chosen: its noise ends at 50 Hz, so that more samples would say
-no more, and many times real time leaves room to catch up."""
+"""Rate of the simulated sensor, Hz. Chosen: its noise ends at 50 Hz, so that more samples would
+say no more, and many times real time leaves room to catch up."""
 _SWEEP_S = 1060.0
 """Sensor time of the sweep, s; measured."""
 _OVERHEAD_S = 15.0
