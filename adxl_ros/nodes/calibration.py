@@ -58,6 +58,9 @@ _YAW_VARIANCE = 8
 """Place of the variance of yaw in an orientation's covariance of 9 numbers, from 0."""
 _SILENT_S = 3.0
 """Time without samples after which the stream is silent, s; chosen."""
+_INFO_NS = 1_000_000_000
+"""Time that samples wait for `sensor_info`, ns; chosen: a latched message comes within it, also
+where the samples of seconds come within a tenth of it."""
 _SAMPLES_QUEUE = 20000
 """Samples that are kept: 20 s at 1 kHz, longer than a fit takes."""
 
@@ -68,6 +71,7 @@ class Samples:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._raw: list[bytes] = []
+        self._begun_ns = 0  # Steady time of the first sample, ns; 0 before it
         self.fault = ''  # Why the newest samples cannot be used, or ''
         self.restart_silence()
         self._subscription = topics.Inbox(node, Imu, _SAMPLES, _SAMPLES_QUEUE)
@@ -87,9 +91,14 @@ class Samples:
         self.keep_newest(0)
 
     def waiting(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the samples that wait: stamps, ns, (n,), and m/s², (n, 3), finite; keep them."""
+        """
+        Return the samples that wait: stamps, ns, (n,), and m/s², (n, 3), finite; keep them.
+
+        There are none as long as `sensor_info` may still come.
+        """
         self._receive()
-        return topics.finite_samples(self._raw)
+        may_come = STEADY.now().nanoseconds - self._begun_ns < _INFO_NS
+        return topics.finite_samples([] if may_come else self._raw)
 
     def take(self, unit: Sensor) -> tuple[np.ndarray, np.ndarray]:
         """Return the samples since the last call: stamps, ns, (n,), and volts, (n, m), finite."""
@@ -113,6 +122,7 @@ class Samples:
         self._raw += new
         if new:
             self.restart_silence()
+            self._begun_ns = self._begun_ns or self._heard_ns
 
     def _fault(self, is_raw: bool, finite: np.ndarray, unit: Sensor) -> str:
         """Return why samples with these finite values, (n, m), cannot be used, or ''."""

@@ -180,8 +180,9 @@ def main() -> int:
     parser.add_argument('--seed', type=int, default=_SEED,
                         help=f'seed of the simulated unit and its stage (default {_SEED})')
     options = parser.parse_args()
-    if not 0 <= options.seed < 2 ** 31:
-        parser.error(f'--seed: {options.seed} is not between 0 and {2 ** 31 - 1}')
+    for name, lowest, highest in (('seed', 0, 2 ** 31 - 1), ('speed', 0.01, 1000)):
+        if not lowest <= (value := getattr(options, name)) <= highest:
+            parser.error(f'--{name}: {value} is not between {lowest} and {highest}')
     jobs.use_own_graph()
     try:
         # A recording that cannot be read is refused before the sweep.

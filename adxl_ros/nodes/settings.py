@@ -248,7 +248,8 @@ NODES: dict[str, tuple[type, ...]] = {
     'driver': (DriverSettings,),
     'stage': (StageSettings, SimulatedStageSettings, BridgeSettings),
     'calibration': (CalibrationSettings,), 'compensation': (CompensationSettings,),
-    'investigate': (InvestigateSettings,), 'monitor': (MonitorSettings,)}
+    'investigate': (InvestigateSettings,), 'monitor': (MonitorSettings,),
+    'screen': (ScreenSettings,)}
 """Parameters by node. One file may serve all nodes: a node ignores what another one has."""
 
 
