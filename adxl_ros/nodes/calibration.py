@@ -21,7 +21,7 @@ from adxl_ros.files import cdr
 from adxl_ros.model.sensor import Sensor, to_volts
 from adxl_ros.nodes import parameters, topics
 from adxl_ros.nodes.display import Announcer, DisplayPublisher
-from adxl_ros.nodes.run_node import NodeHelp, run
+from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.settings import CalibrationSettings, check_given_parameters, given_link
 from adxl_ros.nodes.topics import Level, Status, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -328,4 +328,4 @@ def main() -> int:
     # Through shared memory, Fast DDS does not reach a process again that was killed and started
     # again (eProsima/Fast-DDS issues 2811, 5053 and 5469): a sweep could not be resumed.
     os.environ.setdefault('FASTDDS_BUILTIN_TRANSPORTS', 'UDPv4')
-    return run(Calibration, NodeHelp(__doc__, _EXAMPLES, (CalibrationSettings,)))
+    return run(Calibration, __doc__, _EXAMPLES)

@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 import json
 import math
-import os
 from pathlib import Path
 import subprocess
 import sys
@@ -28,6 +27,7 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes import jobs
 from adxl_ros.nodes.run_node import program_parser
 from adxl_ros.process import ended_by_closed_output
+from adxl_ros.report.screen import coloured
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 import rclpy
@@ -73,10 +73,6 @@ _UNATTENDED = {'autostart': True, 'screen': False,
                'qos_overrides./imu/data_raw.subscription.depth': _QUEUE}
 """Parameters of a calibration that nobody controls and that loses no sample: at many times real
 time, a best-effort subscriber loses samples on a busy machine."""
-_COLOURS = {acceptance.PASS: '\x1b[32m', acceptance.FAIL: '\x1b[31m'}
-"""Green and red by the word that they colour, as codes of xterm."""
-_NO_COLOUR = '\x1b[0m'
-"""Code of xterm that ends a colour."""
 _EXAMPLES = {'the simulated sensor': '-o demo_output',
              'a real recording, too': '--real imu.csv -o demo_output'}
 """Examples of arguments, by their purpose."""
@@ -319,11 +315,7 @@ def file_lines(values: dict[str, object]) -> list[str]:
 
 def _print(*lines: str) -> None:
     """Print lines; PASS and FAIL are coloured in a terminal."""
-    colours = _COLOURS if jobs.drawable() and 'NO_COLOR' not in os.environ else {}
-    for line in lines:
-        for word in colours.keys() & set(line.split()[:1]):
-            line = line.replace(word, f'{colours[word]}{word}{_NO_COLOUR}', 1)
-        print(line, flush=True)
+    print(*map(coloured, lines), sep='\n', flush=True)
 
 
 def _journal(output: Path) -> Path:

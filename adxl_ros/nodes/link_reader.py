@@ -29,7 +29,7 @@ which costs as much as ten samples."""
 _LOOK_S = 1.0
 """Time between two looks at publishers and clock of the samples, s; chosen."""
 _FOREIGN_S = 60.0
-"""Distance of stamps from the clock of the node from which they are of another clock, s; chosen."""
+"""Distance from the clock of the node at which stamps are of another clock, s; chosen."""
 _FOREIGN_LOOKS = 5
 """Looks at such stamps in a row before a warning. Chosen: within it nodes find each other, and a
 reset of the simulator reaches samples and /clock."""

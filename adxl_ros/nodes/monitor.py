@@ -20,7 +20,7 @@ from adxl_ros.monitor.reference_stream import ReferenceKind, ReferenceStream
 from adxl_ros.nodes import topics
 from adxl_ros.nodes.parameters import declare_all, declare_sensor, make_sensor
 from adxl_ros.nodes.rclpy_internals import NotForExecutors, take_request
-from adxl_ros.nodes.run_node import NodeHelp, run
+from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.settings import check_given_parameters, MonitorSettings
 from adxl_ros.nodes.topics import Inbox, Level, Status
 from adxl_ros.report.quantities import percent
@@ -330,4 +330,4 @@ class Monitor(Node):
 
 def main() -> int:
     """Run the node."""
-    return run(Monitor, NodeHelp(__doc__, _EXAMPLES, (MonitorSettings,)))
+    return run(Monitor, __doc__, _EXAMPLES)

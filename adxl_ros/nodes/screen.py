@@ -21,7 +21,7 @@ from adxl_ros.calibrate.guided.screen_contents import ScreenContents
 from adxl_ros.errors import UserError
 from adxl_ros.nodes.jobs import held_output
 from adxl_ros.nodes.parameters import declare_all
-from adxl_ros.nodes.run_node import NodeHelp, run
+from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.settings import check_given_parameters, ScreenSettings
 from adxl_ros.nodes.topics import create_subscription
 from rcl_interfaces.msg import Log
@@ -336,5 +336,4 @@ class Screen(Node):
 
 def main() -> int:
     """Run the screen."""
-    return run(Screen, NodeHelp(__doc__, _EXAMPLES, (ScreenSettings,), has_sensor=False),
-               Screen.show)
+    return run(Screen, __doc__, _EXAMPLES, Screen.show)

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from enum import Enum
 from functools import partial
 import struct
 import threading
@@ -21,6 +20,7 @@ from typing import Any, NamedTuple
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import cdr
 from adxl_ros.files.stream_info import StreamInfo
+from adxl_ros.links.support.base import Level
 from adxl_ros.nodes.rclpy_internals import MessageWait, NotForExecutors, take_messages
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -230,14 +230,6 @@ _REPORTS = 10
 """Reports that are kept for a slow subscriber."""
 
 
-class Level(Enum):
-    """Levels of a diagnostic status."""
-
-    OK = DiagnosticStatus.OK
-    WARN = DiagnosticStatus.WARN
-    ERROR = DiagnosticStatus.ERROR
-
-
 @dataclass(frozen=True)
 class Status:
     """What a task reports."""
@@ -278,8 +270,9 @@ def status_message(name: str, status: Status) -> DiagnosticStatus:
     """Make the message of a status."""
     values = [KeyValue(key=key, value=value if isinstance(value, str) else repr(value))
               for key, value in status.values.items()]
-    return DiagnosticStatus(level=status.level.value, name=name, message=status.summary,
-                            hardware_id=status.hardware_id, values=values)
+    return DiagnosticStatus(
+        level=getattr(DiagnosticStatus, status.level.name), name=name, message=status.summary,
+        hardware_id=status.hardware_id, values=values)
 
 
 def imu_samples(batch: Sequence[bytes]) -> tuple[np.ndarray, np.ndarray]:
