@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The reference, stage or simulator, of the newest time, and samples minus their prediction."""
+"""The reference, stage, simulator or robot, of the newest time, and samples minus prediction."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from adxl_ros.diagnose.comparison import noiseless
 from adxl_ros.files.recording_columns import JOINTS
+from adxl_ros.files.robot_readings import Readings
 from adxl_ros.model import noise
 from adxl_ros.model.constants import MAD_TO_STD, NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.effects import effect_named
@@ -21,6 +22,7 @@ from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.simulate.motion import Held, INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.response import Response
+from adxl_ros.simulate.robot import Robot, RobotPath
 from adxl_ros.simulate.smoothed_paths import ForcePath, SmoothedPath
 import numpy as np
 
@@ -52,6 +54,13 @@ _PARTS = 10
 a step is in one part."""
 _FEWEST_OF_PART = 8
 """Fewest samples of a part; chosen: its variance is then known within a factor of two."""
+_ROBOT_NS, _MARGIN_NS = 1_000_000_000, 500_000_000
+"""Time whose forces of a robot are computed at once, and time of further readings on both sides,
+ns. Chosen: the ends of the splines then add less than a tenth to the error."""
+_HISTORY_NS = 10_000_000_000
+"""Time of readings by which a robot is smoothed, ns. Chosen: a joint moves at some time in it."""
+_GRID_NS = 4_000_000
+"""Distance of the forces of a robot, ns. Chosen: an encoder shows nothing faster."""
 _SMALLEST_MPS2 = 1e-9
 """Smallest standard deviation of a block, m/s²; a simulated sensor may have no noise."""
 
@@ -113,6 +122,7 @@ class ReferenceKind(Enum):
 
     STAGE = 'stage'
     IMU = 'imu'
+    ROBOT = 'robot'
 
 
 class BlockMotion(NamedTuple):
@@ -132,6 +142,7 @@ class ReferenceStream:
         self.readings = StreamBuffer(3, span_ns)
         self.surroundings = {'temperature_c': StreamBuffer(1, span_ns),
                              'supply_v': StreamBuffer(1, span_ns)}
+        self.error_mps2 = np.zeros(3)  # Standard deviation of the newest forces by their source
         self._held = [0.0, 0.0, 0.0]
         self._origin_ns = 0
         self._paths: list[Path] = [Held(), Held(), Held()]
@@ -171,7 +182,7 @@ class ReferenceStream:
 
         temperature_c = surrounding('temperature_c', NOMINAL_TEMPERATURE_C)
         supply_v = surrounding('supply_v', NOMINAL_SUPPLY_V)
-        if self.kind is ReferenceKind.IMU:
+        if self.kind is not ReferenceKind.STAGE:
             return Motion(np.inf, force=lambda time_s: self._force(time_s), internal_rate_hz=max(
                 INTERNAL_RATE_HZ, self._sensor.rate_hz), temperature_c=temperature_c,
                           supply_v=supply_v)
@@ -187,9 +198,9 @@ class ReferenceStream:
             return None
         time_s = (stamps_ns - self._origin_ns) * 1e-9
         changes = np.ptp(readings[first:], axis=0)
-        if self.kind is ReferenceKind.IMU:
+        if self.kind is not ReferenceKind.STAGE:
             self._force = ForcePath(time_s, readings)
-            return BlockMotion(bool((changes > _STILL_MPS2).any()), np.zeros(3))
+            return BlockMotion(bool((changes > _STILL_MPS2).any()), self.error_mps2)
         step_rad = self._sensor.stage_resolution_rad
         self._paths = [SmoothedPath(time_s, values, step)
                        for values, step in zip(readings.T, (step_rad, step_rad, 0.0))]
@@ -218,6 +229,46 @@ class ReferenceStream:
             min(int(at_ns[0]) - _SURROUNDINGS_NS, buffer.newest_ns),
             max(int(at_ns[-1]) + _SURROUNDINGS_NS, buffer.newest_ns + 1))
         return np.interp(at_ns, stamps_ns, values[:, 0])
+
+
+class RobotForce:
+    """Turns the joint readings of a robot with a base at rest into the force in one frame."""
+
+    def __init__(self, robot: Robot, gravity_mps2: float) -> None:
+        self._robot, self._gravity_mps2 = robot, gravity_mps2
+        self._joints = StreamBuffer(len(robot.joints), _HISTORY_NS)
+        self._given_ns = 0  # Newest stamp whose force was returned
+
+    def add(self, stamps_ns: Sequence[int], positions: Sequence[Mapping[str, float]]) -> None:
+        """Add messages; those that do not name all joints of the robot are another device's."""
+        named = [(stamp_ns, [position[joint] for joint in self._robot.joints])
+                 for stamp_ns, position in zip(stamps_ns, positions)
+                 if set(self._robot.joints) <= set(position)]
+        if named:
+            stamp_ns, rows = zip(*named)
+            _add_finite(self._joints, np.array(stamp_ns), np.array(rows), _LONGEST_GAP_NS)
+
+    def send(self, reference: ReferenceStream) -> None:
+        """Give the force of the newest second, once it is complete, and its error."""
+        newest_ns = self._joints.newest_ns
+        if newest_ns is None:
+            return
+        stamp_ns, rows = self._joints.between(newest_ns - _HISTORY_NS, newest_ns + 1)
+        begin_ns = max(self._given_ns if self._given_ns < newest_ns else 0,
+                       int(stamp_ns[0]) + _MARGIN_NS)
+        at_ns = _GRID_NS * np.arange(
+            -(-begin_ns // _GRID_NS), (newest_ns - _MARGIN_NS) // _GRID_NS)
+        if len(at_ns) * _GRID_NS < _ROBOT_NS:
+            return
+        time_s = (stamp_ns - begin_ns) * 1e-9
+        path = RobotPath(self._robot, Readings('the robot', {
+            name: (time_s, values) for name, values in zip(self._robot.joints, rows.T)}),
+            self._gravity_mps2, since_s=-0.1)
+        inside = (path.time_s > 0) & (path.time_s < time_s[-1] - 1e-9 * _MARGIN_NS)
+        self._given_ns = int(at_ns[-1]) + _GRID_NS
+        reference.error_mps2 = np.sqrt(np.mean(
+            (path.rounding_mps2 + 2 * path.smoothing_mps2)[inside] ** 2, axis=0))
+        reference.add_readings(at_ns, np.column_stack(path((at_ns - begin_ns) * 1e-9)))
 
 
 def _add_finite(buffer: StreamBuffer, stamp_ns: np.ndarray, rows: np.ndarray, longest_ns: int
@@ -260,7 +311,7 @@ class Prediction:
 
     def __init__(self, sensor: Sensor, reference: ReferenceStream) -> None:
         # Effects that need the angles of a stage, which the reference has not
-        self.left_out = () if reference.kind is not ReferenceKind.IMU else tuple(
+        self.left_out = () if reference.kind is ReferenceKind.STAGE else tuple(
             name for name in sensor.effects if effect_named(name).concern is Concern.STAGE)
         effects = tuple(name for name in sensor.effects if name not in self.left_out)
         self._sensor, self._reference = sensor, reference

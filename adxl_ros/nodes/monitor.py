@@ -16,7 +16,7 @@ from adxl_ros.files.stream_info import NO_UNIT, StreamInfo
 from adxl_ros.monitor import changes
 from adxl_ros.monitor.changes import DiagnosisResult, DiagnosisRun, iso_time
 from adxl_ros.monitor.live_gap import AxisGap, GapSettings, LiveGap
-from adxl_ros.monitor.reference_stream import ReferenceKind, ReferenceStream
+from adxl_ros.monitor.reference_stream import ReferenceKind, ReferenceStream, RobotForce
 from adxl_ros.nodes import topics
 from adxl_ros.nodes.parameters import declare_all, declare_sensor, make_sensor
 from adxl_ros.nodes.rclpy_internals import NotForExecutors, take_request
@@ -24,6 +24,7 @@ from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.settings import check_given_parameters, MonitorSettings
 from adxl_ros.nodes.topics import Inbox, Level, Status
 from adxl_ros.report.quantities import percent
+from adxl_ros.simulate.robot import Robot
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
 from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
@@ -99,9 +100,10 @@ _INPUT_QUEUE = 10000
 class MonitorStreams:
     """Takes samples, reference and surroundings."""
 
-    def __init__(self, node: Node, kind: ReferenceKind, reference_topic: str) -> None:
-        self._kind = kind
-        reference = JointState if kind is ReferenceKind.STAGE else Imu
+    def __init__(self, node: Node, kind: ReferenceKind, reference_topic: str,
+                 robot: RobotForce | None) -> None:
+        self._kind, self._robot = kind, robot
+        reference = Imu if kind is ReferenceKind.IMU else JointState
         self.samples, self._reference, self._temperature, self._supply = (
             Inbox(node, message, topic, _INPUT_QUEUE) for message, topic in (
                 (Imu, 'imu/data_raw'), (reference, reference_topic),
@@ -123,11 +125,17 @@ class MonitorStreams:
             reference.add_readings(*topics.imu_samples(messages))
         else:
             readings = [reading for reading in topics.joint_readings(messages) if reading.position]
-            reference.add_joints([reading.stamp_ns for reading in readings],
-                                 [reading.position for reading in readings])
+            (self._robot.add if self._robot else reference.add_joints)(
+                [reading.stamp_ns for reading in readings],
+                [reading.position for reading in readings])
+        if self._robot:
+            self._robot.send(reference)
         return len(messages)
 
 
+_TOPICS = {ReferenceKind.STAGE: 'stage/joint_states', ReferenceKind.IMU: 'imu/ideal',
+           ReferenceKind.ROBOT: 'joint_states'}
+"""Usual topic of each reference."""
 _TURN_S = 0.05
 """Time between two looks at the topics, s; chosen: a turn costs as much as ten messages."""
 _PERIOD_S = 1.0
@@ -146,6 +154,8 @@ _EXAMPLES = {
     'a sensor on a stage': '--ros-args --params-file unit.yaml',
     'a sensor beside its simulation': '--ros-args --params-file unit.yaml -p reference:=imu '
     '-p reference_topic:=/sim/imu',
+    'a sensor on a robot': '--ros-args --params-file unit.yaml -p reference:=robot '
+    '-p urdf:=robot.urdf',
     'one false alarm a year at most': '--ros-args -p false_alarms_per_day:=0.0027',
 }
 """Examples of arguments, by their purpose."""
@@ -164,8 +174,9 @@ class Monitor(Node):
         self._file_sensor = make_sensor(declare_sensor(self))
         self._own = own = declare_all(self, MonitorSettings)
         self._kind = ReferenceKind(own.reference)
-        self._reference_topic = own.reference_topic or (
-            'stage/joint_states' if self._kind is ReferenceKind.STAGE else 'imu/ideal')
+        self._reference_topic = own.reference_topic or _TOPICS[self._kind]
+        robot = RobotForce(Robot(own.urdf, own.frame), self._file_sensor.local_gravity_mps2) \
+            if self._kind is ReferenceKind.ROBOT else None
         self._settings = GapSettings(own.window_s, own.false_alarms_per_day, own.history_s,
                                      own.wait_s)
         self._output = Path(own.output).expanduser()
@@ -178,7 +189,7 @@ class Monitor(Node):
         self._changed_ns = 0  # Begin of a change that is not diagnosed yet, ns; 0 without one
         self._diagnosed_s = -_PAUSE_S
         self._begun_s = self._sampled_s = self._referenced_s = 0.0
-        self._streams = MonitorStreams(self, self._kind, self._reference_topic)
+        self._streams = MonitorStreams(self, self._kind, self._reference_topic, robot)
         self._publisher = topics.create_publisher(self, DiagnosticArray, 'gap', _QUEUE)
         self._service = self.create_service(Trigger, '~/diagnose', lambda _, answer: answer,
                                             callback_group=NotForExecutors())

@@ -214,10 +214,12 @@ class MonitorSettings:
     """The monitor."""
 
     reference: str = parameter(
-        'reference', 'stage', 'what the sensor is compared with: the joints of a stage, or the '
-        'ideal Imu of a simulator', choices=('stage', 'imu'))
+        'reference', 'stage', 'what the sensor is compared with: the joints of a stage, the '
+        'ideal Imu of a simulator, or the joints of a robot', choices=('stage', 'imu', 'robot'))
     reference_topic: str = parameter('reference_topic', '', 'topic of the reference; empty: '
-                                     'stage/joint_states, or imu/ideal')
+                                     'stage/joint_states, imu/ideal, or joint_states')
+    urdf: str = parameter('urdf', '', 'file of the robot; its base rests')
+    frame: str = parameter('frame', 'imu_link', 'frame of the robot that carries the sensor')
     window_s: float = parameter('window_s', 60.0, 'time over which gap and floor are taken', 's',
                                 5.0, 3600.0)
     false_alarms_per_day: float = parameter('false_alarms_per_day', 0.0333, 'largest rate of '

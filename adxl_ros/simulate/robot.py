@@ -22,7 +22,7 @@ from adxl_ros.files import robot_readings
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.robot_readings import Readings
 from adxl_ros.model.constants import G0_MPS2
-from adxl_ros.simulate.motion import Held, INTERNAL_RATE_HZ, Motion
+from adxl_ros.simulate.motion import Held, INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.smoothed_paths import (
     ForcePath,
     KNOT_S,
@@ -83,7 +83,8 @@ class Robot:
                             f'{install_hint("pin")}') from None
         self._pin: Any = pinocchio
         if not os.path.isfile(urdf):
-            raise UserError(f'{urdf}: no such file; give the URDF (xacro FILE > robot.urdf)')
+            raise UserError(f'{urdf or "urdf"}: no such file; give the URDF '
+                            '(xacro FILE > robot.urdf)')
         try:
             free = (pinocchio.JointModelFreeFlyer(),) if moves else ()
             model = pinocchio.buildModelFromUrdf(str(urdf), *free)
@@ -182,7 +183,7 @@ class RobotPath(ForcePath):
     is_robot = True
 
     def __init__(self, robot: Robot, readings: Readings, gravity_mps2: float = G0_MPS2,
-                 step_rad: float | None = None) -> None:
+                 step_rad: float | None = None, since_s: float = -np.inf) -> None:
         """
         Smooth the readings, and run the kinematics.
 
@@ -196,6 +197,8 @@ class RobotPath(ForcePath):
             Local gravity, m/s².
         step_rad
             Step of the encoders, rad; None for that which each joint's readings show.
+        since_s
+            Time from which the force is needed, s.
 
         Raises
         ------
@@ -217,18 +220,22 @@ class RobotPath(ForcePath):
             gaps_s = np.append(np.diff(times), 0.0)
             longest_s = max(_LONGEST_GAP_S, _USUAL_GAPS * float(np.median(gaps_s)))
             grid_s = grid_s[gaps_s[np.searchsorted(times, grid_s, 'right') - 1] <= longest_s]
-        self._grid_s = grid_s
-        self._smoothed = self._paths(self._tracks)
+        self._grid_s = grid_s[grid_s >= since_s]
+        self._splines = self._paths(self._tracks)
+        self._smoothed = self._on_grid(self._splines)
         self.motion = self._moved(self._smoothed)
         super().__init__(self._grid_s, self.motion[0])
         self._rotation = CubicSpline(self._grid_s, np.hstack(list(self.motion[1:3])))
         self.joints = robot.joints
 
-    def _paths(self, tracks: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-        """Return derivatives 0 to 2 of the tracks on the grid, (3, n, k)."""
-        paths = [SmoothedPath(times, values, step, is_seen=True, knot_s=min(
+    def _paths(self, tracks: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Path]:
+        """Smooth the tracks."""
+        return [SmoothedPath(times, values, step, is_seen=True, knot_s=min(
             KNOT_S, _KNOT_READINGS * float(np.median(np.diff(times))))) if np.ptp(values)
             else Held(float(values[0])) for (times, values), step in zip(tracks, self._steps)]
+
+    def _on_grid(self, paths: Sequence[Path]) -> np.ndarray:
+        """Return derivatives 0 to 2 of paths on the grid, (3, n, k)."""
         return np.array([[path(self._grid_s, order) for path in paths]
                          for order in range(3)]).transpose(0, 2, 1)
 
@@ -327,7 +334,7 @@ class RobotPath(ForcePath):
     @cached_property
     def smoothing_mps2(self) -> np.ndarray:
         """Return what smoothing once more would change, m/s², at `time_s`, (n, 3)."""
-        return self._moved(self._paths(self._read_again(False)))[0] - self.motion[0]
+        return self._force_read_again(False) - self.motion[0]
 
     @cached_property
     def rounding_mps2(self) -> np.ndarray:
@@ -336,20 +343,19 @@ class RobotPath(ForcePath):
 
         The smoothed motion is read by encoders whose steps lie elsewhere, and smoothed again.
         """
-        return self._moved(self._paths(self._read_again(True)))[0] - self.motion[0] \
+        return self._force_read_again(True) - self.motion[0] \
             - self.smoothing_mps2
 
-    def _read_again(self, is_rounded: bool) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return readings of the smoothed motion, exact or by encoders of the same steps."""
+    def _force_read_again(self, is_rounded: bool) -> np.ndarray:
+        """Return the force by readings of the smoothed motion, exact or of the same encoders."""
         rng, tracks = np.random.default_rng(0), []
-        for (times, values), step, smooth in zip(self._tracks, self._steps, self._smoothed[0].T):
-            read = CubicSpline(self._grid_s, smooth)(np.clip(
-                times, self._grid_s[0], self._grid_s[-1]))
+        for (times, values), step, path in zip(self._tracks, self._steps, self._splines):
+            read = path(times)
             offset = step * rng.random()
             if is_rounded and step and np.ptp(values):
                 read = np.rint((read + offset) / step) * step - offset
             tracks.append((times, read))
-        return tracks
+        return self._moved(self._on_grid(self._paths(tracks)))[0]
 
 
 def _tracks(robot: Robot, readings: Readings) -> list[tuple[np.ndarray, np.ndarray]]:
