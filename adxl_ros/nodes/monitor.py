@@ -333,7 +333,7 @@ class Monitor(Node):
         values = {**state.summary.values, **{
             f'{axis}_{key}': value for axis, status in state.axes.items()
             for key, value in status.values.items()}}
-        values |= {**vars(self._live.counts), 'diagnosis_runs': self._run is not None,
+        values |= {**self._live.counts, 'diagnosis_runs': self._run is not None,
                    'false_alarms_per_day': self._settings.false_alarms_per_day}
         level = Level.ERROR if self._refusal or self._streams.fault() else state.summary.level
         return replace(state.summary, level=level, values=values)

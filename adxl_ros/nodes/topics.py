@@ -189,17 +189,14 @@ class Inbox:
 
     def take(self) -> list[bytes]:
         """Return the messages since the last call, at most as many as are kept."""
-        return list(self._waiting())
+        accept = (self._accepts,) if self._kind is Imu else ()
+        return list(take_messages(self._subscription, self._kind, True, self._depth, *accept))
 
     def receive(self, callback: Callable[[bytes], object]) -> None:
         """Wait for a message for up to 0.1 s, and give all that have come to a function."""
         self.wait()
-        for message in self._waiting():
+        for message in self.take():
             callback(message)
-
-    def _waiting(self) -> Iterator[bytes]:
-        accept = (self._accepts,) if self._kind is Imu else ()
-        return take_messages(self._subscription, self._kind, True, self._depth, *accept)
 
     def _accepts(self, number: int | None) -> bool:
         """Return whether to take a message of a sequence number; None where the RMW has none."""
