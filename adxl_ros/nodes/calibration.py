@@ -142,11 +142,7 @@ class Samples:
         if mixture := self.mixture():
             return mixture
         silent_s = (STEADY.now().nanoseconds - self._heard_ns) * 1e-9
-        if silent_s < _SILENT_S:
-            return ''
-        topic = self._node.resolve_topic_name(_SAMPLES)
-        publishers = '' if self._node.count_publishers(topic) else ', and nobody publishes it'
-        return f'nothing on {topic} for {silent_s:.0f} s{publishers}'
+        return '' if silent_s < _SILENT_S else topics.silence(self._node, _SAMPLES, silent_s)
 
 
 class Calibration(Node):

@@ -305,18 +305,12 @@ class Monitor(Node):
         if fault := self._refusal or self._streams.fault():
             return fault
         if now_s - self._sampled_s > _SILENT_S:
-            return self._silence('imu/data_raw')
+            return topics.silence(self, 'imu/data_raw')
         if self._info is None:
             return 'waiting for sensor_info'
         if now_s - self._referenced_s > _SILENT_S:
-            return f'{self._silence(self._reference_topic)}: no reference'
+            return f'{topics.silence(self, self._reference_topic)}: no reference'
         return self._live.obstacle
-
-    def _silence(self, topic: str) -> str:
-        """Return that a topic is silent, and whether it has a publisher."""
-        name = self.resolve_topic_name(topic)
-        return f'nothing on {name}' + ('' if self.count_publishers(name) else
-                                       ', and nobody publishes it')
 
     def _state(self) -> GapState:
         """Return what is known now."""

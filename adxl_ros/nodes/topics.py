@@ -119,6 +119,14 @@ def log(node: Node, severity: str, text: str) -> None:
         node.get_logger().error(text)
 
 
+def silence(node: Node, topic: str, silent_s: float | None = None) -> str:
+    """Return that a topic is silent, for how long, and whether it has a publisher."""
+    name = node.resolve_topic_name(topic)
+    duration = '' if silent_s is None else f' for {silent_s:.0f} s'
+    publishers = '' if node.count_publishers(name) else ', and nobody publishes it'
+    return f'nothing on {name}{duration}{publishers}'
+
+
 def type_name(kind: Any) -> str:
     """Return the name of the class of a message or service, with its package."""
     return f'{kind.__module__.partition(".")[0]}/{kind.__name__}'
