@@ -19,10 +19,10 @@ before.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from datetime import datetime, UTC
-from functools import cached_property
 from importlib import import_module
 import json
 import os
@@ -58,6 +58,9 @@ three on."""
 _MOST = 400
 """Largest number of independent differences in memory. Chosen: 5 % of the limit, and a slow change
 of the noise is followed."""
+_SMALLEST = 1e-6
+"""Smallest usual size of a difference, in the unit of the series; a series without noise has none
+of its own."""
 _NEVER = 1e300
 """Limit that no difference reaches."""
 _RESERVE = 0.5
@@ -76,46 +79,31 @@ class Change:
     size: float  # Mean after the change minus mean before
 
 
-@dataclass(frozen=True)
-class ChangeSettings:
-    """Settings of the test."""
-
-    channels: int  # Number of series
-    false_alarms_per_day: float  # Largest permitted rate, of all series together
-    block_s: float = 1.0  # Length of a block, s
-    # Smallest usual size of a difference, in the unit of the series; a series without noise has
-    # none of its own
-    smallest: float = 1e-6
-    # Random walk of a healthy series, in its unit a root of a second, by series; infinite where
-    # every drift is usual
-    walks: tuple[float, ...] = (np.inf,)
-
-    @cached_property
-    def p(self) -> float:
-        """Return the permitted probability of a false alarm in one comparison."""
-        comparisons = sum(_DAY_S / self.block_s / _stride(2 ** j) for j in range(_LENGTHS))
-        return min(_RESERVE * self.false_alarms_per_day / (comparisons * self.channels), 0.5)
-
-    @cached_property
-    def limits(self) -> np.ndarray:
-        """Return the limit of Student's t by degrees of freedom, (401,); huge for too few."""
-        limits = np.full(_MOST + 1, _NEVER)
-        limits[_FEWEST:] = -scipy.special.stdtrit(np.arange(_FEWEST, _MOST + 1), self.p / 2)
-        return limits
-
-
 def _stride(length: int) -> int:
     """Return the number of blocks from one comparison of a length to the next."""
     return max(1, length // _PER_LENGTH)
 
 
 class ChangeTest:
-    """Tests several series, block by block."""
+    """
+    Tests several series, block by block.
 
-    def __init__(self, settings: ChangeSettings) -> None:
-        self.settings = settings  # Settings of the test
+    false_alarms_per_day: largest permitted rate, of all series together; block_s: length of a
+    block, s; walks: random walk of a healthy series, in its unit a root of a second, by series;
+    infinite where every drift is usual.
+    """
+
+    def __init__(self, channels: int, false_alarms_per_day: float, block_s: float = 1.0,
+                 walks: Sequence[float] = (np.inf,)) -> None:
+        self._channels, self._block_s, self._walks = channels, block_s, np.array(walks)
+        comparisons = sum(_DAY_S / block_s / _stride(2 ** j) for j in range(_LENGTHS))
+        # Permitted probability of a false alarm in one comparison
+        p = min(_RESERVE * false_alarms_per_day / (comparisons * channels), 0.5)
+        # Limit of Student's t by degrees of freedom, (401,); huge for too few
+        self._limits = np.full(_MOST + 1, _NEVER)
+        self._limits[_FEWEST:] = -scipy.special.stdtrit(np.arange(_FEWEST, _MOST + 1), p / 2)
         self._size = (1 + _BEFORE) * 2 ** (_LENGTHS - 1) + 1
-        n = settings.channels
+        n = channels
         # Sums up to each block; the place of a block is its number modulo the size.
         self._sums = np.zeros((self._size, n))
         self._moves = np.zeros(self._size, int)
@@ -148,7 +136,7 @@ class ChangeTest:
 
     def restart(self) -> None:
         """Compare no block to come with a block before, but keep the usual sizes."""
-        self._begin_again(np.arange(self.settings.channels), self._count)
+        self._begin_again(np.arange(self._channels), self._count)
 
     def _compare(self, j: int, length: int) -> list[int]:
         """Compare one length, and learn; return the channels that have changed."""
@@ -163,8 +151,7 @@ class ChangeTest:
         limit = factor * std
         if not kind:
             # The variance of the difference of a walk's means is L/3 + 4·L/3 steps.
-            walk = np.array(self.settings.walks) * np.sqrt(
-                (1 + _BEFORE) / 3 * length * self.settings.block_s)
+            walk = self._walks * np.sqrt((1 + _BEFORE) / 3 * length * self._block_s)
             shortest_std, shortest_factor = self._usual(kind, 0)
             limit = np.minimum(limit, shortest_factor * np.hypot(shortest_std, walk))
         changed = valid & (np.abs(difference) > limit)
@@ -176,8 +163,7 @@ class ChangeTest:
         weights = self._weights[kind, j]
         freedom = (weights * _stride(2 ** j) / (_INDEPENDENT * 2 ** j)).astype(int)
         std = np.sqrt(self._squares[kind, j] / np.maximum(weights, 1.0))
-        return (np.maximum(std, self.settings.smallest),
-                self.settings.limits[np.minimum(freedom, _MOST)])
+        return np.maximum(std, _SMALLEST), self._limits[np.minimum(freedom, _MOST)]
 
     def _learn(self, j: int, length: int) -> None:
         """Add the differences that are so old that no change can be in them unseen."""

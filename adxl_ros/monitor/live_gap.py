@@ -15,7 +15,7 @@ from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.monitor import reference_stream
-from adxl_ros.monitor.changes import ChangeSettings, ChangeTest, DiagnosisInput, GapChange
+from adxl_ros.monitor.changes import ChangeTest, DiagnosisInput, GapChange
 from adxl_ros.monitor.reference_stream import Block, ReferenceKind
 from adxl_ros.report.quantities import Interval
 import numpy as np
@@ -52,6 +52,10 @@ _MOST_CHANGES = 100
 _OPEN = 1.1
 """Rms of the gap, divided by the floor, from which it is open. Chosen: the intervals alone would
 call every twentieth closed gap open."""
+_COUNTS = ('samples', 'missing', 'dropped', 'jumps', 'blocks', 'skipped')
+"""Samples that came, that are missing between others by their stamps, and that came twice, late or
+are no numbers; jumps of the stamps; seconds that were compared, and that were not for want of
+samples or reference."""
 _EXPLAINED_LEAST = 1.1
 """Rms of the difference to the datasheet, divided by the floor, from which there is something to
 explain. Chosen: an added effect of half the noise."""
@@ -86,18 +90,6 @@ class GapSettings:
     wait_s: float = 120.0  # Time after a change of an axis in which further ones belong to it, s
 
 
-@dataclass
-class Counts:
-    """Counts since the start."""
-
-    samples: int = 0  # Samples that came
-    missing: int = 0  # Samples that are missing between others, by their stamps
-    dropped: int = 0  # Samples that came twice or late, or are no numbers
-    jumps: int = 0  # How often the stamps have jumped
-    blocks: int = 0  # Compared seconds
-    skipped: int = 0  # Seconds that were not compared, for want of samples or reference
-
-
 class LiveGap:
     """
     Compares a stream with the prediction of its parameters, second by second.
@@ -111,16 +103,15 @@ class LiveGap:
         # The reference, which takes its messages itself
         self.reference = reference_stream.ReferenceStream(kind, sensor, span_ns)
         self._samples = reference_stream.StreamBuffer(len(sensor.axes), span_ns)
-        self.counts = Counts()  # Counts since the start
+        self.counts = dict.fromkeys(_COUNTS, 0)  # Counts since the start
         self.obstacle = 'no samples yet'  # Why the newest second was not compared; empty if it was
         self.changes: list[GapChange] = []  # Changes so far, the newest last
         self._blocks: deque[Block] = deque(
             maxlen=max(round(settings.window_s * 1e9 / BLOCK_NS), _FEWEST_BLOCKS))
         self._ends_ns: deque[int] = deque(maxlen=_MEMORY)
         count = len(sensor.axes)
-        self._test = ChangeTest(ChangeSettings(
-            2 * count, settings.false_alarms_per_day, BLOCK_NS * 1e-9,
-            walks=(_healthy_walk(sensor),) * count + (np.inf,) * count))
+        self._test = ChangeTest(2 * count, settings.false_alarms_per_day, BLOCK_NS * 1e-9,
+                                (_healthy_walk(sensor),) * count + (np.inf,) * count)
         self._changed_ns: dict[str, int] = {}
         self._prediction = reference_stream.Prediction(sensor, self.reference)
         self.left_out = self._prediction.left_out  # Effects that the reference cannot drive
@@ -141,8 +132,8 @@ class LiveGap:
         """
         accel_mps2 = accel_mps2[:, :len(self.sensor.axes)]
         finite = np.isfinite(accel_mps2).all(axis=1)
-        self.counts.samples += len(stamp_ns)
-        self.counts.dropped += int((~finite).sum())
+        self.counts['samples'] += len(stamp_ns)
+        self.counts['dropped'] += int((~finite).sum())
         stamp_ns, accel_mps2 = stamp_ns[finite], accel_mps2[finite]
         newest_ns = self._samples.newest_ns
         steps_ns = np.diff(stamp_ns, prepend=stamp_ns[:1] if newest_ns is None else newest_ns)
@@ -204,15 +195,15 @@ class LiveGap:
     def _append(self, stamp_ns: np.ndarray, accel_mps2: np.ndarray) -> None:
         """Keep samples, and count what is missing before them."""
         newest_ns = self._samples.newest_ns
-        self.counts.dropped += self._samples.add(stamp_ns, accel_mps2)
+        self.counts['dropped'] += self._samples.add(stamp_ns, accel_mps2)
         ascending = np.unique(stamp_ns if newest_ns is None else
                               np.maximum(np.append(newest_ns, stamp_ns), newest_ns))
         periods = np.rint(np.diff(ascending) * 1e-9 * self.sensor.rate_hz)
-        self.counts.missing += int((periods - 1).clip(0).sum())
+        self.counts['missing'] += int((periods - 1).clip(0).sum())
 
     def _restart(self) -> None:
         """Begin again after a jump of the stamps; what was learnt of the noise is kept."""
-        self.counts.jumps += 1
+        self.counts['jumps'] += 1
         self._samples.clear()
         self._next_ns = None
         self._prediction.restart()
@@ -256,7 +247,7 @@ class LiveGap:
             self._prediction.start(begin_ns)
         motion = self.reference.prepare(begin_ns, end_ns)
         if motion is None or len(stamps_ns) < _FEWEST_SAMPLES:
-            self.counts.skipped += 1
+            self.counts['skipped'] += 1
             if motion is None and not self.obstacle.startswith(('no ref', 'the ref')):
                 self.obstacle = 'the reference does not cover the samples; is its clock another?'
             elif motion is not None:
@@ -270,7 +261,7 @@ class LiveGap:
 
     def _take(self, block: Block) -> list[GapChange]:
         """Add a block to the window, and test it."""
-        self.counts.blocks += 1
+        self.counts['blocks'] += 1
         self._blocks.append(block)
         self._ends_ns.append(block.end_ns)
         changes = []

@@ -21,7 +21,7 @@ from adxl_ros.files import cdr
 from adxl_ros.model.sensor import Sensor, to_volts
 from adxl_ros.nodes import parameters, topics
 from adxl_ros.nodes.display import Announcer, DisplayPublisher
-from adxl_ros.nodes.run_node import NodeHelp, run
+from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.settings import CalibrationSettings, check_given_parameters, given_link
 from adxl_ros.nodes.topics import Level, Status, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -58,6 +58,9 @@ _YAW_VARIANCE = 8
 """Place of the variance of yaw in an orientation's covariance of 9 numbers, from 0."""
 _SILENT_S = 3.0
 """Time without samples after which the stream is silent, s; chosen."""
+_INFO_NS = 1_000_000_000
+"""Time that samples wait for `sensor_info`, ns; chosen: a latched message comes within it, also
+where the samples of seconds come within a tenth of it."""
 _SAMPLES_QUEUE = 20000
 """Samples that are kept: 20 s at 1 kHz, longer than a fit takes."""
 
@@ -68,6 +71,7 @@ class Samples:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._raw: list[bytes] = []
+        self._begun_ns = 0  # Steady time of the first sample, ns; 0 before it
         self.fault = ''  # Why the newest samples cannot be used, or ''
         self.restart_silence()
         self._subscription = topics.Inbox(node, Imu, _SAMPLES, _SAMPLES_QUEUE)
@@ -87,9 +91,14 @@ class Samples:
         self.keep_newest(0)
 
     def waiting(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the samples that wait: stamps, ns, (n,), and m/s², (n, 3), finite; keep them."""
+        """
+        Return the samples that wait: stamps, ns, (n,), and m/s², (n, 3), finite; keep them.
+
+        There are none as long as `sensor_info` may still come.
+        """
         self._receive()
-        return topics.finite_samples(self._raw)
+        may_come = STEADY.now().nanoseconds - self._begun_ns < _INFO_NS
+        return topics.finite_samples([] if may_come else self._raw)
 
     def take(self, unit: Sensor) -> tuple[np.ndarray, np.ndarray]:
         """Return the samples since the last call: stamps, ns, (n,), and volts, (n, m), finite."""
@@ -113,6 +122,7 @@ class Samples:
         self._raw += new
         if new:
             self.restart_silence()
+            self._begun_ns = self._begun_ns or self._heard_ns
 
     def _fault(self, is_raw: bool, finite: np.ndarray, unit: Sensor) -> str:
         """Return why samples with these finite values, (n, m), cannot be used, or ''."""
@@ -132,11 +142,7 @@ class Samples:
         if mixture := self.mixture():
             return mixture
         silent_s = (STEADY.now().nanoseconds - self._heard_ns) * 1e-9
-        if silent_s < _SILENT_S:
-            return ''
-        topic = self._node.resolve_topic_name(_SAMPLES)
-        publishers = '' if self._node.count_publishers(topic) else ', and nobody publishes it'
-        return f'nothing on {topic} for {silent_s:.0f} s{publishers}'
+        return '' if silent_s < _SILENT_S else topics.silence(self._node, _SAMPLES, silent_s)
 
 
 class Calibration(Node):
@@ -318,4 +324,4 @@ def main() -> int:
     # Through shared memory, Fast DDS does not reach a process again that was killed and started
     # again (eProsima/Fast-DDS issues 2811, 5053 and 5469): a sweep could not be resumed.
     os.environ.setdefault('FASTDDS_BUILTIN_TRANSPORTS', 'UDPv4')
-    return run(Calibration, NodeHelp(__doc__, _EXAMPLES, (CalibrationSettings,)))
+    return run(Calibration, __doc__, _EXAMPLES)

@@ -22,7 +22,7 @@ from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.kinematics import Mounting
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes import parameters, topics
-from adxl_ros.nodes.run_node import NodeHelp, run
+from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.sample_output import SampleAges
 from adxl_ros.nodes.settings import check_given_parameters, CompensationSettings
 from adxl_ros.nodes.topics import Level, Status, STEADY
@@ -315,4 +315,4 @@ class Compensation(Node):
 
 def main() -> int:
     """Run the node."""
-    return run(Compensation, NodeHelp(__doc__, _EXAMPLES, (CompensationSettings,)))
+    return run(Compensation, __doc__, _EXAMPLES)

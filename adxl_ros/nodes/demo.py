@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 import json
 import math
-import os
 from pathlib import Path
 import subprocess
 import sys
@@ -28,6 +27,7 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes import jobs
 from adxl_ros.nodes.run_node import program_parser
 from adxl_ros.process import ended_by_closed_output
+from adxl_ros.report.screen import coloured
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 import rclpy
@@ -76,10 +76,6 @@ _UNATTENDED = {'autostart': True, 'screen': False,
                'qos_overrides./imu/data_raw.subscription.depth': _QUEUE}
 """Parameters of a calibration that nobody controls and that loses no sample: at many times real
 time, a best-effort subscriber loses samples on a busy machine."""
-_COLOURS = {acceptance.PASS: '\x1b[32m', acceptance.FAIL: '\x1b[31m'}
-"""Green and red by the word that they colour, as codes of xterm."""
-_NO_COLOUR = '\x1b[0m'
-"""Code of xterm that ends a colour."""
 _EXAMPLES = {'the simulated sensor': '-o demo_output',
              'a real recording, too': '--real imu.csv -o demo_output'}
 """Examples of arguments, by their purpose."""
@@ -184,8 +180,9 @@ def main() -> int:
     parser.add_argument('--seed', type=int, default=_SEED,
                         help=f'seed of the simulated unit and its stage (default {_SEED})')
     options = parser.parse_args()
-    if not 0 <= options.seed < 2 ** 31:
-        parser.error(f'--seed: {options.seed} is not between 0 and {2 ** 31 - 1}')
+    for name, lowest, highest in (('seed', 0, 2 ** 31 - 1), ('speed', 0.01, 1000)):
+        if not lowest <= (value := getattr(options, name)) <= highest:
+            parser.error(f'--{name}: {value} is not between {lowest} and {highest}')
     jobs.use_own_graph()
     try:
         # A recording that cannot be read is refused before the sweep.
@@ -323,11 +320,7 @@ def file_lines(values: dict[str, object]) -> list[str]:
 
 def _print(*lines: str) -> None:
     """Print lines; PASS and FAIL are coloured in a terminal."""
-    colours = _COLOURS if jobs.drawable() and 'NO_COLOR' not in os.environ else {}
-    for line in lines:
-        for word in colours.keys() & set(line.split()[:1]):
-            line = line.replace(word, f'{colours[word]}{word}{_NO_COLOUR}', 1)
-        print(line, flush=True)
+    print(*map(coloured, lines), sep='\n', flush=True)
 
 
 def _journal(output: Path) -> Path:

@@ -11,9 +11,9 @@ from adxl_ros.errors import one_line, UserError
 from adxl_ros.links.support import base
 from adxl_ros.nodes.link_reader import LinkReader
 from adxl_ros.nodes.parameters import declare_sensor, make_sensor
-from adxl_ros.nodes.run_node import NodeHelp, run
+from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.sample_output import SampleOutput, Tally
-from adxl_ros.nodes.settings import check_given_parameters, declare_driver, DriverSettings
+from adxl_ros.nodes.settings import check_given_parameters, declare_driver
 from adxl_ros.nodes.topics import DiagnosticsReporter, Level, Status, STEADY
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -99,9 +99,8 @@ class Driver(LifecycleNode):
         assert self._output is not None, 'the life cycle configures a node before it activates it'
         self._fault = ''
         link = self._module.open_link(self._sensor, self._settings)
-        self._reader = LinkReader(
-            self, link, self._output, self._settings, self._fail,
-            lambda level: self._diagnostics.notice(Level[level.name]))
+        self._reader = LinkReader(self, link, self._output, self._settings, self._fail,
+                                  self._diagnostics.notice)
 
     def close(self) -> None:
         """End the thread and close the link."""
@@ -181,18 +180,18 @@ class Driver(LifecycleNode):
 
     def _level(self) -> Level:
         """Return the level of the link; a simulated sensor is a warning at least."""
-        level = Level[self._link_status().level.name]
+        level = self._link_status().level
         return Level.WARN if self._simulates and level is Level.OK else level
 
     def _link_status(self) -> base.LinkStatus:
         """Return how the link works, or why there is none."""
         if self._fault:
-            return base.LinkStatus(base.Level.ERROR, self._fault)
+            return base.LinkStatus(Level.ERROR, self._fault)
         if self._reader is None:
-            return base.LinkStatus(base.Level.WARN, 'inactive, no samples are published')
+            return base.LinkStatus(Level.WARN, 'inactive, no samples are published')
         return self._reader.status()
 
 
 def main() -> int:
     """Run the node."""
-    return run(Driver, NodeHelp(__doc__, _EXAMPLES, (DriverSettings,)))
+    return run(Driver, __doc__, _EXAMPLES)

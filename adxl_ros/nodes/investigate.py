@@ -20,10 +20,11 @@ from adxl_ros.links.support.base import Watchdog
 from adxl_ros.nodes import topics
 from adxl_ros.nodes.jobs import LiveLine
 from adxl_ros.nodes.parameters import declare_all, declare_sensor, low_and_high, make_sensor
-from adxl_ros.nodes.run_node import command_lines, NodeHelp, run
+from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.settings import check_given_parameters, InvestigateSettings
 from adxl_ros.nodes.topics import Level, Status
 from adxl_ros.report.quantities import percent
+from adxl_ros.report.screen import COLUMNS, end_lines
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.clock import Clock, ClockType
@@ -33,8 +34,6 @@ from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-_COLUMNS = 79
-"""Columns of a line."""
 _INDENT = 11 * ' '
 """Spaces in place of the time at the beginning of a line."""
 _MOST_NAMED = 3
@@ -60,9 +59,9 @@ def answer_lines(minutes: float, answer: Answer) -> list[str]:
     others = 1 - sum(hypothesis.probability for hypothesis in named)
     if others >= _SMALLEST_SHOWN / 2:
         parts.append(f'others {percent(others)}')
-    lines = wrap(f'{minutes:5.1f} min  {"  ".join(parts)}', _COLUMNS, subsequent_indent=_INDENT)
+    lines = wrap(f'{minutes:5.1f} min  {"  ".join(parts)}', COLUMNS, subsequent_indent=_INDENT)
     if answer.outcome is Outcome.GO_ON:
-        lines += wrap(f'next: {CATALOGUE[answer.manoeuvre].text}', _COLUMNS,
+        lines += wrap(f'next: {CATALOGUE[answer.manoeuvre].text}', COLUMNS,
                       initial_indent=_INDENT, subsequent_indent=_INDENT)
     return lines
 
@@ -70,29 +69,24 @@ def answer_lines(minutes: float, answer: Answer) -> list[str]:
 def status_line(status: Situation) -> str:
     """Return one line about what happens now."""
     remaining = f', {status.remaining_s:.0f} s left' if status.state is State.MOVING else ''
-    return f'{status.minutes:5.1f} min{remaining}  {status.text}'[:_COLUMNS]
+    return f'{status.minutes:5.1f} min{remaining}  {status.text}'[:COLUMNS]
 
 
 def closing_lines(investigation: Investigation, folder: OutputFolder) -> list[str]:
     """Return the result, where the files are, and what to do next."""
     bag, baseline, gap, parameters = (shlex.quote(str(path)) for path in (
         folder.bag, folder.baseline, folder.path / 'gap', folder.parameters))
-    files = {'Report': folder.report, 'Parameters': folder.parameters, 'Bag': folder.bag}
-    named = ['', *(f' {name:11} {path}' for name, path in files.items() if path.exists())]
+    files = [str(path) for path in (folder.report, folder.parameters, folder.bag) if path.exists()]
     if investigation.state is State.STOPPED:
-        stopped = wrap(f'Stopped without a verdict: {investigation.reason}', _COLUMNS)
-        return ['', *stopped, *named, *(_next(
-            f'diagnose {bag} --params {baseline} -o {gap}') if investigation.moved_s else [])]
-    answer = investigation.answers[-1][1]
-    hidden = f'It cannot show {diagnosis_round.listed(answer.hidden)}.' if answer.hidden else ''
-    return ['', *wrap(answer.sentence, _COLUMNS), *wrap(hidden, _COLUMNS), *named,
-            *_next(f'simulate rich --params {parameters} -o sim.csv')]
-
-
-def _next(arguments: str) -> list[str]:
-    """Return a command for the terminal."""
-    first, *others = command_lines(arguments, 13, 15)
-    return [f' {"Next":12}{first[13:]}', *others]
+        result = [f'Stopped without a verdict: {investigation.reason}']
+        following = f'diagnose {bag} --params {baseline} -o {gap}' if investigation.moved_s else ''
+    else:
+        answer = investigation.answers[-1][1]
+        result = [answer.sentence]
+        if answer.hidden:
+            result.append(f'It cannot show {diagnosis_round.listed(answer.hidden)}.')
+        following = f'simulate rich --params {parameters} -o sim.csv'
+    return ['', *end_lines(result, files, following and f'ros2 run adxl_ros {following}')]
 
 
 _SAMPLES = 'imu/data_raw'
@@ -321,4 +315,4 @@ def _work(node: Investigate, executor: Executor) -> None:
 
 def main() -> int:
     """Run the node."""
-    return run(Investigate, NodeHelp(__doc__, _EXAMPLES, (InvestigateSettings,)), _work)
+    return run(Investigate, __doc__, _EXAMPLES, _work)

@@ -26,8 +26,13 @@ _FIELDS = {'orientation': 4, 'orientation_covariance': 9, 'angular_velocity': 3,
 _PAUSE_S = 0.004
 """Time between two looks at the samples, s. At 1 kHz four of them then share a run of the chain,
 which costs as much as ten samples."""
-_COUNT_S = 1.0
-"""Time after which the publishers of the samples are counted again, s; chosen."""
+_LOOK_S = 1.0
+"""Time between two looks at publishers and clock of the samples, s; chosen."""
+_FOREIGN_S = 60.0
+"""Distance from the clock of the node at which stamps are of another clock, s; chosen."""
+_FOREIGN_LOOKS = 5
+"""Looks at such stamps in a row before a warning. Chosen: within it nodes find each other, and a
+reset of the simulator reaches samples and /clock."""
 
 
 class SimulatorInput:
@@ -36,7 +41,8 @@ class SimulatorInput:
     def __init__(self, node: Node, link: ImuLink) -> None:
         self._node, self._link = node, link
         self.frame_id = ''  # Frame of the newest samples
-        self._due_s = self._counted_s = time.monotonic()
+        self._foreign_looks = 0  # Newest looks in a row at stamps of another clock
+        self._due_s = self._looked_s = time.monotonic()
         self._inbox = topics.Inbox(node, Imu, link.imu_topic, _SIMULATOR_QUEUE)
         self._temperature = topics.create_subscription(
             node, Temperature, link.temperature_topic,
@@ -53,14 +59,26 @@ class SimulatorInput:
         self._inbox.wait()
         self._due_s = time.monotonic() + _PAUSE_S
         raws = self._inbox.take()
-        if not raws or self._due_s > self._counted_s + _COUNT_S:
+        is_due = self._due_s > self._looked_s + _LOOK_S
+        if not raws or is_due:
             topic = self._node.resolve_topic_name(self._link.imu_topic)
             self._link.sense_publishers(self._node.count_publishers(topic), self._inbox.fault())
-            self._counted_s = self._due_s
+            self._looked_s = self._due_s
         if raws:
             stamps_ns, fields = topics.decoded(raws, cdr.imu, **_FIELDS)
             self.frame_id = cdr.imu(raws[-1]).texts['frame_id']
+            if is_due:
+                self._look_at_clock(int(stamps_ns[-1]))
             self._link.sense_imu(stamps_ns, fields)
+
+    def _look_at_clock(self, stamp_ns: int) -> None:
+        """Warn once of samples that go on to be of another clock than the node's."""
+        away_s = (self._node.get_clock().now().nanoseconds - stamp_ns) * 1e-9
+        self._foreign_looks = self._foreign_looks + 1 if abs(away_s) > _FOREIGN_S else 0
+        if self._foreign_looks == _FOREIGN_LOOKS:
+            self._node.get_logger().warning(
+                f'{self._link.imu_topic}: stamps are {away_s:+.0f} s from the clock of this '
+                'node; set use_sim_time:=true, and let the simulator publish /clock')
 
 
 _PERIOD_S = 0.004

@@ -20,7 +20,7 @@ from adxl_ros.monitor.reference_stream import ReferenceKind, ReferenceStream, Ro
 from adxl_ros.nodes import topics
 from adxl_ros.nodes.parameters import declare_all, declare_sensor, make_sensor
 from adxl_ros.nodes.rclpy_internals import NotForExecutors, take_request
-from adxl_ros.nodes.run_node import NodeHelp, run
+from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.settings import check_given_parameters, MonitorSettings
 from adxl_ros.nodes.topics import Inbox, Level, Status
 from adxl_ros.report.quantities import percent
@@ -305,18 +305,12 @@ class Monitor(Node):
         if fault := self._refusal or self._streams.fault():
             return fault
         if now_s - self._sampled_s > _SILENT_S:
-            return self._silence('imu/data_raw')
+            return topics.silence(self, 'imu/data_raw')
         if self._info is None:
             return 'waiting for sensor_info'
         if now_s - self._referenced_s > _SILENT_S:
-            return f'{self._silence(self._reference_topic)}: no reference'
+            return f'{topics.silence(self, self._reference_topic)}: no reference'
         return self._live.obstacle
-
-    def _silence(self, topic: str) -> str:
-        """Return that a topic is silent, and whether it has a publisher."""
-        name = self.resolve_topic_name(topic)
-        return f'nothing on {name}' + ('' if self.count_publishers(name) else
-                                       ', and nobody publishes it')
 
     def _state(self) -> GapState:
         """Return what is known now."""
@@ -333,7 +327,7 @@ class Monitor(Node):
         values = {**state.summary.values, **{
             f'{axis}_{key}': value for axis, status in state.axes.items()
             for key, value in status.values.items()}}
-        values |= {**vars(self._live.counts), 'diagnosis_runs': self._run is not None,
+        values |= {**self._live.counts, 'diagnosis_runs': self._run is not None,
                    'false_alarms_per_day': self._settings.false_alarms_per_day}
         level = Level.ERROR if self._refusal or self._streams.fault() else state.summary.level
         return replace(state.summary, level=level, values=values)
@@ -341,4 +335,4 @@ class Monitor(Node):
 
 def main() -> int:
     """Run the node."""
-    return run(Monitor, NodeHelp(__doc__, _EXAMPLES, (MonitorSettings,)))
+    return run(Monitor, __doc__, _EXAMPLES)

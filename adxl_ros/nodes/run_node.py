@@ -10,7 +10,7 @@ made, but not run. It does not discover other nodes, so that no graph sees it.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from itertools import chain
 import os
@@ -19,54 +19,33 @@ import re
 import signal
 import sys
 import textwrap
-from typing import Any, NamedTuple
+from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.links.support import base
 from adxl_ros.nodes.parameters import check_params_files, Kind, nominal_specs, Spec, specs_of
 from adxl_ros.nodes.rclpy_internals import start_error_text
-from adxl_ros.nodes.settings import DriverSettings, link_specs
+from adxl_ros.nodes.settings import DriverSettings, link_specs, NODES
 from adxl_ros.nodes.topics import type_name
 from adxl_ros.process import ended_by_closed_output, package_version
+from adxl_ros.report.screen import COLUMNS, command_lines
 import rclpy
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
 
-_COLUMNS = 79
-"""Columns of a terminal that the text uses."""
 _QUIET = ('--ros-args', '--log-level', 'fatal', '--disable-rosout-logs',
           '--disable-external-lib-logs')
 """Arguments of a node that logs nothing."""
 _ANY_TOPIC = ('/parameter_events', '/rosout')
 """Topics that every node has."""
+_WITHOUT_SENSOR = ('stage', 'screen')
+"""Nodes without the parameters of a sensor."""
 _LISTED_OF_SENSOR = ('sensor.', 'stage.')
 """Begins of the names of those parameters of a file that are listed one by one."""
 _TYPES = {Kind.DOUBLE: 'float', Kind.INTEGER: 'int', Kind.STRING: 'text', Kind.BOOL: 'bool',
           Kind.DOUBLE_ARRAY: 'floats', Kind.STRING_ARRAY: 'texts'}
 """Words for the types of parameters."""
-
-
-class NodeHelp(NamedTuple):
-    """What the help text of a node has beside its topics."""
-
-    description: str | None  # Purpose of the node
-    examples: Mapping[str, str]  # Arguments of each example, by its purpose
-    settings: Sequence[type] = ()  # Dataclasses of its parameters
-    has_sensor: bool = True  # Whether it has those of a sensor, too
-
-
-def print_if_asked(arguments: Sequence[str], make_node: Callable[[], Node], node_help: NodeHelp
-                   ) -> bool:
-    """Print version or help where the command line has that option."""
-    if '--version' in arguments:
-        print(f'adxl_ros {package_version()}')
-        return True
-    if {'-h', '--help'} & set(arguments):
-        name = os.path.basename(sys.argv[0])
-        print('\n'.join(_help_lines(name, make_node, node_help)))
-        return True
-    return False
 
 
 def program_parser(name: str, description: str | None, examples: Mapping[str, str]
@@ -80,16 +59,17 @@ def program_parser(name: str, description: str | None, examples: Mapping[str, st
     return parser
 
 
-def _help_lines(name: str, make_node: Callable[[], Node], node_help: NodeHelp) -> list[str]:
+def _help_lines(name: str, make_node: Callable[[], Node], description: str | None,
+                examples: Mapping[str, str]) -> list[str]:
     """Lay out the help text."""
-    own = list(chain.from_iterable(map(specs_of, node_help.settings)))
+    own = chain.from_iterable(map(specs_of, NODES[name]))
     lines = [f'usage: {name} [--help] [--version] [--ros-args -p NAME:=VALUE ...',
              f'{"":{len(name) + 8}}--params-file FILE -r FROM:=TO ...]', '',
-             *_wrapped(node_help.description or ''), '',
+             *_wrapped(description or ''), '',
              'parameters: type, default, meaning', *_spec_lines(own)]
-    for link in base.link_names() if DriverSettings in node_help.settings else ():
+    for link in base.link_names() if DriverSettings in NODES[name] else ():
         lines += ['', f'with link.type:={link}', *_spec_lines(link_specs(link))]
-    if node_help.has_sensor:
+    if name not in _WITHOUT_SENSOR:
         of_file = nominal_specs()
         listed = [spec for spec in of_file if spec.name.startswith(_LISTED_OF_SENSOR)]
         lines += ['', 'parameters of the sensor, usually from --params-file', *_spec_lines(listed),
@@ -105,7 +85,7 @@ def _help_lines(name: str, make_node: Callable[[], Node], node_help: NodeHelp) -
     for direction, names in topics.items():
         if names:
             lines += ['', direction, *(f'  {topic:28} {kind}' for topic, kind in names.items())]
-    return lines + _example_lines(name, node_help.examples)
+    return lines + _example_lines(name, examples)
 
 
 def _topics(make_node: Callable[[], Node]) -> dict[str, dict[str, str]]:
@@ -136,22 +116,16 @@ def _example_lines(name: str, examples: Mapping[str, str]) -> list[str]:
     """Lay out the examples."""
     lines = ['', 'examples:']
     for purpose, arguments in examples.items():
-        lines += [f'  {purpose}:', *command_lines(f'{name} {arguments}'.rstrip(), 4, 8)]
+        command = f'ros2 run adxl_ros {name} {arguments}'.rstrip()
+        lines += [f'  {purpose}:', *command_lines(command, 4 * ' ')]
     return lines
 
 
-def command_lines(arguments: str, indent: int, further: int) -> list[str]:
-    """Lay out a command of this package; a backslash joins the lines of a long one."""
-    *first, last = _wrapped(f'ros2 run adxl_ros {arguments}', indent, further, 2)
-    return [*(f'{line} \\' for line in first), last]
-
-
-def _wrapped(text: str, indent: int = 0, further: int | None = None, reserve: int = 0
-             ) -> list[str]:
-    """Wrap a text between words, all lines or further ones with an indent."""
-    return textwrap.wrap(' '.join(text.split()), _COLUMNS - reserve, initial_indent=indent * ' ',
-                         subsequent_indent=(indent if further is None else further) * ' ',
-                         break_long_words=False, break_on_hyphens=False)
+def _wrapped(text: str, indent: int = 0) -> list[str]:
+    """Wrap a text between words, with an indent of all lines."""
+    return textwrap.wrap(' '.join(text.split()), COLUMNS, initial_indent=indent * ' ',
+                         subsequent_indent=indent * ' ', break_long_words=False,
+                         break_on_hyphens=False)
 
 
 def _spec_lines(specs: Iterable[Spec]) -> list[str]:
@@ -191,9 +165,13 @@ _USAGE = '%(prog)s [--ros-args -p NAME:=VALUE ... --params-file FILE -r FROM:=TO
 
 
 @ended_by_closed_output()
-def run(make_node: Callable[[], Node], node_help: NodeHelp,
+def run(make_node: Callable[[], Node], description: str | None, examples: Mapping[str, str],
         work: Callable[[Any, Executor], None] = lambda _, executor: executor.spin()) -> int:
-    """Run one node until SIGINT or SIGTERM."""
+    """
+    Run one node until SIGINT or SIGTERM, or show version or help.
+
+    description: purpose of the node; examples: arguments of each, by its purpose.
+    """
     name = Path(sys.argv[0]).name
     is_initialised = False
     interrupts: list[int] = []
@@ -201,7 +179,11 @@ def run(make_node: Callable[[], Node], node_help: NodeHelp,
         # It names a fault of a file by its place; rclpy does not.
         check_params_files()
         # People ask for help behind --ros-args, too.
-        if print_if_asked(sys.argv[1:], make_node, node_help):
+        if '--version' in sys.argv:
+            print(f'adxl_ros {package_version()}')
+            return 0
+        if {'-h', '--help'} & set(sys.argv):
+            print('\n'.join(_help_lines(name, make_node, description, examples)))
             return 0
         argparse.ArgumentParser(prog=name, usage=_USAGE).parse_args(remove_ros_args(sys.argv)[1:])
         # rclpy's own handler ends the context; Python's would raise in the middle of a statement.

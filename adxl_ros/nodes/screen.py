@@ -21,8 +21,8 @@ from adxl_ros.calibrate.guided.screen_contents import ScreenContents
 from adxl_ros.errors import UserError
 from adxl_ros.nodes.jobs import held_output
 from adxl_ros.nodes.parameters import declare_all
-from adxl_ros.nodes.run_node import NodeHelp, run
-from adxl_ros.nodes.settings import ScreenSettings
+from adxl_ros.nodes.run_node import run
+from adxl_ros.nodes.settings import check_given_parameters, ScreenSettings
 from adxl_ros.nodes.topics import create_subscription
 from rcl_interfaces.msg import Log
 import rclpy
@@ -226,6 +226,7 @@ class Screen(Node):
 
     def __init__(self) -> None:
         super().__init__('screen')
+        check_given_parameters(self)
         own = declare_all(self, ScreenSettings)
         name, self._node_pid = own.node, own.node_pid
         self._target = self.resolve_topic_name(name)
@@ -335,5 +336,4 @@ class Screen(Node):
 
 def main() -> int:
     """Run the screen."""
-    return run(Screen, NodeHelp(__doc__, _EXAMPLES, (ScreenSettings,), has_sensor=False),
-               Screen.show)
+    return run(Screen, __doc__, _EXAMPLES, Screen.show)

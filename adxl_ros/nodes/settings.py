@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass, fields
 from itertools import chain
 from typing import Any
 
@@ -250,7 +250,8 @@ NODES: dict[str, tuple[type, ...]] = {
     'driver': (DriverSettings,),
     'stage': (StageSettings, SimulatedStageSettings, BridgeSettings),
     'calibration': (CalibrationSettings,), 'compensation': (CompensationSettings,),
-    'investigate': (InvestigateSettings,), 'monitor': (MonitorSettings,)}
+    'investigate': (InvestigateSettings,), 'monitor': (MonitorSettings,),
+    'screen': (ScreenSettings,)}
 """Parameters by node. One file may serve all nodes: a node ignores what another one has."""
 
 
@@ -267,8 +268,8 @@ def check_given_parameters(node: Node) -> None:
 
 def link_specs(link: str) -> list[Spec]:
     """Return the parameters of a link, `link.type` aside."""
-    return [Spec(f'{LINK}{name}', *description) for name, *description in map(
-        astuple, base.options(base.link_module(link).Settings))]
+    return [Spec(f'{LINK}{option.name}', option.default, **option.metadata)
+            for option in fields(base.link_module(link).Settings)]
 
 
 def links_by_parameter() -> dict[str, list[str]]:

@@ -12,7 +12,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.nodes import settings, topics
 from adxl_ros.nodes.parameters import declare_all, parameter_error
-from adxl_ros.nodes.run_node import NodeHelp, run
+from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.topics import Level, Status, STEADY
 from adxl_ros.simulate.simulated_stage import JOINTS, SimulatedStage
 from builtin_interfaces.msg import Duration
@@ -324,4 +324,4 @@ class Stage(Node):
 
 def main() -> int:
     """Run the node."""
-    return run(Stage, NodeHelp(__doc__, _EXAMPLES, settings.NODES['stage'], has_sensor=False))
+    return run(Stage, __doc__, _EXAMPLES)

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from enum import Enum
 from functools import partial
 import struct
 import threading
@@ -21,6 +20,7 @@ from typing import Any, NamedTuple
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import cdr
 from adxl_ros.files.stream_info import StreamInfo
+from adxl_ros.links.support.base import Level
 from adxl_ros.nodes.rclpy_internals import MessageWait, NotForExecutors, take_messages
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -119,6 +119,14 @@ def log(node: Node, severity: str, text: str) -> None:
         node.get_logger().error(text)
 
 
+def silence(node: Node, topic: str, silent_s: float | None = None) -> str:
+    """Return that a topic is silent, for how long, and whether it has a publisher."""
+    name = node.resolve_topic_name(topic)
+    duration = '' if silent_s is None else f' for {silent_s:.0f} s'
+    publishers = '' if node.count_publishers(name) else ', and nobody publishes it'
+    return f'nothing on {name}{duration}{publishers}'
+
+
 def type_name(kind: Any) -> str:
     """Return the name of the class of a message or service, with its package."""
     return f'{kind.__module__.partition(".")[0]}/{kind.__name__}'
@@ -189,17 +197,14 @@ class Inbox:
 
     def take(self) -> list[bytes]:
         """Return the messages since the last call, at most as many as are kept."""
-        return list(self._waiting())
+        accept = (self._accepts,) if self._kind is Imu else ()
+        return list(take_messages(self._subscription, self._kind, True, self._depth, *accept))
 
     def receive(self, callback: Callable[[bytes], object]) -> None:
         """Wait for a message for up to 0.1 s, and give all that have come to a function."""
         self.wait()
-        for message in self._waiting():
+        for message in self.take():
             callback(message)
-
-    def _waiting(self) -> Iterator[bytes]:
-        accept = (self._accepts,) if self._kind is Imu else ()
-        return take_messages(self._subscription, self._kind, True, self._depth, *accept)
 
     def _accepts(self, number: int | None) -> bool:
         """Return whether to take a message of a sequence number; None where the RMW has none."""
@@ -228,14 +233,6 @@ _PERIOD_S = 1.0
 """Time between two reports, s; the usual rate of ROS diagnostics."""
 _REPORTS = 10
 """Reports that are kept for a slow subscriber."""
-
-
-class Level(Enum):
-    """Levels of a diagnostic status."""
-
-    OK = DiagnosticStatus.OK
-    WARN = DiagnosticStatus.WARN
-    ERROR = DiagnosticStatus.ERROR
 
 
 @dataclass(frozen=True)
@@ -278,8 +275,9 @@ def status_message(name: str, status: Status) -> DiagnosticStatus:
     """Make the message of a status."""
     values = [KeyValue(key=key, value=value if isinstance(value, str) else repr(value))
               for key, value in status.values.items()]
-    return DiagnosticStatus(level=status.level.value, name=name, message=status.summary,
-                            hardware_id=status.hardware_id, values=values)
+    return DiagnosticStatus(
+        level=getattr(DiagnosticStatus, status.level.name), name=name, message=status.summary,
+        hardware_id=status.hardware_id, values=values)
 
 
 def imu_samples(batch: Sequence[bytes]) -> tuple[np.ndarray, np.ndarray]:

@@ -66,17 +66,17 @@ def end_lines(result: Sequence[str], files: Sequence[str],
         lines += wrapped(f' {"wrote":{_LABEL_COLUMNS - 1}}{"  ".join(files)}{took}',
                          _LABEL_COLUMNS)
     if isinstance(following, str):
-        lines += _command_lines(following, f' {"next":{_LABEL_COLUMNS - 1}}')
+        lines += command_lines(following, f' {"next":{_LABEL_COLUMNS - 1}}')
     else:
         for number, step in enumerate(following, 1):
             label = '' if number > 1 else 'next'
             lines += wrapped(f' {label:{_LABEL_COLUMNS - 1}}{number}  {step.purpose}',
                              _STEP_COLUMNS)
-            lines += _command_lines(step.command, _STEP_COLUMNS * ' ')
-    return [_coloured(line) for line in lines]
+            lines += command_lines(step.command, _STEP_COLUMNS * ' ')
+    return [coloured(line) for line in lines]
 
 
-def _command_lines(text: str, start: str) -> list[str]:
+def command_lines(text: str, start: str) -> list[str]:
     """Return the lines of a command behind the start of the first one; a backslash joins them."""
     if not text:
         return []
@@ -91,7 +91,7 @@ def _command_lines(text: str, start: str) -> list[str]:
     return [*(f'{line} \\' for line in first), last]
 
 
-def _coloured(line: str) -> str:
+def coloured(line: str) -> str:
     """Colour the outcomes of a line in a terminal, but not where NO_COLOR is set."""
     if not sys.stdout.isatty() or 'NO_COLOR' in os.environ:
         return line

@@ -2,7 +2,7 @@
 
 """The links without ROS: the simulated sensor and stage, and the replay."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 import sys
 import time
 
@@ -45,9 +45,7 @@ def test_every_link_can_be_opened_by_its_name():
     assert base.link_names()[0] == 'sim'
     assert 'replay' in base.link_names()
     for name in base.link_names():
-        module = base.link_module(name)
-        assert callable(module.open_link)
-        assert all(isinstance(option, base.Option) for option in base.options(module.Settings))
+        assert callable(base.link_module(name).open_link)
 
 
 def test_the_example_of_the_documentation_is_a_link(tmp_path, monkeypatch):
@@ -57,7 +55,7 @@ def test_the_example_of_the_documentation_is_a_link(tmp_path, monkeypatch):
     monkeypatch.delitem(sys.modules, 'adxl_ros.links.constant', raising=False)
     assert 'constant' in base.link_names()
     module = base.link_module('constant')
-    assert [option.name for option in base.options(module.Settings)] == ['level_v']
+    assert [option.name for option in fields(module.Settings)] == ['level_v']
     link = module.open_link(nominal(), module.Settings(level_v=1.5))
     assert link.begin(0) == 0
     assert link.read(0).volts.tolist() == [[1.5, 1.5]]

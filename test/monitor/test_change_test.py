@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from adxl_ros.monitor.changes import Change, ChangeSettings, ChangeTest
+from adxl_ros.monitor.changes import Change, ChangeTest
 import numpy as np
 import pytest
 from scipy.stats import poisson
@@ -36,7 +36,7 @@ def run(test: ChangeTest, values: np.ndarray, moves: bool = False) -> list[tuple
 def test_false_alarms_are_no_more_than_stated(kind: str) -> None:
     """Ten sensors of four series for six hours, with one false alarm a day each."""
     hours, sensors, rate = 6, 10, 1.0
-    test = ChangeTest(ChangeSettings(4 * sensors, rate * sensors))
+    test = ChangeTest(4 * sensors, rate * sensors)
     alarms = run(test, series(kind, hours * 3600, 4 * sensors, 3))
     assert len(alarms) <= poisson.isf(1e-3, rate * sensors * hours / 24)
 
@@ -44,7 +44,7 @@ def test_false_alarms_are_no_more_than_stated(kind: str) -> None:
 @pytest.mark.parametrize('kind, size, delay_s', [
     ('white', 1000.0, 2), ('white', 300.0, 20), ('white', 100.0, 200), ('all', 3000.0, 5)])
 def test_a_step_is_found_in_time(kind: str, size: float, delay_s: int) -> None:
-    test = ChangeTest(ChangeSettings(6, 1 / 30))
+    test = ChangeTest(6, 1 / 30)
     values = series(kind, 5400, 6, 5)
     values[3600:, 2] += size
     (block, change), *others = run(test, values)
@@ -57,7 +57,7 @@ def test_a_step_is_found_in_time(kind: str, size: float, delay_s: int) -> None:
 def test_motion_is_compared_with_motion() -> None:
     """A first move with errors of its own is no change of the sensor."""
     rng = np.random.default_rng(1)
-    test = ChangeTest(ChangeSettings(1, 1 / 30))
+    test = ChangeTest(1, 1 / 30)
     assert not run(test, rng.standard_normal((3000, 1)))
     assert not run(test, 30 * rng.standard_normal((40, 1)), moves=True)
     assert not run(test, rng.standard_normal((3000, 1)))

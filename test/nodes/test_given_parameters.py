@@ -17,7 +17,7 @@ from sensor_msgs.msg import Imu
 from units import NOMINAL, nominal
 
 OWN_PARAMETERS = {node: [spec.name for part in parts for spec in specs_of(part)]
-                  for node, parts in NODES.items()}
+                  for node, parts in NODES.items() if node != 'screen'}
 ROS = '--ros-args'
 SIMULATED = 'SIMULATED sensor (link.type: sim)'
 CHOICES = 'set it to iio, replay, serial, topic, or to sim for a simulated sensor'

@@ -166,7 +166,7 @@ def test_a_terminal_shows_what_the_stage_does_until_ctrl_c(laboratory, ros_env, 
         laboratory.wait_for_motion()
         terminal.wait_for(' s left')
         terminal.press('\x03')
-        terminal.wait_for('Stopped without a verdict: Ctrl-C', 'Bag  ')
+        terminal.wait_for('Stopped without a verdict: Ctrl-C', ' wrote ')
         assert terminal.wait() == 1
         assert ' s left' not in terminal.text()
         assert max(map(len, terminal.text().splitlines())) < 80

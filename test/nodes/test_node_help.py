@@ -9,13 +9,13 @@ import subprocess
 
 from adxl_ros.links.support import base
 from adxl_ros.nodes.parameters import specs_of
-from adxl_ros.nodes.settings import NODES
+from adxl_ros.nodes.settings import link_specs, NODES
 from graph import Graph
 from processes import executable, run_executable
 import pytest
 from terminal import Terminal
 
-PROGRAMS = (*NODES, 'screen', 'demo', 'bench')
+PROGRAMS = (*NODES, 'demo', 'bench')
 
 
 def parts_of(text: str) -> dict[str, str]:
@@ -59,8 +59,8 @@ def test_help_lists_each_parameter_with_type_default_and_meaning(
 def test_help_of_the_driver_has_links_sensor_and_topics(ros_env: dict[str, str]) -> None:
     parts = parts_of(help_of('driver').stdout)
     for link in base.link_names():
-        for option in base.options(base.link_module(link).Settings):
-            assert f'\n  link.{option.name}  ' in parts[f'with link.type:={link}']
+        for spec in link_specs(link):
+            assert f'\n  {spec.name}  ' in parts[f'with link.type:={link}']
     sensor = parts['parameters of the sensor, usually from --params-file']
     assert '\n  sensor.rate_hz  float, 1000\n      sample rate, Hz' in sensor
     assert re.search(r'^  imu/data_raw +sensor_msgs/Imu$', parts['publishes'], re.MULTILINE)

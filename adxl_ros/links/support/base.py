@@ -10,7 +10,7 @@ Each module of the package `links` is one link, found by its file name. It holds
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from enum import Enum
 from importlib import import_module
 import os
@@ -32,31 +32,17 @@ _MAX_SHARE = 1e-3
 """Largest share of a sample that a latency may lack: a float32 of a firmware is not exact."""
 
 
-@dataclass(frozen=True)
-class Option:
-    """One setting of a link, which is the parameter `link.<name>` of the driver."""
-
-    name: str  # Name of the field in `Settings`
-    # Default value; its type is the type of the parameter. An empty tuple stands for a list of
-    # strings, or one string with commas.
-    default: bool | int | float | str | tuple[()]
-    doc: str  # Meaning, for the parameter's descriptor
-    unit: str = ''  # Unit of the value; '' without one
-    # lower, upper: Permitted range, in `unit`; None without limits
-    lower: float | None = None
-    upper: float | None = None
-
-
 def option(default: bool | int | float | str | tuple[()], doc: str, unit: str = '',
            lower: float | None = None, upper: float | None = None) -> Any:
-    """Declare one field of a link's `Settings`, by the attributes of `Option`."""
+    """
+    Declare one field of a link's `Settings`, which is the parameter `link.<name>` of the driver.
+
+    default: its type is that of the parameter; an empty tuple stands for a list of strings, or one
+    string with commas; doc: meaning, for the descriptor; unit: unit of the value, '' without one;
+    lower, upper: permitted range, in `unit`, None without limits.
+    """
     return field(default=default, metadata={'doc': doc, 'unit': unit, 'lower': lower,
                                             'upper': upper})
-
-
-def options(settings: type) -> tuple[Option, ...]:
-    """Describe the fields of a link's `Settings`."""
-    return tuple(Option(f.name, cast(Any, f.default), **f.metadata) for f in fields(settings))
 
 
 @dataclass(frozen=True)
