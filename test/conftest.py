@@ -93,12 +93,7 @@ def ros_env(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[dict[str
 
 @pytest.fixture
 def start(ros_env: dict[str, str], tmp_path: Path) -> Iterator[Callable[..., Started]]:
-    """
-    Give a function of a name and arguments that starts an executable in the graph of the test.
-
-    It returns a `Started` at once. All processes are stopped when the test ends. Their output is
-    in `tmp_path / '<number>_<name>.log'`, and in the report of a failing test.
-    """
+    """Give a function that starts an executable in the graph of the test, and returns at once."""
     started: list[Started] = []
 
     def begin(name: str, *args: object) -> Started:

@@ -39,11 +39,7 @@ def turning(alphas_rad=(np.pi / 2, np.pi / 4)):
 
 
 class Report:
-    """
-    What `diagnose` reports of a simulated recording.
-
-    Attributes: the report `json`, the text of `terminal` and `page`, and the written `sensor`.
-    """
+    """What `diagnose` reports: `json`, text of `terminal` and `page`, and the `sensor`."""
 
     def __init__(self, run_tool, folder, sensor, *effects, motion=None, params=None, change=None):
         columns = simulate(with_effects(sensor, list(effects)), motion or turning(), 3)

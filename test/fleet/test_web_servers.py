@@ -20,11 +20,7 @@ _PART = b'0.0,2.5\n' * 1000
 
 @contextmanager
 def web_server(parts, wait_s=0.0, needs=''):
-    """
-    Serve `parts` pieces of a file with a wait before each; yield its address and the reads.
-
-    It answers only addresses with the text `needs`.
-    """
+    """Serve pieces with a wait before each, at addresses with `needs`; yield address and reads."""
     reads = []
 
     class Handler(BaseHTTPRequestHandler):

@@ -28,11 +28,7 @@ INFO = BoardInfo(1000.0, 16, 2, 5.0, 'A7')
 
 
 class ConnectedBoard:
-    """
-    A board that the test plays on one end of a terminal, and a link on the other end.
-
-    `codes` are those of the next frame, `index` is the number of its first sample.
-    """
+    """A board, one end of a terminal: `codes` of the next frame, `index` of its first sample."""
 
     def __init__(self, tmp_path, info=INFO, sensor=None, **settings):
         self.path = tmp_path / 'port'

@@ -18,12 +18,6 @@ import pytest
 from terminal import Terminal
 
 
-def test_titles() -> None:
-    assert demo.title('Demo', 95.0) == 'Demo   (2 min)'
-    assert demo.title('Demo', 15.0) == 'Demo   (20 s)'
-    assert (REPO / demo.NEXT_PAGE).is_file()
-
-
 def test_steps_without_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     out = io.StringIO()
     monkeypatch.setattr(sys, 'stdout', out)
@@ -53,11 +47,7 @@ def suspend_calibration(demo_pid: int) -> None:
 
 
 def test_live(ros_env, tmp_path) -> None:
-    """
-    In a terminal of 80 columns no line of steps, tables, acceptance and files wraps.
-
-    No sample of a pose is lost, although the calibration is stopped for 20 s of sensor time.
-    """
+    """No line wraps; no sample is lost although the calibration stops for 20 s of sensor time."""
     terminal = Terminal([executable('demo'), '--speed', '40'], ros_env, tmp_path, lines=60,
                         columns=80)
     try:
@@ -71,6 +61,7 @@ def test_live(ros_env, tmp_path) -> None:
     lines = screen.splitlines()
     assert max(map(len, lines)) <= 79 and restored
     assert re.search(r'coefficients are known   \(\d', lines[0])
+    assert (REPO / demo.NEXT_PAGE).is_file()
     assert re.search(r'1/3 sweep +146 of 146 poses +━+ +100 %', screen)
     assert re.search(r'2/3 fit +130 poses, full model', screen)
     assert re.search(r'3/3 check +16 poses that the fit has not seen', screen)

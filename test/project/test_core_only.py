@@ -64,10 +64,8 @@ def test_what_needs_an_extra_names_it() -> None:
     code = """
 from adxl_ros.errors import UserError
 from adxl_ros.files import bag_messages, tables
-from adxl_ros.fleet import inputs, table
 from adxl_ros.report import figures, page
 for use in (lambda: tables.open_table('log.ulg'), lambda: tables.open_table('log.parquet'),
-            lambda: table.read('fleet.parquet'), lambda: inputs.file_system('log.csv'),
             bag_messages.import_rosbags, figures.pyplot, page.check_libraries):
     try:
         use()
@@ -75,9 +73,9 @@ for use in (lambda: tables.open_table('log.ulg'), lambda: tables.open_table('log
         print(error)
 """
     lines = run_without_extras(code).stdout.splitlines()
-    assert len(lines) == 7
-    for line, name in zip(lines, ('pyulog', 'pyarrow', 'pyarrow', 'adxl_ros[fleet]', 'rosbags>=',
-                                  'matplotlib', 'python3-plotly')):
+    assert len(lines) == 5
+    for line, name in zip(lines, ('pyulog', 'pyarrow', 'rosbags>=', 'matplotlib',
+                                  'python3-plotly')):
         assert re.search(f'install .*{re.escape(name)}', line), line
 
 

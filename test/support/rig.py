@@ -62,11 +62,7 @@ class SampleReport:
 
 
 class DriverRig:
-    """
-    Collects the samples of a driver and identifies them on the device.
-
-    wrong: samples with wrong values or in a wrong order.
-    """
+    """Collects samples of a driver; `wrong` are those with wrong values or in a wrong order."""
 
     def __init__(self, graph, rate_hz):
         self.graph = graph
@@ -204,11 +200,7 @@ class SerialRig(DriverRig):
 
 
 class IioRig(DriverRig):
-    """
-    A driver on the IIOD of the tests.
-
-    server: process of the IIOD.
-    """
+    """A driver on the IIOD of the tests, whose process is `server`."""
 
     def __init__(self, graph):
         super().__init__(graph, 1000.0)
