@@ -130,13 +130,7 @@ def test_the_screen_guides_an_operator_through_a_sweep(start, terminal, tmp_path
         seen.wait_for('16 poses are open; press f again')
         assert not (tmp_path / 'unit.yaml.previous').exists()
         seen.press('f')
-        # The acceptance comes first, and no line of its table is folded.
-        screen = seen.wait_for('wrote unit.yaml', 'held out: tilt')
-        assert re.search(r'(?m)^full: datasheet (PASS|FAIL|NOT SHOWN), noise (PASS|FAIL|NOT '
-                         r'SHOWN); limited by the \w+\nheld out: tilt \S+° rms, \S+° max; accel '
-                         r'\S+ mg rms, \S+ mg max$', screen), screen
-        assert re.search(r'(?m)^full +[\d.]+/[\d.]+( +(PASS|FAIL|NOT SHOWN)){2} +[\d.]+/[\d.]+'
-                         r'( +(PASS|FAIL|NOT SHOWN)){2}$', screen), screen
+        seen.wait_for('wrote unit.yaml', 'not assessed: too few poses to hold some of them out')
         seen.press('b')
         seen.wait_for('unit.yaml.journal holds 5 poses of an interrupted calibration', 'y  go on')
         seen.press('q')
