@@ -222,7 +222,7 @@ class RobotPath(ForcePath):
             grid_s = grid_s[gaps_s[np.searchsorted(times, grid_s, 'right') - 1] <= longest_s]
         self._grid_s = grid_s[grid_s >= since_s]
         self._splines = self._paths(self._tracks)
-        self._smoothed = self._on_grid(self._splines)
+        self._smoothed = _derivatives(self._splines, self._grid_s)
         self.motion = self._moved(self._smoothed)
         super().__init__(self._grid_s, self.motion[0])
         self._rotation = CubicSpline(self._grid_s, np.hstack(list(self.motion[1:3])))
@@ -233,11 +233,6 @@ class RobotPath(ForcePath):
         return [SmoothedPath(times, values, step, is_seen=True, knot_s=min(
             KNOT_S, _KNOT_READINGS * float(np.median(np.diff(times))))) if np.ptp(values)
             else Held(float(values[0])) for (times, values), step in zip(tracks, self._steps)]
-
-    def _on_grid(self, paths: Sequence[Path]) -> np.ndarray:
-        """Return derivatives 0 to 2 of paths on the grid, (3, n, k)."""
-        return np.array([[path(self._grid_s, order) for path in paths]
-                         for order in range(3)]).transpose(0, 2, 1)
 
     def _moved(self, tracks: np.ndarray) -> np.ndarray:
         count = len(self._robot.joints)
@@ -339,7 +334,7 @@ class RobotPath(ForcePath):
         A spline through every second reading of the smoothed motion lacks what jerks within a
         few readings, as the motion itself does.
         """
-        return self._moved(self._on_grid(self._paths(self._read_again(2))))[0] - self.motion[0]
+        return self._read_again(2)
 
     @cached_property
     def rounding_mps2(self) -> np.ndarray:
@@ -348,10 +343,10 @@ class RobotPath(ForcePath):
 
         The smoothed motion is read by encoders whose steps lie elsewhere, and smoothed again.
         """
-        return self._moved(self._on_grid(self._paths(self._read_again(1))))[0] - self.motion[0]
+        return self._read_again(1)
 
-    def _read_again(self, every: int) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return readings of the smoothed motion: by the same encoders, or exact ones of some."""
+    def _read_again(self, every: int) -> np.ndarray:
+        """Return the change by reading the smoothed motion: by its encoders, or exactly some."""
         rng, tracks = np.random.default_rng(0), []
         for (times, values), step, path in zip(self._tracks, self._steps, self._splines):
             read = path(times)
@@ -359,7 +354,13 @@ class RobotPath(ForcePath):
             if every == 1 and step and np.ptp(values):
                 read = np.rint((read + offset) / step) * step - offset
             tracks.append((times[::every], read[::every]))
-        return tracks
+        return self._moved(_derivatives(self._paths(tracks), self._grid_s))[0] - self.motion[0]
+
+
+def _derivatives(paths: Sequence[Path], time_s: np.ndarray) -> np.ndarray:
+    """Return derivatives 0 to 2 of paths at times, s, (3, n, k)."""
+    return np.array([[path(time_s, order) for path in paths]
+                     for order in range(3)]).transpose(0, 2, 1)
 
 
 def _tracks(robot: Robot, readings: Readings) -> list[tuple[np.ndarray, np.ndarray]]:
