@@ -169,7 +169,8 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
         counts, rule.block_weights(seed), smallest_mps2,
         max(model.smallest_angle_rad() * G0_MPS2, robot_mps2), robot_mps2 > 0,
         any(c.fading_hz is not None for c in model.comparisons),
-        np.inf if floor.source == 'assumed' else floor.rms_mps2)
+        np.inf if floor.source == 'assumed' else floor.rms_mps2,
+        {effects: h.sizeless for effects, h in search.found.items()})
     detections = _detections(checked, search.best, model.baseline, smallest_mps2)
     bases = [flexible_bases(c, v) for c, v in zip(compared, model.baseline_v)]
     verdict = rule.decide(

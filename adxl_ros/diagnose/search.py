@@ -20,6 +20,7 @@ from adxl_ros.diagnose.evidence import LinearFit, LinearisedHypothesis, Whitener
 from adxl_ros.diagnose.linear_model import LinearModel, Variant
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import fitted_of, get, parameter_of, put, with_neutral
+from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.gauss_newton import gauss_newton, Iterate
@@ -78,6 +79,14 @@ class Hypothesis:
     fit: LinearFit  # The last linear fit
     linearised: LinearisedHypothesis  # The hypothesis linearised at its values
     converged: bool = True  # Whether the Gauss-Newton iteration has converged
+
+    @property
+    def sizeless(self) -> frozenset[str]:
+        """Effects none of whose sizes differs from that of the baseline, by 90 % intervals."""
+        differs = np.abs(self.values) > Z_90 * self.std
+        sizes = [(name.effect, shows) for name, shows in zip(self.names, differs)
+                 if parameter_of(name).is_size]
+        return frozenset(e for e, _ in sizes) - {e for e, shows in sizes if shows}
 
     @property
     def whiteners(self) -> list[Whitener]:

@@ -162,6 +162,8 @@ class Evidence:
     errs_in_motion: bool  # Whether it errs in motion, too, as a robot does
     fades: bool  # Whether the reference lacks motion
     floor_mps2: float  # Noise floor, m/s²; infinite where it is assumed
+    # Effects of each set none of whose sizes differs from 0
+    sizeless: Mapping[frozenset[str], frozenset[str]] = field(default_factory=dict)
 
     def left(self, effects: frozenset[str], rows: slice) -> np.ndarray:
         """Return the power above the noise floor that a set leaves."""
@@ -206,6 +208,8 @@ def _predicts(nats: np.ndarray) -> bool:
 
 def is_needed(evidence: Evidence, effects: frozenset[str], effect: str, rows: slice) -> bool:
     """Determine whether a set loses a material part of what it explains without an effect."""
+    if effect in evidence.sizeless.get(effects, ()):
+        return False
     rest = effects - {effect}
     lost, nats = evidence.gain(effects, rest, rows), evidence.nats(
         (effects, HEALTHY), (rest, HEALTHY), rows)

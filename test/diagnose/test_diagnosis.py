@@ -33,6 +33,10 @@ def report_of(diagnosis):
         assert sum(probabilities) == pytest.approx(1, abs=1e-5)
         assert max(probabilities) == probabilities[0]
         assert 0 < report['verdict']['probability'] <= 1
+    for candidate in report['candidates']:
+        ends = [p['ci'] for p in candidate['parameters'].values() if p.get('ci')]
+        if ends and candidate['effect'] in named(report):
+            assert not all(low <= 0 <= high for low, high in ends), candidate
     return report
 
 

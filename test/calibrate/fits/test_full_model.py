@@ -139,7 +139,7 @@ def test_a_simpler_model_is_fitted_if_the_full_one_is_not_determined():
                        truth.values['misalignment']['alpha_rad'] + [0.02, 0.02]),
      'case is turned by'),
     (lambda truth: put(truth, [Coefficient('bias', 'offset_v', 'x')],
-                       truth.values['bias']['offset_v'][:1] + 0.08), 'zero-g of x is shifted by')])
+                       truth.values['bias']['offset_v'][:1] + 0.08), 'zero-g of . is shifted by')])
 def test_recordings_that_contradict_each_other_are_refused(change, words):
     rng = np.random.default_rng(12)
     truth = drawn(rng, nominal(), TERMS)
