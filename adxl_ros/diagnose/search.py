@@ -82,10 +82,10 @@ class Hypothesis:
 
     @property
     def sizeless(self) -> frozenset[str]:
-        """Effects none of whose sizes differs from that of the baseline, by 90 % intervals."""
+        """Effects whose determined sizes all agree with the baseline, by 90 % intervals."""
         differs = np.abs(self.values) > Z_90 * self.std
-        sizes = [(name.effect, shows) for name, shows in zip(self.names, differs)
-                 if parameter_of(name).is_size]
+        sizes = [(name.effect, shows) for name, shows, is_open in zip(
+            self.names, differs, self.undetermined) if parameter_of(name).is_size and not is_open]
         return frozenset(e for e, _ in sizes) - {e for e, shows in sizes if shows}
 
     @property
