@@ -82,17 +82,17 @@ def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | 
 
     """
     source = ', '.join(recording.source for recording in recordings)
-    at_rail = at_a_rail(sensor, _joined(recordings))
+    poses = _joined(recordings)
     lines: list[str] = []
-    if at_rail.any():
-        starts_s = _joined(recordings).time_s[at_rail, 0]
+    if (at_rail := at_a_rail(sensor, poses)).any():
+        starts_s = poses.time_s[at_rail, 0]
         text = f'ADC at a rail in {len(starts_s)} poses (the first one from {starts_s[0]:.1f} s)'
         if at_rail.all():
             raise UserError(f'{source}: {text}: no other is left; check supply and wiring')
         lines = [f'{text}, left out: check supply and wiring']
         recordings = [replace(recording, poses=recording.poses.subset(
             ~at_a_rail(sensor, recording.poses))) for recording in recordings]
-    poses = _joined(recordings)
+        poses = poses.subset(~at_rail)
     if poses.has_angles.any():
         with_angles = [replace(recording, poses=recording.poses.subset(recording.poses.has_angles))
                        for recording in recordings]
