@@ -9,6 +9,8 @@ all under random signs of whole blocks (max-T; Westfall and Young 1993), because
 The functions stand for what no effect of the library describes, and for the difference between
 the form of an effect and that of a real sensor (Kennedy and O'Hagan 2001, J. R. Stat. Soc. B 63).
 Each axis has functions of its own, by dimension.
+
+The gap is stated in the unit of a user, too: an angle, a velocity, or any function.
 """
 
 from __future__ import annotations

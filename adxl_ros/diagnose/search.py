@@ -21,9 +21,9 @@ from adxl_ros.diagnose.linear_model import LinearModel, Variant
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import fitted_of, get, parameter_of, put, with_neutral
 from adxl_ros.model.constants import Z_90
-from adxl_ros.model.covariance import gauss_newton, Iterate
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.gauss_newton import gauss_newton, Iterate
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 

@@ -7,6 +7,8 @@ An id is serial number, date (UTC) and the beginning of the data's SHA-256, such
 `17-20261121T143000Z-5f3a09c1`. It names the file, so that the files of a unit sort by date. The
 files are parameter files, written as a whole and never changed. Files that people add count by
 the date inside.
+
+A file of its own beside them has the population of a fleet.
 """
 
 from __future__ import annotations
@@ -244,8 +246,8 @@ _HEAD = """\
 """Comments at the begin of the file."""
 
 
-def write(path: str | os.PathLike, population: Population, far_out: Sequence[Mapping[str, Any]]
-          ) -> None:
+def write_population(path: str | os.PathLike, population: Population,
+                     far_out: Sequence[Mapping[str, Any]]) -> None:
     """Write a population."""
     contents = {
         'format': FORMAT, 'version': package_version(),
@@ -260,7 +262,7 @@ def _rounded(value: Any) -> Any:
     return float(f'{value:.{_DIGITS}g}') if isinstance(value, float) else value
 
 
-def read(path: str | os.PathLike) -> Population:
+def read_population(path: str | os.PathLike) -> Population:
     """Read and check a population."""
     node = compose(path)
     contents = yaml.constructor.SafeConstructor().construct_document(node) if node else None

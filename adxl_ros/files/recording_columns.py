@@ -1,6 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a recording holds: samples by named column, their stamps, references, and its unit."""
+"""
+What a recording holds: samples by named column, their stamps, and references.
+
+What a stream states of its unit, as `sensor_info` and lines `# key: value` have it.
+"""
 
 from __future__ import annotations
 

@@ -176,7 +176,7 @@ def write(folder: Path) -> list[Path]:
     population = Population(POPULATION, {
         result.quantity.column: result.population.pooled for result in results
         if result.population is not None and result.population.pooled.prediction_std > 0})
-    calibration_store.write(folder / POPULATION, population, [
+    calibration_store.write_population(folder / POPULATION, population, [
         {'serial': item.serial, 'coefficient': item.quantity.column, 'value': item.value,
          'distance': item.distance} for item in distant])
     write_text(folder / UNITS, _units_csv(results, table.serials))

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers as text: the digits that intervals allow, units that people use, and lists."""
+"""
+Numbers as text: the digits that intervals allow, units that people use, and lists.
+
+Text for a terminal of 80 columns: tables, wrapped lines, commands, and coloured outcomes.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""A manoeuvre: motion of the joints of the stage, and surroundings, over time."""
+"""A manoeuvre: motion of joints and surroundings over time; and a stage that moves by commands."""
 
 from __future__ import annotations
 

@@ -1,6 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The signal chain as a call for simulators: one sample of one or many sensors at a time."""
+"""
+The signal chain as a call for simulators: one sample of one or many sensors at a time.
+
+Many sensors may be other units each, drawn from a population or around a calibrated unit.
+"""
 
 from __future__ import annotations
 
@@ -82,7 +86,8 @@ def unit_draws(sensor: Sensor, units: str | PathLike | Population) -> UnitDraws:
         size, vectors = np.linalg.eigh(sensor.covariance)
         mean, root = get(sensor, names), vectors * np.sqrt(np.maximum(size, 0.0))
     else:
-        population = units if isinstance(units, Population) else calibration_store.read(units)
+        population = units if isinstance(units, Population) else \
+            calibration_store.read_population(units)
         prior = population.prior(sensor)
         names, limit = list(prior.names), np.inf
         mean, root = prior.mean, np.diag(prior.std)

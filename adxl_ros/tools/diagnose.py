@@ -97,7 +97,7 @@ def diagnose(options: argparse.Namespace) -> int:
         if is_wrong:
             raise UserError(message)
     reading = cli.reading_options(options)
-    population = calibration_store.read(options.prior) if options.prior else None
+    population = calibration_store.read_population(options.prior) if options.prior else None
     unit = quantity(options.quantity) if options.quantity else None
     html_page.check_libraries()
     with cli.progress('reading') as show:

@@ -97,7 +97,7 @@ def fit(options: argparse.Namespace) -> int:
     if options.poses and (options.journal or len(options.recording) != 1):
         raise UserError(f'--poses {options.poses}: goes with one recording, and without --journal')
     laboratory = gum.read_laboratory(options.dcc_data)
-    population = calibration_store.read(options.prior) if options.prior else None
+    population = calibration_store.read_population(options.prior) if options.prior else None
     records = sweep_journal.poses_to_fit(sweep_journal.read(options.journal).entries) \
         if options.journal else None
     unit: Sensor | None = None

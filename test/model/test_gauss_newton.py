@@ -4,7 +4,7 @@
 
 from collections.abc import Callable
 
-from adxl_ros.model.covariance import gauss_newton, Iterate, Solution
+from adxl_ros.model.gauss_newton import gauss_newton, Iterate, Solution
 import numpy as np
 import pytest
 

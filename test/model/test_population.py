@@ -72,5 +72,5 @@ def test_a_bad_file_is_refused(tmp_path, text, words):
     path = tmp_path / 'p.yaml'
     path.write_text(text)
     with pytest.raises(UserError) as error:
-        calibration_store.read(path)
+        calibration_store.read_population(path)
     assert words in str(error.value) and str(error.value).startswith(str(path))

@@ -14,8 +14,8 @@ import math
 from typing import Any, NamedTuple
 
 from adxl_ros.model.constants import AXES, G0_MPS2
-from adxl_ros.model.covariance import gauss_newton, Iterate
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.gauss_newton import gauss_newton, Iterate
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 

@@ -4,7 +4,7 @@
 The uncertainty of the acceleration at a stated pose, as the GUM asks for it (JCGM 100).
 
 Squares of contributions add. Those of noise, coefficients, stage and model are the parts of
-`held_out.ErrorBudget`, here pose by pose.
+`held_out.ErrorBudget`, here pose by pose. A Digital Calibration Certificate carries it.
 """
 
 from __future__ import annotations

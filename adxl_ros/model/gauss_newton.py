@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Gauss-Newton iteration with step halving, which reports whether it has converged."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Generic, TypeVar
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """A model linearised about values of its coefficients."""
+
+    values: np.ndarray  # Coefficients, (p,)
+    step: np.ndarray  # Gauss-Newton step to the optimum of the linearised model, (p,)
+    cost: float  # Quantity to minimise, at the values. A constant accepts every step.
+
+
+State = TypeVar('State', bound=Iterate)
+Trial = TypeVar('Trial')
+
+
+@dataclass(frozen=True)
+class Solution(Generic[State]):
+    """Result of a Gauss-Newton iteration."""
+
+    last: State  # The last iterate that was accepted
+    # False if the iteration ended by its count of evaluations, or if no share of a step lowered
+    # the cost
+    converged: bool
+    evaluations: int  # How often the model was linearised
+
+
+def gauss_newton(linearise: Callable[[np.ndarray], State], start: np.ndarray,
+                 has_converged: Callable[[State, State | None, State], bool],
+                 max_evaluations: int, max_halvings: int = 0,
+                 cost_tolerance: float = 0.0) -> Solution[State]:
+    """
+    Iterate Gauss-Newton steps until they converge.
+
+    The caller limits the length of a step and keeps values within their bounds, both in
+    `linearise`. `scipy.optimize.least_squares` needs residuals with independent errors. Fits of
+    this package have correlated errors or maximise an evidence, and stop after few evaluations.
+
+    Parameters
+    ----------
+    linearise
+        Maps coefficients, (p,), to an iterate.
+    start
+        First values, (p,).
+    has_converged
+        Takes the first iterate, the previous one (None at the first) and the present one.
+    max_evaluations
+        Largest count of calls of `linearise`, those of halved steps included.
+    max_halvings
+        How often a step that raises the cost is halved.
+    cost_tolerance
+        A step may raise the cost by this.
+
+    Returns
+    -------
+    Solution
+        The last accepted iterate, and whether the iteration has converged.
+
+    """
+    first = present = linearise(start)
+    previous, evaluations = None, 1
+    while not has_converged(first, previous, present):
+        halvings = min(max_halvings, max_evaluations - evaluations - 1)
+        if halvings < 0:
+            return Solution(present, False, evaluations)
+        trial, accepted, trials = halve_until(
+            partial(_linearise_share, linearise, present),
+            partial(_lowers_cost, present.cost + cost_tolerance), halvings)
+        evaluations += trials
+        if not accepted:
+            return Solution(present, False, evaluations)
+        previous, present = present, trial
+    return Solution(present, True, evaluations)
+
+
+def _linearise_share(linearise: Callable[[np.ndarray], State], origin: State, share: float
+                     ) -> State:
+    return linearise(origin.values + share * origin.step)
+
+
+def _lowers_cost(highest_cost: float, trial: Iterate) -> bool:
+    # A cost of NaN passes, so that a caller sees it instead of a step that is never taken.
+    return not trial.cost > highest_cost
+
+
+def halve_until(attempt: Callable[[float], Trial], accept: Callable[[Trial], bool],
+                max_halvings: int) -> tuple[Trial, bool, int]:
+    """
+    Attempt a step, its half, its quarter and so on, until an attempt is accepted.
+
+    attempt: maps the share of the step, at most 1, to a result; returns: the last result, whether
+    it was accepted, and the count of attempts.
+    """
+    share = 1.0
+    result = attempt(share)
+    for count in range(1, max_halvings + 1):
+        if accept(result):
+            return result, True, count
+        share /= 2
+        result = attempt(share)
+    return result, accept(result), max_halvings + 1
