@@ -73,7 +73,9 @@ def show_screen(context: LaunchContext, is_here: bool) -> Action:
     """Show the screen in the terminal of the launch, or say how to show it in another one."""
     name = launch_nodes.full_name(context, 'calibration')
     if is_here:
-        return make_node(context, 'screen', {'node': name})
+        return make_node(context, 'screen', {'node': name}, on_exit=launch_nodes.end_with(
+            'the screen has ended; accepted poses are kept, and the same command resumes',
+            RESUMES))
     return LogInfo(msg='its screen, in a second terminal: ros2 run adxl_ros screen --ros-args -p '
                    f'node:={name}')
 

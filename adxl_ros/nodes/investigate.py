@@ -45,7 +45,7 @@ def opening_lines(folder: Path, limits: StageLimits, minutes: float) -> list[str
     """Return what is about to happen."""
     ranges = ', '.join(f'{joint} {low:.0f} to {high:.0f}°' for joint, (low, high) in (
         ('alpha', np.degrees(limits.alpha_rad)), ('beta', np.degrees(limits.beta_rad))))
-    return [f'Investigation into {folder}, {minutes:g} minutes at most',
+    return [f'Investigation into {folder}, manoeuvres of {minutes:g} minutes at most',
             f'Stage within {ranges}, {np.degrees(limits.rate_rad_s):.3g}°/s', '']
 
 

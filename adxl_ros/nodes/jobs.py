@@ -14,7 +14,8 @@ import subprocess
 import sys
 from tempfile import TemporaryFile
 import time
-from typing import Any
+
+from adxl_ros.report.quantities import live_bar
 
 _KILL_S = 10.0
 """Longest time that a process may take to end, s; chosen: a node ends within 1 s."""
@@ -106,30 +107,14 @@ _LINE_WIDTH = 69
 """Columns of a line without a bar, before its time."""
 
 
-def drawable() -> bool:
-    """Return whether stdout is a terminal that can draw, and rich is installed."""
-    if not sys.stdout.isatty() or os.environ.get('TERM') == 'dumb':
-        return False
-    try:
-        import rich  # noqa: F401
-    except ImportError:
-        return False
-    return True
-
-
 class LiveLine:
     """Prints lines; in a terminal that can draw, a last one shows what happens now."""
 
-    def __init__(self, columns: Sequence[str] = (), total: int = 0) -> None:
-        """Begin to draw: the text, then columns of rich's `Progress`, as its text or a bar."""
-        self._progress: Any = None
-        if drawable():
-            from rich.console import Console
-            from rich.progress import BarColumn, Progress, TextColumn
-            console = Console(file=sys.stdout, highlight=False, markup=False, emoji=False)
-            drawn = [BarColumn(_BAR_WIDTH) if text == 'bar' else TextColumn(text, markup=False)
-                     for text in ('{task.description}', *columns)]
-            self._progress = Progress(*drawn, console=console, transient=not columns)
+    def __init__(self, *columns: str | int, total: int = 0) -> None:
+        """Begin to draw: the text, then columns as of `live_bar`."""
+        self._progress = live_bar(sys.stdout, '{task.description}', *columns,
+                                  transient=not columns)
+        if self._progress is not None:
             self._task = self._progress.add_task('', total=total or None)
             self._progress.start()
 
@@ -161,8 +146,8 @@ class Step(LiveLine):
     """
 
     def __init__(self, name: str, text: str, total: int = 0) -> None:
-        bar = ('bar', '{task.percentage:3.0f} %') if total else ()
-        super().__init__((*bar, '{task.elapsed:4.0f} s'), total)
+        bar = (_BAR_WIDTH, '{task.percentage:3.0f} %') if total else ()
+        super().__init__(*bar, '{task.elapsed:4.0f} s', total=total)
         self._name, self._total, self._begin_s, self._tenth = name, total, time.monotonic(), 0
         self.show(text)
 

@@ -23,6 +23,7 @@ from launch.launch_description import LaunchDescription
 from launch.logging import get_logger
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+from launch_ros.utilities import prefix_namespace
 
 _REFUSED_START = (1, 2)
 """Exit statuses of a node that does not start; a signal ends it with 0 or a negative one."""
@@ -32,6 +33,8 @@ _REFUSALS_S = 60.0
 """Time within which failed starts count, s; chosen: three starts on a slow machine."""
 _LEAST_LIKENESS = 0.6
 """Smallest likeness of a misspelt name, by difflib; chosen: `params` is like `params_file`."""
+_PUSHED = 'ros_namespace'
+"""Where launch_ros keeps the namespace that a launch file around this one has pushed."""
 _LOG_LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
 """Log levels of rcl."""
 
@@ -140,7 +143,7 @@ def _warn_of_misspelt(context: LaunchContext, names: Sequence[str]) -> None:
 
     They are no error: a launch file that includes this one may have arguments of its own.
     """
-    for name in sorted(context.launch_configurations.keys() - set(names)):
+    for name in sorted(context.launch_configurations.keys() - {*names, _PUSHED}):
         near = difflib.get_close_matches(name, names, 1, _LEAST_LIKENESS)
         if near:
             get_logger('launch.user').warning(
@@ -151,7 +154,7 @@ def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, A
               params_file: str = '', **options: Any) -> Node:
     """Make a node of this package with the parameter file of the launch."""
     path = params_file or text(context, 'params_file')
-    namespace, name = text(context, 'namespace'), full_name(context, executable)
+    name = full_name(context, executable)
     is_named = has_section(path, name)
     if executable == 'driver' and not is_named:
         raise UserError(f'{path}: has no parameters of the node {name}; begin the file with /**: '
@@ -159,13 +162,13 @@ def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, A
     link = [argument for argument in LINK if argument.name in context.launch_configurations]
     given = {'frame_id': text(context, 'frame_id'), **given_parameters(context, link), **overrides}
     # The last argument counts. rcl takes the name of a node without its namespace.
-    node = '' if namespace.strip('/') else f'{executable}:'
+    node = f'{executable}:' if name == f'/{executable}' else ''
     rules = [part for key, value in given.items() for part in (
         '-p', f'{node}{key}:={json.dumps(value, ensure_ascii=False)}')]
     options.setdefault('output', 'screen')
     # The nominal sensor is what a node without a file has; a file would name it for any stream.
     is_named &= path != str(parameter_file.nominal_path())
-    return Node(package='adxl_ros', executable=executable, namespace=namespace,
+    return Node(package='adxl_ros', executable=executable, namespace=text(context, 'namespace'),
                 ros_arguments=[*_enclave(context, executable),
                                '--log-level', text(context, 'log_level'),
                                *(['--params-file', path] if is_named else []), *rules], **options)
@@ -214,7 +217,9 @@ def given_parameters(context: LaunchContext, arguments: Sequence[Argument]) -> d
 
 def full_name(context: LaunchContext, name: str) -> str:
     """Return the fully qualified name of a node or topic."""
-    return '/'.join(('', *filter(None, text(context, 'namespace').split('/')), name))
+    namespace = prefix_namespace(context.launch_configurations.get(_PUSHED),
+                                 text(context, 'namespace')) or ''
+    return '/'.join(('', *filter(None, namespace.split('/')), name))
 
 
 def given_anywhere(context: LaunchContext, parameter: str, executable: str) -> str:

@@ -254,7 +254,7 @@ class Screen(Node):
         if self._node_pid:
             return
         if self._is_fresh():
-            print(f'{self._target} goes on; show it again: ros2 run adxl_ros screen')
+            print(f'while {self._target} runs, show it again: ros2 run adxl_ros screen')
         elif self._contents.outcome:
             # The screen is gone, and its last lines with it.
             print(f'{self._contents.outcome[0]}\n{self._contents.text}')
@@ -317,11 +317,15 @@ class Screen(Node):
             os.kill(self._node_pid, signal.SIGINT)
 
     def _on_display(self, message: String) -> None:
+        before = self._contents.phase
         try:
             self._contents = ScreenContents.from_json(message.data)
         except ValueError:
             self._contents = ScreenContents(
                 'refused', f'{self._target} is of another version of adxl_ros; update both')
+        if self._contents.phase != before:
+            # A launch prints lines of its own into this terminal: draw all, not what is new.
+            self._application.renderer.clear()
         self._received_s = time.monotonic()
 
     def _on_log(self, message: Log) -> None:

@@ -13,7 +13,7 @@ import os
 import re
 import sys
 import textwrap
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TextIO
 
 from adxl_ros.model.constants import G0_MPS2
 import numpy as np
@@ -259,6 +259,27 @@ def command_lines(text: str, start: str) -> list[str]:
                           break_long_words=False, break_on_hyphens=False)
     *first, last = [line.replace(_NO_BREAK, ' ') for line in lines]
     return [*(f'{line} \\' for line in first), last]
+
+
+def live_bar(stream: TextIO, *columns: str | int, transient: bool = True) -> Any:
+    """
+    Return rich's `Progress` on a stream; None without rich, or where nothing can be drawn.
+
+    columns: a number is a bar of that width, `elapsed` and `remaining` are times, and others are
+    texts of rich's `TextColumn`.
+    """
+    if not stream.isatty() or os.environ.get('TERM') == 'dumb':
+        return None
+    try:
+        from rich import console, progress
+    except ImportError:
+        return None
+    times = {'elapsed': progress.TimeElapsedColumn, 'remaining': progress.TimeRemainingColumn}
+    drawn = [progress.BarColumn(column) if isinstance(column, int) else times[column]()
+             if column in times else progress.TextColumn(column, markup=False)
+             for column in columns]
+    screen = console.Console(file=stream, highlight=False, markup=False, emoji=False)
+    return progress.Progress(*drawn, console=screen, transient=transient)
 
 
 def coloured(line: str) -> str:

@@ -34,7 +34,14 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Effect
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import ended_by_closed_output, package_version
-from adxl_ros.report.quantities import column_unit, COLUMNS, end_lines, entry_list, NextStep
+from adxl_ros.report.quantities import (
+    column_unit,
+    COLUMNS,
+    end_lines,
+    entry_list,
+    live_bar,
+    NextStep,
+)
 import numpy as np
 
 if TYPE_CHECKING:
@@ -317,17 +324,12 @@ class ShowDone(Protocol):
 @contextmanager
 def progress(title: str) -> Iterator[ShowDone]:
     """Show a progress bar on a terminal where rich is installed, else nothing."""
-    try:
-        from rich import console, progress as bars
-    except ImportError:
+    bar = live_bar(sys.stderr, '{task.description}', _BAR_COLUMNS, '{task.percentage:3.0f} %',
+                   'elapsed', 'remaining')
+    if bar is None:
         yield lambda done, stage='': None
         return
-    screen = console.Console(stderr=True)
-    columns = (bars.TextColumn('{task.description}'), bars.BarColumn(_BAR_COLUMNS),
-               bars.TextColumn('{task.percentage:3.0f} %'), bars.TimeElapsedColumn(),
-               bars.TimeRemainingColumn())
-    with bars.Progress(*columns, console=screen, transient=True,
-                       disable=not screen.is_terminal) as bar:
+    with bar:
         task = bar.add_task(title, total=1.0)
 
         def show(done: float, stage: str = '') -> None:

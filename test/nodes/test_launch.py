@@ -153,14 +153,16 @@ def test_the_launch_of_a_calibration_ends_with_it(launch, tmp_path, output, stat
         assert 'calibration-3 has ended with the status 1' in launched.output()
 
 
-def test_a_launch_shows_the_screen_in_its_terminal(ros_env, tmp_path):
+@pytest.mark.parametrize('key, words', [('q', 'same command resumes'), ('', 'wrote unit.yaml')])
+def test_a_launch_shows_the_screen_in_its_terminal(ros_env, tmp_path, key, words):
     seen = Terminal([shutil.which('ros2'), 'launch', 'adxl_ros', 'calibrate.launch.py',
                      'output:=unit.yaml', 'screen:=true', 'speed:=20',
                      'sweep_planes_deg:=30,60,90', 'sweep_step_deg:=60', 'sweep_dwell_s:=1',
                      'sweep_check_poses:=3'], ros_env, tmp_path)
     seen.wait_for('redo', timeout_s=60)
     assert '[INFO]' not in seen.text()
+    seen.press(key)
     assert seen.wait(120) == 0
-    assert parameter_file.load(tmp_path / 'unit.yaml').model != 'nominal'
-    seen.wait_for('wrote unit.yaml')
+    seen.wait_for(words)
+    assert key or parameter_file.load(tmp_path / 'unit.yaml').model != 'nominal'
     assert 'Traceback' not in seen.raw.decode()

@@ -67,7 +67,7 @@ def test_a_screen_drives_the_sweep_of_a_node_without_a_terminal(start, screen, t
     seen.press('q')
     assert seen.wait() == 0
     assert seen.restored()
-    assert '/calibration goes on; show it again: ros2 run adxl_ros screen' in seen.text()
+    assert 'while /calibration runs, show it again: ros2 run adxl_ros screen' in seen.text()
     _, entries = sweep_journal.read(tmp_path / 'unit.yaml.journal')
     poses = sweep_journal.accepted_poses(entries)
     # The screen causes no loss: every pose has all samples.
