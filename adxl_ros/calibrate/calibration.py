@@ -113,8 +113,7 @@ def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | 
         span_s = sum(float(np.ptp(recording.poses.time_s)) for recording in recordings)
         result = _against_gravity(sensor, poses, source, span_s, data_sha256, population)
     lines += _turn_on_lines(result.fitted, [recording.poses for recording in recordings])
-    return replace(result, warnings=(*result.warnings, *lines),
-                   report_lines=[*result.report_lines, *lines])
+    return replace(result, warnings=(*result.warnings, *lines))
 
 
 @dataclass(frozen=True)
@@ -160,13 +159,13 @@ def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: s
         'residual_mg': f'{np.sqrt(np.mean(residual_mg ** 2)):.4f}',
         **({'converged': 'yes' if full.converged else 'no'} if full else {}),
         **acceptance.provenance_entries(assessment, errors)})
-    explanation = acceptance.explanation(assessment, fitted) if assessment else []
+    summary = acceptance.summary_lines(
+        fitted, assessment, acceptance.held_out_lines(errors, len(poses) - len(outliers)))
+    budget = acceptance.budget_lines(assessment) if assessment else []
     return CalibrationResult(
-        nominal=sensor, fitted=fitted, poses=poses, assessments=assessments,
+        nominal=sensor, fitted=fitted, summary=summary, poses=poses, assessments=assessments,
         held_out=errors, outliers=outliers, warnings=[*warnings, *fit.notes],
-        report_lines=[*acceptance.headline(assessment, errors), *acceptance.unit_line(fitted),
-                      *acceptance.error_table(errors, assessments), *explanation, *fit_lines,
-                      *fit.notes])
+        details=[*budget, *fit_lines])
 
 
 def _with_population(fit: _StageFit, population: Population) -> _StageFit:
@@ -352,13 +351,11 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, d
         'residual_mg': f'{after:.4f}', 'held_out_mg': f'{unseen:.4f}', 'span_s': f'{span_s:.1f}',
         'converged': 'yes' if fit.converged else 'no',
         **acceptance.provenance_entries(assessment, ())})
-    lines = [*acceptance.headline(assessment, ()),
-             *acceptance.gravity_lines(fit, poses.time_s[:, 0]),
-             *acceptance.explanation(assessment, fitted), *acceptance.unit_line(fitted),
-             *warnings]
+    summary = acceptance.summary_lines(
+        fitted, assessment, acceptance.gravity_lines(fit, poses.time_s[:, 0]))
     return CalibrationResult(
-        nominal=sensor, fitted=fitted, poses=poses, assessments=(assessment,), gravity_fit=fit,
-        warnings=warnings, report_lines=lines)
+        nominal=sensor, fitted=fitted, summary=summary, poses=poses, assessments=(assessment,),
+        gravity_fit=fit, warnings=warnings, details=acceptance.budget_lines(assessment))
 
 
 def _turn_on_lines(fitted: Sensor, recordings: Sequence[Poses]) -> list[str]:
@@ -411,7 +408,7 @@ def calibrate_thermal(base: Sensor, poses: Poses, source: str, data_sha256: str 
         f'zero-g stays as calibrated at {calibrated_c:.1f} °C']
     if not has_scale:
         lines.append('scale factor over temperature: not fitted, it needs a second orientation')
-    return CalibrationResult(nominal=base, fitted=fitted, poses=poses, report_lines=lines)
+    return CalibrationResult(nominal=base, fitted=fitted, summary=lines, poses=poses)
 
 
 def _slope_lines(fitted: Sensor, fit: thermal_fit.ThermalFit) -> list[str]:

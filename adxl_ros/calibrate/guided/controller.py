@@ -438,7 +438,7 @@ class Controller:
             return False
         for line in result.comments():
             self._outputs.log(Severity.INFO, line)
-        self.outcome = tuple(result.report_lines)
+        self.outcome = (result.summary[0].strip(), *result.summary[1:], *result.warnings)
         self._outputs.log(Severity.INFO, self.outcome[0])
         open_poses = session.guide.open_poses
         advice = f'; {open_poses} poses are open: start again to go on' if open_poses else ''
