@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -206,25 +207,22 @@ def _richest_fit(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str
     fits: dict[str, Callable[[], _StageFit]] = {
         'full': lambda: _fit_full(sensor, poses, recordings, effects),
         'physical': lambda: _StageFit(linear.fit_physical(sensor, poses), linear.fit_physical),
-        'affine': lambda: _fit_affine(sensor, poses),
         'linear': lambda: _fit_linear(sensor, poses, population)}
     if model:
         return fits[model]()
-    if sensor.axes != AXES or effects:
-        del fits['affine']
     refusals: list[str] = []
-    *richer, simplest = fits
-    for name in richer:
+    for name in ('full', 'physical'):
         try:
-            fit = fits[name]()
-            # The fit of the twelve coefficients states for itself what is open.
-            return fit if name == 'affine' else replace(fit, notes=refusals)
+            return replace(fits[name](), notes=refusals)
         except _ContradictionError:
             raise
         except UserError as error:
-            if name != 'affine':
-                refusals.append(f'not {name}: {error}')
-    return replace(fits[simplest](), notes=refusals)
+            refusals.append(f'not {name}: {error}')
+    if sensor.axes == AXES and not effects:
+        # The fit of the twelve coefficients states for itself what is open.
+        with suppress(UserError):
+            return _fit_affine(sensor, poses)
+    return replace(fits['linear'](), notes=refusals)
 
 
 def _fit_full(sensor: Sensor, poses: Poses, recordings: Sequence[RecordedPoses],
