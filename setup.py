@@ -17,9 +17,12 @@ def requirements(name: str) -> list[str]:
     return [line for line in lines if line and not line.startswith('#')]
 
 
-def scripts(package: str, names: tuple[str, ...]) -> list[str]:
-    """Name the executables whose modules in `package` have a main()."""
-    return [f'{name} = {PACKAGE}.{package}.{name}:main' for name in names]
+def executables(package: str, end: str = '') -> list[str]:
+    """Make an executable of each module in a package that has a main(); `end` of its name goes."""
+    modules = sorted(Path(__file__).resolve().parent.joinpath(*package.split('.')).glob(
+        f'*{end}.py'))
+    return [f'{path.stem.removesuffix(end)} = {package}.{path.stem}:main' for path in modules
+            if '\ndef main(' in path.read_text(encoding='utf-8')]
 
 
 setup(
@@ -53,12 +56,7 @@ setup(
     license='Apache-2.0',
     entry_points={
         'console_scripts': [
-            *scripts('nodes', ('driver', 'stage', 'calibration', 'screen', 'compensation',
-                               'investigate', 'monitor', 'demo')),
-            *scripts('tools', ('simulate', 'fit', 'apply', 'noise', 'check', 'diagnose', 'export',
-                               'fleet')),
-            *(f'{name} = {PACKAGE}_validation.{name}_command:main'
-              for name in ('bench', 'blind', 'reproduce')),
-        ],
+            *executables(f'{PACKAGE}.nodes'), *executables(f'{PACKAGE}.tools'),
+            *executables(f'{PACKAGE}_validation', '_command')],
     },
 )

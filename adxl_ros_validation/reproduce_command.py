@@ -89,7 +89,7 @@ def _of_recordings(sensor: Sensor, paths: Sequence[str], folder: Path) -> _Repro
     paper = f'The paper: alpha {in_words("alpha")}; beta {in_words("beta")}.'
     page = (f"# The paper's calibration of {', '.join(paths)}\n\n```\n{lines}\n```\n\n{paper}\n\n"
             f'## Figures\n\n![Figures 2 to 8]({FIGURES}/sweep.png)\n')
-    return page, [*acceptance.error_table(result.held_out), f' {paper}']
+    return page, [*acceptance.screen_table(result.held_out), f' {paper}']
 
 
 def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> _Reproduction:

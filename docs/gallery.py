@@ -9,6 +9,7 @@ import sys
 from adxl_ros.files import parameter_file
 from adxl_ros.model.coefficients import put, typical
 from adxl_ros.model.constants import AXES
+from adxl_ros.model.diagnosis_hints import Manoeuvre
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Coefficient, Effect, Need
 from adxl_ros.model.sensor import Sensor, with_axes
@@ -115,16 +116,13 @@ CARRIED = Motion(4.0, force=ForcePath(CARRIED_S, 9.80665 * np.column_stack([
     0.3 * np.sin(3 * CARRIED_S) + 0.02 * np.sin(50 * CARRIED_S), np.ones(len(CARRIED_S))])))
 OVER_TIME = Scene(REST, noisy=True, axes='x')
 SCENES = {
-    'misalignment': plane(90), 'cross_axis_z': TILTING, 'scale_factor_z': plane(30),
-    'scale_factor_cross': plane(90),
+    'cross_axis_z': TILTING, 'scale_factor_z': plane(30),
     'gravity': plane(45, 'xyz'), 'base_tilt': plane(90, 'xyz'), 'stage_offset': plane(45, 'xyz'),
     'saturation': Scene(turning(90), 'beta_rad', 'beta at alpha = 90°, deg', 180 / np.pi),
     'lever_arm': Scene(SWING), 'time_offset': Scene(SWING), 'bandwidth': Scene(SWING),
-    'clock_skew': Scene(turning(90, 120.0)), 'mount_resonance': Scene(SHAKE, axes='x'),
-    'vibration_rectification': Scene(SHAKE, axes='x'), 'temperature_bias': Scene(WARM),
-    'temperature_scale': Scene(WARM), 'warm_up': Scene(WARM), 'thermal_lag': Scene(WARM),
+    'clock_skew': Scene(turning(90, 120.0)),
     'thermal_hysteresis': Scene(CYCLE, 'temperature_c', 'temperature, °C'),
-    'supply': Scene(SUPPLY), 'reference_filter': Scene(CARRIED),
+    'reference_filter': Scene(CARRIED),
     'joint_offset': Scene(SWUNG), 'flexible_link': Scene(SWUNG),
     'reference_delay': Scene(CARRIED), 'reference_frame': Scene(CARRIED),
     'bias_walk': Scene(replace(REST, duration_s=1200.0)), 'spikes': replace(
@@ -134,6 +132,10 @@ SCENES = {
                                                                          kind='spectrum'),
     'noise_excess': replace(OVER_TIME, kind='spectrum'),
     'quantisation': replace(OVER_TIME, kind='codes')}
+SCENES_BY_MANOEUVRE = {
+    Manoeuvre.HEAT: Scene(WARM), Manoeuvre.SUPPLY: Scene(SUPPLY),
+    Manoeuvre.SHAKE: Scene(SHAKE, axes='x')}
+"""Scenes of other effects by the manoeuvre that reveals them; `plane(90)` for the rest."""
 LOUDER = {Coefficient('stuck', 'rate_hz'): 1.0, Coefficient('stuck', 'duration_s'): 0.2,
           **{Coefficient('saturation', 'limit_g', axis): 0.9 for axis in AXES},
           Coefficient('clock_skew', 'ratio'): 1e-3,
@@ -152,7 +154,8 @@ def main(output: Path) -> None:
 
 def draw(nominal: Sensor, effect: Effect, path: Path) -> None:
     """Draw one effect."""
-    scene = SCENES.get(effect.name, plane(90))
+    scene = SCENES.get(effect.name) or SCENES_BY_MANOEUVRE.get(
+        effect.diagnosis.revealed_by, plane(90))
     sensor = nominal if scene.noisy else replace(
         nominal, noise_density_g_per_rthz=np.zeros(3),
         adc_bits=nominal.adc_bits if Need.ADC in effect.needs else 0)

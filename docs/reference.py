@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator
 import dataclasses
 import html
 import importlib
+from importlib.metadata import entry_points
 import inspect
 import json
 import math
@@ -23,14 +24,15 @@ import tempfile
 from typing import Any
 
 from adxl_ros.files import parameter_file
+from adxl_ros.files.column_mapping import UNITS
 from adxl_ros.fleet.row import COLUMNS
 from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor
 
 DOCS = Path(__file__).resolve().parent
 MADE = '<!-- Made by `make reference`: change the package, not this page. -->'
-TOOLS = ('simulate', 'fit', 'apply', 'check', 'noise', 'diagnose', 'export', 'fleet', 'blind',
-         'reproduce')
+TOOLS = sorted({point.name for point in entry_points(group='console_scripts') if point.module
+                .startswith(('adxl_ros.tools.', 'adxl_ros_validation.'))} - {'bench'})
 NODES = ('driver', 'compensation', 'calibration', 'stage', 'monitor', 'investigate', 'screen')
 PICTURED = {'stuck': '`rate_hz` = 1, `duration_s` = 0.2', 'saturation': '`limit_g` = 0.9',
             'clock_skew': '`ratio` = 0.001', 'mount_resonance': '`frequency_hz` = 25'}
@@ -326,7 +328,8 @@ def documented_classes() -> Iterator[str]:
 
 def figures() -> dict[Path, str]:
     """Return the pages with figures between marks, as the measurements have them now."""
-    made = {'demo': demo_table(), 'working cases': working_cases(), 'hand held': hand_held()}
+    made = {'demo': demo_table(), 'working cases': working_cases(), 'hand held': hand_held(),
+            'units': units()}
     pages = {}
     for path in [DOCS.parent / 'README.md', *DOCS.glob('*/*.md')]:
         text = path.read_text('utf-8')
@@ -360,6 +363,14 @@ def working_cases() -> list[str]:
             and not line.startswith(('tracebacks', 'no verdict', '0.'))]
     return [f'`{command}`, {date}; {", ".join(remarks)}. In brackets 90 % intervals.',
             *table('verdict | share | cases', rows)[:-1]]
+
+
+def units() -> list[str]:
+    """Return the names of units by quantity, that of the package first."""
+    rows = [(quantity.name.lower(), ', '.join(
+        f'`{name}`' for name in sorted(names, key=lambda name: name != quantity.value)))
+        for quantity, names in UNITS.items()]
+    return table('quantity | units, that of the package first', rows)[:-1]
 
 
 def hand_held() -> list[str]:

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -112,8 +113,7 @@ def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | 
         span_s = sum(float(np.ptp(recording.poses.time_s)) for recording in recordings)
         result = _against_gravity(sensor, poses, source, span_s, data_sha256, population)
     lines += _turn_on_lines(result.fitted, [recording.poses for recording in recordings])
-    return replace(result, warnings=(*result.warnings, *lines),
-                   report_lines=[*result.report_lines, *lines])
+    return replace(result, warnings=(*result.warnings, *lines))
 
 
 @dataclass(frozen=True)
@@ -159,13 +159,13 @@ def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: s
         'residual_mg': f'{np.sqrt(np.mean(residual_mg ** 2)):.4f}',
         **({'converged': 'yes' if full.converged else 'no'} if full else {}),
         **acceptance.provenance_entries(assessment, errors)})
-    explanation = acceptance.explanation(assessment, fitted) if assessment else []
+    summary = acceptance.summary_lines(
+        fitted, assessment, acceptance.held_out_lines(errors, len(poses) - len(outliers)))
+    budget = acceptance.budget_lines(assessment) if assessment else []
     return CalibrationResult(
-        nominal=sensor, fitted=fitted, poses=poses, assessments=assessments,
+        nominal=sensor, fitted=fitted, summary=summary, poses=poses, assessments=assessments,
         held_out=errors, outliers=outliers, warnings=[*warnings, *fit.notes],
-        report_lines=[*acceptance.headline(assessment, errors), *acceptance.unit_line(fitted),
-                      *acceptance.error_table(errors, assessments), *explanation, *fit_lines,
-                      *fit.notes])
+        details=[*budget, *fit_lines])
 
 
 def _check_polarity(sensor: Sensor, poses: Poses) -> None:
@@ -220,25 +220,22 @@ def _richest_fit(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str
     fits: dict[str, Callable[[], _StageFit]] = {
         'full': lambda: _fit_full(sensor, poses, recordings, effects),
         'physical': lambda: _StageFit(linear.fit_physical(sensor, poses), linear.fit_physical),
-        'affine': lambda: _fit_affine(sensor, poses),
         'linear': lambda: _fit_linear(sensor, poses, population)}
     if model:
         return fits[model]()
-    if sensor.axes != AXES or effects:
-        del fits['affine']
     refusals: list[str] = []
-    *richer, simplest = fits
-    for name in richer:
+    for name in ('full', 'physical'):
         try:
-            fit = fits[name]()
-            # The fit of the twelve coefficients states for itself what is open.
-            return fit if name == 'affine' else replace(fit, notes=refusals)
+            return replace(fits[name](), notes=refusals)
         except _ContradictionError:
             raise
         except UserError as error:
-            if name != 'affine':
-                refusals.append(f'not {name}: {error}')
-    return replace(fits[simplest](), notes=refusals)
+            refusals.append(f'not {name}: {error}')
+    if sensor.axes == AXES and not effects:
+        # The fit of the twelve coefficients states for itself what is open.
+        with suppress(UserError):
+            return _fit_affine(sensor, poses)
+    return replace(fits['linear'](), notes=refusals)
 
 
 def _fit_full(sensor: Sensor, poses: Poses, recordings: Sequence[RecordedPoses],
@@ -365,13 +362,11 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, d
         'residual_mg': f'{after:.4f}', 'held_out_mg': f'{unseen:.4f}', 'span_s': f'{span_s:.1f}',
         'converged': 'yes' if fit.converged else 'no',
         **acceptance.provenance_entries(assessment, ())})
-    lines = [*acceptance.headline(assessment, ()),
-             *acceptance.gravity_lines(fit, poses.time_s[:, 0]),
-             *acceptance.explanation(assessment, fitted), *acceptance.unit_line(fitted),
-             *warnings]
+    summary = acceptance.summary_lines(
+        fitted, assessment, acceptance.gravity_lines(fit, poses.time_s[:, 0]))
     return CalibrationResult(
-        nominal=sensor, fitted=fitted, poses=poses, assessments=(assessment,), gravity_fit=fit,
-        warnings=warnings, report_lines=lines)
+        nominal=sensor, fitted=fitted, summary=summary, poses=poses, assessments=(assessment,),
+        gravity_fit=fit, warnings=warnings, details=acceptance.budget_lines(assessment))
 
 
 def _turn_on_lines(fitted: Sensor, recordings: Sequence[Poses]) -> list[str]:
@@ -424,7 +419,7 @@ def calibrate_thermal(base: Sensor, poses: Poses, source: str, data_sha256: str 
         f'zero-g stays as calibrated at {calibrated_c:.1f} °C']
     if not has_scale:
         lines.append('scale factor over temperature: not fitted, it needs a second orientation')
-    return CalibrationResult(nominal=base, fitted=fitted, poses=poses, report_lines=lines)
+    return CalibrationResult(nominal=base, fitted=fitted, summary=lines, poses=poses)
 
 
 def _slope_lines(fitted: Sensor, fit: thermal_fit.ThermalFit) -> list[str]:

@@ -46,8 +46,7 @@ class CalibrationResult:
     # nominal, fitted: The unit before and after the fit
     nominal: Sensor
     fitted: Sensor
-    # Errors, acceptance and fit as text, the most important lines first
-    report_lines: Sequence[str]
+    summary: Sequence[str]  # Verdict, errors and limits as text
     poses: Poses  # k poses, check poses among them
     # Acceptance of each model; the last one is that of `fitted`
     assessments: tuple[Assessment, ...] = ()
@@ -57,6 +56,12 @@ class CalibrationResult:
     outliers: tuple[int, ...] = ()  # Indices of the outliers, which the fit leaves out
     # What is wrong with the poses or the fit, and why no richer model was fitted
     warnings: Sequence[str] = ()
+    details: Sequence[str] = ()  # What else the fit shows, as text
+
+    @property
+    def report_lines(self) -> list[str]:
+        """Return all lines, the most important first."""
+        return [*self.summary, *self.warnings, *self.details]
 
     def comments(self) -> list[str]:
         """Return coefficients and assessment as text: the head of the parameter file."""

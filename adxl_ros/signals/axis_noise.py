@@ -17,7 +17,7 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals import noise_parameters
 from adxl_ros.signals.allan_deviation import longest_rest, StillStretch
 from adxl_ros.signals.noise_parameters import Drift, Estimate, NoiseFit
-from adxl_ros.signals.recorded_sensor import load_sensor
+from adxl_ros.signals.recorded_sensor import load_sensor, RESISTANCE_OHM
 import numpy as np
 
 TERMS = ('white', 'instability', 'walk')
@@ -31,9 +31,6 @@ _DITHERED_STEPS = 0.6
 of the rounding error (Widrow and Kollár 2008, section 4.4)."""
 _DENSITY = 'noise_density_g_per_rthz'
 """Field of a sensor that holds its white noise."""
-_FILTER_OHM = 1.0e4
-"""Resistance of the filter that stands for an unknown one, Ω. Chosen: only the product with the
-capacitor matters."""
 
 
 @dataclass(frozen=True)
@@ -181,8 +178,8 @@ def with_noise(sensor: Sensor, noises: list[AxisNoise]) -> Sensor:
             density = np.where(low[0] > 0, np.hypot(density, rounding), density)
         changed |= {_DENSITY: density, 'unstated': ()}
     if 'rc_capacitance_f' in sensor.unstated:
-        changed |= {'rc_resistance_ohm': _FILTER_OHM,
-                    'rc_capacitance_f': _filter_s(noises, sensor.rate_hz) / _FILTER_OHM}
+        changed |= {'rc_resistance_ohm': RESISTANCE_OHM,
+                    'rc_capacitance_f': _filter_s(noises, sensor.rate_hz) / RESISTANCE_OHM}
     return replace(sensor, **changed)
 
 

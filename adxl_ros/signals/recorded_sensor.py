@@ -86,7 +86,7 @@ _FILTER_START_SAMPLES = 2.0
 is much faster does not show, and one that is slower is reached from there."""
 _MAX_NOISE_G_PER_RTHZ = 0.1
 """Largest density of a parameter file, g/√Hz."""
-_RESISTANCE_OHM = 1.0e4
+RESISTANCE_OHM = 1.0e4
 """Resistor that a measured filter is written with, Ω: only its product with C has a meaning."""
 
 
@@ -122,8 +122,8 @@ def _measured(unit: Sensor, time_s: np.ndarray, volts: np.ndarray, where: str = 
     bandwidth_hz = 0.25 / rc_s if rc_s else unit.rate_hz / 2
     values = {'noise_density_g_per_rthz': np.minimum(noise_g / np.sqrt(bandwidth_hz),
                                                      _MAX_NOISE_G_PER_RTHZ),
-              'range_g': range_g, 'rc_resistance_ohm': _RESISTANCE_OHM,
-              'rc_capacitance_f': rc_s / _RESISTANCE_OHM}
+              'range_g': range_g, 'rc_resistance_ohm': RESISTANCE_OHM,
+              'rc_capacitance_f': rc_s / RESISTANCE_OHM}
     lines = []
     if 'noise_density_g_per_rthz' in unit.unstated:
         lines.append('noise of a sample: ' + _by_axis(unit, noise_g))

@@ -11,7 +11,7 @@ from pathlib import Path
 from adxl_ros.calibrate import calibration, pose_extraction
 from adxl_ros.calibrate.fits import thermal_fit
 from adxl_ros.calibrate.poses import Poses, with_table_angles
-from adxl_ros.calibrate.report import acceptance, gum, page
+from adxl_ros.calibrate.report import gum, page
 from adxl_ros.calibrate.report.coefficients import errors_in_words
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, sweep_journal
@@ -32,12 +32,6 @@ _EXAMPLES = {
     'a further effect': 'sweep.csv --effect temperature_bias -o unit.yaml',
 }
 """Examples of arguments, by their purpose."""
-_LIMITS = {
-    'noise': 'the noise of the means; longer rests reduce it',
-    'stage': 'the angles of the stage; further poses reduce it',
-    'model': 'the model, which does not have the form of this unit',
-    'stage or model': 'the stage or the model; poses that are visited twice separate them'}
-"""What limits a calibration, and what helps, by cause."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -136,7 +130,7 @@ def fit(options: argparse.Namespace) -> int:
                                        population) \
             if thermal is None else calibration.calibrate_thermal(
                 with_axes(base, unit.axes), thermal, Path(options.recording[0]).name, sha)
-        result = replace(result, report_lines=[*result.report_lines, *measured])
+        result = replace(result, details=[*result.details, *measured])
         if options.dcc:
             gum.write(options.dcc, result, laboratory)
         if options.report:
@@ -147,8 +141,7 @@ def fit(options: argparse.Namespace) -> int:
     cli.note(f'fit: {result.keep(options.store)}')
     report = [Path(options.report) / name for name in page.FILES] if options.report else []
     report += [Path(options.dcc)] if options.dcc else []
-    lines = [errors_in_words(result.fitted), '', *_result_lines(result)] if thermal is None else \
-        [*result.report_lines, '']
+    lines = [*(_head(result) if thermal is None else ()), *result.summary, *result.warnings]
     cli.print_end([*lines, *measured, ''], [options.output, *report], cli.command(
         'apply', f'{cli.quoted(options.recording[0])}{cli.reading_text(options)} --params '
         f'{cli.quoted(options.output)} -o tilt.csv'))
@@ -176,24 +169,12 @@ def _report_range(read: Recording, unit: Sensor) -> None:
         cli.note(f'fit: {read.path}: {text}')
 
 
-def _result_lines(result: calibration.CalibrationResult) -> list[str]:
-    """Return verdict, errors and limits; the file and the page hold everything else."""
+def _head(result: calibration.CalibrationResult) -> list[str]:
+    """Return what was wrong with the unit, and what is fitted."""
     fitted = result.fitted
-    lines = [f'{fitted.serial}: {fitted.model} model of {len(result.inliers)} poses, '
-             f'{len(fitted.covariance_names)} coefficients', '',
-             *acceptance.acceptance_lines(fitted)]
-    if result.held_out:
-        count = result.held_out[-1].pose_count
-        folds = ': a fifth is left out at a time' if count >= len(result.inliers) else ''
-        lines += ['', f' on {count} poses that the fit has not seen{folds}',
-                  *acceptance.screen_table(result.held_out)]
-    elif result.gravity_fit is not None:
-        lines += ['', *acceptance.gravity_lines(result.gravity_fit, result.poses.time_s[:, 0])]
-    if result.assessments:
-        assessment = result.assessments[-1]
-        lines += ['', *acceptance.limit_table(assessment, fitted),
-                  f' limited by               {_LIMITS[assessment.limited_by]}']
-    return lines + [*acceptance.unit_line(fitted), *result.warnings]
+    return [errors_in_words(fitted), '',
+            f'{fitted.serial}: {fitted.model} model of {result.inliers.sum()} poses, '
+            f'{len(fitted.covariance_names)} coefficients', '']
 
 
 def main() -> int:

@@ -11,7 +11,7 @@ import shlex
 import subprocess
 
 from adxl_ros.files import parameter_file
-from processes import REPO, run_executable
+from processes import REPO, run_executable, TOOLS
 import pytest
 import rclpy
 from rclpy.context import Context
@@ -22,8 +22,6 @@ BY_HAND = [page for page in PAGES if 'measurements' not in page.parts
            and 'Made by `make reference`' not in page.read_text('utf-8')]
 MOST_WORDS = 24_000
 """Words of the pages by hand: what they have more, somebody has to read and to keep true."""
-TOOLS = ('simulate', 'fit', 'apply', 'check', 'noise', 'diagnose', 'export', 'fleet', 'blind',
-         'reproduce', 'demo', 'bench')
 NODES = ('driver', 'compensation', 'calibration', 'stage', 'monitor', 'investigate', 'screen')
 OPTIONS_OF_ALL = {'--help', '--version', '--ros-args'}
 
@@ -82,7 +80,8 @@ def test_an_argument_that_ros_does_not_parse() -> None:
 def helps(made_once: Callable) -> dict[str, str]:
     """Return the help of each executable."""
     def fill(folder: Path) -> None:
-        texts = {name: run_executable(name, '--help').stdout for name in TOOLS + NODES}
+        texts = {name: run_executable(name, '--help').stdout
+                 for name in (*TOOLS, *NODES, 'demo', 'bench')}
         (folder / 'helps.json').write_text(json.dumps(texts))
 
     return json.loads((made_once('helps', fill) / 'helps.json').read_text())

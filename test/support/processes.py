@@ -24,6 +24,9 @@ REPO = Path(__file__).resolve().parents[2]
 """The root of the repository."""
 NEEDS_ROS2 = pytest.mark.skipif(shutil.which('ros2') is None, reason='no ros2 and launch: they '
                                 'have no wheels; source a ROS 2 Jazzy')
+TOOLS = sorted({point.name for point in entry_points(group='console_scripts') if point.module
+                .startswith(('adxl_ros.tools.', 'adxl_ros_validation.'))} - {'bench'})
+"""The command-line tools, as they are installed."""
 PATIENCE = 5
 """How many times longer than on a quiet machine any action may take on a busy one."""
 

@@ -10,12 +10,10 @@ import subprocess
 import sys
 
 from adxl_ros.model.effects import library
-from processes import executable, run_executable, run_in_process
+from processes import executable, run_executable, run_in_process, TOOLS
 import pytest
 from terminal import Terminal
 
-TOOLS = ('apply', 'blind', 'check', 'diagnose', 'export', 'fit', 'fleet', 'noise', 'reproduce',
-         'simulate')
 COLUMNS = 79
 COLOUR = '\x1b['
 

@@ -3,7 +3,7 @@
 """
 Selection of the full model's terms by Bayes factors.
 
-- Report of a full fit as lines of text: stage, outliers, weakest direction, terms.
+- Report of a full fit as lines of text: stage, weakest direction, terms; and its warnings.
 
 A Bayes factor is the ratio of the marginal likelihoods of the poses with a term and without it.
 Coefficients are integrated over their priors, and both models have the stage error of the richer
@@ -199,11 +199,10 @@ _MIN_PART = 0.2
 
 
 def report_lines(full: full_model.FullFit, poses: Poses, terms: Sequence[Term]) -> list[str]:
-    """Report the stage, the outliers, the weakest direction and the terms of a fit of poses."""
+    """Report the stage, the weakest direction and the terms of a fit of poses."""
     next_poses = full_model.next_poses(full.unit, poses, full.names, full.stage)
     return [
         *_stage_lines(full),
-        *warnings(full, poses),
         _weakest_direction(full.fitted),
         f'next poses that would help most, (alpha, beta) in deg: {next_poses}',
         *(['log Bayes factor of each term, nats; above 0 the poses support it:'] if terms else []),

@@ -39,8 +39,6 @@ class ControllerState(Enum):
     """The operator is asked what to do with an interrupted calibration."""
     RUNNING = auto()
     """A session takes poses."""
-    FIT_FAILED = auto()
-    """All poses of the session are taken, but the fit or its files failed."""
 
 
 class Resume(Enum):
@@ -211,13 +209,14 @@ class Controller:
         # The running calibration; None in the states IDLE, WAITING_FOR_SENSOR and ASKING
         self.session: Session | None = None
         self.question = ''  # The question to the operator in the state ASKING, else ''
+        # Why the fit or its files failed after all poses were taken, or ''
+        self.fit_fault = ''
         self.outcome: tuple[str, ...] = ()  # Lines on the calibration that ended last
         self.may_ask = False  # Whether somebody is at a screen who can be asked
         self.shows_idle_stream = False  # Whether a screen shows samples without a calibration
         self._sensor, self._resume = sensor, resume
         self._samples, self._outputs, self._log = samples, outputs, _Log(outputs)
         self._starts_over: bool | None = None
-        self._fit_fault = ''
         self._accepted = 0
 
     def start(self, start_over: bool | None = None) -> Answer:
@@ -242,7 +241,7 @@ class Controller:
         if guide.moves_itself:
             return Answer(False, 'nothing to capture: the stage moves itself, and poses are taken '
                                  'when it has arrived')
-        if fault := self.session.fault or self._fit_fault:
+        if fault := self.session.fault or self.fit_fault:
             return Answer(False, fault)
         self._take_samples(self.session)
         obstacle = guide.capture()
@@ -261,7 +260,7 @@ class Controller:
         if not text:
             what = {'redo': 'take again', 'skip': 'leave out'}[request]
             return Answer(False, f'no pose to {what}')
-        self._fit_fault, self.state = '', ControllerState.RUNNING
+        self.fit_fault = ''
         self._outputs.answer_captures(Answer(False, text))
         self._log.line(Severity.INFO, text)
         return Answer(True, text)
@@ -341,7 +340,7 @@ class Controller:
         pose = session.guide.next_pose()
         if pose is not None:
             self._outputs.announce(pose)
-        elif self.state is not ControllerState.FIT_FAILED:
+        elif not self.fit_fault:
             self._fit(session)
 
     def status(self) -> Status:
@@ -361,7 +360,7 @@ class Controller:
             return Status(Phase.IDLE, self._log.last or idle, False)
         if silence := self._samples.silence():
             return Status(Phase.SILENT, silence, True)
-        if fault := self.session.fault or self._fit_fault:
+        if fault := self.session.fault or self.fit_fault:
             return Status(Phase.REFUSED, fault, True)
         return self.session.guide.status()
 
@@ -421,7 +420,7 @@ class Controller:
         """Fit and write all files; return whether that succeeded."""
         self._log.line(Severity.INFO, f'fitting {session.accepted_count} poses')
         self._outputs.show_fit(self._log.last)
-        self._fit_fault, self.state = '', ControllerState.RUNNING
+        self.fit_fault = ''
         try:
             result = session.finish()
             self._outputs.log(Severity.INFO, result.keep(self.settings.store))
@@ -433,12 +432,12 @@ class Controller:
             text = f'cannot finish: {error}'
             if session.guide.next_pose() is None:
                 text = f'{text}; finish again, redo or abort'
-                self._fit_fault, self.state = text, ControllerState.FIT_FAILED
+                self.fit_fault = text
             self._log.line(Severity.ERROR, text)
             return False
         for line in result.comments():
             self._outputs.log(Severity.INFO, line)
-        self.outcome = tuple(result.report_lines)
+        self.outcome = (result.summary[0].strip(), *result.summary[1:], *result.warnings)
         self._outputs.log(Severity.INFO, self.outcome[0])
         open_poses = session.guide.open_poses
         advice = f'; {open_poses} poses are open: start again to go on' if open_poses else ''
@@ -450,8 +449,8 @@ class Controller:
         if self.session is not None:
             self._accepted = self.session.accepted_count
             self.session.journal.close()
-        self.state, self.session, self.question = ControllerState.IDLE, None, ''
-        self._fit_fault = ''
+        self.state, self.session = ControllerState.IDLE, None
+        self.question = self.fit_fault = ''
         self._outputs.answer_captures(Answer(False, text))
         self._outputs.withdraw_pose(text)
         self._log.line(severity, text)

@@ -21,6 +21,7 @@ from adxl_ros.files.recording_columns import stamped_rate_hz
 from adxl_ros.files.sweep_journal import JournalEntry, PoseDropped, PoseRecord
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
+from adxl_ros.report.quantities import duration
 from adxl_ros.signals.rest_detection import (
     datasheet_noise,
     Rest,
@@ -199,8 +200,6 @@ class Dwell:
 
 _CLOCK_OFFSET_S = 2.0
 """Largest offset of the clocks of stage and sensor, s; chosen: above any delay of messages."""
-_LONGEST_IN_S = 600
-"""Longest time that is stated in seconds; a longer time is stated in hours."""
 _KEPT_OFFSETS = 20
 """Offsets of the two clocks that stay in memory; chosen: a second of messages at 20 Hz."""
 _FEWEST_OFFSETS = 4
@@ -236,13 +235,12 @@ class EncoderTrack:
         # The smallest offset is that of the message with the least delay.
         ahead_s = min(self.offsets_s, key=abs) \
             if len(self.offsets_s) >= _FEWEST_OFFSETS else 0.0
-        size_s = abs(ahead_s)
-        if size_s <= _CLOCK_OFFSET_S:
+        if abs(ahead_s) <= _CLOCK_OFFSET_S:
             return ''
-        size = f'{size_s:.1f} s' if size_s < _LONGEST_IN_S else f'{size_s / 3600:.3g} h'
-        return (f'stage/joint_states is stamped {size} {"ahead of" if ahead_s > 0 else "behind"} '
-                'imu/data_raw: stage and sensor must share one clock (use_sim_time for both or '
-                'for none, or synchronise their computers)')
+        order = 'ahead of' if ahead_s > 0 else 'behind'
+        return (f'stage/joint_states is stamped {duration(abs(ahead_s))} {order} imu/data_raw: '
+                'stage and sensor must share one clock (use_sim_time for both or for none, or '
+                'synchronise their computers)')
 
     def silence(self, sample_ns: int) -> str:
         """Return one line on the time without readings up to a stamp, ns; '' if it is short."""

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 from adxl_ros.calibrate.fits import gravity_model
 from adxl_ros.calibrate.guided.screen_contents import Coverage
@@ -118,11 +117,6 @@ class Course:
     def next_open(self) -> int:
         """Return the number of the first open pose; the number of poses if none is."""
         return min({*range(len(self.targets))} - self.closed, default=len(self.targets))
-
-
-def travel_rad(targets: Sequence[Target]) -> float:
-    """Return the travel of the slower joint over all moves, rad: both joints turn at once."""
-    return sum(_distance_rad(first, second) for first, second in pairwise(targets))
 
 
 def _turn(planes_rad: Sequence[float], step_rad: float) -> np.ndarray:

@@ -29,6 +29,7 @@ from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force, tilt
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.report.quantities import decimals
 import numpy as np
 
 _ROUNDS = 2
@@ -39,8 +40,6 @@ _VISIBLE_RAD = np.radians(1.0)
 """Largest standard deviation of alpha by noise alone, rad, at which a pose counts."""
 _LEAST_STD_V = 1e-7
 """Lower bound of the noise of a mean, V; chosen: below any ADC, so that no weight is infinite."""
-_MOST_DECIMALS = 6
-"""Most decimals of a coefficient on the screen; chosen: 1 µV."""
 _OUTLIER_STDS = 3.5
 """Residual from which a pose is refused, standard deviations; chosen: one of 2000 by chance."""
 _MODEL_STD_G = 5e-3
@@ -229,10 +228,9 @@ def coefficient_rows(names: Sequence[Coefficient], values: np.ndarray, std: np.n
 
 def _interval(value: float, half_width: float) -> str:
     """Return a value, with the decimals of one digit of the half width of its interval."""
-    decimals = -math.floor(math.log10(half_width)) if half_width > 0 else _MOST_DECIMALS
-    decimals = min(max(decimals, 0), _MOST_DECIMALS)
+    places = decimals(10 * half_width)
     # A sum with 0 has no negative zero.
-    return f'{round(value, decimals) + 0.0:+.{decimals}f} ± {half_width:.{decimals}f}'
+    return f'{round(value, places) + 0.0:+.{places}f} ± {half_width:.{places}f}'
 
 
 _SPARE_READINGS = 40

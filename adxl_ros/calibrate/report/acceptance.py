@@ -152,33 +152,22 @@ def nonlinearity_mps2(sensor: Sensor) -> float:
     return typical * sensor.range_g ** 3 * G0_MPS2
 
 
-def explanation(assessment: Assessment, sensor: Sensor) -> list[str]:
-    """State the limits, and the parts of the error of the saved model."""
-    accel, to_tilt = assessment.accel, np.degrees(np.sqrt(assessment.tilt.tilt_per_axis))
-    tilt = '' if np.isnan(assessment.error_deg) else f' and {assessment.error_deg:.3f} deg'
-    # The limit of tilt is the tilt that an acceleration error of each axis causes.
-    limits = [f'limit by the {name} {1e3 * limit_mps2 / G0_MPS2:.2g} mg'
-              + ('' if np.isnan(to_tilt) else f' and {limit_mps2 * to_tilt:.2g} deg')
-              for name, limit_mps2 in (
-                  ('datasheet', nonlinearity_mps2(sensor)),
-                  ('noise of one sample', held_out.sample_noise_mps2(sensor))) if limit_mps2]
-    lines = [f'calibration error {assessment.error_mg:.3f} mg{tilt} rms, without noise and stage '
-             'error of the check', '; '.join(limits)]
+def budget_lines(assessment: Assessment) -> list[str]:
+    """State the parts of the acceleration error of the saved model."""
+    accel = assessment.accel
     part = {name: f'{name} {rms_mg(getattr(accel, name)):.3f}'
             for name in ('noise', 'stage', 'coefficients', 'model')}
     if assessment.model == 'gravity':
         # The coefficients' part holds for a direction, the measured error for a magnitude.
-        lines.append(f'gravity: {part["noise"]} mg, {part["model"]} mg; {part["coefficients"]} mg '
-                     'in each direction')
-    else:
-        # The covariance predicts the mean over many fits, of which this is one.
-        by_chance = abs(accel.expected - accel.measured) >= _CHANCE_SHARE * accel.measured
-        lines.append(f'expected {rms_mg(accel.expected):.3f} mg = {", ".join(part.values())} '
-                     f'(squares add); measured {rms_mg(accel.measured):.3f} mg'
-                     + (', which differs by chance' if by_chance else ''))
-    if not accel.separable:
-        lines.append('no pose was visited twice: stage and model are inseparable')
-    return lines
+        return [f'gravity: {part["noise"]} mg, {part["model"]} mg; {part["coefficients"]} mg in '
+                'each direction']
+    # The covariance predicts the mean over many fits, of which this is one.
+    by_chance = abs(accel.expected - accel.measured) >= _CHANCE_SHARE * accel.measured
+    lines = [f'expected {rms_mg(accel.expected):.3f} mg = {", ".join(part.values())} (squares '
+             f'add); measured {rms_mg(accel.measured):.3f} mg'
+             + (', which differs by chance' if by_chance else '')]
+    return lines if accel.separable else \
+        [*lines, 'no pose was visited twice: stage and model are inseparable']
 
 
 def _two_digits(value: float) -> str:
@@ -206,40 +195,31 @@ def unit_line(sensor: Sensor) -> list[str]:
             + (f'{FAIL}: {"; ".join(beyond)}' if beyond else PASS)]
 
 
-def headline(assessment: Assessment | None, models: Sequence[HeldOutErrors]) -> list[str]:
-    """State outcomes and held-out errors of the saved model, in a line each."""
-    if assessment is None:
-        return ['not assessed: too few poses to hold some of them out']
-    outcomes = {'datasheet': assessment.datasheet, 'noise': assessment.noise}
-    against = ', '.join(f'{name} {outcome}' for name, outcome in outcomes.items() if outcome)
-    cause = assessment.limited_by
-    lines = [f'{assessment.model}: {against}; limited by '
-             + (cause if cause == 'stage or model' else f'the {cause}')]
-    for errors in models:
-        if errors.model == assessment.model:
-            tilt, accel = errors.tilt_deg, errors.accel_mg
-            tilt_text = '' if np.isnan(tilt.rms) else \
-                f'tilt {tilt.rms:.2g}° rms, {tilt.largest:.2g}° max; '
-            lines.append(f'held out: {tilt_text}accel {accel.rms:.2g} mg rms, '
-                         f'{accel.largest:.2g} mg max')
-    return lines
+LIMITS = {
+    'noise': 'the noise of the means; longer rests reduce it',
+    'stage': 'the angles of the stage; further poses reduce it',
+    'model': 'the model, which does not have the form of this unit',
+    'stage or model': 'the stage or the model; poses that are visited twice separate them'}
+"""What limits a calibration, and what helps, by cause."""
 
 
-def error_table(models: Sequence[HeldOutErrors], assessments: Sequence[Assessment] = ()
-                ) -> list[str]:
-    """Return errors and outcomes by model in at most 79 columns; the last model is in the file."""
+def summary_lines(fitted: Sensor, assessment: Assessment | None, errors: Sequence[str]
+                  ) -> list[str]:
+    """Return verdict, errors as given, and limits: what a terminal and the head of a file show."""
+    lines = [*acceptance_lines(fitted), '', *errors]
+    if assessment is not None:
+        lines += ['', *limit_table(assessment, fitted),
+                  f' limited by               {LIMITS[assessment.limited_by]}']
+    return [*lines, *unit_line(fitted)]
+
+
+def held_out_lines(models: Sequence[HeldOutErrors], inliers: int) -> list[str]:
+    """Return the errors of the models, and the poses that show them."""
     if not models:
         return []
-    row_of, limits = {row.model: row for row in assessments}, f'{"datasheet":9} {"noise":9}'
-    lines = [
-        f'{"held out":8} {"tilt rms/max°":>14} {limits} {"mg rms/max":>14} {limits}'.rstrip()]
-    for errors in models:
-        row = row_of.get(errors.model)
-        tilt = (row.tilt_datasheet, row.tilt_noise) if row else ('', '')
-        accel = (row.accel_datasheet, row.accel_noise) if row else ('', '')
-        lines.append(f'{errors.model:8} {_cell(errors.tilt_deg, *tilt)} '
-                     f'{_cell(errors.accel_mg, *accel)}'.rstrip())
-    return lines
+    count = models[-1].pose_count
+    folds = ': a fifth is left out at a time' if count >= inliers else ''
+    return [f' on {count} poses that the fit has not seen{folds}', *screen_table(models)]
 
 
 def screen_table(models: Sequence[HeldOutErrors]) -> list[str]:
@@ -279,11 +259,6 @@ def limit_table(assessment: Assessment, sensor: Sensor) -> list[str]:
     return [f' {name:24} {"-" if np.isnan(value_deg) else _two_digits(value_deg):>7} ° {tilt:9} '
             f'{_two_digits(value_mg):>8} mg {accel}'.rstrip()
             for name, value_mg, value_deg, accel, tilt in rows]
-
-
-def _cell(statistic: held_out.ErrorStatistic, datasheet: str, noise: str) -> str:
-    cell = '-' if np.isnan(statistic.rms) else f'{statistic.rms:.3f}/{statistic.largest:.3f}'
-    return f'{cell:>14} {datasheet:9} {noise:9}'
 
 
 def gravity_lines(fit: GravityFit, time_s: np.ndarray) -> list[str]:

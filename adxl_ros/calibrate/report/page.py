@@ -42,13 +42,6 @@ _COLOURS = {PASS: 'green', NOT_SHOWN: 'amber', FAIL: 'red'}
 _PART_COLOURS = {'noise': '#7b8794', 'stage': '#d9930d', 'coefficients': '#1f5fbf',
                  'model': '#c0392b'}
 """Colours of the parts of the error budget."""
-_ADVICE = {
-    'noise': 'Noise limits it most: longer rests at each pose reduce the error.',
-    'stage': 'The stage limits it most: a finer encoder, or more poses, reduce the error.',
-    'model': 'The model limits it most: a model with more terms reduces the error.',
-    'stage or model': 'Stage or model limits it most: visit some poses twice to see which.',
-}
-"""How to get better, by the largest cause of error."""
 _BEYOND = 'beyond the maximum'
 """Outcome of a coefficient whose whole interval exceeds the maximum of the datasheet."""
 _BEYOND_WHISKER = 1.08
@@ -109,7 +102,7 @@ def page(result: CalibrationResult, past: Sequence[Sensor],
         'about': [f'{fitted.model} model', f'{len(result.poses)} poses', f'axes {fitted.axes}'],
         'badge': _badge(fitted),
         'tiles': _tiles(result, assessment),
-        'advice': _ADVICE.get(assessment.limited_by, '') if assessment else
+        'advice': f'Limited by {acceptance.LIMITS[assessment.limited_by]}.' if assessment else
         'Take more poses: too few were held out to assess this calibration.',
         'file_name': re.sub(r'[^\w.-]+', '_', fitted.serial) + '.yaml',
         'download': html_page.download_url(parameter_file.as_text(fitted, result.comments())),

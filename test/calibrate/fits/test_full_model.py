@@ -96,25 +96,24 @@ def test_outliers_are_named_and_excluded():
     bad = [7, 40, 90]
     volts = poses.volts.copy()
     volts[bad] += [[0.01, 0.0], [0.0, -0.02], [0.03, 0.01]]
-    fit, terms = term_selection.fit_selected(sensor, replace(poses, volts=volts))
+    fit, _ = term_selection.fit_selected(sensor, replace(poses, volts=volts))
     assert fit.outliers == tuple(bad)
     error, std = errors(fit, truth)
     assert np.sqrt(np.mean((error / std) ** 2)) < 1.6
     assert any('outliers, left out: pose 8 (alpha' in line
-               for line in term_selection.report_lines(fit, poses, terms))
+               for line in term_selection.warnings(fit, poses))
 
 
 def test_a_change_of_temperature_is_reported_and_fitted():
     sensor, truth, poses = swept_unit(10, check_poses=0)
     warm = replace(poses, temperature_c=np.linspace(20, 35, len(poses)))
-    fit, terms = term_selection.fit_selected(sensor, warm)
-    words = term_selection.report_lines(fit, warm, terms)
-    assert any('temperature moved by 15.0 degC' in line for line in words)
+    fit, _ = term_selection.fit_selected(sensor, warm)
+    assert any('temperature moved by 15.0 degC' in line
+               for line in term_selection.warnings(fit, warm))
     drift = 1e-3 * truth.scale_v_per_g * (warm.temperature_c[:, None] - 25)
-    fit, terms = term_selection.fit_selected(sensor, replace(warm, volts=warm.volts + drift))
+    fit, _ = term_selection.fit_selected(sensor, replace(warm, volts=warm.volts + drift))
     assert fit.fitted.values['temperature_bias']['per_k'] == pytest.approx([1e-3] * 2, rel=0.1)
-    assert not any('temperature moved' in line
-                   for line in term_selection.report_lines(fit, warm, terms))
+    assert not any('temperature moved' in line for line in term_selection.warnings(fit, warm))
 
 
 @pytest.mark.parametrize('planes_deg, lost', [
@@ -130,8 +129,8 @@ def test_a_simpler_model_is_fitted_if_the_full_one_is_not_determined():
     sensor, _, poses = swept_unit(1, planes_rad=PLANES_RAD[2:3], check_poses=0)
     fit = calibration.calibrate(sensor, [calibration.RecordedPoses('made', poses)])
     assert fit.fitted.model == 'linear'
-    assert fit.report_lines[-2].startswith('not full: the full model is not determined')
-    assert fit.report_lines[-1].startswith('not physical: ')
+    assert fit.warnings[-2].startswith('not full: the full model is not determined')
+    assert fit.warnings[-1].startswith('not physical: ')
 
 
 @pytest.mark.parametrize('change, words', [

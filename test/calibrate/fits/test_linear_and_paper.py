@@ -105,5 +105,5 @@ def test_without_check_poses_folds_are_held_out():
     poses = swept(rng, drawn(rng, nominal()), check_poses=0)
     result = calibration.calibrate(nominal(), [calibration.RecordedPoses('made', poses)])
     assert result.fitted.model == 'full'
-    words = [line.split()[0] for line in result.report_lines]
-    assert words[words.index('nominal'):][:4] == ['nominal', 'linear', 'physical', 'full']
+    words = [line.split()[0] for line in result.summary if line]
+    assert words[words.index('datasheet'):][:4] == ['datasheet', 'linear', 'physical', 'full']

@@ -19,12 +19,11 @@ def expected_error_deg(axes, targets, resolution_deg=5 / 60):
 
 @pytest.mark.parametrize('axes', ['xy', 'xyz'])
 def test_the_guided_order_has_smaller_errors_on_a_stage_with_errors_by_setting(axes):
-    """The guided order halves the expected tilt error, and its travel is not longer."""
+    """The guided order halves the expected tilt error."""
     planes = pose_plan.default_planes_rad('xy')
     guided, paper = pose_plan.guided(planes, STEP, 0), pose_plan.sweep(planes, STEP, 0)
     assert sorted(map(str, guided)) == sorted(map(str, paper))
     assert expected_error_deg(axes, guided) < 0.5 * expected_error_deg(axes, paper)
-    assert pose_plan.travel_rad(guided) < 1.05 * pose_plan.travel_rad(paper)
 
 
 @pytest.mark.parametrize('axes', ['xy', 'xyz'])

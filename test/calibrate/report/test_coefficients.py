@@ -7,7 +7,7 @@ import re
 
 from adxl_ros.calibrate.fits.full_model import TERMS
 from adxl_ros.calibrate.report import acceptance, held_out
-from adxl_ros.calibrate.report.acceptance import acceptance_lines, error_table
+from adxl_ros.calibrate.report.acceptance import acceptance_lines, screen_table
 from adxl_ros.calibrate.report.coefficients import compare, truth_table
 from adxl_ros.model.coefficients import get, names_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
@@ -89,9 +89,9 @@ def test_table_of_errors() -> None:
                                  np.radians(np.full(3, 7.2)), np.zeros((3, 3)))
     fitted = replace(errors, accel_mps2=errors.accel_mps2 / 100, tilt_rad=np.full(3, np.nan))
     models = [held_out.summarise('nominal', errors), held_out.summarise('full', fitted)]
-    lines = error_table(models)
-    assert lines[1].split() == ['nominal', '7.200/7.200', '45.887/45.887']
-    assert lines[2].split() == ['full', '-', '0.459/0.459']
+    lines = screen_table(models)
+    assert lines[1].split()[2:] == ['7.20', '°', '45.9', 'mg']
+    assert lines[2].split() == ['full', 'calibration', '-', '°', '0.459', 'mg', '<-', 'saved']
     assert max(map(len, lines)) <= 79
 
 
