@@ -48,6 +48,9 @@ _LONGEST_GAP_S, _USUAL_GAPS = 0.1, 5.0
 it, and a message may be late."""
 _AROUND_S = 0.3
 """Time around which the error of the force is taken, s. Chosen: a part of a move."""
+_BEYOND = np.pi
+"""How far beyond its limits a joint may read, rad or m. Chosen: the zero of an encoder may be
+wrong, and degrees or mm exceed it."""
 _OFFSET_RAD = 1e-4
 """Offset of a joint whose effect on the force is taken, rad. Chosen: linear to 1e-4."""
 _COMPLIANCE_S2 = 1e-5
@@ -85,6 +88,9 @@ class Robot:
         if not os.path.isfile(urdf):
             raise UserError(f'{urdf or "urdf"}: no such file; give the URDF '
                             '(xacro FILE > robot.urdf)')
+        with open(urdf, encoding='utf-8', errors='replace') as file:
+            if '<xacro:' in file.read():
+                raise UserError(f'{urdf}: is a xacro; expand it by xacro FILE > robot.urdf')
         try:
             free = (pinocchio.JointModelFreeFlyer(),) if moves else ()
             model = pinocchio.buildModelFromUrdf(str(urdf), *free)
@@ -99,6 +105,10 @@ class Robot:
                                                         .parentJoint] if i]
         self.joints = tuple(chain[moves:])  # Names of the joints between base and frame
         fixed = [i for i in range(1, model.njoints) if model.names[i] not in chain]
+        # Limits of those joints that do not turn without end, rad or m
+        self.limits = {name: (model.lowerPositionLimit[joint.idx_q],
+                              model.upperPositionLimit[joint.idx_q]) for name in self.joints
+                       if (joint := model.joints[model.getJointId(name)]).nq == 1}
         self._model = pinocchio.buildReducedModel(model, fixed, pinocchio.neutral(model))
         self._data = self._model.createData()
         self._frame = self._model.getFrameId(frame)
@@ -180,10 +190,10 @@ def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 class RobotPath(ForcePath):
     """Specific force in a frame of a robot, and what errors of the robot would add to it."""
 
-    is_robot = True
+    name, is_robot = 'the robot', True
 
     def __init__(self, robot: Robot, readings: Readings, gravity_mps2: float = G0_MPS2,
-                 step_rad: float | None = None, since_s: float = -np.inf) -> None:
+                 since_s: float = -np.inf) -> None:
         """
         Smooth the readings, and run the kinematics.
 
@@ -195,8 +205,6 @@ class RobotPath(ForcePath):
             Readings of its joints, and of its base.
         gravity_mps2
             Local gravity, m/s².
-        step_rad
-            Step of the encoders, rad; None for that which each joint's readings show.
         since_s
             Time from which the force is needed, s.
 
@@ -208,8 +216,8 @@ class RobotPath(ForcePath):
         """
         self._robot, self._gravity_mps2 = robot, gravity_mps2
         self._tracks = _tracks(robot, readings)
-        self._steps = [noise_step(values, _SMALLEST_STEP) if step_rad is None else step_rad
-                       for _, values in self._tracks]
+        self._steps = [noise_step(values, _SMALLEST_STEP, times)
+                       for times, values in self._tracks]
         begin_s = max(times[0] for times, _ in self._tracks)
         end_s = min(times[-1] for times, _ in self._tracks)
         readings_hz = max(1 / float(np.median(np.diff(times))) for times, _ in self._tracks)
@@ -371,7 +379,16 @@ def _tracks(robot: Robot, readings: Readings) -> list[tuple[np.ndarray, np.ndarr
             f'{readings.path}: no position of {", ".join(missing)}, which '
             f'{"move" if len(missing) > 1 else "moves"} {robot.frame} in {robot.urdf}; recorded '
             f'are {", ".join(readings.joints) or "no joints"}')
-    tracks = [(name, *readings.joints[name]) for name in robot.joints]
+    tracks = []
+    for name in robot.joints:
+        times, values = readings.joints[name]
+        low, high = robot.limits.get(name, (-np.inf, np.inf))
+        if np.any((values < low - _BEYOND) | (values > high + _BEYOND)):
+            raise UserError(
+                f'{readings.path}: {name} is at {values.min():.4g} to {values.max():.4g}, but '
+                f'{robot.urdf} limits it to {low:.4g} to {high:.4g} rad or m; convert its unit')
+        # A joint without limits may be stated within a turn.
+        tracks.append((name, times, values if name in robot.limits else np.unwrap(values)))
     if readings.base is not None:
         times, pose = readings.base
         signs = np.cumprod(np.append(1.0, np.where(np.sum(
@@ -383,9 +400,9 @@ def _tracks(robot: Robot, readings: Readings) -> list[tuple[np.ndarray, np.ndarr
         raise UserError(f'{robot.urdf}: no joint moves {robot.frame}, and {readings.path} has no '
                         'pose of a moving base; record odom, or tf')
     for name, times, values in tracks:
-        if len(times) < 8 or not np.all(np.diff(times) > 0) or not np.isfinite(values).all():
-            raise UserError(f'{readings.path}: {name} has {len(times)} readings; at least 8 '
-                            'finite ones with rising stamps are needed')
+        if len(times) < 8:
+            raise UserError(f'{readings.path}: {name} has {len(times)} finite readings whose '
+                            'stamps differ; at least 8 are needed')
     return [(times, values) for _, times, values in tracks]
 
 
