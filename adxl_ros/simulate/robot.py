@@ -234,7 +234,7 @@ class RobotPath(ForcePath):
         self.motion = self._moved(self._smoothed)
         super().__init__(self._grid_s, self.motion[0])
         self._rotation = CubicSpline(self._grid_s, np.hstack(list(self.motion[1:3])))
-        self.joints = robot.joints
+        self.joints, self.wanders = robot.joints, readings.base is not None
 
     def _paths(self, tracks: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Path]:
         """Smooth the tracks."""

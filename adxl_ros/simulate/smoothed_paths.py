@@ -413,6 +413,7 @@ class ForcePath:
 
     name = '--sim'  # What it is, for people
     is_robot = False  # Whether what follows is known
+    wanders = False  # Whether it may drift slowly, as the estimated pose of a base
     modes: Mapping[str, np.ndarray] = MappingProxyType({})
     """Force at `time_s` per unit of each error of a robot, (n, 3)."""
 
