@@ -48,9 +48,6 @@ _LONGEST_GAP_S, _USUAL_GAPS = 0.1, 5.0
 it, and a message may be late."""
 _AROUND_S = 0.3
 """Time around which the error of the force is taken, s. Chosen: a part of a move."""
-_BEYOND = np.pi
-"""How far beyond its limits a joint may read, rad or m. Chosen: the zero of an encoder may be
-wrong, and degrees or mm exceed it."""
 _OFFSET_RAD = 1e-4
 """Offset of a joint whose effect on the force is taken, rad. Chosen: linear to 1e-4."""
 _COMPLIANCE_S2 = 1e-5
@@ -105,10 +102,10 @@ class Robot:
                                                         .parentJoint] if i]
         self.joints = tuple(chain[moves:])  # Names of the joints between base and frame
         fixed = [i for i in range(1, model.njoints) if model.names[i] not in chain]
-        # Limits of those joints that do not turn without end, rad or m
-        self.limits = {name: (model.lowerPositionLimit[joint.idx_q],
-                              model.upperPositionLimit[joint.idx_q]) for name in self.joints
-                       if (joint := model.joints[model.getJointId(name)]).nq == 1}
+        # Range of those joints that do not turn without end, rad or m
+        self.ranges = {name: float((model.upperPositionLimit - model.lowerPositionLimit)[
+            joint.idx_q]) for name in self.joints
+            if (joint := model.joints[model.getJointId(name)]).nq == 1}
         self._model = pinocchio.buildReducedModel(model, fixed, pinocchio.neutral(model))
         self._data = self._model.createData()
         self._frame = self._model.getFrameId(frame)
@@ -382,13 +379,12 @@ def _tracks(robot: Robot, readings: Readings) -> list[tuple[np.ndarray, np.ndarr
     tracks = []
     for name in robot.joints:
         times, values = readings.joints[name]
-        low, high = robot.limits.get(name, (-np.inf, np.inf))
-        if np.any((values < low - _BEYOND) | (values > high + _BEYOND)):
+        # A joint may be stated within a turn.
+        if len(values) and np.ptp(values) > robot.ranges.get(name, np.inf) + 2 * np.pi:
             raise UserError(
                 f'{readings.path}: {name} is at {values.min():.4g} to {values.max():.4g}, but '
-                f'{robot.urdf} limits it to {low:.4g} to {high:.4g} rad or m; convert its unit')
-        # A joint without limits may be stated within a turn.
-        tracks.append((name, times, values if name in robot.limits else np.unwrap(values)))
+                f'{robot.urdf} lets it move by {robot.ranges[name]:.3g} rad or m; convert it')
+        tracks.append((name, times, np.unwrap(values)))
     if readings.base is not None:
         times, pose = readings.base
         signs = np.cumprod(np.append(1.0, np.where(np.sum(
