@@ -164,14 +164,16 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     fits = _held_out(model, search, floor, max(counts.sum(), 1.0))
     smallest_mps2 = material_mps2(model, floor, material_mg)
     robot_mps2 = max(c.robot_error_mps2 for c in model.comparisons)
+    wanders = any(getattr(c.motion.force, 'wanders', False) for c in model.comparisons)
     evidence = rule.Evidence(
         {e: {d: f.figures for d, f in drifts.items()} for e, drifts in fits.items()},
         counts, rule.block_weights(seed), smallest_mps2,
         max(model.smallest_angle_rad() * G0_MPS2, robot_mps2), robot_mps2 > 0,
-        any(c.fading_hz is not None for c in model.comparisons),
+        any(c.fading_hz is not None for c in model.comparisons), wanders,
         np.inf if floor.source == 'assumed' else floor.rms_mps2,
         {effects: h.sizeless for effects, h in search.found.items()})
-    detections = _detections(checked, search.best, model.baseline, smallest_mps2)
+    detections = [d for d in _detections(checked, search.best, model.baseline, smallest_mps2)
+                  if not (wanders and d.effect in drift_effects())]
     bases = [flexible_bases(c, v) for c, v in zip(compared, model.baseline_v)]
     verdict = rule.decide(
         evidence, lambda effects, drift: reproducible_rest(fits[effects][drift], bases),

@@ -150,7 +150,7 @@ def align_force(recording: Recording, sensor: Sensor, sim: Motion, may_shift: bo
     shift = _find_shift(recording, replace(sensor, rate_hz=recording.rate_hz), force)
     if shift is not None and may_shift:
         force = force.shifted(-shift.late_s)
-        notes = [f'--align: --sim was {shift.text}, and is shifted by {-shift.late_s:+.6g} s; a '
+        notes = [f'--align: {force.name} was {shift.text}, and is shifted by {-shift.late_s:+.6g} s; a '
                  'latency of the sensor is a part of that and cannot show']
     elif may_shift:
         notes = [f'--align: no shift beyond {LARGEST_LATENCY_S:g} s was found; less may be an '
@@ -159,17 +159,17 @@ def align_force(recording: Recording, sensor: Sensor, sim: Motion, may_shift: bo
     covered = (recording.time_s >= begin_s) & (recording.time_s <= end_s)
     if not covered.any():
         advice = f'its motion fits, but is {shift.text}; use --align' if shift is not None else \
-            'no shift makes its motion fit; give the simulation of this recording'
-        raise DataFault('no_overlap', '--sim does not overlap the recording in '
+            'no shift makes its motion fit; give that of this recording'
+        raise DataFault('no_overlap', f'{force.name} does not overlap the recording in '
                         f'time: {basename(recording.path)} is from {recording.time_s[0]:.6g} '
-                        f'to {recording.time_s[-1]:.6g} s, --sim from {begin_s:.6g} to '
+                        f'to {recording.time_s[-1]:.6g} s, {force.name} from {begin_s:.6g} to '
                         f'{end_s:.6g} s; {advice}')
     if shift is not None and not may_shift:
-        raise DataFault('time_misaligned', f'--sim is {shift.text}; use --align, or shift its '
+        raise DataFault('time_misaligned', f'{force.name} is {shift.text}; use --align, or shift its '
                         f'stamps by {-shift.late_s:+.6g} s')
     if not covered.all():
         outside_s = (1 - covered.mean()) * float(np.ptp(recording.time_s))
-        notes.append(f'left out: {outside_s:.3g} s of the recording that --sim does not cover '
+        notes.append(f'left out: {outside_s:.3g} s of the recording that {force.name} does not cover '
                      f'(it is from {begin_s:.6g} to {end_s:.6g} s)')
     return _between(recording, begin_s, end_s), replace(sim, force=force), notes
 
@@ -292,12 +292,12 @@ def without_reading(comparison: BaselineComparison, columns: dict[str, np.ndarra
         name: (time_s[np.isfinite(columns[name])], _LONGEST_SLOW_BRIDGE_S)
         for name in ('temperature_c', 'supply_v') if name in columns}
     if isinstance(force, ForcePath):
-        readings['--sim'] = force.time_s, _LONGEST_BRIDGE_S
+        readings[force.name] = force.time_s, _LONGEST_BRIDGE_S
     for name, (read_s, longest_s) in readings.items():
         if len(read_s) < 2:
             continue
         limit_s = max(longest_s, USUAL_GAPS * float(np.median(np.diff(read_s))))
-        beside = name == '--sim'
+        beside = name not in columns
         unknown = np.zeros(len(time_s), bool)
         for begin, end in _in_gaps(time_s, read_s, limit_s):
             if end > begin:
@@ -405,7 +405,7 @@ def too_coarse(comparison: BaselineComparison, columns: dict[str, np.ndarray]) -
     if isinstance(force, ForcePath) and force.is_robot:
         return _too_abrupt(comparison, force, noise_g)
     if isinstance(force, ForcePath):
-        references = [('--sim', force.time_s, np.array(force(force.time_s)) / G0_MPS2, 3, 0, 0.0,
+        references = [(force.name, force.time_s, np.array(force(force.time_s)) / G0_MPS2, 3, 0, 0.0,
                        limit_g, '; write it at a higher rate, and switch off noise that the '
                        'simulator adds')]
     for joint, name in JOINTS.items() if comparison.joints else ():

@@ -161,6 +161,7 @@ class Evidence:
     reference_mps2: float
     errs_in_motion: bool  # Whether it errs in motion, too, as a robot does
     fades: bool  # Whether the reference lacks motion
+    wanders: bool  # Whether the reference may drift slowly, so that no drift is of the sensor
     floor_mps2: float  # Noise floor, m/s²; infinite where it is assumed
     # Effects of each set none of whose sizes differs from 0
     sizeless: Mapping[frozenset[str], frozenset[str]] = field(default_factory=dict)
@@ -227,10 +228,20 @@ def is_needed(evidence: Evidence, effects: frozenset[str], effect: str, rows: sl
 
 
 def minimal_sets(evidence: Evidence, rows: slice) -> list[frozenset[str]]:
-    """Return the sets all of whose effects are needed, the most probable first."""
+    """
+    Return the sets all of whose effects are needed, the most probable first.
+
+    Zero-g and scale factor are free beside every set. A filter that takes out errors of a
+    reference in motion adds no more to them than these errors.
+    """
     kept = [effects for effects in evidence.candidates
             if all(effects - {e} in evidence.candidates
                    and is_needed(evidence, effects, e, rows) for e in effects)]
+    free = [effects for effects in kept if evidence.errs_in_motion and effects
+            and all(effect_named(e).diagnosis.nuisance for e in effects)]
+    kept = [effects for effects in kept if effects in free or not any(
+        len(less) <= len(effects) and float(evidence.gain(effects, less, rows)[0])
+        <= evidence.material_power(1.0) for less in free)]
     return sorted(kept, key=lambda effects: -evidence.nats(
         (effects, HEALTHY), (_NOTHING, HEALTHY), rows)[0])
 
@@ -290,7 +301,8 @@ def _answer(evidence: Evidence, rest: Rest, drifts: Sequence[str], detected: fro
         drifts, drift, left = (), 0.0, max(float(repeats[0]), above)
     if left > explained + drift:
         return _Answer('unknown', _NOTHING, frozenset())
-    if not best and not detected and not drifts:
+    named = () if evidence.wanders else drifts
+    if not best and not detected and not named:
         # What neither repeats nor is noise at rest is no gap only while the noise is larger.
         is_much = above > max(evidence.floor_mps2 ** 2, evidence.material_power(1.0))
         return _Answer('unknown' if is_much else 'no_gap', _NOTHING, frozenset())
@@ -301,9 +313,9 @@ def _answer(evidence: Evidence, rest: Rest, drifts: Sequence[str], detected: fro
         and float(evidence.gain(best, other, rows)[0]) > left)]
     groups = {group for e in best if len(group := frozenset({e}).union(
         *(other - best for other in rivals if e not in other))) > 1}
-    certain = best.difference(*groups) | detected | {*drifts[:1]}
-    if len(drifts) > 1:
-        groups, certain = groups | {frozenset(drifts)}, certain - {*drifts}
+    certain = best.difference(*groups) | detected | {*named[:1]}
+    if len(named) > 1:
+        groups, certain = groups | {frozenset(named)}, certain - {*named}
     if best and above > drift + evidence.material_power(1.0):
         left = max(left, above)
     partly = left > _SHARE_OF_FORM * (explained + left)

@@ -84,12 +84,10 @@ def _from_table(path: str) -> Readings:
     blocks = list(table.blocks(names, names))
     columns = {name: np.concatenate([block.columns[name] for block in blocks]) for name in names}
 
-    def track(values: np.ndarray) -> Track:
-        known = np.isfinite(values).reshape(len(values), -1).all(axis=1)
-        return columns['time_s'][known], values[known]
-
-    return Readings(path, {joint: track(columns[name]) for name, joint in joints.items()},
-                    track(np.column_stack([columns[name] for name in base])) if base else None)
+    times = columns['time_s']
+    return Readings(path, {joint: _track(times, columns[name]) for name, joint in joints.items()},
+                    _track(times, np.column_stack([columns[name] for name in base]))
+                    if base else None)
 
 
 def _topic(bag: Bag, topic: str) -> str:
@@ -120,31 +118,43 @@ def _joints(bag: Bag, topic: str, epoch_ns: int) -> dict[str, Track]:
                 positions.append(values)
     except cdr.CdrError as error:
         raise UserError(f'{bag.path}: topic {topic}: {error}') from None
-    return {name: _track(times, positions, epoch_ns) for name, (times, positions)
-            in readings.items()}
+    return {name: _track((np.concatenate(times) - epoch_ns) / 1e9, np.concatenate(positions))
+            for name, (times, positions) in readings.items()}
 
 
-def _track(stamps_ns: list[np.ndarray], values: list[np.ndarray], epoch_ns: int) -> Track:
-    """Join parts in the order of their stamps, each stamp once."""
-    stamp_ns, first = np.unique(np.concatenate(stamps_ns), return_index=True)
-    return (stamp_ns - epoch_ns) / 1e9, np.concatenate(values)[first]
+def _track(time_s: np.ndarray, values: np.ndarray) -> Track:
+    """Return the finite readings in the order of their times, each time once."""
+    known = np.isfinite(values).reshape(len(values), -1).all(axis=1)
+    time_s, first = np.unique(time_s[known], return_index=True)
+    return time_s, values[known][first]
 
 
 def _base(bag: Bag, root: str, epoch_ns: int) -> Track | None:
     """Return the pose of the base by odometry, or else by tf; None where neither moves it."""
     store, kinds = typestore(), dict(sorted(bag.types))
     odometry = [topic for topic, kind in kinds.items() if kind == _ODOMETRY]
-    topics = odometry[:1] or [topic for topic, kind in kinds.items()
-                              if kind == _TRANSFORMS and topic.endswith('tf')]
-    stamps, poses = [], []
+    topics = odometry or [topic for topic, kind in kinds.items()
+                          if kind == _TRANSFORMS and topic.endswith('tf')]
+    # Stamps and poses by topic and the frame that moves
+    moving: dict[tuple[str, str], tuple[list[int], list[list[float]]]] = {}
     for topic, raw in ((name, raw) for name in topics for raw in bag.messages(name)):
         message = store.deserialize_cdr(raw, kinds[topic])
-        for header, place, turn in [(
-                message.header, message.pose.pose.position, message.pose.pose.orientation)] \
-                if odometry else [(t.header, t.transform.translation, t.transform.rotation)
-                                  for t in message.transforms if t.child_frame_id == root]:
+        for header, child, place, turn in [(
+                message.header, message.child_frame_id, message.pose.pose.position,
+                message.pose.pose.orientation)] if odometry else [
+                (t.header, t.child_frame_id, t.transform.translation, t.transform.rotation)
+                for t in message.transforms if t.child_frame_id.strip('/') == root]:
+            stamps, poses = moving.setdefault((topic, child.strip('/') or root), ([], []))
             stamps.append(header.stamp.sec * 1_000_000_000 + header.stamp.nanosec)
             poses.append([place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w])
-    if not stamps or not np.ptp(poses, axis=0).any():
+    moving = {key: track for key, track in moving.items() if np.ptp(track[1], axis=0).any()}
+    if not moving:
         return None
-    return _track([np.array(stamps)], [np.array(poses)], epoch_ns)
+    of_root = [key for key in moving if key[1] == root]
+    if len(of_root) != 1:
+        raise UserError(
+            f'{bag.path}: {len(of_root) or "no"} topics have the pose of {root}, the root of the '
+            f'URDF; there are {", ".join(f"{t} of {child}" for t, child in moving)}; record one '
+            'for the root, or give a URDF whose root that frame is')
+    stamps, poses = moving[of_root[0]]
+    return _track((np.array(stamps) - epoch_ns) / 1e9, np.array(poses))

@@ -85,6 +85,9 @@ class Robot:
         if not os.path.isfile(urdf):
             raise UserError(f'{urdf or "urdf"}: no such file; give the URDF '
                             '(xacro FILE > robot.urdf)')
+        with open(urdf, encoding='utf-8', errors='replace') as file:
+            if '<xacro:' in file.read():
+                raise UserError(f'{urdf}: is a xacro; expand it by xacro FILE > robot.urdf')
         try:
             free = (pinocchio.JointModelFreeFlyer(),) if moves else ()
             model = pinocchio.buildModelFromUrdf(str(urdf), *free)
@@ -99,6 +102,10 @@ class Robot:
                                                         .parentJoint] if i]
         self.joints = tuple(chain[moves:])  # Names of the joints between base and frame
         fixed = [i for i in range(1, model.njoints) if model.names[i] not in chain]
+        # Range of those joints that do not turn without end, rad or m
+        self.ranges = {name: float((model.upperPositionLimit - model.lowerPositionLimit)[
+            joint.idx_q]) for name in self.joints
+            if (joint := model.joints[model.getJointId(name)]).nq == 1}
         self._model = pinocchio.buildReducedModel(model, fixed, pinocchio.neutral(model))
         self._data = self._model.createData()
         self._frame = self._model.getFrameId(frame)
@@ -180,10 +187,10 @@ def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 class RobotPath(ForcePath):
     """Specific force in a frame of a robot, and what errors of the robot would add to it."""
 
-    is_robot = True
+    name, is_robot = 'the robot', True
 
     def __init__(self, robot: Robot, readings: Readings, gravity_mps2: float = G0_MPS2,
-                 step_rad: float | None = None, since_s: float = -np.inf) -> None:
+                 since_s: float = -np.inf) -> None:
         """
         Smooth the readings, and run the kinematics.
 
@@ -195,8 +202,6 @@ class RobotPath(ForcePath):
             Readings of its joints, and of its base.
         gravity_mps2
             Local gravity, m/s².
-        step_rad
-            Step of the encoders, rad; None for that which each joint's readings show.
         since_s
             Time from which the force is needed, s.
 
@@ -208,8 +213,8 @@ class RobotPath(ForcePath):
         """
         self._robot, self._gravity_mps2 = robot, gravity_mps2
         self._tracks = _tracks(robot, readings)
-        self._steps = [noise_step(values, _SMALLEST_STEP) if step_rad is None else step_rad
-                       for _, values in self._tracks]
+        self._steps = [noise_step(values, _SMALLEST_STEP, times)
+                       for times, values in self._tracks]
         begin_s = max(times[0] for times, _ in self._tracks)
         end_s = min(times[-1] for times, _ in self._tracks)
         readings_hz = max(1 / float(np.median(np.diff(times))) for times, _ in self._tracks)
@@ -226,7 +231,7 @@ class RobotPath(ForcePath):
         self.motion = self._moved(self._smoothed)
         super().__init__(self._grid_s, self.motion[0])
         self._rotation = CubicSpline(self._grid_s, np.hstack(list(self.motion[1:3])))
-        self.joints = robot.joints
+        self.joints, self.wanders = robot.joints, readings.base is not None
 
     def _paths(self, tracks: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Path]:
         """Smooth the tracks."""
@@ -371,7 +376,15 @@ def _tracks(robot: Robot, readings: Readings) -> list[tuple[np.ndarray, np.ndarr
             f'{readings.path}: no position of {", ".join(missing)}, which '
             f'{"move" if len(missing) > 1 else "moves"} {robot.frame} in {robot.urdf}; recorded '
             f'are {", ".join(readings.joints) or "no joints"}')
-    tracks = [(name, *readings.joints[name]) for name in robot.joints]
+    tracks = []
+    for name in robot.joints:
+        times, values = readings.joints[name]
+        # A joint may be stated within a turn.
+        if len(values) and np.ptp(values) > robot.ranges.get(name, np.inf) + 2 * np.pi:
+            raise UserError(
+                f'{readings.path}: {name} is at {values.min():.4g} to {values.max():.4g}, but '
+                f'{robot.urdf} lets it move by {robot.ranges[name]:.3g} rad or m; convert it')
+        tracks.append((name, times, np.unwrap(values)))
     if readings.base is not None:
         times, pose = readings.base
         signs = np.cumprod(np.append(1.0, np.where(np.sum(
@@ -383,9 +396,9 @@ def _tracks(robot: Robot, readings: Readings) -> list[tuple[np.ndarray, np.ndarr
         raise UserError(f'{robot.urdf}: no joint moves {robot.frame}, and {readings.path} has no '
                         'pose of a moving base; record odom, or tf')
     for name, times, values in tracks:
-        if len(times) < 8 or not np.all(np.diff(times) > 0) or not np.isfinite(values).all():
-            raise UserError(f'{readings.path}: {name} has {len(times)} readings; at least 8 '
-                            'finite ones with rising stamps are needed')
+        if len(times) < 8:
+            raise UserError(f'{readings.path}: {name} has {len(times)} finite readings whose '
+                            'stamps differ; at least 8 are needed')
     return [(times, values) for _, times, values in tracks]
 
 

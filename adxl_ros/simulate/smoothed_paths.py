@@ -13,6 +13,7 @@ from types import MappingProxyType
 
 from adxl_ros.model.effects.base import Components
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 import scipy
 
 _DEGREE = 5
@@ -92,9 +93,6 @@ _READING_QUANTILE = 0.9
 """Quantile of the distances between bends that is the distance of two readings. Chosen: a reading
 between two samples bends the line at both of them, so that half of the distances are 1."""
 
-_FIFTH_DIFFERENCE = 252.0
-"""Variance of a fifth difference, divided by that of independent readings: 1² + 5² + 10² + …"""
-
 _THIRD_DIFFERENCE = np.array([-1.0, 3.0, -3.0, 1.0])
 """Weights of four coefficients in a third difference."""
 
@@ -140,7 +138,7 @@ class SmoothedPath:
         if not is_seen and self._step == step and _is_interpolated(self._reading, step):
             kept = _places_of_readings(self._reading, _SMALLEST_CHANGE * step)
             self._time_s, self._reading = self._time_s[kept], self._reading[kept]
-        self._knot_s = knot_s
+        self._knot_s, self._is_seen = knot_s, is_seen
         self._strength = self._matched_strength(self._step)
         self._degree = degree
 
@@ -188,8 +186,8 @@ class SmoothedPath:
         if window not in self._windows:
             while len(self._windows) >= _MAX_WINDOWS:
                 del self._windows[min(self._windows)]
-            spline = smoothing_spline(
-                *self._part(window), self._strength, self._step, self._degree, self._knot_s)
+            spline = smoothing_spline(*self._part(window), self._strength, self._step,
+                                      self._degree, self._knot_s, not self._is_seen)
             self._windows[window] = _polynomials(spline) \
                 if spline.k and len(spline.t) <= _MAX_PIECES else spline
         return self._windows[window]
@@ -210,11 +208,13 @@ class SmoothedPath:
 
 
 def smoothing_spline(time_s: np.ndarray, reading: np.ndarray, strength: float, step: float,
-                     degree: int = _DEGREE, knot_s: float = KNOT_S) -> scipy.interpolate.BSpline:
+                     degree: int = _DEGREE, knot_s: float = KNOT_S, is_bounded: bool = True
+                     ) -> scipy.interpolate.BSpline:
     """
     Fit the smoothing spline of one window; see `SmoothedPath`.
 
-    time_s: ascending times, s, (n,); reading: readings, rad or m, (n,), all finite.
+    time_s: ascending times, s, (n,); reading: readings, rad or m, (n,), all finite; is_bounded:
+    whether no reading is off by more than half a step, as by an encoder and not by other noise.
     """
     if len(time_s) <= 2 * _DEGREE or np.ptp(reading) == 0:
         return scipy.interpolate.make_interp_spline(time_s, reading, k=1) if len(time_s) > 1 else \
@@ -224,8 +224,9 @@ def smoothing_spline(time_s: np.ndarray, reading: np.ndarray, strength: float, s
         even = interval_s.max() < _MAX_UNEVENNESS * np.median(interval_s)
         return scipy.interpolate.make_interp_spline(time_s, reading, k=degree if even else _DEGREE)
     window = _Window(time_s, reading, knot_s)
-    return scipy.interpolate.BSpline(window.knots, window.bounded_coefficients(
-        strength, np.where(_moving(reading), 0.0, _REST_WEIGHT), step / 2) + window.mean, _DEGREE)
+    return scipy.interpolate.BSpline(window.knots, window.mean + (window.bounded_coefficients(
+        strength, np.where(_moving(reading), 0.0, _REST_WEIGHT), step / 2)
+        if is_bounded else window.coefficients(strength)), _DEGREE)
 
 
 def _polynomials(spline: scipy.interpolate.BSpline) -> scipy.interpolate.PPoly:
@@ -284,10 +285,21 @@ def _places_of_readings(reading: np.ndarray, smallest: float) -> np.ndarray:
         for a, b in pairwise(corners.tolist())]))
 
 
-def noise_step(reading: np.ndarray, smallest: float) -> float:
-    """Return the encoder step that has as much noise as readings in motion, (n,), have."""
-    moving = np.diff(reading, 5)[np.abs(np.diff(reading))[4:] > smallest]
-    return float(np.sqrt(12 * np.mean(moving ** 2) / _FIFTH_DIFFERENCE)) if len(moving) else 0.0
+def noise_step(reading: np.ndarray, smallest: float, time_s: np.ndarray | None = None) -> float:
+    """
+    Return the encoder step that has as much noise as readings in motion, (n,), have.
+
+    Divided differences at their times, s, (n,), do not take uneven stamps for noise.
+    """
+    if len(reading) <= 5:
+        return 0.0
+    times = sliding_window_view(np.arange(len(reading)) if time_s is None else time_s, 6)
+    weights = np.array([1 / np.prod([times[:, i] - times[:, j] for j in range(6) if j != i], axis=0)
+                        for i in range(6)])
+    differences = np.sum(weights * sliding_window_view(reading, 6).T, axis=0) \
+        / np.linalg.norm(weights, axis=0)
+    moving = differences[np.abs(np.diff(reading))[4:] > smallest]
+    return float(np.sqrt(12 * np.mean(moving ** 2))) if len(moving) else 0.0
 
 
 def matched_strength(time_s: np.ndarray, reading: np.ndarray, step: float,
@@ -399,7 +411,9 @@ def _moving(reading: np.ndarray) -> np.ndarray:
 class ForcePath:
     """Specific force of a recording or of another simulator, as cubic splines."""
 
+    name = '--sim'  # What it is, for people
     is_robot = False  # Whether what follows is known
+    wanders = False  # Whether it may drift slowly, as the estimated pose of a base
     modes: Mapping[str, np.ndarray] = MappingProxyType({})
     """Force at `time_s` per unit of each error of a robot, (n, 3)."""
 

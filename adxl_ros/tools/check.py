@@ -21,7 +21,7 @@ from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.report import page as html_page
 from adxl_ros.report.quantities import column_unit, COLUMNS, duration, row, short_time, wrapped
-from adxl_ros.signals.findings import check_recording, Findings
+from adxl_ros.signals.findings import Ability, check_recording, Findings
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
 from adxl_ros.signals.recording_contents import RecordingContents
 from adxl_ros.tools import command_line as cli
@@ -183,7 +183,7 @@ def _with_what_shows(result: Findings, options: argparse.Namespace, reading: Rea
     if not result.is_sound or not (options.urdf or any(
             a.tool == 'diagnose' and a.is_able for a in result.abilities)):
         return result
-    remarks, sim = result.remarks, None
+    sim = None
     try:
         if result.contents is None or result.contents.samples > _MOST_SHOWN:
             raise UserError('what diagnose could show is listed for recordings of '
@@ -192,14 +192,22 @@ def _with_what_shows(result: Findings, options: argparse.Namespace, reading: Rea
         sensor, _ = measure_unstated(load_sensor(options.params, read), read)
         if options.urdf:
             robot = cli.robot_path(options, read, sensor)
-            remarks, sim = (*remarks, robot.text()), robot.as_motion()
+            result = replace(result, remarks=(*result.remarks, robot.text()))
+            sim = robot.as_motion()
         shown = what_shows([read], sensor, sim)
-        if isinstance(shown, DataFault):
-            raise UserError(f'diagnose: {shown.message}')
     except UserError as error:
-        return replace(result, remarks=(*result.remarks, one_line(error)))
+        # A robot that does not fit the recording was asked for.
+        told = 'faults' if options.urdf and sim is None else 'remarks'
+        return replace(result, **{told: (*getattr(result, told), one_line(error))})
+    fault = shown.message if isinstance(shown, DataFault) else ''
+    if options.urdf or fault:
+        ability = Ability('diagnose', not fault, fault or 'against the joints of the robot')
+        result = replace(result, abilities=tuple(
+            ability if a.tool == ability.tool else a for a in result.abilities))
+    if isinstance(shown, DataFault):
+        return result
     scale_v_per_g = float(sensor.scale_v_per_g.mean())
-    return replace(result, remarks=remarks, shows=tuple(
+    return replace(result, shows=tuple(
         shows_row(effect, scale_v_per_g) for effect in sorted(
             by_effect(shown).values(), key=lambda effect: (not effect.shows, effect.effect))))
 

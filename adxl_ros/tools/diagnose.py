@@ -186,7 +186,8 @@ def _next_steps(options: argparse.Namespace, diagnosis: Diagnosis) -> str | list
     steps, then = [NextStep(f'record next.csv: {proposal.manoeuvre}, {proposal.why}; simulated, '
                             'it is', proposal.command)], ''
     if proposal.beside_simulator:
-        steps, then = [], (f'record next.csv, and next_simulated.csv in the simulator: '
+        both = ', and next_simulated.csv in the simulator' if options.sim else ''
+        steps, then = [], (f'record next.csv{both}: '
                            f'{proposal.manoeuvre}, {proposal.why}; then ')
     if verdict.status in ('explained', 'partly'):
         steps += [NextStep(f'{then}diagnose the recording: the effects should close its gap, too',
