@@ -108,8 +108,9 @@ class SensorModel:
         """
         count = len(self._steps)
         if count:
-            rows = np.arange(count)[slice(None) if env_ids is None else
-                                    env_ids if isinstance(env_ids, slice) else _on_host(env_ids)]
+            if not (env_ids is None or isinstance(env_ids, slice)):
+                env_ids = _on_host(env_ids) if len(env_ids) else []
+            rows = np.arange(count)[slice(None) if env_ids is None else env_ids]
             self._reset = np.union1d(self._reset, rows)
             self._draw(rows)
 
