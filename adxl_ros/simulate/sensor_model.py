@@ -106,11 +106,10 @@ class SensorModel:
             nothing to do.
 
         """
-        count = len(self._steps)
-        if count:
-            if not (env_ids is None or isinstance(env_ids, slice)):
-                env_ids = _on_host(env_ids) if len(env_ids) else []
-            rows = np.arange(count)[slice(None) if env_ids is None else env_ids]
+        if count := len(self._steps):
+            # An empty list is no array of integers.
+            rows = np.arange(count)[slice(None) if env_ids is None else env_ids if isinstance(
+                env_ids, slice | list) else _on_host(env_ids)]
             self._reset = np.union1d(self._reset, rows)
             self._draw(rows)
 
