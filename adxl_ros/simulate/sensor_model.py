@@ -107,7 +107,6 @@ class SensorModel:
 
         """
         if count := len(self._steps):
-            # An empty list is no array of integers.
             rows = np.arange(count)[slice(None) if env_ids is None else env_ids if isinstance(
                 env_ids, slice | list) else _on_host(env_ids)]
             self._reset = np.union1d(self._reset, rows)

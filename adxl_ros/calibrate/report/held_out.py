@@ -402,8 +402,7 @@ def covariances(errors: HeldOutErrors, held: Poses, reference: np.ndarray) -> li
         fold = errors.fold == number
         force, environment = list(reference[fold].T), held.subset(fold).environment
         exact, none_v2 = sensor.without_covariance(), np.zeros(len(sensor.axes))
-        # Without noise and coefficients, the doubt on which side of 90° alpha is remains. The stage
-        # knows that.
+        # Without both the doubt is left on which side of 90° alpha is, but the stage knows it.
         total, without_noise, by_side, probed = (
             force_covariance(unit, force, variance_v2, environment) for unit, variance_v2 in (
                 (sensor, np.mean(held.std_v[fold], axis=0) ** 2), (sensor, none_v2),
