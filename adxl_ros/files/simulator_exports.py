@@ -138,7 +138,7 @@ def _genesis(export: Export) -> str:
     }
     return '\n'.join([
         *commented(head(
-            export, 'Genesis 0.4', *flat_noise_lines(sensor),
+            export, 'Genesis 0.4 to 1.4', *flat_noise_lines(sensor),
             'Values are those of a step of DT_S; give the scene that dt. Genesis rounds',
             'the delay to steps, and its random walk has no bounds.',
             '  imu = scene.add_sensor(gs.sensors.IMU(',
@@ -223,7 +223,7 @@ _STD = {WHITE_NOISE: 'std', 'noise_excess': 'std', 'bias': 'mean'}
 
 SIMULATORS = {
     'genesis': Format(
-        'Python module with options of an IMU of Genesis 0.4',
+        'Python module with options of an IMU of Genesis 0.4 to 1.4',
         {WHITE_NOISE: 'acc_noise', 'noise_excess': 'acc_noise', 'bias': 'acc_bias',
          'bias_walk': 'acc_random_walk', 'scale_factor': 'CROSS_AXIS_COUPLING',
          'misalignment': 'CROSS_AXIS_COUPLING', 'lever_arm': 'pos_offset',

@@ -19,7 +19,7 @@ import sys
 from typing import Any
 from urllib.parse import unquote_plus
 
-from adxl_ros.errors import UserError
+from adxl_ros.errors import install_hint, UserError
 from adxl_ros.process import package_version
 from adxl_ros.report.figures import png
 
@@ -35,8 +35,7 @@ def check_libraries() -> None:
         import jinja2  # noqa: F401
         from plotly.offline import get_plotlyjs  # noqa: F401
     except ImportError as error:
-        raise UserError(f'pages need {error.name}; apt install python3-plotly python3-jinja2'
-                        ) from None
+        raise UserError(f'pages need {error.name}; {install_hint("plotly", "jinja2")}') from None
 
 
 def render(package: str, template: str, values: Mapping[str, Any]) -> str:

@@ -196,10 +196,9 @@ class SensorModel:
             nothing to do.
 
         """
-        count = len(self._steps)
-        if count:
-            rows = np.arange(count)[slice(None) if env_ids is None else
-                                    env_ids if isinstance(env_ids, slice) else _on_host(env_ids)]
+        if count := len(self._steps):
+            rows = np.arange(count)[slice(None) if env_ids is None else env_ids if isinstance(
+                env_ids, slice | list) else _on_host(env_ids)]
             self._reset = np.union1d(self._reset, rows)
             self._draw(rows)
 

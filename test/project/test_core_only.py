@@ -10,6 +10,7 @@ import json
 from pathlib import Path
 import re
 
+from adxl_ros.errors import install_hint
 from processes import REPO
 from without_extras import run_without_extras
 
@@ -74,8 +75,7 @@ for use in (lambda: tables.open_table('log.ulg'), lambda: tables.open_table('log
 """
     lines = run_without_extras(code).stdout.splitlines()
     assert len(lines) == 5
-    for line, name in zip(lines, ('pyulog', 'pyarrow', 'rosbags>=', 'matplotlib',
-                                  'python3-plotly')):
+    for line, name in zip(lines, ('pyulog', 'pyarrow', 'rosbags>=', 'matplotlib', 'plotly')):
         assert re.search(f'install .*{re.escape(name)}', line), line
 
 
@@ -90,5 +90,4 @@ def test_a_csv_is_fitted(tmp_path: Path) -> None:
     assert Path(output).exists()
     done = run_without_extras(run.format('fit'), sweep, '-o', output, '--report', str(tmp_path))
     assert done.returncode == 1
-    assert done.stderr == \
-        'fit: pages need jinja2; apt install python3-plotly python3-jinja2\n'
+    assert done.stderr == f'fit: pages need jinja2; {install_hint("plotly", "jinja2")}\n'

@@ -148,6 +148,7 @@ def test_a_sensor_that_is_reset_reads_as_a_new_one(effect):
     readings = []
     for step, f in enumerate(batch):
         if step == begin:
+            model.reset([])
             model.reset(np.array([1]))
         readings.append(model(f, 1 / RATE_HZ, temperature=temperature_c()[step]))
     readings, alone = np.array(readings), called(sensor, 0, force)

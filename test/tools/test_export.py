@@ -20,7 +20,7 @@ from adxl_ros.simulate.sensor_model import SensorModel
 from adxl_ros.tools.export import FORMATS
 import numpy as np
 from processes import run_in_process
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ConfigDict, create_model, Field
 import pytest
 from units import nominal
 import yaml
@@ -222,24 +222,15 @@ def test_mjlab(exported, monkeypatch):
 
 NotNegative = Annotated[float, Field(ge=0)]
 Three = Annotated[tuple[float, float, float], Field(strict=False)]
-
-
-class GenesisImu(BaseModel):
-    """Options of gs.sensors.IMU in Genesis 0.4.5, options/sensors/options.py, by its rules."""
-
-    model_config = ConfigDict(strict=True, extra='forbid')
-    pos_offset: Three
-    acc_bias: Three
-    acc_noise: Three
-    acc_random_walk: Three
-    acc_resolution: Three
-    delay: NotNegative
-    jitter: NotNegative
-    interpolate: bool = False
+GenesisImu = create_model(
+    'GenesisImu', __config__=ConfigDict(strict=True, extra='forbid'),
+    **dict.fromkeys(('pos_offset', 'acc_bias', 'acc_noise', 'acc_random_walk', 'acc_resolution'),
+                    (Three, ...)), **dict.fromkeys(('delay', 'jitter'), (NotNegative, ...)))
+"""Options of gs.sensors.IMU in Genesis 0.4.5 and 1.4.5, by the rules of options/sensors."""
 
 
 def test_genesis(exported, monkeypatch, tmp_path):
-    """The sensor multiplies, adds walk, noise and bias, and rounds (Genesis 0.4.5, imu.py)."""
+    """The sensor multiplies, adds walk, noise and bias, and rounds (Genesis 1.4.5, imu.py)."""
     values = run_module(exported, 'genesis', monkeypatch, {})
     options = GenesisImu(**values['ACCELEROMETER'])
     assert options.jitter <= options.delay

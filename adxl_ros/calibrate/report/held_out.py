@@ -401,14 +401,15 @@ def covariances(errors: HeldOutErrors, held: Poses, reference: np.ndarray) -> li
     for number, sensor in enumerate(errors.fitted):
         fold = errors.fold == number
         force, environment = list(reference[fold].T), held.subset(fold).environment
-        variance_v2 = np.mean(held.std_v[fold], axis=0) ** 2
-        total = force_covariance(sensor, force, variance_v2, environment)
-        without_noise = force_covariance(sensor, force, 0 * variance_v2, environment)
+        exact, none_v2 = sensor.without_covariance(), np.zeros(len(sensor.axes))
+        # Without both the doubt is left on which side of 90° alpha is, but the stage knows it.
+        total, without_noise, by_side, probed = (
+            force_covariance(unit, force, variance_v2, environment) for unit, variance_v2 in (
+                (sensor, np.mean(held.std_v[fold], axis=0) ** 2), (sensor, none_v2),
+                (exact, none_v2), (exact, (sensor.scale_v_per_g / G0_MPS2 * _PROBE_MPS2) ** 2)))
         by_noise[:, :, fold] = total - without_noise
-        by_coefficients[:, :, fold] = without_noise
-        exact = sensor.without_covariance()
-        by_probe[:, :, fold] = force_covariance(
-            exact, force, (sensor.scale_v_per_g / G0_MPS2 * _PROBE_MPS2) ** 2, environment)
+        by_coefficients[:, :, fold] = without_noise - by_side
+        by_probe[:, :, fold] = probed - by_side
     return [by_noise, by_coefficients, _stage_covariance(errors.fitted[0], held), by_probe]
 
 

@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 from adxl_ros.calibrate import calibration
 from adxl_ros.calibrate.fits.full_model import TERMS
-from adxl_ros.calibrate.report import gum
+from adxl_ros.calibrate.report import gum, held_out
 from adxl_ros.errors import UserError
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
@@ -94,6 +94,15 @@ def test_the_table_adds_up_and_has_the_numbers_of_the_error_budget(found):
     assert accel._replace(limit=2.576, error=0.9, guard_band=0.1).risk == pytest.approx(
         0.01, rel=1e-3)
     assert accel._replace(limit=1.0, error=1.0, guard_band=0.0).risk == 0.5
+
+
+def test_the_stage_knows_on_which_side_of_90_degrees_a_pose_is(found):
+    errors = next(row for row in found[0].held_out if row.model == 'full')
+    held = found[0].poses.subset(errors.pose_index)
+    force = np.column_stack(specific_force(0 * held.beta_rad + np.radians(87), held.beta_rad,
+                                           GRAVITY_MPS2))
+    by_coefficients = held_out.covariances(errors, held, force)[1]
+    assert np.sqrt(by_coefficients[0, 0].max()) < 2e-3
 
 
 def test_standard_gravity_is_no_local_gravity_and_the_laboratory_may_state_it():
