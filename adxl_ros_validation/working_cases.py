@@ -83,9 +83,8 @@ def draw(seed: int, number: int, only: str | None = None) -> Case:
                        world.COLOUR.draw(rng, unit))
     faults, rows, at_rest = [], [], []
     for kind in kinds:
-        strength = 1e-3 * G0 * math.exp(rng.uniform(*np.log(_STRENGTHS_MG)))
-        fault, _, change = trials.sized(partial(trials.measured, scene, force),
-                                        Fault(kind, kind.start, kind.draw(rng, unit)), strength)
+        fault, strength, _, change = trials.sized(
+            rng, kind, unit, _STRENGTHS_MG, partial(trials.measured, scene, force), 1e-3 * G0)
         calibrated = kind.at_rest and bool(rng.random() < _AT_REST_SHARE)
         stated = unit
         if calibrated:

@@ -3,11 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable
 from dataclasses import replace
 from datetime import date
-from functools import partial
 import json
 import os
 from pathlib import Path
@@ -20,11 +18,11 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.process import code_version, package_version
-from adxl_ros.workers import for_each, Pool, write
+from adxl_ros.workers import Pool, write
 from adxl_ros_validation.blind import grading, ideal_observer, scores, trials
 from adxl_ros_validation.blind.faults import NOISE_LIKE
 from adxl_ros_validation.blind.simulator import Fault, Scene
-from adxl_ros_validation.blind.trials import Label
+from adxl_ros_validation.blind.trials import kept, Label, Show
 import numpy as np
 import pandas as pd
 import yaml
@@ -34,8 +32,6 @@ _ENVIRONMENT = ('PATH', 'LD_LIBRARY_PATH', 'PYTHONPATH', 'AMENT_PREFIX_PATH', 'V
 """Variables that ROS 2 and Python need. None contains the folder of the check."""
 _TIMEOUT_S = 1200.0
 """Longest time of one diagnosis, s; chosen."""
-Show = Callable[[str], AbstractContextManager[Callable[[float], None]]]
-"""Receives the name of a stage; gives a context with what receives the finished fraction."""
 Result = dict[str, Any]
 """What a diagnosis left: `report`, `parameters`, `seconds`, `status` and `error`."""
 
@@ -111,19 +107,6 @@ def diagnose_all(folder: Path, pool: Pool, show: Callable[[float], None]
         raise UserError('the code of the diagnosis changed while it ran; draw a new check into '
                         'another folder, and do not change the package meanwhile')
     return results
-
-
-def kept(folder: Path, names: Sequence[str], work: Callable[..., tuple[str, Any]],
-         job: Callable[[str], tuple], pool: Pool, show: Callable[[float], None]
-         ) -> dict[str, Any]:
-    """Do the work that has no result in a folder yet, and return all results by name."""
-    def keep(name: str, result: Any) -> None:
-        write(folder / f'{name}.json', json.dumps(result).encode())
-
-    todo = [name for name in names if not (folder / f'{name}.json').exists()]
-    for_each(pool, work, [partial(job, name) for name in todo], keep, show,
-             len(names) - len(todo))
-    return {name: json.loads((folder / f'{name}.json').read_bytes()) for name in names}
 
 
 _BLOCK_S = 5.0
