@@ -32,6 +32,7 @@ from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Held, Motion
 from adxl_ros.simulate.response import simulate
 import numpy as np
+import pandas as pd
 import scipy
 
 SEARCH_RAD = np.radians(np.arange(-5.0, 5.01, 0.5))
@@ -89,29 +90,6 @@ _BUTTERWORTH_HZ = 20.0
 """Corner of that low-pass, Hz; the paper's."""
 
 
-@dataclass(frozen=True)
-class AngleErrors:
-    """Errors of alpha and beta in k poses, (k, 2) each, rad."""
-
-    error: np.ndarray  # estimate minus truth
-    std: np.ndarray  # standard deviation by the calibration
-    # cramér-Rao bound by the noise of one pose, and by pose and calibration. It is inf where |f|
-    # = g has two upright solutions, and for beta within 1° of level
-    pose_bound: np.ndarray
-    bound: np.ndarray
-    near_vertical: np.ndarray  # poses within 15° of alpha = ±90°, (k,)
-
-    @property
-    def determined(self) -> np.ndarray:
-        """Return whether each angle counts, (k, 2): its bound is below 1°."""
-        return self.bound < MAX_BOUND_RAD
-
-    def ratio(self, pose_only: bool) -> np.ndarray:
-        """Return the errors that count over the bound of the pose only, or over the full bound."""
-        bound = self.pose_bound if pose_only else self.bound
-        return (self.error / bound)[self.determined]
-
-
 def sweep_bound(truth: Sensor, swept: Poses, true_rad: np.ndarray, stage: StageError,
                 terms: Sequence[str]) -> Sensor:
     """Return the true unit with the Cramér-Rao bound of a sweep as its covariance."""
@@ -129,8 +107,14 @@ def sweep_bound(truth: Sensor, swept: Poses, true_rad: np.ndarray, stage: StageE
 
 
 def angle_errors(fitted: Sensor, bound: Sensor, poses: Poses, true_rad: np.ndarray
-                 ) -> AngleErrors:
-    """Compare the tilt by a calibrated unit with the truth."""
+                 ) -> pd.DataFrame:
+    """
+    Compare the tilt by a calibrated unit with the truth; a row for alpha and beta of each pose.
+
+    It has the error, the standard deviation by the calibration, and the Cramér-Rao bound by the
+    noise of one pose, and by pose and calibration, rad. A bound is inf where |f| = g has two
+    upright solutions, and for beta within 1° of level; an error counts where it is below 1°.
+    """
     force = stage_force(bound, *true_rad.T)
     up = np.where(np.asarray(force[2]) < 0, -1, 1)
     variance_v2 = np.mean(poses.std_v, axis=0) ** 2
@@ -147,8 +131,11 @@ def angle_errors(fitted: Sensor, bound: Sensor, poses: Poses, true_rad: np.ndarr
     error[:, 1] = (error[:, 1] + np.pi) % (2 * np.pi) - np.pi
     error[:, 1] = np.where(np.isfinite(error[:, 1]), error[:, 1], 0.0)
     inclined = np.arctan2(np.hypot(force[0], force[1]), np.abs(force[2]))
-    return AngleErrors(error, measured[1], pose_only[1], true[1],
-                       np.pi / 2 - inclined < NEAR_VERTICAL_RAD)
+    found = pd.DataFrame({name: values.ravel() for name, values in (
+        ('error', error), ('std', measured[1]), ('pose_bound', pose_only[1]), ('bound', true[1]))})
+    return found.assign(
+        angle=np.tile(['alpha', 'beta'], len(error)), counts=found.bound < MAX_BOUND_RAD,
+        near_vertical=np.repeat(np.pi / 2 - inclined < NEAR_VERTICAL_RAD, 2))
 
 
 def _angles(sensor: Sensor, force: Components, up: np.ndarray, variance_v2: np.ndarray
@@ -319,29 +306,17 @@ RANDOM_POSES = 40
 
 
 @dataclass(frozen=True)
-class ModelErrors:
-    """Errors of one model of one unit."""
-
-    # angle errors in random poses, and in each of the paper's tilt experiments
-    random: AngleErrors
-    runs: dict[str, AngleErrors]
-    # errors of the measured axes over their standard deviation in the random poses, (k, m)
-    force_z: np.ndarray
-    # errors of the coefficients over their standard deviation, (p,). Empty where the truth is
-    # not in the gauge of the fit
-    coefficient_z: np.ndarray
-    motion: tuple[float, float]  # rms about the mean, and mean, of the residual in motion, mm/s²
-
-    def all_angles(self) -> list[AngleErrors]:
-        """Return the angle errors of all experiments."""
-        return [self.random, *self.runs.values()]
-
-
-@dataclass(frozen=True)
 class Unit:
-    """One unit on one stage."""
+    """Errors of one unit on one stage; each has values by model."""
 
-    models: dict[str, ModelErrors]  # errors by model
+    # of `angle_errors`, by `model` and by `run`: random poses and the paper's tilt experiments
+    angles: pd.DataFrame
+    # errors over their standard deviation: of the measured axes in the random poses, and of the
+    # coefficients; empty where the truth is not in the gauge of the fit
+    acceleration: dict[str, np.ndarray]
+    coefficients: dict[str, np.ndarray]
+    # rms about the mean, and mean, of the residual in motion, mm/s²
+    motion: dict[str, tuple[float, float]]
     directions: DirectionSearch  # the search for its misalignment
 
 
@@ -358,19 +333,18 @@ def evaluate(nominal: Sensor, stage: Stage, seed: int) -> Unit:
     angles_rad = {'random': random_rad, **{name: np.radians(deg) for name, deg in RUNS.items()}}
     poses_of = {name: poses_at(truth, rad, seed + (i + 1) * 1_000_003)[:2]
                 for i, (name, rad) in enumerate(angles_rad.items())}
-    motion = shaken(truth, seed)
-    models = {}
-    for name, fitted in run.fitted.items():
-        angles = {key: angle_errors(fitted, bound, *poses)
-                  for key, poses in poses_of.items()}
-        error, std = force_errors(fitted, truth, *poses_of['random'])
-        names, coefficient_z = fitted.covariance_names, np.zeros(0)
+    moved, angles, acceleration, coefficients = shaken(truth, seed), [], {}, {}
+    for model, fitted in run.fitted.items():
+        angles += [angle_errors(fitted, bound, *poses).assign(model=model, run=name)
+                   for name, poses in poses_of.items()]
+        acceleration[model] = np.divide(*force_errors(fitted, truth, *poses_of['random']))
+        names, coefficients[model] = fitted.covariance_names, np.zeros(0)
         if all(name.effect in truth.effects for name in names):
-            coefficient_z = (get(fitted, names) - get(truth, names)) / np.sqrt(
+            coefficients[model] = (get(fitted, names) - get(truth, names)) / np.sqrt(
                 np.diag(fitted.covariance))
-        models[name] = ModelErrors(angles.pop('random'), angles, error / std, coefficient_z,
-                                   motion_errors(fitted, *motion)[0])
-    return Unit(models, search(truth, seed))
+    return Unit(pd.concat(angles), acceleration, coefficients, {
+        model: motion_errors(fitted, *moved)[0] for model, fitted in run.fitted.items()},
+        search(truth, seed))
 
 
 def evaluate_all(nominal: Sensor, units: int, seed: int, show: Callable[[float], None]

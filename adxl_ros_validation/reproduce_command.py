@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import date
 import os
@@ -25,9 +25,10 @@ from adxl_ros.process import package_version
 from adxl_ros.report.figures import png, pyplot
 from adxl_ros.tools import command_line as cli
 from adxl_ros_validation import coverage, experiments
-from adxl_ros_validation.blind.report_html import markdown_table
-from adxl_ros_validation.experiments import DirectionSearch, ModelErrors, MODELS, RUNS, Unit
+from adxl_ros_validation.blind.report import markdown_table, terminal_table
+from adxl_ros_validation.experiments import DirectionSearch, MODELS, RUNS, Unit
 import numpy as np
+import pandas as pd
 
 _EXAMPLES = {
     'the experiments on 20 simulated units': '-o reproduction',
@@ -126,11 +127,11 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> _Re
 def _coverage(sensor: Sensor, options: argparse.Namespace) -> _Reproduction:
     """Count how often the intervals hold the truth."""
     with cli.progress('coverage') as show:
-        draws = coverage.draw_all(replace(sensor, effects=(), values={}), options.draws,
-                                  options.seed, show)
-    page = coverage.page(draws, f'adxl_ros {package_version()}, {date.today()}, seed '
+        errors = coverage.draw_all(replace(sensor, effects=(), values={}), options.draws,
+                                   options.seed, show)
+    page = coverage.page(errors, f'adxl_ros {package_version()}, {date.today()}, seed '
                                 f'{options.seed}; `make coverage`.')
-    return wrap_prose(page), coverage.screen_lines(draws)
+    return wrap_prose(page), coverage.screen_lines(errors)
 
 
 _COLOURS = {'linear': 'tab:red', 'physical': 'tab:orange', 'full': 'tab:green'}
@@ -163,13 +164,11 @@ def draw_tilt(path: str | os.PathLike, unit: Unit) -> None:
         turned = asked_deg[:, 1 if run == 'beta' else 0]
         for row, angle in enumerate(('alpha', 'beta')):
             axis = grid[row, column]
-            for name, errors in unit.models.items():
-                angles = errors.runs[run]
-                counts = angles.determined[:, row]
-                error = np.where(counts, np.degrees(angles.error[:, row]), np.nan)
-                axis.plot(turned, error, 'o-', ms=4, lw=1, color=_COLOURS[name], label=name)
-            bound = np.where(counts, np.degrees(angles.bound[:, row]), np.nan)
-            axis.fill_between(turned, -Z_90 * bound, Z_90 * bound, color='0.8',
+            for name, errors in unit.angles[(unit.angles.run == run) & (
+                    unit.angles.angle == angle)].groupby('model', sort=False):
+                shown = np.degrees(errors[['error', 'bound']]).where(errors.counts)
+                axis.plot(turned, shown.error, 'o-', ms=4, lw=1, color=_COLOURS[name], label=name)
+            axis.fill_between(turned, -Z_90 * shown.bound, Z_90 * shown.bound, color='0.8',
                               label='90 % by the bound')
             axis.axhline(0, color='0.5', lw=0.8)
             axis.set_yscale('symlog', linthresh=0.1)
@@ -266,22 +265,16 @@ def _page(results: dict[str, list[Unit]], bound_mmps2: float, made: str, interva
 
 def screen_lines(results: dict[str, list[Unit]], bound_mmps2: float) -> list[str]:
     """Return Table I and the motion experiment as lines for a terminal."""
-    rows: list[tuple[str, str, list[float]]] = []
-    for stage, units in results.items():
-        for row, angle in enumerate(('alpha', 'beta')):
-            paper = ' / '.join(f'{rms:.2f}' for (a, _), (rms, _) in TABLE_I.items() if a == angle)
-            errors = [*(_errors(units, name, row) for name in MODELS), _bounds(units, row)]
-            rows.append((f'{_STAGE_NAMES[stage]}, {angle}', paper,
-                         [np.degrees(_rms(e)) for e in errors]))
+    rows = [[f'{_STAGE_NAMES[stage]}, {angle}',
+             ' / '.join(f'{rms:.2f}' for (a, _), (rms, _) in TABLE_I.items() if a == angle),
+             *(f'{np.degrees(_rms(values)):.3g}' for values in (*errors, bound))]
+            for stage, units in results.items()
+            for angle, *errors, bound in _tilt_errors(units)]
     paper = ' / '.join(f'{value:.1f}' for value in MOTION_MMPS2.values())
-    for stage, units in results.items():
-        both = [_rms(np.hypot(*_motion_errors(units, name))) for name in MODELS]
-        rows.append((f'{_STAGE_NAMES[stage]}, motion', paper, [*both, bound_mmps2]))
-    return [f' {"Table I, rms error of":28}{"paper":>15}'
-            + ''.join(f'{name:>9}' for name in MODELS) + f'{"bound":>8}',
-            *(f' {label:28}{paper:>15}' + ''.join(
-                f'{value:9.3g}' for value in values[:-1]) + f'{values[-1]:8.3g}'
-              for label, paper, values in rows),
+    rows += [[f'{_STAGE_NAMES[stage]}, motion', paper, *(
+        f'{value:.3g}' for value in (*(_rms(np.hypot(*errors)) for errors in _motion_errors(units)),
+                                     bound_mmps2))] for stage, units in results.items()]
+    return [*terminal_table(['Table I, rms error of', 'paper', *MODELS, 'bound'], rows),
             ' tilt in °, motion in mm/s²; paper: linear / physical; bound: Cramér-Rao,',
             ' or the noise floor']
 
@@ -292,69 +285,63 @@ def in_words(angle: str) -> str:
                      in TABLE_I.items() if a == angle)
 
 
-def _errors(units: Sequence[Unit], model: str, row: int, what: str = 'error') -> np.ndarray:
-    """Return the errors of alpha (0) or beta (1) that count, of all units and runs."""
-    return np.concatenate([getattr(a, what)[a.determined[:, row], row] for unit in units
-                           for a in unit.models[model].runs.values()])
+def _counted(units: Sequence[Unit]) -> pd.DataFrame:
+    """Return the angle errors that count, of all units."""
+    errors = pd.concat([unit.angles.assign(unit=i) for i, unit in enumerate(units)])
+    return errors[errors.counts]
 
 
-def _bounds(units: Sequence[Unit], row: int) -> np.ndarray:
-    return _errors(units, 'full', row, 'bound')
+def _tilt_errors(units: Sequence[Unit]) -> list[tuple[Any, ...]]:
+    """Return the errors of each angle in the paper's runs by model, and their bound, rad."""
+    errors = _counted(units).query('run != "random"').groupby(['angle', 'model'])
+    return [(angle, *(errors.get_group((angle, model)).error for model in MODELS),
+             errors.get_group((angle, 'full')).bound) for angle in ('alpha', 'beta')]
 
 
-def _motion_errors(units: Sequence[Unit], model: str) -> np.ndarray:
-    """Return rms and mean of the residual of each unit in motion, mm/s², (2, units)."""
-    return np.array([unit.models[model].motion for unit in units]).T
+def _motion_errors(units: Sequence[Unit]) -> list[np.ndarray]:
+    """Return rms and mean of the residual of each unit in motion by model, mm/s², (2, units)."""
+    return [np.array([unit.motion[model] for unit in units]).T for model in MODELS]
 
 
 def _tilt(units: Sequence[Unit]) -> str:
-    rows = []
-    for row, angle in enumerate(('alpha', 'beta')):
-        errors = [np.degrees(_errors(units, name, row)) for name in MODELS]
-        rows.append([angle, in_words(angle),
-                     *(f'{_rms(e):.3f} / {np.abs(e).max():.3f}' for e in errors),
-                     f'{np.degrees(_rms(_bounds(units, row))):.4f}'])
+    rows = [[angle, in_words(angle),
+             *(f'{np.degrees(_rms(e)):.3f} / {np.degrees(np.abs(e).max()):.3f}' for e in errors),
+             f'{np.degrees(_rms(bound)):.4f}'] for angle, *errors, bound in _tilt_errors(units)]
     return ('Table I: rms / largest error, °, over the three runs of figure 10; poses '
             'whose bound exceeds 1° do not count.\n\n'
             + markdown_table(['', 'paper', *MODELS, 'Cramér-Rao bound, rms'], rows))
 
 
 def _to_reach(units: Sequence[Unit]) -> str:
-    def over(function: Callable[[ModelErrors], np.ndarray]) -> list[list[np.ndarray]]:
-        return [[function(unit.models[name]) for unit in units] for name in MODELS]
-
-    def flat(errors: ModelErrors) -> np.ndarray:
-        return np.concatenate([a.error[a.determined[:, 0] & ~a.near_vertical, 0]
-                               for a in errors.all_angles()])
-
-    def ratio(pose_only: bool) -> Callable[[ModelErrors], np.ndarray]:
-        return lambda errors: np.concatenate([a.ratio(pose_only) for a in errors.all_angles()])
-
-    rows = [[f'angle error ÷ bound {text}, rms', *map(_interval, over(ratio(pose_only)))]
-            for pose_only, text in ((True, 'of the noise of one pose'),
-                                    (False, 'of pose and calibration'))]
-    before, *after = (_rms(np.concatenate(parts)) for parts in over(flat))
+    of_model = dict(iter(_counted(units).groupby('model')))
+    rows = [[f'angle error ÷ bound {text}, rms', *(
+        _interval(of_model[model].error / of_model[model][bound], of_model[model].unit)
+        for model in MODELS)] for bound, text in (('pose_bound', 'of the noise of one pose'),
+                                                  ('bound', 'of pose and calibration'))]
+    before, *after = (_rms(of_model[model].query('angle == "alpha" and not near_vertical').error)
+                      for model in MODELS)
     rows.append(['reduction of the rms error of alpha, 15° and more from ±90°, %', '–',
                  *(f'{100 * (1 - rms / before):.2f}' for rms in after)])
-    for text, z_of in (('acceleration', lambda errors: np.ravel(errors.force_z)),
-                       ('coefficients', lambda errors: errors.coefficient_z)):
-        zs = [np.concatenate(parts) for parts in over(z_of)]
+    for text in ('acceleration', 'coefficients'):
+        zs = [np.concatenate([np.ravel(getattr(unit, text)[model]) for unit in units])
+              for model in MODELS]
         rows.append([f'coverage of 90 % intervals, {text}, %', *(
             f'{100 * np.mean(np.abs(z) < Z_90):.1f} (of {len(z)})' if len(z) else '–'
             for z in zs)])
-    determined = np.concatenate([a.determined[:, 0] for unit in units
-                                 for a in unit.models['full'].all_angles()])
+    determined = np.concatenate([unit.angles.query('model == "full" and angle == "alpha"').counts
+                                 for unit in units])
     return (markdown_table(['random poses and the three runs, none fitted', *MODELS], rows)
             + f'\n\nOf {len(determined)} poses {np.sum(~determined)} determine alpha worse than '
               '1° and do not count.')
 
 
 def _motion(units: Sequence[Unit], bound_mmps2: float) -> str:
-    errors = [_motion_errors(units, name) for name in MODELS]
+    errors, number = _motion_errors(units), pd.Series(range(len(units)))
     paper = ', '.join(f'{name} {value}' for name, value in MOTION_MMPS2.items())
     bound = f'{bound_mmps2:.2f}'
     return markdown_table(['motion, mm/s²', 'paper', *MODELS, 'bound'], [
-        ['rmse about the offset', '–', *(_interval(rmse[:, None]) for rmse, _ in errors), bound],
+        ['rmse about the offset', '–',
+         *(_interval(pd.Series(rmse), number) for rmse, _ in errors), bound],
         ["offset, rms, the stage's part included", '–',
          *(f'{_rms(offset):.1f}' for _, offset in errors), '–'],
         ['both together', paper, *(f'{_rms(np.hypot(*both)):.1f}' for both in errors), bound]])
@@ -370,14 +357,13 @@ def _directions(units: Sequence[Unit]) -> str:
                              [[f'{np.degrees(_rms(error)):.3f}' for error in errors]]))
 
 
-def _interval(parts: Sequence[np.ndarray] | np.ndarray) -> str:
-    """Write the rms over all with its 90 % interval by bootstrap over units."""
-    squares = [(float(np.sum(part ** 2)), len(part)) for part in parts]
-    mean, low, high = np.sqrt(coverage.mean_with_interval(squares))
+def _interval(values: pd.Series, groups: pd.Series) -> str:
+    """Write an rms with its 90 % interval by bootstrap over units."""
+    mean, low, high = np.sqrt(coverage.mean_with_interval(values ** 2, groups))
     return f'{mean:.3f} ({low:.3f} to {high:.3f})'
 
 
-def _rms(values: np.ndarray) -> float:
+def _rms(values: np.ndarray | pd.Series) -> float:
     return float(np.sqrt(np.mean(values ** 2)))
 
 

@@ -9,13 +9,13 @@ the axes and the noise. So the blind check stays blind to what is developed with
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 import math
 
 from adxl_ros_validation.blind import faults, ideal_observer, simulator as sim
 from adxl_ros_validation.blind.motion import low_pass, Manoeuvre
-from adxl_ros_validation.blind.simulator import Fault, G0, Place, Run, Scene, Shape, Unit
+from adxl_ros_validation.blind.simulator import Fault, G0, Kind, Place, Run, Scene, Shape, Unit
 import numpy as np
 import scipy
 
@@ -359,14 +359,6 @@ def _two_levels(run: Run, shape: Shape) -> np.ndarray:
     """Switch zero-g between two levels at uneven times, as popcorn noise does."""
     phase = 2 * np.pi * run.t / shape['period_s'] + shape['phase']
     return np.where(np.sin(phase) + 0.7 * np.sin(2.718 * phase) > 0.4, 1.0, 0.0)
-
-
-@dataclass(frozen=True)
-class Kind(sim.Kind):
-    """A kind of fault of this world."""
-
-    needs: str = ''  # what the manoeuvre must have for it to show
-    at_rest: bool = False  # whether a calibration at rest takes a part of it up
 
 
 _ODD, _DIE = {'odd': (-0.5, 0.5)}, {'bend': (-0.03, 0.03), 'late_s': (0.5, 6.0)}

@@ -114,13 +114,13 @@ class Half:
 def prepare(source: Path) -> tuple[list[Half], list[str]]:
     """Return the later parts of recordings, and why others are left out."""
     halves, left_out = [], []
-    for path, sim, digest in _sources(source):
+    for path, sim_path, digest in _sources(source):
         try:
             if not path.exists():
                 raise UserError('no such file; the manifest has its address')
             if digest and hashlib.sha256(path.read_bytes()).hexdigest() != digest:
                 raise UserError('is not the file whose SHA-256 the manifest has')
-            halves.append(_half(path, sim))
+            halves.append(_half(path, sim_path))
         except UserError as error:
             left_out.append(f'{path.name}: {error}')
     if not halves:
@@ -278,8 +278,9 @@ def draw(halves: Sequence[Half], plan: Plan) -> Drawn:
     half, rng = halves[plan.seed[-1]], np.random.default_rng([*plan.seed, 0])
     end = float(half.columns['time_s'].iloc[-1])
     start = float(rng.uniform(0, (1 - _PART) * end))
-    half = replace(half, **{name: _part(getattr(half, name), start, start + _PART * end)
-                            for name in ('columns', 'sim')})
+    columns, force = (_part(whole, start, start + _PART * end)
+                      for whole in (half.columns, half.sim))
+    half = replace(half, columns=columns, sim=force)
     faults, changed = [], half.g()
     for name in plan.effects:
         fault, _, strength, changed = trials.sized(
@@ -321,7 +322,8 @@ def _with_fault(half: Half, seed: tuple[int, ...], fault: Fault) -> tuple[float,
         run.volts = np.stack([np.interp(t - run.late_s(t), t, row) for row in run.volts])
     after = run.volts - _ZERO_V
     # The rms counts where the reference is known; zero-g and scale factor are free.
-    known = half.columns['alpha_rad'].notna().to_numpy() if half.reference == 'rests' else slice(None)
+    known = half.columns['alpha_rad'].notna().to_numpy() if half.reference == 'rests' \
+        else slice(None)
     rest = G0 * (after - before)[:, known]
     if fault.kind.name not in ('bias', 'scale_factor'):
         for row, along in zip(rest, before[:, known]):

@@ -43,11 +43,11 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def terminal_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Return a table as lines of a terminal; names of rows are wrapped."""
     widths = [max(map(len, column)) for column in zip(head, *rows)][1:]
-    room, lines = COLUMNS - sum(widths) - len(widths), []
+    room, lines = COLUMNS - 1 - sum(widths) - len(widths), []
     for name, *cells in (head, *rows):
         first, *more = textwrap.wrap(name, room) or ['']
         padded = (f'{cell:{width}}' for cell, width in zip(cells, widths))
-        lines += [' '.join([f'{first:{room}}', *padded]).rstrip(), *more]
+        lines += [' '.join([f' {first:{room}}', *padded]).rstrip(), *(f' {m}' for m in more)]
     return lines
 
 

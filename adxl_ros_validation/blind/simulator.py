@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, KW_ONLY
 from enum import auto, Enum
+from functools import partial
 from itertools import product
 import math
 from typing import Any
@@ -209,36 +210,22 @@ def constant(run: Run, shape: Shape) -> float:
     return 1.0
 
 
-def added(law: Law) -> Act:
-    """Add a law to the input of each axis by its weight, g."""
+def _acting(how: str, law: Law) -> Act:
+    """Let a law act on each axis by its weight."""
     def act(run: Run, size: float, shape: Shape) -> None:
-        w = column(shape)
-        run.u[:len(w)] += size * w * law(run, shape)
+        change = size * column(shape) * law(run, shape)
+        if how == 'scaled':
+            run.u[:len(change)] *= 1 + change
+        elif how == 'added':
+            run.u[:len(change)] += change
+        else:
+            run.volts += change * (run.unit.scale_v_per_g[:, None] if how == 'output' else 1.0)
     return act
 
 
-def scaled(law: Law) -> Act:
-    """Change the scale factor of each axis by a law and its weight."""
-    def act(run: Run, size: float, shape: Shape) -> None:
-        w = column(shape)
-        run.u[:len(w)] *= 1 + size * w * law(run, shape)
-    return act
-
-
-def added_v(law: Law) -> Act:
-    """Add a law to the output of each axis by its weight, V."""
-    def act(run: Run, size: float, shape: Shape) -> None:
-        run.volts += size * column(shape) * law(run, shape)
-    return act
-
-
-def added_at_output(law: Law) -> Act:
-    """Add a law to the output of each axis by its weight, g."""
-    def act(run: Run, size: float, shape: Shape) -> None:
-        run.volts += size * column(shape) * law(run, shape) * run.unit.scale_v_per_g[:, None]
-    return act
-
-
+added, scaled, added_at_output, added_v = (
+    partial(_acting, how) for how in ('added', 'scaled', 'output', 'volts'))
+"""Make a fault of a law: added to the input, g, its scale factor, or to the output, g or V."""
 _SINGLE_SHARE = 0.4
 """Share of the faults that have one weight only; chosen."""
 _LOG_SPREAD = 0.4
@@ -278,6 +265,8 @@ class Kind:
     # multiples of `start`, and other numbers, at which its responses span all
     sizes: tuple[float, ...] = (1.0,)
     spread_at: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    needs: str = ''  # what the manoeuvre must have for it to show
+    at_rest: bool = False  # whether a calibration at rest takes a part of it up
 
     def _count(self, unit: Unit) -> int:
         return self.fixed or self.each * len(unit.axes)

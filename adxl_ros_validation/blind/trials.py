@@ -171,8 +171,8 @@ def sized(rng: np.random.Generator, kind: Kind, unit: Unit, bounds: tuple[float,
     """
     Draw a fault of a strength, log-uniform within bounds; it has this or its largest size.
 
-    The bounds are in units of `per_mps2`. `measure` returns the strength of a fault, m/s², and what it does. Return the fault, the drawn
-    strength, and what was measured last.
+    The bounds are in units of `per_mps2`. `measure` returns the strength of a fault, m/s², and
+    what it does. Return the fault, the drawn strength, and what was measured last.
     """
     strength = per_mps2 * math.exp(rng.uniform(*np.log(bounds)))
     fault = Fault(kind, kind.start, kind.draw(rng, unit))
