@@ -32,7 +32,8 @@ setup(
     package_data={PACKAGE: ['calibrate/report/*.html', 'calibrate/report/*.js',
                             'calibrate/report/*.xml', 'diagnose/*.html', 'fleet/*.html',
                             'report/page_templates/*', 'tools/*.html'],
-                  f'{PACKAGE}_validation': ['*.html'], f'{PACKAGE}.params': ['*.yaml']},
+                  f'{PACKAGE}_validation': ['*.yaml', 'blind/*.yaml', 'pages/*'],
+                  f'{PACKAGE}.params': ['*.yaml']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),

@@ -77,7 +77,7 @@ def _check(options: argparse.Namespace, folder: Path) -> int:
     said = (real_sensors.report if is_real else report.of_simulated)(made)
     write_text(folder / 'blind.json', json.dumps(made, indent=1, allow_nan=False) + '\n')
     write_text(folder / 'blind.md', said.markdown())
-    write_text(folder / 'blind.html', page.render('adxl_ros_validation', 'blind.html', {
+    write_text(folder / 'blind.html', page.render('adxl_ros_validation', 'pages/blind.html', {
         **said._asdict(), 'about': [], 'badge': None, 'figures': {}}))
     cli.print_end([*said.screen(), ''],
                   [folder / f'blind.{suffix}' for suffix in ('html', 'md', 'json')])

@@ -22,7 +22,7 @@ from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros_validation import experiments
-from adxl_ros_validation.blind.report import markdown_table, terminal_table
+from adxl_ros_validation.blind.report import filled, markdown_table, terminal_table
 import numpy as np
 import pandas as pd
 import scipy
@@ -143,20 +143,12 @@ def page(errors: pd.DataFrame, made: str) -> str:
         single.append(_row(f'{name} ({len(part)})', part, (
             inside.statistic, *inside.proportion_ci(0.9, 'exact'))))
     head = ['coverage, %', 'rms of error / stated', 'ranks', 'p']
-    return '\n'.join([
-        f'## Coverage of the intervals: {len(draws)} drawn units and stages', '', made, '',
-        'A unit is drawn at datasheet spread. Its stage has an encoder of 0.01° to 0.1° and '
-        'a true error of 0.5 to 2 times the stated one. Plans, axes and stages alternate. '
-        'Coverage is the share of 90 % intervals that contain the truth. In brackets is its '
-        '90 % interval: by the binomial distribution, or by bootstrap over draws where one '
-        'draw has several values. Ranks are counts of the truth in the ten tenths of its '
-        'posterior; p is that of a uniform distribution.', '',
-        f'Error over the Cramér-Rao bound of the same error model, rms over {len(compared)} '
-        f'coefficients of {compared.draw.nunique()} fits with the '
-        f'terms that were drawn: {np.sqrt(np.mean(compared.by_bound ** 2)):.3f}. '
-        f'Fits that converged: {draws.converged.all().sum()} of {len(draws)}.', '',
-        markdown_table(['', *head], rows), '', markdown_table(['coefficient', *head], single),
-        ''])
+    return filled('coverage.md', {
+        'made': made, 'draws': len(draws), 'converged': draws.converged.all().sum(),
+        'compared': len(compared), 'fits': compared.draw.nunique(),
+        'by_bound': np.sqrt(np.mean(compared.by_bound ** 2)),
+        'groups': markdown_table(['', *head], rows),
+        'coefficients': markdown_table(['coefficient', *head], single)})
 
 
 def screen_lines(errors: pd.DataFrame) -> list[str]:

@@ -9,7 +9,6 @@ from dataclasses import replace
 from datetime import date
 import os
 from pathlib import Path
-import textwrap
 from typing import Any
 
 from adxl_ros.calibrate import calibration, pose_extraction
@@ -25,7 +24,7 @@ from adxl_ros.process import package_version
 from adxl_ros.report.figures import png, pyplot
 from adxl_ros.tools import command_line as cli
 from adxl_ros_validation import coverage, experiments
-from adxl_ros_validation.blind.report import markdown_table, terminal_table
+from adxl_ros_validation.blind.report import filled, markdown_table, terminal_table
 from adxl_ros_validation.experiments import DirectionSearch, MODELS, RUNS, Unit
 import numpy as np
 import pandas as pd
@@ -119,7 +118,7 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> _Re
     made = (f'adxl_ros {package_version()}, {date.today()}, {drawn} on each stage, '
             f'seed {options.seed}.')
     bound_mmps2 = experiments.motion_bound_mmps2(sensor)
-    return wrap_prose(_page(results, bound_mmps2, made, coverage_page)), [
+    return _page(results, bound_mmps2, made, coverage_page), [
         f"The paper's experiments, {drawn} on each stage, seed {options.seed}", '',
         *screen_lines(results, bound_mmps2), *[''] * bool(coverage_lines), *coverage_lines]
 
@@ -131,7 +130,7 @@ def _coverage(sensor: Sensor, options: argparse.Namespace) -> _Reproduction:
                                    options.seed, show)
     page = coverage.page(errors, f'adxl_ros {package_version()}, {date.today()}, seed '
                                 f'{options.seed}; `make coverage`.')
-    return wrap_prose(page), coverage.screen_lines(errors)
+    return page, coverage.screen_lines(errors)
 
 
 _COLOURS = {'linear': 'tab:red', 'physical': 'tab:orange', 'full': 'tab:green'}
@@ -236,31 +235,16 @@ TABLE_I = {('alpha', 'linear'): (2.88, 3.95), ('alpha', 'physical'): (0.32, 0.82
 MOTION_MMPS2 = {'linear': 299.8, 'physical': 20.8}
 """The paper's residuals of the motion experiment, mm/s²."""
 _STAGE_NAMES = {'perfect': 'perfect stage', 'paper': "the paper's stage"}
-_STAGE_TITLES = {
-    'perfect': 'Perfect stage',
-    'paper': "The paper's stage (5 arcmin, a new error with each move of a joint, level 0.1°)"}
-_FIGURE_TITLES = {
-    'sweep': 'Figures 2 to 8: deviation from the linear model, and the physical model',
-    'misalignment': 'Figure 9: the direction of the x axis', 'tilt': 'Figure 10: angle errors',
-    'motion': 'Figure 12: motion', 'components': 'Figure 13: what each part of the model does'}
 FIGURES = 'reproduction'
 """Folder of the plots, in the folder of the page."""
 
 
 def _page(results: dict[str, list[Unit]], bound_mmps2: float, made: str, intervals: str) -> str:
     """Lay out the page, Markdown."""
-    parts = ["# The paper's experiments, on simulated units", made,
-             'W. T. Ang, P. K. Khosla, C. N. Riviere, "Nonlinear Regression Model of a Low-g MEMS '
-             'Accelerometer", IEEE Sensors Journal, 2007, doi 10.1109/JSEN.2006.886995. In '
-             'brackets: 90 % intervals over units, by bootstrap.']
-    for stage, units in results.items():
-        parts += [f'## {_STAGE_TITLES[stage]}', _tilt(units), _to_reach(units),
-                  _motion(units, bound_mmps2)]
-    parts += [intervals, '## Direction of the x axis by (18)', _directions(results['paper']),
-              '## Figures',
-              *(f'![{title}]({FIGURES}/{name}.png)' for name, title in _FIGURE_TITLES.items()),
-              '## What differs from the paper, and why', 'See docs/maintain/reproduction.md.']
-    return '\n\n'.join(part.strip('\n') for part in parts if part) + '\n'
+    return filled('reproduction.md', {
+        'made': made, 'coverage': intervals, 'directions': _directions(results['paper']),
+        'step': np.degrees(experiments.SEARCH_RAD[1] - experiments.SEARCH_RAD[0]), **{
+            stage: _of_stage(units, bound_mmps2) for stage, units in results.items()}})
 
 
 def screen_lines(results: dict[str, list[Unit]], bound_mmps2: float) -> list[str]:
@@ -271,9 +255,9 @@ def screen_lines(results: dict[str, list[Unit]], bound_mmps2: float) -> list[str
             for stage, units in results.items()
             for angle, *errors, bound in _tilt_errors(units)]
     paper = ' / '.join(f'{value:.1f}' for value in MOTION_MMPS2.values())
-    rows += [[f'{_STAGE_NAMES[stage]}, motion', paper, *(
-        f'{value:.3g}' for value in (*(_rms(np.hypot(*errors)) for errors in _motion_errors(units)),
-                                     bound_mmps2))] for stage, units in results.items()]
+    rows += [[f'{_STAGE_NAMES[stage]}, motion', paper,
+              *(f'{_rms(np.hypot(*errors)):.3g}' for errors in _motion_errors(units)),
+              f'{bound_mmps2:.3g}'] for stage, units in results.items()]
     return [*terminal_table(['Table I, rms error of', 'paper', *MODELS, 'bound'], rows),
             ' tilt in °, motion in mm/s²; paper: linear / physical; bound: Cramér-Rao,',
             ' or the noise floor']
@@ -303,13 +287,17 @@ def _motion_errors(units: Sequence[Unit]) -> list[np.ndarray]:
     return [np.array([unit.motion[model] for unit in units]).T for model in MODELS]
 
 
-def _tilt(units: Sequence[Unit]) -> str:
+def _of_stage(units: Sequence[Unit], bound_mmps2: float) -> str:
+    """Lay out the tables of a stage."""
     rows = [[angle, in_words(angle),
              *(f'{np.degrees(_rms(e)):.3f} / {np.degrees(np.abs(e).max()):.3f}' for e in errors),
              f'{np.degrees(_rms(bound)):.4f}'] for angle, *errors, bound in _tilt_errors(units)]
-    return ('Table I: rms / largest error, °, over the three runs of figure 10; poses '
-            'whose bound exceeds 1° do not count.\n\n'
-            + markdown_table(['', 'paper', *MODELS, 'Cramér-Rao bound, rms'], rows))
+    counts = np.concatenate([unit.angles.query('model == "full" and angle == "alpha"').counts
+                             for unit in units])
+    return filled('reproduction_stage.md', {
+        'tilt': markdown_table(['', 'paper', *MODELS, 'Cramér-Rao bound, rms'], rows),
+        'reached': _to_reach(units), 'poses': len(counts), 'undetermined': np.sum(~counts),
+        'motion': _motion(units, bound_mmps2)})
 
 
 def _to_reach(units: Sequence[Unit]) -> str:
@@ -328,11 +316,7 @@ def _to_reach(units: Sequence[Unit]) -> str:
         rows.append([f'coverage of 90 % intervals, {text}, %', *(
             f'{100 * np.mean(np.abs(z) < Z_90):.1f} (of {len(z)})' if len(z) else '–'
             for z in zs)])
-    determined = np.concatenate([unit.angles.query('model == "full" and angle == "alpha"').counts
-                                 for unit in units])
-    return (markdown_table(['random poses and the three runs, none fitted', *MODELS], rows)
-            + f'\n\nOf {len(determined)} poses {np.sum(~determined)} determine alpha worse than '
-              '1° and do not count.')
+    return markdown_table(['random poses and the three runs, none fitted', *MODELS], rows)
 
 
 def _motion(units: Sequence[Unit], bound_mmps2: float) -> str:
@@ -348,13 +332,11 @@ def _motion(units: Sequence[Unit], bound_mmps2: float) -> str:
 
 
 def _directions(units: Sequence[Unit]) -> str:
-    step = np.degrees(experiments.SEARCH_RAD[1] - experiments.SEARCH_RAD[0])
     errors = [np.array([getattr(unit.directions, name) - unit.directions.truth_rad
                         for unit in units])
               for name in ('largest_rad', 'parabola_rad', 'null_rad')]
-    return (f'Error of β_x, ° rms over units, base level to 0.1° (steps of {step:g}°):\n\n'
-            + markdown_table(['largest output', 'parabola through the outputs', 'null crossings'],
-                             [[f'{np.degrees(_rms(error)):.3f}' for error in errors]]))
+    return markdown_table(['largest output', 'parabola through the outputs', 'null crossings'],
+                          [[f'{np.degrees(_rms(error)):.3f}' for error in errors]])
 
 
 def _interval(values: pd.Series, groups: pd.Series) -> str:
@@ -365,14 +347,6 @@ def _interval(values: pd.Series, groups: pd.Series) -> str:
 
 def _rms(values: np.ndarray | pd.Series) -> float:
     return float(np.sqrt(np.mean(values ** 2)))
-
-
-def wrap_prose(markdown: str) -> str:
-    """Wrap the lines of prose of a Markdown page; tables, headings and lists stay as they are."""
-    return '\n'.join(
-        line if line.startswith(('|', '#', '!', '-', ' ', '`'))
-        else textwrap.fill(line, 99, break_on_hyphens=False, break_long_words=False)
-        for line in markdown.split('\n'))
 
 
 def main() -> int:

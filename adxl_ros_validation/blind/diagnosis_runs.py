@@ -243,11 +243,4 @@ def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
                    if trial.answer.status == 'failed'},
         'bars': scores.bars(made), 'controls': negative,
         'leaks': any(control['leaks'] for control in negative.values()),
-        'scores': made, 'rows': [{
-            **{name: [fault[name] for fault in label.faults]
-               for name in ('strength_mps2', 'power', 'told', 'inseparable')},
-            'name': label.name, 'group': label.group, 'effects': list(label.effects),
-            'flexible': label.flexible, 'manoeuvre': label.manoeuvre, 'axes': label.axes,
-            'status': answer.status, 'top': sorted(answer.top), 'named': sorted(answer.named),
-            'probability': answer.probability, 'right': grading.verdict_right(answer, label),
-            'seconds': answer.seconds, 'held': held} for label, answer, held in graded]}
+        'scores': made, 'rows': [trial.row() for trial in graded]}

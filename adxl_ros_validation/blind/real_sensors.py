@@ -51,13 +51,6 @@ _STILL_G = 0.05
 """Largest change of the force of a sensor that rests, g rms."""
 _REST_S = 1.5
 """Shortest rest, s."""
-_NO_PLACE = frozenset(['cogging', 'rate_pull', 'supply', 'bandwidth', 'saturation', 'flicker'])
-"""Defects of joints, supply and filter, which need more than samples; sensors have flicker."""
-_OF_TEMPERATURE = frozenset(['temperature_bias', 'temperature_scale', 'thermal_loop'])
-_OF_MOTION = frozenset(['time_offset', 'clock_skew', 'vibration_rectification', 'creep'])
-_OF_FORCE = frozenset(['scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z',
-                       'scale_factor_z', 'nonlinearity', 'quadratic', 'hysteresis', 'dead_zone',
-                       'product', 'loose_gain', 'adc_inl'])
 
 
 @dataclass(frozen=True)
@@ -102,13 +95,12 @@ class Half:
 
     def kinds(self) -> list[str]:
         """Return the defects that can be put into its samples and shown by its reference."""
-        warm = self.columns.get('temperature_c', np.zeros(1))
         is_still = np.std(self.g(), axis=1).max() < _STILL_G
-        out = _NO_PLACE.union(() if np.ptp(warm) > 3 else _OF_TEMPERATURE,
-                              _OF_MOTION if is_still or self.reference == 'rests' else (),
-                              _OF_FORCE if is_still else ())
-        return [name for name, kind in KINDS.items() if name not in out and (
-            kind.place not in (sim.Place.STAGE, sim.Place.MOUNT) or name in _OF_MOTION)]
+        has = {'': True, 'chain': False, 'force': not is_still,
+               'heat': np.ptp(self.columns.get('temperature_c', np.zeros(1))) > 3,
+               'motion': not is_still and self.reference != 'rests'}
+        return [name for name, kind in KINDS.items() if has[kind.needs] and (
+            kind.needs == 'motion' or kind.place not in (sim.Place.STAGE, sim.Place.MOUNT))]
 
 
 def prepare(source: Path) -> tuple[list[Half], list[str]]:

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+import re
 import textwrap
 from typing import Any, NamedTuple
 
@@ -49,6 +51,14 @@ def terminal_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[s
         padded = (f'{cell:{width}}' for cell, width in zip(cells, widths))
         lines += [' '.join([f' {first:{room}}', *padded]).rstrip(), *(f' {m}' for m in more)]
     return lines
+
+
+def filled(name: str, values: Mapping[str, Any]) -> str:
+    """Return a Markdown page with values in it, from the text of its name, its prose wrapped."""
+    text = Path(__file__).parents[1].joinpath('pages', name).read_text(encoding='utf-8')
+    parts = re.split(r'\n{2,}', text.format(**values).strip())
+    return '\n\n'.join(part if part.startswith(('|', '#', '!')) else textwrap.fill(
+        part, 99, break_on_hyphens=False, break_long_words=False) for part in parts) + '\n'
 
 
 class Report(NamedTuple):

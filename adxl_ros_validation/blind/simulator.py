@@ -9,6 +9,7 @@ from enum import auto, Enum
 from functools import partial
 from itertools import product
 import math
+from pathlib import Path
 from typing import Any
 import zlib
 
@@ -258,14 +259,15 @@ class Kind:
     fixed: int = 0  # number of its weights; where it is 0, `each` for each measured axis
     each: int = 1
     weigh: Callable[[np.random.Generator, int], np.ndarray] = weights  # draws the weights
-    # its other numbers: bounds of each, or a list to choose from
-    bounds: Mapping[str, tuple[float, float] | list[float]] = field(default_factory=dict)
+    # its other numbers, drawn within bounds or from a list
+    bounds: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    choices: Mapping[str, Sequence[float]] = field(default_factory=dict)
     per_axis: bool = True  # whether the responses of single axes are independent
     random: bool = False  # whether it differs from run to run
     # multiples of `start`, and other numbers, at which its responses span all
-    sizes: tuple[float, ...] = (1.0,)
-    spread_at: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    needs: str = ''  # what the manoeuvre must have for it to show
+    sizes: Sequence[float] = (1.0,)
+    spread_at: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    needs: str = ''  # what a recording must have for it to act or to show
     at_rest: bool = False  # whether a calibration at rest takes a part of it up
 
     def _count(self, unit: Unit) -> int:
@@ -275,9 +277,8 @@ class Kind:
         """Draw the shape of a fault of a unit."""
         count = self._count(unit)
         shape: Shape = {'w': self.weigh(rng, count)} if count else {}
-        for name, limits in self.bounds.items():
-            shape[name] = float(rng.choice(limits) if isinstance(limits, list)
-                                else rng.uniform(*limits))
+        shape |= {name: float(rng.uniform(*limits)) for name, limits in self.bounds.items()}
+        shape |= {name: float(rng.choice(values)) for name, values in self.choices.items()}
         return shape
 
     def spread(self, unit: Unit) -> list[Shape]:
@@ -287,6 +288,20 @@ class Kind:
         shapes: list[Shape] = [{'w': row} for row in rows if count] or [{}]
         return [{**shape, **dict(zip(self.spread_at, numbers))}
                 for shape in shapes for numbers in product(*self.spread_at.values())]
+
+
+def load_kinds(table: str, functions: Mapping[str, Any]) -> tuple[dict[str, Kind], ...]:
+    """Return the listed and the unlisted faults of a table, whose functions have their names."""
+    named = {**globals(), **functions}
+
+    def kind(name: str, law: str = '', place: str = 'element', weigh: str = 'weights',
+             **numbers: Any) -> Kind:
+        act = named[law](named[name]) if law else named[name]
+        return Kind(name, act, place=Place[place.upper()], weigh=named[weigh], **numbers)
+
+    parts = yaml.safe_load((Path(__file__).parents[1] / table).read_text(encoding='utf-8'))
+    return tuple({name: kind(name, **row) for name, row in parts[part].items()}
+                 for part in ('listed', 'unlisted'))
 
 
 @dataclass(frozen=True)
