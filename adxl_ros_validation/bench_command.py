@@ -238,8 +238,8 @@ def _measure(subject: _Subject, seconds: float) -> _Result:
     periods = np.rint(np.diff(np.sort(stamps_ns)) * 1e-9 * RATE_HZ)
     # The stamps of a bare timer wander: only steps of two periods and more are a loss.
     missing = int(np.sum(np.maximum(periods - 1, 0)))
-    return _Result(first_s, len(stamps_ns) / duration_s, missing,
-                   *np.percentile(age_ms, [50, 99]), tuple(loads))
+    p50_ms, p99_ms = np.percentile(age_ms, [50, 99])
+    return _Result(first_s, len(stamps_ns) / duration_s, missing, p50_ms, p99_ms, tuple(loads))
 
 
 def _row(label: str, results: pd.DataFrame) -> str:

@@ -30,7 +30,6 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.links.support import wire_format
 from adxl_ros.model import coefficients, signal_chain
-from adxl_ros.model.coefficients import Coefficient
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2, with_axes
@@ -203,12 +202,10 @@ def _reading_and_writing(folder: Path, sensor: Sensor, samples: Recording) -> It
 
 def _applying(folder: Path, sensor: Sensor, columns: dict[str, np.ndarray]) -> Job:
     """Apply six effects with a covariance of their coefficients to a long file."""
-    unit, names = _unit(sensor, 'xy')
-    unit = replace(unit, covariance_names=names,
-                   covariance=np.diag((_RELATIVE_STD * _scales(names)) ** 2))
-    path = folder / 'long.csv'
+    unit, path = _unit(sensor, 'xy'), folder / 'long.csv'
     recording.write(path, _recording(unit, columns, _APPLIED_ROWS), unit)
-    return Job(f'apply, {_APPLIED_ROWS} rows, 6 effects, {len(names)} x {len(names)} covariance',
+    count = len(unit.covariance)
+    return Job(f'apply, {_APPLIED_ROWS} rows, 6 effects, {count} x {count} covariance',
                _apply(unit, path, folder / 'applied.csv'), 5.0, rounds=1)
 
 
@@ -229,17 +226,14 @@ def _program(name: str, *arguments: str | Path) -> str:
     return f' ({time.monotonic() - began_s:.0f} s elapsed, {int(done.stdout) / 1e3:.0f} MB)'
 
 
-def _unit(sensor: Sensor, axes: str) -> tuple[Sensor, tuple[Coefficient, ...]]:
-    """Return a unit with six effects, and the names of its coefficients."""
+def _unit(sensor: Sensor, axes: str) -> Sensor:
+    """Return a unit with six effects and a covariance of their coefficients."""
     unit = coefficients.with_neutral(with_axes(sensor, axes), _EFFECTS)
     names = tuple(name for effect in _EFFECTS
                   for name in coefficients.names_of(library()[effect], unit.axes))
-    return coefficients.put(unit, names, 0.5 * _scales(names)), names
-
-
-def _scales(names: Sequence[Coefficient]) -> np.ndarray:
-    """Return the typical sizes of coefficients, in their units, (p,)."""
-    return np.array([coefficients.parameter_of(name).scale for name in names])
+    typical = np.array([coefficients.parameter_of(name).scale for name in names])
+    return replace(coefficients.put(unit, names, 0.5 * typical), covariance_names=names,
+                   covariance=np.diag((_RELATIVE_STD * typical) ** 2))
 
 
 def _long_applying(folder: Path, sensor: Sensor, kind: str, hours: float) -> Iterator[Job]:
@@ -248,7 +242,7 @@ def _long_applying(folder: Path, sensor: Sensor, kind: str, hours: float) -> Ite
     if needed > free:
         raise UserError(f'{folder}: {free / 1e9:.1f} GB free; recordings of {hours:g} h need '
                         f'{needed / 1e9:.1f} GB: set TMPDIR to a larger disk, or --hours')
-    unit, _ = _unit(sensor, 'xyz')
+    unit = _unit(sensor, 'xyz').without_covariance()
     path, output = folder / f'in.{kind}', folder / f'out.{kind}'
     columns = simulate(unit, sweep(np.random.default_rng(0)), 0)
     block = _recording(unit, {f'{axis}_v': columns[f'{axis}_v'] for axis in 'xyz'}, _LONG_BLOCK)

@@ -80,7 +80,7 @@ def draw(nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], se
     bound = experiments.sweep_bound(truth, poses, true_rad, levels, terms)
     angles = np.column_stack([np.arccos(rng.uniform(-1, 1, _HELD_OUT)),
                               rng.uniform(0, 2 * np.pi, _HELD_OUT)])
-    held_out = _read(truth, _resting(truth, angles), angles, rng), angles
+    held_out = _measured(truth, angles, angles, rng), angles
     tilt = experiments.angle_errors(fit.fitted, bound, *held_out)
     force, force_std = experiments.force_errors(fit.fitted, truth, *held_out)
     bound_std = dict(zip(bound.covariance_names, np.sqrt(np.diag(bound.covariance))))
@@ -109,24 +109,23 @@ def _swept(truth: Sensor, targets: Sequence[pose_plan.Target], per_pose: bool, s
            rng: np.random.Generator) -> tuple[Poses, np.ndarray]:
     """Return the poses of a sweep, and where the stage really stood, rad, (k, 2)."""
     read = np.array([[t.alpha_rad, t.beta_rad] for t in targets])
-    poses = _resting(truth, read)
+    poses = Poses.without_volts(read[:, 0], read[:, 1], noise.sample_std_v(truth))
     error = np.empty_like(read)
     for joint, setting in enumerate((poses.alpha_setting, poses.beta_setting)):
         number = np.arange(len(read)) if per_pose else setting
         error[:, joint] = step_rad * rng.uniform(-0.5, 0.5, len(read))[number]
-    return _read(truth, poses, read + error, rng), read + error
+    return _measured(truth, read, read + error, rng), read + error
 
 
-def _resting(truth: Sensor, read_rad: np.ndarray) -> Poses:
+def _measured(truth: Sensor, read_rad: np.ndarray, true_rad: np.ndarray, rng: np.random.Generator
+              ) -> Poses:
+    """Return the poses that the stage reads, with the voltages of where it really stands."""
     samples = round(_DWELL_S * truth.rate_hz)
     count = noise.effective_samples(samples, 1 / truth.rate_hz, truth.rc_s)
-    return Poses.without_volts(read_rad[:, 0], read_rad[:, 1],
-                               noise.sample_std_v(truth) / np.sqrt(count))
-
-
-def _read(truth: Sensor, poses: Poses, true_rad: np.ndarray, rng: np.random.Generator) -> Poses:
-    there = replace(poses, alpha_rad=true_rad[:, 0], beta_rad=true_rad[:, 1])
-    volts = predicted_volts(truth, there)
+    poses = Poses.without_volts(read_rad[:, 0], read_rad[:, 1],
+                                noise.sample_std_v(truth) / np.sqrt(count))
+    volts = predicted_volts(truth, replace(poses, alpha_rad=true_rad[:, 0],
+                                           beta_rad=true_rad[:, 1]))
     return replace(poses, volts=volts + poses.std_v * rng.normal(size=volts.shape))
 
 

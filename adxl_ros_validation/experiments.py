@@ -39,14 +39,10 @@ SEARCH_RAD = np.radians(np.arange(-5.0, 5.01, 0.5))
 """Angles about the case's axis, rad; chosen."""
 
 
-@dataclass(frozen=True)
-class DirectionSearch:
-    """Beta of the direction of the x axis by three methods."""
+class DirectionSearch(NamedTuple):
+    """Beta of the direction of the x axis, and the outputs that it was found by."""
 
-    truth_rad: float  # the true value, rad
-    largest_rad: float  # by the largest output, rad
-    parabola_rad: float  # by a parabola through the outputs, rad
-    null_rad: float  # by the null crossings at ±90°, rad
+    found_rad: dict[str, float]  # true value, and by three methods, rad
     turned_rad: np.ndarray  # angles, rad, and outputs by the nominal scale factor, g, (k,)
     output_g: np.ndarray
 
@@ -72,8 +68,10 @@ def search(truth: Sensor, seed: int) -> DirectionSearch:
     # β_x of (18) with the linear cross-axis term, which equals it to first order.
     direction = sum(float(truth.values.get(effect, {}).get(name, [0.0])[0]) for effect, name in (
         ('misalignment', 'beta_rad'), ('cross_axis', 'linear')))
-    return DirectionSearch(direction, -float(SEARCH_RAD[np.argmax(top)]),
-                           float(curve[1] / (2 * curve[0])), float(level / slope), SEARCH_RAD, top)
+    return DirectionSearch({
+        'truth': direction, 'largest output': -float(SEARCH_RAD[np.argmax(top)]),
+        'parabola through the outputs': float(curve[1] / (2 * curve[0])),
+        'null crossings at ±90°': float(level / slope)}, SEARCH_RAD, top)
 
 
 MAX_BOUND_RAD = np.radians(1.0)

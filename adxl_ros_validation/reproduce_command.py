@@ -7,7 +7,6 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import date
-import os
 from pathlib import Path
 from typing import Any
 
@@ -109,11 +108,11 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> _Re
     cli.make_folder(pictures)
     unit_page.draw_sweep(pictures / 'sweep.png', experiments.bare(truth),
                          unit.fitted['physical'], unit.poses)
-    draw_misalignment(pictures / 'misalignment.png', results['paper'][0].directions)
-    draw_tilt(pictures / 'tilt.png', results['paper'][0])
-    draw_motion(pictures / 'motion.png', unit.fitted, experiments.shaken(truth, first))
-    draw_components(pictures / 'components.png', truth, unit.fitted['physical'],
-                    unit.fitted['linear'])
+    for name, figure in (('misalignment', draw_misalignment(results['paper'][0].directions)),
+                         ('tilt', draw_tilt(results['paper'][0])),
+                         ('motion', draw_motion(unit.fitted, experiments.shaken(truth, first))),
+                         ('components', draw_components(truth, unit.fitted))):
+        write_bytes(pictures / f'{name}.png', png(figure))
     drawn = 'one unit' if sensor.effects else f'{options.units} units'
     made = (f'adxl_ros {package_version()}, {date.today()}, {drawn} on each stage, '
             f'seed {options.seed}.')
@@ -138,25 +137,23 @@ _SHOWN_S = (2.0, 2.5)
 """Interval of figure 12, s; chosen."""
 
 
-def draw_misalignment(path: str | os.PathLike, search: DirectionSearch) -> None:
+def draw_misalignment(search: DirectionSearch) -> Any:
     """Draw the search for β_x of (18) and the results of its three methods, as figure 9."""
     figure, axis = pyplot().subplots(figsize=(7, 4.5), layout='constrained')
     turned = np.degrees(search.turned_rad)
     axis.plot(turned, 1e3 * (search.output_g - search.output_g.max()), 'o', ms=4,
               label='output, means of 5 s')
-    for value, colour, label in (
-            (search.truth_rad, 'k', 'truth'), (search.largest_rad, 'tab:red', 'largest output'),
-            (search.parabola_rad, 'tab:orange', 'parabola through the outputs'),
-            (search.null_rad, 'tab:green', 'null crossings at ±90°')):
+    for (label, value), colour in zip(search.found_rad.items(),
+                                      ('k', 'tab:red', 'tab:orange', 'tab:green')):
         axis.axvline(-np.degrees(value), color=colour, lw=1,
                      label=f'{label}: {-np.degrees(value):+.2f}°')
     axis.set(xlabel='beta of the stage, °', ylabel='x output minus its largest, mg',
              title='Direction of the x axis (18): the maximum is flat')
     axis.legend(fontsize=8)
-    write_bytes(path, png(figure))
+    return figure
 
 
-def draw_tilt(path: str | os.PathLike, unit: Unit) -> None:
+def draw_tilt(unit: Unit) -> Any:
     """Draw figure 10: errors of alpha and beta in the three tilt experiments."""
     figure, grid = pyplot().subplots(2, 3, figsize=(16, 8), layout='constrained', sharex=True)
     for column, (run, asked_deg) in enumerate(RUNS.items()):
@@ -177,21 +174,21 @@ def draw_tilt(path: str | os.PathLike, unit: Unit) -> None:
     grid[0, 0].legend(fontsize=8)
     figure.suptitle('Tilt; gaps are poses whose bound exceeds 1° '
                     '(linear scale within ±0.1°, logarithmic beyond)')
-    write_bytes(path, png(figure))
+    return figure
 
 
-def draw_motion(path: str | os.PathLike, fitted: dict[str, Sensor],
-                shaken: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
+def draw_motion(units: dict[str, Sensor], shaken: tuple[np.ndarray, np.ndarray, np.ndarray]
+                ) -> Any:
     """
     Draw figure 12: the acceleration of the shaken sensor and of the interferometer.
 
     shaken: stamps, s, (n,); volts, (n, m); acceleration along x, m/s², (n,).
     """
-    figure, row = pyplot().subplots(1, len(fitted), figsize=(16, 4.5), layout='constrained',
+    figure, row = pyplot().subplots(1, len(units), figsize=(16, 4.5), layout='constrained',
                                     sharey=True)
     time_s = shaken[0]
     part = (time_s >= _SHOWN_S[0]) & (time_s <= _SHOWN_S[1])
-    for axis, (name, unit) in zip(row, fitted.items()):
+    for axis, (name, unit) in zip(row, units.items()):
         (rmse, offset), estimate, reference = experiments.motion_errors(unit, *shaken)
         axis.plot(time_s[part], 1e3 * reference[part], ':', color='k', label='interferometer')
         axis.plot(time_s[part], 1e3 * estimate[part], color=_COLOURS[name], label=name)
@@ -199,13 +196,12 @@ def draw_motion(path: str | os.PathLike, fitted: dict[str, Sensor],
                                          f'about an offset of {offset:.1f}')
         axis.legend(fontsize=8, loc='upper right')
     row[0].set(ylabel='acceleration along x, mm/s²')
-    write_bytes(path, png(figure))
+    return figure
 
 
-def draw_components(path: str | os.PathLike, truth: Sensor, fitted: Sensor,
-                    linear: Sensor) -> None:
+def draw_components(truth: Sensor, units: dict[str, Sensor]) -> Any:
     """Draw figure 13: what each part of the model does to the response at alpha 45°, beta 90°."""
-    reach = np.linspace(-0.4, 0.4, 81)
+    reach, linear, fitted = np.linspace(-0.4, 0.4, 81), units['linear'], units['physical']
     pose = [reach * G0_MPS2, np.full(81, -np.sqrt(0.5) * truth.local_gravity_mps2),
             np.full(81, np.sqrt(0.5) * truth.local_gravity_mps2)]
     bias = ('bias', 'scale_factor', 'cross_axis', 'cross_axis_z')
@@ -226,7 +222,7 @@ def draw_components(path: str | os.PathLike, truth: Sensor, fitted: Sensor,
     difference.set(xlabel='acceleration along x, g', ylabel='minus the actual response, mV',
                    title='the same, minus the actual response')
     response.legend(fontsize=8)
-    write_bytes(path, png(figure))
+    return figure
 
 
 TABLE_I = {('alpha', 'linear'): (2.88, 3.95), ('alpha', 'physical'): (0.32, 0.82),
@@ -332,11 +328,10 @@ def _motion(units: Sequence[Unit], bound_mmps2: float) -> str:
 
 
 def _directions(units: Sequence[Unit]) -> str:
-    errors = [np.array([getattr(unit.directions, name) - unit.directions.truth_rad
-                        for unit in units])
-              for name in ('largest_rad', 'parabola_rad', 'null_rad')]
+    found = pd.DataFrame([unit.directions.found_rad for unit in units])
+    errors = np.degrees(found.iloc[:, 1:].sub(found.truth, axis=0))
     return markdown_table(['largest output', 'parabola through the outputs', 'null crossings'],
-                          [[f'{np.degrees(_rms(error)):.3f}' for error in errors]])
+                          [[f'{_rms(errors[name]):.3f}' for name in errors]])
 
 
 def _interval(values: pd.Series, groups: pd.Series) -> str:

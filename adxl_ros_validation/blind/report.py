@@ -10,28 +10,12 @@ import textwrap
 from typing import Any, NamedTuple
 
 from adxl_ros.report.screen import COLUMNS
-from adxl_ros_validation.blind.scores import FEWEST_TRIALS, in_words
+from adxl_ros_validation.blind.scores import FEWEST_TRIALS, in_words, WITHOUT_BAR
 from adxl_ros_validation.blind.simulator import G0
 
 _TOO_FEW = (f'Too few: fewer than {FEWEST_TRIALS} trials. '
             'Not refuted: the interval or the value reaches the bar.')
 """Meanings of outcomes."""
-_WITHOUT_BAR = {'verdict_right': 'verdict right, all trials',
-                'utility_of_effects': 'utility of the named set where an effect is visible',
-                'utility': 'utility of the named set, all trials'}
-"""Scores of the result that have no bar, in words."""
-_WORDS = {
-    'top_1_all_singles': 'top-1, all single effects, visible or not',
-    'leading': 'true effect within the top hypothesis, where the oracle sees it',
-    'set_size': 'effects in the named set', 'inseparable_size':
-    'effects that are inseparable by the recording (fixed by the generator)',
-    'brier': 'Brier score, all hypotheses',
-    'closed': 'gap closed on a held-out recording, median',
-    'unknown_recall_all': 'recall of unknown, visible or not',
-    'unknown_wrongly': 'unknown where the library has the effect, or there is none',
-    'seconds': 'run time, median, s',
-}
-"""The other scores in words."""
 Table = tuple[Sequence[str], Sequence[Sequence[str]]]
 """Head and rows."""
 
@@ -87,8 +71,8 @@ def of_simulated(made: dict[str, Any]) -> Report:
     bad = ', '.join(name.replace('_', ' ') for name, control in made['controls'].items()
                     if control['leaks'])
     result = [[bar['words'], _score_text(bar), bar['bar'], bar['met']] for bar in made['bars']]
-    result += [[words, _score_text(scores[name]), '-', '-']
-               for name, words in _WITHOUT_BAR.items()]
+    result += [[row.words, _score_text(scores[name]), '-', '-']
+               for name, row in WITHOUT_BAR.items() if row.result]
     return Report('Blind check of diagnose', [
         f'{made["trials"]} trials and {made["cases"] - made["trials"]} at strength zero, seed '
         f'{made["seed"]}, {made["date"]}; SHA-256 of salt and labels {made["hash"]}; code of '
@@ -97,7 +81,8 @@ def of_simulated(made: dict[str, Any]) -> Report:
         else 'The controls came out at chance.', _TOO_FEW], {
         'Result': (['score', 'diagnose (90 % interval)', 'bar', 'met'], result),
         'Scores': (['score', 'value (90 % interval)'], [
-            *([words, _score_text(scores[name])] for name, words in _WORDS.items()),
+            *([row.words, _score_text(scores[name])]
+              for name, row in WITHOUT_BAR.items() if not row.result),
             *([f'pairs: {name.replace("_", " ")}', _score_text(score)]
               for name, score in scores['pairs'].items()),
             ['run time, longest, s', f'{scores["longest_s"]:.0f}'],

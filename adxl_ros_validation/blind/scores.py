@@ -16,6 +16,7 @@ from adxl_ros_validation.blind.trials import Label
 import numpy as np
 import pandas as pd
 import scipy
+import yaml
 
 LEVEL = 0.9
 """Probability of all intervals."""
@@ -102,7 +103,8 @@ def in_words(made: Score) -> str:
     return f'{value:.0f} % ({low:.0f} to {high:.0f}), n = {made["count"]}'
 
 
-def resampled(rows: Sequence[Any] | pd.Series, statistic: Callable[[list[Any]], float] = np.mean) -> Score:
+def resampled(rows: Sequence[Any] | pd.Series, statistic: Callable[[list[Any]], float] = np.mean
+              ) -> Score:
     """Return a statistic of rows with its interval over resampled rows."""
     if not len(rows):
         return _NO_SCORE
@@ -141,11 +143,12 @@ def calibration_error(rows: Sequence[tuple[float, bool]]) -> float:
 
 
 class Bar(NamedTuple):
-    """What a score should reach; `low` or `high` may be infinite."""
+    """A score in words, and what it should reach; `low` or `high` may be infinite."""
 
     words: str
-    low: float
-    high: float
+    low: float = -math.inf
+    high: float = math.inf
+    result: bool = False  # stands with the bars though it has none
 
     def in_words(self) -> str:
         """Return the bar in words."""
@@ -155,18 +158,12 @@ class Bar(NamedTuple):
             f'{self.low:g} to {self.high:g}'
 
 
-BARS = {
-    'false_alarms': Bar('false alarms', -math.inf, 0.05),
-    'top_1': Bar('top-1 where the oracle separates it', 0.9, math.inf),
-    'set_recall': Bar('recall of the named set where the oracle sees it', 0.95, math.inf),
-    'calibration_error': Bar('calibration error', -math.inf, 0.05),
-    'coverage': Bar('coverage of 90 % intervals', 0.87, 0.93),
-    'closed_by_oracle': Bar('gap closed ÷ oracle, median', 0.95, math.inf),
-    'limit_held': Bar('upper limit of no gap holds the effect', 0.9, math.inf),
-    'harm': Bar('harm', -math.inf, 0.01),
-    'unknown_recall': Bar('recall of unknown where a flexible model sees it', 0.8, math.inf),
-}
-"""What a diagnosis should reach, by score; chosen."""
+_SCORES = {name: Bar(**row) for name, row in yaml.safe_load(
+    Path(__file__).with_suffix('.yaml').read_text(encoding='utf-8')).items()}
+BARS = {name: bar for name, bar in _SCORES.items() if bar[1:3] != (-math.inf, math.inf)}
+"""What a diagnosis should reach, by score."""
+WITHOUT_BAR = {name: bar for name, bar in _SCORES.items() if name not in BARS}
+"""The other scores."""
 FEWEST_TRIALS = 10
 """Fewest trials of a score that is compared with its bar; chosen: the 90 % interval of a share
 is about 0.5 wide there."""

@@ -8,12 +8,13 @@ reports as they are made.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from datetime import date
 from functools import partial
 import hashlib
+import itertools
 import json
 import math
 import os
@@ -115,10 +116,8 @@ def plans(seed: int, count: int, seconds: tuple[float, float] = SECONDS) -> list
 
 def _turns(names: tuple[str, ...], count: int, rng: np.random.Generator) -> list[str]:
     """Return each name in turn, in a new random order in each round."""
-    rounds: list[str] = []
-    while len(rounds) < count:
-        rounds += [str(name) for name in rng.permutation(names)]
-    return rounds[:count]
+    turns = (str(name) for _ in itertools.count() for name in rng.permutation(names))
+    return list(itertools.islice(turns, count))
 
 
 def scene(plan: Plan, held_out: bool = False) -> Scene:
@@ -315,33 +314,33 @@ def save(folder: Path, name: str, texts: Iterable[str | None]) -> None:
             os.utime(folder / f'{name}.{suffix}', (0, 0))
 
 
+@contextmanager
+def _explained(path: Path, missing: str) -> Iterator[None]:
+    """Say in one line why a file of a check cannot be used."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise UserError(f'{path}: no such file; {missing}') from None
+    except (ValueError, KeyError, TypeError):
+        raise UserError(f'{path}: is damaged or of another version; draw a new check into another '
+                        'folder') from None
+
+
 def published_hash(folder: Path) -> str:
     """Return the published hash of a folder's labels."""
-    path = folder / _SEAL
-    try:
-        return str(json.loads(path.read_bytes())['sha256_of_salt_and_labels'])
-    except FileNotFoundError:
-        raise UserError(f'{folder}: no labels are committed there; use --seal {folder} first'
-                        ) from None
-    except (ValueError, KeyError, TypeError):
-        raise UserError(f'{path}: has no hash; draw a new check into another folder') from None
+    with _explained(folder / _SEAL, f'commit labels by --seal {folder} first'):
+        return str(json.loads((folder / _SEAL).read_bytes())['sha256_of_salt_and_labels'])
 
 
 def committed_labels(folder: Path) -> tuple[Setup, list[Label]]:
     """Read the labels and compare them with the published hash."""
     digest, path = published_hash(folder), folder / 'labels' / 'labels.json'
-    try:
+    with _explained(path, 'copy it from where the check was drawn'):
         text = path.read_bytes()
-    except FileNotFoundError:
-        raise UserError(f'{path}: no such file; copy it from where the check was drawn') from None
-    if hashlib.sha256(text).hexdigest() != digest:
-        raise UserError(f'{path}: these are not the labels whose hash {digest} was published; '
-                        'they were changed since')
-    try:
+        if hashlib.sha256(text).hexdigest() != digest:
+            raise UserError(f'{path}: these are not the labels whose hash {digest} was published; '
+                            'they were changed since')
         content: dict[str, Any] = json.loads(text)
         return Setup(content['seed'], content['trials']), [Label(**row | {
             name: tuple(row[name]) for name in ('effects', 'seed', 'seconds')})
             for row in content['labels']]
-    except (ValueError, KeyError, TypeError):
-        raise UserError(f'{path}: is of another version; draw a new check into another folder'
-                        ) from None
