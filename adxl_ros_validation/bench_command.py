@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
@@ -116,45 +116,33 @@ class _Subject(NamedTuple):
     feed: str = ''  # Topic of the process before the last one, if there is one
 
 
-class _Result(NamedTuple):
-    """One measurement of a subject."""
-
-    first_s: float  # Time from the start of its last process to the first sample
-    rate_hz: float  # Messages by time
-    missing: float  # Samples that did not come
-    p50_ms: float  # Age of the samples on arrival
-    p99_ms: float
-    loads: tuple[float, ...]  # Processor time by time, one for each process
-
-
 def measure_live(seconds: float, rounds: int, iiod: str | None) -> None:
     """Print rate, loss, age on arrival and processor time of each subject, of some rounds."""
     print(f'{RATE_HZ:g} Hz, {rounds} x {seconds:g} s: medians (range). '
           f'Load of the machine before: {os.getloadavg()[0]:.1f}')
     print(f'{"":27} {"Hz":>6} {"lost":>4} {"p50 ms":>16} {"p99 ms":>17}  CPU, %', flush=True)
-    results: dict[str, pd.DataFrame] = {}
-    failures: dict[str, list[str]] = {}
+    rows = []
     with ExitStack() as stack:
-        for subject in (subjects := _subjects(stack, iiod)) * rounds:
+        for subject in _subjects(stack, iiod) * rounds:
             try:
-                result = pd.DataFrame([_measure(subject, seconds)])
-                results[subject.label] = pd.concat([results.get(subject.label), result])
+                row = _measure(subject, seconds)
             except UserError as error:
-                failures.setdefault(subject.label, []).append(str(error))
-    for label in (subject.label for subject in subjects):
-        if label in results:
-            print(_row(label, results[label]))
-        if label in failures:
-            print(f'{label:27} failed in {len(failures[label])} of {rounds} rounds: '
-                  f'{failures[label][-1]}')
-    loads = {label: measured.loads.map(sum).median() for label, measured in results.items()}
-    for label, load in loads.items():
+                row = {'error': str(error)}
+            rows.append({'label': subject.label, 'error': None, **row})
+    measured, load = {}, {}
+    for label, table in pd.DataFrame(rows).groupby('label', sort=False):
+        if len(good := table[table.error.isna()]):
+            measured[label], load[label] = good, good.loads.map(sum).median()
+            print(_row(label, good))
+        if len(bad := table.error.dropna()):
+            print(f'{label:27} failed in {len(bad)} of {rounds} rounds: {bad.iloc[-1]}')
+    for label in load:
         if 'compensation' in label:
             print(f'CPU of {label} by that of the {_RELAY}: '
-                  f'{load / loads.get(_RELAY, np.nan):.2f}')
+                  f'{load[label] / load.get(_RELAY, np.nan):.2f}')
     for name, label in (('driver, sim',) * 2, ('compensation', 'driver, sim, compensation')):
-        if label in results:
-            print(f'First sample of {name}: {spread(results[label].first_s, ".2f")} s after its '
+        if label in measured:
+            print(f'First sample of {name}: {spread(measured[label].first_s, ".2f")} s after its '
                   'start')
     print(f'Load of the machine after: {os.getloadavg()[0]:.1f}', flush=True)
 
@@ -205,8 +193,14 @@ def _iio_server(iiod: str) -> Iterator[str]:
             server.kill()
 
 
-def _measure(subject: _Subject, seconds: float) -> _Result:
-    """Measure a subject once, for a time, s."""
+def _measure(subject: _Subject, seconds: float) -> dict[str, Any]:
+    """
+    Measure a subject once, for a time, s.
+
+    Return the time from the start of its last process to the first sample, messages by time,
+    samples that did not come, the age of samples on arrival, and processor time by time, one for
+    each process.
+    """
     with ExitStack() as stack:
         processes = stack.enter_context(running(subject.commands[:-1]))
 
@@ -239,7 +233,8 @@ def _measure(subject: _Subject, seconds: float) -> _Result:
     # The stamps of a bare timer wander: only steps of two periods and more are a loss.
     missing = int(np.sum(np.maximum(periods - 1, 0)))
     p50_ms, p99_ms = np.percentile(age_ms, [50, 99])
-    return _Result(first_s, len(stamps_ns) / duration_s, missing, p50_ms, p99_ms, tuple(loads))
+    return {'first_s': first_s, 'rate_hz': len(stamps_ns) / duration_s, 'missing': missing,
+            'p50_ms': p50_ms, 'p99_ms': p99_ms, 'loads': tuple(loads)}
 
 
 def _row(label: str, results: pd.DataFrame) -> str:
@@ -249,16 +244,13 @@ def _row(label: str, results: pd.DataFrame) -> str:
             f'{spread(results.p50_ms, ".2f"):>16} {spread(results.p99_ms, ".2f"):>17}  {loads}')
 
 
-_EXAMPLES = {'all measurements, ten minutes': '',
-             'with recordings of 10 minutes, not 8 hours': '--hours 0.17',
-             'only the live nodes': '--live',
-             'a short look': '--live --seconds 5 --rounds 1'}
-"""Examples of arguments, by their purpose."""
-
-
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = cli.argument_parser('bench', __doc__, _EXAMPLES)
+    parse = cli.argument_parser('bench', __doc__, {
+        'all measurements, ten minutes': '',
+        'with recordings of 10 minutes, not 8 hours': '--hours 0.17',
+        'only the live nodes': '--live',
+        'a short look': '--live --seconds 5 --rounds 1'})
     parse.add_argument('--seconds', type=float, default=10.0,
                        help='duration of each live measurement, s (default 10)')
     parse.add_argument('--rounds', type=int, default=3,

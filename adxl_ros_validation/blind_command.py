@@ -15,18 +15,15 @@ from adxl_ros_validation.blind import diagnosis_runs, real_sensors, report, tria
 
 PROG = 'blind'
 """Name of the command, for messages."""
-_EXAMPLES = {
-    'a whole check': '--trials 200 -o check',
-    'only draw the trials, and publish the hash of their labels': '--trials 200 --seal check',
-    'defects put into recordings of real sensors': '--real recordings --trials 200 -o real',
-    'diagnose the sealed trials and score them': '--open check',
-}
-"""Examples of arguments, by their purpose."""
 
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = cli.argument_parser(PROG, __doc__, _EXAMPLES)
+    parse = cli.argument_parser(PROG, __doc__, {
+        'a whole check': '--trials 200 -o check',
+        'only draw the trials, and publish the hash of their labels': '--trials 200 --seal check',
+        'defects put into recordings of real sensors': '--real recordings --trials 200 -o real',
+        'diagnose the sealed trials and score them': '--open check'})
     parse.add_argument('--trials', type=int, default=600,
                        help='number of trials (default 600); a twelfth more has strength zero')
     parse.add_argument('--seed', type=int, default=None,

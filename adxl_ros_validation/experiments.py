@@ -197,15 +197,8 @@ SETTLED_S = 1.0
 """Time from the stop of the stage to the start of a pose's mean, s; chosen."""
 
 
-class Stage(NamedTuple):
-    """Errors of a stage."""
-
-    resolution_rad: float  # step of the encoder, rad
-    level_rad: float  # standard deviation of the base's tilt, rad
-
-
-STAGES = {'perfect': Stage(0.0, 0.0),
-          'paper': Stage(np.radians(5 / 60), full_model.LEVEL_STD_RAD)}
+STAGES = {'perfect': (0.0, 0.0), 'paper': (np.radians(5 / 60), full_model.LEVEL_STD_RAD)}
+"""Step of the encoder and standard deviation of the base's tilt, rad, by stage."""
 
 
 @dataclass(frozen=True)
@@ -218,17 +211,17 @@ class Run:
     true_rad: np.ndarray  # true alpha and beta of these poses, rad, (k, 2)
 
 
-def draw(nominal: Sensor, stage: Stage, rng: np.random.Generator) -> Sensor:
+def draw(nominal: Sensor, stage: tuple[float, float], rng: np.random.Generator) -> Sensor:
     """Draw a unit at datasheet spread, or take the given one, on a base that is not level."""
-    unit = replace(nominal, stage_resolution_rad=stage.resolution_rad,
-                   local_gravity_mps2=GRAVITY_MPS2)
+    step_rad, level_rad = stage
+    unit = replace(nominal, stage_resolution_rad=step_rad, local_gravity_mps2=GRAVITY_MPS2)
     if not nominal.effects:
         values = {name: {p: rng.normal(size=np.shape(v)) * v for p, v in typical(
             effect_named(name), unit.axes).items()} for name in DRAWN}
         ratio = rng.uniform(-RESISTANCE, RESISTANCE, len(unit.axes))
         values['bandwidth'] = {'resistance_ratio': ratio}
         unit = replace(unit, effects=tuple(values), values=values)
-    level = {f'{axis}_rad': np.array(stage.level_rad * rng.normal()) for axis in 'xy'}
+    level = {f'{axis}_rad': np.array(level_rad * rng.normal()) for axis in 'xy'}
     unit = with_neutral(unit, ['base_tilt'])
     return replace(unit, values={**unit.values, 'base_tilt': level})
 
@@ -318,7 +311,7 @@ class Unit:
     directions: DirectionSearch  # the search for its misalignment
 
 
-def evaluate(nominal: Sensor, stage: Stage, seed: int) -> Unit:
+def evaluate(nominal: Sensor, stage: tuple[float, float], seed: int) -> Unit:
     """Draw, sweep and calibrate one unit, and run the experiments."""
     rng = np.random.default_rng([seed, 0])
     truth = draw(nominal, stage, rng)

@@ -28,16 +28,12 @@ from adxl_ros_validation.experiments import DirectionSearch, MODELS, RUNS, Unit
 import numpy as np
 import pandas as pd
 
-_EXAMPLES = {
-    'the experiments on 20 simulated units': '-o reproduction',
-    'the calibration of the paper on a recorded sweep': 'sweep.csv -o reproduction',
-}
-"""Examples of arguments, by their purpose."""
-
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = cli.argument_parser('reproduce', __doc__, _EXAMPLES)
+    parse = cli.argument_parser('reproduce', __doc__, {
+        'the experiments on 20 simulated units': '-o reproduction',
+        'the calibration of the paper on a recorded sweep': 'sweep.csv -o reproduction'})
     parse.add_argument('recording', nargs='*',
                        help='sweeps of one unit; without any, units are simulated')
     parse.add_argument('--params', metavar='FILE', default=None,
@@ -230,6 +226,7 @@ TABLE_I = {('alpha', 'linear'): (2.88, 3.95), ('alpha', 'physical'): (0.32, 0.82
 """The paper's rms and largest error, deg."""
 MOTION_MMPS2 = {'linear': 299.8, 'physical': 20.8}
 """The paper's residuals of the motion experiment, mm/s²."""
+_MOTION = ', '.join(f'{name} {value}' for name, value in MOTION_MMPS2.items())
 _STAGE_NAMES = {'perfect': 'perfect stage', 'paper': "the paper's stage"}
 FIGURES = 'reproduction'
 """Folder of the plots, in the folder of the page."""
@@ -245,18 +242,13 @@ def _page(results: dict[str, list[Unit]], bound_mmps2: float, made: str, interva
 
 def screen_lines(results: dict[str, list[Unit]], bound_mmps2: float) -> list[str]:
     """Return Table I and the motion experiment as lines for a terminal."""
-    rows = [[f'{_STAGE_NAMES[stage]}, {angle}',
-             ' / '.join(f'{rms:.2f}' for (a, _), (rms, _) in TABLE_I.items() if a == angle),
-             *(f'{np.degrees(_rms(values)):.3g}' for values in (*errors, bound))]
-            for stage, units in results.items()
-            for angle, *errors, bound in _tilt_errors(units)]
-    paper = ' / '.join(f'{value:.1f}' for value in MOTION_MMPS2.values())
-    rows += [[f'{_STAGE_NAMES[stage]}, motion', paper,
-              *(f'{_rms(np.hypot(*errors)):.3g}' for errors in _motion_errors(units)),
-              f'{bound_mmps2:.3g}'] for stage, units in results.items()]
-    return [*terminal_table(['Table I, rms error of', 'paper', *MODELS, 'bound'], rows),
-            ' tilt in °, motion in mm/s²; paper: linear / physical; bound: Cramér-Rao,',
-            ' or the noise floor']
+    rows = [[f'{_STAGE_NAMES[stage]}, {angle}', *cells]
+            for stage, units in results.items() for angle, _, *cells in _tilt(units)]
+    rows += [[f'{_STAGE_NAMES[stage]}, motion', *cells] for stage, units in results.items()
+             for _, _, *cells in _motion(units, bound_mmps2)[-1:]]
+    return [*terminal_table(['Table I, rms / largest', *MODELS, 'bound'], rows),
+            f' The paper: alpha {in_words("alpha")}; beta {in_words("beta")}; motion '
+            f'{_MOTION}.', ' Tilt in °, motion in mm/s² rms; bound: Cramér-Rao, or the noise floor.']
 
 
 def in_words(angle: str) -> str:
@@ -271,29 +263,25 @@ def _counted(units: Sequence[Unit]) -> pd.DataFrame:
     return errors[errors.counts]
 
 
-def _tilt_errors(units: Sequence[Unit]) -> list[tuple[Any, ...]]:
-    """Return the errors of each angle in the paper's runs by model, and their bound, rad."""
-    errors = _counted(units).query('run != "random"').groupby(['angle', 'model'])
-    return [(angle, *(errors.get_group((angle, model)).error for model in MODELS),
-             errors.get_group((angle, 'full')).bound) for angle in ('alpha', 'beta')]
-
-
-def _motion_errors(units: Sequence[Unit]) -> list[np.ndarray]:
-    """Return rms and mean of the residual of each unit in motion by model, mm/s², (2, units)."""
-    return [np.array([unit.motion[model] for unit in units]).T for model in MODELS]
+def _tilt(units: Sequence[Unit]) -> list[list[str]]:
+    """Return the rows of Table I."""
+    counted = np.degrees(_counted(units).query('run != "random"').set_index(['angle', 'model'])[
+        ['error', 'bound']])
+    return [[angle, in_words(angle),
+             *(f'{_rms(error):.3f} / {error.abs().max():.3f}' for error in (
+                 counted.error[angle, model] for model in MODELS)),
+             f'{_rms(counted.bound[angle, "full"]):.4f}'] for angle in ('alpha', 'beta')]
 
 
 def _of_stage(units: Sequence[Unit], bound_mmps2: float) -> str:
     """Lay out the tables of a stage."""
-    rows = [[angle, in_words(angle),
-             *(f'{np.degrees(_rms(e)):.3f} / {np.degrees(np.abs(e).max()):.3f}' for e in errors),
-             f'{np.degrees(_rms(bound)):.4f}'] for angle, *errors, bound in _tilt_errors(units)]
     counts = np.concatenate([unit.angles.query('model == "full" and angle == "alpha"').counts
                              for unit in units])
     return filled('reproduction_stage.md', {
-        'tilt': markdown_table(['', 'paper', *MODELS, 'Cramér-Rao bound, rms'], rows),
+        'tilt': markdown_table(['', 'paper', *MODELS, 'Cramér-Rao bound, rms'], _tilt(units)),
         'reached': _to_reach(units), 'poses': len(counts), 'undetermined': np.sum(~counts),
-        'motion': _motion(units, bound_mmps2)})
+        'motion': markdown_table(['motion, mm/s²', 'paper', *MODELS, 'bound'],
+                                 _motion(units, bound_mmps2))})
 
 
 def _to_reach(units: Sequence[Unit]) -> str:
@@ -315,16 +303,16 @@ def _to_reach(units: Sequence[Unit]) -> str:
     return markdown_table(['random poses and the three runs, none fitted', *MODELS], rows)
 
 
-def _motion(units: Sequence[Unit], bound_mmps2: float) -> str:
-    errors, number = _motion_errors(units), pd.Series(range(len(units)))
-    paper = ', '.join(f'{name} {value}' for name, value in MOTION_MMPS2.items())
-    bound = f'{bound_mmps2:.2f}'
-    return markdown_table(['motion, mm/s²', 'paper', *MODELS, 'bound'], [
+def _motion(units: Sequence[Unit], bound_mmps2: float) -> list[list[str]]:
+    """Return the rows of the motion experiment."""
+    errors = [np.array([unit.motion[model] for unit in units]).T for model in MODELS]
+    number, bound = pd.Series(range(len(units))), f'{bound_mmps2:.2f}'
+    return [
         ['rmse about the offset', '–',
          *(_interval(pd.Series(rmse), number) for rmse, _ in errors), bound],
         ["offset, rms, the stage's part included", '–',
          *(f'{_rms(offset):.1f}' for _, offset in errors), '–'],
-        ['both together', paper, *(f'{_rms(np.hypot(*both)):.1f}' for both in errors), bound]])
+        ['both together', _MOTION, *(f'{_rms(np.hypot(*both)):.1f}' for both in errors), bound]]
 
 
 def _directions(units: Sequence[Unit]) -> str:

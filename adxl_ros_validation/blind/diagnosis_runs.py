@@ -96,10 +96,8 @@ def diagnose_all(folder: Path, pool: Pool, show: Callable[[float], None]
     write(stamp, code.encode())
 
     def job(name: str) -> tuple:
-        csv, parameters, sim = (recordings / f'{name}.{suffix}' for suffix in (
-            'csv', 'yaml', 'sim'))
-        return (name, csv.read_bytes(), parameters.read_bytes(),
-                sim.read_bytes() if sim.exists() else None)
+        paths = [recordings / f'{name}.{suffix}' for suffix in ('csv', 'yaml', 'sim')]
+        return name, *(path.read_bytes() for path in paths if path.exists())
 
     results = kept(reports, sorted(path.stem for path in recordings.glob('*.csv')), diagnose, job,
                    pool, show)
@@ -210,8 +208,9 @@ def _fitted(label: Label, faults: list[Fault]) -> list[Fault]:
             for fault, size in zip(faults, sizes)]
 
 
-def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
-    """Diagnose all recordings that have no report yet, read the labels and score."""
+def diagnosed(folder: Path, pool: Pool, show: Show
+              ) -> tuple[dict[str, Any], list[Label], dict[str, Result]]:
+    """Diagnose all recordings that have no report yet; return check, labels and results."""
     digest = trials.published_hash(folder)
     # Labels may be on another machine: the diagnosis does not need them.
     with show('diagnose') as advance:
@@ -221,6 +220,13 @@ def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
     if missing:
         raise UserError(f'{folder / "recordings"}: {missing[0]}.csv is missing, {len(missing)} '
                         'of the committed recordings in all; a check needs all of them')
+    return {'hash': digest, **setup._asdict(), 'diagnose_code':
+            (folder / 'reports' / 'version.txt').read_text()}, labels, results
+
+
+def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
+    """Diagnose all recordings that have no report yet, read the labels and score."""
+    check, labels, results = diagnosed(folder, pool, show)
     by_name = {label.name: label for label in labels}
 
     def job(name: str) -> tuple:
@@ -236,9 +242,8 @@ def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
                 'metadata_only': scores.metadata(folder / 'recordings', labels),
                 'strength_zero': scores.strength_zero(graded)}
     return {
-        'schema': 1, 'hash': digest, **setup._asdict(), 'cases': len(labels),
-        'date': str(date.today()), 'version': package_version(),
-        'diagnose_code': (folder / 'reports' / 'version.txt').read_text(),
+        'schema': 1, **check, 'cases': len(labels), 'date': str(date.today()),
+        'version': package_version(),
         'failed': {trial.label.name: results[trial.label.name]['error'] for trial in graded
                    if trial.answer.status == 'failed'},
         'bars': scores.bars(made), 'controls': negative,

@@ -364,9 +364,7 @@ def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
     """Diagnose what has no report yet, compare labels with the hash, and score."""
     with show('untouched') as advance:
         untouched = diagnosis_runs.diagnose_all(folder / 'baseline', pool, advance)
-    with show('diagnose') as advance:
-        results = diagnosis_runs.diagnose_all(folder, pool, advance)
-    setup, labels = trials.committed_labels(folder)
+    check, labels, results = diagnosis_runs.diagnosed(folder, pool, show)
     base = {name: grading.answer(result) for name, result in untouched.items()}
     rows = []
     for label in labels:
@@ -385,8 +383,7 @@ def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
                      'probability': answer.probability, 'seconds': answer.seconds,
                      'error': results[label.name]['error'],
                      'by_chance': float(np.mean(by_chance or [False]))})
-    return {'hash': trials.published_hash(folder), 'seed': setup.seed,
-            'trials': len(rows), 'diagnose_code': (folder / 'reports' / 'version.txt').read_text(),
+    return {**check,
             'left_out': json.loads((folder / 'left_out.json').read_text()), 'rows': rows,
             'baseline': {name: [answer.status, sorted(answer.named)]
                          for name, answer in base.items()}}

@@ -251,18 +251,15 @@ def seal(folder: Path, plan_all: Callable[[int, int], list[Plan]], make: Callabl
 
     A call on a folder that has them returns the hash; an interrupted one continues.
     """
-    drawn, existing = folder / 'labels' / 'drawn', None
-    is_sealed = (folder / _SEAL).exists()
-    if is_sealed:
-        existing = committed_labels(folder)[0]
-    elif (drawn / 'setup').exists():
-        existing = Setup(*json.loads((drawn / 'setup').read_bytes()))
-    elif any(folder.glob('*')):
+    drawn, is_sealed = folder / 'labels' / 'drawn', (folder / _SEAL).exists()
+    known = committed_labels(folder)[0] if is_sealed else Setup(*json.loads(
+        (drawn / 'setup').read_bytes())) if (drawn / 'setup').exists() else None
+    if known is None and any(folder.glob('*')):
         raise UserError(f'{folder}: is not empty and has no check; choose another folder')
     if seed is None:
-        seed = existing.seed if existing else secrets.randbelow(2 ** 31)
+        seed = known.seed if known else secrets.randbelow(2 ** 31)
     setup = Setup(seed, count)
-    if existing not in (None, setup):
+    if known not in (None, setup):
         raise UserError(f'{folder}: has a check of another seed or number of trials; repeat the '
                         'same options to continue it, or choose another folder')
     if not is_sealed:
