@@ -133,7 +133,9 @@ def measure_live(seconds: float, rounds: int, iiod: str | None) -> None:
     for label, table in pd.DataFrame(rows).groupby('label', sort=False):
         if len(good := table[table.error.isna()]):
             measured[label], load[label] = good, good.loads.map(sum).median()
-            print(_row(label, good))
+            loads = ' + '.join(f'{100 * load:.1f}' for load in np.median([*good.loads], axis=0))
+            print(f'{label:27} {good.rate_hz.median():6.0f} {good.missing.median():4.0f} '
+                  f'{spread(good.p50_ms, ".2f"):>16} {spread(good.p99_ms, ".2f"):>17}  {loads}')
         if len(bad := table.error.dropna()):
             print(f'{label:27} failed in {len(bad)} of {rounds} rounds: {bad.iloc[-1]}')
     for label in load:
@@ -235,13 +237,6 @@ def _measure(subject: _Subject, seconds: float) -> dict[str, Any]:
     p50_ms, p99_ms = np.percentile(age_ms, [50, 99])
     return {'first_s': first_s, 'rate_hz': len(stamps_ns) / duration_s, 'missing': missing,
             'p50_ms': p50_ms, 'p99_ms': p99_ms, 'loads': tuple(loads)}
-
-
-def _row(label: str, results: pd.DataFrame) -> str:
-    """Return the row of a subject."""
-    loads = ' + '.join(f'{100 * load:.1f}' for load in np.median([*results.loads], axis=0))
-    return (f'{label:27} {results.rate_hz.median():6.0f} {results.missing.median():4.0f} '
-            f'{spread(results.p50_ms, ".2f"):>16} {spread(results.p99_ms, ".2f"):>17}  {loads}')
 
 
 def parser() -> argparse.ArgumentParser:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 import os
 from typing import Any, NamedTuple
@@ -201,8 +201,7 @@ STAGES = {'perfect': (0.0, 0.0), 'paper': (np.radians(5 / 60), full_model.LEVEL_
 """Step of the encoder and standard deviation of the base's tilt, rad, by stage."""
 
 
-@dataclass(frozen=True)
-class Run:
+class Run(NamedTuple):
     """One unit after its sweep."""
 
     truth: Sensor  # the true unit, with the tilt of the base
@@ -296,8 +295,7 @@ RANDOM_POSES = 40
 """Number of poses in random directions; chosen."""
 
 
-@dataclass(frozen=True)
-class Unit:
+class Unit(NamedTuple):
     """Errors of one unit on one stage; each has values by model."""
 
     # of `angle_errors`, by `model` and by `run`: random poses and the paper's tilt experiments

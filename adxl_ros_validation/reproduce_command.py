@@ -248,7 +248,7 @@ def screen_lines(results: dict[str, list[Unit]], bound_mmps2: float) -> list[str
              for _, _, *cells in _motion(units, bound_mmps2)[-1:]]
     return [*terminal_table(['Table I, rms / largest', *MODELS, 'bound'], rows),
             f' The paper: alpha {in_words("alpha")}; beta {in_words("beta")}; motion '
-            f'{_MOTION}.', ' Tilt in °, motion in mm/s² rms; bound: Cramér-Rao, or the noise floor.']
+            f'{_MOTION}.', ' Tilt in °, motion in mm/s²; bound: Cramér-Rao, or the noise floor.']
 
 
 def in_words(angle: str) -> str:

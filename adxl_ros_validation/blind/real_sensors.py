@@ -154,7 +154,7 @@ def _part(columns: pd.DataFrame | None, start: float, stop: float) -> pd.DataFra
     """Return the rows of a time span, whose time begins at 0."""
     if columns is None:
         return None
-    part = columns[columns['time_s'].between(start, stop, 'left')]
+    part = columns[columns['time_s'].between(start, stop, 'left')].reset_index(drop=True)
     return part.assign(time_s=part['time_s'] - start)
 
 
@@ -213,7 +213,7 @@ def _against_force(first: Half) -> str:
         'unit', nominal_zero_v=0.0, is_certain=True, adc_bits=0, adc_vref_v=100.0, range_g=16.0)
 
 
-def _angles_at_rest(applied: pd.DataFrame, rate: float) -> dict[str, np.ndarray]:
+def _angles_at_rest(applied: pd.DataFrame, rate: float) -> pd.DataFrame:
     """
     Return the angles that a stage with these rests would have; they are empty in motion.
 
@@ -225,16 +225,15 @@ def _angles_at_rest(applied: pd.DataFrame, rate: float) -> dict[str, np.ndarray]
     spread = np.sqrt(np.maximum(scipy.ndimage.uniform_filter1d(force ** 2, width)
                                 - scipy.ndimage.uniform_filter1d(force, width) ** 2, 0)).max(0)
     still = spread < 2 * np.quantile(spread, 0.2)
-    alpha, beta = np.full((2, len(still)), np.nan)
-    edges = np.flatnonzero(np.diff(np.r_[False, still, False]))
-    for start, stop in zip(edges[::2], edges[1::2]):
-        if stop - start >= _REST_S * rate:
-            x, y, z = force[:, start:stop].mean(axis=1)
-            alpha[start:stop], beta[start:stop] = math.atan2(math.hypot(x, y), z), math.atan2(
-                -y, x)
-    if np.isnan(alpha).all():
+    angles = pd.DataFrame(np.nan, applied.index, ['alpha_rad', 'beta_rad'])
+    span = np.cumsum(np.diff(still, prepend=False))
+    for _, part in applied[still].groupby(span[still]):
+        if len(part) >= _REST_S * rate:
+            x, y, z = force[:, part.index].mean(axis=1)
+            angles.loc[part.index] = math.atan2(math.hypot(x, y), z), math.atan2(-y, x)
+    if angles.isna().all(axis=None):
         raise UserError('its later part has no rest, no stage and no other simulator')
-    return {'alpha_rad': alpha, 'beta_rad': beta}
+    return angles
 
 
 def _noise(half: Half) -> float:

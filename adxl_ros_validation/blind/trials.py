@@ -175,22 +175,21 @@ def sized(rng: np.random.Generator, kind: Kind, unit: Unit, bounds: tuple[float,
     """
     strength = per_mps2 * math.exp(rng.uniform(*np.log(bounds)))
     fault = Fault(kind, kind.start, kind.draw(rng, unit))
-    sizes: list[float] = []
-    strengths: list[float] = []
-    while True:
+    previous = math.nan, math.nan
+    for steps in itertools.count(1):
         rms, change = measure(fault)
-        sizes.append(math.log(fault.size))
-        strengths.append(math.log(max(rms, 1e-12)))
-        missing = math.log(strength) - strengths[-1]
-        if abs(missing) < _SIZE_TOLERANCE or len(sizes) == _MAX_SIZE_STEPS or (
+        here = math.log(fault.size), math.log(max(rms, 1e-12))
+        missing = math.log(strength) - here[1]
+        if abs(missing) < _SIZE_TOLERANCE or steps == _MAX_SIZE_STEPS or (
                 fault.size == fault.kind.largest and rms < strength):
-            return fault, strength, rms, change
+            break
         slope = 1.0
-        if len(sizes) > 1 and sizes[-1] != sizes[-2]:
-            slope = (strengths[-1] - strengths[-2]) / (sizes[-1] - sizes[-2])
+        if steps > 1 and here[0] != previous[0]:
+            slope = (here[1] - previous[1]) / (here[0] - previous[0])
         step = missing / min(max(slope, 0.7), 30.0)
         size = fault.size * math.exp(min(max(step, -3.0), 3.0))
-        fault = replace(fault, size=min(size, fault.kind.largest))
+        previous, fault = here, replace(fault, size=min(size, fault.kind.largest))
+    return fault, strength, rms, change
 
 
 def measured(scene: Scene, force: np.ndarray, fault: Fault) -> tuple[float, np.ndarray]:
