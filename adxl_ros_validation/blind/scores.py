@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 import math
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -43,19 +45,23 @@ class Trial(NamedTuple):
         label, answer, gaps = self
         truth, named, top = grading.truth(label), answer.named, sorted(answer.top)
         groups = grading.answered_group(answer), grading.true_group(label)
+        right = grading.verdict_right(answer, label)
+        rivals = label.faults[0]['inseparable'] if label.faults else ()
         return {
             **{key: [fault[key] for fault in label.faults]
                for key in ('strength_mps2', 'power', 'told', 'inseparable')},
             'name': label.name, 'group': label.group, 'effects': list(label.effects),
             'flexible': label.flexible, 'manoeuvre': label.manoeuvre, 'axes': label.axes,
             'status': answer.status, 'top': top, 'named': sorted(named),
-            'probability': answer.probability, 'right': grading.verdict_right(answer, label),
-            'seconds': answer.seconds, 'held': gaps, 'gap': answer.gap,
+            'probability': answer.probability, 'right': right, 'stated':
+            (answer.probability, right), 'seconds': answer.seconds, 'held': gaps,
+            'gap': answer.gap, 'flexible_sees': label.flexible >= grading.CERTAIN_POWER,
             'effect': label.effects[0] if label.effects else 'none',
             'said': answer.status if answer.status in ('failed', 'bad_data') else
             'none' if not top else 'several' if len(top) > 1 else top[0],
             'is_top': answer.top == truth, 'leads': truth <= answer.top,
-            'names': len(named & truth), 'names_all': truth <= named,
+            'names': len(named & truth), 'names_all': truth <= named, 'set_size': len(named),
+            'inseparable_size': 1 + len(rivals),
             'unknown': UNKNOWN in named | answer.top, 'seen': grading.visible(label),
             'separable': grading.separable(label), 'material': grading.material(answer, label),
             'limit_holds': grading.limit_holds(answer, label),
@@ -142,13 +148,17 @@ def calibration_error(rows: Sequence[tuple[float, bool]]) -> float:
                for row in reliability(rows)) / max(len(rows), 1)
 
 
-class Bar(NamedTuple):
-    """A score in words, and what it should reach; `low` or `high` may be infinite."""
+@dataclass(frozen=True)
+class Bar:
+    """A score: what it is of, in words, and what it should reach; see scores.yaml."""
 
     words: str
-    low: float = -math.inf
+    low: float = -math.inf  # `low` and `high` may be infinite
     high: float = math.inf
     result: bool = False  # stands with the bars though it has none
+    of: str = 'group == group'  # rows that count
+    zero: bool = False  # whether trials at strength zero count
+    statistic: tuple[str, str] = ('', '')  # its name and column
 
     def in_words(self) -> str:
         """Return the bar in words."""
@@ -158,9 +168,19 @@ class Bar(NamedTuple):
             f'{self.low:g} to {self.high:g}'
 
 
-_SCORES = {name: Bar(**row) for name, row in yaml.safe_load(
-    Path(__file__).with_suffix('.yaml').read_text(encoding='utf-8')).items()}
-BARS = {name: bar for name, bar in _SCORES.items() if bar[1:3] != (-math.inf, math.inf)}
+def _table(text: str) -> dict[str, Bar]:
+    """Read the table of scores."""
+    return {name: Bar(**{key: row.pop(key) for key in [*row] if key not in _STATISTICS},
+                      statistic=row.popitem()) for name, row in yaml.safe_load(text).items()}
+
+
+_STATISTICS: dict[str, Callable[[pd.Series], Score]] = {
+    'share': share, 'mean': resampled, 'median': partial(resampled, statistic=np.median),
+    'ratio': partial(resampled, statistic=lambda counts: float(
+        np.divide(*np.sum(counts, axis=0)))),
+    'calibration': partial(resampled, statistic=calibration_error)}
+_SCORES = _table(Path(__file__).with_suffix('.yaml').read_text(encoding='utf-8'))
+BARS = {name: bar for name, bar in _SCORES.items() if (bar.low, bar.high) != (-math.inf, math.inf)}
 """What a diagnosis should reach, by score."""
 WITHOUT_BAR = {name: bar for name, bar in _SCORES.items() if name not in BARS}
 """The other scores."""
@@ -191,50 +211,27 @@ def bars(made: dict[str, Any]) -> list[dict[str, Any]]:
 
 def scores(trials: Sequence[Trial]) -> dict[str, Any]:
     """Return every score."""
-    rows = pd.DataFrame([trial.row() for trial in trials]).astype({'group': str})
+    rows = pd.DataFrame([trial.row() for trial in trials])
     real = rows[rows.group != 'zero']
-    none, single, pair, outside = (real[real.group == group]
-                                   for group in ('none', 'single', 'pair', 'outside'))
-    seen, pairs = single[single.seen & single.material], pair[pair.seen]
-    flexible = outside[(outside.flexible >= grading.CERTAIN_POWER) & outside.material]
-    is_noise = single.effect.isin(NOISE_LIKE)
-    confidences = list(zip(real.probability, real.right))
+    single, pairs, outside = (real[real.group == group] for group in ('single', 'pair', 'outside'))
+    pairs, is_noise = pairs[pairs.seen], single.effect.isin(NOISE_LIKE)
     true = real.effect.where(real.group == 'single', real.group.map(
         {'none': 'none', 'outside': UNKNOWN}))
     return {
-        'false_alarms': share(none.gap),
-        'top_1': share(single.is_top[single.separable & single.material]),
-        'set_recall': share(seen.names_all),
-        'unknown_recall': share(flexible.unknown),
-        'verdict_right': share(real.right),
-        'utility': resampled(real.utility),
-        'utility_of_effects': resampled(real.utility[real.has_effect]),
+        **{name: _STATISTICS[bar.statistic[0]](
+            (rows if bar.zero else real).query(bar.of)[bar.statistic[1]].dropna())
+            for name, bar in _SCORES.items()},
         'detection': {'of the mean': by_strength(single[~is_noise]),
                       'noise like': by_strength(single[is_noise]),
                       'outside': by_strength(outside)},
-        'top_1_all_singles': share(single.is_top),
-        'leading': share(seen.leads),
-        'set_size': resampled(seen.named.str.len()),
-        'inseparable_size': resampled(1 + seen.inseparable.str[0].str.len()),
-        'brier': resampled(real.brier),
-        'calibration_error': resampled(confidences, calibration_error),
-        'reliability': reliability(confidences),
-        'coverage': resampled(real.inside.dropna(), lambda counts: float(
-            np.divide(*np.sum(counts, axis=0)))),
-        'closed': resampled(real.closed.dropna(), np.median),
-        'closed_by_oracle': resampled(real.by_oracle.dropna(), np.median),
-        'harm': share(real.harm),
-        'unknown_recall_all': share(outside.unknown),
-        'unknown_wrongly': share(real.unknown[real.group != 'outside']),
+        'reliability': reliability(real.stated.tolist()),
         'pairs': {'whole': share(pairs.names == 2), 'in_part': share(pairs.names == 1),
                   'exactly': share(pairs.is_top)},
         'by_effect': {name: {'trials': len(part), 'detected': int(part.gap.sum()),
                              'named': int(part.names_all.sum()), 'top': int(part.is_top.sum())}
                       for name, part in real[real.seen & real.group.isin(
                           ['single', 'outside'])].groupby('effect')},
-        'limit_held': share(real.limit_holds.dropna()),
         'confusion': {name: dict(Counter(part)) for name, part in real.said.groupby(true)},
-        'seconds': resampled(rows.seconds, np.median),
         'longest_s': float(rows.seconds.max()),
         'status': dict(Counter(real.status)),
     }
