@@ -4,10 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
-import os
 from typing import Any, NamedTuple
 
 from adxl_ros.calibrate import pose_extraction
@@ -31,6 +29,7 @@ from adxl_ros.signals import recorded_sensor
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Held, Motion
 from adxl_ros.simulate.response import simulate
+from adxl_ros.workers import open_pool
 import numpy as np
 import pandas as pd
 import scipy
@@ -349,7 +348,7 @@ def in_parallel(work: Callable[..., Any], show: Callable[[float], None], *argume
                 ) -> list[Any]:
     """Return the results of a function for sequences of its arguments, over the cores."""
     results = []
-    with ProcessPoolExecutor(os.cpu_count()) as pool:
+    with open_pool(None) as pool:
         for result in pool.map(work, *arguments):
             results.append(result)
             show(len(results) / len(arguments[0]))

@@ -15,8 +15,6 @@ from adxl_ros_validation.blind.simulator import G0, Run, Shape
 import numpy as np
 import scipy
 
-_OFF_DIAGONAL = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
-"""Row and column of each weight of a misalignment in the matrix of directions."""
 _ZERO_C = 273.15
 """0 °C in K."""
 
@@ -88,7 +86,7 @@ def sign(rng: np.random.Generator, count: int) -> np.ndarray:
 
 def misalignment(run: Run, size: float, shape: Shape) -> None:
     """Turn each axis on its own, rad; its direction keeps the length 1."""
-    for (row, col), w in zip(_OFF_DIAGONAL, shape['w']):
+    for (row, col), w in zip(np.argwhere(~np.eye(3, dtype=bool)), shape['w']):
         run.directions[row, col] += size * w
     run.directions /= np.linalg.norm(run.directions, axis=1, keepdims=True)
     run.u = (run.directions @ run.force)[run.unit.axis_indices] / G0

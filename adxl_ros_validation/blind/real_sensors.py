@@ -9,6 +9,7 @@ rest (the baseline) is there already, and no error.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -248,19 +249,16 @@ def plans(halves: Sequence[Half], seed: int, count: int) -> list[Plan]:
     """Plan trials: recordings and defects in turn, a quarter without any."""
     rng = np.random.default_rng([seed, 3])
     rows: list[tuple[str, tuple[str, ...], tuple[int, ...]]] = []
-    used = dict.fromkeys(KINDS, 0)
+    used: Counter[str] = Counter()
     for k in range(count):
         half = k % len(halves)
         group = str(rng.choice(['none', 'outside', 'single'], p=(*_SHARES, 1 - sum(_SHARES))))
-        names = [name for name in halves[half].kinds()
-                 if (name in KNOWN) == (group == 'single')]
-        if group == 'none' or not names:
-            rows.append(('none', (), (seed, 4, k, half)))
-            continue
-        fewest = min(used[name] for name in names)
-        name = str(rng.choice([name for name in names if used[name] == fewest]))
-        used[name] += 1
-        rows.append((group, (name,), (seed, 4, k, half)))
+        names = [name for name in halves[half].kinds() if group == (
+            'single' if name in KNOWN else 'outside')]
+        rarest = [name for name in names if used[name] == min(used[other] for other in names)]
+        effects = (str(rng.choice(rarest)),) if rarest else ()
+        used.update(effects)
+        rows.append((group if effects else 'none', effects, (seed, 4, k, half)))
     return [Plan(f'r{i:04d}', *rows[k]) for i, k in enumerate(rng.permutation(count))]
 
 

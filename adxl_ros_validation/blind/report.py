@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 import re
 import textwrap
@@ -27,13 +28,14 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def terminal_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return a table as lines of a terminal; names of rows are wrapped."""
-    widths = [max(map(len, column)) for column in zip(head, *rows)][1:]
-    room, lines = COLUMNS - 1 - sum(widths) - len(widths), []
-    for name, *cells in (head, *rows):
-        first, *more = textwrap.wrap(name, room) or ['']
-        padded = (f'{cell:{width}}' for cell, width in zip(cells, widths))
-        lines += [' '.join([f' {first:{room}}', *padded]).rstrip(), *(f' {m}' for m in more)]
+    """Return a table as lines of a terminal; its head and the names of its rows are wrapped."""
+    widths = [max(map(len, [*title.split(), *cells])) for title, *cells in zip(head, *rows)]
+    widths[0] = COLUMNS - sum(widths[1:]) - len(widths)
+    lines = []
+    for row in (head, *rows):
+        cells = [textwrap.wrap(cell, width) for cell, width in zip(row, widths)]
+        lines += [''.join(f' {part:{width}}' for part, width in zip(parts, widths)).rstrip()
+                  for parts in zip_longest(*cells, fillvalue='')]
     return lines
 
 
