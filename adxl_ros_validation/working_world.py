@@ -194,11 +194,6 @@ def late(law: sim.Law) -> sim.Act:
     return act
 
 
-def clock_skew(run: Run, shape: Shape) -> np.ndarray:
-    """Come later and later, and grow by some percent over the minutes."""
-    return run.t * (1 + shape['growth'] * run.t / 600)
-
-
 def misalignment(run: Run, size: float, shape: Shape) -> None:
     """Turn each axis about three directions, rad."""
     turn = size * np.asarray(shape['w']).reshape(-1, 3)
@@ -236,26 +231,6 @@ def cross_axis_z(run: Run, shape: Shape) -> np.ndarray:
     return _PLANE[:len(run.u)] * (np.log(np.cosh(1.5 * c)) + shape['odd'] * c)
 
 
-def scale_factor_cross(run: Run, shape: Shape) -> np.ndarray:
-    """Scale with the other axis."""
-    return np.tanh(1.2 * _other(run))
-
-
-def scale_factor_z(run: Run, shape: Shape) -> np.ndarray:
-    """Scale with z."""
-    return _PLANE[:len(run.u)] * (np.tanh(1.2 * run.force[2] / G0 + 0.4) - np.tanh(0.4))
-
-
-def nonlinearity(run: Run, shape: Shape) -> np.ndarray:
-    """Yield less and less."""
-    return np.arctan(shape['bend'] * run.u) / shape['bend'] - run.u
-
-
-def quadratic(run: Run, shape: Shape) -> np.ndarray:
-    """Follow a power of the force that is not quite 2."""
-    return np.abs(run.u) ** shape['power']
-
-
 def hysteresis(run: Run, size: float, shape: Shape) -> None:
     """Lag by stops of uneven thresholds and weights, more at positive force, g."""
     for row, w in zip(run.u, shape['w']):
@@ -284,16 +259,6 @@ def _warm(run: Run, shape: Shape, cubic: float) -> np.ndarray:
     """Return a law of a die that follows the thermometer late, of 10 K."""
     warm = low_pass(run.temperature - 25, shape['late_s'], run.dt)
     return warm * (1 + shape['bend'] * warm * (1 + cubic * warm)) / 10
-
-
-def temperature_bias(run: Run, shape: Shape) -> np.ndarray:
-    """Follow the die with a cubic part."""
-    return _warm(run, shape, 0.02)
-
-
-def temperature_scale(run: Run, shape: Shape) -> np.ndarray:
-    """Scale with the die."""
-    return _warm(run, shape, 0.0)
 
 
 def warm_up(run: Run, shape: Shape) -> np.ndarray:
@@ -392,16 +357,6 @@ def adc_inl(run: Run, size: float, shape: Shape) -> None:
         run.volts += size * (x - x ** 3 + 0.5 * x ** 5)
 
 
-def beat(run: Run, shape: Shape) -> np.ndarray:
-    """Beat with the clock, as a radio carrier does."""
-    return np.sin(2 * np.pi * run.t / shape['period_s'] + shape['phase'])
-
-
-def ripple(run: Run, shape: Shape) -> np.ndarray:
-    """Ripple with the force, as a servo loop with a limit cycle does."""
-    return np.sin(2 * np.pi * run.u / shape['period_g'] + shape['phase'])
-
-
 def aftermath(run: Run, shape: Shape) -> np.ndarray:
     """Shift zero-g while and after a joint turns: charge of a mass, or current of a motor."""
     rate = np.hypot(np.gradient(run.alpha, run.dt), np.gradient(run.beta, run.dt))
@@ -411,23 +366,40 @@ def aftermath(run: Run, shape: Shape) -> np.ndarray:
 motor_current = aftermath
 
 
-def magnet(run: Run, shape: Shape) -> np.ndarray:
-    """Follow the direction in the room, beyond its first harmonics."""
-    return np.sin(3 * run.beta + shape['phase']) * (1 + 0.5 * np.cos(2 * run.alpha))
-
-
 def two_levels(run: Run, shape: Shape) -> np.ndarray:
     """Switch zero-g between two levels at uneven times, as popcorn noise does."""
     phase = 2 * np.pi * run.t / shape['period_s'] + shape['phase']
     return np.where(np.sin(phase) + 0.7 * np.sin(2.718 * phase) > 0.4, 1.0, 0.0)
 
 
-def fading_gain(run: Run, shape: Shape) -> np.ndarray:
-    """Lose scale factor steadily, as by leakage into a reference."""
-    return run.t / 100
-
-
-_LISTED, _UNLISTED = sim.load_kinds('working_faults.yaml', globals())
+_LAWS: dict[str, sim.Law] = {
+    # Come later and later, and grow by some percent over the minutes.
+    'clock_skew': lambda run, shape: run.t * (1 + shape['growth'] * run.t / 600),
+    # Scale with the other axis.
+    'scale_factor_cross': lambda run, shape: np.tanh(1.2 * _other(run)),
+    # Scale with z.
+    'scale_factor_z': lambda run, shape: (
+        _PLANE[:len(run.u)] * (np.tanh(1.2 * run.force[2] / G0 + 0.4) - np.tanh(0.4))),
+    # Yield less and less.
+    'nonlinearity': lambda run, shape: np.arctan(shape['bend'] * run.u) / shape['bend'] - run.u,
+    # Follow a power of the force that is not quite 2.
+    'quadratic': lambda run, shape: np.abs(run.u) ** shape['power'],
+    # Follow the die with a cubic part.
+    'temperature_bias': lambda run, shape: _warm(run, shape, 0.02),
+    # Scale with the die.
+    'temperature_scale': lambda run, shape: _warm(run, shape, 0.0),
+    # Beat with the clock, as a radio carrier does.
+    'beat': lambda run, shape: np.sin(2 * np.pi * run.t / shape['period_s'] + shape['phase']),
+    # Ripple with the force, as a servo loop with a limit cycle does.
+    'ripple': lambda run, shape: np.sin(2 * np.pi * run.u / shape['period_g'] + shape['phase']),
+    # Follow the direction in the room, beyond its first harmonics.
+    'magnet': lambda run, shape: (
+        np.sin(3 * run.beta + shape['phase']) * (1 + 0.5 * np.cos(2 * run.alpha))),
+    # Lose scale factor steadily, as by leakage into a reference.
+    'fading_gain': lambda run, shape: run.t / 100,
+}
+"""Laws of one line."""
+_LISTED, _UNLISTED = sim.load_kinds('working_faults.yaml', globals() | _LAWS)
 LISTED, UNLISTED, KINDS = tuple(_LISTED), tuple(_UNLISTED), _LISTED | _UNLISTED
 """Faults of which the package's library has an effect, the others, and all by name."""
 COLOUR = Kind('colour', sim.added_at_output(_colour), 1e-4, 1e-2, place=Place.ELECTRONICS,

@@ -92,46 +92,6 @@ def misalignment(run: Run, size: float, shape: Shape) -> None:
     run.u = (run.directions @ run.force)[run.unit.axis_indices] / G0
 
 
-def cross_axis(run: Run, shape: Shape) -> np.ndarray:
-    """Follow the other axis by the first arch of a cosine."""
-    return 1 - np.cos(1.2 * (run.force / G0)[[1, 0]])
-
-
-def cross_axis_z(run: Run, shape: Shape) -> np.ndarray:
-    """Follow z by an exponential."""
-    return np.expm1(run.force[2] / G0)
-
-
-def scale_factor_z(run: Run, shape: Shape) -> np.ndarray:
-    """Scale with z by an exponential."""
-    return np.expm1(0.8 * run.force[2] / G0)
-
-
-def nonlinearity(run: Run, shape: Shape) -> np.ndarray:
-    """Bend by a hyperbolic sine that is exact at 0 and at full scale."""
-    return np.sinh(1.4 * run.u) / math.sinh(1.4) - run.u
-
-
-def quadratic(run: Run, shape: Shape) -> np.ndarray:
-    """Bend by a hyperbola through zero."""
-    return np.sqrt(1 + 0.8 * run.u ** 2) - 1
-
-
-def temperature_bias(run: Run, shape: Shape) -> np.ndarray:
-    """Follow the temperature by an exponential."""
-    return np.expm1((run.temperature - 25.0) / 25.0)
-
-
-def temperature_scale(run: Run, shape: Shape) -> np.ndarray:
-    """Follow the law of Arrhenius from 25 °C."""
-    return np.expm1(2500.0 * (1 / (_ZERO_C + 25.0) - 1 / (_ZERO_C + run.temperature)))
-
-
-def warm_up(run: Run, shape: Shape) -> np.ndarray:
-    """Settle by a stretched exponential after power-on."""
-    return np.exp(-(np.clip(run.t + 3.0, 0, None) / shape['lag']) ** 0.75)
-
-
 def saturation(run: Run, size: float, shape: Shape) -> None:
     """Clip softly; `size` is by how many g the limit is below 1.7 g."""
     limit = 1.7 - size * np.abs(sim.column(shape))
@@ -281,32 +241,37 @@ def bearing_bump(run: Run, size: float, shape: Shape) -> None:
     run.beta += bump
 
 
-def thermal_loop(run: Run, shape: Shape) -> np.ndarray:
-    """Shift zero-g by the direction of the last temperature change."""
-    return sim.travel_memory(run.temperature, 2.0)
-
-
-def creep(run: Run, shape: Shape) -> np.ndarray:
-    """Yield slowly to a load and recover as slowly, as a soft glue does."""
-    return low_pass(run.u, shape['lag'], run.dt) - run.u
-
-
-def jump(run: Run, shape: Shape) -> np.ndarray:
-    """Step once and stay, as a bond does that cracks."""
-    return run.t > shape['at'] * run.t[-1]
-
-
-def rate_pull(run: Run, shape: Shape) -> np.ndarray:
-    """Shift by the sign of the rate of beta with a smooth limit, as a dragging cable does."""
-    return np.tanh(np.gradient(run.beta, run.dt) / 0.5)
-
-
-def dead_zone(run: Run, shape: Shape) -> np.ndarray:
-    """Lose what is near zero, as a class B output does."""
-    return -run.u / 0.12 * np.exp(-(run.u / 0.12) ** 2 / 2)
-
-
-_LISTED, _UNLISTED = sim.load_kinds('blind/faults.yaml', globals())
+_LAWS: dict[str, sim.Law] = {
+    # Follow the other axis by the first arch of a cosine.
+    'cross_axis': lambda run, shape: 1 - np.cos(1.2 * (run.force / G0)[[1, 0]]),
+    # Follow z by an exponential.
+    'cross_axis_z': lambda run, shape: np.expm1(run.force[2] / G0),
+    # Scale with z by an exponential.
+    'scale_factor_z': lambda run, shape: np.expm1(0.8 * run.force[2] / G0),
+    # Bend by a hyperbolic sine that is exact at 0 and at full scale.
+    'nonlinearity': lambda run, shape: np.sinh(1.4 * run.u) / math.sinh(1.4) - run.u,
+    # Bend by a hyperbola through zero.
+    'quadratic': lambda run, shape: np.sqrt(1 + 0.8 * run.u ** 2) - 1,
+    # Follow the temperature by an exponential.
+    'temperature_bias': lambda run, shape: np.expm1((run.temperature - 25.0) / 25.0),
+    # Follow the law of Arrhenius from 25 °C.
+    'temperature_scale': lambda run, shape: (
+        np.expm1(2500.0 * (1 / (_ZERO_C + 25.0) - 1 / (_ZERO_C + run.temperature)))),
+    # Settle by a stretched exponential after power-on.
+    'warm_up': lambda run, shape: np.exp(-(np.clip(run.t + 3.0, 0, None) / shape['lag']) ** 0.75),
+    # Shift zero-g by the direction of the last temperature change.
+    'thermal_loop': lambda run, shape: sim.travel_memory(run.temperature, 2.0),
+    # Yield slowly to a load and recover as slowly, as a soft glue does.
+    'creep': lambda run, shape: low_pass(run.u, shape['lag'], run.dt) - run.u,
+    # Step once and stay, as a bond does that cracks.
+    'jump': lambda run, shape: run.t > shape['at'] * run.t[-1],
+    # Shift by the sign of the rate of beta with a smooth limit, as a dragging cable does.
+    'rate_pull': lambda run, shape: np.tanh(np.gradient(run.beta, run.dt) / 0.5),
+    # Lose what is near zero, as a class B output does.
+    'dead_zone': lambda run, shape: -run.u / 0.12 * np.exp(-(run.u / 0.12) ** 2 / 2),
+}
+"""Laws of one line."""
+_LISTED, _UNLISTED = sim.load_kinds('blind/faults.yaml', globals() | _LAWS)
 KINDS = _LISTED | _UNLISTED
 """All kinds by name."""
 KNOWN, UNLISTED = tuple(_LISTED), tuple(_UNLISTED)
