@@ -35,6 +35,7 @@ setup(
     package_data={PACKAGE: ['calibrate/report/*.html', 'calibrate/report/*.js',
                             'calibrate/report/*.xml', 'diagnose/*.html', 'fleet/*.html',
                             'report/page_templates/*', 'tools/*.html'],
+                  f'{PACKAGE}_validation': ['*.yaml', 'blind/*.yaml', 'pages/*'],
                   f'{PACKAGE}.params': ['*.yaml']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),

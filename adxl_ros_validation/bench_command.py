@@ -13,15 +13,16 @@ import subprocess
 import sys
 import tempfile
 import time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.nodes.jobs import cpu_time_s, executable, running, use_own_graph
 from adxl_ros.nodes.topics import Inbox
-from adxl_ros.tools.command_line import argument_parser, check_least, run
+from adxl_ros.tools import command_line as cli
 from adxl_ros_validation.bench_jobs import offline_jobs, print_table, spread
 import numpy as np
+import pandas as pd
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -49,21 +50,16 @@ class Listener(Node):
 
     def __init__(self, topic: str) -> None:
         super().__init__('listener')
-        self.raw: list[bytes] = []  # Serialized messages
-        self.arrived_ns: list[int] = []  # Their arrival times, ns
+        self.messages: list[tuple[int, bytes]] = []  # Arrival time, ns, and serialized message
         # An executor of rclpy would take as much of a core as the nodes that are measured.
         self._inbox = Inbox(self, Imu, topic, _QUEUE)
-
-    def _on_message(self, raw: bytes) -> None:
-        self.arrived_ns.append(time.time_ns())
-        self.raw.append(raw)
 
     def listen(self, seconds: float, limit: float = np.inf) -> None:
         """Keep the messages of some time."""
         end_s = time.monotonic() + seconds
-        while time.monotonic() < end_s and len(self.raw) < limit:
-            self._inbox.receive(self._on_message)
-        if not self.raw:
+        while time.monotonic() < end_s and len(self.messages) < limit:
+            self._inbox.receive(lambda raw: self.messages.append((time.time_ns(), raw)))
+        if not self.messages:
             raise UserError(f'no messages for {seconds:g} s')
 
 
@@ -112,21 +108,12 @@ def spin(make: Callable[[], Node]) -> None:
 
 
 class _Subject(NamedTuple):
-    """What is measured."""
+    """What is measured: the last of its processes, behind those that feed it."""
 
     label: str  # Its name in the table
     topic: str  # Topic of its last node
     commands: Sequence[Sequence[str]]  # Commands of its processes
-
-
-class _Result(NamedTuple):
-    """One measurement of a subject."""
-
-    rate_hz: float  # Messages by time
-    missing: float  # Samples that did not come
-    p50_ms: float  # Age of the samples on arrival
-    p99_ms: float
-    loads: tuple[float, ...]  # Processor time by time, one for each process
+    feed: str = ''  # Topic of the process before the last one, if there is one
 
 
 def measure_live(seconds: float, rounds: int, iiod: str | None) -> None:
@@ -134,36 +121,31 @@ def measure_live(seconds: float, rounds: int, iiod: str | None) -> None:
     print(f'{RATE_HZ:g} Hz, {rounds} x {seconds:g} s: medians (range). '
           f'Load of the machine before: {os.getloadavg()[0]:.1f}')
     print(f'{"":27} {"Hz":>6} {"lost":>4} {"p50 ms":>16} {"p99 ms":>17}  CPU, %', flush=True)
-    results: dict[str, list[_Result]] = {}
-    failures: dict[str, list[str]] = {}
+    rows = []
     with ExitStack() as stack:
-        subjects = _subjects(stack, iiod)
-        for subject in subjects * rounds:
+        for subject in _subjects(stack, iiod) * rounds:
             try:
-                result = _measure(subject, seconds)
-                results.setdefault(subject.label, []).append(result)
+                row = _measure(subject, seconds)
             except UserError as error:
-                failures.setdefault(subject.label, []).append(str(error))
-    for label in (subject.label for subject in subjects):
-        if label in results:
-            print(_row(label, results[label]))
-        if label in failures:
-            print(f'{label:27} failed in {len(failures[label])} of {rounds} rounds: '
-                  f'{failures[label][-1]}')
-    loads = {label: np.median([sum(result.loads) for result in measured])
-             for label, measured in results.items()}
-    for label, load in loads.items():
+                row = {'error': str(error)}
+            rows.append({'label': subject.label, 'error': None, **row})
+    measured, load = {}, {}
+    for label, table in pd.DataFrame(rows).groupby('label', sort=False):
+        if len(good := table[table.error.isna()]):
+            measured[label], load[label] = good, good.loads.map(sum).median()
+            loads = ' + '.join(f'{100 * load:.1f}' for load in np.median([*good.loads], axis=0))
+            print(f'{label:27} {good.rate_hz.median():6.0f} {good.missing.median():4.0f} '
+                  f'{spread(good.p50_ms, ".2f"):>16} {spread(good.p99_ms, ".2f"):>17}  {loads}')
+        if len(bad := table.error.dropna()):
+            print(f'{label:27} failed in {len(bad)} of {rounds} rounds: {bad.iloc[-1]}')
+    for label in load:
         if 'compensation' in label:
             print(f'CPU of {label} by that of the {_RELAY}: '
-                  f'{load / loads.get(_RELAY, np.nan):.2f}')
-    driver, compensation = [executable('driver')], [executable('compensation')]
-    for label, topic, command, before in (('driver, sim', 'imu/data_raw', driver, []),
-                                          ('compensation', 'imu/data', compensation, [driver])):
-        try:
-            firsts_s = [_first_sample_s(topic, command, before) for _ in range(rounds)]
-            print(f'First sample of {label}: {spread(firsts_s, ".2f")} s after its start')
-        except UserError as error:
-            print(f'First sample of {label}: {error}')
+                  f'{load[label] / load.get(_RELAY, np.nan):.2f}')
+    for name, label in (('driver, sim',) * 2, ('compensation', 'driver, sim, compensation')):
+        if label in measured:
+            print(f'First sample of {name}: {spread(measured[label].first_s, ".2f")} s after its '
+                  'start')
     print(f'Load of the machine after: {os.getloadavg()[0]:.1f}', flush=True)
 
 
@@ -180,11 +162,11 @@ def _subjects(stack: ExitStack, iiod: str | None) -> list[_Subject]:
         uri = stack.enter_context(_iio_server(iiod))
         drivers['iio'] = [driver, '--ros-args', '-p', 'link.type:=iio', '-p', f'link.uri:={uri}']
     return [
-        _Subject('bare publisher', 'bare', bare[:1]), _Subject(_RELAY, 'relayed', bare),
+        _Subject('bare publisher', 'bare', bare[:1]), _Subject(_RELAY, 'relayed', bare, 'bare'),
         *(_Subject(f'driver, {link}', 'imu/data_raw', [command])
           for link, command in drivers.items()),
-        *(_Subject(f'driver, {link}, compensation', 'imu/data', [command, [compensation]])
-          for link, command in drivers.items())]
+        *(_Subject(f'driver, {link}, compensation', 'imu/data', [command, [compensation]],
+                   'imu/data_raw') for link, command in drivers.items())]
 
 
 @contextmanager
@@ -213,68 +195,57 @@ def _iio_server(iiod: str) -> Iterator[str]:
             server.kill()
 
 
-def _measure(subject: _Subject, seconds: float) -> _Result:
-    """Measure a subject once, for a time, s."""
-    with running(subject.commands) as processes:
+def _measure(subject: _Subject, seconds: float) -> dict[str, Any]:
+    """
+    Measure a subject once, for a time, s.
+
+    Return the time from the start of its last process to the first sample, messages by time,
+    samples that did not come, the age of samples on arrival, and processor time by time, one for
+    each process.
+    """
+    with ExitStack() as stack:
+        processes = stack.enter_context(running(subject.commands[:-1]))
+
         def cpu_times_s() -> np.ndarray:
             return np.array([cpu_time_s(process.pid) for process in processes])
 
         try:
-            with _listening(subject.topic) as listener:
-                listener.listen(_START_S, _FIRST_MESSAGES)
-                listener.listen(_WARM_UP_S)
-                listener.raw.clear()
-                listener.arrived_ns.clear()
-                before_s, began_s = cpu_times_s(), time.monotonic()
-                listener.listen(seconds)
-                duration_s = time.monotonic() - began_s
-                loads = (cpu_times_s() - before_s) / duration_s
+            if processes:
+                with _listening(subject.feed) as fed:
+                    fed.listen(_START_S, _FIRST_MESSAGES)
+            listener = stack.enter_context(_listening(subject.topic))
+            began_ns = time.time_ns()
+            processes = processes + stack.enter_context(running(subject.commands[-1:]))
+            listener.listen(_START_S, _FIRST_MESSAGES)
+            first_s = (listener.messages[0][0] - began_ns) * 1e-9
+            listener.listen(_WARM_UP_S)
+            listener.messages.clear()
+            before_s, began_s = cpu_times_s(), time.monotonic()
+            listener.listen(seconds)
+            duration_s = time.monotonic() - began_s
+            loads = (cpu_times_s() - before_s) / duration_s
         except UserError as error:
             ended = [f'{process.args!r} ended with status {process.returncode}'
                      for process in processes if process.poll() is not None]
             raise UserError(', '.join([*ended, str(error)])) from None
-    stamps_ns = np.concatenate([table.stamp_ns() for table in cdr.tables(listener.raw, cdr.imu)])
-    age_ms = (np.array(listener.arrived_ns) - stamps_ns) * 1e-6
+    arrived_ns, raw = zip(*listener.messages)
+    stamps_ns = np.concatenate([table.stamp_ns() for table in cdr.tables(raw, cdr.imu)])
+    age_ms = (np.array(arrived_ns) - stamps_ns) * 1e-6
     periods = np.rint(np.diff(np.sort(stamps_ns)) * 1e-9 * RATE_HZ)
     # The stamps of a bare timer wander: only steps of two periods and more are a loss.
     missing = int(np.sum(np.maximum(periods - 1, 0)))
     p50_ms, p99_ms = np.percentile(age_ms, [50, 99])
-    return _Result(len(stamps_ns) / duration_s, missing, p50_ms, p99_ms, tuple(loads))
-
-
-def _first_sample_s(topic: str, command: Sequence[str], before: Sequence[Sequence[str]]) -> float:
-    """Return the time from the start of a node to the arrival of its first sample, s."""
-    with running(before):
-        if before:
-            with _listening('imu/data_raw') as listener:
-                listener.listen(_START_S, _FIRST_MESSAGES)
-        with _listening(topic) as listener:
-            began_ns = time.time_ns()
-            with running([command]):
-                listener.listen(_START_S, 1)
-            return (listener.arrived_ns[0] - began_ns) * 1e-9
-
-
-def _row(label: str, results: Sequence[_Result]) -> str:
-    """Return the row of a subject."""
-    loads = ' + '.join(f'{100 * load:.1f}'
-                       for load in np.median([result.loads for result in results], axis=0))
-    return (f'{label:27} {np.median([result.rate_hz for result in results]):6.0f} '
-            f'{np.median([result.missing for result in results]):4.0f} '
-            f'{spread([result.p50_ms for result in results], ".2f"):>16} '
-            f'{spread([result.p99_ms for result in results], ".2f"):>17}  {loads}')
-
-
-_EXAMPLES = {'all measurements, ten minutes': '',
-             'with recordings of 10 minutes, not 8 hours': '--hours 0.17',
-             'only the live nodes': '--live',
-             'a short look': '--live --seconds 5 --rounds 1'}
-"""Examples of arguments, by their purpose."""
+    return {'first_s': first_s, 'rate_hz': len(stamps_ns) / duration_s, 'missing': missing,
+            'p50_ms': p50_ms, 'p99_ms': p99_ms, 'loads': tuple(loads)}
 
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = argument_parser('bench', __doc__, _EXAMPLES)
+    parse = cli.argument_parser('bench', __doc__, {
+        'all measurements, ten minutes': '',
+        'with recordings of 10 minutes, not 8 hours': '--hours 0.17',
+        'only the live nodes': '--live',
+        'a short look': '--live --seconds 5 --rounds 1'})
     parse.add_argument('--seconds', type=float, default=10.0,
                        help='duration of each live measurement, s (default 10)')
     parse.add_argument('--rounds', type=int, default=3,
@@ -289,7 +260,7 @@ def parser() -> argparse.ArgumentParser:
 
 def bench(options: argparse.Namespace) -> int:
     """Run the benchmark; see `parser`."""
-    check_least(options, seconds=0.1, rounds=1, hours=0.01)
+    cli.check_least(options, seconds=0.1, rounds=1, hours=0.01)
     use_own_graph()
     measure_live(options.seconds, options.rounds, options.iiod)
     if not options.live:
@@ -299,4 +270,4 @@ def bench(options: argparse.Namespace) -> int:
 
 def main() -> int:
     """Run the tool on the command line."""
-    return run(parser(), bench)
+    return cli.run(parser(), bench)

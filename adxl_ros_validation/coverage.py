@@ -9,7 +9,7 @@ uniform (Talts et al. 2018, arXiv:1804.06788). 90 % intervals must contain it in
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import product
 
@@ -20,11 +20,11 @@ from adxl_ros.calibrate.poses import Poses, predicted_volts
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
 from adxl_ros.model.constants import Z_90
-from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros_validation import experiments
-from adxl_ros_validation.blind.report_html import markdown_table
+from adxl_ros_validation.blind.report import filled, markdown_table, terminal_table
 import numpy as np
+import pandas as pd
 import scipy
 
 STAGES = ('errors per pose', 'errors per setting', 'eccentric', 'tilted base')
@@ -44,34 +44,23 @@ BINS = 10
 """Number of bins of the ranks; chosen."""
 
 
-@dataclass(frozen=True)
-class Draw:
-    """One unit on one stage."""
-
-    stage: str  # kind of the stage, axes and plan
-    axes: str
-    plan: str
-    names: tuple[Coefficient, ...]  # fitted coefficients of the sensor, (p,)
-    z: np.ndarray  # their errors over the stated standard deviations, (p,)
-    # their errors over the Cramér-Rao bound of the true error model, (p,); empty where the fit
-    # has other terms than were drawn
-    bound_ratio: np.ndarray
-    # as `z`, for alpha and beta, and for the measured axes, over held-out poses
-    tilt_z: np.ndarray
-    force_z: np.ndarray
-    converged: bool  # whether the fit converged
-
-
 def draw_all(nominal: Sensor, draws: int, seed: int, show: Callable[[float], None]
-             ) -> list[Draw]:
-    """Draw and fit units on all kinds of stage, over the cores."""
+             ) -> pd.DataFrame:
+    """Draw and fit units on all kinds of stage, over the cores; see `draw`."""
     kinds = list(product(STAGES, AXES, pose_plan.KINDS))
-    return experiments.in_parallel(partial(draw, nominal, kinds=kinds, seed=seed), show,
-                                   range(draws))
+    return pd.concat(experiments.in_parallel(partial(draw, nominal, kinds=kinds, seed=seed), show,
+                                             range(draws)))
 
 
-def draw(nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], seed: int) -> Draw:
-    """Draw one unit and one stage, sweep, and fit."""
+def draw(nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], seed: int
+         ) -> pd.DataFrame:
+    """
+    Draw one unit and one stage, sweep, and fit; return a row for each error.
+
+    `z` is an error over its stated standard deviation: of the fitted coefficients, and, over
+    held-out poses, of the tilt and of the measured axes. `by_bound` is the error of a coefficient
+    over the Cramér-Rao bound of the true error model, where the fit has the terms of the unit.
+    """
     stage, axes, kind = kinds[number % len(kinds)]
     rng = np.random.default_rng([seed, number])
     stated = np.radians(np.exp(rng.uniform(*np.log(_RESOLUTION_DEG))))
@@ -91,15 +80,17 @@ def draw(nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], se
     bound = experiments.sweep_bound(truth, poses, true_rad, levels, terms)
     angles = np.column_stack([np.arccos(rng.uniform(-1, 1, _HELD_OUT)),
                               rng.uniform(0, 2 * np.pi, _HELD_OUT)])
-    held_out = _read(truth, _resting(truth, angles), angles, rng), angles
+    held_out = _measured(truth, angles, angles, rng), angles
     tilt = experiments.angle_errors(fit.fitted, bound, *held_out)
     force, force_std = experiments.force_errors(fit.fitted, truth, *held_out)
     bound_std = dict(zip(bound.covariance_names, np.sqrt(np.diag(bound.covariance))))
-    bound_ratio = error / [bound_std[name] for name in names] \
-        if set(names) == set(bound_std) else np.zeros(0)
-    return Draw(stage, axes, kind, names, error / np.sqrt(np.diag(fit.fitted.covariance)),
-                bound_ratio, (tilt.error / tilt.std)[tilt.determined],
-                (force / force_std).ravel(), fit.converged)
+    by_bound = [bound_std[name] for name in names] if set(names) == set(bound_std) else np.nan
+    return pd.concat([
+        pd.DataFrame({'of': 'coefficients', 'name': list(map(str, names)), 'by_bound':
+                      error / by_bound, 'z': error / np.sqrt(np.diag(fit.fitted.covariance))}),
+        pd.DataFrame({'of': 'tilt', 'z': (tilt.error / tilt['std'])[tilt.counts]}),
+        pd.DataFrame({'of': 'acceleration', 'z': (force / force_std).ravel()})]).assign(
+            draw=number, stage=stage, axes=axes, plan=kind, converged=fit.converged)
 
 
 def _unit(sensor: Sensor, terms: Sequence[str], stage: str, rng: np.random.Generator) -> Sensor:
@@ -118,87 +109,73 @@ def _swept(truth: Sensor, targets: Sequence[pose_plan.Target], per_pose: bool, s
            rng: np.random.Generator) -> tuple[Poses, np.ndarray]:
     """Return the poses of a sweep, and where the stage really stood, rad, (k, 2)."""
     read = np.array([[t.alpha_rad, t.beta_rad] for t in targets])
-    poses = _resting(truth, read)
+    poses = Poses.without_volts(read[:, 0], read[:, 1], noise.sample_std_v(truth))
     error = np.empty_like(read)
     for joint, setting in enumerate((poses.alpha_setting, poses.beta_setting)):
         number = np.arange(len(read)) if per_pose else setting
         error[:, joint] = step_rad * rng.uniform(-0.5, 0.5, len(read))[number]
-    return _read(truth, poses, read + error, rng), read + error
+    return _measured(truth, read, read + error, rng), read + error
 
 
-def _resting(truth: Sensor, read_rad: np.ndarray) -> Poses:
+def _measured(truth: Sensor, read_rad: np.ndarray, true_rad: np.ndarray, rng: np.random.Generator
+              ) -> Poses:
+    """Return the poses that the stage reads, with the voltages of where it really stands."""
     samples = round(_DWELL_S * truth.rate_hz)
     count = noise.effective_samples(samples, 1 / truth.rate_hz, truth.rc_s)
-    return Poses.without_volts(read_rad[:, 0], read_rad[:, 1],
-                               noise.sample_std_v(truth) / np.sqrt(count))
-
-
-def _read(truth: Sensor, poses: Poses, true_rad: np.ndarray, rng: np.random.Generator) -> Poses:
-    there = replace(poses, alpha_rad=true_rad[:, 0], beta_rad=true_rad[:, 1])
-    volts = predicted_volts(truth, there)
+    poses = Poses.without_volts(read_rad[:, 0], read_rad[:, 1],
+                                noise.sample_std_v(truth) / np.sqrt(count))
+    volts = predicted_volts(truth, replace(poses, alpha_rad=true_rad[:, 0],
+                                           beta_rad=true_rad[:, 1]))
     return replace(poses, volts=volts + poses.std_v * rng.normal(size=volts.shape))
 
 
-def page(draws: Sequence[Draw], made: str) -> str:
+def page(errors: pd.DataFrame, made: str) -> str:
     """Return the section about coverage."""
-    ratio = np.concatenate([d.bound_ratio for d in draws])
-    kinds = [(field, value) for field in ('stage', 'axes', 'plan')
-             for value in dict.fromkeys(getattr(d, field) for d in draws)]
-    rows = [_row(label, np.concatenate(parts), *_coverage(parts)) for label, parts in (
-        ('all coefficients', [d.z for d in draws]), ('tilt', [d.tilt_z for d in draws]),
-        ('acceleration', [d.force_z for d in draws]),
-        *((f'{field} {value}: coefficients', [d.z for d in draws if getattr(d, field) == value])
-          for field, value in kinds))]
+    fitted = errors[errors.of == 'coefficients']
+    compared, draws = fitted.dropna(subset='by_bound'), fitted.groupby('draw')
+    rows = _rows(errors) + [_row(f'{key} {value}: coefficients', part)
+                            for key in ('stage', 'axes', 'plan')
+                            for value, part in fitted.groupby(key, sort=False)]
     single = []
-    for name in dict.fromkeys(name for d in draws for name in d.names):
-        z = np.array([d.z[d.names.index(name)] for d in draws if name in d.names])
-        inside = scipy.stats.binomtest(int(np.sum(np.abs(z) < Z_90)), len(z))
-        single.append(_row(f'{name} ({len(z)})', z, inside.statistic,
-                           *inside.proportion_ci(0.9, 'exact')))
+    for name, part in fitted.groupby('name', sort=False):
+        inside = scipy.stats.binomtest(int(np.sum(part.z.abs() < Z_90)), len(part))
+        single.append(_row(f'{name} ({len(part)})', part, (
+            inside.statistic, *inside.proportion_ci(0.9, 'exact'))))
     head = ['coverage, %', 'rms of error / stated', 'ranks', 'p']
-    return '\n'.join([
-        f'## Coverage of the intervals: {len(draws)} drawn units and stages', '', made, '',
-        'A unit is drawn at datasheet spread. Its stage has an encoder of 0.01° to 0.1° and '
-        'a true error of 0.5 to 2 times the stated one. Plans, axes and stages alternate. '
-        'Coverage is the share of 90 % intervals that contain the truth. In brackets is its '
-        '90 % interval: by the binomial distribution, or by bootstrap over draws where one '
-        'draw has several values. Ranks are counts of the truth in the ten tenths of its '
-        'posterior; p is that of a uniform distribution.', '',
-        f'Error over the Cramér-Rao bound of the same error model, rms over {len(ratio)} '
-        f'coefficients of {sum(len(d.bound_ratio) > 0 for d in draws)} fits with the '
-        f'terms that were drawn: {np.sqrt(np.mean(ratio ** 2)):.3f}. '
-        f'Fits that converged: {sum(d.converged for d in draws)} of {len(draws)}.', '',
-        markdown_table(['', *head], rows), '', markdown_table(['coefficient', *head], single),
-        ''])
+    return filled('coverage.md', {
+        'made': made, 'draws': len(draws), 'converged': draws.converged.all().sum(),
+        'compared': len(compared), 'fits': compared.draw.nunique(),
+        'by_bound': np.sqrt(np.mean(compared.by_bound ** 2)),
+        'groups': markdown_table(['', *head], rows),
+        'coefficients': markdown_table(['coefficient', *head], single)})
 
 
-def screen_lines(draws: Sequence[Draw]) -> list[str]:
+def screen_lines(errors: pd.DataFrame) -> list[str]:
     """Return the coverage of all intervals as lines for a terminal."""
-    parts = {'coefficients': [d.z for d in draws], 'tilt': [d.tilt_z for d in draws],
-             'acceleration': [d.force_z for d in draws]}
-    lines = [f' Coverage of 90 % intervals over {len(draws)} drawn units and stages']
-    for label, z_of_draws in parts.items():
-        share, low, high = _coverage(z_of_draws)
-        lines.append(f' {label:28}{100 * share:15.1f} %   ({100 * low:.1f} to {100 * high:.1f})')
-    return lines
+    return terminal_table(
+        [f'Coverage of 90 % intervals over {errors.draw.nunique()} drawn units and stages', '%'],
+        [row[:2] for row in _rows(errors)])
 
 
-def mean_with_interval(parts: Sequence[tuple[float, int]]) -> tuple[float, float, float]:
-    """Return the mean of sums over counts, and its 90 % interval by bootstrap over the parts."""
-    sums = np.array(parts, float)
+def _rows(errors: pd.DataFrame) -> list[list[str]]:
+    """Return the rows of all draws."""
+    return [_row(f'all {what}' if what == 'coefficients' else str(what), part)
+            for what, part in errors.groupby('of', sort=False)]
+
+
+def mean_with_interval(values: pd.Series, groups: pd.Series) -> tuple[float, float, float]:
+    """Return a mean and its 90 % interval by bootstrap over groups of values."""
+    sums = values.groupby(groups.to_numpy(), sort=False).agg(['sum', 'count']).to_numpy(float)
     drawn = sums[np.random.default_rng(0).integers(0, len(sums), (1000, len(sums)))].sum(axis=1)
     total = sums.sum(axis=0)
     low, high = np.quantile(drawn[:, 0] / drawn[:, 1], [0.05, 0.95])
     return float(total[0] / total[1]), float(low), float(high)
 
 
-def _coverage(parts: Sequence[np.ndarray]) -> tuple[float, float, float]:
-    """Return the share of intervals with the truth, and its 90 % interval over draws."""
-    return mean_with_interval([(int(np.sum(np.abs(z) < Z_90)), len(z)) for z in parts])
-
-
-def _row(label: str, z: np.ndarray, share: float, low: float, high: float) -> list[str]:
-    counts = np.histogram(scipy.special.ndtr(z), BINS, (0, 1))[0]
+def _row(label: str, errors: pd.DataFrame, covered: Sequence[float] = ()) -> list[str]:
+    """Return a row; `covered` has the share and its interval, else they are over draws."""
+    share, low, high = covered or mean_with_interval(errors.z.abs() < Z_90, errors.draw)
+    counts = np.histogram(scipy.special.ndtr(errors.z), BINS, (0, 1))[0]
     return [label, f'{100 * share:.1f} ({100 * low:.1f} to {100 * high:.1f})',
-            f'{np.sqrt(np.mean(z ** 2)):.2f}', ' '.join(map(str, counts)),
+            f'{np.sqrt(np.mean(errors.z ** 2)):.2f}', ' '.join(map(str, counts)),
             f'{scipy.stats.chisquare(counts).pvalue:.2f}']

@@ -4,10 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-import os
 from typing import Any, NamedTuple
 
 from adxl_ros.calibrate import pose_extraction
@@ -30,21 +28,19 @@ from adxl_ros.signals import recorded_sensor
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Held, Motion
 from adxl_ros.simulate.response import simulate
+from adxl_ros.workers import open_pool
 import numpy as np
+import pandas as pd
 import scipy
 
 SEARCH_RAD = np.radians(np.arange(-5.0, 5.01, 0.5))
 """Angles about the case's axis, rad; chosen."""
 
 
-@dataclass(frozen=True)
-class DirectionSearch:
-    """Beta of the direction of the x axis by three methods."""
+class DirectionSearch(NamedTuple):
+    """Beta of the direction of the x axis, and the outputs that it was found by."""
 
-    truth_rad: float  # the true value, rad
-    largest_rad: float  # by the largest output, rad
-    parabola_rad: float  # by a parabola through the outputs, rad
-    null_rad: float  # by the null crossings at ±90°, rad
+    found_rad: dict[str, float]  # true value, and by three methods, rad
     turned_rad: np.ndarray  # angles, rad, and outputs by the nominal scale factor, g, (k,)
     output_g: np.ndarray
 
@@ -70,8 +66,10 @@ def search(truth: Sensor, seed: int) -> DirectionSearch:
     # β_x of (18) with the linear cross-axis term, which equals it to first order.
     direction = sum(float(truth.values.get(effect, {}).get(name, [0.0])[0]) for effect, name in (
         ('misalignment', 'beta_rad'), ('cross_axis', 'linear')))
-    return DirectionSearch(direction, -float(SEARCH_RAD[np.argmax(top)]),
-                           float(curve[1] / (2 * curve[0])), float(level / slope), SEARCH_RAD, top)
+    return DirectionSearch({
+        'truth': direction, 'largest output': -float(SEARCH_RAD[np.argmax(top)]),
+        'parabola through the outputs': float(curve[1] / (2 * curve[0])),
+        'null crossings at ±90°': float(level / slope)}, SEARCH_RAD, top)
 
 
 MAX_BOUND_RAD = np.radians(1.0)
@@ -86,29 +84,6 @@ _BUTTERWORTH_ORDER = 2
 """Order of the low-pass of the motion experiment; the paper's."""
 _BUTTERWORTH_HZ = 20.0
 """Corner of that low-pass, Hz; the paper's."""
-
-
-@dataclass(frozen=True)
-class AngleErrors:
-    """Errors of alpha and beta in k poses, (k, 2) each, rad."""
-
-    error: np.ndarray  # estimate minus truth
-    std: np.ndarray  # standard deviation by the calibration
-    # cramér-Rao bound by the noise of one pose, and by pose and calibration. It is inf where |f|
-    # = g has two upright solutions, and for beta within 1° of level
-    pose_bound: np.ndarray
-    bound: np.ndarray
-    near_vertical: np.ndarray  # poses within 15° of alpha = ±90°, (k,)
-
-    @property
-    def determined(self) -> np.ndarray:
-        """Return whether each angle counts, (k, 2): its bound is below 1°."""
-        return self.bound < MAX_BOUND_RAD
-
-    def ratio(self, pose_only: bool) -> np.ndarray:
-        """Return the errors that count over the bound of the pose only, or over the full bound."""
-        bound = self.pose_bound if pose_only else self.bound
-        return (self.error / bound)[self.determined]
 
 
 def sweep_bound(truth: Sensor, swept: Poses, true_rad: np.ndarray, stage: StageError,
@@ -128,8 +103,14 @@ def sweep_bound(truth: Sensor, swept: Poses, true_rad: np.ndarray, stage: StageE
 
 
 def angle_errors(fitted: Sensor, bound: Sensor, poses: Poses, true_rad: np.ndarray
-                 ) -> AngleErrors:
-    """Compare the tilt by a calibrated unit with the truth."""
+                 ) -> pd.DataFrame:
+    """
+    Compare the tilt by a calibrated unit with the truth; a row for alpha and beta of each pose.
+
+    It has the error, the standard deviation by the calibration, and the Cramér-Rao bound by the
+    noise of one pose, and by pose and calibration, rad. A bound is inf where |f| = g has two
+    upright solutions, and for beta within 1° of level; an error counts where it is below 1°.
+    """
     force = stage_force(bound, *true_rad.T)
     up = np.where(np.asarray(force[2]) < 0, -1, 1)
     variance_v2 = np.mean(poses.std_v, axis=0) ** 2
@@ -146,8 +127,11 @@ def angle_errors(fitted: Sensor, bound: Sensor, poses: Poses, true_rad: np.ndarr
     error[:, 1] = (error[:, 1] + np.pi) % (2 * np.pi) - np.pi
     error[:, 1] = np.where(np.isfinite(error[:, 1]), error[:, 1], 0.0)
     inclined = np.arctan2(np.hypot(force[0], force[1]), np.abs(force[2]))
-    return AngleErrors(error, measured[1], pose_only[1], true[1],
-                       np.pi / 2 - inclined < NEAR_VERTICAL_RAD)
+    found = pd.DataFrame({name: values.ravel() for name, values in (
+        ('error', error), ('std', measured[1]), ('pose_bound', pose_only[1]), ('bound', true[1]))})
+    return found.assign(
+        angle=np.tile(['alpha', 'beta'], len(error)), counts=found.bound < MAX_BOUND_RAD,
+        near_vertical=np.repeat(np.pi / 2 - inclined < NEAR_VERTICAL_RAD, 2))
 
 
 def _angles(sensor: Sensor, force: Components, up: np.ndarray, variance_v2: np.ndarray
@@ -211,19 +195,11 @@ SETTLED_S = 1.0
 """Time from the stop of the stage to the start of a pose's mean, s; chosen."""
 
 
-class Stage(NamedTuple):
-    """Errors of a stage."""
-
-    resolution_rad: float  # step of the encoder, rad
-    level_rad: float  # standard deviation of the base's tilt, rad
+STAGES = {'perfect': (0.0, 0.0), 'paper': (np.radians(5 / 60), full_model.LEVEL_STD_RAD)}
+"""Step of the encoder and standard deviation of the base's tilt, rad, by stage."""
 
 
-STAGES = {'perfect': Stage(0.0, 0.0),
-          'paper': Stage(np.radians(5 / 60), full_model.LEVEL_STD_RAD)}
-
-
-@dataclass(frozen=True)
-class Run:
+class Run(NamedTuple):
     """One unit after its sweep."""
 
     truth: Sensor  # the true unit, with the tilt of the base
@@ -232,17 +208,17 @@ class Run:
     true_rad: np.ndarray  # true alpha and beta of these poses, rad, (k, 2)
 
 
-def draw(nominal: Sensor, stage: Stage, rng: np.random.Generator) -> Sensor:
+def draw(nominal: Sensor, stage: tuple[float, float], rng: np.random.Generator) -> Sensor:
     """Draw a unit at datasheet spread, or take the given one, on a base that is not level."""
-    unit = replace(nominal, stage_resolution_rad=stage.resolution_rad,
-                   local_gravity_mps2=GRAVITY_MPS2)
+    step_rad, level_rad = stage
+    unit = replace(nominal, stage_resolution_rad=step_rad, local_gravity_mps2=GRAVITY_MPS2)
     if not nominal.effects:
         values = {name: {p: rng.normal(size=np.shape(v)) * v for p, v in typical(
             effect_named(name), unit.axes).items()} for name in DRAWN}
         ratio = rng.uniform(-RESISTANCE, RESISTANCE, len(unit.axes))
         values['bandwidth'] = {'resistance_ratio': ratio}
         unit = replace(unit, effects=tuple(values), values=values)
-    level = {f'{axis}_rad': np.array(stage.level_rad * rng.normal()) for axis in 'xy'}
+    level = {f'{axis}_rad': np.array(level_rad * rng.normal()) for axis in 'xy'}
     unit = with_neutral(unit, ['base_tilt'])
     return replace(unit, values={**unit.values, 'base_tilt': level})
 
@@ -317,34 +293,21 @@ RANDOM_POSES = 40
 """Number of poses in random directions; chosen."""
 
 
-@dataclass(frozen=True)
-class ModelErrors:
-    """Errors of one model of one unit."""
+class Unit(NamedTuple):
+    """Errors of one unit on one stage; each has values by model."""
 
-    # angle errors in random poses, and in each of the paper's tilt experiments
-    random: AngleErrors
-    runs: dict[str, AngleErrors]
-    # errors of the measured axes over their standard deviation in the random poses, (k, m)
-    force_z: np.ndarray
-    # errors of the coefficients over their standard deviation, (p,). Empty where the truth is
-    # not in the gauge of the fit
-    coefficient_z: np.ndarray
-    motion: tuple[float, float]  # rms about the mean, and mean, of the residual in motion, mm/s²
-
-    def all_angles(self) -> list[AngleErrors]:
-        """Return the angle errors of all experiments."""
-        return [self.random, *self.runs.values()]
-
-
-@dataclass(frozen=True)
-class Unit:
-    """One unit on one stage."""
-
-    models: dict[str, ModelErrors]  # errors by model
+    # of `angle_errors`, by `model` and by `run`: random poses and the paper's tilt experiments
+    angles: pd.DataFrame
+    # errors over their standard deviation: of the measured axes in the random poses, and of the
+    # coefficients; empty where the truth is not in the gauge of the fit
+    acceleration: dict[str, np.ndarray]
+    coefficients: dict[str, np.ndarray]
+    # rms about the mean, and mean, of the residual in motion, mm/s²
+    motion: dict[str, tuple[float, float]]
     directions: DirectionSearch  # the search for its misalignment
 
 
-def evaluate(nominal: Sensor, stage: Stage, seed: int) -> Unit:
+def evaluate(nominal: Sensor, stage: tuple[float, float], seed: int) -> Unit:
     """Draw, sweep and calibrate one unit, and run the experiments."""
     rng = np.random.default_rng([seed, 0])
     truth = draw(nominal, stage, rng)
@@ -357,19 +320,18 @@ def evaluate(nominal: Sensor, stage: Stage, seed: int) -> Unit:
     angles_rad = {'random': random_rad, **{name: np.radians(deg) for name, deg in RUNS.items()}}
     poses_of = {name: poses_at(truth, rad, seed + (i + 1) * 1_000_003)[:2]
                 for i, (name, rad) in enumerate(angles_rad.items())}
-    motion = shaken(truth, seed)
-    models = {}
-    for name, fitted in run.fitted.items():
-        angles = {key: angle_errors(fitted, bound, *poses)
-                  for key, poses in poses_of.items()}
-        error, std = force_errors(fitted, truth, *poses_of['random'])
-        names, coefficient_z = fitted.covariance_names, np.zeros(0)
+    moved, angles, acceleration, coefficients = shaken(truth, seed), [], {}, {}
+    for model, fitted in run.fitted.items():
+        angles += [angle_errors(fitted, bound, *poses).assign(model=model, run=name)
+                   for name, poses in poses_of.items()]
+        acceleration[model] = np.divide(*force_errors(fitted, truth, *poses_of['random']))
+        names, coefficients[model] = fitted.covariance_names, np.zeros(0)
         if all(name.effect in truth.effects for name in names):
-            coefficient_z = (get(fitted, names) - get(truth, names)) / np.sqrt(
+            coefficients[model] = (get(fitted, names) - get(truth, names)) / np.sqrt(
                 np.diag(fitted.covariance))
-        models[name] = ModelErrors(angles.pop('random'), angles, error / std, coefficient_z,
-                                   motion_errors(fitted, *motion)[0])
-    return Unit(models, search(truth, seed))
+    return Unit(pd.concat(angles), acceleration, coefficients, {
+        model: motion_errors(fitted, *moved)[0] for model, fitted in run.fitted.items()},
+        search(truth, seed))
 
 
 def evaluate_all(nominal: Sensor, units: int, seed: int, show: Callable[[float], None]
@@ -385,7 +347,7 @@ def in_parallel(work: Callable[..., Any], show: Callable[[float], None], *argume
                 ) -> list[Any]:
     """Return the results of a function for sequences of its arguments, over the cores."""
     results = []
-    with ProcessPoolExecutor(os.cpu_count()) as pool:
+    with open_pool(None) as pool:
         for result in pool.map(work, *arguments):
             results.append(result)
             show(len(results) / len(arguments[0]))

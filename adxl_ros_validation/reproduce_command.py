@@ -4,12 +4,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import date
-import os
 from pathlib import Path
-import textwrap
 from typing import Any
 
 from adxl_ros.calibrate import calibration, pose_extraction
@@ -25,20 +23,17 @@ from adxl_ros.process import package_version
 from adxl_ros.report.figures import png, pyplot
 from adxl_ros.tools import command_line as cli
 from adxl_ros_validation import coverage, experiments
-from adxl_ros_validation.blind.report_html import markdown_table
-from adxl_ros_validation.experiments import DirectionSearch, ModelErrors, MODELS, RUNS, Unit
+from adxl_ros_validation.blind.report import filled, markdown_table, terminal_table
+from adxl_ros_validation.experiments import DirectionSearch, MODELS, RUNS, Unit
 import numpy as np
-
-_EXAMPLES = {
-    'the experiments on 20 simulated units': '-o reproduction',
-    'the calibration of the paper on a recorded sweep': 'sweep.csv -o reproduction',
-}
-"""Examples of arguments, by their purpose."""
+import pandas as pd
 
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = cli.argument_parser('reproduce', __doc__, _EXAMPLES)
+    parse = cli.argument_parser('reproduce', __doc__, {
+        'the experiments on 20 simulated units': '-o reproduction',
+        'the calibration of the paper on a recorded sweep': 'sweep.csv -o reproduction'})
     parse.add_argument('recording', nargs='*',
                        help='sweeps of one unit; without any, units are simulated')
     parse.add_argument('--params', metavar='FILE', default=None,
@@ -109,16 +104,16 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> _Re
     cli.make_folder(pictures)
     unit_page.draw_sweep(pictures / 'sweep.png', experiments.bare(truth),
                          unit.fitted['physical'], unit.poses)
-    draw_misalignment(pictures / 'misalignment.png', results['paper'][0].directions)
-    draw_tilt(pictures / 'tilt.png', results['paper'][0])
-    draw_motion(pictures / 'motion.png', unit.fitted, experiments.shaken(truth, first))
-    draw_components(pictures / 'components.png', truth, unit.fitted['physical'],
-                    unit.fitted['linear'])
+    for name, figure in (('misalignment', draw_misalignment(results['paper'][0].directions)),
+                         ('tilt', draw_tilt(results['paper'][0])),
+                         ('motion', draw_motion(unit.fitted, experiments.shaken(truth, first))),
+                         ('components', draw_components(truth, unit.fitted))):
+        write_bytes(pictures / f'{name}.png', png(figure))
     drawn = 'one unit' if sensor.effects else f'{options.units} units'
     made = (f'adxl_ros {package_version()}, {date.today()}, {drawn} on each stage, '
             f'seed {options.seed}.')
     bound_mmps2 = experiments.motion_bound_mmps2(sensor)
-    return wrap_prose(_page(results, bound_mmps2, made, coverage_page)), [
+    return _page(results, bound_mmps2, made, coverage_page), [
         f"The paper's experiments, {drawn} on each stage, seed {options.seed}", '',
         *screen_lines(results, bound_mmps2), *[''] * bool(coverage_lines), *coverage_lines]
 
@@ -126,11 +121,11 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> _Re
 def _coverage(sensor: Sensor, options: argparse.Namespace) -> _Reproduction:
     """Count how often the intervals hold the truth."""
     with cli.progress('coverage') as show:
-        draws = coverage.draw_all(replace(sensor, effects=(), values={}), options.draws,
-                                  options.seed, show)
-    page = coverage.page(draws, f'adxl_ros {package_version()}, {date.today()}, seed '
+        errors = coverage.draw_all(replace(sensor, effects=(), values={}), options.draws,
+                                   options.seed, show)
+    page = coverage.page(errors, f'adxl_ros {package_version()}, {date.today()}, seed '
                                 f'{options.seed}; `make coverage`.')
-    return wrap_prose(page), coverage.screen_lines(draws)
+    return page, coverage.screen_lines(errors)
 
 
 _COLOURS = {'linear': 'tab:red', 'physical': 'tab:orange', 'full': 'tab:green'}
@@ -138,38 +133,34 @@ _SHOWN_S = (2.0, 2.5)
 """Interval of figure 12, s; chosen."""
 
 
-def draw_misalignment(path: str | os.PathLike, search: DirectionSearch) -> None:
+def draw_misalignment(search: DirectionSearch) -> Any:
     """Draw the search for β_x of (18) and the results of its three methods, as figure 9."""
     figure, axis = pyplot().subplots(figsize=(7, 4.5), layout='constrained')
     turned = np.degrees(search.turned_rad)
     axis.plot(turned, 1e3 * (search.output_g - search.output_g.max()), 'o', ms=4,
               label='output, means of 5 s')
-    for value, colour, label in (
-            (search.truth_rad, 'k', 'truth'), (search.largest_rad, 'tab:red', 'largest output'),
-            (search.parabola_rad, 'tab:orange', 'parabola through the outputs'),
-            (search.null_rad, 'tab:green', 'null crossings at ±90°')):
+    for (label, value), colour in zip(search.found_rad.items(),
+                                      ('k', 'tab:red', 'tab:orange', 'tab:green')):
         axis.axvline(-np.degrees(value), color=colour, lw=1,
                      label=f'{label}: {-np.degrees(value):+.2f}°')
     axis.set(xlabel='beta of the stage, °', ylabel='x output minus its largest, mg',
              title='Direction of the x axis (18): the maximum is flat')
     axis.legend(fontsize=8)
-    write_bytes(path, png(figure))
+    return figure
 
 
-def draw_tilt(path: str | os.PathLike, unit: Unit) -> None:
+def draw_tilt(unit: Unit) -> Any:
     """Draw figure 10: errors of alpha and beta in the three tilt experiments."""
     figure, grid = pyplot().subplots(2, 3, figsize=(16, 8), layout='constrained', sharex=True)
     for column, (run, asked_deg) in enumerate(RUNS.items()):
         turned = asked_deg[:, 1 if run == 'beta' else 0]
         for row, angle in enumerate(('alpha', 'beta')):
             axis = grid[row, column]
-            for name, errors in unit.models.items():
-                angles = errors.runs[run]
-                counts = angles.determined[:, row]
-                error = np.where(counts, np.degrees(angles.error[:, row]), np.nan)
-                axis.plot(turned, error, 'o-', ms=4, lw=1, color=_COLOURS[name], label=name)
-            bound = np.where(counts, np.degrees(angles.bound[:, row]), np.nan)
-            axis.fill_between(turned, -Z_90 * bound, Z_90 * bound, color='0.8',
+            for name, errors in unit.angles[(unit.angles.run == run) & (
+                    unit.angles.angle == angle)].groupby('model', sort=False):
+                shown = np.degrees(errors[['error', 'bound']]).where(errors.counts)
+                axis.plot(turned, shown.error, 'o-', ms=4, lw=1, color=_COLOURS[name], label=name)
+            axis.fill_between(turned, -Z_90 * shown.bound, Z_90 * shown.bound, color='0.8',
                               label='90 % by the bound')
             axis.axhline(0, color='0.5', lw=0.8)
             axis.set_yscale('symlog', linthresh=0.1)
@@ -179,21 +170,21 @@ def draw_tilt(path: str | os.PathLike, unit: Unit) -> None:
     grid[0, 0].legend(fontsize=8)
     figure.suptitle('Tilt; gaps are poses whose bound exceeds 1° '
                     '(linear scale within ±0.1°, logarithmic beyond)')
-    write_bytes(path, png(figure))
+    return figure
 
 
-def draw_motion(path: str | os.PathLike, fitted: dict[str, Sensor],
-                shaken: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
+def draw_motion(units: dict[str, Sensor], shaken: tuple[np.ndarray, np.ndarray, np.ndarray]
+                ) -> Any:
     """
     Draw figure 12: the acceleration of the shaken sensor and of the interferometer.
 
     shaken: stamps, s, (n,); volts, (n, m); acceleration along x, m/s², (n,).
     """
-    figure, row = pyplot().subplots(1, len(fitted), figsize=(16, 4.5), layout='constrained',
+    figure, row = pyplot().subplots(1, len(units), figsize=(16, 4.5), layout='constrained',
                                     sharey=True)
     time_s = shaken[0]
     part = (time_s >= _SHOWN_S[0]) & (time_s <= _SHOWN_S[1])
-    for axis, (name, unit) in zip(row, fitted.items()):
+    for axis, (name, unit) in zip(row, units.items()):
         (rmse, offset), estimate, reference = experiments.motion_errors(unit, *shaken)
         axis.plot(time_s[part], 1e3 * reference[part], ':', color='k', label='interferometer')
         axis.plot(time_s[part], 1e3 * estimate[part], color=_COLOURS[name], label=name)
@@ -201,13 +192,12 @@ def draw_motion(path: str | os.PathLike, fitted: dict[str, Sensor],
                                          f'about an offset of {offset:.1f}')
         axis.legend(fontsize=8, loc='upper right')
     row[0].set(ylabel='acceleration along x, mm/s²')
-    write_bytes(path, png(figure))
+    return figure
 
 
-def draw_components(path: str | os.PathLike, truth: Sensor, fitted: Sensor,
-                    linear: Sensor) -> None:
+def draw_components(truth: Sensor, units: dict[str, Sensor]) -> Any:
     """Draw figure 13: what each part of the model does to the response at alpha 45°, beta 90°."""
-    reach = np.linspace(-0.4, 0.4, 81)
+    reach, linear, fitted = np.linspace(-0.4, 0.4, 81), units['linear'], units['physical']
     pose = [reach * G0_MPS2, np.full(81, -np.sqrt(0.5) * truth.local_gravity_mps2),
             np.full(81, np.sqrt(0.5) * truth.local_gravity_mps2)]
     bias = ('bias', 'scale_factor', 'cross_axis', 'cross_axis_z')
@@ -228,7 +218,7 @@ def draw_components(path: str | os.PathLike, truth: Sensor, fitted: Sensor,
     difference.set(xlabel='acceleration along x, g', ylabel='minus the actual response, mV',
                    title='the same, minus the actual response')
     response.legend(fontsize=8)
-    write_bytes(path, png(figure))
+    return figure
 
 
 TABLE_I = {('alpha', 'linear'): (2.88, 3.95), ('alpha', 'physical'): (0.32, 0.82),
@@ -236,54 +226,29 @@ TABLE_I = {('alpha', 'linear'): (2.88, 3.95), ('alpha', 'physical'): (0.32, 0.82
 """The paper's rms and largest error, deg."""
 MOTION_MMPS2 = {'linear': 299.8, 'physical': 20.8}
 """The paper's residuals of the motion experiment, mm/s²."""
+_MOTION = ', '.join(f'{name} {value}' for name, value in MOTION_MMPS2.items())
 _STAGE_NAMES = {'perfect': 'perfect stage', 'paper': "the paper's stage"}
-_STAGE_TITLES = {
-    'perfect': 'Perfect stage',
-    'paper': "The paper's stage (5 arcmin, a new error with each move of a joint, level 0.1°)"}
-_FIGURE_TITLES = {
-    'sweep': 'Figures 2 to 8: deviation from the linear model, and the physical model',
-    'misalignment': 'Figure 9: the direction of the x axis', 'tilt': 'Figure 10: angle errors',
-    'motion': 'Figure 12: motion', 'components': 'Figure 13: what each part of the model does'}
 FIGURES = 'reproduction'
 """Folder of the plots, in the folder of the page."""
 
 
 def _page(results: dict[str, list[Unit]], bound_mmps2: float, made: str, intervals: str) -> str:
     """Lay out the page, Markdown."""
-    parts = ["# The paper's experiments, on simulated units", made,
-             'W. T. Ang, P. K. Khosla, C. N. Riviere, "Nonlinear Regression Model of a Low-g MEMS '
-             'Accelerometer", IEEE Sensors Journal, 2007, doi 10.1109/JSEN.2006.886995. In '
-             'brackets: 90 % intervals over units, by bootstrap.']
-    for stage, units in results.items():
-        parts += [f'## {_STAGE_TITLES[stage]}', _tilt(units), _to_reach(units),
-                  _motion(units, bound_mmps2)]
-    parts += [intervals, '## Direction of the x axis by (18)', _directions(results['paper']),
-              '## Figures',
-              *(f'![{title}]({FIGURES}/{name}.png)' for name, title in _FIGURE_TITLES.items()),
-              '## What differs from the paper, and why', 'See docs/maintain/reproduction.md.']
-    return '\n\n'.join(part.strip('\n') for part in parts if part) + '\n'
+    return filled('reproduction.md', {
+        'made': made, 'coverage': intervals, 'directions': _directions(results['paper']),
+        'step': np.degrees(experiments.SEARCH_RAD[1] - experiments.SEARCH_RAD[0]), **{
+            stage: _of_stage(units, bound_mmps2) for stage, units in results.items()}})
 
 
 def screen_lines(results: dict[str, list[Unit]], bound_mmps2: float) -> list[str]:
     """Return Table I and the motion experiment as lines for a terminal."""
-    rows: list[tuple[str, str, list[float]]] = []
-    for stage, units in results.items():
-        for row, angle in enumerate(('alpha', 'beta')):
-            paper = ' / '.join(f'{rms:.2f}' for (a, _), (rms, _) in TABLE_I.items() if a == angle)
-            errors = [*(_errors(units, name, row) for name in MODELS), _bounds(units, row)]
-            rows.append((f'{_STAGE_NAMES[stage]}, {angle}', paper,
-                         [np.degrees(_rms(e)) for e in errors]))
-    paper = ' / '.join(f'{value:.1f}' for value in MOTION_MMPS2.values())
-    for stage, units in results.items():
-        both = [_rms(np.hypot(*_motion_errors(units, name))) for name in MODELS]
-        rows.append((f'{_STAGE_NAMES[stage]}, motion', paper, [*both, bound_mmps2]))
-    return [f' {"Table I, rms error of":28}{"paper":>15}'
-            + ''.join(f'{name:>9}' for name in MODELS) + f'{"bound":>8}',
-            *(f' {label:28}{paper:>15}' + ''.join(
-                f'{value:9.3g}' for value in values[:-1]) + f'{values[-1]:8.3g}'
-              for label, paper, values in rows),
-            ' tilt in °, motion in mm/s²; paper: linear / physical; bound: Cramér-Rao,',
-            ' or the noise floor']
+    rows = [[f'{_STAGE_NAMES[stage]}, {angle}', *cells]
+            for stage, units in results.items() for angle, _, *cells in _tilt(units)]
+    rows += [[f'{_STAGE_NAMES[stage]}, motion', *cells] for stage, units in results.items()
+             for _, _, *cells in _motion(units, bound_mmps2)[-1:]]
+    return [*terminal_table(['Table I, rms / largest', *MODELS, 'bound'], rows),
+            f' The paper: alpha {in_words("alpha")}; beta {in_words("beta")}; motion '
+            f'{_MOTION}.', ' Tilt in °, motion in mm/s²; bound: Cramér-Rao, or the noise floor.']
 
 
 def in_words(angle: str) -> str:
@@ -292,101 +257,79 @@ def in_words(angle: str) -> str:
                      in TABLE_I.items() if a == angle)
 
 
-def _errors(units: Sequence[Unit], model: str, row: int, what: str = 'error') -> np.ndarray:
-    """Return the errors of alpha (0) or beta (1) that count, of all units and runs."""
-    return np.concatenate([getattr(a, what)[a.determined[:, row], row] for unit in units
-                           for a in unit.models[model].runs.values()])
+def _counted(units: Sequence[Unit]) -> pd.DataFrame:
+    """Return the angle errors that count, of all units."""
+    errors = pd.concat([unit.angles.assign(unit=i) for i, unit in enumerate(units)])
+    return errors[errors.counts]
 
 
-def _bounds(units: Sequence[Unit], row: int) -> np.ndarray:
-    return _errors(units, 'full', row, 'bound')
+def _tilt(units: Sequence[Unit]) -> list[list[str]]:
+    """Return the rows of Table I."""
+    counted = np.degrees(_counted(units).query('run != "random"').set_index(['angle', 'model'])[
+        ['error', 'bound']])
+    return [[angle, in_words(angle),
+             *(f'{_rms(error):.3f} / {error.abs().max():.3f}' for error in (
+                 counted.error[angle, model] for model in MODELS)),
+             f'{_rms(counted.bound[angle, "full"]):.4f}'] for angle in ('alpha', 'beta')]
 
 
-def _motion_errors(units: Sequence[Unit], model: str) -> np.ndarray:
-    """Return rms and mean of the residual of each unit in motion, mm/s², (2, units)."""
-    return np.array([unit.models[model].motion for unit in units]).T
-
-
-def _tilt(units: Sequence[Unit]) -> str:
-    rows = []
-    for row, angle in enumerate(('alpha', 'beta')):
-        errors = [np.degrees(_errors(units, name, row)) for name in MODELS]
-        rows.append([angle, in_words(angle),
-                     *(f'{_rms(e):.3f} / {np.abs(e).max():.3f}' for e in errors),
-                     f'{np.degrees(_rms(_bounds(units, row))):.4f}'])
-    return ('Table I: rms / largest error, °, over the three runs of figure 10; poses '
-            'whose bound exceeds 1° do not count.\n\n'
-            + markdown_table(['', 'paper', *MODELS, 'Cramér-Rao bound, rms'], rows))
+def _of_stage(units: Sequence[Unit], bound_mmps2: float) -> str:
+    """Lay out the tables of a stage."""
+    counts = np.concatenate([unit.angles.query('model == "full" and angle == "alpha"').counts
+                             for unit in units])
+    return filled('reproduction_stage.md', {
+        'tilt': markdown_table(['', 'paper', *MODELS, 'Cramér-Rao bound, rms'], _tilt(units)),
+        'reached': _to_reach(units), 'poses': len(counts), 'undetermined': np.sum(~counts),
+        'motion': markdown_table(['motion, mm/s²', 'paper', *MODELS, 'bound'],
+                                 _motion(units, bound_mmps2))})
 
 
 def _to_reach(units: Sequence[Unit]) -> str:
-    def over(function: Callable[[ModelErrors], np.ndarray]) -> list[list[np.ndarray]]:
-        return [[function(unit.models[name]) for unit in units] for name in MODELS]
-
-    def flat(errors: ModelErrors) -> np.ndarray:
-        return np.concatenate([a.error[a.determined[:, 0] & ~a.near_vertical, 0]
-                               for a in errors.all_angles()])
-
-    def ratio(pose_only: bool) -> Callable[[ModelErrors], np.ndarray]:
-        return lambda errors: np.concatenate([a.ratio(pose_only) for a in errors.all_angles()])
-
-    rows = [[f'angle error ÷ bound {text}, rms', *map(_interval, over(ratio(pose_only)))]
-            for pose_only, text in ((True, 'of the noise of one pose'),
-                                    (False, 'of pose and calibration'))]
-    before, *after = (_rms(np.concatenate(parts)) for parts in over(flat))
+    of_model = dict(iter(_counted(units).groupby('model')))
+    rows = [[f'angle error ÷ bound {text}, rms', *(
+        _interval(of_model[model].error / of_model[model][bound], of_model[model].unit)
+        for model in MODELS)] for bound, text in (('pose_bound', 'of the noise of one pose'),
+                                                  ('bound', 'of pose and calibration'))]
+    before, *after = (_rms(of_model[model].query('angle == "alpha" and not near_vertical').error)
+                      for model in MODELS)
     rows.append(['reduction of the rms error of alpha, 15° and more from ±90°, %', '–',
                  *(f'{100 * (1 - rms / before):.2f}' for rms in after)])
-    for text, z_of in (('acceleration', lambda errors: np.ravel(errors.force_z)),
-                       ('coefficients', lambda errors: errors.coefficient_z)):
-        zs = [np.concatenate(parts) for parts in over(z_of)]
+    for text in ('acceleration', 'coefficients'):
+        zs = [np.concatenate([np.ravel(getattr(unit, text)[model]) for unit in units])
+              for model in MODELS]
         rows.append([f'coverage of 90 % intervals, {text}, %', *(
             f'{100 * np.mean(np.abs(z) < Z_90):.1f} (of {len(z)})' if len(z) else '–'
             for z in zs)])
-    determined = np.concatenate([a.determined[:, 0] for unit in units
-                                 for a in unit.models['full'].all_angles()])
-    return (markdown_table(['random poses and the three runs, none fitted', *MODELS], rows)
-            + f'\n\nOf {len(determined)} poses {np.sum(~determined)} determine alpha worse than '
-              '1° and do not count.')
+    return markdown_table(['random poses and the three runs, none fitted', *MODELS], rows)
 
 
-def _motion(units: Sequence[Unit], bound_mmps2: float) -> str:
-    errors = [_motion_errors(units, name) for name in MODELS]
-    paper = ', '.join(f'{name} {value}' for name, value in MOTION_MMPS2.items())
-    bound = f'{bound_mmps2:.2f}'
-    return markdown_table(['motion, mm/s²', 'paper', *MODELS, 'bound'], [
-        ['rmse about the offset', '–', *(_interval(rmse[:, None]) for rmse, _ in errors), bound],
+def _motion(units: Sequence[Unit], bound_mmps2: float) -> list[list[str]]:
+    """Return the rows of the motion experiment."""
+    errors = [np.array([unit.motion[model] for unit in units]).T for model in MODELS]
+    number, bound = pd.Series(range(len(units))), f'{bound_mmps2:.2f}'
+    return [
+        ['rmse about the offset', '–',
+         *(_interval(pd.Series(rmse), number) for rmse, _ in errors), bound],
         ["offset, rms, the stage's part included", '–',
          *(f'{_rms(offset):.1f}' for _, offset in errors), '–'],
-        ['both together', paper, *(f'{_rms(np.hypot(*both)):.1f}' for both in errors), bound]])
+        ['both together', _MOTION, *(f'{_rms(np.hypot(*both)):.1f}' for both in errors), bound]]
 
 
 def _directions(units: Sequence[Unit]) -> str:
-    step = np.degrees(experiments.SEARCH_RAD[1] - experiments.SEARCH_RAD[0])
-    errors = [np.array([getattr(unit.directions, name) - unit.directions.truth_rad
-                        for unit in units])
-              for name in ('largest_rad', 'parabola_rad', 'null_rad')]
-    return (f'Error of β_x, ° rms over units, base level to 0.1° (steps of {step:g}°):\n\n'
-            + markdown_table(['largest output', 'parabola through the outputs', 'null crossings'],
-                             [[f'{np.degrees(_rms(error)):.3f}' for error in errors]]))
+    found = pd.DataFrame([unit.directions.found_rad for unit in units])
+    errors = np.degrees(found.iloc[:, 1:].sub(found.truth, axis=0))
+    return markdown_table(['largest output', 'parabola through the outputs', 'null crossings'],
+                          [[f'{_rms(errors[name]):.3f}' for name in errors]])
 
 
-def _interval(parts: Sequence[np.ndarray] | np.ndarray) -> str:
-    """Write the rms over all with its 90 % interval by bootstrap over units."""
-    squares = [(float(np.sum(part ** 2)), len(part)) for part in parts]
-    mean, low, high = np.sqrt(coverage.mean_with_interval(squares))
+def _interval(values: pd.Series, groups: pd.Series) -> str:
+    """Write an rms with its 90 % interval by bootstrap over units."""
+    mean, low, high = np.sqrt(coverage.mean_with_interval(values ** 2, groups))
     return f'{mean:.3f} ({low:.3f} to {high:.3f})'
 
 
-def _rms(values: np.ndarray) -> float:
+def _rms(values: np.ndarray | pd.Series) -> float:
     return float(np.sqrt(np.mean(values ** 2)))
-
-
-def wrap_prose(markdown: str) -> str:
-    """Wrap the lines of prose of a Markdown page; tables, headings and lists stay as they are."""
-    return '\n'.join(
-        line if line.startswith(('|', '#', '!', '-', ' ', '`'))
-        else textwrap.fill(line, 99, break_on_hyphens=False, break_long_words=False)
-        for line in markdown.split('\n'))
 
 
 def main() -> int:

@@ -20,18 +20,13 @@ from pathlib import Path
 import sys
 from typing import Any, NamedTuple
 
-from adxl_ros.tools.command_line import argument_parser, check_least, run
+from adxl_ros.tools import command_line as cli
 from adxl_ros.workers import for_each, open_pool, write
 from adxl_ros_validation import working_world as world
-from adxl_ros_validation.blind import (
-    diagnosis_runs,
-    grading,
-    ideal_observer,
-    scores,
-    simulator,
-    trials,
-)
+from adxl_ros_validation.blind import diagnosis_runs, grading, scores, simulator, trials
 from adxl_ros_validation.blind.grading import Answer
+from adxl_ros_validation.blind.ideal_observer import beyond_calibration, rms
+from adxl_ros_validation.blind.report import reliability, terminal_table
 from adxl_ros_validation.blind.simulator import Fault, G0, Scene
 from adxl_ros_validation.blind.trials import Label
 import numpy as np
@@ -83,9 +78,8 @@ def draw(seed: int, number: int, only: str | None = None) -> Case:
                        world.COLOUR.draw(rng, unit))
     faults, rows, at_rest = [], [], []
     for kind in kinds:
-        strength = 1e-3 * G0 * math.exp(rng.uniform(*np.log(_STRENGTHS_MG)))
-        fault, _, change = trials.sized(partial(trials.measured, scene, force),
-                                        Fault(kind, kind.start, kind.draw(rng, unit)), strength)
+        fault, strength, _, change = trials.sized(
+            rng, kind, unit, _STRENGTHS_MG, partial(trials.measured, scene, force), 1e-3 * G0)
         calibrated = kind.at_rest and bool(rng.random() < _AT_REST_SHARE)
         stated = unit
         if calibrated:
@@ -114,7 +108,7 @@ def _strength(unit: simulator.Unit, stated: simulator.Unit, change: np.ndarray,
     zero = (stated.stated_zero_v - unit.stated_zero_v) / unit.stated_scale_v_per_g
     scale = stated.stated_scale_v_per_g / unit.stated_scale_v_per_g - 1
     left = change - zero[:, None] * G0 - scale[:, None] * force
-    return ideal_observer.rms(ideal_observer.beyond_calibration(unit, left, force))
+    return rms(beyond_calibration(unit, left, force))
 
 
 def _harm(case: Case, fitted: str | None) -> bool:
@@ -153,9 +147,8 @@ def diagnosed(seed: int, number: int, only: str | None, folder: Path) -> tuple[R
     """Draw a case, keep its files, diagnose it and measure the harm."""
     case = draw(seed, number, only)
     place = folder / case.label.name
-    for suffix, text in (('csv', case.recording), ('yaml', case.parameters),
-                         ('json', json.dumps(asdict(case.label), indent=1))):
-        write(place / f'{case.label.name}.{suffix}', text.encode())
+    trials.save(place, case.label.name, (case.recording, case.parameters))
+    write(place / f'{case.label.name}.json', json.dumps(asdict(case.label), indent=1).encode())
     result = diagnosis_runs.diagnose(case.label.name, case.recording.encode(),
                                      case.parameters.encode())[1]
     write(place / 'result.json', json.dumps(result).encode())
@@ -214,21 +207,18 @@ def table(rows: Sequence[Row]) -> str:
         ('harm: another recording made worse', [row.harm for row in rows]),
         ('no verdict', [row.answer.status == 'failed' for row in rows]),
         ('tracebacks', [str(row.result['error']).startswith('traceback') for row in rows])]
-    lines = [f'{name:40} {scores.in_words(scores.share(hits))}' for name, hits in cells if hits]
     cpu = [row.result['cpu_s'] for row in rows]
-    lines += [f'{"processor time, s":40} median {np.median(cpu):.1f}, longest {max(cpu):.1f}', '',
-              'probability     mean   right']
-    lines += [f'{part["bin"][0]:.2f} to {part["bin"][1]:.2f}   {part["confidence"]:.2f}   '
-              f'{100 * part["right"]:3.0f} % ({100 * part["ci"][0]:.0f} to '
-              f'{100 * part["ci"][1]:.0f}), n = {part["count"]}' for part in scores.reliability(
-                  [(row.answer.probability, grading.verdict_right(row.answer, row.label))
-                   for row in rows])]
-    return '\n'.join(lines)
+    right_by_probability = scores.reliability([
+        (row.answer.probability, grading.verdict_right(row.answer, row.label)) for row in rows])
+    return '\n'.join([
+        *(f'{name:40} {scores.in_words(scores.share(hits))}' for name, hits in cells if hits),
+        f'{"processor time, s":40} median {np.median(cpu):.1f}, longest {max(cpu):.1f}', '',
+        *terminal_table(*reliability(right_by_probability))])
 
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = argument_parser('working', __doc__, {
+    parse = cli.argument_parser('working', __doc__, {
         'a development loop of one group': '--count 20 --seed 3 --only pair'})
     parse.add_argument('-o', dest='output', metavar='DIR', default='working_output',
                        help='files of the cases (default: working_output)')
@@ -243,7 +233,7 @@ def parser() -> argparse.ArgumentParser:
 
 def working(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
-    check_least(options, count=1, jobs=1, first=0, seed=0)
+    cli.check_least(options, count=1, jobs=1, first=0, seed=0)
     folder, rows = Path(options.output), []
     numbers = range(options.first, options.first + options.count)
 
@@ -261,7 +251,7 @@ def working(options: argparse.Namespace) -> int:
 
 def main() -> int:
     """Run the tool on the command line."""
-    return run(parser(), working)
+    return cli.run(parser(), working)
 
 
 if __name__ == '__main__':

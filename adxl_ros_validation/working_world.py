@@ -5,17 +5,18 @@ The world of the working cases: units, motion, noise and faults that are wrong i
 The chain is that of the blind check's simulator. Everything that a diagnosis could be tuned to is
 different: the forms of the faults, those outside the library, the profiles of motion, the rates,
 the axes and the noise. So the blind check stays blind to what is developed with these cases.
+working_faults.yaml says how each fault acts, and its numbers.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 import math
 
 from adxl_ros_validation.blind import faults, ideal_observer, simulator as sim
 from adxl_ros_validation.blind.motion import low_pass, Manoeuvre
-from adxl_ros_validation.blind.simulator import Fault, G0, Place, Run, Scene, Shape, Unit
+from adxl_ros_validation.blind.simulator import Fault, G0, Kind, Place, Run, Scene, Shape, Unit
 import numpy as np
 import scipy
 
@@ -29,7 +30,6 @@ _OTHER = [1, 0, 0]
 """The other axis of the plane, of x, y and z."""
 _PLANE = np.array([[1.0], [1.0], [0.0]])
 """Weights of the axes of the plane."""
-_PHASE = (0.0, 2 * math.pi)
 
 
 def draw_unit(rng: np.random.Generator) -> Unit:
@@ -144,7 +144,24 @@ def recalibrated(unit: Unit, acting: list[Fault]) -> Unit:
                    stated_scale_v_per_g=unit.stated_scale_v_per_g + scale)
 
 
-def _stage_eccentricity(run: Run, size: float, shape: Shape) -> None:
+bias = scale_factor = time_offset = sim.constant
+stage_offset, lever_arm = faults.stage_offset, faults.lever_arm
+standard_normal, uniform = np.random.Generator.standard_normal, np.random.Generator.random
+"""What draws weights."""
+
+
+def gravity(run: Run, size: float, shape: Shape) -> None:
+    """Add to local gravity, m/s²."""
+    run.gravity = G0 + size * shape['w'][0]
+
+
+def base_tilt(run: Run, size: float, shape: Shape) -> None:
+    """Tilt the base by two angles, rad."""
+    x, y = np.sin(size * np.asarray(shape['w']))
+    run.up = np.array([x, y, math.sqrt(1 - x * x - y * y)])
+
+
+def stage_eccentricity(run: Run, size: float, shape: Shape) -> None:
     """Add harmonics 1, 2 and 4 of the angle to both joints, rad."""
     for joint, (s, c) in ((run.alpha, shape['w'][:2]), (run.beta, shape['w'][2:])):
         q = joint.copy()
@@ -161,7 +178,7 @@ def _play(run: Run, x: np.ndarray, reach: float) -> np.ndarray:
     return np.interp(run.t, run.t[::every], out)
 
 
-def _backlash(run: Run, size: float, shape: Shape) -> None:
+def backlash(run: Run, size: float, shape: Shape) -> None:
     """Follow by three dead bands of different widths, rad, as flanks that yield."""
     for joint, w in ((run.alpha, shape['w'][0]), (run.beta, shape['w'][1])):
         if w:
@@ -169,16 +186,7 @@ def _backlash(run: Run, size: float, shape: Shape) -> None:
                                 for part in (0.5, 0.9, 1.3)], axis=0)
 
 
-def _base_tilt(run: Run, size: float, shape: Shape) -> None:
-    x, y = np.sin(size * np.asarray(shape['w']))
-    run.up = np.array([x, y, math.sqrt(1 - x * x - y * y)])
-
-
-def _gravity(run: Run, size: float, shape: Shape) -> None:
-    run.gravity = G0 + size * shape['w'][0]
-
-
-def _late(law: sim.Law) -> sim.Act:
+def late(law: sim.Law) -> sim.Act:
     """Read the output late by a law, s."""
     def act(run: Run, size: float, shape: Shape) -> None:
         late_s = size * shape['w'][0] * law(run, shape)
@@ -186,7 +194,16 @@ def _late(law: sim.Law) -> sim.Act:
     return act
 
 
-def _mount_resonance(run: Run, size: float, shape: Shape) -> None:
+def misalignment(run: Run, size: float, shape: Shape) -> None:
+    """Turn each axis about three directions, rad."""
+    turn = size * np.asarray(shape['w']).reshape(-1, 3)
+    for d, angles in zip(run.unit.axis_indices, turn):
+        run.directions[d] = scipy.spatial.transform.Rotation.from_rotvec(angles).apply(
+            run.directions[d])
+    run.u = (run.directions @ run.force)[run.unit.axis_indices] / G0
+
+
+def mount_resonance(run: Run, size: float, shape: Shape) -> None:
     """Transmit a share of the force by two modes."""
     force = run.force.copy()
     for ratio, part in ((1.0, 1.0), (2.2, 0.2)):
@@ -197,35 +214,24 @@ def _mount_resonance(run: Run, size: float, shape: Shape) -> None:
         run.force += size * part * (moved - force)
 
 
-def _misalignment(run: Run, size: float, shape: Shape) -> None:
-    turn = size * np.asarray(shape['w']).reshape(-1, 3)
-    for d, angles in zip(run.unit.axis_indices, turn):
-        run.directions[d] = scipy.spatial.transform.Rotation.from_rotvec(angles).apply(
-            run.directions[d])
-    run.u = (run.directions @ run.force)[run.unit.axis_indices] / G0
-
-
 def _other(run: Run) -> np.ndarray:
     """Return the other axis of the plane of each measured axis, g, (m, n)."""
     return run.force[[_OTHER[d] for d in run.unit.axis_indices]] / G0
 
 
-def _cross_axis(run: Run, shape: Shape) -> np.ndarray:
+def cross_axis(run: Run, shape: Shape) -> np.ndarray:
+    """Follow the other axis by an even law with an odd part."""
     c = _other(run)
     return c * c * (1 - 0.3 * c * c) + shape['odd'] * c
 
 
-def _cross_axis_z(run: Run, shape: Shape) -> np.ndarray:
+def cross_axis_z(run: Run, shape: Shape) -> np.ndarray:
+    """Follow z by an even law with an odd part."""
     c = run.force[2] / G0
     return _PLANE[:len(run.u)] * (np.log(np.cosh(1.5 * c)) + shape['odd'] * c)
 
 
-def _scale_factor_z(run: Run, shape: Shape) -> np.ndarray:
-    c = run.force[2] / G0
-    return _PLANE[:len(run.u)] * (np.tanh(1.2 * c + 0.4) - np.tanh(0.4))
-
-
-def _hysteresis(run: Run, size: float, shape: Shape) -> None:
+def hysteresis(run: Run, size: float, shape: Shape) -> None:
     """Lag by stops of uneven thresholds and weights, more at positive force, g."""
     for row, w in zip(run.u, shape['w']):
         if w:
@@ -234,7 +240,13 @@ def _hysteresis(run: Run, size: float, shape: Shape) -> None:
             row -= size * w * lag * (1 + shape['skew'] * row)
 
 
-def _saturation(run: Run, size: float, shape: Shape) -> None:
+def vibration_rectification(run: Run, shape: Shape) -> np.ndarray:
+    """Follow a power of the vibration."""
+    moving = np.abs(run.u - low_pass(run.u, 0.25, run.dt)) ** shape['power']
+    return low_pass(moving, 0.8, run.dt)
+
+
+def saturation(run: Run, size: float, shape: Shape) -> None:
     """Approach a rail exponentially beyond a knee; the two rails differ by some percent."""
     knee = shape['knee']
     for row, w in zip(run.u, shape['w']):
@@ -249,24 +261,20 @@ def _warm(run: Run, shape: Shape, cubic: float) -> np.ndarray:
     return warm * (1 + shape['bend'] * warm * (1 + cubic * warm)) / 10
 
 
-def _warm_up(run: Run, shape: Shape) -> np.ndarray:
+def warm_up(run: Run, shape: Shape) -> np.ndarray:
     """Settle by two time constants, or by a hyperbola."""
     t = np.clip(run.t, 0, None) / shape['tau_s']
     return 0.65 * np.exp(-t) + 0.35 * np.exp(-t / 4) if shape['law'] < 0.5 else 1 / (1 + t)
 
 
-def _vibration_rectification(run: Run, shape: Shape) -> np.ndarray:
-    moving = np.abs(run.u - low_pass(run.u, 0.25, run.dt)) ** shape['power']
-    return low_pass(moving, 0.8, run.dt)
-
-
-def _supply(run: Run, size: float, shape: Shape) -> None:
+def supply(run: Run, size: float, shape: Shape) -> None:
     """Follow the supply with a square, behind a capacitor."""
     change = low_pass(run.supply / 5 - 1, shape['late_s'], run.dt)
     run.volts *= 1 + size * sim.column(shape) * change * (1 + shape['bend'] * change)
 
 
-def _bandwidth(run: Run, size: float, shape: Shape) -> None:
+def bandwidth(run: Run, size: float, shape: Shape) -> None:
+    """Lower the corner and add a second pole."""
     run.corner_hz *= math.exp(-size)
     run.second_hz = run.corner_hz / shape['second']
 
@@ -275,7 +283,7 @@ def _unit_rms(rows: np.ndarray) -> np.ndarray:
     return rows / np.maximum(rows.std(axis=-1, keepdims=True), 1e-12)
 
 
-def _heavy_tails(run: Run, shape: Shape) -> np.ndarray:
+def noise_excess(run: Run, shape: Shape) -> np.ndarray:
     """Add noise of heavy tails behind the filter."""
     drawn = run.random('tails').standard_t(shape['tails'], run.volts.shape)
     return _unit_rms(low_pass(drawn, 0.004, run.dt))
@@ -287,7 +295,7 @@ def _colour(run: Run, shape: Shape) -> np.ndarray:
     return _unit_rms(low_pass(drawn, shape['lag_s'], run.dt))
 
 
-def _flicker(run: Run, shape: Shape) -> np.ndarray:
+def flicker(run: Run, shape: Shape) -> np.ndarray:
     """Add noise whose density falls with another power of the frequency."""
     drawn = np.fft.rfft(run.random('flicker').normal(size=run.volts.shape))
     ratio = np.maximum(np.arange(drawn.shape[1]), 1.0) ** (-shape['power'] / 2)
@@ -295,7 +303,7 @@ def _flicker(run: Run, shape: Shape) -> np.ndarray:
     return _unit_rms(np.fft.irfft(drawn * ratio, run.volts.shape[1]))
 
 
-def _bias_walk(run: Run, shape: Shape) -> np.ndarray:
+def bias_walk(run: Run, shape: Shape) -> np.ndarray:
     """Add a walk whose power changes from part to part."""
     rng, n = run.random('walk'), len(run.t)
     power = np.interp(np.linspace(0, 7, n), np.arange(8), np.exp(shape['uneven'] * rng.normal(
@@ -303,13 +311,13 @@ def _bias_walk(run: Run, shape: Shape) -> np.ndarray:
     return _unit_rms(np.cumsum(power * rng.normal(size=run.volts.shape), axis=1))
 
 
-def _mains_hum(run: Run, shape: Shape) -> np.ndarray:
+def mains_hum(run: Run, shape: Shape) -> np.ndarray:
     """Add hum off its nominal frequency, with the harmonics of a rectifier."""
     phase = 2 * np.pi * (shape['mains'] + shape['off']) * run.t + shape['phase']
     return np.sin(phase) + shape['second'] * np.sin(2 * phase) + 0.15 * np.sin(5 * phase)
 
 
-def _spikes(run: Run, size: float, shape: Shape) -> None:
+def spikes(run: Run, size: float, shape: Shape) -> None:
     """Add spikes of exponential height, most of one sign, V."""
     rng, like = run.random('spikes'), run.volts.shape
     hit = rng.random(like) < shape['rate_hz'] * run.dt
@@ -318,7 +326,7 @@ def _spikes(run: Run, size: float, shape: Shape) -> None:
         size=like))
 
 
-def _stuck(run: Run, size: float, shape: Shape) -> None:
+def stuck(run: Run, size: float, shape: Shape) -> None:
     """Hold all axes for `size` s, more or less by a half."""
     rng = run.random('stuck')
     for start in np.flatnonzero(rng.random(len(run.t)) < shape['rate_hz'] * run.dt):
@@ -326,7 +334,7 @@ def _stuck(run: Run, size: float, shape: Shape) -> None:
         run.volts[:, start:start + held + 1] = run.volts[:, start:start + 1]
 
 
-def _quantisation(run: Run, size: float, shape: Shape) -> None:
+def quantisation(run: Run, size: float, shape: Shape) -> None:
     """Lose low bits by rounding or by cutting off; single axes may lose none."""
     step = sim.LSB_V * 2.0 ** round(math.log2(1 + size / sim.LSB_V))
     rounded = np.floor if shape['cut'] > 0.5 else np.rint
@@ -335,7 +343,7 @@ def _quantisation(run: Run, size: float, shape: Shape) -> None:
             run.volts[d] = rounded(run.volts[d] / step) * step
 
 
-def _adc_inl(run: Run, size: float, shape: Shape) -> None:
+def adc_inl(run: Run, size: float, shape: Shape) -> None:
     """Bend the converter, V: some wrong bits, two sines, or a bow."""
     share, (law, phase, cycles, *bits) = run.volts / (sim.LSB_V * 2 ** sim.ADC_BITS), shape['w']
     if law < 0.5:
@@ -349,113 +357,51 @@ def _adc_inl(run: Run, size: float, shape: Shape) -> None:
         run.volts += size * (x - x ** 3 + 0.5 * x ** 5)
 
 
-def _motion_lag(run: Run, shape: Shape) -> np.ndarray:
-    """Shift zero-g while and after a joint turns: current of a motor, charge of a mass."""
+def aftermath(run: Run, shape: Shape) -> np.ndarray:
+    """Shift zero-g while and after a joint turns: charge of a mass, or current of a motor."""
     rate = np.hypot(np.gradient(run.alpha, run.dt), np.gradient(run.beta, run.dt))
     return low_pass(1 - np.exp(-(rate / 0.3) ** 2), shape['late_s'], run.dt)
 
 
-def _two_levels(run: Run, shape: Shape) -> np.ndarray:
+motor_current = aftermath
+
+
+def two_levels(run: Run, shape: Shape) -> np.ndarray:
     """Switch zero-g between two levels at uneven times, as popcorn noise does."""
     phase = 2 * np.pi * run.t / shape['period_s'] + shape['phase']
     return np.where(np.sin(phase) + 0.7 * np.sin(2.718 * phase) > 0.4, 1.0, 0.0)
 
 
-@dataclass(frozen=True)
-class Kind(sim.Kind):
-    """A kind of fault of this world."""
-
-    needs: str = ''  # what the manoeuvre must have for it to show
-    at_rest: bool = False  # whether a calibration at rest takes a part of it up
-
-
-_ODD, _DIE = {'odd': (-0.5, 0.5)}, {'bend': (-0.03, 0.03), 'late_s': (0.5, 6.0)}
-_LISTED = (
-    Kind('bias', sim.added_at_output(sim.constant), 2e-3, 0.1, place=Place.ELECTRONICS),
-    Kind('scale_factor', sim.scaled(sim.constant), 3e-3, 0.1),
-    Kind('gravity', _gravity, 0.02, 0.09, place=Place.STAGE, fixed=1, at_rest=True),
-    Kind('base_tilt', _base_tilt, 2e-3, place=Place.STAGE, fixed=2, at_rest=True),
-    Kind('stage_offset', faults.stage_offset, 2e-3, place=Place.STAGE, fixed=2, at_rest=True),
-    Kind('stage_eccentricity', _stage_eccentricity, 2e-3, place=Place.STAGE, fixed=4, at_rest=True,
-         bounds={'second': (-0.15, 0.15)}),
-    Kind('backlash', _backlash, 4e-3, place=Place.STAGE, fixed=2, weigh=sim.positive),
-    Kind('lever_arm', faults.lever_arm, 0.02, 0.5, place=Place.STAGE, fixed=3, needs='fast'),
-    Kind('time_offset', _late(sim.constant), 5e-3, 0.2, place=Place.WIRE, fixed=1, needs='fast'),
-    # It grows by some percent over the minutes.
-    Kind('clock_skew', _late(lambda run, shape: run.t * (1 + shape['growth'] * run.t / 600)),
-         5e-5, 2e-3, place=Place.WIRE, fixed=1, needs='fast', bounds={'growth': (-0.1, 0.1)}),
-    Kind('misalignment', _misalignment, 3e-3, each=3,
-         weigh=np.random.Generator.standard_normal, at_rest=True),
-    Kind('mount_resonance', _mount_resonance, 0.3, 1.0, place=Place.MOUNT, needs='shake',
-         bounds={'hertz': (12.0, 45.0), 'damping': (0.03, 0.12)}),
-    Kind('cross_axis', sim.added(_cross_axis), 3e-3, 0.1, at_rest=True, bounds=_ODD),
-    Kind('cross_axis_z', sim.added(_cross_axis_z), 3e-3, 0.1, at_rest=True, bounds=_ODD),
-    Kind('scale_factor_cross', sim.scaled(lambda run, shape: np.tanh(1.2 * _other(run))), 5e-3,
-         0.1, at_rest=True),
-    Kind('scale_factor_z', sim.scaled(_scale_factor_z), 5e-3, 0.1, at_rest=True),
-    Kind('nonlinearity', sim.added(
-        lambda run, shape: np.arctan(shape['bend'] * run.u) / shape['bend'] - run.u), 0.02, 0.5,
-        at_rest=True, bounds={'bend': (0.6, 1.2)}),
-    Kind('quadratic', sim.added(lambda run, shape: np.abs(run.u) ** shape['power']), 5e-3, 0.1,
-         at_rest=True, bounds={'power': (1.5, 2.5)}),
-    Kind('hysteresis', _hysteresis, 4e-3, bounds={'reach': (0.08, 0.5), 'skew': (-0.3, 0.3)}),
-    Kind('vibration_rectification', sim.added(_vibration_rectification), 0.3, 30.0, needs='shake',
-         bounds={'power': (1.7, 2.4)}),
-    Kind('saturation', _saturation, 0.6, 1.2, weigh=sim.positive, at_rest=True,
-         bounds={'knee': (0.005, 0.05), 'lower': (0.96, 1.04)}),
-    Kind('temperature_bias', sim.added(partial(_warm, cubic=0.02)), 3e-3, 0.1, needs='heat',
-         bounds=_DIE),
-    Kind('temperature_scale', sim.scaled(partial(_warm, cubic=0.0)), 5e-3, 0.2, needs='heat',
-         bounds=_DIE),
-    Kind('warm_up', sim.added(_warm_up), 5e-3, 0.1,
-         bounds={'tau_s': (20.0, 150.0), 'law': (0.0, 1.0)}),
-    Kind('supply', _supply, 0.3, 3.0, place=Place.ELECTRONICS, needs='supply',
-         bounds={'late_s': (0.05, 0.5), 'bend': (-3.0, 3.0)}),
-    Kind('bandwidth', _bandwidth, 0.3, 1.5, place=Place.ELECTRONICS, needs='shake',
-         bounds={'second': (0.02, 0.1)}),
-    Kind('noise_excess', sim.added_at_output(_heavy_tails), 2e-3, place=Place.WIRE, random=True,
-         bounds={'tails': (3.5, 30.0)}),
-    Kind('flicker', sim.added_at_output(_flicker), 2e-3, place=Place.WIRE, random=True,
-         bounds={'power': (0.85, 1.25)}),
-    Kind('bias_walk', sim.added_at_output(_bias_walk), 2e-3, place=Place.WIRE, random=True,
-         bounds={'uneven': (0.0, 0.7)}),
-    Kind('mains_hum', sim.added_at_output(_mains_hum), 3e-3, 0.1, place=Place.WIRE, random=True,
-         bounds={'off': (-0.03, 0.03), 'phase': _PHASE, 'second': (0.0, 0.3),
-                 'mains': [50.0, 60.0]}),
-    Kind('spikes', _spikes, 0.1, 2.0, place=Place.SAMPLES, random=True,
-         bounds={'rate_hz': (0.05, 0.5), 'up': (0.3, 1.0)}),
-    Kind('stuck', _stuck, 0.1, 2.0, place=Place.SAMPLES, random=True,
-         bounds={'rate_hz': (0.03, 0.2)}),
-    Kind('quantisation', _quantisation, 5e-3, 0.1, place=Place.SAMPLES, random=True,
-         bounds={'cut': (0.0, 1.0)}),
-    Kind('adc_inl', _adc_inl, 3e-3, place=Place.SAMPLES, fixed=9,
-         weigh=np.random.Generator.random, at_rest=True),
-)
-_UNLISTED = (
-    # A radio carrier that beats with the clock.
-    Kind('beat', sim.added_at_output(
-        lambda run, shape: np.sin(2 * np.pi * run.t / shape['period_s'] + shape['phase'])),
-        3e-3, 0.1, place=Place.ELECTRONICS, bounds={'period_s': (6.0, 40.0), 'phase': _PHASE}),
-    # A servo loop with a limit cycle.
-    Kind('ripple', sim.added(
-        lambda run, shape: np.sin(2 * np.pi * run.u / shape['period_g'] + shape['phase'])),
-        3e-3, 0.1, bounds={'period_g': (0.2, 0.5), 'phase': _PHASE}),
-    Kind('aftermath', sim.added_at_output(_motion_lag), 3e-3, 0.1, place=Place.ELECTRONICS,
-         needs='fast', bounds={'late_s': (4.0, 15.0)}),
-    Kind('motor_current', sim.added_at_output(_motion_lag), 3e-3, 0.1, place=Place.ELECTRONICS,
-         needs='fast', bounds={'late_s': (0.03, 0.1)}),
-    # The direction in the room, beyond its first harmonics.
-    Kind('magnet', sim.added_at_output(lambda run, shape: np.sin(3 * run.beta + shape['phase']) * (
-        1 + 0.5 * np.cos(2 * run.alpha))), 3e-3, 0.1, place=Place.ELECTRONICS,
-        bounds={'phase': _PHASE}),
-    Kind('two_levels', sim.added_at_output(_two_levels), 3e-3, 0.1, place=Place.ELECTRONICS,
-         bounds={'period_s': (15.0, 60.0), 'phase': _PHASE}),
-    # Leakage into a reference.
-    Kind('fading_gain', sim.scaled(lambda run, shape: run.t / 100), 3e-3, 0.1),
-)
-LISTED, UNLISTED = (tuple(kind.name for kind in kinds) for kinds in (_LISTED, _UNLISTED))
-KINDS = {kind.name: kind for kind in (*_LISTED, *_UNLISTED)}
-"""All kinds by name; the order is part of a seed."""
+_LAWS: dict[str, sim.Law] = {
+    # Come later and later, and grow by some percent over the minutes.
+    'clock_skew': lambda run, shape: run.t * (1 + shape['growth'] * run.t / 600),
+    # Scale with the other axis.
+    'scale_factor_cross': lambda run, shape: np.tanh(1.2 * _other(run)),
+    # Scale with z.
+    'scale_factor_z': lambda run, shape: (
+        _PLANE[:len(run.u)] * (np.tanh(1.2 * run.force[2] / G0 + 0.4) - np.tanh(0.4))),
+    # Yield less and less.
+    'nonlinearity': lambda run, shape: np.arctan(shape['bend'] * run.u) / shape['bend'] - run.u,
+    # Follow a power of the force that is not quite 2.
+    'quadratic': lambda run, shape: np.abs(run.u) ** shape['power'],
+    # Follow the die with a cubic part.
+    'temperature_bias': lambda run, shape: _warm(run, shape, 0.02),
+    # Scale with the die.
+    'temperature_scale': lambda run, shape: _warm(run, shape, 0.0),
+    # Beat with the clock, as a radio carrier does.
+    'beat': lambda run, shape: np.sin(2 * np.pi * run.t / shape['period_s'] + shape['phase']),
+    # Ripple with the force, as a servo loop with a limit cycle does.
+    'ripple': lambda run, shape: np.sin(2 * np.pi * run.u / shape['period_g'] + shape['phase']),
+    # Follow the direction in the room, beyond its first harmonics.
+    'magnet': lambda run, shape: (
+        np.sin(3 * run.beta + shape['phase']) * (1 + 0.5 * np.cos(2 * run.alpha))),
+    # Lose scale factor steadily, as by leakage into a reference.
+    'fading_gain': lambda run, shape: run.t / 100,
+}
+"""Laws of one line."""
+_LISTED, _UNLISTED = sim.load_kinds('working_faults.yaml', globals() | _LAWS)
+LISTED, UNLISTED, KINDS = tuple(_LISTED), tuple(_UNLISTED), _LISTED | _UNLISTED
+"""Faults of which the package's library has an effect, the others, and all by name."""
 COLOUR = Kind('colour', sim.added_at_output(_colour), 1e-4, 1e-2, place=Place.ELECTRONICS,
               random=True, bounds={'lag_s': (0.02, 0.3)})
 """What every recording has: noise that is not quite white."""

@@ -3,11 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable
 from dataclasses import replace
 from datetime import date
-from functools import partial
 import json
 import os
 from pathlib import Path
@@ -20,11 +18,11 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.process import code_version, package_version
-from adxl_ros.workers import for_each, Pool, write
+from adxl_ros.workers import Pool, write
 from adxl_ros_validation.blind import grading, ideal_observer, scores, trials
 from adxl_ros_validation.blind.faults import NOISE_LIKE
 from adxl_ros_validation.blind.simulator import Fault, Scene
-from adxl_ros_validation.blind.trials import Label
+from adxl_ros_validation.blind.trials import kept, Label, Show
 import numpy as np
 import pandas as pd
 import yaml
@@ -34,8 +32,6 @@ _ENVIRONMENT = ('PATH', 'LD_LIBRARY_PATH', 'PYTHONPATH', 'AMENT_PREFIX_PATH', 'V
 """Variables that ROS 2 and Python need. None contains the folder of the check."""
 _TIMEOUT_S = 1200.0
 """Longest time of one diagnosis, s; chosen."""
-Show = Callable[[str], AbstractContextManager[Callable[[float], None]]]
-"""Receives the name of a stage; gives a context with what receives the finished fraction."""
 Result = dict[str, Any]
 """What a diagnosis left: `report`, `parameters`, `seconds`, `status` and `error`."""
 
@@ -100,10 +96,8 @@ def diagnose_all(folder: Path, pool: Pool, show: Callable[[float], None]
     write(stamp, code.encode())
 
     def job(name: str) -> tuple:
-        csv, parameters, sim = (recordings / f'{name}.{suffix}' for suffix in (
-            'csv', 'yaml', 'sim'))
-        return (name, csv.read_bytes(), parameters.read_bytes(),
-                sim.read_bytes() if sim.exists() else None)
+        paths = [recordings / f'{name}.{suffix}' for suffix in ('csv', 'yaml', 'sim')]
+        return name, *(path.read_bytes() for path in paths if path.exists())
 
     results = kept(reports, sorted(path.stem for path in recordings.glob('*.csv')), diagnose, job,
                    pool, show)
@@ -111,19 +105,6 @@ def diagnose_all(folder: Path, pool: Pool, show: Callable[[float], None]
         raise UserError('the code of the diagnosis changed while it ran; draw a new check into '
                         'another folder, and do not change the package meanwhile')
     return results
-
-
-def kept(folder: Path, names: Sequence[str], work: Callable[..., tuple[str, Any]],
-         job: Callable[[str], tuple], pool: Pool, show: Callable[[float], None]
-         ) -> dict[str, Any]:
-    """Do the work that has no result in a folder yet, and return all results by name."""
-    def keep(name: str, result: Any) -> None:
-        write(folder / f'{name}.json', json.dumps(result).encode())
-
-    todo = [name for name in names if not (folder / f'{name}.json').exists()]
-    for_each(pool, work, [partial(job, name) for name in todo], keep, show,
-             len(names) - len(todo))
-    return {name: json.loads((folder / f'{name}.json').read_bytes()) for name in names}
 
 
 _BLOCK_S = 5.0
@@ -227,8 +208,9 @@ def _fitted(label: Label, faults: list[Fault]) -> list[Fault]:
             for fault, size in zip(faults, sizes)]
 
 
-def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
-    """Diagnose all recordings that have no report yet, read the labels and score."""
+def diagnosed(folder: Path, pool: Pool, show: Show
+              ) -> tuple[dict[str, Any], list[Label], dict[str, Result]]:
+    """Diagnose all recordings that have no report yet; return check, labels and results."""
     digest = trials.published_hash(folder)
     # Labels may be on another machine: the diagnosis does not need them.
     with show('diagnose') as advance:
@@ -238,6 +220,13 @@ def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
     if missing:
         raise UserError(f'{folder / "recordings"}: {missing[0]}.csv is missing, {len(missing)} '
                         'of the committed recordings in all; a check needs all of them')
+    return {'hash': digest, **setup._asdict(), 'diagnose_code':
+            (folder / 'reports' / 'version.txt').read_text()}, labels, results
+
+
+def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
+    """Diagnose all recordings that have no report yet, read the labels and score."""
+    check, labels, results = diagnosed(folder, pool, show)
     by_name = {label.name: label for label in labels}
 
     def job(name: str) -> tuple:
@@ -253,18 +242,10 @@ def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
                 'metadata_only': scores.metadata(folder / 'recordings', labels),
                 'strength_zero': scores.strength_zero(graded)}
     return {
-        'schema': 1, 'hash': digest, **setup._asdict(), 'cases': len(labels),
-        'date': str(date.today()), 'version': package_version(),
-        'diagnose_code': (folder / 'reports' / 'version.txt').read_text(),
+        'schema': 1, **check, 'cases': len(labels), 'date': str(date.today()),
+        'version': package_version(),
         'failed': {trial.label.name: results[trial.label.name]['error'] for trial in graded
                    if trial.answer.status == 'failed'},
         'bars': scores.bars(made), 'controls': negative,
         'leaks': any(control['leaks'] for control in negative.values()),
-        'scores': made, 'rows': [{
-            **{name: [fault[name] for fault in label.faults]
-               for name in ('strength_mps2', 'power', 'told', 'inseparable')},
-            'name': label.name, 'group': label.group, 'effects': list(label.effects),
-            'flexible': label.flexible, 'manoeuvre': label.manoeuvre, 'axes': label.axes,
-            'status': answer.status, 'top': sorted(answer.top), 'named': sorted(answer.named),
-            'probability': answer.probability, 'right': grading.verdict_right(answer, label),
-            'seconds': answer.seconds, 'held': held} for label, answer, held in graded]}
+        'scores': made, 'rows': [trial.row() for trial in graded]}

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The faults of this world: of stage and clock, of the element, like noise, and unlisted ones."""
+"""
+The faults of this world: of stage and clock, of the element, like noise, and unlisted ones.
+
+faults.yaml says how each acts, and its numbers.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +11,15 @@ import math
 
 from adxl_ros_validation.blind import simulator as sim
 from adxl_ros_validation.blind.motion import low_pass
-from adxl_ros_validation.blind.simulator import G0, Kind, Place, Run, Shape
+from adxl_ros_validation.blind.simulator import G0, Run, Shape
 import numpy as np
 import scipy
 
-_OFF_DIAGONAL = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
-"""Row and column of each weight of a misalignment in the matrix of directions."""
 _ZERO_C = 273.15
 """0 °C in K."""
+
+
+bias = scale_factor = sim.constant
 
 
 def stage_offset(run: Run, size: float, shape: Shape) -> None:
@@ -23,7 +28,7 @@ def stage_offset(run: Run, size: float, shape: Shape) -> None:
     run.beta += size * shape['w'][1]
 
 
-def _stage_eccentricity(run: Run, size: float, shape: Shape) -> None:
+def stage_eccentricity(run: Run, size: float, shape: Shape) -> None:
     """Add a Fourier series of the angle, rad: three harmonics to beta and one to alpha."""
     c = np.asarray(shape['w'])
     beta, alpha = run.beta.copy(), run.alpha.copy()
@@ -32,19 +37,20 @@ def _stage_eccentricity(run: Run, size: float, shape: Shape) -> None:
     run.alpha += size * (c[2] * np.sin(alpha) + c[3] * np.cos(alpha))
 
 
-def _backlash(run: Run, size: float, shape: Shape) -> None:
+def backlash(run: Run, size: float, shape: Shape) -> None:
     """Follow with a gap that closes exponentially (Dahl), as of worn teeth with grease, rad."""
     for joint, w in ((run.alpha, shape['w'][0]), (run.beta, shape['w'][1])):
         if size * w:
             joint -= 0.5 * size * abs(w) * sim.travel_memory(joint, abs(size * w))
 
 
-def _base_tilt(run: Run, size: float, shape: Shape) -> None:
+def base_tilt(run: Run, size: float, shape: Shape) -> None:
+    """Tilt the direction that is up, rad."""
     up = run.up + size * np.array([shape['w'][0], shape['w'][1], 0.0])
     run.up = up / np.linalg.norm(up)
 
 
-def _gravity(run: Run, size: float, shape: Shape) -> None:
+def gravity(run: Run, size: float, shape: Shape) -> None:
     """Change local gravity by a share, as at another site."""
     run.gravity = G0 * (1 + size * shape['w'][0])
 
@@ -54,16 +60,17 @@ def lever_arm(run: Run, size: float, shape: Shape) -> None:
     run.arm = size * np.asarray(shape['w'], float)
 
 
-def _time_offset(run: Run, size: float, shape: Shape) -> None:
+def time_offset(run: Run, size: float, shape: Shape) -> None:
+    """Read the samples late, s."""
     run.late += size * shape['w'][0]
 
 
-def _clock_skew(run: Run, size: float, shape: Shape) -> None:
+def clock_skew(run: Run, size: float, shape: Shape) -> None:
     """Change the rate of the clock by a share; the oven of the clock makes it wander."""
     run.skew += size * shape['w'][0]
 
 
-def _mount_resonance(run: Run, size: float, shape: Shape) -> None:
+def mount_resonance(run: Run, size: float, shape: Shape) -> None:
     """Add one mode of the bracket; `size` is its share of the motion."""
     w0, zeta, fs = 2 * np.pi * shape['hertz'], shape['zeta'], 1 / run.dt
     b, a = scipy.signal.bilinear([-1.0, -2 * zeta * w0 * 0.2, 0.0],
@@ -72,49 +79,32 @@ def _mount_resonance(run: Run, size: float, shape: Shape) -> None:
     run.force += size * scipy.signal.lfilter(b, a, moved)
 
 
-def _sign(rng: np.random.Generator, count: int) -> np.ndarray:
+def sign(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Draw weights of 1 or −1."""
     return rng.choice([-1.0, 1.0], count)
 
 
-_STAGE = (
-    Kind('stage_offset', stage_offset, 1e-3, 0.03, place=Place.STAGE, fixed=2, per_axis=False),
-    Kind('stage_eccentricity', _stage_eccentricity, 1e-3, 0.03, place=Place.STAGE, fixed=4,
-         per_axis=False),
-    Kind('backlash', _backlash, 1e-3, 0.03, place=Place.STAGE, fixed=2, weigh=sim.positive,
-         per_axis=False, sizes=(0.3, 1.0, 4.0)),
-    Kind('base_tilt', _base_tilt, 1e-3, 0.03, place=Place.STAGE, fixed=2, per_axis=False),
-    Kind('gravity', _gravity, 1e-3, 5e-3, place=Place.STAGE, fixed=1, weigh=_sign, per_axis=False),
-    Kind('lever_arm', lever_arm, 0.01, 0.3, place=Place.STAGE, fixed=3, per_axis=False),
-    Kind('time_offset', _time_offset, 1e-3, 0.1, place=Place.STAGE, fixed=1, weigh=_sign,
-         per_axis=False),
-    Kind('clock_skew', _clock_skew, 1e-5, 1e-3, place=Place.STAGE, fixed=1, weigh=_sign,
-         per_axis=False),
-    Kind('mount_resonance', _mount_resonance, 0.1, 1.0, place=Place.MOUNT, each=0, per_axis=False,
-         bounds={'hertz': (14, 38), 'zeta': (0.03, 0.12)},
-         spread_at={'hertz': (14.0, 20.0, 28.0, 38.0), 'zeta': (0.06,)}),
-)
-
-
-def _misalignment(run: Run, size: float, shape: Shape) -> None:
+def misalignment(run: Run, size: float, shape: Shape) -> None:
     """Turn each axis on its own, rad; its direction keeps the length 1."""
-    for (row, col), w in zip(_OFF_DIAGONAL, shape['w']):
+    for (row, col), w in zip(np.argwhere(~np.eye(3, dtype=bool)), shape['w']):
         run.directions[row, col] += size * w
     run.directions /= np.linalg.norm(run.directions, axis=1, keepdims=True)
     run.u = (run.directions @ run.force)[run.unit.axis_indices] / G0
 
 
-def _saturation(run: Run, size: float, shape: Shape) -> None:
+def saturation(run: Run, size: float, shape: Shape) -> None:
     """Clip softly; `size` is by how many g the limit is below 1.7 g."""
     limit = 1.7 - size * np.abs(sim.column(shape))
     run.u /= (1 + np.abs(run.u / limit) ** 40) ** (1 / 40)
 
 
-def _clipped_axes(rng: np.random.Generator, count: int) -> np.ndarray:
+def clipped_axes(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Draw the axes that are clipped: one of them, or all."""
     single = np.arange(count) == rng.integers(count)
     return single.astype(float) if rng.random() < 0.4 else np.ones(count)
 
 
-def _hysteresis(run: Run, size: float, shape: Shape) -> None:
+def hysteresis(run: Run, size: float, shape: Shape) -> None:
     """Add a hysteresis loop of Bouc and Wen, g: exponent 2, unequal branches."""
     every = max(int(0.004 / run.dt), 1)
     for row, w in zip(run.u, shape['w']):
@@ -127,7 +117,7 @@ def _hysteresis(run: Run, size: float, shape: Shape) -> None:
             row += size * w * np.interp(run.t, run.t[::every], loop)
 
 
-def _vibration_rectification(run: Run, shape: Shape) -> np.ndarray:
+def vibration_rectification(run: Run, shape: Shape) -> np.ndarray:
     """Shift zero-g by the power of the vibration, with a limit, 1/g."""
     fast = scipy.signal.sosfilt(scipy.signal.butter(2, 2.0, 'high', fs=1 / run.dt, output='sos'),
                                 run.u - run.u[:, :1])
@@ -135,12 +125,12 @@ def _vibration_rectification(run: Run, shape: Shape) -> np.ndarray:
     return power / (1 + 4 * power)
 
 
-def _supply(run: Run, size: float, shape: Shape) -> None:
+def supply(run: Run, size: float, shape: Shape) -> None:
     """Scale zero-g and scale factor by the supply to the power 1.13 (560 mV/g at 3 V)."""
     run.volts *= 1 + size * sim.column(shape) * ((run.supply / 5.0) ** 1.13 - 1)
 
 
-def _bandwidth(run: Run, size: float, shape: Shape) -> None:
+def bandwidth(run: Run, size: float, shape: Shape) -> None:
     """Move the corner of the filter; a slower filter has a second pole."""
     factor = math.exp(-size * shape['w'][0])
     run.corner_hz *= factor
@@ -148,54 +138,24 @@ def _bandwidth(run: Run, size: float, shape: Shape) -> None:
         run.second_hz = 8 * run.corner_hz / (1 - factor)
 
 
-_ELEMENT = (
-    Kind('bias', sim.added_at_output(sim.constant), 1e-3, 0.1, place=Place.ELECTRONICS),
-    Kind('scale_factor', sim.scaled(sim.constant)),
-    Kind('misalignment', _misalignment, each=2, per_axis=False),
-    # The first arch of a cosine.
-    Kind('cross_axis', sim.added(lambda run, shape: 1 - np.cos(1.2 * (run.force / G0)[[1, 0]])),
-         fixed=2),
-    Kind('cross_axis_z', sim.added(lambda run, shape: np.expm1(run.force[2] / G0)), fixed=2),
-    Kind('scale_factor_z', sim.scaled(lambda run, shape: np.expm1(0.8 * run.force[2] / G0)),
-         fixed=2),
-    # Exact at 0 and at full scale.
-    Kind('nonlinearity', sim.added(
-        lambda run, shape: np.sinh(1.4 * run.u) / math.sinh(1.4) - run.u), 1e-3, 0.1),
-    # A hyperbola through zero.
-    Kind('quadratic', sim.added(lambda run, shape: np.sqrt(1 + 0.8 * run.u ** 2) - 1), 1e-3, 0.1),
-    Kind('saturation', _saturation, 0.6, 1.1, weigh=_clipped_axes, sizes=(0.8, 1.0, 1.3)),
-    Kind('hysteresis', _hysteresis, 1e-3, 0.03),
-    Kind('temperature_bias', sim.added(
-        lambda run, shape: np.expm1((run.temperature - 25.0) / 25.0))),
-    # The law of Arrhenius from 25 °C.
-    Kind('temperature_scale', sim.scaled(lambda run, shape: np.expm1(2500.0 * (
-        1 / (_ZERO_C + 25.0) - 1 / (_ZERO_C + run.temperature)))), 1e-3, 0.1),
-    # A stretched exponential after power-on.
-    Kind('warm_up', sim.added(
-        lambda run, shape: np.exp(-(np.clip(run.t + 3.0, 0, None) / shape['lag']) ** 0.75)),
-        1e-3, 0.1, bounds={'lag': (15, 50)}, spread_at={'lag': (15.0, 27.0, 50.0)}),
-    Kind('vibration_rectification', sim.added(_vibration_rectification), 1e-2, 3.0),
-    Kind('supply', _supply, 0.1, 1.5, place=Place.ELECTRONICS),
-    # Two of three are slower.
-    Kind('bandwidth', _bandwidth, 0.1, 1.0, place=Place.ELECTRONICS, fixed=1,
-         weigh=lambda rng, count: rng.choice([1.0, 1.0, -1.0], count), per_axis=False,
-         sizes=(-1.0, 1.0, 4.0)),
-)
+def mostly_slower(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Draw weights of which two of three are positive."""
+    return rng.choice([1.0, 1.0, -1.0], count)
 
 
-def _heavy_tails(run: Run, shape: Shape) -> np.ndarray:
+def noise_excess(run: Run, shape: Shape) -> np.ndarray:
     """Add white, heavy-tailed noise before the filter; size 1 V is 1 V rms within 50 Hz."""
     hiss = run.random('hiss').laplace(size=run.volts.shape) / math.sqrt(2)
     return math.sqrt(0.5 / run.dt / 78.5) * hiss
 
 
-def _flicker(run: Run, shape: Shape) -> np.ndarray:
+def flicker(run: Run, shape: Shape) -> np.ndarray:
     """Add 1/f noise: relaxations over four decades, V."""
     rng, slow = run.random('flicker'), np.arange(run.t[0], run.t[-1] + 0.05, 0.02)
     return np.stack([np.interp(run.t, slow, sim.pink_noise(slow, rng)) for _ in run.volts])
 
 
-def _bias_walk(run: Run, shape: Shape) -> np.ndarray:
+def bias_walk(run: Run, shape: Shape) -> np.ndarray:
     """Add a random walk, V: a smoothed step every second."""
     rng, knots = run.random('walk'), np.arange(run.t[0] - 1, run.t[-1] + 2, 0.25)
     steps = rng.normal(size=(len(run.volts), len(knots))) * (np.arange(len(knots)) % 4 == 0)
@@ -203,7 +163,7 @@ def _bias_walk(run: Run, shape: Shape) -> np.ndarray:
     return np.stack([np.interp(run.t, knots, walk - walk[0]) for walk in walks])
 
 
-def _mains_hum(run: Run, shape: Shape) -> np.ndarray:
+def mains_hum(run: Run, shape: Shape) -> np.ndarray:
     """Add mains hum, V: its frequency wanders, and it has two harmonics."""
     rng, slow = run.random('mains'), np.arange(run.t[0], run.t[-1] + 1, 0.5)
     wander = scipy.ndimage.gaussian_filter1d(rng.normal(size=len(slow)), 20)
@@ -213,7 +173,7 @@ def _mains_hum(run: Run, shape: Shape) -> np.ndarray:
     return (1 + 0.1 * np.sin(run.t / 17)) * hum
 
 
-def _spikes(run: Run, shape: Shape) -> np.ndarray:
+def spikes(run: Run, shape: Shape) -> np.ndarray:
     """Add spikes at random, V, each with a tail of a sample or two."""
     rng = run.random('spikes')
     hits = rng.random(run.volts.shape) < shape['rate'] * run.dt
@@ -221,7 +181,7 @@ def _spikes(run: Run, shape: Shape) -> np.ndarray:
     return scipy.signal.lfilter([1.0], [1.0, -0.25], hits * heights)
 
 
-def _stuck(run: Run, size: float, shape: Shape) -> None:
+def stuck(run: Run, size: float, shape: Shape) -> None:
     """Repeat a sample of all axes, for `size` s on average."""
     rng = run.random('stuck')
     starts = np.flatnonzero(rng.random(len(run.t)) < shape['rate'] * run.dt)
@@ -230,37 +190,21 @@ def _stuck(run: Run, size: float, shape: Shape) -> None:
         run.volts[:, start:start + 1 + int(length)] = run.volts[:, start:start + 1]
 
 
-def _quantisation(run: Run, size: float, shape: Shape) -> None:
+def quantisation(run: Run, size: float, shape: Shape) -> None:
     """Lose the low bits: steps of `size` V, which need not be a power of 2."""
     if size > sim.LSB_V:
         step = size * np.maximum(np.abs(sim.column(shape)), sim.LSB_V / size)
         run.volts = np.floor(run.volts / step) * step + step / 2
 
 
-def _adc_inl(run: Run, size: float, shape: Shape) -> None:
+def adc_inl(run: Run, size: float, shape: Shape) -> None:
     """Weigh the high bits wrongly, V, as a charge converter with unmatched capacitors does."""
     integer = np.clip(run.volts / sim.LSB_V, 0, 2 ** sim.ADC_BITS - 1).astype(np.int64)
     for i, w in enumerate(shape['w']):
         run.volts += size * w * 0.7 ** i * ((integer >> (sim.ADC_BITS - 1 - i) & 1) - 0.5)
 
 
-_NOISE = (
-    Kind('noise_excess', sim.added_v(_heavy_tails), 1e-3, 0.1, place=Place.ELECTRONICS,
-         random=True),
-    Kind('flicker', sim.added_v(_flicker), 3e-4, place=Place.ELECTRONICS, random=True),
-    Kind('bias_walk', sim.added_v(_bias_walk), 1e-4, place=Place.ELECTRONICS, random=True),
-    Kind('mains_hum', sim.added_v(_mains_hum), 1e-3, 0.1, place=Place.WIRE, random=True,
-         bounds={'hertz': [50.0, 60.0]}),
-    Kind('spikes', sim.added_v(_spikes), 0.05, 1.5, place=Place.SAMPLES, random=True,
-         bounds={'rate': (0.05, 0.3)}),
-    Kind('stuck', _stuck, 0.05, 1.0, place=Place.SAMPLES, random=True,
-         bounds={'rate': (0.03, 0.15)}),
-    Kind('quantisation', _quantisation, 1e-3, 0.08, place=Place.SAMPLES, random=True),
-    Kind('adc_inl', _adc_inl, 1e-3, 0.1, place=Place.SAMPLES, fixed=5, per_axis=False),
-)
-
-
-def _loose_gain(run: Run, size: float, shape: Shape) -> None:
+def loose_gain(run: Run, size: float, shape: Shape) -> None:
     """Lose a share of the scale factor for some seconds, as a loose contact does."""
     rng = run.random('loose')
     loose = np.zeros_like(run.t)
@@ -269,13 +213,13 @@ def _loose_gain(run: Run, size: float, shape: Shape) -> None:
     run.u *= 1 - size * np.abs(sim.column(shape)) * low_pass(loose, 0.05, run.dt)
 
 
-def _cogging(run: Run, shape: Shape) -> np.ndarray:
+def cogging(run: Run, shape: Shape) -> np.ndarray:
     """Shake with the poles of the motor while it turns, g."""
     speed = np.hypot(np.gradient(run.beta, run.dt), np.gradient(run.alpha, run.dt))
     return np.tanh(speed / 0.2) * np.sin(shape['poles'] * (run.beta + run.alpha))
 
 
-def _floor_sway(run: Run, size: float, shape: Shape) -> None:
+def floor_sway(run: Run, size: float, shape: Shape) -> None:
     """Sway with the floor under the bench in gusts, rad."""
     rng = run.random('sway')
     gust = np.interp(run.t, np.linspace(0, run.t[-1], 12), rng.uniform(0, 1.6, 12))
@@ -284,45 +228,53 @@ def _floor_sway(run: Run, size: float, shape: Shape) -> None:
     run.beta += sway
 
 
-def _product(run: Run, shape: Shape) -> np.ndarray:
+def product(run: Run, shape: Shape) -> np.ndarray:
     """Add the product of the two other axes, g, as a frame does that shears."""
     x, y, z = run.force / G0
     return np.stack([y * z, x * z, x * y])[run.unit.axis_indices]
 
 
-def _bearing_bump(run: Run, size: float, shape: Shape) -> None:
+def bearing_bump(run: Run, size: float, shape: Shape) -> None:
     """Tilt within about 20° of one angle, rad, as a dented ball of a bearing does."""
     bump = size * np.exp(shape['sharp'] * (np.cos(run.beta - shape['at']) - 1))
     run.alpha += bump
     run.beta += bump
 
 
-_UNLISTED = (
+_LAWS: dict[str, sim.Law] = {
+    # Follow the other axis by the first arch of a cosine.
+    'cross_axis': lambda run, shape: 1 - np.cos(1.2 * (run.force / G0)[[1, 0]]),
+    # Follow z by an exponential.
+    'cross_axis_z': lambda run, shape: np.expm1(run.force[2] / G0),
+    # Scale with z by an exponential.
+    'scale_factor_z': lambda run, shape: np.expm1(0.8 * run.force[2] / G0),
+    # Bend by a hyperbolic sine that is exact at 0 and at full scale.
+    'nonlinearity': lambda run, shape: np.sinh(1.4 * run.u) / math.sinh(1.4) - run.u,
+    # Bend by a hyperbola through zero.
+    'quadratic': lambda run, shape: np.sqrt(1 + 0.8 * run.u ** 2) - 1,
+    # Follow the temperature by an exponential.
+    'temperature_bias': lambda run, shape: np.expm1((run.temperature - 25.0) / 25.0),
+    # Follow the law of Arrhenius from 25 °C.
+    'temperature_scale': lambda run, shape: (
+        np.expm1(2500.0 * (1 / (_ZERO_C + 25.0) - 1 / (_ZERO_C + run.temperature)))),
+    # Settle by a stretched exponential after power-on.
+    'warm_up': lambda run, shape: np.exp(-(np.clip(run.t + 3.0, 0, None) / shape['lag']) ** 0.75),
     # Shift zero-g by the direction of the last temperature change.
-    Kind('thermal_loop', sim.added(lambda run, shape: sim.travel_memory(run.temperature, 2.0))),
+    'thermal_loop': lambda run, shape: sim.travel_memory(run.temperature, 2.0),
     # Yield slowly to a load and recover as slowly, as a soft glue does.
-    Kind('creep', sim.added(lambda run, shape: low_pass(run.u, shape['lag'], run.dt) - run.u),
-         bounds={'lag': (1.5, 8.0)}),
+    'creep': lambda run, shape: low_pass(run.u, shape['lag'], run.dt) - run.u,
     # Step once and stay, as a bond does that cracks.
-    Kind('jump', sim.added(lambda run, shape: run.t > shape['at'] * run.t[-1]),
-         bounds={'at': (0.2, 0.8)}),
-    Kind('loose_gain', _loose_gain),
-    Kind('cogging', sim.added(_cogging), bounds={'poles': (20.0, 60.0)}),
+    'jump': lambda run, shape: run.t > shape['at'] * run.t[-1],
     # Shift by the sign of the rate of beta with a smooth limit, as a dragging cable does.
-    Kind('rate_pull', sim.added(lambda run, shape: np.tanh(np.gradient(run.beta, run.dt) / 0.5))),
-    Kind('floor_sway', _floor_sway, place=Place.STAGE, bounds={'hertz': (0.15, 0.6)}),
-    # A dead zone about zero, as a class B output has.
-    Kind('dead_zone', sim.added(
-        lambda run, shape: -run.u / 0.12 * np.exp(-(run.u / 0.12) ** 2 / 2))),
-    Kind('product', sim.added(_product)),
-    Kind('bearing_bump', _bearing_bump, 1e-3, 0.01, place=Place.STAGE,
-         bounds={'sharp': (6.0, 20.0), 'at': (-3.1, 3.1)}),
-)
-UNLISTED = tuple(kind.name for kind in _UNLISTED)
-"""Kinds of which the package's library has no effect."""
-KINDS = {kind.name: kind for kind in (*_STAGE, *_ELEMENT, *_NOISE, *_UNLISTED)}
-"""All kinds by name. Their order is part of a seed: do not change it."""
-KNOWN = tuple(name for name in KINDS if name not in UNLISTED)
-"""Kinds of which the package's library has an effect of the same name."""
+    'rate_pull': lambda run, shape: np.tanh(np.gradient(run.beta, run.dt) / 0.5),
+    # Lose what is near zero, as a class B output does.
+    'dead_zone': lambda run, shape: -run.u / 0.12 * np.exp(-(run.u / 0.12) ** 2 / 2),
+}
+"""Laws of one line."""
+_LISTED, _UNLISTED = sim.load_kinds('blind/faults.yaml', globals() | _LAWS)
+KINDS = _LISTED | _UNLISTED
+"""All kinds by name."""
+KNOWN, UNLISTED = tuple(_LISTED), tuple(_UNLISTED)
+"""Kinds of which the package's library has an effect of the same name, and the others."""
 NOISE_LIKE = frozenset(name for name, kind in KINDS.items() if kind.random)
 """Kinds that differ from run to run."""

@@ -10,7 +10,7 @@ import math
 from typing import Any
 
 from adxl_ros_validation.blind import trials
-from adxl_ros_validation.blind.faults import KNOWN
+from adxl_ros_validation.blind.faults import KINDS, KNOWN
 from adxl_ros_validation.blind.simulator import G0
 from adxl_ros_validation.blind.trials import Label
 import numpy as np
@@ -160,24 +160,6 @@ def brier(answer: Answer, label: Label) -> float:
     return (1 - correct) ** 2 + wrong
 
 
-_PARAMETERS: dict[str, tuple[tuple[str, int, float, int | None], ...]] = {
-    'gravity': (('offset_mps2', 0, G0, None),),
-    'time_offset': (('offset_s', 0, 1, None),),
-    'lever_arm': (('x_m', 0, 1, None), ('y_m', 1, 1, None), ('z_m', 2, 1, None)),
-    'stage_offset': (('alpha_rad', 0, 1, 0), ('beta_rad', 1, 1, 3)),
-    'base_tilt': (('x_rad', 1, -1, None), ('y_rad', 0, 1, None)),
-    'backlash': (('alpha_rad', 0, 1, None), ('beta_rad', 1, 1, None)),
-    'stage_eccentricity': (('beta_sine_rad', 0, 1, 4), ('beta_cosine_rad', 1, 1, 5),
-                           ('alpha_sine_rad', 2, 1, 1), ('alpha_cosine_rad', 3, 1, 2)),
-    # Equations 18 and 19, to first order, of the directions xy, xz, yx, yz, zx, zy.
-    'misalignment': (('beta_rad.x', 0, 1, None), ('alpha_rad.x', 1, -1, None),
-                     ('beta_rad.y', 2, -1, None), ('alpha_rad.y', 3, 1, None),
-                     ('beta_rad.z', 4, 1, None), ('alpha_rad.z', 5, -1, None)),
-}
-"""Parameters that mean the same in both worlds: name in the report, weight of the fault, factor,
-and the error of each unit's own stage that adds to it."""
-
-
 def true_parameters(label: Label) -> dict[str, float]:
     """
     Return the true values of parameters that mean the same in both worlds, by name of the report.
@@ -189,9 +171,8 @@ def true_parameters(label: Label) -> dict[str, float]:
     for fault in label.faults:
         name = fault['effect']
         w = fault['size'] * np.asarray(fault['shape'].get('w', []), float)
-        true |= {f'{name}.{part}': float(factor * w[i] + (0 if own is None else
-                                                          unit.stage_rad[own]))
-                 for part, i, factor, own in _PARAMETERS.get(name, ()) if i < len(w)}
+        true |= {f'{name}.{part}': float(factor * w[i] + unit.stage_rad[own].sum())
+                 for part, (i, factor, *own) in KINDS[name].same.items() if i < len(w)}
         m = w[:len(unit.axes)]
         if name == 'mount_resonance':
             true['mount_resonance.frequency_hz'] = fault['shape']['hertz']

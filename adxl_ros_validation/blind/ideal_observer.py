@@ -111,10 +111,7 @@ class IdealObserver:
     def rivals(self) -> dict[str, np.ndarray]:
         """Return columns that span the responses of each effect that is not like noise, (v, k)."""
         rivals = {}
-        for name in KNOWN:
-            kind = KINDS[name]
-            if kind.random:
-                continue
+        for name, kind in ((name, KINDS[name]) for name in KNOWN if not KINDS[name].random):
             changes = [self.scene.response([Fault(kind, multiple * kind.start, shape)], True)
                        for shape in kind.spread(self.scene.unit) for multiple in kind.sizes]
             if kind.per_axis:
@@ -130,11 +127,9 @@ class IdealObserver:
         rest = vector - reserved @ (reserved.T @ vector)
         hats = _hats(scene, self.force)
         for d in range(self.axes):
-            columns = []
-            for hat in hats:
-                column = self.project(self.of_axis(d, hat))
-                columns.append(column - reserved @ (reserved.T @ column))
-            basis = _orthonormal(columns, len(rest))
+            columns = [self.project(self.of_axis(d, hat)) for hat in hats]
+            basis = _orthonormal([column - reserved @ (reserved.T @ column)
+                                  for column in columns], len(rest))
             explained += float(np.sum((basis.T @ rest) ** 2))
             used += basis.shape[1]
         threshold = scipy.stats.chi2.isf(_FLEXIBLE_LEVEL, used)

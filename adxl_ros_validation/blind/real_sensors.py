@@ -9,7 +9,8 @@ rest (the baseline) is there already, and no error.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 import hashlib
@@ -21,27 +22,13 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.workers import Pool, write
-from adxl_ros_validation.blind import (
-    diagnosis_runs,
-    grading,
-    ideal_observer,
-    report_html,
-    scores,
-    trials,
-)
-from adxl_ros_validation.blind.diagnosis_runs import Show
+from adxl_ros_validation.blind import diagnosis_runs, grading, scores, simulator as sim, trials
 from adxl_ros_validation.blind.faults import KINDS, KNOWN
 from adxl_ros_validation.blind.grading import Answer, UNKNOWN
-from adxl_ros_validation.blind.simulator import (
-    csv_text,
-    Fault,
-    G0,
-    parameter_file,
-    Place,
-    Run,
-    Unit,
-)
-from adxl_ros_validation.blind.trials import Drawn, Label, Plan
+from adxl_ros_validation.blind.ideal_observer import line, rms
+from adxl_ros_validation.blind.report import reliability, Report, Table
+from adxl_ros_validation.blind.simulator import Fault, G0, Unit
+from adxl_ros_validation.blind.trials import Drawn, Label, Plan, Show
 import numpy as np
 import pandas as pd
 import scipy
@@ -65,13 +52,6 @@ _STILL_G = 0.05
 """Largest change of the force of a sensor that rests, g rms."""
 _REST_S = 1.5
 """Shortest rest, s."""
-_NO_PLACE = frozenset(['cogging', 'rate_pull', 'supply', 'bandwidth', 'saturation', 'flicker'])
-"""Defects of joints, supply and filter, which need more than samples; sensors have flicker."""
-_OF_TEMPERATURE = frozenset(['temperature_bias', 'temperature_scale', 'thermal_loop'])
-_OF_MOTION = frozenset(['time_offset', 'clock_skew', 'vibration_rectification', 'creep'])
-_OF_FORCE = frozenset(['scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z',
-                       'scale_factor_z', 'nonlinearity', 'quadratic', 'hysteresis', 'dead_zone',
-                       'product', 'loose_gain', 'adc_inl'])
 
 
 @dataclass(frozen=True)
@@ -80,11 +60,11 @@ class Half:
 
     name: str
     reference: str  # 'simulator', 'stage' or 'rests'
-    columns: dict[str, np.ndarray]
+    columns: pd.DataFrame
+    sim: pd.DataFrame | None  # the force by another simulator
     digits: dict[str, int]  # digits after the point of each column
-    parameters: str
-    sim: dict[str, np.ndarray] | None
-    noise_mps2: float  # rms of the noise of one sample
+    parameters: str = ''
+    noise_mps2: float = 0.0  # rms of the noise of one sample
 
     @property
     def samples(self) -> dict[str, tuple[float, float]]:
@@ -99,42 +79,41 @@ class Half:
 
     def g(self) -> np.ndarray:
         """Return the samples, g, (m, n); volts by 2.5 V and 1 V/g."""
-        return np.stack([(self.columns[name] - zero) / step
+        return np.stack([(self.columns[name].to_numpy() - zero) / step
                          for name, (zero, step) in self.samples.items()])
 
     def texts(self) -> tuple[str, str, str | None]:
         """Return recording, parameters and another simulator's force as texts of files."""
-        return (csv_text(self.columns, self.digits), self.parameters,
-                csv_text(self.sim, self.digits) if self.sim else None)
+        return (sim.csv_text(dict(self.columns), self.digits), self.parameters,
+                None if self.sim is None else sim.csv_text(dict(self.sim), self.digits))
 
     def unit(self) -> Unit:
         """Return a unit of 2.5 V and 1 V/g with the axes of the recording."""
         one = np.ones(len(self.axes))
-        rate_hz = 1 / float(np.median(np.diff(self.columns['time_s'])))
+        rate_hz = 1 / float(self.columns['time_s'].diff().median())
         return Unit(self.axes, _ZERO_V * one, one, _ZERO_V * one, one, one, one, math.inf, one,
                     one, 0.0, np.zeros(6), rate_hz)
 
     def kinds(self) -> list[str]:
         """Return the defects that can be put into its samples and shown by its reference."""
-        warm = self.columns.get('temperature_c', np.zeros(1))
         is_still = np.std(self.g(), axis=1).max() < _STILL_G
-        out = _NO_PLACE.union(() if np.ptp(warm) > 3 else _OF_TEMPERATURE,
-                              _OF_MOTION if is_still or self.reference == 'rests' else (),
-                              _OF_FORCE if is_still else ())
-        return [name for name, kind in KINDS.items() if name not in out and (
-            kind.place not in (Place.STAGE, Place.MOUNT) or name in _OF_MOTION)]
+        has = {'': True, 'chain': False, 'force': not is_still,
+               'heat': np.ptp(self.columns.get('temperature_c', np.zeros(1))) > 3,
+               'motion': not is_still and self.reference != 'rests'}
+        return [name for name, kind in KINDS.items() if has[kind.needs] and (
+            kind.needs == 'motion' or kind.place not in (sim.Place.STAGE, sim.Place.MOUNT))]
 
 
 def prepare(source: Path) -> tuple[list[Half], list[str]]:
     """Return the later parts of recordings, and why others are left out."""
     halves, left_out = [], []
-    for path, sim, digest in _sources(source):
+    for path, sim_path, digest in _sources(source):
         try:
             if not path.exists():
                 raise UserError('no such file; the manifest has its address')
             if digest and hashlib.sha256(path.read_bytes()).hexdigest() != digest:
                 raise UserError('is not the file whose SHA-256 the manifest has')
-            halves.append(_half(path, sim))
+            halves.append(_half(path, sim_path))
         except UserError as error:
             left_out.append(f'{path.name}: {error}')
     if not halves:
@@ -159,11 +138,11 @@ def _sources(source: Path) -> list[tuple[Path, Path | None, str]]:
             for (path, digest), sim in zip(paths, sims)]
 
 
-def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+def _read(path: Path) -> tuple[pd.DataFrame, dict[str, int]]:
     """Read the columns of a CSV file, and their digits after the point."""
     try:
         cells = pd.read_csv(path, comment='#', dtype=str, keep_default_na=False)
-        columns = {name: cells[name].replace('', 'nan').to_numpy(float) for name in cells}
+        columns = cells.replace('', 'nan').astype(float)
     except ValueError as error:
         raise UserError(f'is no recording of this project: {error}') from None
     if 'time_s' not in columns:
@@ -172,27 +151,27 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, int]]:
                      for name in cells}
 
 
-def _part(columns: dict[str, np.ndarray], start: float, stop: float) -> dict[str, np.ndarray]:
+def _part(columns: pd.DataFrame | None, start: float, stop: float) -> pd.DataFrame | None:
     """Return the rows of a time span, whose time begins at 0."""
-    t = columns['time_s']
-    part = {name: column[(t >= start) & (t < stop)] for name, column in columns.items()}
-    return {**part, 'time_s': part['time_s'] - start}
+    if columns is None:
+        return None
+    part = columns[columns['time_s'].between(start, stop, 'left')].reset_index(drop=True)
+    return part.assign(time_s=part['time_s'] - start)
 
 
 def _half(path: Path, sim_path: Path | None) -> Half:
     """Make the parameters of the first part of a recording, and the reference of the later one."""
     columns, digits = _read(path)
     sim = _read(sim_path)[0] if sim_path else None
-    t = columns['time_s']
-    if t[-1] - t[0] < _SHORTEST_S:
-        raise UserError(f'has {t[-1] - t[0]:.0f} s; at least {_SHORTEST_S:.0f} s are needed')
-    cut = t[0] + _FIRST * (t[-1] - t[0])
-    kind = 'simulator' if sim else 'stage' if 'alpha_rad' in columns else 'rests'
-    first, second = (Half(path.stem, kind, _part(columns, *span), digits, '',
-                          _part(sim, *span) if sim else None, 0.0)
-                     for span in ((t[0], cut), (cut, math.inf)))
+    begin, end = columns['time_s'].iloc[[0, -1]]
+    if end - begin < _SHORTEST_S:
+        raise UserError(f'has {end - begin:.0f} s; at least {_SHORTEST_S:.0f} s are needed')
+    cut = begin + _FIRST * (end - begin)
+    kind = 'simulator' if sim_path else 'stage' if 'alpha_rad' in columns else 'rests'
+    first, second = (Half(path.stem, kind, _part(columns, *span), _part(sim, *span), digits)
+                     for span in ((begin, cut), (cut, math.inf)))
     second = replace(second, noise_mps2=_noise(second))
-    if sim:
+    if sim_path:
         return replace(second, parameters=_against_force(first))
     with tempfile.TemporaryDirectory(prefix='half_') as temporary:
         folder = Path(temporary)
@@ -204,11 +183,9 @@ def _half(path: Path, sim_path: Path | None) -> Half:
                                                 'unit.yaml', '-o', 'force.csv')
             if status:
                 raise UserError(error)
-            applied = _read(folder / 'force.csv')[0]
-            angles = _angles_at_rest(np.stack([applied[f'a{d}_mps2'] for d in 'xyz']),
-                                     second.columns['time_s'])
-            second = replace(second, columns={**second.columns, **angles},
-                             digits={**digits, 'alpha_rad': 7, 'beta_rad': 7})
+            angles = _angles_at_rest(_read(folder / 'force.csv')[0], second.unit().rate_hz)
+            second = replace(second, columns=second.columns.assign(**angles),
+                             digits=digits | dict.fromkeys(angles, 7))
     return second
 
 
@@ -226,41 +203,38 @@ def _fitted(folder: Path, warm: bool) -> str:
 def _against_force(first: Half) -> str:
     """Return zero-g and scale factor by least squares over another simulator's force."""
     assert first.sim is not None
-    lines = []
-    for d, row in zip(first.axes, first.g()):
-        force = np.interp(first.columns['time_s'], first.sim['time_s'], first.sim[f'a{d}_mps2'])
-        lines.append(ideal_observer.line(force / G0, row))
-    zero, scale = np.transpose(lines)
+    zero, scale = np.transpose([line(np.interp(
+        first.columns['time_s'], first.sim['time_s'], first.sim[f'a{d}_mps2']) / G0, row)
+        for d, row in zip(first.axes, first.g())])
     unit = first.unit()
     density = np.full(len(first.axes), _noise(first) / G0 / math.sqrt(unit.rate_hz / 2))
-    return parameter_file(
+    return sim.parameter_file(
         replace(unit, stated_zero_v=zero, stated_scale_v_per_g=scale,
                 stated_noise_g_per_rthz=density, resolution_rad=1e-3),
         'unit', nominal_zero_v=0.0, is_certain=True, adc_bits=0, adc_vref_v=100.0, range_g=16.0)
 
 
-def _angles_at_rest(force: np.ndarray, t: np.ndarray) -> dict[str, np.ndarray]:
+def _angles_at_rest(applied: pd.DataFrame, rate: float) -> pd.DataFrame:
     """
     Return the angles that a stage with these rests would have; they are empty in motion.
 
     They are those of the mean force of each rest. So the noise and the error of the magnitude of
     gravity are real, and the direction is known, as from a table that was indexed by hand.
     """
-    rate = 1 / float(np.median(np.diff(t)))
+    force = applied[['ax_mps2', 'ay_mps2', 'az_mps2']].to_numpy().T
     width = max(int(0.5 * rate), 3)
     spread = np.sqrt(np.maximum(scipy.ndimage.uniform_filter1d(force ** 2, width)
                                 - scipy.ndimage.uniform_filter1d(force, width) ** 2, 0)).max(0)
     still = spread < 2 * np.quantile(spread, 0.2)
-    alpha, beta = np.full(len(t), np.nan), np.full(len(t), np.nan)
-    edges = np.flatnonzero(np.diff(np.r_[False, still, False]))
-    for start, stop in zip(edges[::2], edges[1::2]):
-        if stop - start >= _REST_S * rate:
-            x, y, z = force[:, start:stop].mean(axis=1)
-            alpha[start:stop], beta[start:stop] = math.atan2(math.hypot(x, y), z), math.atan2(
-                -y, x)
-    if np.isnan(alpha).all():
+    angles = pd.DataFrame(np.nan, applied.index, ['alpha_rad', 'beta_rad'])
+    span = np.cumsum(np.diff(still, prepend=False))
+    for _, part in applied[still].groupby(span[still]):
+        if len(part) >= _REST_S * rate:
+            x, y, z = force[:, part.index].mean(axis=1)
+            angles.loc[part.index] = math.atan2(math.hypot(x, y), z), math.atan2(-y, x)
+    if angles.isna().all(axis=None):
         raise UserError('its later part has no rest, no stage and no other simulator')
-    return {'alpha_rad': alpha, 'beta_rad': beta}
+    return angles
 
 
 def _noise(half: Half) -> float:
@@ -275,39 +249,35 @@ def plans(halves: Sequence[Half], seed: int, count: int) -> list[Plan]:
     """Plan trials: recordings and defects in turn, a quarter without any."""
     rng = np.random.default_rng([seed, 3])
     rows: list[tuple[str, tuple[str, ...], tuple[int, ...]]] = []
-    used = dict.fromkeys(KINDS, 0)
+    used: Counter[str] = Counter()
     for k in range(count):
         half = k % len(halves)
         group = str(rng.choice(['none', 'outside', 'single'], p=(*_SHARES, 1 - sum(_SHARES))))
-        names = [name for name in halves[half].kinds()
-                 if (name in KNOWN) == (group == 'single')]
-        if group == 'none' or not names:
-            rows.append(('none', (), (seed, 4, k, half)))
-            continue
-        fewest = min(used[name] for name in names)
-        name = str(rng.choice([name for name in names if used[name] == fewest]))
-        used[name] += 1
-        rows.append((group, (name,), (seed, 4, k, half)))
+        names = [name for name in halves[half].kinds() if group == (
+            'single' if name in KNOWN else 'outside')]
+        rarest = [name for name in names if used[name] == min(used[other] for other in names)]
+        effects = (str(rng.choice(rarest)),) if rarest else ()
+        used.update(effects)
+        rows.append((group if effects else 'none', effects, (seed, 4, k, half)))
     return [Plan(f'r{i:04d}', *rows[k]) for i, k in enumerate(rng.permutation(count))]
 
 
 def draw(halves: Sequence[Half], plan: Plan) -> Drawn:
     """Cut a part of a later part and put the defect of a plan into it."""
     half, rng = halves[plan.seed[-1]], np.random.default_rng([*plan.seed, 0])
-    end = float(half.columns['time_s'][-1])
+    end = float(half.columns['time_s'].iloc[-1])
     start = float(rng.uniform(0, (1 - _PART) * end))
-    half = replace(half, columns=_part(half.columns, start, start + _PART * end),
-                   sim=_part(half.sim, start, start + _PART * end) if half.sim else None)
+    columns, force = (_part(whole, start, start + _PART * end)
+                      for whole in (half.columns, half.sim))
+    half = replace(half, columns=columns, sim=force)
     faults, changed = [], half.g()
     for name in plan.effects:
-        kind = KINDS[name]
-        wanted = half.noise_mps2 * math.exp(rng.uniform(*np.log(_NOISES)))
-        fault, strength, changed = trials.sized(
-            partial(_with_fault, half, plan.seed),
-            Fault(kind, kind.start, kind.draw(rng, half.unit())), wanted)
+        fault, _, strength, changed = trials.sized(
+            rng, KINDS[name], half.unit(), _NOISES,
+            partial(_with_fault, half, plan.seed), half.noise_mps2)
         faults.append(trials.described(fault, strength))
-    columns = half.columns | {name: step * row + zero for (name, (zero, step)), row in zip(
-        half.samples.items(), changed)}
+    columns = half.columns.assign(**{name: step * row + zero for (name, (zero, step)), row in zip(
+        half.samples.items(), changed)})
     return Drawn(Label(**asdict(plan), manoeuvre=f'{half.name} by {half.reference}',
                        axes=half.axes, floor_mps2=half.noise_mps2, faults=faults),
                  *replace(half, columns=columns).texts())
@@ -316,12 +286,11 @@ def draw(halves: Sequence[Half], plan: Plan) -> Drawn:
 def _motion(half: Half) -> np.ndarray:
     """Return the force without its noise, m/s², (3, n); an axis that is not measured has 0."""
     rate = half.unit().rate_hz
-    force = np.zeros((3, len(half.columns['time_s'])))
-    rows = half.g() * G0
+    rows, force = half.g() * G0, np.zeros((3, len(half.columns)))
     if rate > 3 * _MOTION_HZ:
         low = scipy.signal.butter(2, _MOTION_HZ, fs=rate, output='sos')
         rows = scipy.signal.sosfiltfilt(low, rows, axis=1)
-    force[['xyz'.index(d) for d in half.axes]] = rows
+    force[half.unit().axis_indices] = rows
     return force
 
 
@@ -330,9 +299,9 @@ def _with_fault(half: Half, seed: tuple[int, ...], fault: Fault) -> tuple[float,
     unit, before = half.unit(), half.g()
     t = np.arange(before.shape[1]) / unit.rate_hz
     still = np.zeros_like(t)
-    run = Run(unit, t, trials.integer_seed(*seed), still, still,
-              still, half.columns.get('temperature_c', still + 25.0), still + 5.0,
-              corner_hz=math.inf, force=_motion(half))
+    warm = np.asarray(half.columns.get('temperature_c', still + 25.0))
+    run = sim.Run(unit, t, trials.integer_seed(*seed), still, still, still, warm, still + 5.0,
+                  corner_hz=math.inf, force=_motion(half))
     run.u = run.force[unit.axis_indices] / G0
     run.volts = before + _ZERO_V
     sensed = run.u.copy()
@@ -342,13 +311,14 @@ def _with_fault(half: Half, seed: tuple[int, ...], fault: Fault) -> tuple[float,
         run.volts = np.stack([np.interp(t - run.late_s(t), t, row) for row in run.volts])
     after = run.volts - _ZERO_V
     # The rms counts where the reference is known; zero-g and scale factor are free.
-    known = ~np.isnan(half.columns['alpha_rad']) if half.reference == 'rests' else slice(None)
+    known = half.columns['alpha_rad'].notna().to_numpy() if half.reference == 'rests' \
+        else slice(None)
     rest = G0 * (after - before)[:, known]
     if fault.kind.name not in ('bias', 'scale_factor'):
         for row, along in zip(rest, before[:, known]):
-            zero, scale = ideal_observer.line(along, row)
+            zero, scale = line(along, row)
             row -= zero + scale * along
-    return ideal_observer.rms(rest), after
+    return rms(rest), after
 
 
 def seal(folder: Path, source: Path, seed: int | None, count: int, pool: Pool, show: Show
@@ -359,14 +329,11 @@ def seal(folder: Path, source: Path, seed: int | None, count: int, pool: Pool, s
         return trials.published_hash(folder)
     with show('first parts'):
         halves, left_out = prepare(source)
-    with show('draw') as advance:
-        digest = trials.seal(folder, seed, count, partial(plans, halves), partial(draw, halves),
-                             pool, advance)
+    digest = trials.seal(folder, partial(plans, halves), partial(draw, halves), seed, count, pool,
+                         show)
     write(folder / 'left_out.json', json.dumps(left_out).encode())
     for half in halves:
-        for suffix, text in zip(('csv', 'yaml', 'sim'), half.texts()):
-            if text is not None:
-                write(base / f'{half.name}.{suffix}', text.encode())
+        trials.save(base, half.name, half.texts())
     return digest
 
 
@@ -394,9 +361,7 @@ def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
     """Diagnose what has no report yet, compare labels with the hash, and score."""
     with show('untouched') as advance:
         untouched = diagnosis_runs.diagnose_all(folder / 'baseline', pool, advance)
-    with show('diagnose') as advance:
-        results = diagnosis_runs.diagnose_all(folder, pool, advance)
-    setup, labels = trials.committed_labels(folder)
+    check, labels, results = diagnosis_runs.diagnosed(folder, pool, show)
     base = {name: grading.answer(result) for name, result in untouched.items()}
     rows = []
     for label in labels:
@@ -415,50 +380,41 @@ def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
                      'probability': answer.probability, 'seconds': answer.seconds,
                      'error': results[label.name]['error'],
                      'by_chance': float(np.mean(by_chance or [False]))})
-    return {'hash': trials.published_hash(folder), 'seed': setup.seed,
-            'trials': len(rows), 'diagnose_code': (folder / 'reports' / 'version.txt').read_text(),
+    return {**check,
             'left_out': json.loads((folder / 'left_out.json').read_text()), 'rows': rows,
             'baseline': {name: [answer.status, sorted(answer.named)]
                          for name, answer in base.items()}}
 
 
-def tables(made: dict[str, Any]) -> dict[str, report_html.Table]:
-    """Return the tables of a run."""
+def report(made: dict[str, Any]) -> Report:
+    """Return the report of a check on real sensors."""
     rows = made['rows']
-
-    def part(name: str, chosen: Sequence[dict[str, Any]]) -> list[str]:
-        return [name, *(scores.in_words(scores.share([row[key] for row in chosen]))
-                        for key in ('exact', 'in_set')),
-                f'{np.mean([row["by_chance"] for row in chosen]):.2f}']
-
-    def parts(name_of: Callable[[dict[str, Any]], str | None]) -> report_html.Table:
-        names = sorted({name for name in map(name_of, rows) if name})
-        return head, [part(name, [row for row in rows if name_of(row) == name]) for name in names]
-
-    def strength(row: dict[str, Any]) -> str | None:
-        edges = {'0 to 3': 3, '3 to 8': 8, 'more than 8': math.inf}
-        return next(f'{words} times the noise' for words, high in edges.items()
-                    if row['noises'] < high) if row['group'] == 'single' else None
-
     groups = {'none': 'no defect: nothing new is named', 'single': 'a defect of the library',
               'outside': 'a defect outside it: unknown or partly'}
-    head = ['trials', 'exactly right (90 % interval)', 'in the named set', 'labels permuted']
-    pairs = [(row['probability'], row['exact']) for row in rows]
-    return {
-        'Result': parts(lambda row: groups[row['group']]),
-        'By strength': parts(strength),
-        'By recording': parts(lambda row: row['recording']),
-        'By defect': parts(lambda row: ''.join(row['effects'])),
-        'How often verdicts of a probability are right': report_html.reliability_table(
-            scores.reliability(pairs)),
+
+    def parts(names: Sequence[str]) -> Table:
+        """Return the shares of rows by a name of each row; rows without a name do not count."""
+        return (['trials', 'exactly right (90 % interval)', 'in the named set',
+                 'labels permuted'], [
+            [name, *(scores.in_words(scores.share(part[key])) for key in ('exact', 'in_set')),
+             f'{part["by_chance"].mean():.2f}']
+            for name, part in pd.DataFrame(rows).groupby(np.array(names)) if name])
+
+    strengths = pd.cut([row['noises'] for row in rows], [-1, 3, 8, math.inf], right=False,
+                       labels=[f'{words} times the noise' for words in (
+                           '0 to 3', '3 to 8', 'more than 8')])
+    return Report('Blind check on real sensors', [
+        f'{made["trials"]} trials on recordings of real sensors, seed {made["seed"]}; SHA-256 '
+        f'of salt and labels {made["hash"]}; code of the diagnosis '
+        f'{made["diagnose_code"][:16]}.'], {
+        'Result': parts([groups[row['group']] for row in rows]),
+        'By strength': parts([strength if row['group'] == 'single' else ''
+                              for strength, row in zip(strengths, rows)]),
+        'By recording': parts([row['recording'] for row in rows]),
+        'By defect': parts([''.join(row['effects']) for row in rows]),
+        'How often verdicts of a probability are right': reliability(scores.reliability(
+            [(row['probability'], row['exact']) for row in rows])),
         'Untouched parts': (['recording', 'verdict', 'named'], [
             [name, status, ', '.join(named) or '-']
             for name, (status, named) in made['baseline'].items()]),
-        'Left out': (['recording'], [[text] for text in made['left_out']])}
-
-
-def said(made: dict[str, Any]) -> str:
-    """Return how the trials were drawn."""
-    return (f'{made["trials"]} trials on recordings of real sensors, seed {made["seed"]}; SHA-256 '
-            f'of salt and labels {made["hash"]}; code of the diagnosis '
-            f'{made["diagnose_code"][:16]}.')
+        'Left out': (['recording'], [[text] for text in made['left_out']])})

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 import math
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +16,9 @@ from adxl_ros_validation.blind.faults import NOISE_LIKE
 from adxl_ros_validation.blind.grading import Answer, UNKNOWN
 from adxl_ros_validation.blind.trials import Label
 import numpy as np
+import pandas as pd
 import scipy
+import yaml
 
 LEVEL = 0.9
 """Probability of all intervals."""
@@ -36,8 +40,59 @@ class Trial(NamedTuple):
     answer: Answer  # what the diagnosis answered
     held_out: dict[str, Any] | None  # result of `diagnosis_runs.evaluate`
 
+    def row(self) -> dict[str, Any]:
+        """Return what is known of it, and what the scores count."""
+        label, answer, gaps = self
+        truth, named, top = grading.truth(label), answer.named, sorted(answer.top)
+        groups = grading.answered_group(answer), grading.true_group(label)
+        right = grading.verdict_right(answer, label)
+        rivals = label.faults[0]['inseparable'] if label.faults else ()
+        return {
+            **{key: [fault[key] for fault in label.faults]
+               for key in ('strength_mps2', 'power', 'told', 'inseparable')},
+            'name': label.name, 'group': label.group, 'effects': list(label.effects),
+            'flexible': label.flexible, 'manoeuvre': label.manoeuvre, 'axes': label.axes,
+            'status': answer.status, 'top': top, 'named': sorted(named),
+            'probability': answer.probability, 'right': right, 'stated':
+            (answer.probability, right), 'seconds': answer.seconds, 'held': gaps,
+            'gap': answer.gap, 'flexible_sees': label.flexible >= grading.CERTAIN_POWER,
+            'effect': label.effects[0] if label.effects else 'none',
+            'said': answer.status if answer.status in ('failed', 'bad_data') else
+            'none' if not top else 'several' if len(top) > 1 else top[0],
+            'is_top': answer.top == truth, 'leads': truth <= answer.top,
+            'names': len(named & truth), 'names_all': truth <= named, 'set_size': len(named),
+            'inseparable_size': 1 + len(rivals),
+            'unknown': UNKNOWN in named | answer.top, 'seen': grading.visible(label),
+            'separable': grading.separable(label), 'material': grading.material(answer, label),
+            'limit_holds': grading.limit_holds(answer, label),
+            'brier': grading.brier(answer, label), 'utility': grading.utility(*groups),
+            'has_effect': any(groups[1]),
+            'harm': gaps is not None and gaps['harm_ci'][0] > _HARM * gaps['floor'],
+            'inside': self._inside(), **self._closed()}
 
-def share(hits: Sequence[bool] | np.ndarray) -> Score:
+    def _inside(self) -> tuple[int, int] | None:
+        """Count intervals with the truth, and all, of effects that are rightly named for sure."""
+        label, answer, _ = self
+        if label.group not in ('single', 'pair') or answer.groups \
+                or answer.certain != grading.truth(label):
+            return None
+        true = grading.true_parameters(label)
+        inside = [low <= true[name] <= high
+                  for name, (_, low, high) in answer.parameters.items() if name in true]
+        return (sum(inside), len(inside)) if inside else None
+
+    def _closed(self) -> dict[str, float | None]:
+        """Return the share closed of a visible gap on a held-out recording, by the oracle's."""
+        label, _, gaps = self
+        if gaps is None or label.group not in ('single', 'pair') or gaps['gap_ci'][0] <= 0 \
+                or not grading.visible(label):
+            return {'closed': None, 'by_oracle': None}
+        gap = gaps['before'] - gaps['floor']
+        part, oracle = (1 - (gaps[name] - gaps['floor']) / gap for name in ('after', 'oracle'))
+        return {'closed': part, 'by_oracle': part / oracle if oracle > 0 else None}
+
+
+def share(hits: Sequence[bool] | np.ndarray | pd.Series) -> Score:
     """Return the share of hits with Wilson's interval; None without trials."""
     count, true = len(hits), int(np.sum(hits))
     if not count:
@@ -54,29 +109,27 @@ def in_words(made: Score) -> str:
     return f'{value:.0f} % ({low:.0f} to {high:.0f}), n = {made["count"]}'
 
 
-def resampled(rows: Sequence[Any], statistic: Callable[[list[Any]], float] = np.mean) -> Score:
+def resampled(rows: Sequence[Any] | pd.Series, statistic: Callable[[list[Any]], float] = np.mean
+              ) -> Score:
     """Return a statistic of rows with its interval over resampled rows."""
     if not len(rows):
         return _NO_SCORE
+    rows = list(rows)
     rng = np.random.default_rng(0)
     drawn = [statistic([rows[i] for i in rng.integers(len(rows), size=len(rows))])
              for _ in range(_RESAMPLES)]
     low, high = np.nanquantile(drawn, ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
-    return {'value': float(statistic(list(rows))), 'ci': [float(low), float(high)],
+    return {'value': float(statistic(rows)), 'ci': [float(low), float(high)],
             'count': len(rows)}
 
 
-def by_strength(trials: Sequence[Trial], count: int = 8) -> list[dict[str, Any]]:
+def by_strength(rows: pd.DataFrame, count: int = 8) -> list[dict[str, Any]]:
     """Return the share detected, and that which the oracle sees, in bins of equal numbers."""
-    order = sorted(trials, key=lambda trial: trial.label.faults[0]['strength_mps2'])
-    parts = np.array_split(np.arange(len(order)), min(count, max(len(order) // 3, 1)))
-    rows = []
-    for part in ([order[i] for i in index] for index in parts if len(index)):
-        faults = [trial.label.faults[0] for trial in part]
-        rows.append({'strength': float(np.median([row['strength_mps2'] for row in faults])),
-                     **share([trial.answer.gap for trial in part]),
-                     'oracle': float(np.mean([row['power'] > 0.5 for row in faults]))})
-    return rows
+    rows = rows.assign(strength=rows.strength_mps2.str[0]).sort_values('strength', kind='stable')
+    parts = np.array_split(np.arange(len(rows)), min(count, max(len(rows) // 3, 1)))
+    return [{'strength': float(part.strength.median()), **share(part.gap),
+             'oracle': float((part.power.str[0] > 0.5).mean())}
+            for part in (rows.iloc[index] for index in parts) if len(part)]
 
 
 def reliability(rows: Sequence[tuple[float, bool]]) -> list[dict[str, Any]]:
@@ -95,12 +148,17 @@ def calibration_error(rows: Sequence[tuple[float, bool]]) -> float:
                for row in reliability(rows)) / max(len(rows), 1)
 
 
-class Bar(NamedTuple):
-    """What a score should reach; `low` or `high` may be infinite."""
+@dataclass(frozen=True)
+class Bar:
+    """A score: what it is of, in words, and what it should reach; see scores.yaml."""
 
     words: str
-    low: float
-    high: float
+    low: float = -math.inf  # `low` and `high` may be infinite
+    high: float = math.inf
+    result: bool = False  # stands with the bars though it has none
+    of: str = 'group == group'  # rows that count
+    zero: bool = False  # whether trials at strength zero count
+    statistic: tuple[str, str] = ('', '')  # its name and column
 
     def in_words(self) -> str:
         """Return the bar in words."""
@@ -110,18 +168,22 @@ class Bar(NamedTuple):
             f'{self.low:g} to {self.high:g}'
 
 
-BARS = {
-    'false_alarms': Bar('false alarms', -math.inf, 0.05),
-    'top_1': Bar('top-1 where the oracle separates it', 0.9, math.inf),
-    'set_recall': Bar('recall of the named set where the oracle sees it', 0.95, math.inf),
-    'calibration_error': Bar('calibration error', -math.inf, 0.05),
-    'coverage': Bar('coverage of 90 % intervals', 0.87, 0.93),
-    'closed_by_oracle': Bar('gap closed ÷ oracle, median', 0.95, math.inf),
-    'limit_held': Bar('upper limit of no gap holds the effect', 0.9, math.inf),
-    'harm': Bar('harm', -math.inf, 0.01),
-    'unknown_recall': Bar('recall of unknown where a flexible model sees it', 0.8, math.inf),
-}
-"""What a diagnosis should reach, by score; chosen."""
+def _table(text: str) -> dict[str, Bar]:
+    """Read the table of scores."""
+    return {name: Bar(**{key: row.pop(key) for key in [*row] if key not in _STATISTICS},
+                      statistic=row.popitem()) for name, row in yaml.safe_load(text).items()}
+
+
+_STATISTICS: dict[str, Callable[[pd.Series], Score]] = {
+    'share': share, 'mean': resampled, 'median': partial(resampled, statistic=np.median),
+    'ratio': partial(resampled, statistic=lambda counts: float(
+        np.divide(*np.sum(counts, axis=0)))),
+    'calibration': partial(resampled, statistic=calibration_error)}
+_SCORES = _table(Path(__file__).with_suffix('.yaml').read_text(encoding='utf-8'))
+BARS = {name: bar for name, bar in _SCORES.items() if (bar.low, bar.high) != (-math.inf, math.inf)}
+"""What a diagnosis should reach, by score."""
+WITHOUT_BAR = {name: bar for name, bar in _SCORES.items() if name not in BARS}
+"""The other scores."""
 FEWEST_TRIALS = 10
 """Fewest trials of a score that is compared with its bar; chosen: the 90 % interval of a share
 is about 0.5 wide there."""
@@ -149,131 +211,30 @@ def bars(made: dict[str, Any]) -> list[dict[str, Any]]:
 
 def scores(trials: Sequence[Trial]) -> dict[str, Any]:
     """Return every score."""
-    real = [trial for trial in trials if trial.label.group != 'zero']
-    confidences = [(trial.answer.probability, grading.verdict_right(trial.answer, trial.label))
-                   for trial in real]
-    singles = _group(real, 'single')
-    seen = _group(real, 'single', grading.visible)
-    pairs = [trial for trial in _group(real, 'pair') if grading.visible(trial.label)]
-    named_of_pair = [len(trial.answer.named & grading.truth(trial.label)) for trial in pairs]
-    limits = [grading.limit_holds(trial.answer, trial.label) for trial in real]
-    outside = _group(real, 'outside', lambda label: label.flexible >= grading.CERTAIN_POWER)
-    groups = [(grading.answered_group(trial.answer), grading.true_group(trial.label))
-              for trial in real]
+    rows = pd.DataFrame([trial.row() for trial in trials])
+    real = rows[rows.group != 'zero']
+    single, pairs, outside = (real[real.group == group] for group in ('single', 'pair', 'outside'))
+    pairs, is_noise = pairs[pairs.seen], single.effect.isin(NOISE_LIKE)
+    true = real.effect.where(real.group == 'single', real.group.map(
+        {'none': 'none', 'outside': UNKNOWN}))
     return {
-        'false_alarms': share([trial.answer.gap for trial in _group(real, 'none')]),
-        'top_1': share([_top(trial) for trial in _group(real, 'single', grading.separable)]),
-        'set_recall': share([_effect(trial) in trial.answer.named for trial in seen]),
-        'unknown_recall': share([_unknown(trial) for trial in outside]),
-        'verdict_right': share([right for _, right in confidences]),
-        'utility': resampled([grading.utility(*pair) for pair in groups]),
-        'utility_of_effects': resampled([grading.utility(group, true) for group, true in groups
-                                         if any(true)]),
-        'detection': {
-            'of the mean': by_strength([t for t in singles if _effect(t) not in NOISE_LIKE]),
-            'noise like': by_strength([t for t in singles if _effect(t) in NOISE_LIKE]),
-            'outside': by_strength(_group(real, 'outside'))},
-        'top_1_all_singles': share([_top(trial) for trial in singles]),
-        'leading': share([_effect(trial) in trial.answer.top for trial in seen]),
-        'set_size': resampled([len(trial.answer.named) for trial in seen]),
-        'inseparable_size': resampled(
-            [1 + len(trial.label.faults[0]['inseparable']) for trial in seen]),
-        'brier': resampled([grading.brier(trial.answer, trial.label) for trial in real]),
-        'calibration_error': resampled(confidences, calibration_error),
-        'reliability': reliability(confidences),
-        'coverage': _coverage(real),
-        **_held(real),
-        'unknown_recall_all': share([_unknown(trial) for trial in _group(real, 'outside')]),
-        'unknown_wrongly': share([_unknown(trial) for trial in real
-                                  if trial.label.group != 'outside']),
-        'pairs': {'whole': share([n == 2 for n in named_of_pair]),
-                  'in_part': share([n == 1 for n in named_of_pair]),
-                  'exactly': share([_top(trial) for trial in pairs])},
-        'by_effect': _by_effect(real),
-        'limit_held': share([held for held in limits if held is not None]),
-        'confusion': _confusion(real),
-        'seconds': resampled([trial.answer.seconds for trial in trials], np.median),
-        'longest_s': max((trial.answer.seconds for trial in trials), default=0.0),
-        'status': dict(Counter(trial.answer.status for trial in real)),
+        **{name: _STATISTICS[bar.statistic[0]](
+            (rows if bar.zero else real).query(bar.of)[bar.statistic[1]].dropna())
+            for name, bar in _SCORES.items()},
+        'detection': {'of the mean': by_strength(single[~is_noise]),
+                      'noise like': by_strength(single[is_noise]),
+                      'outside': by_strength(outside)},
+        'reliability': reliability(real.stated.tolist()),
+        'pairs': {'whole': share(pairs.names == 2), 'in_part': share(pairs.names == 1),
+                  'exactly': share(pairs.is_top)},
+        'by_effect': {name: {'trials': len(part), 'detected': int(part.gap.sum()),
+                             'named': int(part.names_all.sum()), 'top': int(part.is_top.sum())}
+                      for name, part in real[real.seen & real.group.isin(
+                          ['single', 'outside'])].groupby('effect')},
+        'confusion': {name: dict(Counter(part)) for name, part in real.said.groupby(true)},
+        'longest_s': float(rows.seconds.max()),
+        'status': dict(Counter(real.status)),
     }
-
-
-def _group(trials: Sequence[Trial], name: str,
-           test: Callable[[Label], bool] | None = None) -> list[Trial]:
-    """Return the trials of a group; with a test those that pass it with material effects."""
-    return [trial for trial in trials if trial.label.group == name and (
-        test is None or (test(trial.label) and grading.material(trial.answer, trial.label)))]
-
-
-def _effect(trial: Trial) -> str:
-    return trial.label.effects[0]
-
-
-def _top(trial: Trial) -> bool:
-    return trial.answer.top == grading.truth(trial.label)
-
-
-def _unknown(trial: Trial) -> bool:
-    return UNKNOWN in trial.answer.named or UNKNOWN in trial.answer.top
-
-
-def _coverage(real: Sequence[Trial]) -> Score:
-    """Return the coverage by intervals of effects that are rightly named for certain."""
-    rows: list[tuple[int, int]] = []
-    for trial in real:
-        if trial.label.group not in ('single', 'pair') or trial.answer.groups \
-                or trial.answer.certain != grading.truth(trial.label):
-            continue
-        true = grading.true_parameters(trial.label)
-        inside = [low <= true[name] <= high
-                  for name, (_, low, high) in trial.answer.parameters.items() if name in true]
-        if inside:
-            rows.append((sum(inside), len(inside)))
-    return resampled(rows, lambda counts: float(np.divide(*np.sum(counts, axis=0))))
-
-
-def _held(real: Sequence[Trial]) -> dict[str, Any]:
-    """Return the share closed on held-out recordings, its ratio to the oracle's, and the harm."""
-    closed, ratio, harm = [], [], []
-    for trial in real:
-        gaps = trial.held_out
-        harm.append(gaps is not None and gaps['harm_ci'][0] > _HARM * gaps['floor'])
-        if gaps is None or trial.label.group not in ('single', 'pair') \
-                or gaps['gap_ci'][0] <= 0 or not grading.visible(trial.label):
-            continue
-        gap = gaps['before'] - gaps['floor']
-        part, oracle = (1 - (gaps[name] - gaps['floor']) / gap for name in ('after', 'oracle'))
-        closed.append(part)
-        if oracle > 0:
-            ratio.append(part / oracle)
-    return {'closed': resampled(closed, np.median),
-            'closed_by_oracle': resampled(ratio, np.median), 'harm': share(harm)}
-
-
-def _by_effect(real: Sequence[Trial]) -> dict[str, dict[str, int]]:
-    """Count trials, detected, named and top for each effect that the ideal observer sees."""
-    table: dict[str, Counter] = {}
-    for trial in real:
-        if trial.label.group in ('single', 'outside') and grading.visible(trial.label):
-            true = grading.truth(trial.label)
-            table.setdefault(_effect(trial), Counter()).update({
-                'trials': 1, 'detected': int(trial.answer.gap),
-                'named': int(true <= trial.answer.named), 'top': int(_top(trial))})
-    return {name: dict(row) for name, row in sorted(table.items())}
-
-
-def _confusion(real: Sequence[Trial]) -> dict[str, dict[str, int]]:
-    """Count top answers by true effect, without pairs."""
-    table: dict[str, Counter] = {}
-    for trial in real:
-        label, top = trial.label, trial.answer.top
-        if label.group == 'pair':
-            continue
-        row = {'none': 'none', 'outside': UNKNOWN}.get(label.group) or _effect(trial)
-        column = trial.answer.status if trial.answer.status in ('failed', 'bad_data') \
-            else 'none' if not top else 'several' if len(top) > 1 else next(iter(top))
-        table.setdefault(row, Counter())[column] += 1
-    return {name: dict(row) for name, row in sorted(table.items())}
 
 
 _CHANCE = 0.002

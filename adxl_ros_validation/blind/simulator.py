@@ -5,9 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, KW_ONLY
-from enum import auto, Enum
+from enum import Enum
+from functools import partial
 from itertools import product
 import math
+from pathlib import Path
 from typing import Any
 import zlib
 
@@ -85,38 +87,29 @@ def draw_unit(rng: np.random.Generator) -> Unit:
 def parameter_file(unit: Unit, serial: str, *, nominal_zero_v: float = 2.5,
                    is_certain: bool = False, **sensor: float) -> str:
     """Return the parameter file that the user has, with other values of the sensor, if any."""
-    n, resistance = len(unit.axes), 32e3
-    names = ('bias.offset_v', 'scale_factor.offset_v_per_g')
-    variance = np.repeat(np.square((ZERO_G_STD_G, SCALE_STD)), n) * np.tile(
-        unit.stated_scale_v_per_g, 2) ** 2
-    stated = {} if is_certain else {
-        'covariance_names': [f'{name}.{axis}' for name in names for axis in unit.axes],
-        'covariance': np.diag(variance).ravel().tolist()}
-    return yaml.safe_dump({'/**': {'ros__parameters': {
-        'format': 1, 'units': 'V, V/g, 1/g, rad', 'model': 'linear',
-        'sensor': {
-            'serial': serial, 'axes': unit.axes, 'nominal_zero_g_v': [nominal_zero_v] * n,
-            'nominal_scale_v_per_g': [1.0] * n,
-            'noise_density_g_per_rthz': unit.stated_noise_g_per_rthz.tolist(),
-            'rc_resistance_ohm': resistance,
-            'rc_capacitance_f': float(1 / (2 * np.pi * resistance * unit.corner_hz)),
-            'adc_bits': ADC_BITS, 'adc_vref_v': ADC_VREF, 'rate_hz': unit.rate_hz,
-            'range_g': 1.7, 'local_gravity_mps2': G0, 'z_sign': 1, **sensor},
-        'stage': {'resolution_rad': unit.resolution_rad}, 'effects': ['bias', 'scale_factor'],
+    file = yaml.safe_load(Path(__file__).with_name('unit.yaml').read_text(encoding='utf-8'))
+    keys, ones = file['/**']['ros__parameters'], np.ones(len(unit.axes))
+    keys['sensor'].update({
+        'serial': serial, 'axes': unit.axes, 'nominal_zero_g_v': (nominal_zero_v * ones).tolist(),
+        'nominal_scale_v_per_g': ones.tolist(),
+        'noise_density_g_per_rthz': unit.stated_noise_g_per_rthz.tolist(), 'rc_capacitance_f':
+        float(1 / (2 * np.pi * keys['sensor']['rc_resistance_ohm'] * unit.corner_hz)),
+        'adc_bits': ADC_BITS, 'adc_vref_v': ADC_VREF, 'rate_hz': unit.rate_hz, **sensor})
+    keys.update({
+        'stage': {'resolution_rad': unit.resolution_rad},
         'bias': {'offset_v': (unit.stated_zero_v - nominal_zero_v).tolist()},
-        'scale_factor': {'offset_v_per_g': (unit.stated_scale_v_per_g - 1.0).tolist()},
-        **stated, 'provenance': {'source': 'sweep'}}}}, sort_keys=False)
+        'scale_factor': {'offset_v_per_g': (unit.stated_scale_v_per_g - 1.0).tolist()}})
+    names = ('bias.offset_v', 'scale_factor.offset_v_per_g')
+    variance = np.outer(np.square((ZERO_G_STD_G, SCALE_STD)), unit.stated_scale_v_per_g ** 2)
+    keys['covariance_names'] = [f'{name}.{axis}' for name in names for axis in unit.axes]
+    keys['covariance'] = np.diag(variance.ravel()).ravel().tolist()
+    if is_certain:
+        del keys['covariance_names'], keys['covariance']
+    return yaml.safe_dump(file, sort_keys=False)
 
 
-class Place(Enum):
-    """Where in the chain a fault acts."""
-
-    STAGE = auto()
-    MOUNT = auto()
-    ELEMENT = auto()
-    ELECTRONICS = auto()
-    WIRE = auto()
-    SAMPLES = auto()
+Place = Enum('Place', ['STAGE', 'MOUNT', 'ELEMENT', 'ELECTRONICS', 'WIRE', 'SAMPLES'])
+"""Where in the chain a fault acts."""
 
 
 @dataclass
@@ -209,36 +202,22 @@ def constant(run: Run, shape: Shape) -> float:
     return 1.0
 
 
-def added(law: Law) -> Act:
-    """Add a law to the input of each axis by its weight, g."""
+def _acting(how: str, law: Law) -> Act:
+    """Let a law act on each axis by its weight."""
     def act(run: Run, size: float, shape: Shape) -> None:
-        w = column(shape)
-        run.u[:len(w)] += size * w * law(run, shape)
+        change = size * column(shape) * law(run, shape)
+        if how == 'scaled':
+            run.u[:len(change)] *= 1 + change
+        elif how == 'added':
+            run.u[:len(change)] += change
+        else:
+            run.volts += change * (run.unit.scale_v_per_g[:, None] if how == 'output' else 1.0)
     return act
 
 
-def scaled(law: Law) -> Act:
-    """Change the scale factor of each axis by a law and its weight."""
-    def act(run: Run, size: float, shape: Shape) -> None:
-        w = column(shape)
-        run.u[:len(w)] *= 1 + size * w * law(run, shape)
-    return act
-
-
-def added_v(law: Law) -> Act:
-    """Add a law to the output of each axis by its weight, V."""
-    def act(run: Run, size: float, shape: Shape) -> None:
-        run.volts += size * column(shape) * law(run, shape)
-    return act
-
-
-def added_at_output(law: Law) -> Act:
-    """Add a law to the output of each axis by its weight, g."""
-    def act(run: Run, size: float, shape: Shape) -> None:
-        run.volts += size * column(shape) * law(run, shape) * run.unit.scale_v_per_g[:, None]
-    return act
-
-
+added, scaled, added_at_output, added_v = (
+    partial(_acting, how) for how in ('added', 'scaled', 'output', 'volts'))
+"""Make a fault of a law: added to the input, g, its scale factor, or to the output, g or V."""
 _SINGLE_SHARE = 0.4
 """Share of the faults that have one weight only; chosen."""
 _LOG_SPREAD = 0.4
@@ -271,13 +250,18 @@ class Kind:
     fixed: int = 0  # number of its weights; where it is 0, `each` for each measured axis
     each: int = 1
     weigh: Callable[[np.random.Generator, int], np.ndarray] = weights  # draws the weights
-    # its other numbers: bounds of each, or a list to choose from
-    bounds: Mapping[str, tuple[float, float] | list[float]] = field(default_factory=dict)
+    # its other numbers, drawn within bounds or from a list
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    choices: Mapping[str, Sequence[float]] = field(default_factory=dict)
     per_axis: bool = True  # whether the responses of single axes are independent
     random: bool = False  # whether it differs from run to run
     # multiples of `start`, and other numbers, at which its responses span all
-    sizes: tuple[float, ...] = (1.0,)
-    spread_at: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    sizes: Sequence[float] = (1.0,)
+    spread_at: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    # what the package calls its weights; see the table
+    same: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+    needs: str = ''  # what a recording must have for it to act or to show
+    at_rest: bool = False  # whether a calibration at rest takes a part of it up
 
     def _count(self, unit: Unit) -> int:
         return self.fixed or self.each * len(unit.axes)
@@ -286,9 +270,8 @@ class Kind:
         """Draw the shape of a fault of a unit."""
         count = self._count(unit)
         shape: Shape = {'w': self.weigh(rng, count)} if count else {}
-        for name, limits in self.bounds.items():
-            shape[name] = float(rng.choice(limits) if isinstance(limits, list)
-                                else rng.uniform(*limits))
+        shape |= {name: float(rng.uniform(*limits)) for name, limits in self.bounds.items()}
+        shape |= {name: float(rng.choice(values)) for name, values in self.choices.items()}
         return shape
 
     def spread(self, unit: Unit) -> list[Shape]:
@@ -298,6 +281,20 @@ class Kind:
         shapes: list[Shape] = [{'w': row} for row in rows if count] or [{}]
         return [{**shape, **dict(zip(self.spread_at, numbers))}
                 for shape in shapes for numbers in product(*self.spread_at.values())]
+
+
+def load_kinds(table: str, functions: Mapping[str, Any]) -> tuple[dict[str, Kind], ...]:
+    """Return the listed and the unlisted faults of a table, whose functions have their names."""
+    named = {**globals(), **functions}
+
+    def kind(name: str, law: str = '', place: str = 'element', weigh: str = 'weights',
+             **numbers: Any) -> Kind:
+        act = named[law](named[name]) if law else named[name]
+        return Kind(name, act, place=Place[place.upper()], weigh=named[weigh], **numbers)
+
+    parts = yaml.safe_load((Path(__file__).parents[1] / table).read_text(encoding='utf-8'))
+    return tuple({name: kind(name, **row) for name, row in parts[part].items()}
+                 for part in ('listed', 'unlisted'))
 
 
 @dataclass(frozen=True)

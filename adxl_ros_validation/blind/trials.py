@@ -8,11 +8,13 @@ reports as they are made.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from datetime import date
 from functools import partial
 import hashlib
+import itertools
 import json
 import math
 import os
@@ -26,7 +28,7 @@ from adxl_ros.workers import for_each, Pool, write
 from adxl_ros_validation.blind import ideal_observer, motion, simulator
 from adxl_ros_validation.blind.faults import KINDS, KNOWN, UNLISTED
 from adxl_ros_validation.blind.ideal_observer import IdealObserver
-from adxl_ros_validation.blind.simulator import Fault, G0, Scene
+from adxl_ros_validation.blind.simulator import Fault, G0, Kind, Scene, Unit
 import numpy as np
 
 STRENGTHS_MPS2 = (0.02e-3 * G0, 15e-3 * G0)
@@ -114,10 +116,8 @@ def plans(seed: int, count: int, seconds: tuple[float, float] = SECONDS) -> list
 
 def _turns(names: tuple[str, ...], count: int, rng: np.random.Generator) -> list[str]:
     """Return each name in turn, in a new random order in each round."""
-    rounds: list[str] = []
-    while len(rounds) < count:
-        rounds += [str(name) for name in rng.permutation(names)]
-    return rounds[:count]
+    turns = (str(name) for _ in itertools.count() for name in rng.permutation(names))
+    return list(itertools.islice(turns, count))
 
 
 def scene(plan: Plan, held_out: bool = False) -> Scene:
@@ -154,11 +154,8 @@ def _with_faults(label: Label, observer: IdealObserver) -> Label:
     rivals = observer.rivals()
     rows, flexible = [], 0.0
     for name in label.effects:
-        kind = KINDS[name]
-        strength = math.exp(rng.uniform(*np.log(STRENGTHS_MPS2)))
-        shape = kind.draw(rng, observer.scene.unit)
-        fault, found, change = sized(partial(measured, observer.scene, observer.force),
-                                     Fault(kind, kind.start, shape), strength)
+        fault, _, found, change = sized(rng, KINDS[name], observer.scene.unit, STRENGTHS_MPS2,
+                                        partial(measured, observer.scene, observer.force))
         row = _visibility(observer, rivals, fault, change)
         rows.append({**described(fault, found), **row,
                      'strength_floors': found / label.floor_mps2})
@@ -167,29 +164,32 @@ def _with_faults(label: Label, observer: IdealObserver) -> Label:
     return replace(label, faults=rows, flexible=flexible)
 
 
-def sized(measure: Callable[[Fault], tuple[float, np.ndarray]], fault: Fault, strength: float
-          ) -> tuple[Fault, float, np.ndarray]:
+def sized(rng: np.random.Generator, kind: Kind, unit: Unit, bounds: tuple[float, float],
+          measure: Callable[[Fault], tuple[float, np.ndarray]], per_mps2: float = 1.0
+          ) -> tuple[Fault, float, float, np.ndarray]:
     """
-    Find the size of a fault that has a strength, or its largest; return what was measured last.
+    Draw a fault of a strength, log-uniform within bounds; it has this or its largest size.
 
-    `measure` returns the strength of a fault, m/s², and what it does.
+    The bounds are in units of `per_mps2`. `measure` returns the strength of a fault, m/s², and
+    what it does. Return the fault, the drawn strength, and what was measured last.
     """
-    sizes: list[float] = []
-    strengths: list[float] = []
-    while True:
+    strength = per_mps2 * math.exp(rng.uniform(*np.log(bounds)))
+    fault = Fault(kind, kind.start, kind.draw(rng, unit))
+    previous = math.nan, math.nan
+    for steps in itertools.count(1):
         rms, change = measure(fault)
-        sizes.append(math.log(fault.size))
-        strengths.append(math.log(max(rms, 1e-12)))
-        missing = math.log(strength) - strengths[-1]
-        if abs(missing) < _SIZE_TOLERANCE or len(sizes) == _MAX_SIZE_STEPS or (
+        here = math.log(fault.size), math.log(max(rms, 1e-12))
+        missing = math.log(strength) - here[1]
+        if abs(missing) < _SIZE_TOLERANCE or steps == _MAX_SIZE_STEPS or (
                 fault.size == fault.kind.largest and rms < strength):
-            return fault, rms, change
+            break
         slope = 1.0
-        if len(sizes) > 1 and sizes[-1] != sizes[-2]:
-            slope = (strengths[-1] - strengths[-2]) / (sizes[-1] - sizes[-2])
+        if steps > 1 and here[0] != previous[0]:
+            slope = (here[1] - previous[1]) / (here[0] - previous[0])
         step = missing / min(max(slope, 0.7), 30.0)
         size = fault.size * math.exp(min(max(step, -3.0), 3.0))
-        fault = replace(fault, size=min(size, fault.kind.largest))
+        previous, fault = here, replace(fault, size=min(size, fault.kind.largest))
+    return fault, strength, rms, change
 
 
 def measured(scene: Scene, force: np.ndarray, fault: Fault) -> tuple[float, np.ndarray]:
@@ -239,86 +239,104 @@ class Setup(NamedTuple):
     trials: int  # number of trials, without those at strength zero
 
 
-def seal(folder: Path, seed: int | None, count: int, plan_all: Callable[[int, int], list[Plan]],
-         make: Callable[[Plan], Drawn], pool: Pool, show: Callable[[float], None]) -> str:
+Show = Callable[[str], AbstractContextManager[Callable[[float], None]]]
+"""Receives the name of a stage; gives a context with what receives the finished fraction."""
+
+
+def seal(folder: Path, plan_all: Callable[[int, int], list[Plan]], make: Callable[[Plan], Drawn],
+         seed: int | None, count: int, pool: Pool, show: Show) -> str:
     """
     Draw trials into a folder and publish the hash of their labels.
 
     A call on a folder that has them returns the hash; an interrupted one continues.
     """
-    drawn, existing = folder / 'labels' / 'drawn', None
-    is_sealed = (folder / _SEAL).exists()
-    if is_sealed:
-        existing = committed_labels(folder)[0]
-    elif (drawn / 'setup').exists():
-        existing = Setup(*json.loads((drawn / 'setup').read_bytes()))
-    elif any(folder.glob('*')):
+    drawn, is_sealed = folder / 'labels' / 'drawn', (folder / _SEAL).exists()
+    known = committed_labels(folder)[0] if is_sealed else Setup(*json.loads(
+        (drawn / 'setup').read_bytes())) if (drawn / 'setup').exists() else None
+    if known is None and any(folder.glob('*')):
         raise UserError(f'{folder}: is not empty and has no check; choose another folder')
     if seed is None:
-        seed = existing.seed if existing else secrets.randbelow(2 ** 31)
+        seed = known.seed if known else secrets.randbelow(2 ** 31)
     setup = Setup(seed, count)
-    if existing not in (None, setup):
+    if known not in (None, setup):
         raise UserError(f'{folder}: has a check of another seed or number of trials; repeat the '
                         'same options to continue it, or choose another folder')
     if not is_sealed:
-        _draw(folder, drawn, setup, plan_all(*setup), make, pool, show)
+        write(drawn / 'setup', json.dumps(setup).encode())
+        plans = {plan.name: plan for plan in plan_all(*setup)}
+        with show('draw') as advance:
+            labels = kept(drawn, sorted(plans), partial(_made, make),
+                          lambda name: (plans[name],), pool, advance)
+        text = json.dumps({'salt': secrets.token_hex(16), **setup._asdict(),
+                           'labels': list(labels.values())}, indent=1).encode()
+        write(folder / 'labels' / 'labels.json', text)
+        write(folder / _SEAL, json.dumps({
+            'sha256_of_salt_and_labels': hashlib.sha256(text).hexdigest(), 'cases': len(labels),
+            'date': str(date.today())}, indent=1).encode())
     shutil.rmtree(drawn, ignore_errors=True)
     return published_hash(folder)
 
 
-def _draw(folder: Path, drawn: Path, setup: Setup, plans: list[Plan],
-          make: Callable[[Plan], Drawn], pool: Pool, show: Callable[[float], None]) -> None:
-    """Draw what is not drawn yet, then write all labels and publish their hash."""
-    write(drawn / 'setup', json.dumps(setup).encode())
+def _made(make: Callable[[Plan], Drawn], plan: Plan) -> tuple[str, dict[str, Any], list]:
+    """Make a trial; return its name, its label and the texts of its files."""
+    label, *texts = make(plan)
+    return label.name, asdict(label), texts
 
-    def keep(label: Label, *texts: str | None) -> None:
-        for suffix, text in zip(('csv', 'yaml', 'sim'), texts):
-            if text is not None:
-                path = folder / 'recordings' / f'{label.name}.{suffix}'
-                write(path, text.encode())
-                # The time of writing would show how long the label took to draw.
-                os.utime(path, (0, 0))
-        write(drawn / f'{label.name}.json', json.dumps(asdict(label)).encode())
 
-    todo = [plan for plan in plans if not (drawn / f'{plan.name}.json').exists()]
-    for_each(pool, make, [partial(tuple, (plan,)) for plan in todo], keep, show,
-             len(plans) - len(todo))
-    rows = [json.loads(path.read_bytes()) for path in sorted(drawn.glob('*.json'))]
-    text = json.dumps({'salt': secrets.token_hex(16), **setup._asdict(), 'labels': rows},
-                      indent=1).encode()
-    write(folder / 'labels' / 'labels.json', text)
-    write(folder / _SEAL, json.dumps({
-        'sha256_of_salt_and_labels': hashlib.sha256(text).hexdigest(), 'cases': len(rows),
-        'date': str(date.today())}, indent=1).encode())
+def kept(folder: Path, names: Sequence[str], work: Callable[..., tuple],
+         job: Callable[[str], tuple], pool: Pool, show: Callable[[float], None]
+         ) -> dict[str, Any]:
+    """
+    Do the work that has no result in a folder yet, and return all results by name.
+
+    `work` returns a name, its result, and the texts of the files of a trial that was drawn.
+    """
+    def keep(name: str, result: Any, texts: Iterable[str | None] = ()) -> None:
+        save(folder.parents[1] / 'recordings', name, texts)
+        write(folder / f'{name}.json', json.dumps(result).encode())
+
+    todo = [name for name in names if not (folder / f'{name}.json').exists()]
+    for_each(pool, work, [partial(job, name) for name in todo], keep, show,
+             len(names) - len(todo))
+    return {name: json.loads((folder / f'{name}.json').read_bytes()) for name in names}
+
+
+def save(folder: Path, name: str, texts: Iterable[str | None]) -> None:
+    """Write recording, parameters and another simulator's force, if any, with the time 0."""
+    for suffix, text in zip(('csv', 'yaml', 'sim'), texts):
+        if text is not None:
+            write(folder / f'{name}.{suffix}', text.encode())
+            # The time of writing would show how long the label took to draw.
+            os.utime(folder / f'{name}.{suffix}', (0, 0))
+
+
+@contextmanager
+def _explained(path: Path, missing: str) -> Iterator[None]:
+    """Say in one line why a file of a check cannot be used."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise UserError(f'{path}: no such file; {missing}') from None
+    except (ValueError, KeyError, TypeError):
+        raise UserError(f'{path}: is damaged or of another version; draw a new check into another '
+                        'folder') from None
 
 
 def published_hash(folder: Path) -> str:
     """Return the published hash of a folder's labels."""
-    path = folder / _SEAL
-    try:
-        return str(json.loads(path.read_bytes())['sha256_of_salt_and_labels'])
-    except FileNotFoundError:
-        raise UserError(f'{folder}: no labels are committed there; use --seal {folder} first'
-                        ) from None
-    except (ValueError, KeyError, TypeError):
-        raise UserError(f'{path}: has no hash; draw a new check into another folder') from None
+    with _explained(folder / _SEAL, f'commit labels by --seal {folder} first'):
+        return str(json.loads((folder / _SEAL).read_bytes())['sha256_of_salt_and_labels'])
 
 
 def committed_labels(folder: Path) -> tuple[Setup, list[Label]]:
     """Read the labels and compare them with the published hash."""
     digest, path = published_hash(folder), folder / 'labels' / 'labels.json'
-    try:
+    with _explained(path, 'copy it from where the check was drawn'):
         text = path.read_bytes()
-    except FileNotFoundError:
-        raise UserError(f'{path}: no such file; copy it from where the check was drawn') from None
-    if hashlib.sha256(text).hexdigest() != digest:
-        raise UserError(f'{path}: these are not the labels whose hash {digest} was published; '
-                        'they were changed since')
-    try:
+        if hashlib.sha256(text).hexdigest() != digest:
+            raise UserError(f'{path}: these are not the labels whose hash {digest} was published; '
+                            'they were changed since')
         content: dict[str, Any] = json.loads(text)
         return Setup(content['seed'], content['trials']), [Label(**row | {
             name: tuple(row[name]) for name in ('effects', 'seed', 'seconds')})
             for row in content['labels']]
-    except (ValueError, KeyError, TypeError):
-        raise UserError(f'{path}: is of another version; draw a new check into another folder'
-                        ) from None

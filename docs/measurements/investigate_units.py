@@ -21,7 +21,7 @@ import json
 from pathlib import Path
 import time
 
-from adxl_ros.diagnose.noise_effects import UNKNOWN
+from adxl_ros.diagnose.verdict import UNKNOWN
 from adxl_ros.files import parameter_file
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.investigate.diagnosis_round import Outcome, Question, run_round

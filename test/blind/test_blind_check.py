@@ -15,7 +15,7 @@ from adxl_ros_validation.blind import (
     grading,
     ideal_observer,
     motion,
-    report_html,
+    report,
     scores,
     simulator,
     trials,
@@ -68,13 +68,9 @@ def short_plans(seed, count):
     return plans(seed, count, SECONDS)
 
 
-def no_progress(fraction):
-    """Receive the fraction that is finished."""
-
-
 @contextmanager
 def show(stage):
-    yield no_progress
+    yield lambda fraction: None
 
 
 def scored(folder, body, pool):
@@ -103,7 +99,7 @@ def pool():
 def committed_check(tmp_path_factory):
     folder = tmp_path_factory.mktemp('check') / 'blind'
     with open_pool(None) as pool:
-        trials.seal(folder, SEED, TRIALS, short_plans, trials.draw_trial, pool, no_progress)
+        trials.seal(folder, short_plans, trials.draw_trial, SEED, TRIALS, pool, show)
     return folder
 
 
@@ -168,8 +164,8 @@ def test_a_failed_diagnosis_is_counted(monkeypatch):
     result = diagnosis_runs.diagnose('r0', b'time_s,x_v\n', b'')[1]
     given = grading.answer(result)
     assert (given.status, given.gap, result['error']) == ('failed', False, 'no such thing')
-    for report in ({}, {'verdict': None}, {'verdict': {'status': 'explained'}}, []):
-        assert grading.answer({'report': report, 'seconds': 1.0}).status == 'failed'
+    for given in ({}, {'verdict': None}, {'verdict': {'status': 'explained'}}, []):
+        assert grading.answer({'report': given, 'seconds': 1.0}).status == 'failed'
 
 
 def padded(label, recording):
@@ -195,11 +191,12 @@ def test_a_generator_that_leaks_labels_is_detected(null_check, tmp_path, pool):
                             for suffix in ('csv', 'yaml'))
         return trials.Drawn(label, padded(label, text), parameters)
 
-    trials.seal(folder, SEED, TRIALS, short_plans, leaking, pool, no_progress)
+    trials.seal(folder, short_plans, leaking, SEED, TRIALS, pool, show)
     shutil.copytree(null_check[0] / 'labels' / 'held', folder / 'labels' / 'held')
     made = scored(folder, PADDED, pool)
     assert made['controls']['metadata_only']['leaks'] and made['leaks']
-    assert 'LEAKS' in report_html.summary(made) and 'LEAKS' in report_html.page(made)
+    said = report.of_simulated(made)
+    assert 'LEAKS' in ''.join(said.screen()) and 'LEAKS' in said.markdown()
 
 
 def drawn_labels():

@@ -41,21 +41,21 @@ def refuse(*_: object) -> float:
 
 
 def test_a_row_that_fails_is_named_and_the_others_stand(monkeypatch, capsys) -> None:
-    def measure(subject: bench_command._Subject, seconds: float) -> bench_command._Result:
-        return refuse() if 'iio' in subject.label else bench_command._Result(
-            1000.0, 0, 0.5, 1.0, (0.1,))
+    def measure(subject: bench_command._Subject, seconds: float) -> dict:
+        return refuse() if 'iio' in subject.label else {
+            'first_s': 2.0, 'rate_hz': 1000.0, 'missing': 0, 'p50_ms': 0.5, 'p99_ms': 1.0,
+            'loads': (0.1,)}
 
     labels = 'bare publisher and relay', 'driver, iio, compensation', 'driver, sim, compensation'
     monkeypatch.setattr(bench_command, '_subjects', lambda *_: [
         bench_command._Subject(label, 'imu/data', []) for label in labels])
     monkeypatch.setattr(bench_command, '_measure', measure)
-    monkeypatch.setattr(bench_command, '_first_sample_s', refuse)
     bench_command.measure_live(1.0, 3, None)
     table = capsys.readouterr().out.splitlines()[2:]
     assert table[1] == f'{labels[1]:27} failed in 3 of 3 rounds: no messages for 20 s'
     assert [line[:34].split()[-1] for line in table[0:3:2]] == ['1000', '1000']
     assert f'CPU of {labels[2]} by that of the {labels[0]}: 1.00' in table
-    assert 'First sample of compensation: no messages for 20 s' in table
+    assert 'First sample of compensation: 2.00 (2.00–2.00) s after its start' in table
 
     failing = Job('apply', refuse)
     print_table([failing, Job('count', lambda: None)], 1)

@@ -5,6 +5,7 @@ from adxl_ros.files import parameter_file
 from adxl_ros.model.constants import Z_90
 from adxl_ros_validation import experiments
 import numpy as np
+import pandas as pd
 import pytest
 from units import NOMINAL
 
@@ -22,25 +23,26 @@ def evaluations():
 
 
 def angles_of(evaluated, model):
-    return [a for unit in evaluated for a in unit.models[model].all_angles()]
+    errors = pd.concat([unit.angles for unit in evaluated])
+    return errors[errors.counts & (errors.model == model)]
 
 
-def rms(parts):
-    return np.sqrt(np.mean(np.concatenate(parts) ** 2))
+def rms(values):
+    return np.sqrt(np.mean(values ** 2))
 
 
-@pytest.mark.parametrize('stage, without_stage', [('perfect', True), ('paper', False)])
-def test_tilt_error_reaches_its_bound(evaluations, stage, without_stage):
+@pytest.mark.parametrize('stage, bound', [('perfect', 'pose_bound'), ('paper', 'bound')])
+def test_tilt_error_reaches_its_bound(evaluations, stage, bound):
     """The error is at most 1.10 of the bound by noise, or by noise, stage and calibration."""
-    assert rms([a.ratio(without_stage) for a in angles_of(evaluations[stage], 'full')]) < 1.10
+    errors = angles_of(evaluations[stage], 'full')
+    assert rms(errors.error / errors[bound]) < 1.10
 
 
 @pytest.mark.parametrize('stage', ['perfect', 'paper'])
 def test_alpha_errors_are_below_those_of_the_linear_model(evaluations, stage):
     """15° or more from ±90° the error falls by 88.9 % (physical) and 98 % (full)."""
-    error_rad = {model: rms([a.error[a.determined[:, 0] & ~a.near_vertical, 0]
-                             for a in angles_of(evaluations[stage], model)])
-                 for model in experiments.MODELS}
+    error_rad = {model: rms(angles_of(evaluations[stage], model).query(
+        'angle == "alpha" and not near_vertical').error) for model in experiments.MODELS}
     assert 1 - error_rad['physical'] / error_rad['linear'] >= 0.889
     assert 1 - error_rad['full'] / error_rad['linear'] >= 0.98
 
@@ -50,7 +52,7 @@ def test_motion_error_reaches_the_noise_floor(evaluations):
     nominal = parameter_file.load(NOMINAL)
     bound = experiments.motion_bound_mmps2(nominal)
     assert bound == pytest.approx(5.08, abs=0.01)
-    error_mmps2 = [unit.models['full'].motion[0]
+    error_mmps2 = [unit.motion['full'][0]
                    for evaluated in evaluations.values() for unit in evaluated]
     assert np.sqrt(np.mean(np.square(error_mmps2))) < 1.05 * bound
 
@@ -58,10 +60,10 @@ def test_motion_error_reaches_the_noise_floor(evaluations):
 @pytest.mark.parametrize('stage', ['perfect', 'paper'])
 def test_intervals_have_their_stated_coverage(evaluations, stage):
     # Poses of one unit share the errors of its few settings of alpha. Units are independent.
-    inside = np.array([np.mean(np.abs(unit.models['full'].force_z) < Z_90)
+    inside = np.array([np.mean(np.abs(unit.acceleration['full']) < Z_90)
                        for unit in evaluations[stage]])
     assert abs(inside.mean() - 0.9) < 0.02 + 2.5 * inside.std() / np.sqrt(len(inside))
-    spread = np.sqrt(np.mean([np.mean(unit.models['full'].force_z ** 2)
+    spread = np.sqrt(np.mean([np.mean(unit.acceleration['full'] ** 2)
                               for unit in evaluations[stage]]))
     assert 0.7 < spread < 1.4
 
