@@ -23,6 +23,7 @@ from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.population import Population, posterior
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.report.quantities import with_half_width
 from adxl_ros.signals.recorded_sensor import (
     CERTAIN_CORRELATION,
     FilterNoise,
@@ -430,8 +431,8 @@ def _slope_lines(fitted: Sensor, fit: thermal_fit.ThermalFit) -> list[str]:
         slope, curvature = (Coefficient('temperature_bias', parameter, axis)
                             for parameter in ('per_k', 'per_k2'))
         k, k2 = get(fitted, [slope, curvature])
-        lines.append(f'  {axis}  {k * 1e3:+.3f} ± {std[slope] * 1e3:.3f} mg/K at 25 °C, '
-                     f'{k2 * 1e6:+.2f} ± {std[curvature] * 1e6:.2f} µg/K²')
+        lines.append(f'  {axis}  {with_half_width(k * 1e3, std[slope] * 1e3)} mg/K at 25 °C, '
+                     f'{with_half_width(k2 * 1e6, std[curvature] * 1e6)} µg/K²')
     return lines
 
 

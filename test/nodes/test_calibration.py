@@ -94,7 +94,7 @@ def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp
     assert copy.stem == live.provenance['id']
     assert 'held out' in (tmp_path / 'report' / 'report.html').read_text()
     head = (tmp_path / 'unit.yaml').read_text().split('/**')[0]
-    assert all(f'# {model}' in head for model in ('linear', 'physical', 'full'))
+    assert all(f'#  {model} calibration' in head for model in ('linear', 'physical', 'full'))
 
     sent = []
     for topic, kind in (('/imu/data_raw', rosbags.IMU), ('/stage/joint_states', rosbags.JOINTS),

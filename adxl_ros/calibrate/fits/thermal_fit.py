@@ -10,7 +10,7 @@ Zero-g over temperature, fitted to a sensor that rests while it warms and cools.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import NamedTuple
 
 from adxl_ros.calibrate.poses import Poses
@@ -163,13 +163,10 @@ class _Model:
         """Return values and covariance of all coefficients, the shape among them."""
         axes = self._sensor.axes
         solved = [self._solved(d, history) for d in range(len(axes))]
-        names: list[Coefficient] = []
-        places: list[list[int]] = []
-        for d, axis in enumerate(axes):
-            of_axis = [Coefficient(*name, axis) for name in self._columns(d, history)]
-            places.append(list(range(len(names), len(names) + len(of_axis))))
-            names += of_axis
-        values = np.concatenate([a.values[:len(p)] for a, p in zip(solved, places)])
+        by_axis = [[Coefficient(*name, axis) for name in self._columns(d, history)]
+                   for d, axis in enumerate(axes)]
+        names = list(chain.from_iterable(by_axis))
+        values = np.concatenate([a.values[:len(own)] for a, own in zip(solved, by_axis)])
         if history.effect:
             names.append(Coefficient(history.effect, _SHAPES[history.effect]))
             values = np.append(values, history.shape)
@@ -178,12 +175,13 @@ class _Model:
                             for s in (step, -step))
             by_shape = (above - below) / (2 * step)
         precision = np.diag([(PRIOR_WIDTH * parameter_of(name).scale) ** -2.0 for name in names])
-        for a, place in zip(solved, places):
-            columns, free = a.design[:, :len(place)], a.design[:, len(place):]
+        for a, own in zip(solved, by_axis):
+            columns, free = np.hsplit(a.design, [len(own)])
+            place = [names.index(name) for name in own]
             if history.effect:
-                place = [*place, len(names) - 1]
-                size = a.values[len(place) - 2]
-                columns = np.column_stack([columns, size * by_shape])
+                # The last coefficient of an axis is the size of the history.
+                columns = np.column_stack([columns, a.values[len(own) - 1] * by_shape])
+                place.append(len(names) - 1)
             white, white_free = (self._whitened(v, a.correlation) for v in (columns, free))
             white = white - white_free @ np.linalg.lstsq(white_free, white, rcond=None)[0]
             precision[np.ix_(place, place)] += white.T @ white / a.variance_g2

@@ -15,11 +15,11 @@ from typing import NamedTuple
 
 from adxl_ros.files import calibration_store
 from adxl_ros.model.coefficients import get, parameter_of, with_neutral
-from adxl_ros.model.constants import AXES, Z_90
+from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.effects.element import OTHER_AXIS
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.report.quantities import decimals
+from adxl_ros.report.quantities import decimals, mg_text
 import numpy as np
 
 _ABSOLUTE = {'bias.offset_v': 'nominal_zero_g_v',
@@ -85,28 +85,16 @@ def compare(fitted: Sensor, truth: Sensor) -> list[Comparison]:
     return rows
 
 
-_NEGLIGIBLE_MG = 0.01
-"""Error below which only this limit is shown, mg. Chosen: no sensor repeats that well."""
-_SMALL_MG = 10.0
-"""Error below which mg is the unit, and above which g is. Chosen: two digits read as 9.9 mg."""
-
-
 def errors_in_words(fitted: Sensor) -> str:
     """Return the largest errors of the uncalibrated sensor, for people."""
     offset_g = (fitted.zero_g_v - fitted.nominal_zero_g_v) / fitted.nominal_scale_v_per_g
     gain = fitted.scale_v_per_g / fitted.nominal_scale_v_per_g - 1
     first, second = int(np.argmax(np.abs(offset_g))), int(np.argmax(np.abs(gain)))
-    return (f'Uncalibrated, {fitted.axes[first]} is {_force_text(offset_g[first])} off, and '
-            f'{fitted.axes[second]} reads {abs(100 * gain[second]):.2g} % too '
-            f'{"much" if gain[second] > 0 else "little"}.')
-
-
-def _force_text(force_g: float) -> str:
-    """Return a specific force with two digits, small ones in mg."""
-    force_mg = 1e3 * force_g
-    if abs(force_mg) < _NEGLIGIBLE_MG:
-        return f'less than {_NEGLIGIBLE_MG:g} mg'
-    return f'{force_g:+.2g} g' if abs(force_mg) >= _SMALL_MG else f'{force_mg:+.2g} mg'
+    shift, slope = ('much' if error > 0 else 'little'
+                    for error in (offset_g[first], gain[second]))
+    return (f'Uncalibrated, {fitted.axes[first]} reads {mg_text(abs(offset_g[first]) * G0_MPS2)} '
+            f'too {shift}, and {fitted.axes[second]} {abs(100 * gain[second]):.2g} % too '
+            f'{slope}.')
 
 
 _LONGEST_LABEL = 26
