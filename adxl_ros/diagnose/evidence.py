@@ -331,9 +331,10 @@ class LinearisedHypothesis:
         Return the departures from the prior mean after a fit, (k,).
 
         A limit or a shape keeps its value if the samples do not determine it, because its prior
-        mean is no better guess. It also keeps its value if only the blocks that are not fitted
-        determine it. A shape changes by a factor of two at most. In a fit to some blocks, zero-g,
-        scale factor, filter and latency stay within the tolerance of a healthy unit.
+        mean is no better guess. Beside it, each nuisance parameter does so if only the blocks that
+        are not fitted determine it: a drift may leave the zero-g open. A shape changes by a factor
+        of two at most. In a fit to some blocks, zero-g, scale factor, filter and latency stay
+        within the tolerance of a healthy unit.
         """
         j = len(self.values)
         parameters = [parameter_of(name) for name in self.names[:j]]
@@ -351,8 +352,11 @@ class LinearisedHypothesis:
         given = np.concatenate([values != fitted, np.zeros(len(self.reach), bool)])
         target = np.concatenate([values - self.prior_mean[:j], np.zeros(len(self.reach))])
         departures = fit.given(np.flatnonzero(given), target[given])
-        outside = np.abs(departures[j:]) > self.reach
-        if full_fit is None or not outside.any():
+        if full_fit is None:
             return departures
-        given[j:], target[j:] = outside, np.clip(departures[j:], -self.reach, self.reach)
+        is_open = np.diag(fit.covariance)[j:] > _UNDETERMINED_RATIO ** 2 * np.diag(
+            full_fit.covariance)[j:]
+        nuisance = np.clip(np.where(is_open, full_fit.values[j:], departures[j:]),
+                           -self.reach, self.reach)
+        given[j:], target[j:] = nuisance != departures[j:], nuisance
         return fit.given(np.flatnonzero(given), target[given])

@@ -210,6 +210,13 @@ def test_a_recording_at_rest_is_insufficient():
     assert 'motion' in report['not_covered'] and report['next_experiment']
 
 
+def test_blocks_that_leave_the_zero_g_open_make_no_gap():
+    sensor = replace(nominal('xy'), rate_hz=20.0)
+    soak = trajectories.TRAJECTORIES['soak'](np.random.default_rng(0))
+    report = report_of(diagnose([simulated(sensor, motion=soak, seed=4)], sensor))
+    assert report['verdict']['status'] == 'no_gap'
+
+
 def test_next_experiment_separates_most():
     """Heating separates temperature from supply, and a shaker does not."""
     rivals, sensor = ('temperature_bias', 'supply'), with_effects(
