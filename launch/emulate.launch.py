@@ -19,13 +19,13 @@ from adxl_ros.nodes.settings import DriverSettings
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
 
-LINK = arguments(DriverSettings, in_topic='link.topic', temperature_topic='link.temperature_topic',
-                 seed='link.seed')
+LINK = arguments(DriverSettings, 'frame_id', in_topic='link.topic',
+                 temperature_topic='link.temperature_topic', seed='link.seed')
 
 
 def generate_launch_description() -> LaunchDescription:
     return launch_nodes.describe([
-        *launch_nodes.common_arguments(*LINK, frame_id=''),
+        *launch_nodes.common_arguments(*LINK),
         launch_nodes.declared('rpy_rad', '0,0,0', 'roll, pitch and yaw of the case in the frame '
                               'of the ideal samples, rad'),
         launch_nodes.declared('out_topic', 'imu/data_raw', 'topic of the realistic samples'),

@@ -93,11 +93,11 @@ def ros_env(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[dict[str
 
 @pytest.fixture
 def start(ros_env: dict[str, str], tmp_path: Path) -> Iterator[Callable[..., Started]]:
-    """Give a function that starts an executable in the graph of the test, and returns at once."""
+    """Give a function that starts an executable, by name or path, in the graph of the test."""
     started: list[Started] = []
 
     def begin(name: str, *args: object) -> Started:
-        log = tmp_path / f'{len(started)}_{name}.log'
+        log = tmp_path / f'{len(started)}_{Path(name).name}.log'
         with open(log, 'wb') as file:
             popen = subprocess.Popen(
                 [executable(name), *map(str, args)], env=ros_env, cwd=tmp_path,

@@ -16,10 +16,9 @@ from adxl_ros.calibrate.guided.controller import Controller, ControllerState, ID
 from adxl_ros.calibrate.guided.guide import NextPose
 from adxl_ros.calibrate.guided.screen_contents import KeyAction, Phase, ScreenContents
 from adxl_ros.nodes.jobs import executable, held_output
-from adxl_ros.nodes.topics import create_publisher, Level, Status, status_message, STEADY
+from adxl_ros.nodes.topics import create_publisher, Level, stamp, Status, status_message, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
-from rclpy.time import Time
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
@@ -114,7 +113,7 @@ class Announcer:
             command = JointState(name=['alpha', 'beta'], position=list(pose.command_rad))
             # The clock of a simulation may lag behind samples that have come.
             stamp_ns = max(self._node.get_clock().now().nanoseconds, pose.newest_ns)
-            command.header.stamp = Time(nanoseconds=stamp_ns).to_msg()
+            command.header.stamp = stamp(stamp_ns)
             self._command.publish(command)
 
     def withdraw(self, reason: str) -> None:

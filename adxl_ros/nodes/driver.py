@@ -13,15 +13,13 @@ from adxl_ros.nodes.link_reader import LinkReader
 from adxl_ros.nodes.parameters import declare_sensor, make_sensor
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.sample_output import SampleOutput, Tally
-from adxl_ros.nodes.settings import check_given_parameters, declare_driver
+from adxl_ros.nodes.settings import check_given_parameters, declare_driver, DEFAULT_FRAME
 from adxl_ros.nodes.topics import DiagnosticsReporter, Level, Status, STEADY
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 _SIMULATED = f'SIMULATED sensor (link.type: {base.DEFAULT_LINK})'
 """Words of log and diagnostics where no sensor is read."""
-_FRAME = 'imu_link'
-"""Frame of the case, unless a parameter or a simulator states it."""
 _EXAMPLES = {
     'a simulated sensor': '',
     'a board on a serial port': '--ros-args -p link.type:=serial -p link.port:=/dev/ttyACM0',
@@ -63,7 +61,7 @@ class Driver(LifecycleNode):
         self._delay_ns = round(1e9 * own.stamp_offset_s)
         settings, self._link = self._settings, own.link
         has_frame = isinstance(settings, base.SimulatorSettings) and not settings.turns_case
-        self._frame_id = own.frame_id or ('' if has_frame else _FRAME)
+        self._frame_id = own.frame_id or ('' if has_frame else DEFAULT_FRAME)
         paced = isinstance(settings, base.PacedSettings)
         # All nodes must share a sensor time that is not real time: this node then publishes it,
         # unless another node does.

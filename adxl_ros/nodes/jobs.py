@@ -15,7 +15,7 @@ import sys
 from tempfile import TemporaryFile
 import time
 
-from adxl_ros.report.quantities import live_bar
+from adxl_ros.report.quantities import bar
 
 _KILL_S = 10.0
 """Longest time that a process may take to end, s; chosen: a node ends within 1 s."""
@@ -111,9 +111,7 @@ class LiveLine:
     """Prints lines; in a terminal that can draw, a last one shows what happens now."""
 
     def __init__(self, *columns: str | int, total: int = 0) -> None:
-        """Begin to draw: the text, then columns as of `live_bar`."""
-        self._progress = live_bar(sys.stdout, '{task.description}', *columns,
-                                  transient=not columns)
+        self._progress = bar(sys.stdout, *columns, transient=not columns)
         if self._progress is not None:
             self._task = self._progress.add_task('', total=total or None)
             self._progress.start()
@@ -146,8 +144,8 @@ class Step(LiveLine):
     """
 
     def __init__(self, name: str, text: str, total: int = 0) -> None:
-        bar = (_BAR_WIDTH, '{task.percentage:3.0f} %') if total else ()
-        super().__init__(*bar, '{task.elapsed:4.0f} s', total=total)
+        columns = (_BAR_WIDTH, '{task.percentage:3.0f} %') if total else ()
+        super().__init__(*columns, '{task.elapsed:4.0f} s', total=total)
         self._name, self._total, self._begin_s, self._tenth = name, total, time.monotonic(), 0
         self.show(text)
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 import difflib
-import json
 import time
 from typing import Any, NamedTuple
 
@@ -23,6 +22,7 @@ from launch.launch_description import LaunchDescription
 from launch.logging import get_logger
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.utilities import prefix_namespace
 
 _REFUSED_START = (1, 2)
@@ -35,8 +35,6 @@ _LEAST_LIKENESS = 0.6
 """Smallest likeness of a misspelt name, by difflib; chosen: `params` is like `params_file`."""
 _PUSHED = 'ros_namespace'
 """Where launch_ros keeps the namespace that a launch file around this one has pushed."""
-_LOG_LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
-"""Log levels of rcl."""
 
 
 class Argument(NamedTuple):
@@ -49,10 +47,9 @@ class Argument(NamedTuple):
         """Return the action that declares it; an empty value leaves the parameter as it is."""
         links = settings.links_by_parameter().get(self.spec.name)
         used_by = f'{" and ".join(links)}: ' if links else ''
-        return DeclareLaunchArgument(
-            self.name, default_value='', description=f'{used_by}{self.spec.meaning}; not given: '
-            'as in params_file, or the default',
-            choices=['', *self.spec.choices] if self.spec.choices else None)
+        return declared(self.name, '', f'{used_by}{self.spec.meaning}; not given: as in '
+                        'params_file, or the default', *('',) * bool(self.spec.choices),
+                        *self.spec.choices)
 
     def value(self, text: str) -> Any:
         """Return the value of the parameter."""
@@ -90,9 +87,9 @@ def arguments(own: type, *parameters: str, **renamed: str) -> tuple[Argument, ..
     return tuple(Argument(name, specs[parameter]) for name, parameter in names.items())
 
 
-LINK = arguments(settings.DriverSettings, 'link.type', 'link.port', 'link.baud', 'link.uri',
-                 'link.device', 'link.channels', 'link.recording')
-"""Arguments of the link."""
+LINK = arguments(settings.DriverSettings, 'frame_id', 'link.type', 'link.port', 'link.baud',
+                 'link.uri', 'link.device', 'link.channels', 'link.recording')
+"""Arguments of the link, and of the frame of its samples."""
 STAGE = (*arguments(settings.StageSettings, 'stage.type'), *arguments(
     settings.BridgeSettings, *(spec.name for spec in specs_of(settings.BridgeSettings))))
 """Arguments of the stage."""
@@ -101,7 +98,7 @@ SPEED = arguments(settings.DriverSettings, speed='link.speed')
 
 
 def declared(name: str, default: str, description: str, *choices: str) -> DeclareLaunchArgument:
-    """Declare an argument of a launch that gives no parameter of a node."""
+    """Declare an argument of a launch."""
     return DeclareLaunchArgument(name, default_value=default, description=description,
                                  choices=choices or None)
 
@@ -114,15 +111,13 @@ TRANSFORM = (
 """Arguments of the static transform."""
 
 
-def common_arguments(*own: Argument, frame_id: str = 'imu_link') -> list[DeclareLaunchArgument]:
+def common_arguments(*own: Argument) -> list[DeclareLaunchArgument]:
     """Return the arguments that all launch files have."""
     return [
         declared('params_file', str(parameter_file.nominal_path()),
                  'parameter file of the sensor, its link and the nodes'),
         declared('namespace', '', 'namespace of the nodes and their topics'),
-        declared('frame_id', frame_id, 'frame of the case' + (
-            '' if frame_id else "; '': that of the ideal samples")),
-        declared('log_level', 'info', 'log level', *_LOG_LEVELS),
+        declared('log_level', 'info', 'log level', 'debug', 'info', 'warn', 'error', 'fatal'),
         declared('enclave', '', 'folder of the enclaves of SROS 2, such as /adxl_ros; each node '
                  'has one of its name there; empty: none'),
         *(argument.declared() for argument in own)]
@@ -160,18 +155,18 @@ def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, A
         raise UserError(f'{path}: has no parameters of the node {name}; begin the file with /**: '
                         f'or {name}:')
     link = [argument for argument in LINK if argument.name in context.launch_configurations]
-    given = {'frame_id': text(context, 'frame_id'), **given_parameters(context, link), **overrides}
-    # The last argument counts. rcl takes the name of a node without its namespace.
-    node = f'{executable}:' if name == f'/{executable}' else ''
-    rules = [part for key, value in given.items() for part in (
-        '-p', f'{node}{key}:={json.dumps(value, ensure_ascii=False)}')]
+    # launch_ros would read a text as YAML.
+    given = {key: ParameterValue(value, value_type=str) if isinstance(value, str) else value
+             for key, value in {**given_parameters(context, link), **overrides}.items()}
     options.setdefault('output', 'screen')
     # The nominal sensor is what a node without a file has; a file would name it for any stream.
     is_named &= path != str(parameter_file.nominal_path())
-    return Node(package='adxl_ros', executable=executable, namespace=text(context, 'namespace'),
+    # With its name a node gets the parameters in a section of its own, which counts before others.
+    return Node(package='adxl_ros', executable=executable, name=executable,
+                namespace=text(context, 'namespace'),
+                parameters=[path] * is_named + [given] * bool(given),
                 ros_arguments=[*_enclave(context, executable),
-                               '--log-level', text(context, 'log_level'),
-                               *(['--params-file', path] if is_named else []), *rules], **options)
+                               '--log-level', text(context, 'log_level')], **options)
 
 
 def _enclave(context: LaunchContext, executable: str) -> list[str]:
@@ -185,12 +180,14 @@ def static_transform(context: LaunchContext) -> list[Action]:
     base_frame, executable = text(context, 'base_frame'), 'static_transform_publisher'
     if not base_frame:
         return []
-    options = dict(zip(('--x', '--y', '--z', '--roll', '--pitch', '--yaw'), map(repr, (
-        *three_numbers(context, 'mounting_xyz_m'), *three_numbers(context, 'mounting_rpy_rad')))))
-    options |= {'--frame-id': base_frame, '--child-frame-id': text(context, 'frame_id')}
+    frame_id = given_anywhere(context, 'frame_id', 'driver') or settings.DEFAULT_FRAME
+    values = (*three_numbers(context, 'mounting_xyz_m'),
+              *three_numbers(context, 'mounting_rpy_rad'), base_frame, frame_id)
+    options = zip(('--x', '--y', '--z', '--roll', '--pitch', '--yaw', '--frame-id',
+                   '--child-frame-id'), map(str, values))
     return [Node(package='tf2_ros', executable=executable,
                  ros_arguments=_enclave(context, executable),
-                 arguments=[part for option in options.items() for part in option])]
+                 arguments=[part for option in options for part in option])]
 
 
 def three_numbers(context: LaunchContext, name: str) -> list[float]:

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import field, fields
 from difflib import get_close_matches
 from itertools import pairwise
+from pathlib import Path
 import re
 import sys
 from typing import Any, NamedTuple, TypeVar
@@ -38,6 +39,8 @@ _FILE_FLAG = '--params-file'
 """Argument of rcl before a parameter file."""
 _RULE_FLAGS = ('-p', '--param')
 """Arguments of rcl before one parameter."""
+_OF_LAUNCH = 'launch_params_'
+"""Begin of the names of files in which launch_ros gives the parameters of a launch."""
 _LARGEST = 3600.0
 """Largest number of a range; chosen: ten turns in degrees, and hotter than any sensor."""
 
@@ -174,15 +177,16 @@ def _place_of(key: str) -> str:
         marks = [found.start_mark for _, name, found in _entries(value) if name == key] \
             if flag == _FILE_FLAG else []
         if marks:
-            return f'{value}:{marks[0].line + 1}:{marks[0].column + 1}: '
+            return f'{value}:{marks[0].line + 1}:{marks[0].column + 1}: ' * (value in _paths())
     files = sorted(_paths(), key=lambda path: any(
         name == 'format' for _, name, _ in _entries(path)))
     return f'{files[-1]}: ' if files else ''
 
 
 def _paths() -> list[str]:
-    """Return the files of `--params-file` in the order of the command line."""
-    return [path for flag, path in pairwise(sys.argv) if flag == _FILE_FLAG]
+    """Return the files of `--params-file` in the order of the command line, without a launch's."""
+    return [path for flag, path in pairwise(sys.argv)
+            if flag == _FILE_FLAG and not Path(path).name.startswith(_OF_LAUNCH)]
 
 
 def _entries(path: str) -> Iterator[tuple[str, str, yaml.Node]]:

@@ -18,7 +18,6 @@ from pathlib import Path
 import re
 import signal
 import sys
-import textwrap
 from typing import Any
 
 from adxl_ros.errors import UserError
@@ -28,7 +27,7 @@ from adxl_ros.nodes.rclpy_internals import start_error_text
 from adxl_ros.nodes.settings import DriverSettings, link_specs, NODES
 from adxl_ros.nodes.topics import type_name
 from adxl_ros.process import ended_by_closed_output, package_version
-from adxl_ros.report.quantities import COLUMNS, command_lines
+from adxl_ros.report.quantities import command_lines, wrapped
 import rclpy
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -123,9 +122,7 @@ def _example_lines(name: str, examples: Mapping[str, str]) -> list[str]:
 
 def _wrapped(text: str, indent: int = 0) -> list[str]:
     """Wrap a text between words, with an indent of all lines."""
-    return textwrap.wrap(' '.join(text.split()), COLUMNS, initial_indent=indent * ' ',
-                         subsequent_indent=indent * ' ', break_long_words=False,
-                         break_on_hyphens=False)
+    return wrapped(indent * ' ' + ' '.join(text.split()), indent)
 
 
 def _spec_lines(specs: Iterable[Spec]) -> list[str]:

@@ -23,6 +23,8 @@ LINK = 'link.'
 """Begin of the names of all parameters of a link; the driver alone has them."""
 _TYPE = 'link.type'
 """Parameter that chooses the link."""
+DEFAULT_FRAME = 'imu_link'
+"""Frame of the case, unless a parameter or a simulator states it."""
 _ANY_NODE = ('use_sim_time', 'start_type_description_service')
 """Parameters of every node of rclpy."""
 _FREE_PREFIXES = ('provenance.', 'qos_overrides.', LINK)

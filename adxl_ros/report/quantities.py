@@ -261,23 +261,18 @@ def command_lines(text: str, start: str) -> list[str]:
     return [*(f'{line} \\' for line in first), last]
 
 
-def live_bar(stream: TextIO, *columns: str | int, transient: bool = True) -> Any:
-    """
-    Return rich's `Progress` on a stream; None without rich, or where nothing can be drawn.
-
-    columns: a number is a bar of that width, `elapsed` and `remaining` are times, and others are
-    texts of rich's `TextColumn`.
-    """
+def bar(stream: TextIO, *columns: str | int, transient: bool = True) -> Any:
+    """Return rich's `Progress`, or None if nothing can be drawn; a number is a bar so wide."""
     if not stream.isatty() or os.environ.get('TERM') == 'dumb':
         return None
     try:
         from rich import console, progress
     except ImportError:
         return None
-    times = {'elapsed': progress.TimeElapsedColumn, 'remaining': progress.TimeRemainingColumn}
-    drawn = [progress.BarColumn(column) if isinstance(column, int) else times[column]()
-             if column in times else progress.TextColumn(column, markup=False)
-             for column in columns]
+    drawn = [progress.BarColumn(column) if isinstance(column, int)
+             else getattr(progress, column)() if column.isidentifier()
+             else progress.TextColumn(column, markup=False)
+             for column in ('{task.description}', *columns)]
     screen = console.Console(file=stream, highlight=False, markup=False, emoji=False)
     return progress.Progress(*drawn, console=screen, transient=transient)
 

@@ -34,14 +34,7 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Effect
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import ended_by_closed_output, package_version
-from adxl_ros.report.quantities import (
-    column_unit,
-    COLUMNS,
-    end_lines,
-    entry_list,
-    live_bar,
-    NextStep,
-)
+from adxl_ros.report.quantities import bar, column_unit, COLUMNS, end_lines, entry_list, NextStep
 import numpy as np
 
 if TYPE_CHECKING:
@@ -324,18 +317,18 @@ class ShowDone(Protocol):
 @contextmanager
 def progress(title: str) -> Iterator[ShowDone]:
     """Show a progress bar on a terminal where rich is installed, else nothing."""
-    bar = live_bar(sys.stderr, '{task.description}', _BAR_COLUMNS, '{task.percentage:3.0f} %',
-                   'elapsed', 'remaining')
-    if bar is None:
+    drawn = bar(sys.stderr, _BAR_COLUMNS, '{task.percentage:3.0f} %', 'TimeElapsedColumn',
+                'TimeRemainingColumn')
+    if drawn is None:
         yield lambda done, stage='': None
         return
-    with bar:
-        task = bar.add_task(title, total=1.0)
+    with drawn:
+        task = drawn.add_task(title, total=1.0)
 
         def show(done: float, stage: str = '') -> None:
             """Show a fraction; see `ShowDone`."""
             # A plan that grows does not take the bar back.
-            bar.update(task, completed=max(done, bar.tasks[task].completed),
-                       description=stage or title)
+            drawn.update(task, completed=max(done, drawn.tasks[task].completed),
+                         description=stage or title)
 
         yield show

@@ -2,13 +2,11 @@
 
 """The launch files under `ros2 launch`: refusals, failed starts, a killed driver, the end."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 import os
-from pathlib import Path
 import re
 import shutil
 import signal
-import subprocess
 
 from adxl_ros.files import parameter_file
 from graph import Graph
@@ -19,26 +17,17 @@ from terminal import Terminal
 from units import NOMINAL, nominal
 
 pytestmark = NEEDS_ROS2
+SHORT = ('speed:=20', 'sweep_planes_deg:=30,60,90', 'sweep_step_deg:=60', 'sweep_dwell_s:=1',
+         'sweep_check_poses:=3')
+OUTER = ('<launch><push-ros-namespace namespace="arm"/><include file="$(find-pkg-share adxl_ros)/'
+         'launch/robot.launch.py"/></launch>')
 
 
 @pytest.fixture
-def launch(ros_env: dict[str, str], tmp_path: Path) -> Iterator[Callable[..., Started]]:
-    started: list[Started] = []
-
-    def begin(name: str, *arguments: str) -> Started:
-        log = tmp_path / 'launch.log'
-        with open(log, 'wb') as file:
-            popen = subprocess.Popen(
-                ['ros2', 'launch', 'adxl_ros', f'{name}.launch.py', *arguments], env=ros_env,
-                cwd=tmp_path, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT,
-                start_new_session=True)
-        started.append(Started(name, popen, log))
-        return started[-1]
-
-    yield begin
-    for process in started:
-        process.stop()
-        print(process.output())
+def launch(start: Callable[..., Started]) -> Callable[..., Started]:
+    return lambda name, *arguments: start(
+        shutil.which('ros2'), 'launch',
+        *([name] if '.' in name else ['adxl_ros', f'{name}.launch.py']), *arguments)
 
 
 @pytest.mark.parametrize('name, argument, words', [
@@ -105,12 +94,15 @@ def test_a_killed_driver_starts_again(launch, name):
     assert 'Traceback' not in launched.output()
 
 
-def test_the_arguments_count_before_the_file(launch, tmp_path):
+@pytest.mark.parametrize('name, node', [('robot', 'driver'), ('outer.launch.xml', '/arm/driver')])
+def test_the_arguments_count_before_the_file(launch, tmp_path, name, node):
     """A section of the file for the node itself counts before a wildcard, but not before them."""
+    (tmp_path / 'outer.launch.xml').write_text(OUTER)
     (tmp_path / 'own.yaml').write_text(
-        NOMINAL.read_text() + 'driver:\n  ros__parameters:\n    link.type: serial\n')
-    launched = launch('robot', 'params_file:=own.yaml', 'link_type:=sim')
+        NOMINAL.read_text() + f'{node}:\n  ros__parameters:\n    link.type: serial\n')
+    launched = launch(name, 'params_file:=own.yaml', 'link_type:=sim')
     launched.wait_for('active: link sim, unit nominal')
+    assert 'did you mean' not in launched.output()
 
 
 def test_a_robot_takes_the_imu_of_another_driver(launch):
@@ -139,9 +131,7 @@ def test_a_launch_puts_a_sensor_behind_a_simulator(launch, tmp_path):
 
 @pytest.mark.parametrize('output, status', [('unit.yaml', 0), ('none/unit.yaml', 1)])
 def test_the_launch_of_a_calibration_ends_with_it(launch, tmp_path, output, status):
-    launched = launch('calibrate', f'output:={output}', 'speed:=20', 'sweep_planes_deg:=30,60,90',
-                      'sweep_step_deg:=60', 'sweep_dwell_s:=1', 'sweep_check_poses:=3',
-                      'report:=report')
+    launched = launch('calibrate', f'output:={output}', *SHORT, 'report:=report')
     assert launched.wait(120) == status
     assert (tmp_path / output).exists() == (status == 0)
     if status == 0:
@@ -156,9 +146,7 @@ def test_the_launch_of_a_calibration_ends_with_it(launch, tmp_path, output, stat
 @pytest.mark.parametrize('key, words', [('q', 'same command resumes'), ('', 'wrote unit.yaml')])
 def test_a_launch_shows_the_screen_in_its_terminal(ros_env, tmp_path, key, words):
     seen = Terminal([shutil.which('ros2'), 'launch', 'adxl_ros', 'calibrate.launch.py',
-                     'output:=unit.yaml', 'screen:=true', 'speed:=20',
-                     'sweep_planes_deg:=30,60,90', 'sweep_step_deg:=60', 'sweep_dwell_s:=1',
-                     'sweep_check_poses:=3'], ros_env, tmp_path)
+                     'output:=unit.yaml', 'screen:=true', *SHORT], ros_env, tmp_path)
     seen.wait_for('redo', timeout_s=60)
     assert '[INFO]' not in seen.text()
     seen.press(key)
