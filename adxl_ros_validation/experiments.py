@@ -16,8 +16,7 @@ from adxl_ros.calibrate.fits.linearisation import StageError
 from adxl_ros.calibrate.guided.pose_plan import sweep
 from adxl_ros.calibrate.poses import Poses, stage_force
 from adxl_ros.compensate import inversions
-from adxl_ros.files.recording_columns import Recording
-from adxl_ros.files.stream_info import sensor_info
+from adxl_ros.files.recording_columns import Recording, sensor_info
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.coefficients import get, typical, with_neutral

@@ -10,13 +10,7 @@ from functools import partial
 
 from adxl_ros.calibrate.fits import full_model, gravity_fit, linear, term_selection, thermal_fit
 from adxl_ros.calibrate.fits.linearisation import volts_covariance
-from adxl_ros.calibrate.poses import (
-    at_a_rail,
-    check_polarity,
-    Poses,
-    predicted_volts,
-    reference_force,
-)
+from adxl_ros.calibrate.poses import at_a_rail, Poses, predicted_volts, reference_force
 from adxl_ros.calibrate.report import acceptance, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment
 from adxl_ros.calibrate.report.held_out import HeldOutErrors, rms_mg
@@ -28,7 +22,12 @@ from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.population import Population, posterior
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.recorded_sensor import FilterNoise, with_filter
+from adxl_ros.signals.recorded_sensor import (
+    CERTAIN_CORRELATION,
+    FilterNoise,
+    find_polarity_fault,
+    with_filter,
+)
 import numpy as np
 
 STAGE_FITS = {'linear': linear.fit, 'physical': linear.fit_physical, 'full': term_selection.fit}
@@ -132,7 +131,7 @@ def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: s
                    effects: Sequence[str], source: str, data_sha256: str,
                    population: Population | None) -> CalibrationResult:
     poses = _joined(recordings)
-    check_polarity(sensor, poses)
+    _check_polarity(sensor, poses)
     fit = _richest_fit(sensor, recordings, model, effects, population)
     if population is not None:
         fit = _with_population(fit, population)
@@ -167,6 +166,20 @@ def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: s
         report_lines=[*acceptance.headline(assessment, errors), *acceptance.unit_line(fitted),
                       *acceptance.error_table(errors, assessments), *explanation, *fit_lines,
                       *fit.notes])
+
+
+def _check_polarity(sensor: Sensor, poses: Poses) -> None:
+    """Refuse a unit with an inverted axis or with swapped axes."""
+    if len(poses) < 2:
+        return
+    reference = reference_force(poses, sensor.local_gravity_mps2)
+    with np.errstate(invalid='ignore', divide='ignore'):
+        correlation = np.array([[np.corrcoef(volts, force)[0, 1] for force in reference]
+                                for volts in poses.volts.T])
+    fault = find_polarity_fault(correlation, [AXES.index(axis) for axis in sensor.axes],
+                                CERTAIN_CORRELATION)
+    if fault is not None:
+        raise UserError(fault.describe(sensor.axes[fault.axis], AXES[fault.follows]))
 
 
 def _with_population(fit: _StageFit, population: Population) -> _StageFit:

@@ -17,13 +17,11 @@ from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.files.tables import PoseTable
 from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get, parameter_of, put
-from adxl_ros.model.constants import AXES
 from adxl_ros.model.effects import base
 from adxl_ros.model.effects.base import Coefficient, Components, Environment, NOMINAL_ENVIRONMENT
 from adxl_ros.model.kinematics import specific_force, UPRIGHT
 from adxl_ros.model.noise import sample_std_v
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.recorded_sensor import CERTAIN_CORRELATION, find_polarity_fault
 from adxl_ros.signals.rest_detection import SAME_ANGLE_RAD
 import numpy as np
 
@@ -150,20 +148,6 @@ def reference_force(poses: Poses, gravity_mps2: float) -> Components:
     returns: three components in the case frame, m/s², (k,).
     """
     return specific_force(poses.alpha_rad, poses.beta_rad, gravity_mps2)
-
-
-def check_polarity(sensor: Sensor, poses: Poses) -> None:
-    """Refuse a unit with an inverted axis or with swapped axes."""
-    if len(poses) < 2:
-        return
-    reference = reference_force(poses, sensor.local_gravity_mps2)
-    with np.errstate(invalid='ignore', divide='ignore'):
-        correlation = np.array([[np.corrcoef(volts, force)[0, 1] for force in reference]
-                                for volts in poses.volts.T])
-    fault = find_polarity_fault(correlation, [AXES.index(axis) for axis in sensor.axes],
-                                CERTAIN_CORRELATION)
-    if fault is not None:
-        raise UserError(fault.describe(sensor.axes[fault.axis], AXES[fault.follows]))
 
 
 _RAIL_STDS = 3.0

@@ -22,7 +22,7 @@ from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.atomic_write import keep_previous
-from adxl_ros.files.stream_info import NO_UNIT
+from adxl_ros.files.recording_columns import NO_UNIT
 from adxl_ros.model.coefficients import get
 from adxl_ros.model.covariance import leverage
 from adxl_ros.model.effects import effect_named

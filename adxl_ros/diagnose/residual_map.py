@@ -9,11 +9,14 @@ all under random signs of whole blocks (max-T; Westfall and Young 1993), because
 The functions stand for what no effect of the library describes, and for the difference between
 the form of an effect and that of a real sensor (Kennedy and O'Hagan 2001, J. R. Stat. Soc. B 63).
 Each axis has functions of its own, by dimension.
+
+The gap is stated in the unit of a user, too: an angle, a velocity, or any function.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from importlib import import_module
 from itertools import pairwise
 from math import prod
 from typing import NamedTuple
@@ -25,9 +28,11 @@ from adxl_ros.diagnose.comparison import (
     Reference,
     time_since_move_s,
 )
-from adxl_ros.model.constants import AXES
+from adxl_ros.errors import one_line, UserError
+from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.diagnosis_hints import FormDimension as Form
 from adxl_ros.model.filters import loop, low_pass
+from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 RANGES = 8
@@ -287,3 +292,129 @@ def residual_map(comparison: BaselineComparison, seed: int) -> list[ResidualCell
     cells = [ResidualCell(*place, *map(float, figures))
              for place, *figures in zip(places, mean, share, p)]
     return sorted(cells, key=lambda cell: -cell.share)
+
+
+INTEGRATED_S = 10.0
+"""Time over which the acceleration is integrated, s. Chosen: a short loss of other sensors."""
+
+Figure = Callable[[np.ndarray, np.ndarray, np.ndarray], float]
+"""Size of a gap by times, s, (n,), and recorded and simulated acceleration, m/s², (n, 3)."""
+
+
+class Quantity(NamedTuple):
+    """A quantity in which a gap is stated."""
+
+    name: str
+    unit: str
+    figure: Figure
+
+
+class GapInUnit(NamedTuple):
+    """The gap in the unit of a quantity, root mean square over recordings."""
+
+    quantity: str
+    unit: str
+    before: float  # Recording and simulation by --params
+    after: float  # Recording and simulation by params.yaml
+    floor: float  # Two simulations, one with noise
+
+    @property
+    def text(self) -> str:
+        """Return it for people."""
+        return (f'{self.quantity} {self.before:.3g} -> {self.after:.3g} {self.unit}; noise alone '
+                f'{self.floor:.3g}')
+
+
+def tilt_deg(time_s: np.ndarray, recorded: np.ndarray, simulated: np.ndarray) -> float:
+    """Return the rms angle between the recorded and the simulated vector, deg."""
+    cross = np.linalg.norm(np.cross(recorded, simulated), axis=1)
+    angle = np.arctan2(cross, np.sum(recorded * simulated, axis=1))
+    return float(np.degrees(np.sqrt(np.mean(angle ** 2))))
+
+
+def velocity_mps(time_s: np.ndarray, recorded: np.ndarray, simulated: np.ndarray) -> float:
+    """Return the rms velocity, m/s, that the difference has become after `INTEGRATED_S`."""
+    steps = np.diff(time_s)[:, None]
+    difference = recorded - simulated
+    # Over a gap the difference counts as the mean of both sides.
+    velocity = np.vstack([np.zeros(3), np.cumsum(
+        steps * (difference[1:] + difference[:-1]) / 2, axis=0)])
+    later = np.searchsorted(time_s, time_s + INTEGRATED_S)
+    within = later < len(time_s)
+    if not within.any():
+        raise UserError(f'--in velocity: integrates for {INTEGRATED_S:g} s, but the recording '
+                        f'has {np.ptp(time_s):.3g} s')
+    gained = velocity[later[within]] - velocity[:len(time_s)][within]
+    return float(np.sqrt(np.mean(np.sum(gained ** 2, axis=1))))
+
+
+_QUANTITIES = {'tilt': Quantity('tilt', 'deg', tilt_deg),
+               'velocity': Quantity('velocity', f'm/s after {INTEGRATED_S:g} s', velocity_mps)}
+
+
+def quantity(text: str) -> Quantity:
+    """
+    Return the quantity that an option names.
+
+    Parameters
+    ----------
+    text
+        tilt, velocity, or MODULE:FUNCTION for a function of times, s, (n,), recorded and
+        simulated acceleration, m/s², (n, 3), that returns a number; its attribute `unit` is
+        shown.
+
+    Returns
+    -------
+    Quantity
+        Name, unit and function.
+
+    Raises
+    ------
+    UserError
+        There is no such quantity or function.
+
+    """
+    if text in _QUANTITIES:
+        return _QUANTITIES[text]
+    module, _, name = text.partition(':')
+    try:
+        figure = getattr(import_module(module), name)
+        return Quantity(name, getattr(figure, 'unit', ''), figure)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise UserError(f'--in {text}: {one_line(error)}; give {", ".join(_QUANTITIES)}, or '
+                        'MODULE:FUNCTION of a module that Python can import') from None
+
+
+def gap_in(chosen: Quantity, comparisons: Sequence[BaselineComparison], baseline: Sensor,
+           found: Sensor, seed: int) -> GapInUnit:
+    """Return the gap before and after what was found, and the same figure of noise alone."""
+    def figure(comparison: BaselineComparison, recorded_v: np.ndarray, sensor: Sensor) -> float:
+        used = comparison.used & np.isfinite(recorded_v).all(axis=1)
+        recorded, simulated = (_acceleration(v[used], baseline) for v in (
+            recorded_v, comparison.simulated_v(sensor)))
+        try:
+            return float(chosen.figure(comparison.time_s[used], recorded, simulated))
+        except UserError:
+            raise
+        except Exception as error:
+            raise UserError(f'--in {chosen.name}: {type(error).__name__}: {one_line(error)}'
+                            ) from None
+
+    rows = [(figure(c, c.volts, baseline), figure(c, c.volts, found), figure(
+        c, c.simulated_v(found) + c.simulated_noise_v(found, seed), found)) for c in comparisons]
+    return GapInUnit(chosen.name, chosen.unit, *(
+        float(v) for v in np.sqrt(np.mean(np.square(rows), axis=0))))
+
+
+def _acceleration(volts: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """
+    Convert volts by zero-g and scale factor of the baseline, m/s², (n, 3).
+
+    Of two axes, gravity gives the third; of one, the others are 0.
+    """
+    out = np.zeros((len(volts), 3))
+    for d, axis in enumerate(sensor.axes):
+        out[:, AXES.index(axis)] = (volts[:, d] - sensor.zero_g_v[d]) / sensor.scale_v_per_g[d]
+    if len(sensor.axes) == 2:
+        out[:, 2] = np.sqrt(np.maximum(1 - out[:, 0] ** 2 - out[:, 1] ** 2, 0.0))
+    return out * G0_MPS2

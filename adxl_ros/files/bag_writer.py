@@ -25,8 +25,7 @@ from adxl_ros.files.bag_messages import (
     typestore,
 )
 from adxl_ros.files.mcap_file import Batch, write_messages
-from adxl_ros.files.recording_columns import COMMANDS, JOINTS, Recording
-from adxl_ros.files.stream_info import converted_info
+from adxl_ros.files.recording_columns import COMMANDS, converted_info, JOINTS, Recording
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.noise import sample_std_v

@@ -38,10 +38,10 @@ from adxl_ros.files.recording_columns import (
     sensor_columns,
     StampCheck,
     stamped_rate_hz,
+    StreamInfo,
     TIME,
     VOLTS,
 )
-from adxl_ros.files.stream_info import StreamInfo
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.kinematics import stage_angles
 import numpy as np

@@ -24,8 +24,7 @@ from urllib.parse import urlsplit
 from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files import recording
 from adxl_ros.files.calibration_store import date_in
-from adxl_ros.files.recording_columns import Recording
-from adxl_ros.files.stream_info import NO_UNIT
+from adxl_ros.files.recording_columns import NO_UNIT, Recording
 from adxl_ros.files.tables import TABLE_ENDINGS
 from adxl_ros.fleet.row import PAGE, POPULATION, TABLE, UNITS
 from adxl_ros.report.page import as_utf_8, without_secrets

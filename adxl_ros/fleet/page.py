@@ -11,7 +11,7 @@ from functools import partial
 from itertools import repeat
 from pathlib import Path
 
-from adxl_ros.files import population_file
+from adxl_ros.files import calibration_store
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.fleet.findings import effect_matrix, EffectMatrix, rank, State, UnitState
 from adxl_ros.fleet.row import PAGE, POPULATION, reason_kind, TABLE, UNITS
@@ -176,7 +176,7 @@ def write(folder: Path) -> list[Path]:
     population = Population(POPULATION, {
         result.quantity.column: result.population.pooled for result in results
         if result.population is not None and result.population.pooled.prediction_std > 0})
-    population_file.write(folder / POPULATION, population, [
+    calibration_store.write_population(folder / POPULATION, population, [
         {'serial': item.serial, 'coefficient': item.quantity.column, 'value': item.value,
          'distance': item.distance} for item in distant])
     write_text(folder / UNITS, _units_csv(results, table.serials))

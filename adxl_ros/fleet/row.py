@@ -25,7 +25,7 @@ from adxl_ros import process
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
-from adxl_ros.files.stream_info import NO_UNIT
+from adxl_ros.files.recording_columns import NO_UNIT
 from adxl_ros.model.constants import AXES
 import yaml
 

@@ -25,8 +25,7 @@ from adxl_ros.errors import one_line, UserError
 from adxl_ros.files.atomic_write import atomic_path
 from adxl_ros.fleet.inputs import as_date, Source, stated_by
 from adxl_ros.fleet.row import arrow_schema, as_table, Recipe, Row, TABLE
-from adxl_ros.fleet.staging import StagingError
-from adxl_ros.fleet.task import make_row, refused, Result, TaskCrashed
+from adxl_ros.fleet.task import make_row, refused, Result, StagingError, TaskCrashed
 from adxl_ros.workers import Finished, finished_tasks, Pool, write
 
 _ROWS = 'rows'

@@ -12,9 +12,8 @@ from typing import NamedTuple
 
 from adxl_ros.links.support import base
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.simulate.motion import Motion
+from adxl_ros.simulate.motion import JOINTS, Motion
 from adxl_ros.simulate.response import Response
-from adxl_ros.simulate.simulated_stage import JOINTS
 import numpy as np
 
 _AHEAD_NS = 50_000_000

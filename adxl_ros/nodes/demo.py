@@ -15,11 +15,12 @@ import sys
 import time
 
 from adxl_ros.calibrate.fits import gravity_fit, linear
+from adxl_ros.calibrate.fits.full_model import default_terms
 from adxl_ros.calibrate.guided import pose_plan
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import acceptance, held_out as unseen
 from adxl_ros.calibrate.report.acceptance import acceptance_lines, screen_table
-from adxl_ros.calibrate.report.coefficients import added_effect_lines, compare, truth_table
+from adxl_ros.calibrate.report.coefficients import compare, truth_table
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording, sweep_journal
 from adxl_ros.model.effects import effect_named
@@ -27,7 +28,7 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes import jobs
 from adxl_ros.nodes.run_node import program_parser
 from adxl_ros.process import ended_by_closed_output
-from adxl_ros.report.screen import coloured
+from adxl_ros.report.quantities import coloured
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 import rclpy
@@ -224,9 +225,11 @@ def _run_sweep(folder: Path, speed: float, seed: int) -> None:
             'sweep.check_poses': _CHECK_POSES})
         poses = _show_sweep(graph, output)
     fitted = parameter_file.load(output)
+    expected = {*default_terms(fitted.axes), *truth.effects}
     _print('', *screen_table(_held_out_errors(sensor, fitted, poses)), '',
            *truth_table(compare(fitted, truth)), '', *acceptance_lines(fitted),
-           *added_effect_lines(fitted, truth), '',
+           *[f'       The fit has the term {effect}, which this unit does not have.'
+             for effect in fitted.effects if effect not in expected], '',
            *file_lines({'Page': report / 'report.html', 'Calibration': output}))
 
 

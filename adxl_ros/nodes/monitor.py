@@ -11,8 +11,7 @@ import time
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
-from adxl_ros.files.recording_columns import check_unit, unit_of
-from adxl_ros.files.stream_info import NO_UNIT, StreamInfo
+from adxl_ros.files.recording_columns import check_unit, NO_UNIT, StreamInfo, unit_of
 from adxl_ros.monitor import changes
 from adxl_ros.monitor.changes import DiagnosisResult, DiagnosisRun, iso_time
 from adxl_ros.monitor.live_gap import AxisGap, GapSettings, LiveGap

@@ -10,8 +10,7 @@ import math
 from typing import Any
 
 from adxl_ros.files import cdr
-from adxl_ros.files.recording_columns import JOINTS
-from adxl_ros.files.stream_info import sensor_info
+from adxl_ros.files.recording_columns import JOINTS, sensor_info
 from adxl_ros.links.support.base import Samples
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2

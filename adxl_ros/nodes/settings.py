@@ -11,7 +11,7 @@ from typing import Any
 from adxl_ros.compensate.inversions import HALF
 from adxl_ros.files import calibration_store
 from adxl_ros.files.parameter_file import SENSOR_FIELDS
-from adxl_ros.files.stream_info import NO_UNIT
+from adxl_ros.files.recording_columns import NO_UNIT
 from adxl_ros.links.support import base
 from adxl_ros.nodes import parameters
 from adxl_ros.nodes.parameters import declare, Kind, nearest, parameter, parameter_error, Spec

@@ -14,7 +14,7 @@ from adxl_ros.nodes import settings, topics
 from adxl_ros.nodes.parameters import declare_all, parameter_error
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.topics import Level, Status, STEADY
-from adxl_ros.simulate.simulated_stage import JOINTS, SimulatedStage
+from adxl_ros.simulate.motion import JOINTS, SimulatedStage
 from builtin_interfaces.msg import Duration
 import numpy as np
 from rclpy.node import Node

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import cdr
-from adxl_ros.files.stream_info import StreamInfo
+from adxl_ros.files.recording_columns import StreamInfo
 from adxl_ros.links.support.base import Level
 from adxl_ros.nodes.rclpy_internals import MessageWait, NotForExecutors, take_messages
 from builtin_interfaces.msg import Time

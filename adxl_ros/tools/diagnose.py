@@ -13,18 +13,17 @@ from typing import Any
 from adxl_ros.diagnose import page
 from adxl_ros.diagnose.diagnosis import diagnose as diagnose_recordings, Diagnosis, self_check
 from adxl_ros.diagnose.report import as_json, screen_lines
-from adxl_ros.diagnose.user_unit import gap_in, GapInUnit, quantity
+from adxl_ros.diagnose.residual_map import gap_in, GapInUnit, quantity
 from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.errors import UserError
-from adxl_ros.files import parameter_file, population_file, recording
+from adxl_ros.files import calibration_store, parameter_file, recording
 from adxl_ros.files.atomic_write import write_text
-from adxl_ros.files.recording_columns import Recording
-from adxl_ros.files.stream_info import NO_UNIT
+from adxl_ros.files.recording_columns import NO_UNIT, Recording
 from adxl_ros.model.effects import library
 from adxl_ros.model.population import posterior
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report import page as html_page
-from adxl_ros.report.screen import NextStep
+from adxl_ros.report.quantities import NextStep
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
 from adxl_ros.simulate.trajectories import motion_from_force
 from adxl_ros.tools import command_line as cli
@@ -98,7 +97,7 @@ def diagnose(options: argparse.Namespace) -> int:
         if is_wrong:
             raise UserError(message)
     reading = cli.reading_options(options)
-    population = population_file.read(options.prior) if options.prior else None
+    population = calibration_store.read_population(options.prior) if options.prior else None
     unit = quantity(options.quantity) if options.quantity else None
     html_page.check_libraries()
     with cli.progress('reading') as show:

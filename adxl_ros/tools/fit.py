@@ -11,10 +11,10 @@ from pathlib import Path
 from adxl_ros.calibrate import calibration, pose_extraction
 from adxl_ros.calibrate.fits import thermal_fit
 from adxl_ros.calibrate.poses import Poses, with_table_angles
-from adxl_ros.calibrate.report import acceptance, dcc, page
+from adxl_ros.calibrate.report import acceptance, gum, page
 from adxl_ros.calibrate.report.coefficients import errors_in_words
 from adxl_ros.errors import UserError
-from adxl_ros.files import calibration_store, population_file, sweep_journal
+from adxl_ros.files import calibration_store, sweep_journal
 from adxl_ros.files.calibration_store import sha256
 from adxl_ros.files.recording_columns import recorded_unit, Recording
 from adxl_ros.files.tables import read_pose_table
@@ -69,7 +69,7 @@ def parser() -> argparse.ArgumentParser:
                        help='write the page report.html and its plots there')
     parse.add_argument('--dcc', metavar='FILE.xml',
                        help='write a Digital Calibration Certificate of a calibration on a stage, '
-                            f'by the schema DCC {dcc.SCHEMA_VERSION} of PTB')
+                            f'by the schema DCC {gum.SCHEMA_VERSION} of PTB')
     parse.add_argument('--dcc-data', metavar='FILE',
                        help='YAML file with what a laboratory states for it, as laboratory_name, '
                             'customer_name, responsible, gravity_std_mps2')
@@ -96,8 +96,8 @@ def fit(options: argparse.Namespace) -> int:
         html_page.check_libraries()
     if options.poses and (options.journal or len(options.recording) != 1):
         raise UserError(f'--poses {options.poses}: goes with one recording, and without --journal')
-    laboratory = dcc.read_laboratory(options.dcc_data)
-    population = population_file.read(options.prior) if options.prior else None
+    laboratory = gum.read_laboratory(options.dcc_data)
+    population = calibration_store.read_population(options.prior) if options.prior else None
     records = sweep_journal.poses_to_fit(sweep_journal.read(options.journal).entries) \
         if options.journal else None
     unit: Sensor | None = None
@@ -138,7 +138,7 @@ def fit(options: argparse.Namespace) -> int:
                 with_axes(base, unit.axes), thermal, Path(options.recording[0]).name, sha)
         result = replace(result, report_lines=[*result.report_lines, *measured])
         if options.dcc:
-            dcc.write(options.dcc, result, laboratory)
+            gum.write(options.dcc, result, laboratory)
         if options.report:
             show(0.6, 'report')
             cli.make_folder(Path(options.report))

@@ -14,13 +14,12 @@ import sys
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.recording_columns import Recording
-from adxl_ros.files.stream_info import sensor_info
+from adxl_ros.files.recording_columns import Recording, sensor_info
 from adxl_ros.links.support import emulated_board
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Concern
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.report.screen import entry_list
+from adxl_ros.report.quantities import entry_list
 from adxl_ros.simulate.motion import INTERNAL_RATE_HZ
 from adxl_ros.simulate.response import Columns, simulate_at_stamps, simulate_blocks
 from adxl_ros.simulate.trajectories import (

@@ -7,8 +7,7 @@ from dataclasses import replace
 import json
 
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.recording_columns import Recording
-from adxl_ros.files.stream_info import sensor_info
+from adxl_ros.files.recording_columns import Recording, sensor_info
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.smoothed_paths import ForcePath

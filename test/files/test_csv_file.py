@@ -8,8 +8,7 @@ import sys
 from adxl_ros.errors import UserError
 from adxl_ros.files import csv_file, recording
 from adxl_ros.files.csv_file import csv_writer
-from adxl_ros.files.recording_columns import ACCEL, check_unit, Recording
-from adxl_ros.files.stream_info import sensor_info
+from adxl_ros.files.recording_columns import ACCEL, check_unit, Recording, sensor_info
 import numpy as np
 from pace import within
 import pytest

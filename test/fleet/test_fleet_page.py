@@ -4,7 +4,7 @@
 import csv
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import population_file
+from adxl_ros.files.calibration_store import read_population
 from adxl_ros.fleet import page as fleet_page
 from made_up_fleet import MadeUpFleet
 from pages import layout_faults, NEEDS_CHROMIUM, wait_until_drawn, WIDTHS
@@ -99,7 +99,7 @@ def test_a_sound_fleet_is_in_order(folders):
 
 
 def test_files_beside_the_page(folders):
-    population = population_file.read(folders['bad'] / 'population.yaml')
+    population = read_population(folders['bad'] / 'population.yaml')
     pooled = population.coefficients['zero_g_y_v']
     assert pooled.units == 60
     assert abs(pooled.mean - 2.5) < 4 * pooled.mean_std
@@ -109,7 +109,7 @@ def test_files_beside_the_page(folders):
     assert len(rows) == 60
     assert all(min(float(row['estimate']), pooled.mean) - 1e-9 <= float(row['shrunken'])
                <= max(float(row['estimate']), pooled.mean) + 1e-9 for row in rows)
-    assert population_file.read(folders['single'] / 'population.yaml').coefficients == {}
+    assert read_population(folders['single'] / 'population.yaml').coefficients == {}
 
 
 @pytest.mark.parametrize('batch', [6, 10])
@@ -123,7 +123,7 @@ def test_a_bad_batch_shows_without_a_diagnosis(tmp_path, batch):
         strange = [row['serial'] for row in csv.DictReader(file)
                    if row['coefficient'] == 'scale_x_v_per_g' and row['is_far_out'] == 'true']
     assert len(strange) == batch and all(serial.startswith('B') for serial in strange)
-    pooled = population_file.read(tmp_path / 'population.yaml').coefficients['scale_x_v_per_g']
+    pooled = read_population(tmp_path / 'population.yaml').coefficients['scale_x_v_per_g']
     assert pooled.units == 24 - batch
 
 

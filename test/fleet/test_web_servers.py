@@ -10,7 +10,7 @@ import time
 
 from adxl_ros.fleet import inputs
 from adxl_ros.fleet.inputs import find_sources, Source
-from adxl_ros.fleet.staging import stage, StagingError
+from adxl_ros.fleet.task import stage, StagingError
 import pytest
 
 http = pytest.importorskip('fsspec.implementations.http', reason='fsspec is not installed')

@@ -4,7 +4,7 @@
 from dataclasses import replace
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import population_file
+from adxl_ros.files import calibration_store
 from adxl_ros.model.coefficients import get, put, with_neutral
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.population import PooledCoefficient, Population, posterior
@@ -72,5 +72,5 @@ def test_a_bad_file_is_refused(tmp_path, text, words):
     path = tmp_path / 'p.yaml'
     path.write_text(text)
     with pytest.raises(UserError) as error:
-        population_file.read(path)
+        calibration_store.read_population(path)
     assert words in str(error.value) and str(error.value).startswith(str(path))

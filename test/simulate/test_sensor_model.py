@@ -6,7 +6,7 @@ from dataclasses import replace
 from time import process_time
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import population_file
+from adxl_ros.files import calibration_store
 from adxl_ros.model.coefficients import put
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import library
@@ -203,8 +203,8 @@ def test_units_around_a_calibration_have_its_covariance():
 
 def test_units_of_a_fleet(tmp_path):
     pooled = PooledCoefficient(2.45, 1e-3, 0.02, 0.015, 0.03, 0.021, 12)
-    population_file.write(tmp_path / 'population.yaml',
-                          Population('fleet', {'zero_g_x_v': pooled}), [])
+    calibration_store.write_population(tmp_path / 'population.yaml',
+                                       Population('fleet', {'zero_g_x_v': pooled}), [])
     model = SensorModel(nominal('xyz'), units=tmp_path / 'population.yaml')
     model(np.zeros((5000, 3)), 1 / RATE_HZ)
     assert model.coefficients.mean() == pytest.approx(2.45 - 2.5, abs=2e-3)

@@ -10,8 +10,7 @@ import signal
 import subprocess
 
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.recording_columns import Recording
-from adxl_ros.files.stream_info import sensor_info
+from adxl_ros.files.recording_columns import Recording, sensor_info
 from adxl_ros.model import signal_chain
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force

@@ -3,7 +3,7 @@
 
 from dataclasses import replace
 
-from adxl_ros.files import parameter_file, population_file
+from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.model.coefficients import get, put, with_neutral
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.population import PooledCoefficient, Population
@@ -38,7 +38,7 @@ def drawn(rng):
 def test_an_open_axis_takes_the_population(run_tool, tmp_path):
     truth = replace(drawn(np.random.default_rng(1)), serial='N1')
     parameter_file.save(tmp_path / 'truth.yaml', truth)
-    population_file.write(tmp_path / 'population.yaml', population(), [])
+    calibration_store.write_population(tmp_path / 'population.yaml', population(), [])
     run_tool('simulate', 'tilt_alpha', '--params', 'truth.yaml', '--rate', 100, '-o', 'one.csv')
     done = run_tool('fit', 'one.csv', '-o', 'unit.yaml')
     assert done.returncode == 1 and 'y: its reference spans 0.00 g' in done.stderr
@@ -57,7 +57,7 @@ def test_a_stranger_is_named_by_fit(run_tool, tmp_path):
     """A wrong prior is said and not used: the fit is that without it, or is refused."""
     truth = drawn(np.random.default_rng(2))
     parameter_file.save(tmp_path / 'truth.yaml', truth)
-    population_file.write(tmp_path / 'wrong.yaml', population(0.1), [])
+    calibration_store.write_population(tmp_path / 'wrong.yaml', population(0.1), [])
     for name in ('tilt_alpha', 'sweep'):
         run_tool('simulate', name, '--params', 'truth.yaml', '--rate', 50, '-o', f'{name}.csv')
     done = run_tool('fit', 'tilt_alpha.csv', '--prior', 'wrong.yaml', '-o', 'a.yaml')

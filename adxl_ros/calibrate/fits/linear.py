@@ -20,6 +20,9 @@ from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
+AFFINE = ('bias', 'scale_factor', 'misalignment')
+"""Terms of the twelve coefficients of a three-axis unit that six known faces determine."""
+
 _UPRIGHT_COS = np.cos(np.radians(0.5))
 """Smallest cosine of an axis at ±1 g: it is within 0.5° of the vertical, an error of 40 µg."""
 _MIN_SPAN_G = 0.2

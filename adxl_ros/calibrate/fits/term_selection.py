@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from adxl_ros.calibrate.fits import full_model
+from adxl_ros.calibrate.fits.linear import AFFINE
 from adxl_ros.calibrate.fits.linearisation import Linearised, linearised
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.model.coefficients import get, parameter_of, with_neutral
@@ -31,8 +32,6 @@ import scipy
 
 ALWAYS = ('bias', 'scale_factor')
 """Terms that every fit has and that are not compared."""
-AFFINE = ('bias', 'scale_factor', 'misalignment')
-"""Terms of the twelve coefficients of a three-axis unit that six known faces determine."""
 _MAX_OPEN = 3
 """Largest number of the twelve coefficients that their priors may give. Chosen: an axis that never
 points up or down leaves its scale factor and two misalignments open."""

@@ -19,8 +19,7 @@ from adxl_ros.calibrate.guided.screen_contents import Phase, Status
 from adxl_ros.calibrate.guided.session import Session, SessionSettings
 from adxl_ros.calibrate.guided.stage_guide import MountingError
 from adxl_ros.errors import UserError
-from adxl_ros.files.recording_columns import unit_of
-from adxl_ros.files.stream_info import StreamInfo
+from adxl_ros.files.recording_columns import StreamInfo, unit_of
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals import recorded_sensor
 import numpy as np

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
-from adxl_ros.calibrate.fits.term_selection import AFFINE
+from adxl_ros.calibrate.fits.linear import AFFINE
 from adxl_ros.calibrate.report import held_out
 from adxl_ros.calibrate.report.held_out import ErrorBudget, ErrorBudgets, HeldOutErrors, rms_mg
 from adxl_ros.model.coefficients import get, parameter_of

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from adxl_ros.calibrate.fits import full_model
 from adxl_ros.files import calibration_store
 from adxl_ros.model.coefficients import get, parameter_of, with_neutral
 from adxl_ros.model.constants import AXES, Z_90
@@ -135,13 +134,6 @@ def rounded(row: Comparison, value: float) -> str:
     """Write a value with the decimals that show two digits of the interval."""
     places = decimals(row.half_width)
     return f'{round(value, places) + 0.0:.{places}f}'
-
-
-def added_effect_lines(fitted: Sensor, truth: Sensor) -> list[str]:
-    """Name each effect of the fit that neither the full model nor the simulated unit has."""
-    expected = {*full_model.default_terms(fitted.axes), *truth.effects}
-    return [f'       The fit has the term {effect}, which this unit does not have.'
-            for effect in fitted.effects if effect not in expected]
 
 
 class _Quantity(NamedTuple):
