@@ -49,7 +49,7 @@ def _whole_chain(export: Export) -> list[str]:
             f'from {_MODEL} import SensorNoise  # noqa: E402', '', '',
             'class WholeChain(SensorNoise, NoiseModel):',
             '    """All parts of the sensor; the attributes are its configuration."""', '',
-            f'    params = {export.source!r}',
+            f'    params = {export.source!r}  # path from where the program starts',
             f'    dt = {1 / export.sensor.rate_hz!r}  # s; set it to a step of the environment',
             "    units = None  # 'datasheet', 'calibration', population.yaml: one a robot",
             '    seed = 0', '',
