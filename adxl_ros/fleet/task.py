@@ -372,7 +372,7 @@ class _Job:
                 self.row |= {f'{name}_{axis}_{unit_name}': float(value),
                              f'{name}_std_{axis}_{unit_name}':
                              stds.get(Coefficient(*coefficient, axis))}
-        self.row |= {'fit_model': fitted.model, 'fit_poses': len(result.inliers)}
+        self.row |= {'fit_model': fitted.model, 'fit_poses': int(result.inliers.sum())}
         self._put_coefficients('fit', fitted, stds)
         self.files['unit.yaml'] = parameter_file.as_text(
             fitted, result.report_lines).encode('utf-8')
