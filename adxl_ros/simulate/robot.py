@@ -395,7 +395,7 @@ def _tracks(robot: Robot, readings: Readings) -> list[tuple[np.ndarray, np.ndarr
     if not tracks:
         raise UserError(f'{robot.urdf}: no joint moves {robot.frame}, and {readings.path} has no '
                         'pose of a moving base; record odom, or tf')
-    for name, times, values in tracks:
+    for name, times, _ in tracks:
         if len(times) < 8:
             raise UserError(f'{readings.path}: {name} has {len(times)} finite readings whose '
                             'stamps differ; at least 8 are needed')
