@@ -126,9 +126,9 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
     comparison = _without(comparison, reference.too_coarse(comparison, recording.columns))
     fading_hz = reference.fading_frequency_hz(comparison)
     if fading_hz is not None:
-        notes = [*notes, f'{comparison.motion.force.name} is smoother than the sensor: above '
-                 f'{fading_hz:.3g} Hz it lacks motion that the recording has; effects that show '
-                 'in fast motion are not named']
+        notes = [*notes, f'the reference is smoother than the sensor: above {fading_hz:.3g} '
+                 'Hz it lacks motion that the recording has; effects that show in fast motion '
+                 'are not named']
     return replace(comparison, notes=(*notes, *comparison.notes), fading_hz=fading_hz)
 
 

@@ -150,8 +150,9 @@ def align_force(recording: Recording, sensor: Sensor, sim: Motion, may_shift: bo
     shift = _find_shift(recording, replace(sensor, rate_hz=recording.rate_hz), force)
     if shift is not None and may_shift:
         force = force.shifted(-shift.late_s)
-        notes = [f'--align: {force.name} was {shift.text}, and is shifted by {-shift.late_s:+.6g} s; a '
-                 'latency of the sensor is a part of that and cannot show']
+        notes = [f'--align: {force.name} was {shift.text}, and is shifted by '
+                 f'{-shift.late_s:+.6g} s; a latency of the sensor is a part of that and cannot '
+                 'show']
     elif may_shift:
         notes = [f'--align: no shift beyond {LARGEST_LATENCY_S:g} s was found; less may be an '
                  'effect of the sensor (time_offset), and nothing is shifted']
@@ -165,12 +166,12 @@ def align_force(recording: Recording, sensor: Sensor, sim: Motion, may_shift: bo
                         f'to {recording.time_s[-1]:.6g} s, {force.name} from {begin_s:.6g} to '
                         f'{end_s:.6g} s; {advice}')
     if shift is not None and not may_shift:
-        raise DataFault('time_misaligned', f'{force.name} is {shift.text}; use --align, or shift its '
-                        f'stamps by {-shift.late_s:+.6g} s')
+        raise DataFault('time_misaligned', f'{force.name} is {shift.text}; use --align, or '
+                        f'shift its stamps by {-shift.late_s:+.6g} s')
     if not covered.all():
         outside_s = (1 - covered.mean()) * float(np.ptp(recording.time_s))
-        notes.append(f'left out: {outside_s:.3g} s of the recording that {force.name} does not cover '
-                     f'(it is from {begin_s:.6g} to {end_s:.6g} s)')
+        notes.append(f'left out: {outside_s:.3g} s of the recording that {force.name} does not '
+                     f'cover (it is from {begin_s:.6g} to {end_s:.6g} s)')
     return _between(recording, begin_s, end_s), replace(sim, force=force), notes
 
 
@@ -405,9 +406,9 @@ def too_coarse(comparison: BaselineComparison, columns: dict[str, np.ndarray]) -
     if isinstance(force, ForcePath) and force.is_robot:
         return _too_abrupt(comparison, force, noise_g)
     if isinstance(force, ForcePath):
-        references = [(force.name, force.time_s, np.array(force(force.time_s)) / G0_MPS2, 3, 0, 0.0,
-                       limit_g, '; write it at a higher rate, and switch off noise that the '
-                       'simulator adds')]
+        references = [(
+            force.name, force.time_s, np.array(force(force.time_s)) / G0_MPS2, 3, 0, 0.0, limit_g,
+            '; write it at a higher rate, and switch off noise that the simulator adds')]
     for joint, name in JOINTS.items() if comparison.joints else ():
         values = columns.get(name, np.zeros(0))
         read = np.isfinite(values)

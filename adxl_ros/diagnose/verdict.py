@@ -307,10 +307,11 @@ def _answer(evidence: Evidence, rest: Rest, drifts: Sequence[str], detected: fro
         is_much = above > max(evidence.floor_mps2 ** 2, evidence.material_power(1.0))
         return _Answer('unknown' if is_much else 'no_gap', _NOTHING, frozenset())
     # The order of two sets could be that of their errors of form, where these are as large as
-    # the rest that the best set leaves.
+    # the rest that the best set leaves; or that of errors of the reference in motion.
+    smallest = max(left, evidence.errs_in_motion * evidence.reference_mps2 ** 2)
     rivals = [other for other in minimal[1:] if len(other) == len(best) and not (
         _predicts(evidence.nats((best, HEALTHY), (other, HEALTHY), rows))
-        and float(evidence.gain(best, other, rows)[0]) > left)]
+        and float(evidence.gain(best, other, rows)[0]) > smallest)]
     groups = {group for e in best if len(group := frozenset({e}).union(
         *(other - best for other in rivals if e not in other))) > 1}
     certain = best.difference(*groups) | detected | {*named[:1]}

@@ -33,6 +33,7 @@ from adxl_ros.simulate.smoothed_paths import (
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
+from scipy.spatial.transform import Rotation
 
 _HIGHEST_RATE_HZ = 1000.0
 """Highest rate at which the kinematics are evaluated, Hz. Chosen: the rate of the simulator."""
@@ -165,16 +166,10 @@ def _free_flyer(base: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     norm = np.linalg.norm(q, axis=1, keepdims=True)
     q, dq, ddq = q / norm, dq / norm, ddq / norm
     inverse = q * [-1, -1, -1, 1]
-    omega = 2 * _product(inverse, dq)[:, :3]
-    alpha = 2 * _product(inverse, ddq)[:, :3]
-
-    def local(vector: np.ndarray) -> np.ndarray:
-        pure = np.column_stack([vector, np.zeros(len(vector))])
-        return _product(_product(inverse, pure), q)[:, :3]
-
-    velocity = local(dx)
+    omega, alpha = (2 * _product(inverse, d)[:, :3] for d in (dq, ddq))
+    velocity, acceleration = (Rotation.from_quat(inverse).apply(d) for d in (dx, ddx))
     return (np.hstack([x, q]), np.hstack([velocity, omega]),
-            np.hstack([local(ddx) - np.cross(omega, velocity), alpha]))
+            np.hstack([acceleration - np.cross(omega, velocity), alpha]))
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -395,7 +390,7 @@ def _tracks(robot: Robot, readings: Readings) -> list[tuple[np.ndarray, np.ndarr
     if not tracks:
         raise UserError(f'{robot.urdf}: no joint moves {robot.frame}, and {readings.path} has no '
                         'pose of a moving base; record odom, or tf')
-    for name, times, values in tracks:
+    for name, times, _ in tracks:
         if len(times) < 8:
             raise UserError(f'{readings.path}: {name} has {len(times)} finite readings whose '
                             'stamps differ; at least 8 are needed')

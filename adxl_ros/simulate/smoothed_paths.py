@@ -293,9 +293,9 @@ def noise_step(reading: np.ndarray, smallest: float, time_s: np.ndarray | None =
     """
     if len(reading) <= 5:
         return 0.0
-    times = sliding_window_view(np.arange(len(reading)) if time_s is None else time_s, 6)
-    weights = np.array([1 / np.prod([times[:, i] - times[:, j] for j in range(6) if j != i], axis=0)
-                        for i in range(6)])
+    times = sliding_window_view(np.arange(len(reading)) if time_s is None else time_s, 6).T
+    weights = np.array([1 / np.prod(np.delete(own - times, i, 0), axis=0)
+                        for i, own in enumerate(times)])
     differences = np.sum(weights * sliding_window_view(reading, 6).T, axis=0) \
         / np.linalg.norm(weights, axis=0)
     moving = differences[np.abs(np.diff(reading))[4:] > smallest]

@@ -196,9 +196,9 @@ def _with_what_shows(result: Findings, options: argparse.Namespace, reading: Rea
             sim = robot.as_motion()
         shown = what_shows([read], sensor, sim)
     except UserError as error:
-        # A robot that does not fit the recording was asked for.
-        told = 'faults' if options.urdf and sim is None else 'remarks'
-        return replace(result, **{told: (*getattr(result, told), one_line(error))})
+        if options.urdf and sim is None:
+            return replace(result, faults=(*result.faults, one_line(error)))
+        return replace(result, remarks=(*result.remarks, one_line(error)))
     fault = shown.message if isinstance(shown, DataFault) else ''
     if options.urdf or fault:
         ability = Ability('diagnose', not fault, fault or 'against the joints of the robot')

@@ -36,6 +36,7 @@ def pendulum(tmp_path):
 
 def path_of(robot, rate_hz, step_rad, base=None, span_s=40.0):
     time_s = np.arange(0, span_s, 1 / rate_hz)
+    time_s = time_s + np.random.default_rng(0).uniform(0, 2e-5, len(time_s))  # as read
     return RobotPath(robot, Readings('run', {
         'j1': (time_s, encoded(swing(time_s)[0], step_rad)), 'other': (time_s, time_s)}, base))
 
@@ -43,8 +44,9 @@ def path_of(robot, rate_hz, step_rad, base=None, span_s=40.0):
 @pytest.mark.parametrize(('rate_hz', 'step_rad'), [
     (100, 0.0), (100, 1e-5), (250, 5e-5), (500, 1e-7), (500, 1e-3)])
 def test_force_of_a_pendulum(pendulum, rate_hz, step_rad):
-    """Its error is that which the steps of the encoder predict."""
+    """Its error is that which the steps of the encoder predict, which uneven stamps are not."""
     path, time_s = path_of(pendulum, rate_hz, step_rad), np.arange(2, 38, 0.003)
+    assert path.step_rad == pytest.approx(step_rad, rel=0.3, abs=1e-7)
     error = np.array(path(time_s)).T - pendulum_force(*swing(time_s))
     predicted = np.column_stack([path.errors(time_s, c).std for c in range(3)])
     assert np.sqrt(np.mean(error ** 2)) < 3 * np.sqrt(np.mean(predicted ** 2)) + 1e-3
@@ -114,11 +116,12 @@ def test_a_moving_base(tmp_path):
 @pytest.mark.parametrize(('frame', 'joints', 'words'), [
     ('imu', 'time_s,j1_rad', 'no frame imu; it has'),
     ('imu_link', 'time_s,j2_rad', 'no position of j1, which moves imu_link'),
+    ('imu_link', 'time_s,j1_rad', 'j1 is at 0 to 99, but'),
     ('base', 'time_s,j1_rad', 'no joint moves base')])
-def test_wrong_names_are_told(tmp_path, frame, joints, words):
+def test_wrong_names_and_units_are_told(tmp_path, frame, joints, words):
     (tmp_path / 'robot.urdf').write_text(urdf(PENDULUM))
     (tmp_path / 'run.csv').write_text(joints + '\n' + ''.join(
-        f'{t},{t}\n' for t in np.arange(0, 1, 0.01)))
+        f'{t},{100 * t}\n' for t in np.arange(0, 1, 0.01)))
     with pytest.raises(UserError) as error:
         robot_path(tmp_path / 'robot.urdf', frame, str(tmp_path / 'run.csv'), 0)
     assert words in str(error.value)
@@ -127,6 +130,9 @@ def test_wrong_names_are_told(tmp_path, frame, joints, words):
 def test_a_file_that_is_no_urdf(tmp_path):
     (tmp_path / 'robot.urdf').write_text('<mujoco/>')
     with pytest.raises(UserError, match='no URDF that pinocchio reads'):
+        Robot(tmp_path / 'robot.urdf', 'imu_link')
+    (tmp_path / 'robot.urdf').write_text('<robot><xacro:include filename="a"/></robot>')
+    with pytest.raises(UserError, match='is a xacro'):
         Robot(tmp_path / 'robot.urdf', 'imu_link')
     with pytest.raises(UserError, match='no such file'):
         Robot(tmp_path / 'none.urdf', 'imu_link')
