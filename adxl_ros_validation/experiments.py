@@ -38,20 +38,13 @@ SEARCH_RAD = np.radians(np.arange(-5.0, 5.01, 0.5))
 """Angles about the case's axis, rad; chosen."""
 
 
-class DirectionSearch(NamedTuple):
-    """Beta of the direction of the x axis, and the outputs that it was found by."""
-
-    found_rad: dict[str, float]  # true value, and by three methods, rad
-    turned_rad: np.ndarray  # angles, rad, and outputs by the nominal scale factor, g, (k,)
-    output_g: np.ndarray
-
-
-def search(truth: Sensor, seed: int) -> DirectionSearch:
+def search(truth: Sensor, seed: int) -> tuple[dict[str, float], np.ndarray]:
     """
     Turn beta about 0 at alpha = 90° (maximum), and about ±90° (null), 5 s in each pose.
 
     The beta of the largest output is minus that of (18): x_ref has to turn back by it. Between
-    the null crossings at +90° and −90° the zero-g cancels.
+    the null crossings at +90° and −90° the zero-g cancels. Return the beta of the direction of
+    the x axis, true and by three methods, rad, and the outputs at `SEARCH_RAD`, g.
     """
     around = {'top': 0.0, 'left': np.pi / 2, 'right': -np.pi / 2}
     volts = {}
@@ -67,10 +60,10 @@ def search(truth: Sensor, seed: int) -> DirectionSearch:
     # β_x of (18) with the linear cross-axis term, which equals it to first order.
     direction = sum(float(truth.values.get(effect, {}).get(name, [0.0])[0]) for effect, name in (
         ('misalignment', 'beta_rad'), ('cross_axis', 'linear')))
-    return DirectionSearch({
+    return {
         'truth': direction, 'largest output': -float(SEARCH_RAD[np.argmax(top)]),
         'parabola through the outputs': float(curve[1] / (2 * curve[0])),
-        'null crossings at ±90°': float(level / slope)}, SEARCH_RAD, top)
+        'null crossings at ±90°': float(level / slope)}, top
 
 
 MAX_BOUND_RAD = np.radians(1.0)
@@ -81,10 +74,8 @@ _SAME_MPS2 = 1e-3
 """Largest difference of two solutions of |f| = g that are the same, m/s²; chosen."""
 _SETTLED_S = 1.0
 """Time after which the start of Butterworth and RC filter has decayed, s; chosen."""
-_BUTTERWORTH_ORDER = 2
-"""Order of the low-pass of the motion experiment; the paper's."""
-_BUTTERWORTH_HZ = 20.0
-"""Corner of that low-pass, Hz; the paper's."""
+_BUTTERWORTH = 2, 20.0
+"""Order and corner, Hz, of the low-pass of the motion experiment; the paper's."""
 
 
 def sweep_bound(truth: Sensor, swept: Poses, true_rad: np.ndarray, stage: StageError,
@@ -167,7 +158,7 @@ def motion_errors(fitted: Sensor, time_s: np.ndarray, volts: np.ndarray, referen
     unfiltered = inversions.undo_filter(volts, time_s, noise.electronics(fitted).rc_s,
                                         fitted.rate_hz)
     estimate = signal_chain.inverse(fitted)(list(unfiltered.T))[0]
-    b, a = scipy.signal.butter(_BUTTERWORTH_ORDER, _BUTTERWORTH_HZ, fs=fitted.rate_hz)
+    b, a = scipy.signal.butter(*_BUTTERWORTH, fs=fitted.rate_hz)
     smooth, expected = (scipy.signal.lfilter(b, a, v) for v in (estimate, reference_mps2))
     residual = 1e3 * (smooth - expected)[time_s > _SETTLED_S]
     return (float(residual.std()), float(residual.mean())), smooth, expected
@@ -175,15 +166,13 @@ def motion_errors(fitted: Sensor, time_s: np.ndarray, volts: np.ndarray, referen
 
 def motion_bound_mmps2(nominal: Sensor) -> float:
     """Return the floor of the motion experiment, mm/s²: white noise after the Butterworth."""
-    b, a = scipy.signal.butter(_BUTTERWORTH_ORDER, _BUTTERWORTH_HZ, fs=nominal.rate_hz)
+    b, a = scipy.signal.butter(*_BUTTERWORTH, fs=nominal.rate_hz)
     impulse = scipy.signal.lfilter(b, a, np.eye(1, round(nominal.rate_hz))[0])
     density = nominal.noise_density_g_per_rthz[0] * G0_MPS2
     return float(1e3 * density * np.sqrt(nominal.rate_hz / 2 * np.sum(impulse ** 2)))
 
 
 MODELS = {'linear': linear.fit, 'physical': linear.fit_physical, 'full': term_selection.fit}
-DRAWN = full_model.TERMS
-"""Effects of a unit. Each coefficient is normal; its typical size is the standard deviation."""
 PLANES_RAD = tuple(np.radians([90.0, 60.0, 30.0, 0.0, 120.0, 150.0, 180.0]).tolist())
 """Planes alpha of the sweep, rad; the paper's."""
 STEP_RAD = float(np.radians(30.0))
@@ -210,12 +199,16 @@ class Run(NamedTuple):
 
 
 def draw(nominal: Sensor, stage: tuple[float, float], rng: np.random.Generator) -> Sensor:
-    """Draw a unit at datasheet spread, or take the given one, on a base that is not level."""
+    """
+    Draw a unit at datasheet spread, or take the given one, on a base that is not level.
+
+    Each coefficient is normal; its typical size is the standard deviation.
+    """
     step_rad, level_rad = stage
     unit = replace(nominal, stage_resolution_rad=step_rad, local_gravity_mps2=GRAVITY_MPS2)
     if not nominal.effects:
         values = {name: {p: rng.normal(size=np.shape(v)) * v for p, v in typical(
-            effect_named(name), unit.axes).items()} for name in DRAWN}
+            effect_named(name), unit.axes).items()} for name in full_model.TERMS}
         ratio = rng.uniform(-RESISTANCE, RESISTANCE, len(unit.axes))
         values['bandwidth'] = {'resistance_ratio': ratio}
         unit = replace(unit, effects=tuple(values), values=values)
@@ -305,7 +298,7 @@ class Unit(NamedTuple):
     coefficients: dict[str, np.ndarray]
     # rms about the mean, and mean, of the residual in motion, mm/s²
     motion: dict[str, tuple[float, float]]
-    directions: DirectionSearch  # the search for its misalignment
+    directions: tuple[dict[str, float], np.ndarray]  # of `search`
 
 
 def evaluate(nominal: Sensor, stage: tuple[float, float], seed: int) -> Unit:

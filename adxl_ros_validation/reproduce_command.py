@@ -24,7 +24,7 @@ from adxl_ros.report.figures import png, pyplot
 from adxl_ros.tools import command_line as cli
 from adxl_ros_validation import coverage, experiments
 from adxl_ros_validation.blind.report import filled, markdown_table, terminal_table
-from adxl_ros_validation.experiments import DirectionSearch, MODELS, RUNS, Unit
+from adxl_ros_validation.experiments import MODELS, RUNS, Unit
 import numpy as np
 import pandas as pd
 
@@ -104,7 +104,7 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> _Re
     cli.make_folder(pictures)
     unit_page.draw_sweep(pictures / 'sweep.png', experiments.bare(truth),
                          unit.fitted['physical'], unit.poses)
-    for name, figure in (('misalignment', draw_misalignment(results['paper'][0].directions)),
+    for name, figure in (('misalignment', draw_misalignment(*results['paper'][0].directions)),
                          ('tilt', draw_tilt(results['paper'][0])),
                          ('motion', draw_motion(unit.fitted, experiments.shaken(truth, first))),
                          ('components', draw_components(truth, unit.fitted))):
@@ -133,13 +133,12 @@ _SHOWN_S = (2.0, 2.5)
 """Interval of figure 12, s; chosen."""
 
 
-def draw_misalignment(search: DirectionSearch) -> Any:
+def draw_misalignment(found_rad: dict[str, float], output_g: np.ndarray) -> Any:
     """Draw the search for β_x of (18) and the results of its three methods, as figure 9."""
     figure, axis = pyplot().subplots(figsize=(7, 4.5), layout='constrained')
-    turned = np.degrees(search.turned_rad)
-    axis.plot(turned, 1e3 * (search.output_g - search.output_g.max()), 'o', ms=4,
+    axis.plot(np.degrees(experiments.SEARCH_RAD), 1e3 * (output_g - output_g.max()), 'o', ms=4,
               label='output, means of 5 s')
-    for (label, value), colour in zip(search.found_rad.items(),
+    for (label, value), colour in zip(found_rad.items(),
                                       ('k', 'tab:red', 'tab:orange', 'tab:green')):
         axis.axvline(-np.degrees(value), color=colour, lw=1,
                      label=f'{label}: {-np.degrees(value):+.2f}°')
@@ -316,7 +315,7 @@ def _motion(units: Sequence[Unit], bound_mmps2: float) -> list[list[str]]:
 
 
 def _directions(units: Sequence[Unit]) -> str:
-    found = pd.DataFrame([unit.directions.found_rad for unit in units])
+    found = pd.DataFrame([unit.directions[0] for unit in units])
     errors = np.degrees(found.iloc[:, 1:].sub(found.truth, axis=0))
     return markdown_table(['largest output', 'parabola through the outputs', 'null crossings'],
                           [[f'{_rms(errors[name]):.3f}' for name in errors]])

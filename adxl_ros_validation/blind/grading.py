@@ -140,12 +140,6 @@ def material(answer: Answer, label: Label) -> bool:
     return all(fault['strength_mps2'] >= answer.material_mps2 for fault in label.faults)
 
 
-def separable(label: Label) -> bool:
-    """Return whether the ideal observer detects every effect and separates it from all others."""
-    return bool(label.faults) and all(
-        fault['power'] * fault['told'] >= CERTAIN_POWER for fault in label.faults)
-
-
 def visible(label: Label) -> bool:
     """Return whether the ideal observer detects every effect."""
     return bool(label.faults) and all(

@@ -107,13 +107,13 @@ class Half:
 def prepare(source: Path) -> tuple[list[Half], list[str]]:
     """Return the later parts of recordings, and why others are left out."""
     halves, left_out = [], []
-    for path, sim_path, digest in _sources(source):
+    for path, digest in _sources(source).items():
         try:
             if not path.exists():
                 raise UserError('no such file; the manifest has its address')
             if digest and hashlib.sha256(path.read_bytes()).hexdigest() != digest:
                 raise UserError('is not the file whose SHA-256 the manifest has')
-            halves.append(_half(path, sim_path))
+            halves.append(_half(path))
         except UserError as error:
             left_out.append(f'{path.name}: {error}')
     if not halves:
@@ -121,21 +121,17 @@ def prepare(source: Path) -> tuple[list[Half], list[str]]:
     return halves, left_out
 
 
-def _sources(source: Path) -> list[tuple[Path, Path | None, str]]:
-    """List recordings, each with another simulator's force (NAME_sim.csv), and SHA-256."""
-    if not source.exists():
-        raise UserError(f'{source}: no such file or folder')
+def _sources(source: Path) -> dict[Path, str]:
+    """List recordings, each with the SHA-256 that a manifest states."""
+    if source.is_dir():
+        return {path: '' for path in sorted(source.glob('*.csv')) if not path.match('*_sim.csv')}
     try:
-        rows = [{'file': path.name} for path in sorted(source.glob('*.csv'))
-                if not path.stem.endswith('_sim')] if source.is_dir() else \
-            yaml.safe_load(source.read_text(encoding='utf-8'))['recordings']
-        folder = source if source.is_dir() else source.parent
-        paths = [(folder / row['file'], row.get('sha256', '')) for row in rows]
+        rows = yaml.safe_load(source.read_text(encoding='utf-8'))['recordings']
+        return {source.parent / row['file']: row.get('sha256', '') for row in rows}
+    except FileNotFoundError:
+        raise UserError(f'{source}: no such file or folder') from None
     except (OSError, UnicodeError, yaml.YAMLError, KeyError, TypeError) as error:
         raise UserError(f'{source}: no folder, and no manifest: {error}') from None
-    sims = [path.with_name(path.stem.removesuffix('_real') + '_sim.csv') for path, _ in paths]
-    return [(path, sim if sim.exists() else None, digest)
-            for (path, digest), sim in zip(paths, sims)]
 
 
 def _read(path: Path) -> tuple[pd.DataFrame, dict[str, int]]:
@@ -159,19 +155,24 @@ def _part(columns: pd.DataFrame | None, start: float, stop: float) -> pd.DataFra
     return part.assign(time_s=part['time_s'] - start)
 
 
-def _half(path: Path, sim_path: Path | None) -> Half:
-    """Make the parameters of the first part of a recording, and the reference of the later one."""
+def _half(path: Path) -> Half:
+    """
+    Make the parameters of the first part of a recording, and the reference of the later one.
+
+    NAME_sim.csv beside it is another simulator's force.
+    """
     columns, digits = _read(path)
-    sim = _read(sim_path)[0] if sim_path else None
+    sim_path = path.with_name(path.stem.removesuffix('_real') + '_sim.csv')
+    force = _read(sim_path)[0] if sim_path.exists() else None
     begin, end = columns['time_s'].iloc[[0, -1]]
     if end - begin < _SHORTEST_S:
         raise UserError(f'has {end - begin:.0f} s; at least {_SHORTEST_S:.0f} s are needed')
     cut = begin + _FIRST * (end - begin)
-    kind = 'simulator' if sim_path else 'stage' if 'alpha_rad' in columns else 'rests'
-    first, second = (Half(path.stem, kind, _part(columns, *span), _part(sim, *span), digits)
+    kind = 'simulator' if force is not None else 'stage' if 'alpha_rad' in columns else 'rests'
+    first, second = (Half(path.stem, kind, _part(columns, *span), _part(force, *span), digits)
                      for span in ((begin, cut), (cut, math.inf)))
     second = replace(second, noise_mps2=_noise(second))
-    if sim_path:
+    if force is not None:
         return replace(second, parameters=_against_force(first))
     with tempfile.TemporaryDirectory(prefix='half_') as temporary:
         folder = Path(temporary)

@@ -63,7 +63,9 @@ class Trial(NamedTuple):
             'names': len(named & truth), 'names_all': truth <= named, 'set_size': len(named),
             'inseparable_size': 1 + len(rivals),
             'unknown': UNKNOWN in named | answer.top, 'seen': grading.visible(label),
-            'separable': grading.separable(label), 'material': grading.material(answer, label),
+            'separable': bool(label.faults) and all(
+                fault['power'] * fault['told'] >= grading.CERTAIN_POWER for fault in label.faults),
+            'material': grading.material(answer, label),
             'limit_holds': grading.limit_holds(answer, label),
             'brier': grading.brier(answer, label), 'utility': grading.utility(*groups),
             'has_effect': any(groups[1]),
