@@ -35,10 +35,6 @@ _START_S = 20.0
 """Longest time until the first messages, s; chosen: a busy machine starts a node in 10 s."""
 _FIRST_MESSAGES = 50
 """Messages after which a stream has begun."""
-_WARM_UP_S = 2.0
-"""Time between the begin of a stream and its measurement, s; chosen."""
-_QUEUE = 1000
-"""Messages that the listener keeps while it is busy; chosen: 1 s."""
 BARE_QUEUE = 10
 """Messages that a bare node keeps, the usual depth of ROS examples."""
 _RELAY = 'bare publisher and relay'
@@ -52,7 +48,8 @@ class Listener(Node):
         super().__init__('listener')
         self.messages: list[tuple[int, bytes]] = []  # Arrival time, ns, and serialized message
         # An executor of rclpy would take as much of a core as the nodes that are measured.
-        self._inbox = Inbox(self, Imu, topic, _QUEUE)
+        # Messages of 1 s are kept while the listener is busy.
+        self._inbox = Inbox(self, Imu, topic, round(RATE_HZ))
 
     def listen(self, seconds: float, limit: float = np.inf) -> None:
         """Keep the messages of some time."""
@@ -216,7 +213,8 @@ def _measure(subject: _Subject, seconds: float) -> dict[str, Any]:
             processes = processes + stack.enter_context(running(subject.commands[-1:]))
             listener.listen(_START_S, _FIRST_MESSAGES)
             first_s = (listener.messages[0][0] - began_ns) * 1e-9
-            listener.listen(_WARM_UP_S)
+            # A stream that has begun runs for 2 s before it is measured.
+            listener.listen(2.0)
             listener.messages.clear()
             before_s, began_s = cpu_times_s(), time.monotonic()
             listener.listen(seconds)

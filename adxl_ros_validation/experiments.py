@@ -70,10 +70,6 @@ MAX_BOUND_RAD = np.radians(1.0)
 """Largest bound of an angle, rad, at which a pose counts; chosen."""
 NEAR_VERTICAL_RAD = np.radians(15.0)
 """Distance from ±90°, rad, below which a pose does not count for the alpha error; chosen."""
-_SAME_MPS2 = 1e-3
-"""Largest difference of two solutions of |f| = g that are the same, m/s²; chosen."""
-_SETTLED_S = 1.0
-"""Time after which the start of Butterworth and RC filter has decayed, s; chosen."""
 _BUTTERWORTH = 2, 20.0
 """Order and corner, Hz, of the low-pass of the motion experiment; the paper's."""
 
@@ -111,7 +107,7 @@ def angle_errors(fitted: Sensor, bound: Sensor, poses: Poses, true_rad: np.ndarr
     measured_force = signal_chain.inverse(fitted, up)(list(poses.volts.T))
     measured = _angles(fitted, measured_force, up, variance_v2)
     solution = signal_chain.inverse(bound, up)(list(signal_chain.static_response(bound)(force)))
-    twofold = np.abs(np.subtract(solution, force)).max(axis=0) > _SAME_MPS2
+    twofold = np.abs(np.subtract(solution, force)).max(axis=0) > 1e-3
     true[1][twofold] = pose_only[1][twofold] = np.inf
     level = np.hypot(force[0], force[1]) < np.sin(MAX_BOUND_RAD) * np.abs(force[2])
     true[1][level, 1] = pose_only[1][level, 1] = np.inf
@@ -160,7 +156,8 @@ def motion_errors(fitted: Sensor, time_s: np.ndarray, volts: np.ndarray, referen
     estimate = signal_chain.inverse(fitted)(list(unfiltered.T))[0]
     b, a = scipy.signal.butter(*_BUTTERWORTH, fs=fitted.rate_hz)
     smooth, expected = (scipy.signal.lfilter(b, a, v) for v in (estimate, reference_mps2))
-    residual = 1e3 * (smooth - expected)[time_s > _SETTLED_S]
+    # The start of both filters has decayed after 1 s.
+    residual = 1e3 * (smooth - expected)[time_s > 1.0]
     return (float(residual.std()), float(residual.mean())), smooth, expected
 
 
@@ -174,11 +171,7 @@ def motion_bound_mmps2(nominal: Sensor) -> float:
 
 MODELS = {'linear': linear.fit, 'physical': linear.fit_physical, 'full': term_selection.fit}
 PLANES_RAD = tuple(np.radians([90.0, 60.0, 30.0, 0.0, 120.0, 150.0, 180.0]).tolist())
-"""Planes alpha of the sweep, rad; the paper's."""
-STEP_RAD = float(np.radians(30.0))
-"""Step of beta, rad; the paper's."""
-RESISTANCE = 0.25
-"""Largest departure of the filter's resistor from the stated one, a share; the paper's."""
+"""Planes alpha of the sweep, rad; the paper's, as its step of beta, 30°."""
 GRAVITY_MPS2 = 9.80131
 """Local gravity of the paper's experiments, m/s²."""
 SETTLED_S = 1.0
@@ -202,14 +195,15 @@ def draw(nominal: Sensor, stage: tuple[float, float], rng: np.random.Generator) 
     """
     Draw a unit at datasheet spread, or take the given one, on a base that is not level.
 
-    Each coefficient is normal; its typical size is the standard deviation.
+    Each coefficient is normal; its typical size is the standard deviation. The filter's resistor
+    departs from the stated one by a quarter at most, as in the paper.
     """
     step_rad, level_rad = stage
     unit = replace(nominal, stage_resolution_rad=step_rad, local_gravity_mps2=GRAVITY_MPS2)
     if not nominal.effects:
         values = {name: {p: rng.normal(size=np.shape(v)) * v for p, v in typical(
             effect_named(name), unit.axes).items()} for name in full_model.TERMS}
-        ratio = rng.uniform(-RESISTANCE, RESISTANCE, len(unit.axes))
+        ratio = rng.uniform(-0.25, 0.25, len(unit.axes))
         values['bandwidth'] = {'resistance_ratio': ratio}
         unit = replace(unit, effects=tuple(values), values=values)
     level = {f'{axis}_rad': np.array(level_rad * rng.normal()) for axis in 'xy'}
@@ -252,7 +246,7 @@ def poses_at(truth: Sensor, read_rad: np.ndarray, seed: int
 
 def calibrated(truth: Sensor, seed: int, models: Sequence[str] = tuple(MODELS)) -> Run:
     """Sweep a unit (the paper's experiments 1 and 2) and fit the models."""
-    targets = sweep(PLANES_RAD, STEP_RAD, 0)
+    targets = sweep(PLANES_RAD, float(np.radians(30.0)), 0)
     poses, true, recording = poses_at(
         truth, np.array([[t.alpha_rad, t.beta_rad] for t in targets]), seed)
     nominal = bare(truth)
@@ -283,8 +277,6 @@ RUNS = {
     'both': np.array([(a, a) for a in range(-180, 181, 30)]),
 }
 """Alpha and beta of figure 10, deg; (b) at alpha = 90°, as beta has no effect at 0."""
-RANDOM_POSES = 40
-"""Number of poses in random directions; chosen."""
 
 
 class Unit(NamedTuple):
@@ -309,8 +301,8 @@ def evaluate(nominal: Sensor, stage: tuple[float, float], seed: int) -> Unit:
     bound = sweep_bound(
         truth, run.poses, run.true_rad, StageError(truth.stage_std_rad),
         (*full_model.default_terms(truth.axes), *full_model.GAUGE))
-    random_rad = np.column_stack([np.arccos(rng.uniform(-1, 1, RANDOM_POSES)),
-                                 rng.uniform(0, 2 * np.pi, RANDOM_POSES)])
+    random_rad = np.column_stack([np.arccos(rng.uniform(-1, 1, 40)),
+                                  rng.uniform(0, 2 * np.pi, 40)])
     angles_rad = {'random': random_rad, **{name: np.radians(deg) for name, deg in RUNS.items()}}
     poses_of = {name: poses_at(truth, rad, seed + (i + 1) * 1_000_003)[:2]
                 for i, (name, rad) in enumerate(angles_rad.items())}

@@ -113,7 +113,11 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> _Re
     made = (f'adxl_ros {package_version()}, {date.today()}, {drawn} on each stage, '
             f'seed {options.seed}.')
     bound_mmps2 = experiments.motion_bound_mmps2(sensor)
-    return _page(results, bound_mmps2, made, coverage_page), [
+    page = filled('reproduction.md', {
+        'made': made, 'coverage': coverage_page, 'directions': _directions(results['paper']),
+        'step': np.degrees(experiments.SEARCH_RAD[1] - experiments.SEARCH_RAD[0]), **{
+            stage: _of_stage(units, bound_mmps2) for stage, units in results.items()}})
+    return page, [
         f"The paper's experiments, {drawn} on each stage, seed {options.seed}", '',
         *screen_lines(results, bound_mmps2), *[''] * bool(coverage_lines), *coverage_lines]
 
@@ -124,7 +128,7 @@ def _coverage(sensor: Sensor, options: argparse.Namespace) -> _Reproduction:
         errors = coverage.draw_all(replace(sensor, effects=(), values={}), options.draws,
                                    options.seed, show)
     page = coverage.page(errors, f'adxl_ros {package_version()}, {date.today()}, seed '
-                                f'{options.seed}; `make coverage`.')
+                                 f'{options.seed}; `make coverage`.')
     return page, coverage.screen_lines(errors)
 
 
@@ -229,14 +233,6 @@ _MOTION = ', '.join(f'{name} {value}' for name, value in MOTION_MMPS2.items())
 _STAGE_NAMES = {'perfect': 'perfect stage', 'paper': "the paper's stage"}
 FIGURES = 'reproduction'
 """Folder of the plots, in the folder of the page."""
-
-
-def _page(results: dict[str, list[Unit]], bound_mmps2: float, made: str, intervals: str) -> str:
-    """Lay out the page, Markdown."""
-    return filled('reproduction.md', {
-        'made': made, 'coverage': intervals, 'directions': _directions(results['paper']),
-        'step': np.degrees(experiments.SEARCH_RAD[1] - experiments.SEARCH_RAD[0]), **{
-            stage: _of_stage(units, bound_mmps2) for stage, units in results.items()}})
 
 
 def screen_lines(results: dict[str, list[Unit]], bound_mmps2: float) -> list[str]:

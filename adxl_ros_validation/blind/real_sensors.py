@@ -48,10 +48,6 @@ _ZERO_V = 2.5
 """Zero-g of the volts in which defects act, V; their scale factor is 1 V/g."""
 _MOTION_HZ = 8.0
 """Corner of the low-pass that separates the motion from the noise, Hz."""
-_STILL_G = 0.05
-"""Largest change of the force of a sensor that rests, g rms."""
-_REST_S = 1.5
-"""Shortest rest, s."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +92,7 @@ class Half:
 
     def kinds(self) -> list[str]:
         """Return the defects that can be put into its samples and shown by its reference."""
-        is_still = np.std(self.g(), axis=1).max() < _STILL_G
+        is_still = np.std(self.g(), axis=1).max() < 0.05
         has = {'': True, 'chain': False, 'force': not is_still,
                'heat': np.ptp(self.columns.get('temperature_c', np.zeros(1))) > 3,
                'motion': not is_still and self.reference != 'rests'}
@@ -219,8 +215,9 @@ def _angles_at_rest(applied: pd.DataFrame, rate: float) -> pd.DataFrame:
     """
     Return the angles that a stage with these rests would have; they are empty in motion.
 
-    They are those of the mean force of each rest. So the noise and the error of the magnitude of
-    gravity are real, and the direction is known, as from a table that was indexed by hand.
+    They are those of the mean force of each rest of 1.5 s and more. So the noise and the error of
+    the magnitude of gravity are real, and the direction is known, as from a table that was indexed
+    by hand.
     """
     force = applied[['ax_mps2', 'ay_mps2', 'az_mps2']].to_numpy().T
     width = max(int(0.5 * rate), 3)
@@ -230,7 +227,7 @@ def _angles_at_rest(applied: pd.DataFrame, rate: float) -> pd.DataFrame:
     angles = pd.DataFrame(np.nan, applied.index, ['alpha_rad', 'beta_rad'])
     span = np.cumsum(np.diff(still, prepend=False))
     for _, part in applied[still].groupby(span[still]):
-        if len(part) >= _REST_S * rate:
+        if len(part) >= 1.5 * rate:
             x, y, z = force[:, part.index].mean(axis=1)
             angles.loc[part.index] = math.atan2(math.hypot(x, y), z), math.atan2(-y, x)
     if angles.isna().all(axis=None):
@@ -284,25 +281,19 @@ def draw(halves: Sequence[Half], plan: Plan) -> Drawn:
                  *replace(half, columns=columns).texts())
 
 
-def _motion(half: Half) -> np.ndarray:
-    """Return the force without its noise, m/s², (3, n); an axis that is not measured has 0."""
-    rate = half.unit().rate_hz
-    rows, force = half.g() * G0, np.zeros((3, len(half.columns)))
-    if rate > 3 * _MOTION_HZ:
-        low = scipy.signal.butter(2, _MOTION_HZ, fs=rate, output='sos')
-        rows = scipy.signal.sosfiltfilt(low, rows, axis=1)
-    force[half.unit().axis_indices] = rows
-    return force
-
-
 def _with_fault(half: Half, seed: tuple[int, ...], fault: Fault) -> tuple[float, np.ndarray]:
     """Let a fault act on recorded samples; return its strength, m/s², and samples, g."""
     unit, before = half.unit(), half.g()
+    # The force without its noise; an axis that is not measured has 0.
+    force = np.zeros((3, len(half.columns)))
+    force[unit.axis_indices] = before * G0 if unit.rate_hz <= 3 * _MOTION_HZ else \
+        scipy.signal.sosfiltfilt(scipy.signal.butter(
+            2, _MOTION_HZ, fs=unit.rate_hz, output='sos'), before * G0, axis=1)
     t = np.arange(before.shape[1]) / unit.rate_hz
     still = np.zeros_like(t)
     warm = np.asarray(half.columns.get('temperature_c', still + 25.0))
     run = sim.Run(unit, t, trials.integer_seed(*seed), still, still, still, warm, still + 5.0,
-                  corner_hz=math.inf, force=_motion(half))
+                  corner_hz=math.inf, force=force)
     run.u = run.force[unit.axis_indices] / G0
     run.volts = before + _ZERO_V
     sensed = run.u.copy()
