@@ -217,6 +217,7 @@ added, scaled, added_at_output, added_v = (
     partial(_acting, how) for how in ('added', 'scaled', 'output', 'volts'))
 """Make a fault of a law: added to the input, g, its scale factor, or to the output, g or V."""
 
+
 def weights(rng: np.random.Generator, count: int) -> np.ndarray:
     """Draw weights with rms 1 over those that are not 0: in four of ten cases one, else all."""
     w = rng.choice([-1.0, 1.0], count) * np.exp(rng.normal(0, 0.4, count))
