@@ -35,10 +35,6 @@ _START_S = 20.0
 """Longest time until the first messages, s; chosen: a busy machine starts a node in 10 s."""
 _FIRST_MESSAGES = 50
 """Messages after which a stream has begun."""
-_WARM_UP_S = 2.0
-"""Time between the begin of a stream and its measurement, s; chosen."""
-_QUEUE = 1000
-"""Messages that the listener keeps while it is busy; chosen: 1 s."""
 BARE_QUEUE = 10
 """Messages that a bare node keeps, the usual depth of ROS examples."""
 _RELAY = 'bare publisher and relay'
@@ -52,7 +48,8 @@ class Listener(Node):
         super().__init__('listener')
         self.messages: list[tuple[int, bytes]] = []  # Arrival time, ns, and serialized message
         # An executor of rclpy would take as much of a core as the nodes that are measured.
-        self._inbox = Inbox(self, Imu, topic, _QUEUE)
+        # Messages of 1 s are kept while the listener is busy.
+        self._inbox = Inbox(self, Imu, topic, round(RATE_HZ))
 
     def listen(self, seconds: float, limit: float = np.inf) -> None:
         """Keep the messages of some time."""
@@ -120,7 +117,8 @@ def measure_live(seconds: float, rounds: int, iiod: str | None) -> None:
     """Print rate, loss, age on arrival and processor time of each subject, of some rounds."""
     print(f'{RATE_HZ:g} Hz, {rounds} x {seconds:g} s: medians (range). '
           f'Load of the machine before: {os.getloadavg()[0]:.1f}')
-    print(f'{"":27} {"Hz":>6} {"lost":>4} {"p50 ms":>16} {"p99 ms":>17}  CPU, %', flush=True)
+    print(f'{"":27} {"Hz":>6} {"lost":>4} {"p50 ms":>16} {"p99 ms":>17} {"first, s":>17}  CPU, %\n'
+          'first: from the start of the last process of a row to its first sample', flush=True)
     rows = []
     with ExitStack() as stack:
         for subject in _subjects(stack, iiod) * rounds:
@@ -129,23 +127,20 @@ def measure_live(seconds: float, rounds: int, iiod: str | None) -> None:
             except UserError as error:
                 row = {'error': str(error)}
             rows.append({'label': subject.label, 'error': None, **row})
-    measured, load = {}, {}
+    load = {}
     for label, table in pd.DataFrame(rows).groupby('label', sort=False):
         if len(good := table[table.error.isna()]):
-            measured[label], load[label] = good, good.loads.map(sum).median()
+            load[label] = good.loads.map(sum).median()
             loads = ' + '.join(f'{100 * load:.1f}' for load in np.median([*good.loads], axis=0))
             print(f'{label:27} {good.rate_hz.median():6.0f} {good.missing.median():4.0f} '
-                  f'{spread(good.p50_ms, ".2f"):>16} {spread(good.p99_ms, ".2f"):>17}  {loads}')
+                  f'{spread(good.p50_ms, ".2f"):>16} {spread(good.p99_ms, ".2f"):>17} '
+                  f'{spread(good.first_s, ".2f"):>17}  {loads}')
         if len(bad := table.error.dropna()):
             print(f'{label:27} failed in {len(bad)} of {rounds} rounds: {bad.iloc[-1]}')
     for label in load:
         if 'compensation' in label:
             print(f'CPU of {label} by that of the {_RELAY}: '
                   f'{load[label] / load.get(_RELAY, np.nan):.2f}')
-    for name, label in (('driver, sim',) * 2, ('compensation', 'driver, sim, compensation')):
-        if label in measured:
-            print(f'First sample of {name}: {spread(measured[label].first_s, ".2f")} s after its '
-                  'start')
     print(f'Load of the machine after: {os.getloadavg()[0]:.1f}', flush=True)
 
 
@@ -218,7 +213,8 @@ def _measure(subject: _Subject, seconds: float) -> dict[str, Any]:
             processes = processes + stack.enter_context(running(subject.commands[-1:]))
             listener.listen(_START_S, _FIRST_MESSAGES)
             first_s = (listener.messages[0][0] - began_ns) * 1e-9
-            listener.listen(_WARM_UP_S)
+            # A stream that has begun runs for 2 s before it is measured.
+            listener.listen(2.0)
             listener.messages.clear()
             before_s, began_s = cpu_times_s(), time.monotonic()
             listener.listen(seconds)

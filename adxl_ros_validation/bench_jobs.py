@@ -117,8 +117,6 @@ _APPLIED_ROWS = 3_000_000
 """Rows of the file that `apply` corrects; chosen: 50 min at 1 kHz."""
 _LONG_BLOCK = 100_000
 """Rows of a block of the long recording; chosen: a few MB."""
-_LONG_GOAL_S_PER_H = 60 / 8
-"""Largest time of `apply` for an hour of a long recording, s: 60 s for 8 h."""
 _ROW_BYTES = 1100
 """Largest room that a sample of a long recording and its corrected bag take, measured."""
 _MEASURE = ('import resource, subprocess, sys; '
@@ -131,8 +129,6 @@ _RATE_HZ = 1000.0
 _EFFECTS = ('bias', 'scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z',
             'scale_factor_z')
 """Effects of the units that `apply` corrects, with twenty coefficients on two axes."""
-_RELATIVE_STD = 0.05
-"""Standard deviation of its coefficients, in typical sizes."""
 _TOOLS = ('simulate', 'fit', 'apply', 'noise', 'check', 'diagnose', 'export', 'blind', 'reproduce')
 """Tools whose `--help` is measured."""
 _FREE_BODY = """<mujoco><option timestep="0.001"/><worldbody><body><freejoint/>
@@ -232,7 +228,7 @@ def _unit(sensor: Sensor, axes: str) -> Sensor:
                   for name in coefficients.names_of(library()[effect], unit.axes))
     typical = np.array([coefficients.parameter_of(name).scale for name in names])
     return replace(coefficients.put(unit, names, 0.5 * typical), covariance_names=names,
-                   covariance=np.diag((_RELATIVE_STD * typical) ** 2))
+                   covariance=np.diag((0.05 * typical) ** 2))
 
 
 def _long_applying(folder: Path, sensor: Sensor, kind: str, hours: float) -> Iterator[Job]:
@@ -251,7 +247,7 @@ def _long_applying(folder: Path, sensor: Sensor, kind: str, hours: float) -> Ite
             append(replace(block, time_s=(begin + np.arange(count)) / _RATE_HZ, columns={
                 name: values[:count] for name, values in block.columns.items()}))
     yield Job(f'apply, {hours:g} h at 1 kHz, {kind.upper()} to {kind.upper()}',
-              _apply(unit, path, output), hours * _LONG_GOAL_S_PER_H, rounds=1)
+              _apply(unit, path, output), hours * 60 / 8, rounds=1)
     path.unlink()
     output.unlink()
 

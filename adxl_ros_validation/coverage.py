@@ -30,12 +30,6 @@ import scipy
 STAGES = ('errors per pose', 'errors per setting', 'eccentric', 'tilted base')
 """Errors of a joint are new with each pose, or with each move; the last two are per setting."""
 AXES = ('xy', 'xyz')
-_RESOLUTION_DEG = (0.01, 0.1)
-"""Smallest and largest step of the drawn encoders, deg, log-uniform; chosen."""
-_STATED = (0.5, 2.0)
-"""Range of the true error of a stage over the stated one, log-uniform; chosen."""
-_QUICK_RAD = float(np.radians(0.1))
-"""Required tilt error of the plan `quick`, rad; chosen."""
 _DWELL_S = 5.0
 """Duration of each dwell, s; the paper's."""
 _HELD_OUT = 8
@@ -57,19 +51,22 @@ def draw(nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], se
     """
     Draw one unit and one stage, sweep, and fit; return a row for each error.
 
+    The encoder has steps of 0.01° to 0.1°, and the true error of the stage is 0.5 to 2 times the
+    stated one, both log-uniform.
+
     `z` is an error over its stated standard deviation: of the fitted coefficients, and, over
     held-out poses, of the tilt and of the measured axes. `by_bound` is the error of a coefficient
     over the Cramér-Rao bound of the true error model, where the fit has the terms of the unit.
     """
     stage, axes, kind = kinds[number % len(kinds)]
     rng = np.random.default_rng([seed, number])
-    stated = np.radians(np.exp(rng.uniform(*np.log(_RESOLUTION_DEG))))
+    stated = np.radians(np.exp(rng.uniform(*np.log((0.01, 0.1)))))
     sensor = replace(with_axes(nominal, axes), stage_resolution_rad=float(stated))
     terms = (*full_model.default_terms(axes), *['stage_eccentricity'] * (stage == 'eccentric'))
     truth = _unit(sensor, terms, stage, rng)
-    step = float(stated * np.exp(rng.uniform(*np.log(_STATED))))
+    step = float(stated * np.exp(rng.uniform(*np.log((0.5, 2.0)))))
     targets = pose_plan.guided(pose_plan.default_planes_rad(axes), pose_plan.STEP_RAD, 0) \
-        if kind == 'full' else running_estimate.quick(sensor, _DWELL_S, _QUICK_RAD, 0)
+        if kind == 'full' else running_estimate.quick(sensor, _DWELL_S, float(np.radians(0.1)), 0)
     poses, true_rad = _swept(truth, targets, stage == STAGES[0], step, rng)
     fit, _ = term_selection.fit_selected(sensor, poses)
     names = fit.fitted.covariance_names

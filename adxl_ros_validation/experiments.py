@@ -37,20 +37,13 @@ SEARCH_RAD = np.radians(np.arange(-5.0, 5.01, 0.5))
 """Angles about the case's axis, rad; chosen."""
 
 
-class DirectionSearch(NamedTuple):
-    """Beta of the direction of the x axis, and the outputs that it was found by."""
-
-    found_rad: dict[str, float]  # true value, and by three methods, rad
-    turned_rad: np.ndarray  # angles, rad, and outputs by the nominal scale factor, g, (k,)
-    output_g: np.ndarray
-
-
-def search(truth: Sensor, seed: int) -> DirectionSearch:
+def search(truth: Sensor, seed: int) -> tuple[dict[str, float], np.ndarray]:
     """
     Turn beta about 0 at alpha = 90° (maximum), and about ±90° (null), 5 s in each pose.
 
     The beta of the largest output is minus that of (18): x_ref has to turn back by it. Between
-    the null crossings at +90° and −90° the zero-g cancels.
+    the null crossings at +90° and −90° the zero-g cancels. Return the beta of the direction of
+    the x axis, true and by three methods, rad, and the outputs at `SEARCH_RAD`, g.
     """
     around = {'top': 0.0, 'left': np.pi / 2, 'right': -np.pi / 2}
     volts = {}
@@ -66,24 +59,18 @@ def search(truth: Sensor, seed: int) -> DirectionSearch:
     # β_x of (18) with the linear cross-axis term, which equals it to first order.
     direction = sum(float(truth.values.get(effect, {}).get(name, [0.0])[0]) for effect, name in (
         ('misalignment', 'beta_rad'), ('cross_axis', 'linear')))
-    return DirectionSearch({
+    return {
         'truth': direction, 'largest output': -float(SEARCH_RAD[np.argmax(top)]),
         'parabola through the outputs': float(curve[1] / (2 * curve[0])),
-        'null crossings at ±90°': float(level / slope)}, SEARCH_RAD, top)
+        'null crossings at ±90°': float(level / slope)}, top
 
 
 MAX_BOUND_RAD = np.radians(1.0)
 """Largest bound of an angle, rad, at which a pose counts; chosen."""
 NEAR_VERTICAL_RAD = np.radians(15.0)
 """Distance from ±90°, rad, below which a pose does not count for the alpha error; chosen."""
-_SAME_MPS2 = 1e-3
-"""Largest difference of two solutions of |f| = g that are the same, m/s²; chosen."""
-_SETTLED_S = 1.0
-"""Time after which the start of Butterworth and RC filter has decayed, s; chosen."""
-_BUTTERWORTH_ORDER = 2
-"""Order of the low-pass of the motion experiment; the paper's."""
-_BUTTERWORTH_HZ = 20.0
-"""Corner of that low-pass, Hz; the paper's."""
+_BUTTERWORTH = 2, 20.0
+"""Order and corner, Hz, of the low-pass of the motion experiment; the paper's."""
 
 
 def sweep_bound(truth: Sensor, swept: Poses, true_rad: np.ndarray, stage: StageError,
@@ -119,7 +106,7 @@ def angle_errors(fitted: Sensor, bound: Sensor, poses: Poses, true_rad: np.ndarr
     measured_force = signal_chain.inverse(fitted, up)(list(poses.volts.T))
     measured = _angles(fitted, measured_force, up, variance_v2)
     solution = signal_chain.inverse(bound, up)(list(signal_chain.static_response(bound)(force)))
-    twofold = np.abs(np.subtract(solution, force)).max(axis=0) > _SAME_MPS2
+    twofold = np.abs(np.subtract(solution, force)).max(axis=0) > 1e-3
     true[1][twofold] = pose_only[1][twofold] = np.inf
     level = np.hypot(force[0], force[1]) < np.sin(MAX_BOUND_RAD) * np.abs(force[2])
     true[1][level, 1] = pose_only[1][level, 1] = np.inf
@@ -166,29 +153,24 @@ def motion_errors(fitted: Sensor, time_s: np.ndarray, volts: np.ndarray, referen
     unfiltered = inversions.undo_filter(volts, time_s, noise.electronics(fitted).rc_s,
                                         fitted.rate_hz)
     estimate = signal_chain.inverse(fitted)(list(unfiltered.T))[0]
-    b, a = scipy.signal.butter(_BUTTERWORTH_ORDER, _BUTTERWORTH_HZ, fs=fitted.rate_hz)
+    b, a = scipy.signal.butter(*_BUTTERWORTH, fs=fitted.rate_hz)
     smooth, expected = (scipy.signal.lfilter(b, a, v) for v in (estimate, reference_mps2))
-    residual = 1e3 * (smooth - expected)[time_s > _SETTLED_S]
+    # The start of both filters has decayed after 1 s.
+    residual = 1e3 * (smooth - expected)[time_s > 1.0]
     return (float(residual.std()), float(residual.mean())), smooth, expected
 
 
 def motion_bound_mmps2(nominal: Sensor) -> float:
     """Return the floor of the motion experiment, mm/s²: white noise after the Butterworth."""
-    b, a = scipy.signal.butter(_BUTTERWORTH_ORDER, _BUTTERWORTH_HZ, fs=nominal.rate_hz)
+    b, a = scipy.signal.butter(*_BUTTERWORTH, fs=nominal.rate_hz)
     impulse = scipy.signal.lfilter(b, a, np.eye(1, round(nominal.rate_hz))[0])
     density = nominal.noise_density_g_per_rthz[0] * G0_MPS2
     return float(1e3 * density * np.sqrt(nominal.rate_hz / 2 * np.sum(impulse ** 2)))
 
 
 MODELS = {'linear': linear.fit, 'physical': linear.fit_physical, 'full': term_selection.fit}
-DRAWN = full_model.TERMS
-"""Effects of a unit. Each coefficient is normal; its typical size is the standard deviation."""
 PLANES_RAD = tuple(np.radians([90.0, 60.0, 30.0, 0.0, 120.0, 150.0, 180.0]).tolist())
-"""Planes alpha of the sweep, rad; the paper's."""
-STEP_RAD = float(np.radians(30.0))
-"""Step of beta, rad; the paper's."""
-RESISTANCE = 0.25
-"""Largest departure of the filter's resistor from the stated one, a share; the paper's."""
+"""Planes alpha of the sweep, rad; the paper's, as its step of beta, 30°."""
 GRAVITY_MPS2 = 9.80131
 """Local gravity of the paper's experiments, m/s²."""
 SETTLED_S = 1.0
@@ -209,13 +191,18 @@ class Run(NamedTuple):
 
 
 def draw(nominal: Sensor, stage: tuple[float, float], rng: np.random.Generator) -> Sensor:
-    """Draw a unit at datasheet spread, or take the given one, on a base that is not level."""
+    """
+    Draw a unit at datasheet spread, or take the given one, on a base that is not level.
+
+    Each coefficient is normal; its typical size is the standard deviation. The filter's resistor
+    departs from the stated one by a quarter at most, as in the paper.
+    """
     step_rad, level_rad = stage
     unit = replace(nominal, stage_resolution_rad=step_rad, local_gravity_mps2=GRAVITY_MPS2)
     if not nominal.effects:
         values = {name: {p: rng.normal(size=np.shape(v)) * v for p, v in typical(
-            effect_named(name), unit.axes).items()} for name in DRAWN}
-        ratio = rng.uniform(-RESISTANCE, RESISTANCE, len(unit.axes))
+            effect_named(name), unit.axes).items()} for name in full_model.TERMS}
+        ratio = rng.uniform(-0.25, 0.25, len(unit.axes))
         values['bandwidth'] = {'resistance_ratio': ratio}
         unit = replace(unit, effects=tuple(values), values=values)
     level = {f'{axis}_rad': np.array(level_rad * rng.normal()) for axis in 'xy'}
@@ -258,7 +245,7 @@ def poses_at(truth: Sensor, read_rad: np.ndarray, seed: int
 
 def calibrated(truth: Sensor, seed: int, models: Sequence[str] = tuple(MODELS)) -> Run:
     """Sweep a unit (the paper's experiments 1 and 2) and fit the models."""
-    targets = sweep(PLANES_RAD, STEP_RAD, 0)
+    targets = sweep(PLANES_RAD, float(np.radians(30.0)), 0)
     poses, true, recording = poses_at(
         truth, np.array([[t.alpha_rad, t.beta_rad] for t in targets]), seed)
     nominal = bare(truth)
@@ -289,8 +276,6 @@ RUNS = {
     'both': np.array([(a, a) for a in range(-180, 181, 30)]),
 }
 """Alpha and beta of figure 10, deg; (b) at alpha = 90°, as beta has no effect at 0."""
-RANDOM_POSES = 40
-"""Number of poses in random directions; chosen."""
 
 
 class Unit(NamedTuple):
@@ -304,7 +289,7 @@ class Unit(NamedTuple):
     coefficients: dict[str, np.ndarray]
     # rms about the mean, and mean, of the residual in motion, mm/s²
     motion: dict[str, tuple[float, float]]
-    directions: DirectionSearch  # the search for its misalignment
+    directions: tuple[dict[str, float], np.ndarray]  # of `search`
 
 
 def evaluate(nominal: Sensor, stage: tuple[float, float], seed: int) -> Unit:
@@ -315,8 +300,8 @@ def evaluate(nominal: Sensor, stage: tuple[float, float], seed: int) -> Unit:
     bound = sweep_bound(
         truth, run.poses, run.true_rad, StageError(truth.stage_std_rad),
         (*full_model.default_terms(truth.axes), *full_model.GAUGE))
-    random_rad = np.column_stack([np.arccos(rng.uniform(-1, 1, RANDOM_POSES)),
-                                 rng.uniform(0, 2 * np.pi, RANDOM_POSES)])
+    random_rad = np.column_stack([np.arccos(rng.uniform(-1, 1, 40)),
+                                  rng.uniform(0, 2 * np.pi, 40)])
     angles_rad = {'random': random_rad, **{name: np.radians(deg) for name, deg in RUNS.items()}}
     poses_of = {name: poses_at(truth, rad, seed + (i + 1) * 1_000_003)[:2]
                 for i, (name, rad) in enumerate(angles_rad.items())}

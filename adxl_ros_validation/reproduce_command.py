@@ -24,7 +24,7 @@ from adxl_ros.report.figures import png, pyplot
 from adxl_ros.tools import command_line as cli
 from adxl_ros_validation import coverage, experiments
 from adxl_ros_validation.blind.report import filled, markdown_table, terminal_table
-from adxl_ros_validation.experiments import DirectionSearch, MODELS, RUNS, Unit
+from adxl_ros_validation.experiments import MODELS, RUNS, Unit
 import numpy as np
 import pandas as pd
 
@@ -104,7 +104,7 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> _Re
     cli.make_folder(pictures)
     unit_page.draw_sweep(pictures / 'sweep.png', experiments.bare(truth),
                          unit.fitted['physical'], unit.poses)
-    for name, figure in (('misalignment', draw_misalignment(results['paper'][0].directions)),
+    for name, figure in (('misalignment', draw_misalignment(*results['paper'][0].directions)),
                          ('tilt', draw_tilt(results['paper'][0])),
                          ('motion', draw_motion(unit.fitted, experiments.shaken(truth, first))),
                          ('components', draw_components(truth, unit.fitted))):
@@ -113,7 +113,11 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> _Re
     made = (f'adxl_ros {package_version()}, {date.today()}, {drawn} on each stage, '
             f'seed {options.seed}.')
     bound_mmps2 = experiments.motion_bound_mmps2(sensor)
-    return _page(results, bound_mmps2, made, coverage_page), [
+    page = filled('reproduction.md', {
+        'made': made, 'coverage': coverage_page, 'directions': _directions(results['paper']),
+        'step': np.degrees(experiments.SEARCH_RAD[1] - experiments.SEARCH_RAD[0]), **{
+            stage: _of_stage(units, bound_mmps2) for stage, units in results.items()}})
+    return page, [
         f"The paper's experiments, {drawn} on each stage, seed {options.seed}", '',
         *screen_lines(results, bound_mmps2), *[''] * bool(coverage_lines), *coverage_lines]
 
@@ -124,7 +128,7 @@ def _coverage(sensor: Sensor, options: argparse.Namespace) -> _Reproduction:
         errors = coverage.draw_all(replace(sensor, effects=(), values={}), options.draws,
                                    options.seed, show)
     page = coverage.page(errors, f'adxl_ros {package_version()}, {date.today()}, seed '
-                                f'{options.seed}; `make coverage`.')
+                                 f'{options.seed}; `make coverage`.')
     return page, coverage.screen_lines(errors)
 
 
@@ -133,13 +137,12 @@ _SHOWN_S = (2.0, 2.5)
 """Interval of figure 12, s; chosen."""
 
 
-def draw_misalignment(search: DirectionSearch) -> Any:
+def draw_misalignment(found_rad: dict[str, float], output_g: np.ndarray) -> Any:
     """Draw the search for β_x of (18) and the results of its three methods, as figure 9."""
     figure, axis = pyplot().subplots(figsize=(7, 4.5), layout='constrained')
-    turned = np.degrees(search.turned_rad)
-    axis.plot(turned, 1e3 * (search.output_g - search.output_g.max()), 'o', ms=4,
+    axis.plot(np.degrees(experiments.SEARCH_RAD), 1e3 * (output_g - output_g.max()), 'o', ms=4,
               label='output, means of 5 s')
-    for (label, value), colour in zip(search.found_rad.items(),
+    for (label, value), colour in zip(found_rad.items(),
                                       ('k', 'tab:red', 'tab:orange', 'tab:green')):
         axis.axvline(-np.degrees(value), color=colour, lw=1,
                      label=f'{label}: {-np.degrees(value):+.2f}°')
@@ -232,14 +235,6 @@ FIGURES = 'reproduction'
 """Folder of the plots, in the folder of the page."""
 
 
-def _page(results: dict[str, list[Unit]], bound_mmps2: float, made: str, intervals: str) -> str:
-    """Lay out the page, Markdown."""
-    return filled('reproduction.md', {
-        'made': made, 'coverage': intervals, 'directions': _directions(results['paper']),
-        'step': np.degrees(experiments.SEARCH_RAD[1] - experiments.SEARCH_RAD[0]), **{
-            stage: _of_stage(units, bound_mmps2) for stage, units in results.items()}})
-
-
 def screen_lines(results: dict[str, list[Unit]], bound_mmps2: float) -> list[str]:
     """Return Table I and the motion experiment as lines for a terminal."""
     rows = [[f'{_STAGE_NAMES[stage]}, {angle}', *cells]
@@ -316,7 +311,7 @@ def _motion(units: Sequence[Unit], bound_mmps2: float) -> list[list[str]]:
 
 
 def _directions(units: Sequence[Unit]) -> str:
-    found = pd.DataFrame([unit.directions.found_rad for unit in units])
+    found = pd.DataFrame([unit.directions[0] for unit in units])
     errors = np.degrees(found.iloc[:, 1:].sub(found.truth, axis=0))
     return markdown_table(['largest output', 'parabola through the outputs', 'null crossings'],
                           [[f'{_rms(errors[name]):.3f}' for name in errors]])

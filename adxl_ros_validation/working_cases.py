@@ -36,10 +36,6 @@ _SHARES = (0.2, 0.4, 0.2, 0.2)
 """Shares of the groups."""
 _STRENGTHS_MG = (0.5, 8.0)
 """Lowest and highest strength, mg rms beyond zero-g and scale factor; log-uniform."""
-_AT_REST_SHARE = 0.5
-"""Share of the faults that were there when the unit was calibrated, of those that show at rest."""
-_COLOUR = (0.03, 0.12)
-"""Smallest and largest share of coloured noise, of the rms of the noise."""
 _DIGITS = {**simulator.DIGITS, 'shift_m': 8}
 """Digits of the columns of a recording."""
 _NOTICED = 1.05
@@ -74,13 +70,15 @@ def draw(seed: int, number: int, only: str | None = None) -> Case:
     force = scene.force()
     noise_g = float(np.mean(unit.noise_g_per_rthz)) * math.sqrt(
         min(unit.corner_hz * math.pi / 2, unit.rate_hz / 2))
-    background = Fault(world.COLOUR, noise_g * rng.uniform(*_COLOUR),
+    # 3 to 12 % of the noise are coloured.
+    background = Fault(world.COLOUR, noise_g * rng.uniform(0.03, 0.12),
                        world.COLOUR.draw(rng, unit))
     faults, rows, at_rest = [], [], []
     for kind in kinds:
         fault, strength, _, change = trials.sized(
             rng, kind, unit, _STRENGTHS_MG, partial(trials.measured, scene, force), 1e-3 * G0)
-        calibrated = kind.at_rest and bool(rng.random() < _AT_REST_SHARE)
+        # Half of the faults that show at rest were there when the unit was calibrated.
+        calibrated = kind.at_rest and bool(rng.random() < 0.5)
         stated = unit
         if calibrated:
             left = _strength(unit, world.recalibrated(unit, [fault]), change, force)

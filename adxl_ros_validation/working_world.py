@@ -20,14 +20,6 @@ from adxl_ros_validation.blind.simulator import Fault, G0, Kind, Place, Run, Sce
 import numpy as np
 import scipy
 
-RATES_HZ = (50.0, 100.0, 200.0, 250.0, 400.0, 500.0, 1000.0)
-SECONDS = (60.0, 200.0)
-"""Shortest and longest recording, s."""
-_MOST_SAMPLES = 120_000
-_NOISE_OFF = (0.05, 0.2)
-"""Smallest and largest share by which the noise is not the stated one."""
-_OTHER = [1, 0, 0]
-"""The other axis of the plane, of x, y and z."""
 _PLANE = np.array([[1.0], [1.0], [0.0]])
 """Weights of the axes of the plane."""
 
@@ -35,10 +27,10 @@ _PLANE = np.array([[1.0], [1.0], [0.0]])
 def draw_unit(rng: np.random.Generator) -> Unit:
     """Draw a unit whose noise is 5 to 20 % above or below the stated one."""
     axes = str(rng.choice(['x', 'xy', 'xyz'], p=(0.1, 0.35, 0.55)))
-    n, rate = len(axes), float(rng.choice(RATES_HZ))
+    n, rate = len(axes), float(rng.choice([50, 100, 200, 250, 400, 500, 1000]))
     zero, scale = 2.5 + 0.05 * rng.uniform(-1, 1, n), 1 + 0.03 * rng.uniform(-1, 1, n)
     stated = rng.uniform(60e-6, 250e-6) * rng.uniform(0.9, 1.1, n)
-    off = 1 + rng.choice([-1, 1]) * rng.uniform(*_NOISE_OFF)
+    off = 1 + rng.choice([-1, 1]) * rng.uniform(0.05, 0.2)
     resolution = math.radians(rng.choice([0.001, 0.005, 0.02]))
     return Unit(axes, zero, scale, zero + sim.ZERO_G_STD_G * scale * rng.normal(size=n),
                 scale * (1 + sim.SCALE_STD * rng.normal(size=n)), off * stated, stated,
@@ -63,9 +55,13 @@ def _fade(u: np.ndarray) -> np.ndarray:
 
 
 def draw_motion(rng: np.random.Generator, unit: Unit, needs: set[str]) -> Manoeuvre:
-    """Draw a manoeuvre that has what some faults need: 'heat', 'supply', 'shake' or 'fast'."""
+    """
+    Draw a manoeuvre that has what some faults need: 'heat', 'supply', 'shake' or 'fast'.
+
+    It takes 60 to 200 s, and has 120 000 samples at most.
+    """
     script = Manoeuvre(share=trapezoidal if rng.random() < 0.5 else cycloidal, fade=_fade)
-    length = min(rng.uniform(*SECONDS), _MOST_SAMPLES / unit.rate_hz)
+    length = min(rng.uniform(60, 200), 120_000 / unit.rate_hz)
     script.beta[0] = rng.uniform(-3, 3)
     script.rest(2.0)
     blocks = ['planes', 'poses', 'fast', 'shake']
@@ -216,7 +212,7 @@ def mount_resonance(run: Run, size: float, shape: Shape) -> None:
 
 def _other(run: Run) -> np.ndarray:
     """Return the other axis of the plane of each measured axis, g, (m, n)."""
-    return run.force[[_OTHER[d] for d in run.unit.axis_indices]] / G0
+    return run.force[[(1, 0, 0)[d] for d in run.unit.axis_indices]] / G0
 
 
 def cross_axis(run: Run, shape: Shape) -> np.ndarray:

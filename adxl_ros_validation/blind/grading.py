@@ -22,8 +22,6 @@ VISIBLE_POWER = 0.5
 """Power of the ideal observer below which an effect may be missing in a right answer; chosen."""
 CERTAIN_POWER = 0.9
 """Power of the ideal observer from which scores count an effect; chosen."""
-_NOISE_BAND_HZ = 78.5
-"""Noise bandwidth of the 50 Hz output filter, Hz: π/2 of its corner."""
 
 
 @dataclass(frozen=True)
@@ -140,12 +138,6 @@ def material(answer: Answer, label: Label) -> bool:
     return all(fault['strength_mps2'] >= answer.material_mps2 for fault in label.faults)
 
 
-def separable(label: Label) -> bool:
-    """Return whether the ideal observer detects every effect and separates it from all others."""
-    return bool(label.faults) and all(
-        fault['power'] * fault['told'] >= CERTAIN_POWER for fault in label.faults)
-
-
 def visible(label: Label) -> bool:
     """Return whether the ideal observer detects every effect."""
     return bool(label.faults) and all(
@@ -177,11 +169,12 @@ def true_parameters(label: Label) -> dict[str, float]:
         if name == 'mount_resonance':
             true['mount_resonance.frequency_hz'] = fault['shape']['hertz']
         elif name in ('bias', 'scale_factor', 'noise_excess'):
+            # The noise bandwidth of the filter is 78.5 Hz, π/2 of its corner.
             part, values = {
                 'bias': ('offset_v', unit.zero_v + m * unit.scale_v_per_g - 2.5),
                 'scale_factor': ('offset_v_per_g', unit.scale_v_per_g * (1 + m) - 1.0),
                 'noise_excess': ('ratio', np.hypot(
-                    unit.noise_g_per_rthz, m / unit.scale_v_per_g / _NOISE_BAND_HZ ** 0.5)
+                    unit.noise_g_per_rthz, m / unit.scale_v_per_g / 78.5 ** 0.5)
                     / unit.stated_noise_g_per_rthz - 1)}[name]
             true |= {f'{name}.{part}.{axis}': float(value)
                      for axis, value in zip(unit.axes, values)}

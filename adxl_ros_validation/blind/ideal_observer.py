@@ -20,8 +20,6 @@ These are three standard deviations; chosen.
 """
 _NOISE_STD = 0.02
 """Uncertainty of the stated noise density, a share; that of units is 0.015."""
-_FLEXIBLE_LEVEL = 0.001
-"""Level of the test by a flexible model; chosen."""
 _RECOGNISABLE_SAMPLE = 7.0
 """Squared visibility of one repeated sample; chosen."""
 
@@ -122,7 +120,11 @@ class IdealObserver:
         return rivals
 
     def flexible_power(self, reserved: np.ndarray, vector: np.ndarray) -> float:
-        """Return the power of a flexible model of force, rate, angle, temperature and time."""
+        """
+        Return the power of a flexible model of force, rate, angle, temperature and time.
+
+        The level of its test is 0.001.
+        """
         scene, explained, used = self.scene, 0.0, 0
         rest = vector - reserved @ (reserved.T @ vector)
         hats = _hats(scene, self.force)
@@ -132,7 +134,7 @@ class IdealObserver:
                                   for column in columns], len(rest))
             explained += float(np.sum((basis.T @ rest) ** 2))
             used += basis.shape[1]
-        threshold = scipy.stats.chi2.isf(_FLEXIBLE_LEVEL, used)
+        threshold = scipy.stats.chi2.isf(0.001, used)
         return float(scipy.stats.ncx2.sf(threshold, used, explained))
 
 

@@ -12,8 +12,6 @@ import scipy
 
 POOR = ('one_way', 'crawl', 'few_poses', 'together', 'one_plane')
 """Kinds of manoeuvres that cannot separate all effects."""
-_FASTEST_HZ = 22.0
-"""Highest frequency of the shaker, Hz; chosen: below the 50 Hz of the filter."""
 
 
 Curve = Callable[[np.ndarray], np.ndarray]
@@ -109,8 +107,9 @@ def draw(rng: np.random.Generator, seconds: tuple[float, float], rate_hz: float,
     script = Manoeuvre(kind)
     script.beta[0] = rng.uniform(-np.pi, np.pi)
     script.rest(rng.uniform(1.5, 3.0))
+    # The shaker stays below the 50 Hz of the filter.
     moves: dict[str, Callable[[Manoeuvre, float, np.random.Generator], None]] = {
-        'rich': partial(_rich, min(_FASTEST_HZ, rate_hz / 10)), 'one_way': _one_way,
+        'rich': partial(_rich, min(22.0, rate_hz / 10)), 'one_way': _one_way,
         'crawl': _crawl, 'few_poses': _few_poses, 'together': _few_poses,
         'one_plane': _one_plane}
     moves[kind](script, length, rng)

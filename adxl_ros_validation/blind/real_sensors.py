@@ -48,10 +48,6 @@ _ZERO_V = 2.5
 """Zero-g of the volts in which defects act, V; their scale factor is 1 V/g."""
 _MOTION_HZ = 8.0
 """Corner of the low-pass that separates the motion from the noise, Hz."""
-_STILL_G = 0.05
-"""Largest change of the force of a sensor that rests, g rms."""
-_REST_S = 1.5
-"""Shortest rest, s."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +92,7 @@ class Half:
 
     def kinds(self) -> list[str]:
         """Return the defects that can be put into its samples and shown by its reference."""
-        is_still = np.std(self.g(), axis=1).max() < _STILL_G
+        is_still = np.std(self.g(), axis=1).max() < 0.05
         has = {'': True, 'chain': False, 'force': not is_still,
                'heat': np.ptp(self.columns.get('temperature_c', np.zeros(1))) > 3,
                'motion': not is_still and self.reference != 'rests'}
@@ -107,13 +103,13 @@ class Half:
 def prepare(source: Path) -> tuple[list[Half], list[str]]:
     """Return the later parts of recordings, and why others are left out."""
     halves, left_out = [], []
-    for path, sim_path, digest in _sources(source):
+    for path, digest in _sources(source).items():
         try:
             if not path.exists():
                 raise UserError('no such file; the manifest has its address')
             if digest and hashlib.sha256(path.read_bytes()).hexdigest() != digest:
                 raise UserError('is not the file whose SHA-256 the manifest has')
-            halves.append(_half(path, sim_path))
+            halves.append(_half(path))
         except UserError as error:
             left_out.append(f'{path.name}: {error}')
     if not halves:
@@ -121,21 +117,17 @@ def prepare(source: Path) -> tuple[list[Half], list[str]]:
     return halves, left_out
 
 
-def _sources(source: Path) -> list[tuple[Path, Path | None, str]]:
-    """List recordings, each with another simulator's force (NAME_sim.csv), and SHA-256."""
-    if not source.exists():
-        raise UserError(f'{source}: no such file or folder')
+def _sources(source: Path) -> dict[Path, str]:
+    """List recordings, each with the SHA-256 that a manifest states."""
+    if source.is_dir():
+        return {path: '' for path in sorted(source.glob('*.csv')) if not path.match('*_sim.csv')}
     try:
-        rows = [{'file': path.name} for path in sorted(source.glob('*.csv'))
-                if not path.stem.endswith('_sim')] if source.is_dir() else \
-            yaml.safe_load(source.read_text(encoding='utf-8'))['recordings']
-        folder = source if source.is_dir() else source.parent
-        paths = [(folder / row['file'], row.get('sha256', '')) for row in rows]
+        rows = yaml.safe_load(source.read_text(encoding='utf-8'))['recordings']
+        return {source.parent / row['file']: row.get('sha256', '') for row in rows}
+    except FileNotFoundError:
+        raise UserError(f'{source}: no such file or folder') from None
     except (OSError, UnicodeError, yaml.YAMLError, KeyError, TypeError) as error:
         raise UserError(f'{source}: no folder, and no manifest: {error}') from None
-    sims = [path.with_name(path.stem.removesuffix('_real') + '_sim.csv') for path, _ in paths]
-    return [(path, sim if sim.exists() else None, digest)
-            for (path, digest), sim in zip(paths, sims)]
 
 
 def _read(path: Path) -> tuple[pd.DataFrame, dict[str, int]]:
@@ -159,19 +151,24 @@ def _part(columns: pd.DataFrame | None, start: float, stop: float) -> pd.DataFra
     return part.assign(time_s=part['time_s'] - start)
 
 
-def _half(path: Path, sim_path: Path | None) -> Half:
-    """Make the parameters of the first part of a recording, and the reference of the later one."""
+def _half(path: Path) -> Half:
+    """
+    Make the parameters of the first part of a recording, and the reference of the later one.
+
+    NAME_sim.csv beside it is another simulator's force.
+    """
     columns, digits = _read(path)
-    sim = _read(sim_path)[0] if sim_path else None
+    sim_path = path.with_name(path.stem.removesuffix('_real') + '_sim.csv')
+    force = _read(sim_path)[0] if sim_path.exists() else None
     begin, end = columns['time_s'].iloc[[0, -1]]
     if end - begin < _SHORTEST_S:
         raise UserError(f'has {end - begin:.0f} s; at least {_SHORTEST_S:.0f} s are needed')
     cut = begin + _FIRST * (end - begin)
-    kind = 'simulator' if sim_path else 'stage' if 'alpha_rad' in columns else 'rests'
-    first, second = (Half(path.stem, kind, _part(columns, *span), _part(sim, *span), digits)
+    kind = 'simulator' if force is not None else 'stage' if 'alpha_rad' in columns else 'rests'
+    first, second = (Half(path.stem, kind, _part(columns, *span), _part(force, *span), digits)
                      for span in ((begin, cut), (cut, math.inf)))
     second = replace(second, noise_mps2=_noise(second))
-    if sim_path:
+    if force is not None:
         return replace(second, parameters=_against_force(first))
     with tempfile.TemporaryDirectory(prefix='half_') as temporary:
         folder = Path(temporary)
@@ -218,8 +215,9 @@ def _angles_at_rest(applied: pd.DataFrame, rate: float) -> pd.DataFrame:
     """
     Return the angles that a stage with these rests would have; they are empty in motion.
 
-    They are those of the mean force of each rest. So the noise and the error of the magnitude of
-    gravity are real, and the direction is known, as from a table that was indexed by hand.
+    They are those of the mean force of each rest of 1.5 s and more. So the noise and the error of
+    the magnitude of gravity are real, and the direction is known, as from a table that was indexed
+    by hand.
     """
     force = applied[['ax_mps2', 'ay_mps2', 'az_mps2']].to_numpy().T
     width = max(int(0.5 * rate), 3)
@@ -229,7 +227,7 @@ def _angles_at_rest(applied: pd.DataFrame, rate: float) -> pd.DataFrame:
     angles = pd.DataFrame(np.nan, applied.index, ['alpha_rad', 'beta_rad'])
     span = np.cumsum(np.diff(still, prepend=False))
     for _, part in applied[still].groupby(span[still]):
-        if len(part) >= _REST_S * rate:
+        if len(part) >= 1.5 * rate:
             x, y, z = force[:, part.index].mean(axis=1)
             angles.loc[part.index] = math.atan2(math.hypot(x, y), z), math.atan2(-y, x)
     if angles.isna().all(axis=None):
@@ -283,25 +281,19 @@ def draw(halves: Sequence[Half], plan: Plan) -> Drawn:
                  *replace(half, columns=columns).texts())
 
 
-def _motion(half: Half) -> np.ndarray:
-    """Return the force without its noise, m/s², (3, n); an axis that is not measured has 0."""
-    rate = half.unit().rate_hz
-    rows, force = half.g() * G0, np.zeros((3, len(half.columns)))
-    if rate > 3 * _MOTION_HZ:
-        low = scipy.signal.butter(2, _MOTION_HZ, fs=rate, output='sos')
-        rows = scipy.signal.sosfiltfilt(low, rows, axis=1)
-    force[half.unit().axis_indices] = rows
-    return force
-
-
 def _with_fault(half: Half, seed: tuple[int, ...], fault: Fault) -> tuple[float, np.ndarray]:
     """Let a fault act on recorded samples; return its strength, m/s², and samples, g."""
     unit, before = half.unit(), half.g()
+    # The force without its noise; an axis that is not measured has 0.
+    force = np.zeros((3, len(half.columns)))
+    force[unit.axis_indices] = before * G0 if unit.rate_hz <= 3 * _MOTION_HZ else \
+        scipy.signal.sosfiltfilt(scipy.signal.butter(
+            2, _MOTION_HZ, fs=unit.rate_hz, output='sos'), before * G0, axis=1)
     t = np.arange(before.shape[1]) / unit.rate_hz
     still = np.zeros_like(t)
     warm = np.asarray(half.columns.get('temperature_c', still + 25.0))
     run = sim.Run(unit, t, trials.integer_seed(*seed), still, still, still, warm, still + 5.0,
-                  corner_hz=math.inf, force=_motion(half))
+                  corner_hz=math.inf, force=force)
     run.u = run.force[unit.axis_indices] / G0
     run.volts = before + _ZERO_V
     sensed = run.u.copy()

@@ -14,9 +14,6 @@ from adxl_ros.report.quantities import COLUMNS
 from adxl_ros_validation.blind.scores import FEWEST_TRIALS, in_words, WITHOUT_BAR
 from adxl_ros_validation.blind.simulator import G0
 
-_TOO_FEW = (f'Too few: fewer than {FEWEST_TRIALS} trials. '
-            'Not refuted: the interval or the value reaches the bar.')
-"""Meanings of outcomes."""
 Table = tuple[Sequence[str], Sequence[Sequence[str]]]
 """Head and rows."""
 
@@ -80,7 +77,8 @@ def of_simulated(made: dict[str, Any]) -> Report:
         f'{made["seed"]}, {made["date"]}; SHA-256 of salt and labels {made["hash"]}; code of '
         f'the diagnosis {made["version"]}, {made["diagnose_code"][:16]}.',
         f'THE CHECK ITSELF LEAKS: not at chance: {bad}. Its scores mean nothing.' if bad
-        else 'The controls came out at chance.', _TOO_FEW], {
+        else 'The controls came out at chance.', f'Too few: fewer than {FEWEST_TRIALS} trials. '
+        'Not refuted: the interval or the value reaches the bar.'], {
         'Result': (['score', 'diagnose (90 % interval)', 'bar', 'met'], result),
         'Scores': (['score', 'value (90 % interval)'], [
             *([row.words, _score_text(scores[name])]

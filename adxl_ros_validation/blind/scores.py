@@ -63,7 +63,9 @@ class Trial(NamedTuple):
             'names': len(named & truth), 'names_all': truth <= named, 'set_size': len(named),
             'inseparable_size': 1 + len(rivals),
             'unknown': UNKNOWN in named | answer.top, 'seen': grading.visible(label),
-            'separable': grading.separable(label), 'material': grading.material(answer, label),
+            'separable': bool(label.faults) and all(
+                fault['power'] * fault['told'] >= grading.CERTAIN_POWER for fault in label.faults),
+            'material': grading.material(answer, label),
             'limit_holds': grading.limit_holds(answer, label),
             'brier': grading.brier(answer, label), 'utility': grading.utility(*groups),
             'has_effect': any(groups[1]),
@@ -293,8 +295,7 @@ def metadata(recordings: Path, labels: Sequence[Label]) -> dict[str, Any]:
     rng, count = np.random.default_rng(0), len(labels)
     explained, chance = [], []
     for grouping in groupings:
-        index = np.unique(grouping, return_inverse=True)[1]
-        members = np.eye(index.max() + 1)[index]
+        members = pd.get_dummies(pd.Series(grouping), dtype=float).to_numpy()
         explained.append(explained_by(members))
         chance.append([explained_by(members[rng.permutation(count)]) for _ in range(_SHUFFLES)])
     above = np.sum(np.array(chance) >= np.array(explained)[:, None] - 1e-12, axis=1)
@@ -311,7 +312,7 @@ def strength_zero(trials: Sequence[Trial]) -> dict[str, Any]:
                 if trial.label.group == 'zero')
     if not zero or not none:
         return {'score': None, 'chance': None, 'p': 1.0, 'leaks': False, 'named': named}
-    p = float(scipy.stats.fisher_exact([[sum(zero), len(zero) - sum(zero)],
-                                       [sum(none), len(none) - sum(none)]]).pvalue)
+    p = float(scipy.stats.fisher_exact([
+        [sum(gaps), len(gaps) - sum(gaps)] for gaps in (zero, none)]).pvalue)
     return {'score': sum(zero) / len(zero), 'chance': sum(none) / len(none), 'p': p,
             'named': named, 'leaks': p < _CHANCE}

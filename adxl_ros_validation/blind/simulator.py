@@ -172,8 +172,6 @@ def travel_memory(x: np.ndarray, travel: float) -> np.ndarray:
     direction = np.sign(np.diff(x, prepend=x[0]))
     moving = np.flatnonzero(direction)
     memory = np.zeros_like(x)
-    if not len(moving):
-        return memory
     turns = moving[np.flatnonzero(np.diff(direction[moving], prepend=0))]
     level = 0.0
     for start, stop in zip(turns, [*turns[1:], len(x)]):
@@ -218,16 +216,12 @@ def _acting(how: str, law: Law) -> Act:
 added, scaled, added_at_output, added_v = (
     partial(_acting, how) for how in ('added', 'scaled', 'output', 'volts'))
 """Make a fault of a law: added to the input, g, its scale factor, or to the output, g or V."""
-_SINGLE_SHARE = 0.4
-"""Share of the faults that have one weight only; chosen."""
-_LOG_SPREAD = 0.4
-"""Standard deviation of the logarithm of a weight; chosen."""
 
 
 def weights(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Draw weights with rms 1 over those that are not 0: one of them, or all."""
-    w = rng.choice([-1.0, 1.0], count) * np.exp(rng.normal(0, _LOG_SPREAD, count))
-    if rng.random() < _SINGLE_SHARE:
+    """Draw weights with rms 1 over those that are not 0: in four of ten cases one, else all."""
+    w = rng.choice([-1.0, 1.0], count) * np.exp(rng.normal(0, 0.4, count))
+    if rng.random() < 0.4:
         w *= np.arange(count) == rng.integers(count)
     return w / np.sqrt(np.mean(w[w != 0] ** 2))
 

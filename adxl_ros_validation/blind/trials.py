@@ -40,8 +40,6 @@ SECONDS = (90.0, 200.0)
 """Shortest and longest recording, s; chosen."""
 _SHARES = (0.25, 0.2, 0.2)
 """Shares of trials without an effect, with two effects and with an unlisted fault; chosen."""
-_TRIALS_PER_ZERO = 12
-"""Number of trials for each further trial at strength zero; chosen."""
 _MAX_SIZE_STEPS = 9
 """Largest number of simulations to find the size for a strength; chosen."""
 _SIZE_TOLERANCE = 0.05
@@ -108,7 +106,7 @@ def plans(seed: int, count: int, seconds: tuple[float, float] = SECONDS) -> list
     rows += [('outside', (name,)) for name in _turns(UNLISTED, outside, rng)]
     rows += [('pair', tuple(str(name) for name in rng.choice(KNOWN, 2, replace=False)))
              for _ in range(pairs)]
-    rows += [('zero', (name,)) for name in _turns(KNOWN, math.ceil(count / _TRIALS_PER_ZERO), rng)]
+    rows += [('zero', (name,)) for name in _turns(KNOWN, math.ceil(count / 12), rng)]
     order = rng.permutation(len(rows)).tolist()
     return [Plan(f'r{i:04d}', rows[k][0], rows[k][1], (seed, 2, k), seconds)
             for i, k in enumerate(order)]

@@ -51,11 +51,11 @@ def test_a_row_that_fails_is_named_and_the_others_stand(monkeypatch, capsys) -> 
         bench_command._Subject(label, 'imu/data', []) for label in labels])
     monkeypatch.setattr(bench_command, '_measure', measure)
     bench_command.measure_live(1.0, 3, None)
-    table = capsys.readouterr().out.splitlines()[2:]
+    table = capsys.readouterr().out.splitlines()[3:]
     assert table[1] == f'{labels[1]:27} failed in 3 of 3 rounds: no messages for 20 s'
     assert [line[:34].split()[-1] for line in table[0:3:2]] == ['1000', '1000']
     assert f'CPU of {labels[2]} by that of the {labels[0]}: 1.00' in table
-    assert 'First sample of compensation: 2.00 (2.00–2.00) s after its start' in table
+    assert '2.00 (2.00–2.00)  10.0' in table[2]
 
     failing = Job('apply', refuse)
     print_table([failing, Job('count', lambda: None)], 1)
