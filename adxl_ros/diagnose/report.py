@@ -20,7 +20,6 @@ from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import ActsOn, Coefficient, Concern
 from adxl_ros.report.quantities import (
     amplitude_text,
-    COLUMNS,
     Interval,
     listed,
     mg_text,
@@ -28,8 +27,8 @@ from adxl_ros.report.quantities import (
     parameter_text,
     percent,
     power_text,
-    wrapped,
 )
+from adxl_ros.report.screen import COLUMNS, wrapped
 import numpy as np
 
 _DIGITS = 6

@@ -28,7 +28,7 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes import jobs
 from adxl_ros.nodes.run_node import program_parser
 from adxl_ros.process import ended_by_closed_output
-from adxl_ros.report.quantities import coloured
+from adxl_ros.report.screen import coloured
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 import rclpy

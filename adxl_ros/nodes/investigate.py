@@ -23,7 +23,8 @@ from adxl_ros.nodes.parameters import declare_all, declare_sensor, low_and_high,
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.settings import check_given_parameters, InvestigateSettings
 from adxl_ros.nodes.topics import Level, Status
-from adxl_ros.report.quantities import COLUMNS, end_lines, percent
+from adxl_ros.report.quantities import percent
+from adxl_ros.report.screen import COLUMNS, end_lines
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.clock import Clock, ClockType

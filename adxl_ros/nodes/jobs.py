@@ -15,7 +15,7 @@ import sys
 from tempfile import TemporaryFile
 import time
 
-from adxl_ros.report.quantities import bar
+from adxl_ros.report.screen import bar
 
 _KILL_S = 10.0
 """Longest time that a process may take to end, s; chosen: a node ends within 1 s."""

@@ -27,7 +27,7 @@ from adxl_ros.nodes.rclpy_internals import start_error_text
 from adxl_ros.nodes.settings import DriverSettings, link_specs, NODES
 from adxl_ros.nodes.topics import type_name
 from adxl_ros.process import ended_by_closed_output, package_version
-from adxl_ros.report.quantities import command_lines, wrapped
+from adxl_ros.report.screen import command_lines, wrapped
 import rclpy
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node

@@ -1,19 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Numbers as text: the digits that intervals allow, units that people use, and lists.
-
-Text for a terminal of 80 columns: tables, wrapped lines, commands, and coloured outcomes.
-"""
+"""Numbers as text: the digits that intervals allow, units that people use, and lists."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-import os
-import re
-import sys
-import textwrap
-from typing import Any, NamedTuple, TextIO
+from typing import Any
 
 from adxl_ros.model.constants import G0_MPS2
 import numpy as np
@@ -178,107 +170,3 @@ def _for_people(values: np.ndarray, unit: str, scale_v_per_g: float) -> tuple[np
         base = {1e6: 'ppm', 1e2: '%'}[factor] if base == '1' else {1e6: 'µ', 1e3: 'm'}[
             factor] + base
     return values, (base + slash + per).removeprefix('1' if not per else '')
-
-
-COLUMNS = 79
-"""Columns of a terminal that a tool uses."""
-_NO_BREAK = '\N{NO-BREAK SPACE}'
-"""A blank at which no line is wrapped."""
-_LABEL_COLUMNS = 8
-"""Columns of the words before files and commands."""
-_STEP_COLUMNS = _LABEL_COLUMNS + 3
-"""Columns before the purpose of one of several steps."""
-_GREEN, _RED, _YELLOW = '\x1b[32m', '\x1b[31m', '\x1b[33m'
-"""Codes of xterm: good, bad, and not decided."""
-_COLOURS = {'GAP EXPLAINED': _GREEN, 'PARTLY EXPLAINED': _YELLOW, 'NO GAP': _GREEN,
-            'CAUSES NOT SEPARATED': _YELLOW, 'UNKNOWN CAUSE': _RED,
-            'TOO LITTLE DATA': _YELLOW, 'BAD DATA': _RED, 'NOT SHOWN': _YELLOW,
-            'PASS': _GREEN, 'FAIL': _RED, 'NO': _RED,
-            'not refuted': _YELLOW, 'too few': _YELLOW}
-"""Colours of outcomes in a terminal, those of several words first."""
-_NO_COLOUR = '\x1b[0m'
-_OUTCOME = re.compile(rf'\b({"|".join(_COLOURS)})\b')
-
-
-class NextStep(NamedTuple):
-    """Something that a user does next."""
-
-    purpose: str  # What it is for, one sentence without a period
-    command: str  # The command line that does it
-
-
-def row(cells: Iterable[str], formats: Iterable[str | int]) -> str:
-    """Return a line of a table; a format is the width of a column, `>` before it to the right."""
-    return ''.join(f'{cell:{form}}' for cell, form in zip(cells, formats)).rstrip()
-
-
-def wrapped(text: str, indent: int = 0) -> list[str]:
-    """Wrap a text between words."""
-    return textwrap.wrap(text, COLUMNS, subsequent_indent=indent * ' ', break_long_words=False,
-                         break_on_hyphens=False)
-
-
-def entry_list(title: str, entries: Mapping[str, str]) -> str:
-    """Return a list of names with their meanings."""
-    width = max(map(len, entries)) + 2
-    return '\n'.join([f'{title}:', *(
-        textwrap.fill(f'  {name:{width}}{meaning}', COLUMNS, subsequent_indent=(width + 2) * ' ')
-        for name, meaning in entries.items())])
-
-
-def end_lines(result: Sequence[str], files: Sequence[str],
-              following: str | Sequence[NextStep] = '', took_s: float | None = None) -> list[str]:
-    """Return the end of what a tool prints: result, files and what to do next."""
-    lines = [part for line in result for part in wrapped(line, 2) or ['']]
-    if files:
-        took = '' if took_s is None else f'  ({took_s:.0f}{_NO_BREAK}s)' if took_s >= 1 else \
-            f'  (< 1{_NO_BREAK}s)'
-        lines += wrapped(f' {"wrote":{_LABEL_COLUMNS - 1}}{"  ".join(files)}{took}',
-                         _LABEL_COLUMNS)
-    if isinstance(following, str):
-        lines += command_lines(following, f' {"next":{_LABEL_COLUMNS - 1}}')
-    else:
-        for number, step in enumerate(following, 1):
-            label = '' if number > 1 else 'next'
-            lines += wrapped(f' {label:{_LABEL_COLUMNS - 1}}{number}  {step.purpose}',
-                             _STEP_COLUMNS)
-            lines += command_lines(step.command, _STEP_COLUMNS * ' ')
-    return [coloured(line) for line in lines]
-
-
-def command_lines(text: str, start: str) -> list[str]:
-    """Return the lines of a command behind the start of the first one; a backslash joins them."""
-    if not text:
-        return []
-    if len(start + text) <= COLUMNS:
-        return [start + text]
-    # A line must not end within quotes.
-    text = re.sub(r"'[^']*'", lambda quotes: quotes[0].replace(' ', _NO_BREAK), text)
-    lines = textwrap.wrap(text, COLUMNS - 2, initial_indent=start,
-                          subsequent_indent=(len(start) + 2) * ' ',
-                          break_long_words=False, break_on_hyphens=False)
-    *first, last = [line.replace(_NO_BREAK, ' ') for line in lines]
-    return [*(f'{line} \\' for line in first), last]
-
-
-def bar(stream: TextIO, *columns: str | int, transient: bool = True) -> Any:
-    """Return rich's `Progress`, or None if nothing can be drawn; a number is a bar so wide."""
-    if not stream.isatty() or os.environ.get('TERM') == 'dumb':
-        return None
-    try:
-        from rich import console, progress
-    except ImportError:
-        return None
-    drawn = [progress.BarColumn(column) if isinstance(column, int)
-             else getattr(progress, column)() if column.isidentifier()
-             else progress.TextColumn(column, markup=False)
-             for column in ('{task.description}', *columns)]
-    screen = console.Console(file=stream, highlight=False, markup=False, emoji=False)
-    return progress.Progress(*drawn, console=screen, transient=transient)
-
-
-def coloured(line: str) -> str:
-    """Colour the outcomes of a line in a terminal, but not where NO_COLOR is set."""
-    if not sys.stdout.isatty() or 'NO_COLOR' in os.environ:
-        return line
-    return _OUTCOME.sub(lambda match: f'{_COLOURS[match[0]]}{match[0]}{_NO_COLOUR}', line)

@@ -34,7 +34,8 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Effect
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import ended_by_closed_output, package_version
-from adxl_ros.report.quantities import bar, column_unit, COLUMNS, end_lines, entry_list, NextStep
+from adxl_ros.report.quantities import column_unit
+from adxl_ros.report.screen import bar, COLUMNS, end_lines, entry_list, NextStep
 import numpy as np
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from adxl_ros.model.effects import library
 from adxl_ros.model.population import posterior
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report import page as html_page
-from adxl_ros.report.quantities import NextStep
+from adxl_ros.report.screen import NextStep
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
 from adxl_ros.simulate.trajectories import motion_from_force
 from adxl_ros.tools import command_line as cli

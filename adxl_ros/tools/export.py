@@ -12,7 +12,7 @@ from adxl_ros.files import exports, parameter_file, simulator_exports
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.report.quantities import entry_list
+from adxl_ros.report.screen import entry_list
 from adxl_ros.simulate.response import PartSizes
 from adxl_ros.simulate.trajectories import TRAJECTORIES
 from adxl_ros.tools import command_line as cli

@@ -20,7 +20,8 @@ from adxl_ros.fleet.inputs import find_sources, stated_by
 from adxl_ros.fleet.row import make_recipe, reason_kind, Recipe, Row, task_names, TASKS
 from adxl_ros.fleet.run import only_client, Plan, plan, Results, Selection, since_text, work
 from adxl_ros.report.page import as_utf_8, without_secrets
-from adxl_ros.report.quantities import counted, duration, file_size, wrapped
+from adxl_ros.report.quantities import counted, duration, file_size
+from adxl_ros.report.screen import wrapped
 from adxl_ros.tools import command_line as cli
 from adxl_ros.workers import open_pool, RETRIES
 

@@ -22,7 +22,8 @@ from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report import page as html_page
 from adxl_ros.report.figures import png, pyplot
-from adxl_ros.report.quantities import duration, row
+from adxl_ros.report.quantities import duration
+from adxl_ros.report.screen import row
 from adxl_ros.signals import axis_noise
 from adxl_ros.signals.allan_deviation import StillStretch
 from adxl_ros.signals.axis_noise import AxisNoise, RecordingNoise, settings, TERMS

@@ -19,7 +19,7 @@ from adxl_ros.links.support import emulated_board
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Concern
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.report.quantities import entry_list
+from adxl_ros.report.screen import entry_list
 from adxl_ros.simulate.motion import INTERNAL_RATE_HZ
 from adxl_ros.simulate.response import Columns, simulate_at_stamps, simulate_blocks
 from adxl_ros.simulate.trajectories import (

@@ -10,7 +10,7 @@ import re
 import textwrap
 from typing import Any, NamedTuple
 
-from adxl_ros.report.quantities import COLUMNS
+from adxl_ros.report.screen import COLUMNS
 from adxl_ros_validation.blind.scores import FEWEST_TRIALS, in_words, WITHOUT_BAR
 from adxl_ros_validation.blind.simulator import G0
 
