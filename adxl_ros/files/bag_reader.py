@@ -50,7 +50,9 @@ def blocks(path: str | os.PathLike, rows: int, ideal: bool = False,
            reading: ReadingOptions = AS_IT_IS) -> Generator[Recording, None, None]:
     """Read a bag in blocks of at most `rows` samples."""
     with open_bag(path) as bag:
-        _refuse_mapping(bag, reading)
+        if reading.mapping is not None or reading.lsb_per_g or reading.lsb_at_0g:
+            raise UserError(f'{bag.path}: is a bag, with topics in m/s²; leave --columns and '
+                            '--lsb-per-g out, or name a topic with --topic')
         topics = find_ideal(bag) if ideal else find_topics(bag, reading.topic)
         info = read_info(bag, topics.info)
         samples = _Samples(f'{bag.path}: topic {topics.imu}', AXES if ideal else info.get('axes'),
@@ -58,17 +60,16 @@ def blocks(path: str | os.PathLike, rows: int, ideal: bool = False,
         tracks, kinds = _tracks(bag, topics), dict(bag.types)
         commands = {column: Command() for column in COMMANDS.values() if topics.command}
         for pieces, is_last in _batches(bag, topics, rows, samples):
-            messages = {topic: [piece.messages[topic] for piece in pieces
-                                if len(piece.messages.get(topic, ()))]
-                        for topic in topics.sampled()}
-            samples.add(messages.pop(topics.imu))
-            if topics.command:
-                _add_commands(f'{bag.path}: topic {topics.command}', commands,
-                              messages.pop(topics.command),
-                              samples.arrived_ns[_samples_before(pieces, topics)])
-            for topic, parts in messages.items():
-                _add_references(f'{bag.path}: topic {topic}', _REFERENCES[kinds[topic]], parts,
-                                tracks)
+            for topic in topics.sampled():
+                found = [piece for piece in pieces if len(piece.messages.get(topic, ()))]
+                parts = [piece.messages[topic] for piece in found]
+                where = f'{bag.path}: topic {topic}'
+                if topic == topics.imu:
+                    samples.add(parts)
+                elif topic == topics.command:
+                    _add_commands(where, commands, parts, [p.log_ns[topic] for p in found])
+                else:
+                    _add_references(where, _REFERENCES[kinds[topic]], parts, tracks)
             ready = len(samples.stamp_ns) if is_last else samples.ready(tracks) // rows * rows
             for start in range(0, ready, rows):
                 yield _block(bag, samples, tracks, commands, info,
@@ -76,15 +77,6 @@ def blocks(path: str | os.PathLike, rows: int, ideal: bool = False,
             samples.drop(ready)
     if not samples.count:
         raise UserError(f'{samples.where}: holds no message')
-
-
-def _refuse_mapping(bag: Bag, reading: ReadingOptions) -> None:
-    """Refuse options that only tables have."""
-    if reading.mapping is not None:
-        raise UserError(f'{reading.mapping.where}: {bag.path} is a bag, which has topics; name '
-                        'one with --topic')
-    if reading.lsb_per_g or reading.lsb_at_0g:
-        raise UserError(f'--lsb-per-g: {bag.path} is a bag, whose readings are in m/s²')
 
 
 def _batches(bag: Bag, topics: Topics, rows: int, samples: _Samples
@@ -97,20 +89,8 @@ def _batches(bag: Bag, topics: Topics, rows: int, samples: _Samples
             yield batch, False
             batch, count = [], 0
         batch.append(piece)
-        count += len(piece.places.get(topics.imu, ()))
+        count += len(piece.messages.get(topics.imu, ()))
     yield batch, True
-
-
-def _samples_before(pieces: list[Piece], topics: Topics) -> np.ndarray:
-    """Return how many samples of a batch precede each of its commands, (k,)."""
-    none, count = np.zeros(0, np.int64), 0
-    before = [none]
-    for piece in pieces:
-        samples = piece.places.get(topics.imu, none)
-        before.append(count + np.searchsorted(samples,
-                                              piece.places.get(topics.command or '', none)))
-        count += len(samples)
-    return np.concatenate(before)
 
 
 class _Samples:
@@ -126,8 +106,6 @@ class _Samples:
         self.stamp_ns = np.zeros(0, np.int64)  # Stamps of the waiting samples, ns, (n,)
         # Their specific force, m/s², (n,) by column
         self.force: dict[str, np.ndarray] = dict.fromkeys(ACCEL, np.zeros(0))
-        # Stamps of the newest batch after the stamp of the sample before it, ns; 0 is none
-        self.arrived_ns = np.zeros(1, np.int64)
         self._rate_hz = reading.rate_hz
         self._first_ns = 0
         self._frame: str | None = None
@@ -135,7 +113,6 @@ class _Samples:
     def add(self, parts: list[Raws]) -> None:
         """Decode and check further messages."""
         if not parts:
-            self.arrived_ns = self.arrived_ns[-1:]
             return
         stamp_ns, force = _columns(self.where, parts, cdr.imu, ACCEL, self._force)
         if not self.count:
@@ -143,7 +120,6 @@ class _Samples:
         if self._rate_hz is not None:
             number = self.count + np.arange(len(stamp_ns))
             stamp_ns = self._first_ns + np.rint(number * 1e9 / self._rate_hz).astype(np.int64)
-        self.arrived_ns = np.concatenate([self.arrived_ns[-1:], stamp_ns])
 
         def place(row: int) -> str:
             number = self.count + row + 1
@@ -180,12 +156,9 @@ class _Samples:
             self.epoch_ns = stamp_ns // 1_000_000_000 * 1_000_000_000
         table = next(_tables(self.where, [first], cdr.imu))
         variance = table.numbers('linear_acceleration_covariance')[0, [0, 4, 8]]
-        if variance[0] == -1:
-            raise UserError(f'{self.where}: states no linear acceleration: '
-                            'linear_acceleration_covariance[0] is -1')
         if self.axes is None:
-            present = variance < _ABSENT_VARIANCE
-            self.axes = ''.join(axis for axis, is_there in zip(AXES, present) if is_there)
+            is_there = (variance < _ABSENT_VARIANCE) & (variance[0] != -1)
+            self.axes = ''.join(np.array(list(AXES))[is_there])
         if self.axes not in MEASURED_AXES:
             raise UserError(f'{self.where}: linear_acceleration_covariance gives the axes '
                             f'{self.axes or "none"}, expected x, xy or xyz; record sensor_info')
@@ -264,17 +237,18 @@ def _add_references(where: str, kind: tuple[Any, ...], parts: list[Raws],
 
 
 def _add_commands(where: str, commands: dict[str, Command], parts: list[Raws],
-                  arrived_ns: np.ndarray) -> None:
+                  log_ns: list[np.ndarray]) -> None:
     """
-    Add commands; one without a stamp counts from the newest sample that was recorded before it.
+    Add commands; one without a stamp counts from the time of its record.
 
     A value that is no angle is left out, because the stage refuses it.
     """
     stamp_ns, columns = _columns(where, parts, cdr.joint_state, commands,
                                  lambda table: _positions(table, COMMANDS))
     for column, value in columns.items():
-        commands[column].add(np.where(stamp_ns == 0, arrived_ns, stamp_ns),
-                             np.where(np.abs(value) <= LIMIT, value, np.nan))
+        if len(value):
+            commands[column].add(np.where(stamp_ns == 0, np.concatenate(log_ns), stamp_ns),
+                                 np.where(np.abs(value) <= LIMIT, value, np.nan))
 
 
 def _block(bag: Bag, samples: _Samples, tracks: dict[str, Track], commands: dict[str, Command],

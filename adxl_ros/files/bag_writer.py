@@ -4,13 +4,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 import os
 from pathlib import Path
 import threading
-from types import TracebackType
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
@@ -32,9 +31,6 @@ from adxl_ros.model.noise import sample_std_v
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-if TYPE_CHECKING:
-    from typing import Self  # since Python 3.11
-
 FRAME = 'imu_link'
 """Frame of the sensor's messages (REP-145)."""
 
@@ -47,12 +43,6 @@ _END_OF_TIME_NS = (1 << 31) * 1_000_000_000
 _LONGEST_NS = (1 << 63) - 1
 """Largest duration of ROS, ns: a QoS without a deadline."""
 
-_LATCHED_DEPTH = 1
-"""Messages that a latched topic keeps for late subscribers."""
-
-_DEPTH = 10
-"""Messages that any other topic keeps, the default depth of ROS."""
-
 
 class Form(NamedTuple):
     """How the messages of a topic are written."""
@@ -62,166 +52,128 @@ class Form(NamedTuple):
     template: bytes  # A message
 
 
-class OpenBag:
-    """
-    A new bag: a rosbag2 directory, or one file for a name.mcap.
+class _NewBag:
+    """Writes the messages of a new bag by topic."""
 
-    A context manager: the bag appears under its name when the block ends without an error.
-    """
-
-    def __init__(self, path: str | os.PathLike) -> None:
-        """Prepare to write to `path`, which is replaced if it exists."""
-        self._path = Path(path)
-        self._rosbag2 = import_rosbags()
+    def __init__(self, path: Path, writer: Any) -> None:
+        self.path, self.writer = path, writer
         self.types = typestore()
-        self._connections: dict[str, Any] = {}
+        self.connections: dict[str, Any] = {}
 
-    def __enter__(self) -> Self:
-        """Open a new bag next to the one to replace."""
-        with ExitStack() as stack:
-            fresh = stack.enter_context(atomic_path(self._path))
-            folder = fresh
-            if self._path.suffix == '.mcap':
-                # rosbags writes directories; only the file inside is kept.
-                folder = fresh.with_suffix('')
-                stack.callback(_keep_file, folder / f'{folder.name}.mcap', fresh)
-            self._writer = stack.enter_context(self._rosbag2.Writer(
-                folder, version=9, storage_plugin=self._rosbag2.StoragePlugin.MCAP))
-            self._stack = stack.pop_all()
-        return self
+    def connection(self, topic: str, kind: str, qos: Sequence[Any] = ()) -> Any:
+        """Return the connection of a topic; without a QoS, `ros2 bag play` takes its default."""
+        if topic not in self.connections:
+            self.connections[topic] = self.writer.add_connection(
+                topic, kind, typestore=self.types, offered_qos_profiles=qos)
+        return self.connections[topic]
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 trace: TracebackType | None) -> None:
-        """Close the bag and, if all went well, put it in its place."""
-        self._stack.__exit__(kind, error, trace)
+    def batch(self, topic: str, form: Form, stamp_ns: np.ndarray,
+              fields: Mapping[str, np.ndarray]) -> Batch:
+        """Return the messages of a topic at stamps, ns, (n,), rising."""
+        return Batch(self.connection(topic, form.kind), stamp_ns,
+                     cdr.fill(form.template, form.find, stamp_ns, fields))
 
-    def connection(self, topic: str, kind: str, is_latched: bool = False) -> Any:
-        """Return the connection of a topic."""
-        if topic not in self._connections:
-            self._connections[topic] = self._writer.add_connection(
-                topic, kind, typestore=self.types, offered_qos_profiles=[_qos(is_latched)])
-        return self._connections[topic]
-
-    def check_stamps(self, stamp_ns: np.ndarray) -> None:
-        """Refuse stamps, ns, (n,), rising, that a ROS message cannot have."""
+    def append(self, batches: Sequence[Batch]) -> None:
+        """Append messages, those of the sensor first."""
+        stamp_ns = batches[0].stamp_ns
         if stamp_ns[0] < 0 or stamp_ns[-1] >= _END_OF_TIME_NS:
-            raise UserError(f'{self._path}: times from {stamp_ns[0] / 1e9:g} to '
+            raise UserError(f'{self.path}: times from {stamp_ns[0] / 1e9:g} to '
                             f'{stamp_ns[-1] / 1e9:g} s cannot be stamps of ROS messages, '
                             'which go from 0 to 2^31 s')
-
-    def batch(self, topic: str, form: Form, stamp_ns: np.ndarray, rows: np.ndarray,
-              fields: Mapping[str, np.ndarray]) -> Batch:
-        """Return the messages of some samples of all, whose stamps are `stamp_ns`."""
-        return Batch(self.connection(topic, form.kind), rows,
-                     cdr.fill(form.template, form.find, stamp_ns[rows], fields))
-
-    def write_messages(self, stamp_ns: np.ndarray, batches: Sequence[Batch]) -> None:
-        """
-        Append the messages of samples.
-
-        stamp_ns: stamps of the samples, ns, (n,), rising.
-        """
-        write_messages(self._writer, stamp_ns, batches)
-        release_written(self._writer.storage.bio)
+        write_messages(self.writer, batches)
+        release_written(self.writer.storage.bio)
 
 
-class BagWriter(OpenBag):
+@contextmanager
+def _new_bag(path: str | os.PathLike) -> Iterator[_NewBag]:
+    """Open a rosbag2 directory, or one file for a name.mcap; it appears at the end of the block."""
+    rosbag2 = import_rosbags()
+    with atomic_path(path) as fresh:
+        # rosbags writes directories; of a name.mcap, only the file inside is kept.
+        folder = fresh.with_suffix('') if fresh.suffix == '.mcap' else fresh
+        with rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
+            yield _NewBag(Path(path), writer)
+        if folder != fresh:
+            os.replace(folder / f'{folder.name}.mcap', fresh)
+
+
+@contextmanager
+def recording_bag(path: str | os.PathLike, sensor: Sensor
+                  ) -> Iterator[Callable[[Recording], None]]:
     """
-    Writes the samples of a recording, block by block, into a bag.
+    Open a new bag, and yield a function that appends samples of a recording.
 
     Each sample becomes a message of `imu/data_raw`. Sampled references become messages of
     `stage/joint_states`, `temperature` and `supply` with the same stamp; the voltage of
     sensor_msgs/BatteryState is float32. A command becomes a message of `stage/command` where it
     changes, and once every 65536 samples. Columns with other names are left out.
     """
+    imu = _imu_form(_noise_covariance(sensor))
+    with _new_bag(path) as bag:
+        def append(recording: Recording) -> None:
+            if not bag.connections:
+                _write_info(bag, recording, sensor)
+            for start in range(0, len(recording), _ROWS_AT_ONCE):
+                part = recording.rows(start, start + _ROWS_AT_ONCE)
+                accel = part.accel_mps2(sensor)
+                force = np.zeros((len(part), 3))
+                force[:, :accel.shape[1]] = accel
+                batches = [bag.batch('/imu/data_raw', imu, part.stamp_ns,
+                                     {'linear_acceleration': force}),
+                           *_joint_batches(bag, part.stamp_ns, part.columns, JOINTS,
+                                           '/stage/joint_states'),
+                           *_joint_batches(bag, part.stamp_ns, _changes(part.columns), COMMANDS,
+                                           '/stage/command')]
+                for column, (topic, field, form) in _SCALARS.items():
+                    known = ~np.isnan(part.columns.get(column, np.full(len(part), np.nan)))
+                    if known.any():
+                        batches.append(bag.batch(topic, form, part.stamp_ns[known],
+                                                 {field: part.columns[column][known]}))
+                bag.append(batches)
 
-    def __init__(self, path: str | os.PathLike, sensor: Sensor) -> None:
-        """Prepare to write to `path`."""
-        super().__init__(path)
-        self._sensor = sensor
-        self._imu = _imu_form(_noise_covariance(sensor))
+        yield append
 
-    def write(self, recording: Recording) -> None:
-        """Append samples."""
-        stamp_ns = recording.stamp_ns
-        self.check_stamps(stamp_ns)
-        if '/sensor_info' not in self._connections:
-            self._write_info(recording, int(stamp_ns[0]))
-        accel = recording.accel_mps2(self._sensor)
-        for start in range(0, len(recording), _ROWS_AT_ONCE):
-            part = slice(start, start + _ROWS_AT_ONCE)
-            references = {name: values[part] for name, values in recording.columns.items()}
-            force = np.zeros((len(stamp_ns[part]), 3))
-            force[:, :accel.shape[1]] = accel[part]
-            batches = [self.batch('/imu/data_raw', self._imu, stamp_ns[part],
-                                  np.arange(len(force)), {'linear_acceleration': force}),
-                       *self._joint_batches(stamp_ns[part], references, JOINTS,
-                                            '/stage/joint_states'),
-                       *self._joint_batches(stamp_ns[part], _changes(references), COMMANDS,
-                                            '/stage/command')]
-            for column, (topic, field, form) in _SCALARS.items():
-                values = references.get(column, np.zeros(0))
-                rows = np.flatnonzero(~np.isnan(values))
-                if len(rows):
-                    batches.append(self.batch(topic, form, stamp_ns[part], rows,
-                                              {field: values[rows]}))
-            self.write_messages(stamp_ns[part], batches)
 
-    def _write_info(self, recording: Recording, stamp_ns: int) -> None:
-        kinds = self.types.types
-        pair = kinds['diagnostic_msgs/msg/KeyValue']
-        info = converted_info(recording.info, self._sensor)
-        message = kinds[DIAGNOSTIC_STATUS](
-            level=0, name='sensor_info', message='', hardware_id=info['serial'],
-            values=[pair(key=key, value=value) for key, value in info.items()])
-        raw = self.types.serialize_cdr(message, DIAGNOSTIC_STATUS)
-        connection = self.connection('/sensor_info', DIAGNOSTIC_STATUS, is_latched=True)
-        self._writer.write(connection, stamp_ns, raw)
+def _write_info(bag: _NewBag, recording: Recording, sensor: Sensor) -> None:
+    """Write what the sensor states, latched for late subscribers of `ros2 bag play`."""
+    from rosbags import interfaces as ros
+    kinds = bag.types.types
+    info = converted_info(recording.info, sensor)
+    message = kinds[DIAGNOSTIC_STATUS](
+        level=0, name='sensor_info', message='', hardware_id=info['serial'],
+        values=[kinds['diagnostic_msgs/msg/KeyValue'](key=key, value=value)
+                for key, value in info.items()])
+    forever = ros.QosTime(*divmod(_LONGEST_NS, 1_000_000_000))
+    latched = ros.Qos(ros.QosHistory.KEEP_LAST, 1, ros.QosReliability.RELIABLE,
+                      ros.QosDurability.TRANSIENT_LOCAL, forever, forever,
+                      ros.QosLiveliness.AUTOMATIC, forever, False)
+    bag.writer.write(bag.connection('/sensor_info', DIAGNOSTIC_STATUS, [latched]),
+                     int(recording.stamp_ns[0]),
+                     bag.types.serialize_cdr(message, DIAGNOSTIC_STATUS))
 
-    def _joint_batches(self, stamp_ns: np.ndarray, columns: dict[str, np.ndarray],
-                       names: Mapping[str, str], topic: str) -> list[Batch]:
-        """Return one batch for each set of joints that were sampled together."""
-        joints = {joint: columns[column] for joint, column in names.items() if column in columns}
-        if not joints:
-            return []
-        values = np.column_stack(list(joints.values()))
-        is_sampled = ~np.isnan(values)
-        batches = []
-        for pattern in np.unique(is_sampled, axis=0):
-            rows = np.flatnonzero((is_sampled == pattern).all(axis=1))
-            sampled_joints = [joint for joint, sampled in zip(joints, pattern) if sampled]
-            if sampled_joints:
-                count = len(sampled_joints)
-                template = cdr.message('', count, *sampled_joints, count, np.zeros(count), 0, 0)
-                batches.append(self.batch(topic, Form(JOINT_STATE, cdr.joint_state, template),
-                                          stamp_ns, rows, {'position': values[rows][:, pattern]}))
-        return batches
+
+def _joint_batches(bag: _NewBag, stamp_ns: np.ndarray, columns: Mapping[str, np.ndarray],
+                   names: Mapping[str, str], topic: str) -> Iterator[Batch]:
+    """Yield one batch for each set of joints that were sampled together."""
+    joints = [joint for joint, column in names.items() if column in columns]
+    values = np.column_stack([np.zeros((len(stamp_ns), 0)),
+                              *(columns[names[joint]] for joint in joints)])
+    is_sampled = ~np.isnan(values)
+    for pattern in np.unique(is_sampled, axis=0):
+        rows = (is_sampled == pattern).all(axis=1)
+        sampled = [joint for joint, is_there in zip(joints, pattern) if is_there]
+        template = cdr.message('', len(sampled), *sampled, len(sampled), np.zeros(len(sampled)),
+                               0, 0)
+        if sampled:
+            yield bag.batch(topic, Form(JOINT_STATE, cdr.joint_state, template), stamp_ns[rows],
+                            {'position': values[rows][:, pattern]})
 
 
 def _changes(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return commands where they change and in the first row, NaN elsewhere."""
-    changed = {}
-    for name in COMMANDS.values():
-        if name in columns:
-            values = columns[name]
-            new = np.concatenate([[True], values[1:] != values[:-1]])
-            changed[name] = np.where(new & np.isfinite(values), values, np.nan)
-    return changed
-
-
-def _keep_file(file: Path, target: Path) -> None:
-    if file.exists():
-        os.replace(file, target)
-
-
-def _qos(is_latched: bool) -> Any:
-    """Return the QoS of `ros2 bag play`: reliable, and latched for late subscribers if asked."""
-    from rosbags import interfaces as ros
-    durability = ros.QosDurability.TRANSIENT_LOCAL if is_latched else ros.QosDurability.VOLATILE
-    forever = ros.QosTime(*divmod(_LONGEST_NS, 1_000_000_000))
-    return ros.Qos(ros.QosHistory.KEEP_LAST, _LATCHED_DEPTH if is_latched else _DEPTH,
-                   ros.QosReliability.RELIABLE, durability, forever, forever,
-                   ros.QosLiveliness.AUTOMATIC, forever, False)
+    return {name: np.where(np.append(True, columns[name][1:] != columns[name][:-1]),
+                           columns[name], np.nan)
+            for name in COMMANDS.values() if name in columns}
 
 
 def _noise_covariance(sensor: Sensor) -> np.ndarray:
@@ -261,31 +213,27 @@ _VECTOR = 'geometry_msgs/msg/Vector3Stamped'
 """Type of the tilt."""
 
 
-class TiltBag(OpenBag):
-    """Writes corrected samples block by block: a message of `imu/data` and `tilt` for each."""
+@contextmanager
+def tilt_bag(path: str | os.PathLike) -> Iterator[Callable[..., None]]:
+    """
+    Open a new bag, and yield a function that appends messages of `imu/data` and `tilt`.
 
-    def __init__(self, path: str | os.PathLike) -> None:
-        """Prepare to write to `path`, which is replaced if it exists."""
-        super().__init__(path)
-        self._imu = _imu_form(np.zeros(9))
-        self._tilt = Form(_VECTOR, cdr.vector3_stamped, cdr.message(FRAME, np.zeros(3)))
+    Its arguments are stamps, ns, (n,), rising; fields of sensor_msgs/Imu by name, (n, k) each;
+    and roll, pitch and inclination, rad, (n, 3).
+    """
+    forms = {'/imu/data': _imu_form(np.zeros(9)),
+             '/tilt': Form(_VECTOR, cdr.vector3_stamped, cdr.message(FRAME, np.zeros(3)))}
+    with _new_bag(path) as bag:
+        for topic, form in forms.items():
+            bag.connection(topic, form.kind)
 
-    def write(self, stamp_ns: np.ndarray, imu_fields: Mapping[str, np.ndarray],
-              tilt_rad: np.ndarray) -> None:
-        """
-        Append samples.
+        def append(stamp_ns: np.ndarray, imu_fields: Mapping[str, np.ndarray],
+                   tilt_rad: np.ndarray) -> None:
+            if len(stamp_ns):
+                bag.append([bag.batch(topic, form, stamp_ns, fields) for (topic, form), fields
+                            in zip(forms.items(), (imu_fields, {'vector': tilt_rad}))])
 
-        stamp_ns: stamps, ns, (n,), rising; imu_fields: fields of sensor_msgs/Imu by name, (n, k)
-        each; tilt_rad: roll, pitch and inclination, rad, (n, 3).
-        """
-        self.connection('/imu/data', IMU)
-        self.connection('/tilt', _VECTOR)
-        if len(stamp_ns):
-            self.check_stamps(stamp_ns)
-            rows = np.arange(len(stamp_ns))
-            self.write_messages(stamp_ns, [
-                self.batch('/imu/data', self._imu, stamp_ns, rows, imu_fields),
-                self.batch('/tilt', self._tilt, stamp_ns, rows, {'vector': tilt_rad})])
+        yield append
 
 
 _FLUSH_NS = 500_000_000
@@ -297,7 +245,7 @@ class LiveBag:
     Writes serialized messages of any topics into a rosbag2 directory, as they come.
 
     A reader, or a kill, finds all messages but those of the last half second. Threads may share
-    it. Unlike `BagWriter`, it appears under its name at once.
+    it. Unlike other bags, it appears under its name at once.
     """
 
     def __init__(self, path: Path) -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import bag_reader, mapped_recording
-from adxl_ros.files.bag_writer import BagWriter
+from adxl_ros.files.bag_writer import recording_bag
 from adxl_ros.files.column_guess import describe
 from adxl_ros.files.column_mapping import AS_IT_IS, Mounting, parse_mapping, ReadingOptions
 from adxl_ros.files.csv_file import csv_writer
@@ -156,8 +156,8 @@ def writer(path: str | os.PathLike, sensor: Sensor) -> Iterator[Callable[[Record
     ending determines the format. A bag holds the nominal conversion of `sensor`.
     """
     if Path(path).suffix != '.csv':
-        with BagWriter(path, sensor) as bag:
-            yield bag.write
+        with recording_bag(path, sensor) as append:
+            yield append
         return
     with csv_writer(path) as append:
         def write_block(block: Recording) -> None:

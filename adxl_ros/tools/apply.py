@@ -14,7 +14,7 @@ from pathlib import Path
 from adxl_ros.compensate.estimators import Estimates, RecordingEstimator
 from adxl_ros.compensate.live_stream import ImuFields
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.bag_writer import TiltBag
+from adxl_ros.files.bag_writer import tilt_bag
 from adxl_ros.files.csv_file import csv_writer
 from adxl_ros.files.recording_columns import check_unit, Recording
 from adxl_ros.model.constants import AXES
@@ -114,9 +114,9 @@ def _table(path: str) -> Iterator[Callable[[Recording, Estimates], None]]:
 def _bag(path: str) -> Iterator[Callable[[Recording, Estimates], None]]:
     """Open a bag, and yield a function that appends a block with its estimates."""
     fields = ImuFields()
-    with TiltBag(path) as bag:
-        yield lambda block, estimates: bag.write(block.stamp_ns[~estimates.unsolved],
-                                                 *fields(estimates))
+    with tilt_bag(path) as append:
+        yield lambda block, estimates: append(block.stamp_ns[~estimates.unsolved],
+                                              *fields(estimates))
 
 
 def _sensor(params: str | None, first: Recording | None) -> tuple[Sensor, list[str]]:
