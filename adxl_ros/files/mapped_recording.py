@@ -38,7 +38,6 @@ from adxl_ros.files.recording_columns import (
     sensor_columns,
     StampCheck,
     stamped_rate_hz,
-    StreamInfo,
     TIME,
     VOLTS,
 )
@@ -64,9 +63,6 @@ _FEWEST_STAMPS = 8
 
 _WHOLE = 1e-3
 """Largest distance of a stamp from a whole number by rounding, in its unit."""
-
-_SAME_RATE = 0.1
-"""Largest relative difference of a stated sample rate from that of the stamps. Chosen."""
 
 _NATIVE = {TIME: 'time', **{column: joint for joint, column in JOINTS.items()},
            'temperature_c': 'temperature', 'supply_v': 'supply'}
@@ -100,33 +96,25 @@ def native_mapping(table: Table, output: tuple[str, ...] = ()) -> ColumnMapping:
     # Where one form of output is there, the other may stand there in any unit.
     outputs = next((kind for kind in (output, VOLTS, ACCEL) if set(kind) & set(names)),
                    (*VOLTS, *ACCEL))
-    roles = {**_NATIVE, **{column: AXES[i % len(AXES)] for i, column in enumerate(outputs)}}
-    for column, role in roles.items():
-        if column in names:
-            continue
-        other = _in_other_unit(names, column, role)
-        if other is not None:
-            raise NotNativeError(f'{table.header}:{other + 1}: column {names[other]} is in '
-                                 f'another unit; expected the column {column}')
-        if column in (TIME, *output):
-            raise NotNativeError(f'{table.header}: no column {column}'
-                                 + f'; the columns are {listed(names)}' * bool(output))
+    roles = {**_NATIVE, **dict(zip(outputs, 2 * AXES))}
+    stems = {column.rpartition('_')[0]: column for column in roles}
+    for number, name in enumerate(names, 1):
+        stem, _, unit = name.lower().rpartition('_')
+        column = stems.get(stem, name)
+        if column not in names and unit_name(unit, ROLES[roles[column]]):
+            raise NotNativeError(f'{table.header}:{number}: column {name} is in another unit; '
+                                 f'expected the column {column}')
+    missing = [column for column in (TIME, *output) if column not in names]
+    if missing:
+        raise NotNativeError(f'{table.header}: no column {missing[0]}'
+                             + f'; the columns are {listed(names)}' * bool(output))
     try:
         outputs = output or sensor_columns(names, table.header)
     except UserError as error:
         raise NotNativeError(str(error)) from None
-    return ColumnMapping({
-        **{role: Source(name, ROLES[role].value) for name, role in _NATIVE.items()
-           if name in names},
-        **{axis: Source(name, name.rpartition('_')[2]) for axis, name in zip(AXES, outputs)}},
-        table.path)
-
-
-def _in_other_unit(names: tuple[str, ...], column: str, role: str) -> int | None:
-    """Return the index of a column of the same name with another unit."""
-    stem = column.rpartition('_')[0]
-    return next((i for i, name in enumerate(names) if re.match(f'(?i){stem}_', name)
-                 and unit_name(name[len(stem) + 1:], ROLES[role])), None)
+    native = {role: name for name, role in _NATIVE.items() if name in names}
+    return ColumnMapping({role: Source(name, name.rpartition('_')[2]) for role, name in {
+        **native, **dict(zip(AXES, outputs))}.items()}, table.path)
 
 
 def blocks(table: Table, mapping: ColumnMapping | None, reading: ReadingOptions, rows: int,
@@ -162,16 +150,14 @@ def _resolved(table: Table, mapping: ColumnMapping, reading: ReadingOptions
         raise UserError(f'{mapping.where}: some axes are in volts and others are not; state one '
                         'kind')
     counts = [column.name for column in outputs if column.unit_name in (LSB, UNSIGNED)]
-    for option, values in (('--lsb-per-g', reading.lsb_per_g), ('--lsb-at-0g', reading.lsb_at_0g)):
-        if values and len(values) not in (1, len(outputs)):
-            raise UserError(f'{option}: has {len(values)} values for {len(outputs)} axes; write '
-                            'one for all, or one for each')
-    if (reading.lsb_per_g or reading.lsb_at_0g) and not counts:
-        raise UserError(f'--lsb-per-g: no column is in LSB; write for example '
-                        f'x={outputs[0].name}:lsb')
-    if counts and not reading.lsb_per_g:
+    if bool(counts) != bool(reading.lsb_per_g):
         raise UserError(f'{mapping.where}: {counts[0]} is in LSB; add --lsb-per-g with the counts '
-                        'of 1 g, as in the datasheet')
+                        'of 1 g, as in the datasheet' if counts else
+                        '--lsb-per-g: no column is in LSB; write for example '
+                        f'x={outputs[0].name}:lsb')
+    if not {len(reading.lsb_per_g), len(reading.lsb_at_0g)} <= {0, 1, len(outputs)}:
+        raise UserError(f'--lsb-per-g, --lsb-at-0g: write one value for all {len(outputs)} axes, '
+                        'or one for each')
     return columns
 
 
@@ -215,18 +201,17 @@ class _Converter:
         self._empty += int((~is_sample).sum())
         for column, values in zip(self._axes, outputs.T):
             _refuse(block, column, is_sample & ~(np.abs(values) <= LIMIT),
-                    f', no reading of a sensor in {column.unit_name}; delete the line, or correct '
-                    'the unit', 'every sample needs it')
+                    f'no reading of a sensor in {column.unit_name}', 'every sample needs it')
         time_s, is_kept = self._times(block, is_sample)
         columns = dict(zip(VOLTS if self._axes[0].unit.is_volts else ACCEL, outputs.T))
         columns |= self._references(block)
         if self._is_native:
-            columns = {**columns, **{name: values for name, values in block.columns.items()
-                                     if name not in columns and name != TIME}}
+            columns |= {name: values for name, values in block.columns.items()
+                        if name not in columns and name != TIME}
         columns = {name: np.ascontiguousarray(values[is_kept])
                    for name, values in columns.items()}
         if not self._count and is_kept.any():
-            self._look_at_first(block, outputs[is_kept], time_s[is_kept])
+            self._look_at_first(outputs[is_kept], time_s[is_kept])
         self._count += int(is_kept.sum())
         info = {key: text for key, text in block.info.items() if key != 'epoch_ns'}
         left_out = f'{self._path}: left out, lines without a reading of the sensor: {self._empty}'
@@ -257,11 +242,9 @@ class _Converter:
             if role == 'time' or role in AXES:
                 continue
             stated = block.columns[column.name]
-            if role in ('roll', 'pitch') and column.unit_name == 'rad':
-                _refuse(block, column, np.abs(stated) > _TURN_RAD, ' rad, more than a turn; if it '
-                        f'is in degrees, write {role}={column.name}:deg')
-            _refuse(block, column, np.abs(stated) > LIMIT,
-                    f' {column.unit_name}, no {role}; delete the line')
+            is_tilt = role in ('roll', 'pitch') and column.unit_name == 'rad'
+            _refuse(block, column, np.abs(stated) > (_TURN_RAD if is_tilt else LIMIT),
+                    f'no {role} in {column.unit_name}')
             values[role] = column.unit.convert(stated)
         if 'roll' in values:
             values['alpha'], beta_rad = stage_angles(values['roll'], values['pitch'])
@@ -284,32 +267,29 @@ class _Converter:
             return number / self._reading.rate_hz, is_sample
         column = self._columns['time']
         stamps = block.columns[column.name]
-        needed = 'every sample needs a time: delete the line, or give --rate HZ to stamp by index'
-        _refuse(block, column, is_sample & ~np.isfinite(stamps), f', not finite; {needed}', needed)
+        _refuse(block, column, is_sample & ~(np.abs(column.unit.convert(stamps)) < _TIME_LIMIT_S),
+                f'no time in {column.unit_name} (200 years at most)',
+                'every sample needs a time: delete the line, or give --rate HZ to stamp by index')
         if self._epoch_ns is None and is_sample.any():
             self._find_epoch(block, float(column.unit.convert(stamps[is_sample][:1])[0]))
         time_s = column.unit.convert(stamps - self._begin)
-        _refuse(block, column, is_sample & (np.abs(time_s) > _TIME_LIMIT_S),
-                f' {column.unit_name}, more than 200 years; state its unit, for example ms, us or '
-                'ns')
         return time_s, self._stamps.increasing(time_s, is_sample,
                                                lambda row: block.where(row, column.name))
 
     def _find_epoch(self, block: TableBlock, first_s: float) -> None:
         """Find the origin of the times: as comments state it, or near the first one."""
         text = block.info.get('epoch_ns', '0')
-        if not re.fullmatch(r'-?\d{1,19}', text) or abs(int(text)) >= 1 << 63:
+        if not re.fullmatch(r'-?\d{1,18}|-?[1-8]\d{18}', text):
             raise UserError(f'{self._path}: epoch_ns is {text!r}, expected whole nanoseconds')
-        is_since_1970 = _EPOCH_S < first_s <= _TIME_LIMIT_S and not self._is_native
-        whole_s = int(first_s) if is_since_1970 and not int(text) else 0
-        self._epoch_ns = int(text) or whole_s * 1_000_000_000
-        unit = self._columns['time'].unit
-        self._begin = whole_s * unit.divisor / unit.factor
+        self._epoch_ns = int(text)
+        if first_s > _EPOCH_S and not self._is_native and not self._epoch_ns:
+            self._epoch_ns = int(first_s) * 1_000_000_000
+            self._begin = int(first_s) * self._columns['time'].unit.divisor
 
-    def _look_at_first(self, block: TableBlock, outputs: np.ndarray, time_s: np.ndarray) -> None:
+    def _look_at_first(self, outputs: np.ndarray, time_s: np.ndarray) -> None:
         """Note what is assumed; refuse readings and stamps that are in another unit."""
         if len(time_s) > _FEWEST_STAMPS and self._reading.rate_hz is None:
-            self._check_step(block, time_s)
+            self._check_step(time_s)
         if len(self._axes) == len(AXES) and not self._axes[0].unit.is_volts:
             self._check_length(outputs)
         assumed = [f'{column.name} in {column.unit_name}' for column in self._columns.values()
@@ -322,36 +302,33 @@ class _Converter:
             self._remarks.append(f'{self._path}: {bursts.removeprefix("; ")}; this rate is '
                                  'used, and --rate HZ stamps by index')
 
-    def _check_step(self, block: TableBlock, time_s: np.ndarray) -> None:
-        """Refuse stamps whose steps no sensor has, unless the file states their rate."""
+    def _check_step(self, time_s: np.ndarray) -> None:
+        """Refuse stamps whose steps no sensor has."""
         column = self._columns['time']
         rate_hz = stamped_rate_hz(time_s)
-        stated_hz = StreamInfo(block.info, self._path).rate_hz
         stamps, step = time_s * column.unit.divisor, column.unit.divisor / rate_hz
         is_whole = bool((np.abs(stamps - np.rint(stamps)) < _WHOLE).all())
-        if (stated_hz and abs(stated_hz / rate_hz - 1) < _SAME_RATE) or \
-                is_sensor_step(1 / rate_hz, is_whole):
-            return
-        unit = time_unit_of_step(step, is_whole)
-        fitting = {**self._mapping.sources, 'time': Source(column.name, unit)}
-        raise UserError(
-            f'{self._path}: {column.name} has steps of {step:.4g}, which as '
-            f'{column.unit_name} are {rate_hz:.3g} Hz; if that is right, give --rate '
-            f'{rate_hz:.3g}, and if they are {unit}:',
-            f'--columns {shell_quoted(str(ColumnMapping(fitting)))}')
+        if not is_sensor_step(1 / rate_hz, is_whole):
+            unit = time_unit_of_step(step, is_whole)
+            fitting = {**self._mapping.sources, 'time': Source(column.name, unit)}
+            raise UserError(
+                f'{self._path}: {column.name} has steps of {step:.4g}, which as '
+                f'{column.unit_name} are {rate_hz:.3g} Hz; if that is right, give --rate '
+                f'{rate_hz:.3g}, and if they are {unit}:',
+                f'--columns {shell_quoted(str(ColumnMapping(fitting)))}')
 
     def _check_length(self, outputs: np.ndarray) -> None:
         """Compare the length of the readings with gravity: a wrong unit shows in it."""
         first = self._axes[0]
         length_g = float(np.median(np.linalg.norm(outputs, axis=1))) / G0_MPS2
-        if _LENGTHS_G[0] < length_g < _LENGTHS_G[1]:
-            return
-        text = f'{self._path}: {", ".join(column.name for column in self._axes)} have a length ' \
-               f'of {length_g:.3g} g in {first.unit_name}, where gravity has 1 g'
-        if not first.is_stated:
-            raise UserError(f'{text}; state their unit, for example x={first.name}:'
-                            f'{likely_unit(length_g * G0_MPS2) or "UNIT"}')
-        self._remarks.append(f'{text}: check the unit')
+        if not _LENGTHS_G[0] < length_g < _LENGTHS_G[1]:
+            names = ', '.join(column.name for column in self._axes)
+            text = f'{self._path}: {names} have a length of {length_g:.3g} g in ' \
+                   f'{first.unit_name}, where gravity has 1 g'
+            if not first.is_stated:
+                raise UserError(f'{text}; state their unit, for example x={first.name}:'
+                                f'{likely_unit(length_g * G0_MPS2) or "UNIT"}')
+            self._remarks.append(f'{text}: check the unit')
 
 
 def _refuse(block: TableBlock, column: _Column, wrong: np.ndarray, reason: str,
@@ -360,5 +337,6 @@ def _refuse(block: TableBlock, column: _Column, wrong: np.ndarray, reason: str,
     if wrong.any():
         row = int(wrong.argmax())
         value = block.columns[column.name][row]
-        text = f'empty or NaN; {reason_of_none}' if np.isnan(value) else f'{value:g}{reason}'
+        text = f'empty or NaN; {reason_of_none}' if np.isnan(value) else \
+            f'{value:g}, {reason}; delete the line, or correct the unit'
         raise UserError(f'{block.where(row, column.name)} is {text}')

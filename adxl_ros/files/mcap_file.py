@@ -158,13 +158,16 @@ class Batch(NamedTuple):
 
 
 def write_messages(writer: Any, batches: Sequence[Batch]) -> None:
-    """Append messages to an MCAP file by rosbags' writer, in chunks of their own."""
+    """
+    Append messages to an MCAP file by rosbags' writer, in chunks of their own.
+
+    The first batch has all stamps that occur.
+    """
     if writer.storage.chunk.msgs:
         writer.storage.close_chunk()
     size = sum(batch.data.shape[1] + _MESSAGE_HEAD.itemsize for batch in batches)
-    times = np.unique(np.concatenate([batch.stamp_ns for batch in batches]))
-    starts = times[::max(_CHUNK_BYTES // size, 1)]
-    for begin, end in pairwise([*starts, times[-1] + 1]):
+    stamps = batches[0].stamp_ns
+    for begin, end in pairwise([*stamps[::max(_CHUNK_BYTES // size, 1)], stamps[-1] + 1]):
         parts = [Batch(connection, stamp_ns[part], data[part])
                  for connection, stamp_ns, data in batches
                  for part in [slice(*np.searchsorted(stamp_ns, (begin, end)))]]
