@@ -33,8 +33,9 @@ setup(
               f'{PACKAGE}.params'],
     package_dir={f'{PACKAGE}.params': 'params'},
     package_data={PACKAGE: ['calibrate/report/*.html', 'calibrate/report/*.js',
-                            'calibrate/report/*.xml', 'diagnose/*.html', 'fleet/*.html',
-                            'report/page_templates/*', 'tools/*.html'],
+                            'calibrate/report/*.xml', 'diagnose/*.html',
+                            'files/export_templates/*', 'fleet/*.html', 'report/page_templates/*',
+                            'tools/*.html'],
                   f'{PACKAGE}_validation': ['*.yaml', 'blind/*.yaml', 'pages/*'],
                   f'{PACKAGE}.params': ['*.yaml']},
     data_files=[

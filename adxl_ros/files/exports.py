@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A sensor in the formats of estimators; `simulator_exports` has those of simulators.
+A sensor in the formats of estimators and simulators.
 
 A format states which parts of the sensor it holds, with their places in the file; the head of each
 file lists them next to what it cannot hold.
@@ -9,13 +9,15 @@ file lists them next to what it cannot hold.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from functools import partial
 import json
+import re
 from textwrap import wrap
 from typing import Any, NamedTuple
 
-from adxl_ros.errors import UserError
+from adxl_ros.errors import install_hint, UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.files.parameter_file import float_text
 from adxl_ros.model import noise, signal_chain
@@ -62,11 +64,10 @@ class Export:
 
 
 class Format(NamedTuple):
-    """A format of files."""
+    """A format of files; its text is the template of its name, or JSON."""
 
     meaning: str  # What the file is, for the help text
     holds: Mapping[str, str]  # Place in the file by name of the part that it holds
-    text: Callable[[Export], str]  # Returns the content of a file
 
 
 @dataclass(frozen=True)
@@ -131,7 +132,7 @@ def places(form: Format, sensor: Sensor) -> dict[str, str]:
             if part != 'time_offset' or delay_s(sensor) >= 0}
 
 
-def head(export: Export, software: str, *further: str) -> list[str]:
+def _head(export: Export, software: str, prefix: str = '# ') -> str:
     """Return the head of a file: what it holds of the sensor, and what it cannot hold."""
     sensor = export.sensor
     width = max(map(len, export.sizes_mg)) + 2
@@ -147,16 +148,22 @@ def head(export: Export, software: str, *further: str) -> list[str]:
     if stage := stage_effects(sensor):
         lines += ['', *wrap('Left out, as errors of the stage or of another reference: '
                             f'{", ".join(stage)}.', _COLUMNS)]
-    return [*lines, '', *wrap(origin_text(sensor), _COLUMNS), '',
-            'Sizes: change of the output in the manoeuvre rich (7 minutes of turns,',
-            'shaking, warming and a step of the supply), by simulation.',
-            'All that is not held, but for noise and steps: '
-            f'{size_text(export.remaining_mg)} mg rms.', '', *further]
+    lines += ['', *wrap(origin_text(sensor), _COLUMNS), '',
+              'Sizes: change of the output in the manoeuvre rich (7 minutes of turns,',
+              'shaking, warming and a step of the supply), by simulation.',
+              'All that is not held, but for noise and steps: '
+              f'{size_text(export.remaining_mg)} mg rms.']
+    text = _prefixed(lines, prefix)
+    return text if prefix.startswith('#') else _without_double_dashes(text)
 
 
-def commented(lines: list[str]) -> list[str]:
-    """Return lines as comments behind a hash."""
-    return [f'# {line}'.rstrip() for line in lines]
+def _prefixed(lines: list[str], prefix: str) -> str:
+    return '\n'.join(f'{prefix}{line}'.rstrip() for line in lines)
+
+
+def _without_double_dashes(text: str) -> str:
+    """Return a text with single dashes: a comment of XML may not hold two."""
+    return re.sub('--+', '-', text)
 
 
 def origin_text(sensor: Sensor) -> str:
@@ -169,7 +176,7 @@ def origin_text(sensor: Sensor) -> str:
             'Rate: as the parameter file states it.')
 
 
-def flat_noise_lines(sensor: Sensor) -> list[str]:
+def _flat_noise(sensor: Sensor, prefix: str = '# ') -> str:
     """
     Return how much quieter white noise is than filtered noise of the same rms at low frequency.
 
@@ -178,11 +185,12 @@ def flat_noise_lines(sensor: Sensor) -> list[str]:
     """
     rc_s = float(noise.electronics(sensor).rc_s.max())
     if not rc_s:
-        return []
+        return ''
     ratio = np.tanh(0.5 / (sensor.rate_hz * rc_s)) ** -0.5
-    return wrap('White noise is not filtered here: its spectrum is flat up to half the rate. Its '
-                f'density is {ratio:.3g} times too small below the corner of the filter, '
-                f'{0.5 / (np.pi * rc_s):.3g} Hz.', _COLUMNS)
+    return _prefixed(wrap(
+        'White noise is not filtered here: its spectrum is flat up to half the rate. Its density '
+        f'is {ratio:.3g} times too small below the corner of the filter, '
+        f'{0.5 / (np.pi * rc_s):.3g} Hz.', _COLUMNS), prefix)
 
 
 def stage_effects(sensor: Sensor) -> list[str]:
@@ -194,23 +202,6 @@ def stage_effects(sensor: Sensor) -> list[str]:
 def size_text(size_mg: float) -> str:
     """Return a size with three digits, mg."""
     return f'{size_mg:.3g}' if size_mg >= _SMALLEST_MG else '< 0.0005'
-
-
-def _broadcaster(export: Export) -> str:
-    """ros2_controllers: parameters of `imu_sensor_broadcaster` with its static covariances."""
-    variance = by_axis(export.sensor, 'sample_variance')
-    acceleration = np.diag([v if axis in export.sensor.axes else _NO_AXIS_VARIANCE
-                            for axis, v in zip(AXES, variance)])
-    return '\n'.join([
-        *commented(head(
-            export, 'imu_sensor_broadcaster',
-            'The covariance is that of one sample. Set sensor_name to that of the URDF.')),
-        'imu_sensor_broadcaster:', '  ros__parameters:', '    sensor_name: imu',
-        '    frame_id: imu_link',
-        *(f'    static_covariance_{quantity}: '
-          f'[{", ".join(float_text(value) for value in matrix.ravel().tolist())}]'
-          for quantity, matrix in (('orientation', _ABSENT), ('angular_velocity', _ABSENT),
-                                   ('linear_acceleration', acceleration))), ''])
 
 
 def _json(export: Export) -> str:
@@ -255,18 +246,13 @@ def kalibr_settings(white: float, walk: float, rate_hz: float) -> list[tuple[str
             ('accelerometer_random_walk', walk, 'm/s^3/sqrt(Hz)'), ('update_rate', rate_hz, 'Hz')]
 
 
-def _densities(export: Export, software: str) -> tuple[float, float, list[str]]:
-    """Return white noise and random walk of the noisiest axis over both signs, and remarks."""
+def _white_density(export: Export, software: str) -> float:
+    """Return the density of the white noise of the noisiest axis over both signs."""
     white = max(by_axis(export.sensor, 'noise_density')) / ONE_SIDED
     if not white:
         raise UserError(f'{export.source}: sensor.noise_density_g_per_rthz is 0, and {software} '
                         'needs noise; measure it: ros2 run adxl_ros noise RECORDING -o FILE.yaml')
-    walk = max(by_axis(export.sensor, 'walk_density'))
-    remarks = ['Values are those of the noisiest axis.']
-    if not walk:
-        walk = effect_named('bias_walk').diagnosis.healthy_density * G0_MPS2
-        remarks += ['The random walk is that of a healthy unit: the file states none.']
-    return white, walk, remarks
+    return white
 
 
 def _largest_mps2(sensor: Sensor) -> float:
@@ -278,122 +264,98 @@ def _largest_mps2(sensor: Sensor) -> float:
     return float(min(limits_g)) * G0_MPS2
 
 
-def _settings(indent: str, values: Sequence[tuple[str, float | tuple[float, ...], str]]
-              ) -> list[str]:
-    """Return lines of YAML: name, number or numbers, and unit."""
-    texts = {name: float_text(value) if isinstance(value, float)
-             else f'[{", ".join(map(float_text, value))}]' for name, value, _ in values}
-    return [f'{indent}{name}: {texts[name]}  # {unit}' for name, _, unit in values]
+def _yaml(value: float | Sequence[float]) -> str:
+    """Return a number, or a list of numbers, as YAML."""
+    if isinstance(value, float):
+        return float_text(value)
+    return f'[{", ".join(map(float_text, value))}]'
 
 
-def _kalibr(export: Export) -> str:
-    """Kalibr: the accelerometer's part of `imu.yaml`."""
-    white, walk, remarks = _densities(export, 'Kalibr')
-    return '\n'.join([
-        *commented(head(export, 'Kalibr', *remarks,
-                        'This sensor has no gyroscope. Kalibr needs these lines of yours, too:',
-                        'gyroscope_noise_density, gyroscope_random_walk')),
-        'rostopic: /imu/data_raw',
-        *_settings('', kalibr_settings(white, walk, export.sensor.rate_hz)), ''])
-
-
-def _okvis2(export: Export) -> str:
-    """OKVIS2: the accelerometer's part of `imu_parameters`, with the densities of Kalibr."""
+def text(name: str, export: Export) -> str:
+    """Return the content of a file in a format: the values of a sensor in its template."""
+    if name == 'json':
+        return _json(export)
+    try:
+        from jinja2 import Environment, PackageLoader, StrictUndefined
+    except ImportError:
+        raise UserError(f'--to {name} needs jinja2: {install_hint("jinja2")}') from None
     sensor = export.sensor
-    white, walk, remarks = _densities(export, 'OKVIS2')
-    return '\n'.join([
-        *commented(head(export, 'OKVIS2', *remarks,
-                        'OKVIS2 stops without these lines, which are yours: use, T_BS, g_max,',
-                        'sigma_g_c, sigma_gw_c, sigma_bg, sigma_ba, g0')),
-        'imu_parameters:',
-        *_settings('    ', [
-            ('a_max', _largest_mps2(sensor), 'm/s^2'),
-            ('sigma_a_c', white, 'm/s^2/sqrt(Hz)'),
-            ('sigma_aw_c', walk, 'm/s^3/sqrt(Hz)'),
-            ('a0', by_axis(sensor, 'zero_g_mps2'), 'm/s^2'),
-            ('g', sensor.local_gravity_mps2, 'm/s^2')]), ''])
-
-
-def _fusioncore(export: Export) -> str:
-    """
-    FusionCore: parameters of its node.
-
-    It adds the variance of the walk once a step, whatever its length: here a sample.
-    """
-    sensor = export.sensor
-    _, walk, remarks = _densities(export, 'FusionCore')
-    return '\n'.join([
-        *commented(head(export, 'FusionCore', *remarks, *flat_noise_lines(sensor),
-                        'FusionCore adapts accel_noise, unless adaptive.imu is false. An arm of 0',
-                        'makes it take that of TF. imu.gyro_noise is yours.')),
-        'fusioncore:', '  ros__parameters:',
-        *_settings('    ', [
-            ('imu.accel_noise', max(by_axis(sensor, 'sample_variance')) ** 0.5, 'm/s^2'),
-            ('ukf.q_accel_bias', walk ** 2 / sensor.rate_hz, '(m/s^2)^2 a sample'),
-            *((f'imu.lever_arm_{axis}', value, 'm, from base_link')
-              for axis, value in zip(AXES, arm_m(sensor)))]), ''])
-
-
-def _point_lio(export: Export) -> str:
-    """
-    Point-LIO: the accelerometer's part of `mapping`.
-
-    It multiplies its process noise by dt² (esekfom.hpp), so that a walk has the value k²·rate. It
-    scales readings by the length of `gravity` over `acc_norm`: both are the same here.
-    """
-    sensor = export.sensor
-    _, walk, remarks = _densities(export, 'Point-LIO')
-    gravity, variance = sensor.local_gravity_mps2, max(by_axis(sensor, 'sample_variance'))
-    return '\n'.join([
-        *commented(head(export, 'Point-LIO', *remarks, *flat_noise_lines(sensor),
-                        'Variances are those of the sensor alone; files of Point-LIO have 0.01 to',
-                        '0.1, for vibration, too. In ROS 2 this is below ros__parameters.',
-                        'Yours: satu_gyro, imu_meas_omg_cov, b_gyr_cov, gyr_cov_input.')),
-        'mapping:',
-        *_settings('    ', [
-            ('imu_time_inte', 1 / sensor.rate_hz, 's'),
-            ('satu_acc', _largest_mps2(sensor), 'm/s^2'),
-            ('acc_norm', gravity, 'm/s^2'),
-            ('gravity', (0.0, 0.0, -gravity), 'm/s^2, down'),
-            ('imu_meas_acc_cov', variance, '(m/s^2)^2'),
-            ('acc_cov_input', variance, '(m/s^2)^2'),
-            ('b_acc_cov', walk ** 2 * sensor.rate_hz, '(m/s^2)^2/s^2')]), ''])
+    values = {field.name: by_axis(sensor, field.name) for field in fields(Axis)[1:]}
+    variance = [v if axis in sensor.axes else _NO_AXIS_VARIANCE
+                for axis, v in zip(AXES, values['sample_variance'])]
+    coupling = np.eye(3)
+    coupling[[AXES.index(axis) for axis in sensor.axes]] = gain(sensor)
+    walk, remark = max(values['walk_density']), 'Values are those of the noisiest axis.'
+    if not walk:
+        walk = effect_named('bias_walk').diagnosis.healthy_density * G0_MPS2
+        remark += '\n# The random walk is that of a healthy unit: the file states none.'
+    templates = Environment(loader=PackageLoader('adxl_ros', 'files/export_templates'),
+                            undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+                            keep_trailing_newline=True)
+    templates.filters |= {'yaml': _yaml, 'single_dashes': _without_double_dashes}
+    return templates.get_template(f'{name}.jinja').render(
+        head=partial(_head, export), flat_noise=partial(_flat_noise, sensor),
+        white=partial(_white_density, export), walk=walk, walk_remark=f'# {remark}',
+        kalibr_settings=kalibr_settings, sensor=sensor, source=export.source, axes=axes(sensor),
+        by_axis=values, arm_m=arm_m(sensor), delay_s=delay_s(sensor), gain=coupling.tolist(),
+        walk_a_sample=tuple(density / sensor.rate_hz ** 0.5 for density in values['walk_density']),
+        largest_mps2=_largest_mps2(sensor), absent=_ABSENT.ravel().tolist(),
+        covariance=np.diag(variance).ravel().tolist())
 
 
 _SAMPLE = (WHITE_NOISE, 'noise_excess', STEPS, 'quantisation')
 """Parts in the variance of one sample."""
 
-ESTIMATORS = {
+_STD = {WHITE_NOISE: 'std', 'noise_excess': 'std', 'bias': 'mean'}
+"""Places of the parts in Gaussian noise."""
+
+
+FORMATS = {
     'broadcaster': Format(
         'parameters of imu_sensor_broadcaster (ros2_controllers)',
-        dict.fromkeys(_SAMPLE, 'covariance'),
-        _broadcaster),
+        dict.fromkeys(_SAMPLE, 'covariance')),
     'fusioncore': Format(
         'parameters of FusionCore 0.3',
         {**dict.fromkeys(_SAMPLE, 'imu.accel_noise'), 'bias_walk': 'ukf.q_accel_bias',
-         'lever_arm': 'imu.lever_arm_x, _y, _z'},
-        _fusioncore),
+         'lever_arm': 'imu.lever_arm_x, _y, _z'}),
     'json': Format(
         'all values with units, for any program',
         {WHITE_NOISE: 'axes.noise_std_mps2', 'noise_excess': 'axes.noise_std_mps2',
          'bias': 'axes.zero_g_mps2', 'scale_factor': 'gain', 'misalignment': 'gain',
          'bias_walk': 'axes.walk_density', 'lever_arm': 'position_m', STEPS: 'axes.step_mps2',
-         'quantisation': 'axes.step_mps2', FILTER: 'filter_s', 'bandwidth': 'filter_s'},
-        _json),
+         'quantisation': 'axes.step_mps2', FILTER: 'filter_s', 'bandwidth': 'filter_s'}),
     'kalibr': Format(
         'the part of the accelerometer in imu.yaml of Kalibr',
         {WHITE_NOISE: 'accelerometer_noise_density',
-         'noise_excess': 'accelerometer_noise_density', 'bias_walk': 'accelerometer_random_walk'},
-        _kalibr),
+         'noise_excess': 'accelerometer_noise_density', 'bias_walk': 'accelerometer_random_walk'}),
     'okvis2': Format(
         'the part of the accelerometer in the configuration of OKVIS2',
         {WHITE_NOISE: 'sigma_a_c', 'noise_excess': 'sigma_a_c', 'bias': 'a0',
-         'bias_walk': 'sigma_aw_c', 'saturation': 'a_max'},
-        _okvis2),
+         'bias_walk': 'sigma_aw_c', 'saturation': 'a_max'}),
     'point_lio': Format(
         'the part of the accelerometer in the configuration of Point-LIO',
         {**dict.fromkeys(_SAMPLE, 'imu_meas_acc_cov'), 'bias_walk': 'b_acc_cov',
-         'saturation': 'satu_acc'},
-        _point_lio),
+         'saturation': 'satu_acc'}),
+    'genesis': Format(
+        'Python module with options of an IMU of Genesis 0.4 to 1.4',
+        {WHITE_NOISE: 'acc_noise', 'noise_excess': 'acc_noise', 'bias': 'acc_bias',
+         'bias_walk': 'acc_random_walk', 'scale_factor': 'CROSS_AXIS_COUPLING',
+         'misalignment': 'CROSS_AXIS_COUPLING', 'lever_arm': 'pos_offset',
+         STEPS: 'acc_resolution', 'quantisation': 'acc_resolution', 'time_offset': 'delay'}),
+    'isaaclab': Format(
+        'Python module with configurations of Isaac Lab, 2.x and 3.0',
+        {**_STD, 'lever_arm': 'pos'}),
+    'mjlab': Format(
+        'Python module with configurations of mjlab 1.x',
+        {**_STD, 'lever_arm': 'POS'}),
+    'mujoco': Format(
+        'site and accelerometer of MuJoCo (MJCF)',
+        {'lever_arm': 'pos of the site', WHITE_NOISE: 'noise (MuJoCo does not add it)',
+         'noise_excess': 'noise (MuJoCo does not add it)'}),
+    'sdf': Format(
+        'imu of gz-sensors, Gazebo (SDFormat)',
+        {WHITE_NOISE: '<stddev>', 'noise_excess': '<stddev>', 'bias': '<mean>',
+         'bias_walk': '<dynamic_bias_stddev>', 'lever_arm': '<pose>', STEPS: '<precision>',
+         'quantisation': '<precision>'}),
 }
 """Formats by name."""

@@ -8,7 +8,7 @@ import argparse
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from adxl_ros.files import exports, parameter_file, simulator_exports
+from adxl_ros.files import exports, parameter_file
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
@@ -25,7 +25,7 @@ _EXAMPLES = {
 }
 """Examples of arguments, by their purpose."""
 
-FORMATS = dict(sorted({**exports.ESTIMATORS, **simulator_exports.SIMULATORS}.items()))
+FORMATS = dict(sorted(exports.FORMATS.items()))
 """All formats by name."""
 
 _NAMED_PARTS = 3
@@ -50,7 +50,7 @@ def export(options: argparse.Namespace) -> int:
     exporter = FORMATS[options.format]
     with cli.progress('sizes of the effects') as show:
         exported = _sized(sensor, options, exports.places(exporter, sensor), show)
-    write_text(options.output, exporter.text(exported))
+    write_text(options.output, exports.text(options.format, exported))
     held = [name for name in exported.sizes_mg if name in exported.holds]
     cli.print_end(_result_lines(exported, options.format, held), [options.output], cli.command(
         'simulate', f'rich --params {cli.quoted(options.params)} -o rich.csv'))
