@@ -89,7 +89,7 @@ _SIGN_GAP = (24576, 40960)
 
 def describe(table: Table) -> tuple[str, str]:
     """Describe the columns of a table, and the options that most likely read it."""
-    seen = f'the columns are {listed(table.names)}' + f' ({table.form})' * bool(table.form)
+    seen = f'the columns are {listed(table.names)}'
     values = {name: np.where(np.abs(column) < _LARGEST, column, np.nan)
               for name, column in table.sample().items() if np.isfinite(column).any()}
     time = _time_column(table, values)

@@ -48,7 +48,6 @@ class Table:
     default_mapping: str = ''  # Mapping that the definition of the format states
     header_line: int | None = None  # Line of a text file with the names; 0 where it has none
     repeated: str = ''  # A name that stands twice; empty for none
-    form: str = ''  # How the file is written, for messages; empty where nothing is special
 
     @property
     def has_names(self) -> bool:

@@ -38,14 +38,8 @@ _HEAD_LINES = 200
 """Lines that show the form of a file (chosen: more than any preamble seen)."""
 _FEWEST_NUMBERS = 2
 """Fewest numbers of a line of samples with text (chosen: `rate, 100` is in a preamble)."""
-_LONGEST_CELL = 24
-"""Characters of a cell in a message. Chosen: a number with all its digits."""
-
-_DELIMITERS = {'\t': 'tabs', ';': 'semicolons', ',': 'commas', ' ': 'blanks'}
-"""Names of delimiters; the first that fits is taken."""
-
-_OWN_NAME = 'time_s'
-"""Column of the package's own recordings."""
+_DELIMITERS = ('\t', ';', ',', ' ')
+"""Delimiters; the first that fits is taken."""
 
 _INFO = re.compile(r'#+\s*([A-Za-z_][\w.]*)\s*:(?:\s+(.*))?$')
 """A comment line with key and value."""
@@ -80,14 +74,7 @@ class Form:
     header_line: int  # Number of the line with the names, from 1; 0 where there is none
     first_line: int  # Number of the first line with samples
     delimiter: str  # A tab, semicolon, comma or blank; several blanks are one
-    decimal_comma: bool  # Whether numbers have a decimal comma
     is_worded: bool  # Whether lines have dates, labels or quotes, which `_plain` removes
-
-    def __str__(self) -> str:
-        """Describe the form for messages; empty for commas with a header."""
-        parts = [f'separated by {_DELIMITERS[self.delimiter]}'] * (self.delimiter != ',')
-        parts += ['decimal commas'] * self.decimal_comma + ['no header'] * (not self.header_line)
-        return ', '.join(parts)
 
     def rewritten(self, data: bytes) -> bytes:
         """Return lines with commas between fields, and decimal points."""
@@ -111,27 +98,10 @@ class _Lines:
     data: bytes  # The lines, each with a newline
     numbers: Sequence[int]  # Their numbers in the file, from 1
     done: float  # Fraction of the file that has been read at their end
-    is_open_ended: bool  # Whether the last one has no newline in the file
-
-    def rows(self) -> list[list[str]]:
-        """Return the fields of all lines."""
-        rows: list[list[str]] = []
-        try:
-            for line in self.data.decode().split('\n')[:len(self.numbers)]:
-                rows += csv.reader([line])
-        except csv.Error as error:
-            raise UserError(f'{self.path}:{self.numbers[len(rows)]}: cannot read the line: {error}'
-                            ) from None
-        return rows
 
     def where(self, row: int, index: int) -> str:
         """Return the place of a field for messages."""
         return f'{self.path}:{self.numbers[row]}:{index + 1}'
-
-    def cut_hint(self, row: int) -> str:
-        """Return what to do about the last line of a file that is cut off, else ''."""
-        is_cut = self.is_open_ended and row == len(self.numbers) - 1
-        return '; the file ends in the middle of this line: delete it' * is_cut
 
 
 def read_blocks(path: str, form: Form, names: Collection[str], required: Collection[str]
@@ -161,10 +131,8 @@ def _read_lines(path: str, form: Form, info: dict[str, str]) -> Iterator[_Lines]
         size = max(os.fstat(file.fileno()).st_size, 1)
         last = 0
         for data in _whole_lines(path, file):
-            is_open_ended = not data.endswith(b'\n')
-            if b'\r' in data:
-                data = data.replace(b'\r\n', b'\n')
-            data += b'\n' * is_open_ended
+            data = data.replace(b'\r\n', b'\n') if b'\r' in data else data
+            data += b'\n' * (not data.endswith(b'\n'))
             *preamble, data = data.split(b'\n', max(form.first_line - 1 - last, 0))
             for line in preamble:
                 _add_info(line, info)
@@ -179,8 +147,7 @@ def _read_lines(path: str, form: Form, info: dict[str, str]) -> Iterator[_Lines]
                 data = b''.join(line + b'\n' for line, _ in rows)
                 numbers = [number for _, number in rows]
             if data:
-                yield _Lines(path, form.rewritten(data), numbers, file.tell() / size,
-                             is_open_ended)
+                yield _Lines(path, form.rewritten(data), numbers, file.tell() / size)
 
 
 def _add_info(line: bytes, info: dict[str, str]) -> bool:
@@ -251,7 +218,7 @@ def _by_pandas(lines: _Lines, names: Sequence[str], used: Sequence[str]
 def _field_by_field(lines: _Lines, form: Form, used: Sequence[str], required: Collection[str]
                     ) -> dict[str, np.ndarray]:
     """Parse with Python; refuse a field that is no number, and drop other columns with text."""
-    rows = lines.rows()
+    rows = [_fields(line, ',') for line in lines.data.decode().split('\n')[:len(lines.numbers)]]
     expected = len(form.names)
     if not required:
         rows = [row for row in rows if len(row) == expected]
@@ -259,20 +226,17 @@ def _field_by_field(lines: _Lines, form: Form, used: Sequence[str], required: Co
         if len(row) != expected:
             source = 'the header' if form.header_line else 'the first line'
             raise UserError(f'{lines.where(i, min(len(row), expected))}: {len(row)} fields, '
-                            f'but {source} has {expected}{lines.cut_hint(i)}')
+                            f'but {source} has {expected}')
     columns = {}
     for name in used:
         index = form.names.index(name)
         cells = [row[index] for row in rows]
         wrong = next((i for i, cell in enumerate(cells) if not _FIELD.fullmatch(cell)), None)
         if wrong is None:
-            columns[name] = np.array([float(cell) if cell.strip() else np.nan for cell in cells])
+            columns[name] = np.array([float(cell or 'nan') for cell in cells])
         elif name in required:
-            text = cells[wrong]
-            text = text if len(text) <= _LONGEST_CELL else f'{text[:_LONGEST_CELL]}…'
-            damage = '; the file is damaged here: delete the zero bytes' * (chr(0) in text)
-            raise UserError(f'{lines.where(wrong, index)}: {name} is {text!r}, not a number'
-                            f'{damage}{lines.cut_hint(wrong)}')
+            raise UserError(f'{lines.where(wrong, index)}: {name} is {cells[wrong][:24]!r}, not a '
+                            'number')
     return columns
 
 
@@ -280,10 +244,9 @@ def find_form(path: str) -> Form:
     """
     Return the form of a table by its first lines.
 
-    The samples are the lines with as many fields as hold most of the numbers. Of two such forms
-    the one with fewer fields counts, as with labels and quotes left out and dates as numbers. The
-    header is the line with text and as many fields that is nearest before them, or a first line
-    with the package's name of the time.
+    The samples are the lines with as many fields as hold most of the numbers; of two delimiters
+    the one with fewer fields counts. The header is the line with text and as many fields that is
+    nearest before them.
     """
     with _opened(path) as file:
         lines = [line.decode() for line in islice(
@@ -294,44 +257,39 @@ def find_form(path: str) -> Form:
         raise UserError(f'{path}: is empty')
     plain = [_plain(line.encode()).decode() for line in lines]
     best, form = (0, 0), None
-    for rows in (lines, plain) if plain != lines else (lines,):
-        for delimiter in _DELIMITERS:
-            numbers: Counter[int] = Counter()
-            first: dict[int, int] = {}
-            for index, line in enumerate(rows):
-                count = 0 if _COMMENT.match(line) else _numbers(line, delimiter)
-                fields = _fields(line, delimiter)
-                # One number with empty cells is a row, one with a text may be a preamble.
-                if count >= _FEWEST_NUMBERS or (count and count == sum(map(bool, fields))):
-                    numbers[len(fields)] += count
-                    first.setdefault(len(fields), index)
-            size = max(numbers, key=lambda size: numbers[size], default=0)
-            if size and (numbers[size], -size) > best:
-                best = numbers[size], -size
-                form = _form(lines, rows, first[size], delimiter)
-    names = _fields(written[0], ',')
-    if _OWN_NAME in names and not (form and form.header_line):
-        number = lines.index(written[0]) + 1
-        return _named(names, number, number + 1, ',', False, False)
+    for delimiter in _DELIMITERS:
+        numbers: Counter[int] = Counter()
+        first: dict[int, int] = {}
+        for index, line in enumerate(plain):
+            count = 0 if _COMMENT.match(line) else _numbers(line, delimiter)
+            fields = _fields(line, delimiter)
+            # One number with empty cells is a row, one with a text may be a preamble.
+            if count >= _FEWEST_NUMBERS or (count and count == sum(map(bool, fields))):
+                numbers[len(fields)] += count
+                first.setdefault(len(fields), index)
+        size = max(numbers, key=lambda size: numbers[size], default=0)
+        if size and (numbers[size], -size) > best:
+            best = numbers[size], -size
+            form = _form(lines, plain, first[size], delimiter)
+    if 'time_s' in _fields(written[0], ',') and not (form and form.header_line):
+        number = lines.index(written[0]) + 1  # a recording of the package without good samples
+        return _named(_fields(written[0], ','), number, number + 1, ',', False)
     if form is None:
         raise NoNumbers(f'{path}: the first {_HEAD_LINES} lines hold no row of numbers; expected '
                         'a header, and a line of numbers for each sample')
     return form
 
 
-def _form(lines: Sequence[str], rows: Sequence[str], index: int, delimiter: str) -> Form:
+def _form(lines: Sequence[str], plain: Sequence[str], index: int, delimiter: str) -> Form:
     """Return the form of a table whose samples begin at a line, by its lines and plain lines."""
-    is_worded = rows is not lines
-    count = len(_fields(rows[index], delimiter))
+    count = len(_fields(plain[index], delimiter))
     header_line, header = _header(lines[:index], delimiter, count)
-    labels = _LABEL.findall(_DATE.sub(b'0', lines[index].encode())) if is_worded else []
+    labels = _LABEL.findall(_DATE.sub(b'0', lines[index].encode()))
     if not header and len(labels) == count:
         header_line, header = index + 1, [label.decode().strip('":= ') for label in labels]
-    decimal_comma = delimiter != ',' and any(
-        re.fullmatch(r'[-+]?\d*,\d+([eE][-+]?\d+)?', field) for line in rows[index:]
-        if not _COMMENT.match(line) for field in _fields(line, delimiter))
-    return _named(header or [''] * count, header_line, index + 1, delimiter, decimal_comma,
-                  is_worded)
+    is_worded = any(line != bare and not _COMMENT.match(line)
+                    for line, bare in zip(lines[index:], plain[index:]))
+    return _named(header or [''] * count, header_line, index + 1, delimiter, is_worded)
 
 
 def _named(names: Sequence[str], *about: Any) -> Form:
@@ -365,10 +323,8 @@ def _header(lines: Sequence[str], delimiter: str, count: int) -> tuple[int, list
 def _names(line: str, delimiter: str, count: int) -> list[str] | None:
     """Return the fields of a line if they can be names, also in a comment; else None."""
     text = _COMMENT.sub('', line, count=1)
-    for mark in dict.fromkeys((delimiter, ',', '\t', ';')):
+    for mark in (delimiter, ','):
         fields = _fields(text, mark)
-        # A row of samples may end in a delimiter, and its header not.
-        fields += [''] * (len(fields) == count - 1 and count > 2)
         if len(fields) == count and any(fields) and not _numbers(text, mark):
             return fields
     return None
