@@ -14,14 +14,13 @@ A file of its own beside them has the population of a fleet.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, fields
 from datetime import datetime, timezone
-from functools import lru_cache
 import hashlib
 import math
 import os
 from pathlib import Path
+import re
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
@@ -47,8 +46,8 @@ _HASH_DIGITS = 8
 _MAX_NAME = 120
 """Characters of a serial number in a file name (chosen: file systems permit 255 bytes)."""
 
-_CACHED_DATES = 256
-"""Dates of files without a date in their name that are kept in memory (chosen: some kB)."""
+_DATE_LETTERS = 16
+"""Letters of such a date."""
 
 
 class StoredCalibration(NamedTuple):
@@ -166,40 +165,17 @@ def newest(folder: str | os.PathLike, serial: str, check: Callable[[Sensor], Non
 
 def newer(folder: str | os.PathLike, sensor: Sensor) -> Path | None:
     """
-    Return the newest file of a unit if its date is later than that of a calibration.
+    Return the newest file of a unit if its name has a later date than a calibration.
 
-    This is quick: file names of the store hold the date, and other files are read once.
+    This is quick, because no file is read: files that people add count at the next start.
     """
-    dated = {path: _dated(path, sensor.serial)
-             for path in unit_folder(folder, sensor.serial).glob('*.yaml')}
-    last = max(dated, key=lambda path: (dated[path], path), default=None)
-    return last if last is not None and dated[last] > _second_of(sensor) else None
-
-
-def _dated(path: Path, serial: str) -> datetime:
-    """Return the date of a file by its name, else by its content."""
-    text = path.name.removeprefix(f'{_name(serial)}-').split('-')[0].removesuffix('.yaml')
-    with suppress(ValueError):
-        return datetime.strptime(text, _DATE).replace(tzinfo=timezone.utc)
-    try:
-        return _date_inside(path, path.stat().st_mtime_ns, serial)
-    except OSError:
-        return _OLDEST
-
-
-@lru_cache(maxsize=_CACHED_DATES)
-def _date_inside(path: Path, _: int, serial: str) -> datetime:
-    """Return the date inside a file; it is read again after a change, by its time of change."""
-    try:
-        sensor = parameter_file.load(path)
-    except UserError:
-        return _OLDEST
-    return _second_of(sensor) if sensor.serial == serial else _OLDEST
-
-
-def _second_of(sensor: Sensor) -> datetime:
-    """Return the date of a calibration in whole seconds, as in file names."""
-    return (date_of(sensor) or _OLDEST).replace(microsecond=0)
+    begin = f'{_name(sensor.serial)}-'
+    names = [path.name for path in unit_folder(folder, sensor.serial).glob('*.yaml')
+             if re.match(r'\d{8}T\d{6}Z', path.name.removeprefix(begin))]
+    last = max(names, default='').removeprefix(begin)
+    date = date_of(sensor)
+    is_newer = bool(last) and (not date or last[:_DATE_LETTERS] > f'{date:{_DATE}}')
+    return unit_folder(folder, sensor.serial) / f'{begin}{last}' if is_newer else None
 
 
 _READ_BYTES = 1 << 20
@@ -270,21 +246,13 @@ def read_population(path: str | os.PathLike) -> Population:
             or not isinstance(contents.get('coefficients'), dict):
         raise UserError(f'{path}: no population of format {FORMAT}; give the population.yaml '
                         'that fleet writes')
-    pooled = {str(name): _coefficient(f'{path}: coefficients.{name}', values)
-              for name, values in contents['coefficients'].items()}
+    names = [field.name for field in fields(PooledCoefficient)]
+    pooled = {}
+    for name, values in contents['coefficients'].items():
+        numbers = [values.get(key) if isinstance(values, dict) else None for key in names]
+        if not all(type(each) in (int, float) and math.isfinite(each) for each in numbers) \
+                or not values['prediction_std'] > 0:
+            raise UserError(f'{path}: coefficients.{name}: {values!r} is no set of numbers '
+                            f'{", ".join(names)}, with a positive prediction_std')
+        pooled[str(name)] = PooledCoefficient(*numbers)
     return Population(Path(path).name, pooled)
-
-
-def _coefficient(place: str, values: Any) -> PooledCoefficient:
-    """Check one coefficient."""
-    if not isinstance(values, dict):
-        raise UserError(f'{place}: {values!r} is no mapping of mean, spread and others')
-    for field in fields(PooledCoefficient):
-        value = values.get(field.name)
-        if isinstance(value, bool) or not isinstance(value, (int, float)) \
-                or not math.isfinite(value):
-            raise UserError(f'{place}.{field.name}: {value!r} is no number')
-    if not values['prediction_std'] > 0:
-        raise UserError(f'{place}.prediction_std: {values["prediction_std"]!r} must be positive')
-    return PooledCoefficient(**{field.name: values[field.name]
-                                for field in fields(PooledCoefficient)})

@@ -98,28 +98,25 @@ def parse_mapping(text: str) -> ColumnMapping:
     if '=' not in text:
         where, text = f'--columns {text}', _content(text)
     sources: dict[str, Source] = {}
-    place = 0
     text = text.strip().rstrip(',')
-    while place < len(text):
-        entry = _ENTRY.match(text, place)
+    while text:
+        entry = _ENTRY.match(text)
         if entry is None:
-            raise UserError(f'{where}: {text[place:place + 40].strip()!r} is no role=column:unit; '
+            raise UserError(f'{where}: {text[:40]!r} is no role=column:unit; '
                             f'write for example {_EXAMPLE}')
+        text = text[entry.end():]
         role, *columns, unit = entry.groups(default='')
         column = next(filter(None, columns), '').strip()
         if role not in ROLES:
             raise UserError(f'{where}: no role {role!r}; the roles are {", ".join(ROLES)}')
-        if role in sources:
-            raise UserError(f'{where}: {role} stands twice; keep one')
-        if not column:
-            raise UserError(f'{where}: {role} names no column')
+        if role in sources or not column:
+            raise UserError(f'{where}: {role} must name one column, once')
         name = unit_name(unit, ROLES[role]) if unit else ''
         if name is None:
             raise UserError(f'{where}: {role}={column}:{unit}: unknown unit {unit!r}; write one '
                             f'of {", ".join(UNITS[ROLES[role]])}, or quote a name that has a '
                             'colon')
         sources[role] = Source(column, name)
-        place = entry.end()
     _check_roles(where, sources)
     return ColumnMapping(sources, where)
 
@@ -128,12 +125,9 @@ def _content(path: str) -> str:
     """Return the text of a mapping file without comments."""
     try:
         text = re.sub('#.*', '', Path(path).read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f'--columns {path}: is neither a mapping nor a file that can be read '
-                        f'({getattr(error, "strerror", None) or error}); write for example '
-                        f'{_EXAMPLE}') from None
-    if '=' not in text:
-        raise UserError(f'--columns {path}: holds no mapping; write for example {_EXAMPLE}')
+    except (OSError, UnicodeDecodeError):
+        raise UserError(f'--columns {path}: is neither a mapping nor a file that can be read; '
+                        f'write for example {_EXAMPLE}') from None
     return text
 
 
@@ -143,14 +137,10 @@ def _check_roles(where: str, sources: Mapping[str, Source]) -> None:
     if not axes or axes != AXES[:len(axes)]:
         raise UserError(f'{where}: names the axes {axes or "none"}, expected x, x and y, or x, y '
                         f'and z; write for example {_EXAMPLE}')
-    given = [role for role in ('roll', 'pitch', 'alpha', 'beta') if role in sources]
-    tilts = [role for role in given if role in ('roll', 'pitch')]
-    if tilts and given != tilts:
-        raise UserError(f'{where}: {tilts[0]} and {given[-1]} are two references; keep roll and '
+    given = {'roll', 'pitch', 'alpha', 'beta'} & set(sources)
+    if given & {'roll', 'pitch'} and given != {'roll', 'pitch'}:
+        raise UserError(f'{where}: {", ".join(sorted(given))} are no reference; name roll and '
                         'pitch, or alpha and beta')
-    if len(tilts) == 1:
-        other = 'pitch' if tilts == ['roll'] else 'roll'
-        raise UserError(f'{where}: {tilts[0]} without {other} is no reference; add {other}')
 
 
 @dataclass(frozen=True)
@@ -170,13 +160,11 @@ def parse_mounting(text: str) -> Mounting:
     entries: dict[str, tuple[int, int]] = {}
     for entry in text.split(','):
         match = re.fullmatch(r'\s*([xyz])\s*=\s*([-+]?)\s*([xyz])\s*', entry)
-        if match is None or match[1] in entries:
-            raise UserError(f'--axes {text}: {entry.strip()!r} is wrong; write for example '
-                            'x=-y,y=x,z=z')
-        entries[match[1]] = AXES.index(match[3]), -1 if match[2] == '-' else 1
+        if match:
+            entries[match[1]] = AXES.index(match[3]), -1 if match[2] == '-' else 1
     axes = AXES[:len(entries)]
-    if set(entries) != set(axes) or sorted(index for index, _ in entries.values()) != \
-            list(range(len(axes))):
+    if set(entries) != set(axes) or text.count(',') + 1 != len(axes) or \
+            sorted(index for index, _ in entries.values()) != list(range(len(axes))):
         raise UserError(f'--axes {text}: each axis of the sensor must stand once on both sides; '
                         'write for example x=-y,y=x,z=z')
     return Mounting(tuple(entries[axis][0] for axis in axes),

@@ -230,9 +230,8 @@ def compose(path: str | os.PathLike) -> yaml.Node | None:
 
 
 def _yaml_error(path: str | os.PathLike, error: yaml.YAMLError) -> UserError:
-    problem = str(getattr(error, 'problem', error))
     place = _where(path, getattr(error, 'problem_mark', None))
-    return UserError(f'{place}: not YAML: {" ".join(problem.split())}')
+    return UserError(f'{place}: not YAML: {" ".join(str(getattr(error, "problem", error)).split())}')
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -253,8 +252,6 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         _flatten(parameters, '', flat, marks, path)
     except yaml.YAMLError as error:
         raise _yaml_error(path, error) from None
-    except RecursionError:
-        raise UserError(f'{path}: a node contains itself') from None
     return flat, marks
 
 
@@ -418,9 +415,9 @@ class _FlatReader:
                       f'{len(names)} names need {len(names) ** 2}')
         matrix = matrix.reshape(len(names), -1)
         variances = np.diag(matrix)
-        for name, variance in zip(names, variances):
-            self._require(variance >= 0, key,
-                          f'the variance of {name} is {variance:g}, not positive')
+        least = variances.argmin()
+        self._require(variances[least] >= 0, key, f'the variance of {names[least]} is '
+                      f'{variances[least]:g}, not positive')
         std = np.sqrt(np.maximum(variances, _SMALLEST_VARIANCE))
         correlation = matrix / np.outer(std, std)
         self._require(np.abs(correlation - correlation.T).max() <= _ASYMMETRY, key,
@@ -447,23 +444,19 @@ class _FlatReader:
     def _datasheet(self) -> dict[Coefficient, tuple[float, float]]:
         """Return the typical and the greatest departure by `effect.parameter`."""
         names = self._names('datasheet.figures')
-        departures = []
-        for key in ('datasheet.typical', 'datasheet.maximum') if names else ():
-            self._require(key in self.flat, key,
-                          f'missing; {len(names)} names stand in datasheet.figures')
-            values = self._numbers(key, self.flat[key])
-            self._require(len(values) == len(names) and (values >= 0).all(), key,
-                          f'{len(values)} values, but {len(names)} names need as many, of 0 or '
-                          'more')
-            departures.append(values.tolist())
-        coefficients = []
         for name in names:
             effect, _, parameter = name.partition('.')
             known = self._effect('datasheet.figures', effect).parameters
             self._require(parameter in [each.name for each in known], 'datasheet.figures',
                           f'{name!r} is no parameter of {effect}')
-            coefficients.append(Coefficient.parse(name))
-        return dict(zip(coefficients, zip(*departures)))
+        departures = []
+        for key in ('datasheet.typical', 'datasheet.maximum') if names else ():
+            values = self._numbers(key, self.flat.get(key, []))
+            self._require(len(values) == len(names) and (values >= 0).all(), key,
+                          f'{len(values)} values, but {len(names)} names need as many, of 0 or '
+                          'more')
+            departures.append(values.tolist())
+        return dict(zip(map(Coefficient.parse, names), zip(*departures)))
 
 
 def _as_float(value: Any) -> str:

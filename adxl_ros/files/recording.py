@@ -99,22 +99,16 @@ def _mounted(blocks: Iterator[Recording], mounting: Mounting) -> Generator[Recor
         if len(names) != len(mounting.signs):
             raise UserError(f'--axes: names the axes {AXES[:len(mounting.signs)]}, but '
                             f'{block.path} has {block.axes}')
-        outputs = np.column_stack([block.columns[name] for name in names])
-        zero = _zero(block, mounting)
-        turned = mounting.turn(outputs - zero) + zero
-        yield replace(block, columns={**block.columns, **dict(zip(names, turned.T.copy()))})
-
-
-def _zero(block: Recording, mounting: Mounting) -> float:
-    """Return the output at zero specific force, in the unit of the output."""
-    if block.sensor_columns[0] in ACCEL or min(mounting.signs) > 0:
-        return 0.0
-    zeros = block.stream_info.nominal_values(block.axes).get('nominal_zero_g_v', np.zeros(0))
-    if not len(zeros) or np.ptp(zeros) > 0:
-        raise UserError(f'--axes: inverts an axis of {block.path}, whose {VOLTS[0]} is in volts '
-                        'about an unknown zero; write a line "# nominal_zero_g_v: ..." with the '
-                        'same value for each axis, or state the mounting in the parameter file')
-    return float(zeros[0])
+        zero = np.zeros(1)
+        if names[0] in VOLTS and min(mounting.signs) < 0:
+            zero = block.stream_info.nominal_values(block.axes).get('nominal_zero_g_v', np.ones(0))
+            if len(set(zero)) != 1:
+                raise UserError(f'--axes: inverts an axis of {block.path} in volts about an '
+                                'unknown zero; write a line "# nominal_zero_g_v: ..." with the '
+                                'same value for each axis')
+        turned = mounting.turn(np.column_stack([block.columns[name] for name in names]) - zero)
+        yield replace(block, columns={**block.columns,
+                                      **dict(zip(names, (turned + zero).T.copy()))})
 
 
 def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> Recording:

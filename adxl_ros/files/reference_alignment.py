@@ -135,10 +135,8 @@ class Track:
 
 def _largest_gap_ns(sample_ns: np.ndarray, message_ns: np.ndarray) -> int:
     """Return the largest time from a sample, ns, (n,), to its nearest message, ns, (k,)."""
-    after = np.searchsorted(message_ns, sample_ns).clip(1, max(len(message_ns) - 1, 1))
-    nearest_ns = np.minimum(np.abs(sample_ns - message_ns[after - 1]),
-                            np.abs(sample_ns - message_ns[after.clip(max=len(message_ns) - 1)]))
-    return int(nearest_ns.max())
+    places = np.interp(sample_ns, message_ns, np.arange(len(message_ns)))
+    return int(np.abs(sample_ns - message_ns[np.rint(places).astype(int)]).max())
 
 
 class Command:

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, MISSING
+from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
 import fcntl
 import json
@@ -20,8 +20,6 @@ from adxl_ros.files.atomic_write import append_line, atomic_path, sync
 
 FORMAT = 1
 """Version of the format, in the head of each journal; raised with each change of the lines."""
-_LONGEST_VALUE = 60
-"""Characters of a value in a message; chosen: two values fit on a line."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,13 +56,8 @@ class PoseRecord:
 
     @classmethod
     def from_json(cls, line: Mapping[str, Any]) -> PoseRecord:
-        """Read the record of a line; unknown keys are left out."""
-        missing = [f.name for f in fields(cls) if f.default is MISSING and f.name not in line]
-        if missing:
-            raise ValueError(f'the pose has no {", ".join(missing)}')
-        values = {f.name: line[f.name] for f in fields(cls) if f.name in line}
-        return cls(**{**values, 'mean_v': tuple(values['mean_v']),
-                      'std_v': tuple(values['std_v'])})
+        """Read the record of a line."""
+        return cls(**{**line, 'mean_v': tuple(line['mean_v']), 'std_v': tuple(line['std_v'])})
 
 
 @dataclass(frozen=True)
@@ -90,7 +83,7 @@ class MountingUnchecked:
 class Fitted:
     """A note that a fit is written."""
 
-    rests: tuple[PoseRecord, ...] | None  # Poses of the fit; None in journals of earlier versions
+    rests: tuple[PoseRecord, ...]  # Poses of the fit
     done: bool  # Whether no pose was open, so that the calibration is over
 
 
@@ -100,32 +93,33 @@ JournalEntry: TypeAlias = PoseRecord | PoseDropped | PoseSkipped | MountingUnche
 
 def _line(entry: JournalEntry) -> dict[str, Any]:
     """Return the keys and values of the line of an entry."""
-    if isinstance(entry, PoseRecord):
-        return entry.to_json()
-    if isinstance(entry, Fitted):
-        rests = {} if entry.rests is None else {'rests': [r.to_json() for r in entry.rests]}
-        return {**rests, 'done': entry.done}
-    if isinstance(entry, MountingUnchecked):
-        return {'mounting': 'not checked'}
-    skip = {'skip': entry.pose} if isinstance(entry, PoseSkipped) else {}
-    return {**skip, 'drop': entry.pose}
+    match entry:
+        case PoseRecord():
+            return entry.to_json()
+        case PoseDropped(pose):
+            return {'drop': pose}
+        case PoseSkipped(pose):
+            return {'skip': pose, 'drop': pose}
+        case MountingUnchecked():
+            return {'mounting': 'not checked'}
+        case Fitted(rests, done):
+            return {'rests': [rest.to_json() for rest in rests], 'done': done}
 
 
-def _entry(line: Mapping[str, Any]) -> JournalEntry | None:
-    """Return the entry of a line; None for a line of another version without a meaning here."""
-    if 'pose' in line:
-        return PoseRecord.from_json(line)
-    if 'skip' in line:
-        return PoseSkipped(line['skip'])
-    if 'drop' in line:
-        return PoseDropped(line['drop'])
-    if 'mounting' in line:
-        return MountingUnchecked()
-    if 'done' in line:
-        rests = line.get('rests')
-        return Fitted(None if rests is None else tuple(map(PoseRecord.from_json, rests)),
-                      bool(line['done']))
-    return None
+def _entry(line: Mapping[str, Any]) -> JournalEntry:
+    """Return the entry of a line."""
+    match line:
+        case {'pose': _}:
+            return PoseRecord.from_json(line)
+        case {'skip': pose}:
+            return PoseSkipped(pose)
+        case {'drop': pose}:
+            return PoseDropped(pose)
+        case {'mounting': _}:
+            return MountingUnchecked()
+        case {'rests': rests, 'done': done}:
+            return Fitted(tuple(map(PoseRecord.from_json, rests)), done)
+    raise ValueError('no pose, drop, skip, mounting or fit')
 
 
 class JournalContents(NamedTuple):
@@ -261,7 +255,7 @@ def unfinished(path: str | os.PathLike, head: Mapping[str, Any]) -> Unfinished |
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
     """Return in which keys two heads differ."""
-    return ', '.join(f'{key} was {_short(old.get(key))}, is {_short(new.get(key))}'
+    return ', '.join(f'{key} was {json.dumps(old.get(key))}, is {json.dumps(new.get(key))}'
                      for key in {**new, **old} if old.get(key) != new.get(key))
 
 
@@ -290,7 +284,7 @@ def accepted_poses(entries: Sequence[JournalEntry]) -> list[PoseRecord]:
 def poses_to_fit(entries: Sequence[JournalEntry]) -> list[PoseRecord]:
     """Return the poses of the last fit, or the accepted ones if the sweep went on since."""
     for entry in reversed(entries):
-        if isinstance(entry, Fitted) and entry.rests is not None:
+        if isinstance(entry, Fitted):
             return list(entry.rests)
         if isinstance(entry, PoseRecord | PoseDropped | PoseSkipped):
             break
@@ -316,14 +310,13 @@ def _parse(path: Path) -> tuple[JournalContents | None, int]:
             if not isinstance(line, dict):
                 raise ValueError('not an object')
             if number > 1:
-                entry = _entry(line)
-                entries += [] if entry is None else [entry]
+                entries.append(_entry(line))
             elif line.get('format') == FORMAT:
                 head = line
             else:
                 raise ValueError(f'format {line.get("format")!r}, but this package reads version '
                                  f'{FORMAT}')
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, KeyError) as error:
             raise NotJournalError(path, number, error, entries) from None
     return (JournalContents(head, entries) if lines else None,
             sum(len(raw) + 1 for raw in lines))
@@ -332,9 +325,3 @@ def _parse(path: Path) -> tuple[JournalContents | None, int]:
 def _as_read(head: Mapping[str, Any]) -> dict[str, Any]:
     """Return a head as it is read from a file: with its format, and tuples as lists."""
     return json.loads(json.dumps({'format': FORMAT, **head}))
-
-
-def _short(value: Any) -> str:
-    """Return a value as text that fits into a message."""
-    text = json.dumps(value)
-    return text if len(text) < _LONGEST_VALUE else f'{text[:_LONGEST_VALUE - 3]}...'

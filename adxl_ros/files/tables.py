@@ -78,9 +78,6 @@ def _library(path: str, kind: str, package: str) -> Iterator[None]:
     except ImportError:
         raise UserError(f'{path}: {kind} needs the Python package {package}: '
                         f'{install_hint(package)}') from None
-    except OSError as error:
-        raise UserError(f'{path}: cannot read it as {kind}: {error.strerror or one_line(error)}'
-                        ) from None
     except Exception as error:
         # In a damaged file, a library can raise errors of any kind.
         raise UserError(f'{path}: cannot read it as {kind}: '
@@ -103,13 +100,11 @@ def _open_npz(path: str) -> Table:
 
 def _array_columns(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
     """Return the columns of an array, `acc[0]` the first of (n, k); none where it is no table."""
-    if values.dtype.kind not in 'iuf' or values.ndim not in (1, 2) or len(values) < 2:
+    if values.dtype.kind not in 'iuf' or values.ndim not in (1, 2) or values.size < 2:
         return {}
-    if values.ndim == 1:
-        return {name: values}
-    # MATLAB and others keep a vector as a row.
+    values = np.atleast_2d(values)
     if values.shape[0] < values.shape[1]:
-        values = values.T
+        values = values.T  # MATLAB and others keep a vector as a row
     if values.shape[1] == 1:
         return {name: values[:, 0]}
     return {f'{name}[{i}]': values[:, i] for i in range(values.shape[1])}
@@ -156,19 +151,13 @@ def _open_ulog(path: str, topic: str) -> Table:
                 for data in log.data_list}
     accelerations = [name for kind in _MAPPINGS for name in messages
                      if messages[name].name == kind and _MAPPINGS[kind]]
-    name = topic.removesuffix('_0')
-    if name and name not in messages:
-        raise UserError(f'{path}: no message {topic}; name one of '
-                        f'{", ".join(accelerations or sorted(messages))}')
-    if not name:
-        if not accelerations:
-            raise UserError(f'{path}: holds no acceleration; name a message with --topic: '
-                            f'{", ".join(sorted(messages)) or "it has none"}')
-        name = accelerations[0]
-        raw = [each for each in accelerations if messages[each].name == messages[name].name]
-        if len(raw) > 1:
-            raise UserError(f'{path}: several accelerometers: {", ".join(raw)}; choose one: '
-                            f'--topic {name}')
+    raw = [each for each in accelerations
+           if messages[each].name == messages[accelerations[0]].name]
+    name = topic.removesuffix('_0') or ', '.join(raw)
+    if name not in messages:
+        raise UserError(f'{path}: no message {topic}' * bool(topic) or
+                        f'{path}: {len(raw) or "no"} accelerometers'
+                        f'; choose one with --topic: {", ".join(accelerations or messages)}')
     data = messages[name]
     columns = {name: values for name, values in data.data.items()
                if getattr(values, 'dtype', None) is not None and values.dtype.kind in 'iuf'}
