@@ -144,6 +144,7 @@ TEMPERATURE = 'sensor_msgs/msg/Temperature'
 BATTERY_STATE = 'sensor_msgs/msg/BatteryState'
 """Type of the supply."""
 
+
 @dataclass(frozen=True)
 class Topics:
     """Full names of the topics in a bag; None where the bag does not hold it."""

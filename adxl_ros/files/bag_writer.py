@@ -86,12 +86,13 @@ class _NewBag:
 
 @contextmanager
 def _new_bag(path: str | os.PathLike) -> Iterator[_NewBag]:
-    """Open a rosbag2 directory, or one file for a name.mcap; it appears at the end of the block."""
+    """Open a rosbag2 directory, or one file for a name.mcap; it appears with the block's end."""
     rosbag2 = import_rosbags()
     with atomic_path(path) as fresh:
         # rosbags writes directories; of a name.mcap, only the file inside is kept.
         folder = fresh.with_suffix('') if fresh.suffix == '.mcap' else fresh
-        with rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
+        with rosbag2.Writer(folder, version=9,
+                            storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
             yield _NewBag(Path(path), writer)
         if folder != fresh:
             os.replace(folder / f'{folder.name}.mcap', fresh)

@@ -249,7 +249,8 @@ def read_population(path: str | os.PathLike) -> Population:
     names = [field.name for field in fields(PooledCoefficient)]
     pooled = {}
     for name, values in contents['coefficients'].items():
-        numbers = [values.get(key) if isinstance(values, dict) else None for key in names]
+        numbers: list[Any] = [values.get(key) if isinstance(values, dict) else None
+                              for key in names]
         if not all(type(each) in (int, float) and math.isfinite(each) for each in numbers) \
                 or not values['prediction_std'] > 0:
             raise UserError(f'{path}: coefficients.{name}: {values!r} is no set of numbers '

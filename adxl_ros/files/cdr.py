@@ -16,7 +16,7 @@ import struct
 
 import numpy as np
 
-_ORDERS = {b'\x00\x00': '>', b'\x00\x01': '<'}
+ORDERS = {b'\x00\x00': '>', b'\x00\x01': '<'}
 """Byte orders of numpy by the identifier of plain CDR (DDSI-RTPS, 10.5)."""
 
 _BODY_OFFSET = 4
@@ -42,9 +42,9 @@ class Layout:
     def __init__(self, raw: bytes) -> None:
         """Start after the encapsulation header of `raw`."""
         self._raw = raw
-        if raw[:2] not in _ORDERS:
+        if raw[:2] not in ORDERS:
             raise CdrError(f'encapsulation 0x{raw[:2].hex()} is not plain CDR')
-        self.order = _ORDERS[raw[:2]]  # Byte order, < or >
+        self.order = ORDERS[raw[:2]]  # Byte order, < or >
         self.fields: dict[str, NumberField] = {}  # The number fields by name
         self.texts: dict[str, str] = {}  # Strings by name, in the order of the message
         # Offsets of the bytes that all messages of this layout share: lengths and strings

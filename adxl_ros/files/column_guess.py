@@ -109,7 +109,7 @@ def describe(table: Table) -> tuple[str, str]:
         stamps = _stamp_options(values[time], source)
         note = ' (add --params with the parameter file of the sensor)' * (unit in ('v', 'mv'))
     sources |= _references(values, {*outputs, time}) if table.has_names else {}
-    options = f'--columns {shell_quoted(str(ColumnMapping(sources)))}' + f' {stamps}' * bool(stamps)
+    options = f'--columns {shell_quoted(str(ColumnMapping(sources)))} {stamps}'.rstrip()
     if unit in (LSB, UNSIGNED):
         usual = min(_COUNTS, key=lambda count: abs(np.log(count / length)))
         options += f' --lsb-per-g {round(length) if zero else usual}'

@@ -198,10 +198,10 @@ def _write_chunk(writer: Any, batches: list[Batch]) -> None:
     writer.max_timestamp = max(writer.max_timestamp, storage.message_end_time)
     storage.close_chunk()
     begin, offsets = storage.bio.tell(), b''
-    for channel, entries in indices.items():
+    for channel, index in indices.items():
         offsets += _INDEX_OFFSET.pack(channel, storage.bio.tell())
-        storage.bio.write(_INDEX_HEAD.pack(_MESSAGE_INDEX, len(entries) + 6, channel,
-                                           len(entries)) + entries)
+        storage.bio.write(_INDEX_HEAD.pack(_MESSAGE_INDEX, len(index) + 6, channel, len(index))
+                          + index)
     # The entry of the chunk in the index of the file states no message index yet.
     entry = storage.chunks[-1]
     text = entry.getvalue()
@@ -226,7 +226,7 @@ def open_unfinished(path: Path) -> tuple[Any, str]:
     """Return a reader of rosbags up to the last whole record of a file, and where that ends."""
     from rosbags.rosbag2.storage_mcap import McapReader
     reader = McapReader(path)
-    reader.bio = file = open(path, 'rb')
+    reader.bio = file = open(path, 'rb')  # noqa: SIM115 (closed with the reader)
     size = os.fstat(file.fileno()).st_size
     end = reader.data_start = file.seek(len(_MAGIC))
     while end <= size:
@@ -235,6 +235,6 @@ def open_unfinished(path: Path) -> tuple[Any, str]:
         code, length = _RECORD_HEAD.unpack(head)
         end = file.tell() + length if code else size + 1
     reader.meta_scan()
-    counts = reader.statistics.channel_message_counts
+    counts = reader.statistics.channel_message_counts if reader.statistics else {}
     reader.connections = [each._replace(msgcount=counts[each.id]) for each in reader.connections]
     return reader, f'{path}: cut off at byte {reader.data_end} of {size}'

@@ -230,8 +230,8 @@ def compose(path: str | os.PathLike) -> yaml.Node | None:
 
 
 def _yaml_error(path: str | os.PathLike, error: yaml.YAMLError) -> UserError:
-    place = _where(path, getattr(error, 'problem_mark', None))
-    return UserError(f'{place}: not YAML: {" ".join(str(getattr(error, "problem", error)).split())}')
+    problem = ' '.join(str(getattr(error, 'problem', error)).split())
+    return UserError(f'{_where(path, getattr(error, "problem_mark", None))}: not YAML: {problem}')
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -138,7 +138,7 @@ def test_forms_that_are_read(tmp_path: Path, text: str | bytes) -> None:
     (f'{HEADER}\n{GOOD}nan,2.5,2.5,1,1\n', ':5:1: time_s is empty or NaN'),
     (f'{HEADER}\n{GOOD}0.003,2.5,1e38,1,1\n', ':5:3: y_v is 1e+38, no reading of a sensor in v'),
     (f'{HEADER}\n{GOOD}0.003,2.5,1e999,1,1\n', ':5:3: y_v is inf, no reading of a sensor in v'),
-    (f'{HEADER}\n{GOOD}0.003,2.5,2.5,1,-1e38\n', ':5:5: beta_rad is -1e+38, no beta in rad; delete'),
+    (f'{HEADER}\n{GOOD}0.003,2.5,2.5,1,-1e38\n', ':5:5: beta_rad is -1e+38, no beta in rad'),
     (f'{HEADER}\n{GOOD}1e38,2.5,2.5,1,1\n', ':5:1: time_s is 1e+38, no time in s (200 years'),
     (f'{HEADER}\n{GOOD}0.0015,2.5,2.5,1,1\n', ':5:1: time_s: time runs backwards, 0.0005 s '
                                               'before the newest sample'),

@@ -65,7 +65,7 @@ def test_a_stranger_is_named_and_keeps_its_estimates():
     ('', 'no population of format 1'),
     ('format: 2\ncoefficients: {}\n', 'no population of format 1'),
     ('format: [1\n', ':2:1: not YAML'),
-    ('format: 1\ncoefficients: {zero_g_x_v: 3}\n', 'coefficients.zero_g_x_v: 3 is no set of numbers'),
+    ('format: 1\ncoefficients: {zero_g_x_v: 3}\n', 'zero_g_x_v: 3 is no set of numbers'),
     ('format: 1\ncoefficients: {zero_g_x_v: {mean: .nan}}\n',
      "coefficients.zero_g_x_v: {'mean': nan} is no set of numbers")])
 def test_a_bad_file_is_refused(tmp_path, text, words):

@@ -261,7 +261,7 @@ def test_numbered_columns_and_a_mapping_file(run_tool, tmp_path) -> None:
     (SHORT, ['--columns', 'x=x:g,y=y:g,z=z:g'], 'has no time; add time=COLUMN:UNIT, or give'),
     (SHORT, ['--columns', 'time=t:s,x=x:lsb,y=y:lsb,z=z:lsb'], 'x is in LSB; add --lsb-per-g'),
     (SHORT, ['--columns', 'time=t:s,x=x:g,y=y:v'], 'some axes are in volts and others are not'),
-    (SHORT, ['--columns', 'time=t:s,x=x:g,roll=y:deg'], 'roll are no reference; name roll and pitch, or'),
+    (SHORT, ['--columns', 'time=t:s,x=x:g,roll=y:deg'], 'roll are no reference; name roll and'),
     ('t,x,y,z,r,p\n' + 20 * '0,0,0,1,90,0\n',
      ['--columns', f'{XYZ_G},roll=r:rad,pitch=p:deg', '--rate', '9'],
      'log.csv:2:5: r is 90, no roll in rad; delete the line, or correct the unit'),
