@@ -257,7 +257,7 @@ class LiveBag:
         self._writer.open()
         self._connections: dict[str, Any] = {}
         self._flushed_ns = 0
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._is_open = True
 
     def write(self, topic: str, kind: str, data: bytes, time_ns: int) -> None:
@@ -270,7 +270,7 @@ class LiveBag:
                                                                        typestore=self._types)
             self._writer.write(self._connections[topic], time_ns, data)
             if time_ns - self._flushed_ns > _FLUSH_NS:
-                self._flush()
+                self.flush()
                 self._flushed_ns = time_ns
 
     def close(self) -> None:
@@ -283,11 +283,7 @@ class LiveBag:
     def flush(self) -> None:
         """Write the messages so far to the file."""
         with self._lock:
-            if self._is_open:
-                self._flush()
-
-    def _flush(self) -> None:
-        storage = self._writer.storage
-        if storage.chunk.bio.tell():
-            storage.close_chunk()
-        storage.bio.flush()
+            storage = self._writer.storage
+            if self._is_open and storage.chunk.bio.tell():
+                storage.close_chunk()
+                storage.bio.flush()

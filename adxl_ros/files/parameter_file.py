@@ -435,9 +435,7 @@ class _FlatReader:
             if key in self.flat:
                 values = self._numbers(key, self.flat[key])
                 count = ENVELOPE_LISTS.get(name, 1)
-                is_right = len(values) == count and (count > 1 or values[0] >= 0) and (
-                    name != 'temperature_c' or values[0] <= values[1])
-                self._require(is_right, key, f'{self.flat[key]} is not the {meaning}')
+                self._require(len(values) == count, key, f'{self.flat[key]} is not the {meaning}')
                 stated[name] = values[0].item() if count == 1 else tuple(values.tolist())
         return Envelope(**stated)
 

@@ -63,14 +63,11 @@ class StreamInfo:
         """Sample rate, Hz; None where it is not stated."""
         if 'rate_hz' not in self.texts:
             return None
-        text = self.texts['rate_hz']
-        try:
-            rate_hz = float(text)
-        except ValueError:
-            rate_hz = 0.0
-        if not 0 < rate_hz < _HIGHEST_RATE_HZ:
-            raise UserError(f'{self.where}: rate_hz is {text!r}, expected samples a second')
-        return rate_hz
+        rate_hz = _numbers(self.texts['rate_hz'])
+        if len(rate_hz) != 1 or not 0 < rate_hz[0] < _HIGHEST_RATE_HZ:
+            raise UserError(f'{self.where}: rate_hz is {self.texts["rate_hz"]!r}, expected samples '
+                            'a second')
+        return float(rate_hz[0])
 
     def nominal_values(self, axes: str) -> dict[str, np.ndarray]:
         """

@@ -43,7 +43,7 @@ class Track:
         self._message_count = 0
         self._stamp_ns = np.zeros(0, np.int64)
         self._value = np.zeros(0)
-        self._period_ns = 0.0
+        self._usual_ns = 0.0  # Usual time between messages, ns; 0 before the second one
         self._gap_ns = 0
         self._square_sum = 0.0
         self._square_count = 0
@@ -72,10 +72,9 @@ class Track:
         new = max(len(self._stamp_ns) - 1, 0)
         self._steps_ns = np.concatenate([self._steps_ns, step[new:][step[new:] > 0]])[
             :_LEARNT_STEPS]
+        self._usual_ns = float(np.median(self._steps_ns)) if len(self._steps_ns) else 0.0
         is_last = np.append(step > 0, True)[:len(stamps)]
         self._stamp_ns, self._value = stamps[is_last], values[is_last]
-        if len(self._stamp_ns) > 1:
-            self._period_ns = float(np.median(np.diff(self._stamp_ns)))
         self._compare(compared)
 
     def _compare(self, start: int) -> None:
@@ -96,8 +95,7 @@ class Track:
         sample_ns = (stamp_ns - self._stamp_ns[0]).astype(float)
         message_ns = (self._stamp_ns - self._stamp_ns[0]).astype(float)
         value = np.interp(sample_ns, message_ns, self._value)
-        is_known = ((sample_ns >= -self._period_ns)
-                    & (sample_ns <= message_ns[-1] + self._period_ns))
+        is_known = (sample_ns >= -self._usual_ns) & (sample_ns <= message_ns[-1] + self._usual_ns)
         value[~is_known | self._in_long_gap(sample_ns, message_ns)] = np.nan
         if is_known.any():
             self._gap_ns = max(self._gap_ns, _largest_gap_ns(sample_ns[is_known], message_ns))
@@ -107,7 +105,7 @@ class Track:
         """Return which samples, ns, (n,), lie in a gap that no line bridges, (n,)."""
         if len(message_ns) < 2:
             return np.zeros(len(sample_ns), bool)
-        limit_ns = max(self._longest_ns, USUAL_GAPS * float(np.median(self._steps_ns)))
+        limit_ns = max(self._longest_ns, USUAL_GAPS * self._usual_ns)
         is_long = (np.diff(message_ns) > limit_ns) & (np.diff(self._value) != 0)
         after = np.searchsorted(message_ns, sample_ns).clip(max=len(message_ns) - 1)
         inside = (sample_ns > message_ns[0]) & (sample_ns < message_ns[after])
