@@ -65,8 +65,8 @@ class StreamInfo:
             return None
         rate_hz = _numbers(self.texts['rate_hz'])
         if len(rate_hz) != 1 or not 0 < rate_hz[0] < _HIGHEST_RATE_HZ:
-            raise UserError(f'{self.where}: rate_hz is {self.texts["rate_hz"]!r}, expected samples '
-                            'a second')
+            raise UserError(f'{self.where}: rate_hz is {self.texts["rate_hz"]!r}, expected '
+                            'samples a second')
         return float(rate_hz[0])
 
     def nominal_values(self, axes: str) -> dict[str, np.ndarray]:
