@@ -17,11 +17,13 @@ from adxl_ros.files.column_mapping import (
     Quantity,
     ROLES,
     shell_quoted,
+    signed,
     Source,
     Table,
     time_unit_of_step,
     unit_in_name,
     UNITS,
+    UNSIGNED,
 )
 from adxl_ros.files.recording_columns import burst_samples, stamped_rate_hz
 from adxl_ros.model.constants import AXES
@@ -81,6 +83,9 @@ _TURNED = 0.3
 _COUNTS = (64, 100, 128, 256, 512, 1000, 1024, 1365, 2048, 4096, 8192, 16384, 32768)
 """Usual counts of 1 g."""
 
+_SIGN_GAP = (24576, 40960)
+"""Counts of 16 bits that are beyond the range, 1.5 times ±16384, where their sign was lost."""
+
 
 def describe(table: Table) -> tuple[str, str]:
     """Describe the columns of a table, and the options that most likely read it."""
@@ -105,7 +110,7 @@ def describe(table: Table) -> tuple[str, str]:
         note = ' (add --params with the parameter file of the sensor)' * (unit in ('v', 'mv'))
     sources |= _references(values, {*outputs, time}) if table.has_names else {}
     options = f'--columns {shell_quoted(str(ColumnMapping(sources)))} {stamps}'.rstrip()
-    if unit == LSB:
+    if unit in (LSB, UNSIGNED):
         usual = min(_COUNTS, key=lambda count: abs(np.log(count / length)))
         options += f' --lsb-per-g {round(length) if zero else usual}'
         options += f' --lsb-at-0g {zero:.0f}' * bool(zero)
@@ -121,6 +126,11 @@ def _unit(table: Table, outputs: Sequence[str], readings: np.ndarray) -> tuple[s
     if not len(readings):
         return '', 0.0, 0.0
     unit = table.units.get(outputs[0]) or unit_in_name(outputs[0], Quantity.OUTPUT)
+    is_whole = bool((readings == np.rint(readings)).all())
+    middle = (readings > _SIGN_GAP[0]) & (readings < _SIGN_GAP[1])
+    if unit in (None, LSB) and is_whole and readings.min() >= 0 and not middle.any() and \
+            _SIGN_GAP[1] < readings.max() < 1 << 16:
+        unit, readings = UNSIGNED, signed(readings)
     low, spread = readings.min(axis=0), np.ptp(readings, axis=0)
     zero = 0.0
     if low.min() > 0 and spread.min() > _TURNED * spread.max():

@@ -53,6 +53,8 @@ _NUMBER = re.compile(r'[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan|inf)'
 _DATE = re.compile(rb'"?(\d{4})[-/](\d\d)[-/](\d\d)[T ](\d\d:\d\d:\d\d(?:[.,]\d{1,9})?)'
                    rb'(?:Z|([-+]\d\d):?(\d\d))?"?')
 """A date and time by ISO 8601; without an offset it counts as UTC."""
+_LABEL = re.compile(rb'"?[A-Za-z_][\w ]*"?\s*[:=]\s*(?=[-+.]?\d)')
+"""A label before a number, as in `x: 0.1` and `"x": 0.1`."""
 _COMMENT = re.compile(r'\s*(#|//|%)')
 """Begin of a comment."""
 
@@ -72,12 +74,12 @@ class Form:
     header_line: int  # Number of the line with the names, from 1; 0 where there is none
     first_line: int  # Number of the first line with samples
     delimiter: str  # A tab, semicolon, comma or blank; several blanks are one
-    has_dates: bool  # Whether lines have dates, which become seconds since 1970
+    is_worded: bool  # Whether lines have dates, labels or quotes, which `_plain` removes
 
     def rewritten(self, data: bytes) -> bytes:
         """Return lines with commas between fields, and decimal points."""
-        if self.has_dates:
-            data = _DATE.sub(_since_1970, data)
+        if self.is_worded:
+            data = _plain(data)
         if self.delimiter == ',':
             return data
         # A comma in a text would look like a delimiter.
@@ -253,7 +255,7 @@ def find_form(path: str) -> Form:
     written = [line for line in lines if line.strip() and not line.lstrip().startswith('#')]
     if not written:
         raise UserError(f'{path}: is empty')
-    plain = [_DATE.sub(_since_1970, line.encode()).decode() for line in lines]
+    plain = [_plain(line.encode()).decode() for line in lines]
     best, form = (0, 0), None
     for delimiter in _DELIMITERS:
         numbers: Counter[int] = Counter()
@@ -279,11 +281,15 @@ def find_form(path: str) -> Form:
 
 
 def _form(lines: Sequence[str], plain: Sequence[str], index: int, delimiter: str) -> Form:
-    """Return the form of a table whose samples begin at a line; `plain` has no dates."""
+    """Return the form of a table whose samples begin at a line, by its lines and plain lines."""
     count = len(_fields(plain[index], delimiter))
     header_line, header = _header(lines[:index], delimiter, count)
-    has_dates = lines[index:] != plain[index:]
-    return _named(header or [''] * count, header_line, index + 1, delimiter, has_dates)
+    labels = _LABEL.findall(_DATE.sub(b'0', lines[index].encode()))
+    if not header and len(labels) == count:
+        header_line, header = index + 1, [label.decode().strip('":= ') for label in labels]
+    is_worded = any(line != bare and not _COMMENT.match(line)
+                    for line, bare in zip(lines[index:], plain[index:]))
+    return _named(header or [''] * count, header_line, index + 1, delimiter, is_worded)
 
 
 def _named(names: Sequence[str], *about: Any) -> Form:
@@ -299,7 +305,8 @@ def _header(lines: Sequence[str], delimiter: str, count: int) -> tuple[int, list
     units: list[str] = []
     number = 0
     for index, line in reversed(list(enumerate(lines))):
-        names = _names(line, delimiter, count)
+        # Quotes around the whole of a line are left out.
+        names = _names(re.sub(r'^"([^"]*)"\s*$', r'\1', line), delimiter, count)
         if names is None:
             if line.strip() and not _COMMENT.match(line):
                 break
@@ -337,6 +344,13 @@ def _numbers(line: str, delimiter: str) -> int:
     """Return how many numbers a line has; 0 where it has one field only."""
     fields = _fields(line, delimiter)
     return 0 if len(fields) < 2 else sum(bool(_NUMBER.fullmatch(field)) for field in fields)
+
+
+def _plain(data: bytes) -> bytes:
+    """Return lines without labels and quotes, and with seconds since 1970 in place of dates."""
+    data = _LABEL.sub(b'', _DATE.sub(_since_1970, data))
+    data = re.sub(rb'(?m)^\s*"([^"\n]*)"[ \t\r]*$', rb'\1', data)
+    return re.sub(rb'(?m)^[ \t]*\{|\}[,\s]*?$', b'', data)
 
 
 def _since_1970(date: re.Match[bytes]) -> bytes:

@@ -125,6 +125,15 @@ def _preamble(log: Turned) -> str:
         [log.time_s, *log.output_g.T], ['%.3f'] + ['%.4f'] * 3)
 
 
+def _labels(log: Turned) -> str:
+    return ''.join(f'X: {x:.4f} Y: {y:.4f} Z: {z:.4f}\n' for x, y, z in log.output_g)
+
+
+def _unsigned(log: Turned) -> str:
+    counts = np.rint(16384 * log.output_g) % 65536
+    return 'ms,x,y,z\n' + lines([1e3 * log.time_s, *counts.T], ['%.0f'] * 4)
+
+
 def _dates(log: Turned) -> str:
     dates = np.datetime64('2026-01-02T03:04:05', 'us') + np.rint(1e6 * log.time_s).astype(int)
     rows = lines([*log.output_g.T], ['%.4f'] * 3, ';', ',').splitlines()
@@ -135,7 +144,8 @@ def _dates(log: Turned) -> str:
 FORMS = {'arduino.csv': _arduino, 'german.csv': _german, 'phyphox.csv': _phyphox,
          'counts.txt': _counts, 'epoch.csv': _epoch, 'units_row.dat': _units_row,
          'euroc.csv': _euroc, 'usb.csv': _usb, 'repeated.csv': _repeated,
-         'preamble.csv': _preamble, 'dates.csv': _dates}
+         'preamble.csv': _preamble, 'labels.txt': _labels, 'unsigned.csv': _unsigned,
+         'dates.csv': _dates}
 """Text of a log by the name of its file."""
 
 
