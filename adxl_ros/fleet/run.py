@@ -151,27 +151,24 @@ class Plan(NamedTuple):
     core_hours: float  # Expected run time on one core, h
 
 
-class Selection(NamedTuple):
-    """Which recordings a run works on."""
+def plan(sources: Sequence[Source], recipe: Recipe, results: Results, only_failed: bool = False,
+         since: str = '', limit: int | None = None) -> Plan:
+    """
+    Decide which recordings are to be worked on.
 
-    only_failed: bool = False  # Whether only those whose row is a refusal or a crash
-    since: str = ''  # Begin of the period, ISO 8601, UTC; empty for all
-    limit: int | None = None  # Largest number; None for all
-
-
-def plan(sources: Sequence[Source], recipe: Recipe, results: Results,
-         selection: Selection) -> Plan:
-    """Decide which recordings are to be worked on."""
-    chosen = _since(sources, selection.since, results) if selection.since else sources
+    only_failed: whether only those whose row is a refusal or a crash; since: begin of the period,
+    ISO 8601, UTC; limit: largest number.
+    """
+    chosen = _since(sources, since, results) if since else sources
     newest = results.newest
-    if selection.only_failed:
+    if only_failed:
         todo, done = [source for source in chosen if source.url in newest
                       and newest[source.url].row['outcome'] != 'done'], 0
     else:
         todo = [source for source in chosen
                 if not is_done(source, newest.get(source.url), recipe)]
         done = len(chosen) - len(todo)
-    todo = todo[:selection.limit]
+    todo = todo[:limit]
     size_bytes = sum(source.size_bytes or 0 for source in todo)
     return Plan(todo, done, len(sources) - done - len(todo), size_bytes,
                 _expected_s(len(todo), size_bytes, recipe, results) / 3600)

@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
-import shlex
 from time import monotonic
 
 from adxl_ros.errors import install_hint, UserError
@@ -25,8 +24,8 @@ from adxl_ros.fleet.row import (
     task_names,
     TASKS,
 )
-from adxl_ros.fleet.run import only_client, Plan, plan, Results, Selection, work
-from adxl_ros.report.page import as_utf_8, without_secrets
+from adxl_ros.fleet.run import only_client, Plan, plan, Results, work
+from adxl_ros.report.page import command_of_this_process
 from adxl_ros.report.quantities import counted, duration, file_size
 from adxl_ros.report.screen import wrapped
 from adxl_ros.tools import command_line as cli
@@ -101,16 +100,16 @@ def fleet(options: argparse.Namespace) -> int:
     recipe = make_recipe(tasks, options.params, (source.params for source in sources),
                          options.store, cli.reading_options(options))
     folder = Path(options.output)
-    selection = Selection(options.only_failed, since, options.limit)
+    selection = (options.only_failed, since, options.limit)
     if options.dry_run:
         results = Results(folder)
-        cli.print_end(_plan_lines(plan(sources, recipe, results, selection), results), [],
-                      _command(options, options.only_failed))
+        cli.print_end(_plan_lines(plan(sources, recipe, results, *selection), results), [],
+                      command_of_this_process().replace(' --dry-run', ''))
         return 0
     cli.make_folder(folder)
     with only_client(folder):
         results = Results(folder)
-        to_do, rows = plan(sources, recipe, results, selection), []
+        to_do, rows = plan(sources, recipe, results, *selection), []
         try:
             if to_do.todo:
                 shared = (recipe, frozenset(results.known))
@@ -124,7 +123,7 @@ def fleet(options: argparse.Namespace) -> int:
     took_s = monotonic() - begin_s
     is_repeated = any(row['outcome'] == 'crashed' or row['refused_by'] == 'stage' for row in rows)
     cli.print_end([*_result_lines(rows, to_do, took_s), ''], files,
-                  _command(options, True) if is_repeated else '', took_s)
+                  f'{command_of_this_process()} --only-failed' if is_repeated else '', took_s)
     return 1 if rows and not any(row['outcome'] == 'done' for row in rows) else 0
 
 
@@ -184,17 +183,6 @@ def _result_lines(rows: Sequence[Row], to_do: Plan, took_s: float) -> list[str]:
             + (f'; {to_do.done} had their row before' if to_do.done else ''), '',
             *(f' {name:11}{value}' for name, value in figures.items() if value),
             *(['', ' refused by'] if reasons else []), *reasons]
-
-
-def _command(options: argparse.Namespace, only_failed: bool) -> str:
-    """Return the command that does what --dry-run shows, or that repeats what failed."""
-    words = [without_secrets(as_utf_8(word)) for word in options.input]
-    words += ['--do', options.do, '-o', options.output]
-    for name in ('params', 'store', 'scheduler', 'jobs', 'retries', 'since', 'limit'):
-        value = getattr(options, name)
-        words += [f'--{name}', str(value)] if value != parser().get_default(name) else []
-    words += ['--only-failed'] if only_failed else []
-    return cli.command(PROG, shlex.join(words) + cli.reading_text(options))
 
 
 def main() -> int:
