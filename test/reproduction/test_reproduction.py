@@ -11,7 +11,7 @@ from units import NOMINAL
 
 pytestmark = pytest.mark.long
 
-_UNITS = {'perfect': 4, 'paper': 10}
+_UNITS = {'perfect': 3, 'paper': 10}
 
 
 @pytest.fixture(scope='module')
