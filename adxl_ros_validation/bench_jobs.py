@@ -129,6 +129,7 @@ _EFFECTS = ('bias', 'scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z'
 _TOOLS = ('simulate', 'fit', 'apply', 'noise', 'check', 'diagnose', 'export', 'blind', 'reproduce')
 """Tools whose `--help` is measured."""
 
+
 def offline_jobs(hours: float) -> Iterator[Job]:
     """Yield the jobs, each with its files."""
     with tempfile.TemporaryDirectory() as temporary:
