@@ -14,19 +14,18 @@ from concurrent.futures import ThreadPoolExecutor
 import csv
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
+from glob import has_magic
 import hashlib
 import os
 from pathlib import Path, PurePosixPath
-import re
 from typing import Any
 from urllib.parse import urlsplit
 
 from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files import recording
-from adxl_ros.files.calibration_store import date_in
 from adxl_ros.files.recording_columns import NO_UNIT, Recording
 from adxl_ros.files.tables import TABLE_ENDINGS
-from adxl_ros.fleet.row import PAGE, POPULATION, TABLE, UNITS
+from adxl_ros.fleet.row import as_date, PAGE, POPULATION, TABLE, UNITS
 from adxl_ros.report.page import as_utf_8, without_secrets
 
 _ENDINGS = ('.csv', '.mcap', '.db3')
@@ -41,26 +40,14 @@ _STAMPS = ('ETag', 'etag', 'e_tag', 'md5Hash', 'Content-MD5', 'Digest', 'created
 _THREADS = 32
 """Objects of a manifest that are looked up at once. Chosen: a server answers in 0.1 s."""
 _SILENCE_S = 60.0
-"""Time in which a web server must send something, s. Chosen: the whole may take as long as it
-likes, where aiohttp would stop after five minutes."""
-_CONNECT_S = 30.0
-"""Time in which a web server must accept a connection, s: that of aiohttp."""
-_HEAD_BYTES = 4096
-"""Begin of a CSV file that is read for serial number and date, byte. Chosen: its comments fit."""
-_COMMENT = re.compile(r'^#\s*(\w+)\s*:\s*(.*?)\s*$', re.MULTILINE)
-"""A comment of a CSV file that states something."""
+"""Time in which a web server must accept a connection and send something, s. Chosen: the whole may
+take as long as it likes, where aiohttp would stop after five minutes."""
 _DATES_S = (946684800.0, 4102444800.0)
 """Stamps between these count from 1970, s: the years 2000 to 2100. Others count from a start."""
 NO_FILE = 'no such file'
 """Fault of a recording that is not there."""
-_DELIMITERS = ',;\t'
-"""Characters between the columns of a manifest; the header has the one that it uses."""
 _MANIFEST_COLUMNS = ('url', 'serial', 'params', 'date')
 """Columns of a manifest."""
-
-
-class Unreachable(UserError):
-    """A server does not answer or refuses; it may answer later."""
 
 
 @dataclass(frozen=True)
@@ -89,27 +76,21 @@ def file_system(url: str, secret: str = '') -> tuple[Any, str]:
     address = secret if _is_web(secret) else url
     # A path of this machine may have two colons, which join addresses.
     if '://' not in address or address.startswith('file://'):
-        path = LocalFileSystem._strip_protocol(address)
-        # One file has one address.
-        is_long = '..' in PurePosixPath(path).parts
-        return LocalFileSystem(), os.path.realpath(path) if is_long else str(PurePosixPath(path))
+        return LocalFileSystem(), os.path.normpath(LocalFileSystem._strip_protocol(address))
     try:
-        options: dict[str, Any] = {}
+        options: dict[str, Any] = {'password': secret} if secret else {}
         if _is_web(address):
             from aiohttp import ClientTimeout
             options = {'client_kwargs': {'timeout': ClientTimeout(
-                total=None, sock_connect=_CONNECT_S, sock_read=_SILENCE_S)}}
-        elif secret:
-            options = {'password': secret}
+                total=None, sock_connect=_SILENCE_S, sock_read=_SILENCE_S)}}
         return url_to_fs(address, **options)
     except (ImportError, ValueError) as error:
         # fsspec itself says what to install.
         name = getattr(error, 'name', None)
-        hint = f'; {install_hint(name)}' if name else ''
-        raise UserError(without_secrets(f'{url}: {one_line(error)}{hint}')) from None
+        reason = one_line(error) + (f'; {install_hint(name)}' if name else '')
     except Exception as error:
-        raise Unreachable(
-            without_secrets(f'{url}: cannot be opened: {one_line(error)}')) from None
+        reason = f'cannot be opened: {one_line(error)}'
+    raise UserError(without_secrets(f'{url}: {reason}'))
 
 
 def _is_web(url: str) -> bool:
@@ -137,13 +118,10 @@ def find_sources(inputs: Iterable[str]) -> list[Source]:
 
 def _of_input(text: str) -> Iterable[Source]:
     """Return the recordings of one input."""
-    try:
-        fs, path = file_system(text)
-    except Unreachable as error:
-        if _wild_characters(text) or not _is_recording_name(text):
-            raise
-        return [_unreachable(text, error)]
-    if _wild_characters(path) and not os.path.exists(path):
+    fs, path = file_system(text)
+    # In a web address only * makes a glob.
+    is_glob = '*' in path or ('://' not in path and has_magic(path))
+    if is_glob and not os.path.exists(path):
         return _of_listing(text, fs, path, fs.glob(path, detail=True))
     # A web server answers `isdir` with the whole file.
     if os.path.isdir(path) or (not _is_recording_name(path) and fs.isdir(path)):
@@ -157,48 +135,25 @@ def _of_listing(text: str, fs: Any, path: str, named: Mapping[str, Mapping[str, 
     """
     Return the recordings of a folder or a glob, those in folders too; a bag is one recording.
 
-    named: what the folder or the glob names, by path. Hidden files do not count, unless the glob
+    named: what the folder or the glob names, by path. Hidden files do not count, unless the input
     asks for them.
     """
-    wild = [path.index(letter) for letter in _wild_characters(path) if path not in named]
-    base = path[:path.rfind('/', 0, min(wild)) + 1] if wild else path
-    asks_for_hidden = '/.' in f'/{path.removeprefix(base)}'
-
-    def is_visible(name: str) -> bool:
-        return asks_for_hidden or '/.' not in f'/{name.removeprefix(base).lstrip("/")}'
-
     files: dict[str, Mapping[str, Any]] = {}
     for name, info in named.items():
         files |= fs.find(name, detail=True) if info['type'] == 'directory' else {name: info}
-    bags: dict[str, dict[str, Any]] = {
-        name.rpartition('/')[0]: {} for name in files if file_name(name) == _BAG
-        and is_visible(name)}
-    found = []
+    bags = {name.rpartition('/')[0] for name in files if file_name(name) == _BAG}
+    found: dict[str, dict[str, Mapping[str, Any]]] = {}
     for name, info in files.items():
-        bag = name.rpartition('/')[0]
-        while bag and bag not in bags:
-            bag = bag.rpartition('/')[0]
-        if bag:
-            bags[bag][name] = info
-        elif is_visible(name) and not _is_of_fleet(fs, name) and (
-                name in named or _is_recording_name(name)):
-            found.append(_of_info(fs, name, info))
-    found += [_of_bag(fs, bag, content) for bag, content in bags.items()]
-    if not found:
-        raise UserError(f'{text}: matches nothing' if wild else f'{text}: has no recording '
-                        f'(*{", *".join(_ENDINGS)}, a bag or a table)')
-    return found
-
-
-def _unreachable(url: str, error: UserError) -> Source:
-    """Return a recording whose server cannot be reached."""
-    plain = without_secrets(url)
-    return Source(plain, fault=one_line(error).removeprefix(f'{plain}: '))
-
-
-def _wild_characters(path: str) -> set[str]:
-    """Return the characters of a glob in a path; in a web address only * is one."""
-    return set(path) & set('*' if '://' in path else '*?[')
+        bag = next((str(folder) for folder in PurePosixPath(name).parents if str(folder) in bags),
+                   '')
+        if bag or (not _is_of_fleet(fs, name) and (name in named or _is_recording_name(name))):
+            found.setdefault(bag or name, {})[name] = info
+    sources = [_of_files(fs, name, content) for name, content in found.items()
+               if name.count('/.') <= path.count('/.')]
+    if not sources:
+        raise UserError(f'{text}: matches nothing' if path not in named else f'{text}: has no '
+                        f'recording (*{", *".join(_ENDINGS)}, a bag or a table)')
+    return sources
 
 
 def file_name(path: str) -> str:
@@ -222,9 +177,9 @@ def look_up(fs: Any, path: str) -> Source:
     try:
         info = fs.info(path)
         if info['type'] != 'directory':
-            return _of_info(fs, path, info)
+            return _of_files(fs, path, {path: info})
         files = fs.find(path, detail=True)
-        return _of_bag(fs, path, files) if _BAG in map(file_name, files) else \
+        return _of_files(fs, path, files) if _BAG in map(file_name, files) else \
             _source(fs, path, fault=f'is a folder without {_BAG}, not a recording')
     except Exception as error:
         if not isinstance(error, FileNotFoundError):
@@ -244,8 +199,7 @@ def fault_of(error: BaseException) -> str:
     return f'cannot be read: {without_secrets(reason)}'
 
 
-def _source(fs: Any, path: str, size_bytes: int | None = None, stamp: str = '',
-            modified: str = '', fault: str = '') -> Source:
+def _source(fs: Any, path: str, **known: Any) -> Source:
     """Return a recording by its address, which is the path itself on this machine."""
     name, options = str(fs.unstrip_protocol(path)), fs.storage_options
     scheme, _, rest = name.partition(':///')
@@ -260,32 +214,22 @@ def _source(fs: Any, path: str, size_bytes: int | None = None, stamp: str = '',
     secret = str(options.get('password') or '')
     if _is_web(path):
         secret = path if path != url else ''
-    return Source(url, size_bytes, stamp, modified, fault=fault, secret=secret)
+    return Source(url, **known, secret=secret)
 
 
-def _of_info(fs: Any, path: str, info: Mapping[str, Any]) -> Source:
-    """Return the recording that a file system describes."""
-    if info['type'] not in ('file', 'link'):
+def _of_files(fs: Any, path: str, files: Mapping[str, Mapping[str, Any]]) -> Source:
+    """Return the recording that a file, or all files of a bag, make."""
+    if any(info['type'] not in ('file', 'link') for info in files.values()):
         return _source(fs, path, fault='is no file')
     if as_utf_8(path) != path:
         return _source(fs, path, fault='its name is not UTF-8; rename it')
-    return _source(fs, path, info.get('size'), _stamp_of(info), _modified(info))
-
-
-def _of_bag(fs: Any, folder: str, files: Mapping[str, Mapping[str, Any]]) -> Source:
-    """Return the recording of a bag's folder."""
     sizes = [info.get('size') for info in files.values()]
-    stamps = {name: _stamp_of(info) for name, info in sorted(files.items())}
-    text = '\n'.join(f'{name} {stamp}' for name, stamp in stamps.items())
-    return _source(fs, folder, None if None in sizes else sum(filter(None, sizes)),
-                   hashlib.sha256(text.encode()).hexdigest() if all(stamps.values()) else '',
-                   max(map(_modified, files.values()), default=''))
-
-
-def _stamp_of(info: Mapping[str, Any]) -> str:
-    """Return what changes with the content of a file; empty if the server states nothing."""
-    stated = [f'{name}={info[name]}' for name in sorted(_STAMPS) if info.get(name)]
-    return ' '.join([f'size={info.get("size")}', *stated]) if stated else ''
+    stated = [[name, *(str(info.get(key)) for key in ('size', *_STAMPS))]
+              for name, info in sorted(files.items()) if any(map(info.get, _STAMPS))]
+    stamp = hashlib.sha256(repr(stated).encode()).hexdigest()
+    return _source(fs, path, size_bytes=None if None in sizes else sum(filter(None, sizes)),
+                   stamp=stamp if len(stated) == len(files) else '',
+                   modified=max(map(_modified, files.values())))
 
 
 def _modified(info: Mapping[str, Any]) -> str:
@@ -296,77 +240,56 @@ def _modified(info: Mapping[str, Any]) -> str:
     return as_date(str(value))
 
 
-def as_date(text: str) -> str:
-    """Return a date of ISO 8601 in UTC; empty if the text is none. UTC is the usual zone."""
-    date = date_in(text.strip())
-    return date.isoformat() if date else ''
-
-
 def _manifest_rows(text: str, fs: Any, path: str) -> dict[int, dict[str, str]] | None:
     """
     Return the rows of a manifest by their numbers, which are lines of a CSV file.
 
-    It is None for a recording, and where nothing can be read.
+    It is None for a recording, and where nothing can be read: its task reports why.
     """
     suffix = PurePosixPath(file_name(path)).suffix.lower()
-    if os.path.exists(path) and not os.path.isfile(path):
-        # A pipe or a device may never end.
+    if suffix not in ('.csv', '.parquet', '.pq') or (
+            os.path.exists(path) and not os.path.isfile(path)):  # a pipe may never end
         return None
     try:
         if suffix == '.csv':
             with fs.open(path, 'r', encoding='utf-8-sig', newline='') as file:
                 return _csv_rows(text, file)
-        if suffix in ('.parquet', '.pq'):
-            with fs.open(path, 'rb') as file:
-                return _parquet_rows(file)
+        from pyarrow import parquet, string
+        with fs.open(path, 'rb') as file:
+            content = parquet.ParquetFile(file)
+            names = [name for name in _MANIFEST_COLUMNS if name in content.schema_arrow.names]
+            if 'url' not in names:
+                return None
+            columns = {name: column.cast(string()).fill_null('').to_pylist()
+                       for name, column in zip(names, content.read(names).columns)}
+        return {number: dict(zip(names, row))
+                for number, row in enumerate(zip(*columns.values()), 1)}
     except UserError:
         raise
     except Exception:
-        # Whatever it is, the task of this recording reports it.
         return None
-    return None
 
 
 def _csv_rows(text: str, file: Iterable[str]) -> dict[int, dict[str, str]] | None:
     """Return the rows of a manifest, by line and column; None for a recording."""
-    lines = iter(file)
-    begin, head = next(((number, line) for number, line in enumerate(lines, 1)
-                        if line.strip() and not line.lstrip().startswith('#')), (0, ''))
-    delimiter = max(_DELIMITERS, key=head.count)
-    names = [name.strip().lower() for name in next(csv.reader([head], delimiter=delimiter), [])]
+    lines = ((number, line) for number, line in enumerate(file, 1)
+             if line.strip() and not line.lstrip().startswith('#'))
+    _, head = next(lines, (0, ''))
+    delimiter = max(',;\t', key=head.count)
+    names = [name.strip().lower() for name in head.split(delimiter)]
     if 'url' not in names:
         return None
-    result, reader = {}, csv.reader(lines, delimiter=delimiter)
-    for cells in reader:
-        if any(map(str.strip, cells)) and not cells[0].lstrip().startswith('#'):
-            number = begin + reader.line_num
-            if len(cells) != len(names):
-                raise UserError(
-                    f'{text}: row {number}: {len(cells)} columns, expected {len(names)}')
-            result[number] = dict(zip(names, map(str.strip, cells)))
-    return result
-
-
-def _parquet_rows(file: Any) -> dict[int, dict[str, str]] | None:
-    """Return the rows of a manifest by number and column; None for a recording."""
-    from pyarrow import parquet
-    content = parquet.ParquetFile(file)
-    names = [name for name in _MANIFEST_COLUMNS if name in content.schema_arrow.names]
-    if 'url' not in names:
-        return None
-    return {number: {name: _text(value) for name, value in row.items()}
-            for number, row in enumerate(content.read(names).to_pylist(), 1)}
-
-
-def _text(value: Any) -> str:
-    """Return a value of a manifest as text; a column with empty cells has floats."""
-    if value is None or value != value:
-        return ''
-    return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
+    rows = {}
+    for number, line in lines:
+        cells, = csv.reader([line], delimiter=delimiter)
+        if len(cells) != len(names):
+            raise UserError(f'{text}: row {number}: {len(cells)} columns, expected {len(names)}')
+        rows[number] = dict(zip(names, map(str.strip, cells)))
+    return rows
 
 
 def _of_manifest(text: str, rows: dict[int, dict[str, str]]) -> Iterable[Source]:
-    """Return the recordings that a manifest lists, each once."""
+    """Return the recordings that a manifest lists; the last row of a recording counts."""
     folder = text.rpartition('/')[0]
     if not rows:
         raise UserError(f'{text}: the manifest has no row below its header')
@@ -378,37 +301,30 @@ def _of_manifest(text: str, rows: dict[int, dict[str, str]]) -> Iterable[Source]
                             'for example 2026-11-01T10:00:00Z')
 
     def source(row: dict[str, str]) -> Source:
-        url, params = _beside(folder, row['url']), row.get('params', '')
+        url, params, serial = (row.get(name, '') for name in ('url', 'params', 'serial'))
         try:
-            recorded = look_up(*file_system(url))
+            recorded = look_up(*file_system(_beside(folder, url)))
         except UserError as error:
-            recorded = _unreachable(url, error)
-        serial = row.get('serial', '')
+            plain = without_secrets(url)
+            recorded = Source(plain, fault=one_line(error).removeprefix(f'{plain}: '))
         return replace(recorded, serial='' if serial == NO_UNIT else serial,
                        params=_beside(folder, params) if set(params) & set('/.') else params,
                        date=as_date(row.get('date', '')))
 
-    result: dict[str, Source] = {}
     with ThreadPoolExecutor(_THREADS) as pool:
-        for number, found in zip(rows, pool.map(source, rows.values())):
-            first = result.setdefault(found.url, found)
-            if found.serial and found.serial != first.serial:
-                raise UserError(f'{text}: row {number}: the serial of {found.url} is '
-                                f'{found.serial}, but an earlier row says {first.serial!r}')
-    return result.values()
+        return list(pool.map(source, rows.values()))
 
 
-def is_manifest(path: Path) -> bool:
-    """Return whether a file of this machine is a manifest."""
-    try:
-        return _manifest_rows(str(path), *file_system(str(path))) is not None
-    except UserError:
-        return True
+def _beside(folder: str, url: str) -> str:
+    """Return an address of a manifest; one that is relative counts from the manifest's folder."""
+    if not url or '://' in url or Path(url).is_absolute() or not folder:
+        return url
+    return f'{folder}/{url}'
 
 
 def stated_by(sources: Iterable[Source]) -> list[tuple[str, str]]:
     """
-    Return what recordings state at their begin, as far as it takes a few bytes to see.
+    Return what recordings of this machine state at their begin; nothing for those of a server.
 
     It is the serial number of the unit, and the date, ISO 8601 in UTC; empty for nothing.
     """
@@ -417,24 +333,14 @@ def stated_by(sources: Iterable[Source]) -> list[tuple[str, str]]:
 
 
 def _stated(source: Source) -> tuple[str, str]:
-    """Return what a recording states: one of this machine, or a CSV file in its comments."""
-    serial, date = '', ''
-    if source.fault:
-        # A pipe would be waited for.
-        return serial, date
+    if source.fault or '://' in source.url:
+        return '', ''
     try:
-        fs, path = file_system(source.url, source.secret)
-        if path.lower().endswith('.csv'):
-            head = fs.cat_file(path, 0, _HEAD_BYTES).decode('utf-8', 'replace')
-            texts = dict(_COMMENT.findall(head))
-            serial, date = texts.get('serial', ''), as_date(texts.get('date', ''))
-        if not (serial and date) and '://' not in source.url:
-            first = next(recording.blocks(path, 1))
-            serial, date = first.stream_info.texts.get('serial', ''), begin_of(first)[0]
+        first = next(recording.blocks(source.url, 1))
+        return first.stream_info.texts.get('serial', ''), begin_of(first)[0]
     except Exception:
         # Whatever it is, the task of this recording reports it.
-        serial, date = '', ''
-    return serial, date
+        return '', ''
 
 
 def begin_of(first: Recording) -> tuple[str, str]:
@@ -446,10 +352,3 @@ def begin_of(first: Recording) -> tuple[str, str]:
     if _DATES_S[0] < begin_s < _DATES_S[1]:
         return datetime.fromtimestamp(begin_s, timezone.utc).isoformat(), 'stamps'
     return '', ''
-
-
-def _beside(folder: str, url: str) -> str:
-    """Return an address of a manifest; one that is relative counts from the manifest's folder."""
-    if not url or '://' in url or Path(url).is_absolute() or not folder:
-        return url
-    return f'{folder}/{url}'

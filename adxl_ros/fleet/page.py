@@ -13,16 +13,20 @@ from pathlib import Path
 
 from adxl_ros.files import calibration_store
 from adxl_ros.files.atomic_write import write_text
-from adxl_ros.fleet.findings import effect_matrix, EffectMatrix, rank, State, UnitState
 from adxl_ros.fleet.row import PAGE, POPULATION, reason_kind, TABLE, UNITS
 from adxl_ros.fleet.table import (
     analyse,
+    effect_matrix,
+    EffectMatrix,
     far_out,
     FleetTable,
     MG,
     QuantityResult,
+    rank,
     read,
+    State,
     TOLERANCE_MG,
+    UnitState,
 )
 from adxl_ros.fleet.trends import FALSE_DISCOVERY_RATE
 from adxl_ros.model.constants import AXES, Z_90
@@ -31,18 +35,11 @@ from adxl_ros.report import figures as plotly, page as html_page
 from adxl_ros.report.quantities import decimals, number
 import numpy as np
 import pandas as pd
-import scipy
 
 _TREND_HEIGHT = 190
 """Height of the plot of a trend, pixels."""
-_LINE_POINTS = 9
-"""Points of a line with its band, between two calibrations. Chosen: a band is hardly curved."""
-_BAND = 0.05
-"""Probability on each side of a band."""
 _MOST_EFFECTS = 20
 """Largest count of effects in the matrix. Chosen: their names fit beside each other."""
-_MOST_NAMES = 40
-"""Largest count of units whose serial numbers stand beside the matrix."""
 _ROW_PIXELS = 16
 _MOST_PIXELS = 640
 _MATRIX_HEAD_PIXELS = 150
@@ -53,8 +50,8 @@ _SHOWN = 12
 """Number of units in the first table and with a plot. Chosen: they fit on one screen."""
 _MOST_ROWS = 50
 """Largest count of outliers and of reasons on the page; the table holds them all."""
-_SMALLEST_SCATTER = 1e-3
-"""Smallest scatter on the page, mg, mg/g or µg. Chosen: far below the noise of any recording."""
+_DECIMALS = 3
+"""Decimals of a scatter, mg, mg/g or µg. Chosen: far below the noise of any recording."""
 _MEASURES = ('gap_before_mps2', *(f'zero_g_{axis}_v' for axis in AXES))
 """Columns that tell whether a unit is within the tolerance."""
 _SENTENCES = {State.OUT_OF_TOLERANCE: 'Recalibrate what is at the head of the list.',
@@ -79,24 +76,18 @@ def _trend_figure(table: FleetTable, result: QuantityResult, unit: int) -> plotl
     origin = float(result.trends.level[place]) if is_relative and place is not None else 0.0
     part = table.unit[result.rows] == unit
     years, is_outlier = result.recordings.time[part], result.is_outlier[part]
-    value = quantity.factor * (result.recordings.value[part] - origin)
-    std = quantity.factor * result.recordings.std[part]
     dates = np.array(_stamps(years), object)
-    recorded = plotly.points([], value[~is_outlier], Z_90 * std[~is_outlier], 'recording',
-                             plotly.AXIS_COLOURS['x'])
-    recorded |= {'x': list(dates[~is_outlier]), 'marker': {
-        'color': plotly.AXIS_COLOURS['x'], 'size': 4}}
-    recorded['error_y'] |= {'width': 0, 'thickness': 0.8}
-    traces = [recorded]
+    value = quantity.factor * (result.recordings.value[part] - origin)
+    half = Z_90 * quantity.factor * result.recordings.std[part]
+    traces = []
     if place is not None and (~is_outlier).sum() > 1:
         periods = result.recordings[~result.is_outlier].period[part[~result.is_outlier]]
-        traces = [*_lines(result, place, years[~is_outlier], periods, origin), recorded]
-    if is_outlier.any():
-        traces.append({'type': 'scatter', 'mode': 'markers', 'name': 'outlier',
-                       'x': list(dates[is_outlier]), 'y': plotly.rounded(value[is_outlier]),
-                       'marker': {'color': plotly.BEFORE_COLOUR, 'size': 7,
-                                  'symbol': 'x-thin', 'line': {
-                                      'width': 1.6, 'color': plotly.BEFORE_COLOUR}}})
+        traces = _lines(result, place, years[~is_outlier], periods, origin)
+    for name, shown, colour in (('recording', ~is_outlier, plotly.AXIS_COLOURS['x']),
+                                ('outlier', is_outlier, plotly.BEFORE_COLOUR)):
+        if shown.any():
+            traces.append(plotly.points([], value[shown], half[shown], name, colour)
+                          | {'x': list(dates[shown])})
     marks = [{'type': 'line', 'x0': stamp, 'x1': stamp, 'yref': 'paper', 'y0': 0, 'y1': 1,
               'line': {'color': plotly.QUIET_COLOUR, 'width': 1.2, 'dash': 'dash'}}
              for stamp in _stamps(calibration_years(table, unit))]
@@ -108,63 +99,44 @@ def _trend_figure(table: FleetTable, result: QuantityResult, unit: int) -> plotl
 
 
 def calibration_years(table: FleetTable, unit: int) -> np.ndarray:
-    """Return when the calibrations of a unit were made."""
+    """Return when a unit was calibrated again between its recordings."""
     rows = table.rows_of(unit)
     made = table.years[rows] - table['calibration_age_days'][rows] / _DAYS_PER_YEAR
-    dated = np.flatnonzero(np.isfinite(made))
-    if not len(dated):
-        return made[dated]
-    made = made[dated[np.unique(table.period[rows[dated]], return_index=True)[1]]]
-    first, last = np.nanmin(table.years[rows]), np.nanmax(table.years[rows])
-    # A calibration long before the first recording would compress the plot.
-    return made[made > first - 0.1 * max(last - first, 0.01)]
+    begins = made[1:][np.diff(table.period[rows]) > 0]
+    return begins[np.isfinite(begins)]
 
 
 def _lines(result: QuantityResult, place: int, times: np.ndarray, periods: np.ndarray,
            origin: float) -> list[plotly.Figure]:
-    """Return the lines of a unit between calibrations with their bands."""
-    trends, factor = result.trends, result.quantity.factor
-    is_claimed = bool(result.is_claimed[place])
-    slope, slope_std = (trends.slope[place], trends.slope_std[place]) if is_claimed else (0, 0)
-    width = -float(scipy.special.stdtrit(trends.freedom[place], _BAND)) if is_claimed else Z_90
-    colour = plotly.BEFORE_COLOUR if is_claimed else plotly.QUIET_COLOUR
+    """Return the lines of a unit between calibrations."""
+    trends, is_claimed = result.trends, bool(result.is_claimed[place])
+    slope = trends.slope[place] if is_claimed else 0.0
     traces = []
     for period in np.unique(periods):
         part = times[periods == period]
-        x = np.linspace(part.min(), part.max(), _LINE_POINTS)
-        distance = x - trends.period_time[period]
-        middle = factor * (trends.period_value[period] + slope * distance - origin)
-        half = factor * width * np.hypot(trends.period_std[period], slope_std * distance)
-        dates = _stamps(x)
-        traces += [
-            {'x': [*dates, *dates[::-1]], 'mode': 'lines', 'line': {'width': 0},
-             'fill': 'toself', 'type': 'scatter', 'fillcolor': colour, 'opacity': 0.25,
-             'hoverinfo': 'skip',
-             'y': plotly.rounded(np.concatenate([middle + half, (middle - half)[::-1]]))},
-            plotly.line([], middle, 'line', colour) | {'x': dates}]
+        ends = np.array([part.min(), part.max()])
+        value = trends.period_value[period] + slope * (ends - trends.period_time[period])
+        traces.append(plotly.line(
+            [], result.quantity.factor * (value - origin), 'line', plotly.BEFORE_COLOUR
+            if is_claimed else plotly.QUIET_COLOUR) | {'x': _stamps(ends)})
     return traces
 
 
 def _matrix_figure(table: FleetTable, effects: EffectMatrix) -> plotly.Figure:
     """Plot how often each effect is named in each unit."""
-    columns = effects.effects[:_MOST_EFFECTS]
+    columns = list(effects.effects[:_MOST_EFFECTS])
     share = 100 * effects.share[:, :len(columns)]
-    serials = [table.serials[unit] for unit in effects.units]
-    named = len(serials) <= _MOST_NAMES
-    height = _MATRIX_HEAD_PIXELS + min(_ROW_PIXELS * len(serials), _MOST_PIXELS)
-    trace = {'type': 'heatmap', 'x': list(columns), 'y': serials,
-             'z': [[float(f'{value:.3g}') for value in row] for row in share],
-             'zmin': 0, 'zmax': 100, 'colorscale': [[0, '#f0f3f6'], [1, '#b03224']],
-             'xgap': 2, 'ygap': 1 if named else 0,
+    trace = {'type': 'heatmap', 'x': columns, 'y': [table.serials[i] for i in effects.units],
+             'z': share.round(1).tolist(), 'zmin': 0, 'zmax': 100,
+             'colorscale': [[0, '#f0f3f6'], [1, '#b03224']], 'xgap': 2,
              'hovertemplate': '%{y}: %{x} in %{z} % of the recordings<extra></extra>',
              'colorbar': {'title': {'text': '%'}, 'thickness': 10, 'len': 0.6}}
+    height = _MATRIX_HEAD_PIXELS + min(_ROW_PIXELS * len(share), _MOST_PIXELS)
     return plotly.figure([trace], height,
                          xaxis={'side': 'top', 'tickangle': -90, 'type': 'category',
-                                'tickvals': list(columns)},
+                                'tickvals': columns},
                          yaxis={'autorange': 'reversed', 'type': 'category',
-                                'showticklabels': named, 'tickvals': serials if named else [],
-                                'title': {'text': 'unit' if named else
-                                          'units by serial number'}})
+                                'title': {'text': 'unit'}})
 
 
 def write(folder: Path) -> list[Path]:
@@ -194,7 +166,7 @@ def _units_csv(results: Sequence[QuantityResult], serials: Sequence[str]) -> str
             rows += zip([serials[unit] for unit in result.units], repeat(result.quantity.column),
                         repeat(result.quantity.unit), population.estimates, population.std,
                         *population.shrunken(), population.distances(),
-                        ['true' if far else 'false' for far in population.is_far_out])
+                        np.where(population.is_far_out, 'true', 'false'))
     return pd.DataFrame(rows, columns=columns).to_csv(
         index=False, float_format='%.9g', lineterminator='\n')
 
@@ -226,7 +198,7 @@ def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> 
                for result in results if (batch := result.batch) is not None]
     return html_page.render('adxl_ros.fleet', 'fleet.html', {
         'title': 'Fleet', 'about': about, 'badge': _badge(table, units, counts),
-        'tiles': _tiles(table, units, counts), 'shown': _SHOWN, 'figures': figures,
+        'tiles': _tiles(table, counts), 'shown': _SHOWN, 'figures': figures,
         'units': units, 'date': date_text, 'link': partial(_link, folder),
         'without_unit': _rows_without_unit(table),
         'without_unit_count': int((table.unit < 0).sum()),
@@ -236,10 +208,7 @@ def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> 
         'findings': [*batches, *effects.findings], 'has_effects': bool(effects.effects),
         'judged': len(effects.units), 'populations': _population_rows(results),
         'far_out': [
-            [item.serial, item.quantity.label,
-             f'{item.value:.5g} {item.quantity.unit}'
-             if not item.quantity.unit.startswith('m/s') else
-             f'{number(item.value * item.quantity.factor)} {item.quantity.shown_unit}',
+            [item.serial, item.quantity.label, f'{item.value:.5g} {item.quantity.unit}',
              number(item.distance, True)] for item in distant[:_MOST_ROWS]],
         'outliers': _outlier_rows(table, results),
         'outlier_count': sum(int(result.is_outlier.sum()) for result in results),
@@ -254,33 +223,22 @@ def _badge(table: FleetTable, units: Sequence[UnitState], counts: Counter[State]
         return {'colour': 'grey', 'word': 'NO UNITS',
                 'sentence': 'No recording states a serial number.'}
     worst = units[0].state
-    if worst >= State.FAR_OUT and not any(
-            np.isfinite(table[column]).any() for column in _MEASURES):
+    if worst >= State.FAR_OUT and table.frame[[*_MEASURES]].isna().all(axis=None):
         # What was not measured is not within the tolerance.
         return {'colour': 'grey', 'word': 'NOT MEASURED',
                 'sentence': 'No gap and no zero-g were measured; they need diagnose and fit.'}
-    word = 'IN ORDER' if worst is State.IN_ORDER else \
-        f'{counts[worst]} of {len(units)} {worst.words}'.upper()
-    return {'colour': worst.colour, 'word': word,
-            'sentence': _SENTENCES.get(
+    return {'colour': worst.colour, 'word': 'IN ORDER' if worst is State.IN_ORDER else
+            f'{counts[worst]} of {len(units)} {worst.words}'.upper(), 'sentence': _SENTENCES.get(
                 worst, 'No unit is out of tolerance. Look at the head of the list.')}
 
 
-def _tiles(table: FleetTable, units: Sequence[UnitState], counts: Counter[State]
-           ) -> list[dict[str, str]]:
+def _tiles(table: FleetTable, counts: Counter[State]) -> list[dict[str, str]]:
     outcome = table['outcome']
     refused, crashed = (int((outcome == name).sum()) for name in ('refused', 'crashed'))
     rows = [{'label': 'recordings', 'text': str(len(table)),
              'note': f'{refused} refused, {crashed} crashed'}]
-    notes = {State.OUT_OF_TOLERANCE: f'gap above {number(TOLERANCE_MG)} mg',
-             State.DRIFTS: 'a slope beyond chance', State.NOT_JUDGED: 'last recording refused',
-             State.FAR_OUT: 'not of the population', State.OLD_CALIBRATION: 'over a year, or none',
-             State.IN_ORDER: 'nothing to do'}
-    # A unit that is out of tolerance may drift, too.
-    numbers = Counter({**counts, State.DRIFTS: sum(unit.is_drifting for unit in units)})
-    rows += [{'label': f'units: {state.words}', 'text': str(numbers[state]), 'note': notes[state]}
-             for state in State if counts[state] or state in (State.OUT_OF_TOLERANCE,
-                                                              State.DRIFTS, State.IN_ORDER)]
+    rows += [{'label': f'units: {state.words}', 'text': str(counts[state]), 'note': ''}
+             for state in State]
     hours = float(np.nansum(table['seconds'])) / 3600
     return [*rows, {'label': 'core hours', 'text': number(hours),
                     'note': f'{number(3600 * hours / max(len(table), 1))} s a recording'}]
@@ -288,15 +246,13 @@ def _tiles(table: FleetTable, units: Sequence[UnitState], counts: Counter[State]
 
 def _rows_without_unit(table: FleetTable) -> list[dict[str, str]]:
     """Return the recordings that state no serial number, the largest gap first."""
-    gap_mg, floor_mg = (MG * table[f'gap_{name}_mps2'] for name in ('before', 'floor'))
     rows = np.flatnonzero(table.unit < 0)
+    gap_mg, floor_mg = (MG * table[f'gap_{name}_mps2'] for name in ('before', 'floor'))
     rows = rows[np.argsort(-np.nan_to_num(gap_mg[rows]), kind='stable')]
-    return [{'url': str(table['url'][row]), 'date': date_text(table.years[row]),
-             'verdict': ': '.join(filter(None, [
-                 str(table['status'][row] or table['outcome'][row]).replace('_', ' '),
-                 ', '.join(table['effects'][row])])),
-             'gap': f'{number(gap_mg[row])} / {number(floor_mg[row])}'
-             if np.isfinite(gap_mg[row]) else '-',
+    return [{'url': table['url'][row], 'date': date_text(table.years[row]),
+             'verdict': ', '.join([table['status'][row] or table['outcome'][row],
+                                   *table['effects'][row]]),
+             'gap': f'{number(gap_mg[row])} / {number(floor_mg[row])}',
              'report': table['report'][row]} for row in rows[:_MOST_ROWS]]
 
 
@@ -313,45 +269,38 @@ def _population_rows(results: Sequence[QuantityResult]) -> list[list[str]]:
         if population is None:
             continue
         pooled, factor, unit = population.pooled, quantity.factor, quantity.shown_unit
-        shown = (factor, unit) if quantity.unit.startswith('m/s') else (1.0, quantity.unit)
-        mean, std = shown[0] * pooled.mean, shown[0] * pooled.mean_std
+        spread, low, high = (number(factor * value) for value in (
+            pooled.spread, pooled.spread_low, pooled.spread_high))
         rows.append([
-            quantity.label, f'{mean:.{decimals(std)}f} ± {number(std, digits=2)} {shown[1]}',
-            f'{number(factor * pooled.spread)} ({number(factor * pooled.spread_low)} to '
-            f'{number(factor * pooled.spread_high)}) {unit}',
-            *(f'{_scatter(factor * value)} {unit}'
+            quantity.label, f'{pooled.mean:.{decimals(pooled.mean_std)}f} ± '
+            f'{number(pooled.mean_std, digits=2)} {quantity.unit}',
+            f'{spread} ({low} to {high}) {unit}',
+            *(f'{number(round(factor * value, _DECIMALS))} {unit}'
               for value in (scatter.recording, scatter.calibration)),
             str(pooled.units), str(int(population.is_far_out.sum()))])
     return rows
 
 
-def _scatter(value: float) -> str:
-    """Return a scatter; one that is too small to matter as its limit."""
-    return f'< {_SMALLEST_SCATTER:g}' if 0 < value < _SMALLEST_SCATTER else number(value)
-
-
 def _outlier_rows(table: FleetTable, results: Sequence[QuantityResult]
                   ) -> list[dict[str, str]]:
     """Return the recordings that are far from others of their unit, the farthest first."""
-    outliers = [(float(result.distance[i]), result, i) for result in results
-                for i in np.flatnonzero(result.is_outlier)]
+    outliers = [(float(result.distance[i]), result.rows[i], result.quantity,
+                 result.quantity.factor * result.recordings.value[i])
+                for result in results for i in np.flatnonzero(result.is_outlier)]
     outliers.sort(key=lambda item: -item[0])
     return [{'serial': table.serials[table.unit[row]], 'date': date_text(table.years[row]),
              'quantity': quantity.label, 'distance': number(distance),
-             'value': f'{number(quantity.factor * result.recordings.value[i])} '
-             f'{quantity.shown_unit}',
+             'value': f'{number(value)} {quantity.shown_unit}',
              'url': table['url'][row], 'report': table['report'][row]}
-            for distance, result, i in outliers[:_MOST_ROWS]
-            for row, quantity in [(result.rows[i], result.quantity)]]
+            for distance, row, quantity, value in outliers[:_MOST_ROWS]]
 
 
 def _refusal_rows(table: FleetTable) -> list[list[str]]:
     """Return the reasons of refusals: how often, in how many units, and an example."""
     failed = table.frame.assign(unit=table.unit)[table['outcome'] != 'done']
-    kinds = [reason_kind(row) for row in failed.to_dict('records')]
-    groups = sorted(failed.groupby(np.array(kinds, object)),
-                    key=lambda item: (-len(item[1]), item[0]))
+    kinds = np.array([reason_kind(row) for row in failed.to_dict('records')], object)
     # A recording without a serial number is of no unit.
-    return [[str(len(group)), str(len({*group['unit']} - {-1})), kind,
+    rows = [[str(len(group)), str(len({*group['unit']} - {-1})), kind,
              group['refused_by'].iloc[0] or '-', group['url'].iloc[0]]
-            for kind, group in groups[:_MOST_ROWS]]
+            for kind, group in failed.groupby(kinds)]
+    return sorted(rows, key=lambda row: (-int(row[0]), row[2]))[:_MOST_ROWS]

@@ -4,11 +4,11 @@
 Random effects: the mean and the spread of a coefficient over units, and what they say of each.
 
 The estimate of unit u is y = μ + b + e. Its own error e has the known standard deviation v, and
-the unit's departure b from the mean has the standard deviation τ, the spread. The spread
-maximises the restricted likelihood (REML; Viechtbauer 2005), and its interval is that of the
-Q-profile (Viechtbauer 2007). Few units hardly determine the spread. The errors of the mean and of
-a further unit therefore are those over all spreads by their restricted likelihood, with all
-spreads equally likely before (Gelman 2006).
+the unit's departure b from the mean has the standard deviation τ, the spread. At the spread the
+weighted squares about the mean are as large as expected (Paule and Mandel 1982), and at the ends
+of its interval as large as quantiles of χ² (Viechtbauer 2007). Few units hardly determine the
+spread. The errors of the mean and of a further unit therefore are those over all spreads by their
+restricted likelihood, with all spreads equally likely before (Gelman 2006).
 
 Variances that units share moderate each other: they have a scaled inverse χ² distribution over
 units, whose two parameters the units determine (Smyth 2004, section 6.2).
@@ -20,9 +20,9 @@ difference that no one would notice is no bad batch, however certain it is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
 from adxl_ros.model.constants import MAD_TO_STD
@@ -149,10 +149,9 @@ def _of_units(estimates: np.ndarray, std: np.ndarray, kept: np.ndarray) -> Rando
     y, variance = estimates[kept], std[kept] ** 2
     unit = max(float(np.ptp(y)), float(std[kept].max()), np.finfo(float).tiny)
     y, variance = (y - y.mean()) / unit, variance / unit ** 2
-    spread2 = reml_spread2(y, variance)
+    spread2, low, high = _spreads2(y, variance)
     mean, _ = weighted_mean(y, variance, spread2)
     mean_variance, prediction_variance = _variances(y, variance, mean)
-    low, high = _q_profile(y, variance)
     pooled = PooledCoefficient(
         mean=float(estimates[kept].mean() + unit * mean), mean_std=unit * mean_variance ** 0.5,
         spread=unit * spread2 ** 0.5, spread_low=unit * low ** 0.5,
@@ -190,40 +189,26 @@ def weighted_mean(y: np.ndarray, variance: np.ndarray, spread2: float) -> tuple[
     return float(weight @ y) / total, 1 / total
 
 
-def reml_spread2(y: np.ndarray, variance: np.ndarray) -> float:
+def _spreads2(y: np.ndarray, variance: np.ndarray) -> list[float]:
     """
-    Return the variance between units that maximises the restricted likelihood.
+    Return the variance between units, and the ends of its 90 % interval.
 
-    y: estimates, (n,); variance: their own variances, (n,).
+    Each is the one at which the weighted squares about the mean have a value: that which they are
+    expected to have, or a quantile of their χ² distribution; 0 where they are below it everywhere.
     """
-    def score(spread2: float) -> float:
-        weight = 1 / (variance + spread2)
-        mean, mean_variance = weighted_mean(y, variance, spread2)
-        squares = float(np.sum((weight * (y - mean)) ** 2))
-        return squares - float(weight.sum() - weight @ weight * mean_variance)
-
-    return _root(score, y, variance)
-
-
-def _q_profile(y: np.ndarray, variance: np.ndarray) -> list[float]:
-    """Return the 90 % interval of the variance between units."""
-    def excess(spread2: float, target: float) -> float:
+    def squares(spread2: float) -> float:
         mean, _ = weighted_mean(y, variance, spread2)
-        return float(np.sum((y - mean) ** 2 / (variance + spread2))) - target
+        return float(np.sum((y - mean) ** 2 / (variance + spread2)))
 
-    return [_root(partial(excess, target=float(scipy.special.chdtri(len(y) - 1, chance))), y,
-                  variance) for chance in (0.05, 0.95)]
-
-
-def _root(falling: Callable[[float], float], y: np.ndarray, variance: np.ndarray) -> float:
-    """Return the variance between units at which a function is 0; 0 if it is below everywhere."""
-    floor = 1e-12 * float(np.var(y) + variance.mean())
-    if floor == 0 or falling(floor) <= 0:
-        return 0.0
-    high = float(np.var(y, ddof=1)) + floor
-    while falling(high) > 0:
-        high *= 2
-    return float(scipy.optimize.brentq(falling, floor, high, rtol=1e-12, xtol=1e-300))
+    floor, freedom, spreads2 = 1e-12 * float(np.var(y) + variance.mean()), len(y) - 1, []
+    for target in (freedom, *scipy.special.chdtri(freedom, [0.05, 0.95])):
+        # No weight is above 1/spread2, so that the squares are below the target at the high end.
+        high = floor + len(y) * float(np.var(y)) / target
+        is_below = floor == 0 or squares(floor) <= target
+        spreads2.append(0.0 if is_below else float(scipy.optimize.brentq(
+            lambda spread2, target=target: squares(spread2) - target, floor, high,
+            rtol=1e-12, xtol=1e-300)))
+    return spreads2
 
 
 class BadBatch(NamedTuple):
@@ -236,11 +221,15 @@ class BadBatch(NamedTuple):
     high: float
 
 
-def by_prefix(serials: Sequence[str]) -> dict[str, np.ndarray]:
-    """Return the units whose serial numbers begin alike, (m,) bool each, by this beginning."""
-    prefixes = {serial[:length] for serial in serials for length in range(1, len(serial))}
-    return {prefix: np.array([serial.startswith(prefix) for serial in serials])
-            for prefix in sorted(prefixes)}
+def by_prefix(names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Return the groups whose names begin alike, (m,) bool each, by the shortest beginning."""
+    counts = Counter(name[:length] for name in names for length in range(1, len(name) + 1))
+    groups: dict[bytes, tuple[str, np.ndarray]] = {}
+    for prefix in sorted(counts, key=len):
+        if MIN_GROUP <= counts[prefix] < len(names):
+            members = np.array([name.startswith(prefix) for name in names])
+            groups.setdefault(members.tobytes(), (prefix, members))
+    return dict(groups.values())
 
 
 def bad_batch(serials: Sequence[str], level: np.ndarray, tolerance: float, tests: int
@@ -252,7 +241,7 @@ def bad_batch(serials: Sequence[str], level: np.ndarray, tolerance: float, tests
     """
     # The larger part of a fleet is what the others are compared with.
     groups = {prefix: members for prefix, members in by_prefix(serials).items()
-              if MIN_GROUP <= members.sum() <= len(serials) / 2}
+              if members.sum() <= len(serials) / 2}
     best, lowest = None, CHANCE / (max(len(groups), 1) * tests)
     for prefix, members in groups.items():
         test = scipy.stats.ttest_ind(level[members], level[~members], equal_var=False)

@@ -11,8 +11,9 @@ each worker once, with the texts of all parameter files: a worker needs no acces
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import datetime
 from functools import lru_cache
 import hashlib
 import json
@@ -25,7 +26,6 @@ from adxl_ros import process
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
-from adxl_ros.files.recording_columns import NO_UNIT
 from adxl_ros.model.constants import AXES
 import yaml
 
@@ -188,9 +188,6 @@ def as_table(rows: Iterable[Row]) -> Any:
 TASKS = ('check', 'noise', 'fit', 'diagnose')
 """All tasks, in the order in which they run."""
 
-_CACHED_CALIBRATIONS = 8192
-"""Stored calibrations that are kept after they were read. Chosen: 200 units for years."""
-
 
 class ParameterText(NamedTuple):
     """A parameter file by its content."""
@@ -214,8 +211,7 @@ class Recipe:
     # Parameter file of all recordings; None takes the calibration of each
     params: ParameterText | None
     stated: dict[str, ParameterText]  # Parameter files that a manifest names, by their names there
-    # Names and texts of the calibrations, by the folder of the unit in the store
-    store: dict[str, tuple[tuple[str, str], ...]]
+    store: dict[str, list[ParameterText]]  # The stored calibrations, by serial number
     reading: ReadingOptions = AS_IT_IS  # How recordings are to be read
 
     def parameters_of(self, serial: str, date: str, stated: str) -> ParameterText:
@@ -229,14 +225,8 @@ class Recipe:
             return self.stated[stated]
         if self.params is not None:
             return self.params
-        if not date:
-            return _NOMINAL
-        files = self.store.get(calibration_store.unit_folder('', serial).name, ()) \
-            if serial not in ('', NO_UNIT) else ()
-        read = filter(None, (_stored_parameters(name, text) for name, text in files))
-        return max((parameters for unit, parameters in read
-                    if unit == serial and '' < parameters.date <= date),
-                   key=lambda parameters: parameters.date, default=_NOMINAL)
+        return max((stored for stored in self.store.get(serial, ()) if '' < stored.date <= date),
+                   key=lambda stored: stored.date, default=_NOMINAL)
 
     def digest(self, chosen: ParameterText, serial: str) -> str:
         """Return the SHA-256 of all that a row follows from, beside the content."""
@@ -248,12 +238,10 @@ def sha256_of(*values: object) -> str:
     return hashlib.sha256(json.dumps(values).encode()).hexdigest()
 
 
-def age_days(chosen: ParameterText, date: str) -> float | None:
-    """Return the age of a calibration at a date, days."""
-    if not (chosen.date and date):
-        return None
-    begun, calibrated = map(datetime.fromisoformat, (date, chosen.date))
-    return (begun - calibrated) / timedelta(days=1)
+def as_date(text: str) -> str:
+    """Return a date of ISO 8601 in UTC; empty if the text is none. UTC is the usual zone."""
+    date = calibration_store.date_in(text.strip())
+    return date.isoformat() if date else ''
 
 
 def task_names(text: str) -> tuple[str, ...]:
@@ -284,29 +272,21 @@ def _read(name: str) -> ParameterText:
                          date.isoformat() if date else '')
 
 
-def _stored(folder: str) -> dict[str, tuple[tuple[str, str], ...]]:
-    """Return names and texts of all calibrations of a store, by the folder of the unit."""
-    root = Path(folder)
+def _stored(folder: str) -> dict[str, list[ParameterText]]:
+    """Return the calibrations of a store by serial number; a file without one is left out."""
+    stored: dict[str, list[ParameterText]] = {}
     try:
-        return {unit.name: tuple((path.name, path.read_text(encoding='utf-8'))
-                                 for path in sorted(unit.glob('*.yaml')))
-                for unit in sorted(root.iterdir()) if unit.is_dir()} if root.is_dir() else {}
+        for path in sorted(Path(folder).glob('*/*.yaml')):
+            text = path.read_text(encoding='utf-8')
+            with suppress(yaml.YAMLError, KeyError, TypeError, AttributeError):
+                keys = yaml.load(text, getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+                                 )['/**']['ros__parameters']
+                made = keys['provenance']
+                stored.setdefault(keys['sensor']['serial'], []).append(
+                    ParameterText(path.name, text, made['id'], as_date(made['date'])))
     except (OSError, ValueError) as error:
         raise UserError(f'{folder}: cannot be read: {one_line(error)}') from None
-
-
-@lru_cache(maxsize=_CACHED_CALIBRATIONS)
-def _stored_parameters(name: str, text: str) -> tuple[str, ParameterText] | None:
-    """Return serial number and content of a stored file; None for one that cannot be used."""
-    try:
-        keys = yaml.load(text, getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
-                         )['/**']['ros__parameters']
-        provenance = keys['provenance']
-        date = calibration_store.date_in(provenance['date'])
-        return keys['sensor']['serial'], ParameterText(
-            name, text, provenance['id'], date.isoformat() if date else '')
-    except (yaml.YAMLError, KeyError, TypeError, AttributeError):
-        return None
+    return stored
 
 
 @lru_cache(maxsize=1)

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files.atomic_write import atomic_path
-from adxl_ros.fleet.inputs import as_date, Source, stated_by
+from adxl_ros.fleet.inputs import Source, stated_by
 from adxl_ros.fleet.row import arrow_schema, as_table, Recipe, Row, TABLE
 from adxl_ros.fleet.task import make_row, refused, Result, StagingError, TaskCrashed
 from adxl_ros.workers import Finished, finished_tasks, Pool, write
@@ -43,10 +43,7 @@ _SECONDS = {'check': (0.02, 30.0), 'noise': (0.05, 60.0), 'fit': (1.0, 100.0),
 """Usual run time of each task: of any recording, s, and for each GB, s. Measured on one core with
 CSV files of 416 s at 250 Hz; replaced by the run times of earlier rows where there are some."""
 _IDENTITY = ('url', 'serial', 'date', 'date_source', 'calibration_id', 'calibration_age_days')
-"""Columns of a recording whose content is that of another row."""
-_COST = ('seconds', 'memory_mb', 'worker')
-"""Columns of what a row costs. A copy costs next to nothing; a file that is read again has the
-cost of its tasks, by which a further run is estimated."""
+"""Columns of a recording whose content is that of another row, which has its other values."""
 
 
 @contextmanager
@@ -150,45 +147,37 @@ class Plan(NamedTuple):
     todo: list[Source]  # Recordings to work on
     done: int  # Number of recordings that have their row
     outside: int  # Number of recordings that --since, --limit or --only-failed leave out
-    # Serial numbers of the recordings to work on as far as they are known before; else empty
-    serials: list[str]
     size_bytes: int  # Size of the recordings to work on
     core_hours: float  # Expected run time on one core, h
 
 
-class Selection(NamedTuple):
-    """Which recordings a run works on."""
+def plan(sources: Sequence[Source], recipe: Recipe, results: Results, only_failed: bool = False,
+         since: str = '', limit: int | None = None) -> Plan:
+    """
+    Decide which recordings are to be worked on.
 
-    only_failed: bool = False  # Whether only those whose row is a refusal or a crash
-    since: str = ''  # Begin of the period, ISO 8601, UTC; empty for all
-    limit: int | None = None  # Largest number; None for all
-
-
-def plan(sources: Sequence[Source], recipe: Recipe, results: Results,
-         selection: Selection) -> Plan:
-    """Decide which recordings are to be worked on."""
-    chosen = _since(sources, selection.since, results) if selection.since else sources
-    entries = {source.url: results.newest.get(source.url) for source in chosen}
-    if selection.only_failed:
-        todo, done = [source for source in chosen if (entry := entries[source.url])
-                      and entry.row['outcome'] != 'done'], 0
+    only_failed: whether only those whose row is a refusal or a crash; since: begin of the period,
+    ISO 8601, UTC; limit: largest number.
+    """
+    chosen = _since(sources, since, results) if since else sources
+    newest = results.newest
+    if only_failed:
+        todo, done = [source for source in chosen if source.url in newest
+                      and newest[source.url].row['outcome'] != 'done'], 0
     else:
-        todo = [source for source in chosen if not is_done(source, entries[source.url], recipe)]
+        todo = [source for source in chosen
+                if not is_done(source, newest.get(source.url), recipe)]
         done = len(chosen) - len(todo)
-    todo = todo[:selection.limit]
-    serials = [source.serial or ((entry := entries[source.url]) and entry.row['serial']) or ''
-               for source in todo]
+    todo = todo[:limit]
     size_bytes = sum(source.size_bytes or 0 for source in todo)
-    return Plan(todo, done, len(sources) - done - len(todo), serials, size_bytes,
+    return Plan(todo, done, len(sources) - done - len(todo), size_bytes,
                 _expected_s(len(todo), size_bytes, recipe, results) / 3600)
 
 
 def _since(sources: Sequence[Source], since: str, results: Results) -> list[Source]:
     """Return the recordings that began at a date or later, and those without a date."""
     dates = {url: entry.row['date'] for url, entry in results.newest.items()}
-    # The server of an object states truly when it was written, which is after it began.
-    unread = [source for source in sources if not (source.date or dates.get(source.url))
-              and ('://' not in source.url or (source.modified or since) >= since)]
+    unread = [source for source in sources if not (source.date or dates.get(source.url))]
     dates |= {source.url: date for source, (_, date) in zip(unread, stated_by(unread))}
     return [source for source in sources
             if (source.date or dates.get(source.url) or source.modified or since) >= since]
@@ -232,30 +221,16 @@ def _written(end: Finished, recipe: Recipe, results: Results) -> Row:
     error = end.error
     if isinstance(error, UserError):
         raise error
-    if error is None:
-        result = end.value
-    elif isinstance(error, TaskCrashed):
-        result = error.args[0]
+    if error is None or isinstance(error, TaskCrashed):
+        result = error.args[0] if error else end.value
     elif isinstance(error, StagingError):
         result = refused(recipe, source, one_line(error).removeprefix(f'{source.url}: '))
     else:
         result = refused(recipe, source, f'{type(error).__name__}: {one_line(error)} '
                          f'({end.attempts} attempts)', 'crashed')
-    # What a row costs in this run need not be what its tasks took.
-    spent = {name: result.row[name] for name in _COST}
     if result.is_known:
-        # The content has a row already, and this recording gets the values of that row.
         content = _read(results.folder / _ROWS / results.known[result.row['key']])
         assert content is not None, 'rows are never removed'
-        row = content['row']
-        names = _IDENTITY if row['url'] == source.url else (*_IDENTITY, *_COST)
-        result = result._replace(row={**row, **{name: result.row[name] for name in names}})
-    return {**results.put(result, end.attempts), **spent}
-
-
-def since_text(text: str) -> str:
-    """Return the date of --since, ISO 8601 in UTC; raise `UserError` for another text."""
-    date = as_date(text)
-    if not date:
-        raise UserError(f'--since {text}: expected a date, for example 2026-11-01')
-    return date
+        identity = {name: result.row[name] for name in _IDENTITY}
+        result = result._replace(row={**content['row'], **identity})
+    return results.put(result, end.attempts)

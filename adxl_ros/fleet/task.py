@@ -10,9 +10,9 @@ other. A task that refuses leaves its reason. What a recording does not hold is 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager, ExitStack, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-import fcntl
+from datetime import datetime, timedelta
 from functools import cached_property
 import json
 import os
@@ -21,19 +21,17 @@ from resource import getrusage, RUSAGE_SELF
 import shlex
 import shutil
 import tempfile
-from time import monotonic
+from time import monotonic, time
 import traceback
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.calibration_store import sha256
-from adxl_ros.files.csv_file import NoNumbers
 from adxl_ros.files.recording_columns import NO_UNIT, recorded_unit, Recording
 from adxl_ros.fleet import inputs
-from adxl_ros.fleet.inputs import begin_of, is_manifest, Source
+from adxl_ros.fleet.inputs import begin_of, Source
 from adxl_ros.fleet.row import (
-    age_days,
     code_version,
     empty_row,
     finite,
@@ -58,6 +56,8 @@ if TYPE_CHECKING:
 
 _SPARE_MB = 64
 """Space that stays free, MB. Chosen: a task writes some MB."""
+_LEFT_S = 86400.0
+"""Age from which a temporary folder is that of a killed worker, s. Chosen: no task takes a day."""
 
 
 class StagingError(Exception):
@@ -73,33 +73,19 @@ class Staged(NamedTuple):
 
 
 @contextmanager
-def locked(folder: Path, how: int = fcntl.LOCK_EX) -> Iterator[None]:
-    """Lock a folder as long as the block, or this process, lasts; raise `OSError` if it cannot."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, how)
-        yield
-    finally:
-        os.close(descriptor)
-
-
-@contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """Yield an empty folder; those that killed workers left behind, unlocked, are removed."""
+    """Yield an empty folder; those that killed workers left behind a day ago are removed."""
     root = Path(tempfile.gettempdir(), f'adxl_ros_fleet_{os.getuid()}')
-    with ExitStack() as stack:
-        try:
-            root.mkdir(mode=0o700, exist_ok=True)
-            with locked(root):
-                for left in root.iterdir():
-                    with suppress(OSError), locked(left, fcntl.LOCK_EX | fcntl.LOCK_NB):
-                        shutil.rmtree(left)
-                folder = Path(stack.enter_context(
-                    tempfile.TemporaryDirectory(dir=root, ignore_cleanup_errors=True)))
-                stack.enter_context(locked(folder))
-        except OSError as error:
-            raise StagingError(f'{root}: no temporary folder: {error.strerror}') from None
-        yield folder
+    try:
+        root.mkdir(mode=0o700, exist_ok=True)
+        for left in root.iterdir():
+            if time() - left.stat().st_mtime > _LEFT_S:
+                shutil.rmtree(left, ignore_errors=True)
+        folder = tempfile.TemporaryDirectory(dir=root, ignore_cleanup_errors=True)
+    except OSError as error:
+        raise StagingError(f'{root}: no temporary folder: {error.strerror}') from None
+    with folder as name:
+        yield Path(name)
 
 
 def stage(source: Source, folder: Path) -> Staged:
@@ -107,7 +93,7 @@ def stage(source: Source, folder: Path) -> Staged:
     url = source.url
     try:
         fs, path = inputs.file_system(url, source.secret)
-    except inputs.Unreachable as reason:
+    except UserError as reason:
         raise StagingError(one_line(reason)) from None
     before = inputs.look_up(fs, path)
     if before.fault:
@@ -204,8 +190,6 @@ def _in_folder(recipe: Recipe, source: Source, earlier: frozenset[str], folder: 
     try:
         first = next(recording.blocks(
             staged.path, 1, replace(recipe.reading, drop_bad_stamps=True)), None)
-    except NoNumbers as error:
-        fault = f'{one_line(error)}; a manifest needs a column url'
     except UserError as error:
         fault = one_line(error)
     recorded = first.stream_info.serial if first else NO_UNIT
@@ -225,8 +209,7 @@ def _in_folder(recipe: Recipe, source: Source, earlier: frozenset[str], folder: 
         params.write_text(parameters.text, encoding='utf-8')
     job = _Job(recipe, source, staged, parameters, str(params) if params else None, row)
     if fault:
-        job.refuse('read', 'is a manifest; name it itself, not its folder'
-                   if is_manifest(staged.path) else job.plain(fault))
+        job.refuse('read', job.plain(fault))
     elif is_other:
         job.refuse('read', f'states the serial {recorded}, but the manifest says {source.serial}')
     else:
@@ -237,13 +220,14 @@ def _in_folder(recipe: Recipe, source: Source, earlier: frozenset[str], folder: 
 def _identity(recipe: Recipe, source: Source, staged: Staged | None, serial: str,
               date: tuple[str, str], parameters: ParameterText) -> Row:
     """Return the columns that do not depend on the tasks."""
-    age = age_days(parameters, date[0])
+    begun, made = (datetime.fromisoformat(text) if text else None
+                   for text in (date[0], parameters.date))
     return {**empty_row(), 'url': source.url, 'hash': staged and staged.content,
             'size_bytes': staged.size_bytes if staged else source.size_bytes,
             'serial': serial if serial not in ('', NO_UNIT) else None,
             'date': date[0] or None, 'date_source': date[1] if date[0] else None,
             'tasks': list(recipe.tasks), 'calibration_id': parameters.calibration_id or None,
-            'calibration_age_days': finite(age),
+            'calibration_age_days': (begun - made) / timedelta(days=1) if begun and made else None,
             'validity': None if parameters.calibration_id else 'not calibrated',
             'version': package_version(), 'code': recipe.code}
 

@@ -103,12 +103,10 @@ class Trends:
     slope: np.ndarray
     slope_std: np.ndarray
     freedom: np.ndarray  # Degrees of freedom of the slopes, (m,)
-    # period_time, period_value, period_std: A point of the line in each period, and the standard
-    # deviation of its value, (k,). The point does not depend on the slope: it is the same for a
-    # line without one.
+    # period_time, period_value: A point of the line in each period, (k,). It is the same for a
+    # line without a slope.
     period_time: np.ndarray
     period_value: np.ndarray
-    period_std: np.ndarray
     squares: np.ndarray  # Weighted squares of the residuals of each unit, (m,)
     residual: np.ndarray  # Residuals over the expected scatter, (n,)
     log_likelihood: float  # Restricted log-likelihood of the scatter
@@ -135,8 +133,7 @@ def fit_trends(recordings: Recordings) -> Trends:
     factor = np.sqrt(variance * widening)
     return replace(
         fit, scatter=replace(scatter, widening=widening), level_std=factor * fit.level_std,
-        slope_std=factor * fit.slope_std, freedom=np.where(sums.has_slope, freedom, np.nan),
-        period_std=factor[sums.unit_of_period] * fit.period_std)
+        slope_std=factor * fit.slope_std, freedom=np.where(sums.has_slope, freedom, np.nan))
 
 
 class _Sums:
@@ -190,8 +187,7 @@ class _Sums:
             np.full(len(a), np.inf),
             self.centre_time[unit] + (1 - share) * (b / a)[unit] + share * wt / w,
             self.centre_value[unit] + (1 - share) * (p / a)[unit] + share * wy / w,
-            np.sqrt(shared + (1 - share) ** 2 / a[unit]), squares, residual,
-            float(log_likelihood))
+            squares, residual, float(log_likelihood))
 
 
 def _shared_scatter(sums: _Sums) -> Scatter:

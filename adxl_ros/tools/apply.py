@@ -32,13 +32,12 @@ _DIGITS = 12
 """Significant digits of an estimate (chosen: rounding is below a millionth of the noise)."""
 
 _COUNTED = {
-    'unsolved': ('have no solution: their cells are empty',
-                 'have no solution: they are left out'),
-    'outside': ('lie outside of the validity range (temperature or force): their standard '
-                'deviations are raised',) * 2,
-    'at_rail': ('have the ADC at its rail: their standard deviations are inf',
-                f'have the ADC at its rail: their variances are {UNMEASURED_VARIANCE:g}')}
-"""What is said of counted samples in a table, and in a bag, by the field of `Estimates`."""
+    'unsolved': 'have no solution: their cells are empty, and a bag leaves them out',
+    'outside': 'lie outside of the validity range (temperature or force): their standard '
+               'deviations are raised',
+    'at_rail': 'have the ADC at its rail: their standard deviations are inf, in a bag '
+               f'their variances {UNMEASURED_VARIANCE:g}'}
+"""What is said of counted samples, by the field of `Estimates`."""
 
 _EXAMPLES = {
     'acceleration and tilt by a calibration': 'recording.csv --params unit.yaml -o tilt.csv',
@@ -75,8 +74,8 @@ def apply(options: argparse.Namespace) -> int:
     blocks = recording.blocks(options.recording, _BLOCK_ROWS, cli.reading_options(options))
     first = next(blocks, None)
     sensor, measured = _sensor(options.params, first)
-    is_table = Path(options.output).suffix == '.csv'
-    with (_table if is_table else _bag)(options.output) as write, cli.progress('apply') as show:
+    opened = (_table if Path(options.output).suffix == '.csv' else _bag)(options.output)
+    with opened as write, cli.progress('apply') as show:
         for block, estimates in _estimated(options, sensor, first, blocks):
             write(block, estimates)
             explained = ~(estimates.unsolved | estimates.at_rail)
@@ -85,10 +84,9 @@ def apply(options: argparse.Namespace) -> int:
             for name in _COUNTED:
                 counts[name] += int(getattr(estimates, name).sum())
             show(block.done)
-    for name, statements in _COUNTED.items():
+    for name, statement in _COUNTED.items():
         if counts[name]:
-            cli.note(f'apply: {counts[name]} of {counts["rows"]} samples '
-                     f'{statements[0 if is_table else 1]}')
+            cli.note(f'apply: {counts[name]} of {counts["rows"]} samples {statement}')
     if beyond.describe(sensor):
         cli.note(f'apply: {beyond.describe(sensor)}')
     if block is not None:

@@ -35,35 +35,19 @@ _SHOWS_HEAD = ('effect', 'from', 'typical', '')
 _SHOWS_COLUMNS = (24, 16, 14)
 _MOST_SHOWN = 1_000_000
 """Samples up to which it is listed what `diagnose` could show. Chosen: a minute, and 1 GB."""
-_MOST_DETAILED = 3
-"""Recordings up to which the details of sound ones are printed, too. Chosen: a screen."""
 _LABEL_COLUMNS = 12
 """Columns of the label of a line below a recording."""
 
 
 def _lines(results: list[Findings]) -> list[str]:
-    """Return a line for each recording, then why some are not sound, 79 columns at most."""
+    """Return a line for each recording, then the details of one, or of those with a fault."""
     rows = []
     for name, *cells, verdict in (_HEAD, *map(_cells, results)):
-        short = name if len(name) < _NAME_COLUMNS else f'{name[:_NAME_COLUMNS - 2]}…'
+        short = textwrap.shorten(name, _NAME_COLUMNS - 1, placeholder='…')
         rows.append(' ' + row((short, *cells, f'  {verdict}'), _COLUMNS))
-    detailed = results if len(results) <= _MOST_DETAILED else \
-        [result for result in results if not result.is_sound]
-    for result in detailed:
-        rows += ['', result.path, *_details(result)]
-        if result.shows:
-            shown = [cells[:3] for cells in result.shows if not cells[3]]
-            rows += ['', f'  {len(shown)} of {len(result.shows)} effects could show to diagnose',
-                     *('  ' + row(cells, _SHOWS_COLUMNS) for cells in (_SHOWS_HEAD[:3], *shown))]
-            hidden: dict[str, list[str]] = {}
-            for effect, _, _, missing in result.shows:
-                hidden.setdefault(missing, []).append(effect)
-            hidden.pop('', None)
-            rows += ['', '  the others cannot show'] * bool(hidden)
-            for missing, effects in hidden.items():
-                rows += [*wrapped(f'  {missing}', 2), *wrapped(f'    {", ".join(effects)}', 4)]
-    if len(detailed) < len(results):
-        rows += ['', '--report DIR and --json have the details of all recordings.']
+    for result in results:
+        if len(results) == 1 or not result.is_sound:
+            rows += ['', result.path, *_details(result)]
     return [*rows, '']
 
 
@@ -103,6 +87,14 @@ def _details(result: Findings) -> list[str]:
             f'  {label:{_LABEL_COLUMNS - 3}} {text.removesuffix(paste).rstrip()}', COLUMNS,
             subsequent_indent=_LABEL_COLUMNS * ' ', break_on_hyphens=False)
         rows += [_LABEL_COLUMNS * ' ' + paste] if paste else []
+    shown = [cells for cells in result.shows if not cells[3]]
+    if result.shows:
+        rows += ['', f'  {len(shown)} of {len(result.shows)} effects could show to diagnose',
+                 *('  ' + row(cells, _SHOWS_COLUMNS) for cells in (_SHOWS_HEAD, *shown)),
+                 '', '  the others cannot show']
+    for missing in dict.fromkeys(cells[3] for cells in result.shows if cells[3]):
+        effects = ', '.join(cells[0] for cells in result.shows if cells[3] == missing)
+        rows += wrapped(f'  {missing}: {effects}', 4)
     return rows
 
 
@@ -184,11 +176,12 @@ def _with_what_shows(result: Findings, options: argparse.Namespace, reading: Rea
     if not result.is_sound or not (options.urdf or any(
             a.tool == 'diagnose' and a.is_able for a in result.abilities)):
         return result
-    sim = None
+    if result.contents is None or result.contents.samples > _MOST_SHOWN:
+        return replace(result, remarks=(
+            *result.remarks, 'what diagnose could show is listed for recordings of '
+            f'{_MOST_SHOWN} samples at most; check a part'))
+    reason, sim = 'against the joints of the robot', None
     try:
-        if result.contents is None or result.contents.samples > _MOST_SHOWN:
-            raise UserError('what diagnose could show is listed for recordings of '
-                            f'{_MOST_SHOWN} samples at most; check a part')
         read = recording.read(result.path, reading)
         sensor, _ = measure_unstated(load_sensor(options.params, read), read)
         if options.urdf:
@@ -196,21 +189,23 @@ def _with_what_shows(result: Findings, options: argparse.Namespace, reading: Rea
             result = replace(result, remarks=(*result.remarks, robot.text()))
             sim = robot.as_motion()
         shown = what_shows([read], sensor, sim)
+        if isinstance(shown, DataFault):
+            reason = shown.message
+        else:
+            scale_v_per_g = float(sensor.scale_v_per_g.mean())
+            effects = sorted(by_effect(shown).values(),
+                             key=lambda effect: (not effect.shows, effect.effect))
+            result = replace(result, shows=tuple(
+                shows_row(effect, scale_v_per_g) for effect in effects))
     except UserError as error:
-        if options.urdf and sim is None:
-            return replace(result, faults=(*result.faults, one_line(error)))
-        return replace(result, remarks=(*result.remarks, one_line(error)))
-    fault = shown.message if isinstance(shown, DataFault) else ''
-    if options.urdf or fault:
-        ability = Ability('diagnose', not fault, fault or 'against the joints of the robot')
+        reason = one_line(error)
+        if options.urdf:
+            result = replace(result, faults=(*result.faults, reason))
+    if options.urdf or not result.shows:
+        ability = Ability('diagnose', bool(result.shows), reason)
         result = replace(result, abilities=tuple(
             ability if a.tool == ability.tool else a for a in result.abilities))
-    if isinstance(shown, DataFault):
-        return result
-    scale_v_per_g = float(sensor.scale_v_per_g.mean())
-    return replace(result, shows=tuple(
-        shows_row(effect, scale_v_per_g) for effect in sorted(
-            by_effect(shown).values(), key=lambda effect: (not effect.shows, effect.effect))))
+    return result
 
 
 def _next_command(results: list[Findings], options: argparse.Namespace) -> str:

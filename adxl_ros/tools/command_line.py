@@ -8,7 +8,6 @@ import argparse
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from difflib import get_close_matches
 from functools import partial
 import math
 import os
@@ -18,7 +17,7 @@ import signal
 import sys
 import textwrap
 from types import FrameType
-from typing import Protocol, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
@@ -31,7 +30,7 @@ from adxl_ros.files.column_mapping import (
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model import coefficients
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Coefficient, Effect
+from adxl_ros.model.effects.base import Effect
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import ended_by_closed_output, package_version
 from adxl_ros.report.quantities import column_unit
@@ -138,28 +137,27 @@ def reading_options(options: argparse.Namespace) -> ReadingOptions:
                         f'{_HIGHEST_RATE_HZ:g}')
     return ReadingOptions(
         options.topic, parse_mapping(options.columns) if options.columns else None,
-        _counts('--lsb-per-g', options.lsb_per_g, True),
-        _counts('--lsb-at-0g', options.lsb_at_0g, False), options.rate, options.drop_bad_stamps,
-        parse_mounting(options.axes) if options.axes else None)
+        _counts('--lsb-per-g', options.lsb_per_g, 0.0),
+        _counts('--lsb-at-0g', options.lsb_at_0g, -math.inf), options.rate,
+        options.drop_bad_stamps, parse_mounting(options.axes) if options.axes else None)
 
 
 def reading_text(options: argparse.Namespace) -> str:
     """Return the given options for a command line that reads the same recording."""
-    values = {'--topic': options.topic, '--columns': options.columns,
-              '--lsb-per-g': options.lsb_per_g, '--lsb-at-0g': options.lsb_at_0g,
-              '--rate': '' if options.rate is None else f'{options.rate:g}',
-              '--axes': options.axes}
-    words = [word for option, value in values.items() if value for word in (option, value)]
+    words = []
+    for name in ('topic', 'columns', 'lsb_per_g', 'lsb_at_0g', 'rate', 'axes'):
+        if value := getattr(options, name):
+            words += [f'--{name.replace("_", "-")}', str(value)]
     words += ['--drop-bad-stamps'] * options.drop_bad_stamps
     return f' {shlex.join(words)}' if words else ''
 
 
-def _counts(option: str, text: str, is_positive: bool) -> tuple[float, ...]:
+def _counts(option: str, text: str, above: float) -> tuple[float, ...]:
     try:
         values = tuple(float(word) for word in text.split(',')) if text else ()
     except ValueError:
         values = (math.nan,)
-    if not all(math.isfinite(value) and (value > 0 or not is_positive) for value in values):
+    if not all(above < value < math.inf for value in values):
         raise UserError(f'{option} {text}: expected counts, for example 16384 or '
                         '16384,16384,16500')
     return values
@@ -168,13 +166,10 @@ def _counts(option: str, text: str, is_positive: bool) -> tuple[float, ...]:
 SYNTAX = ('NAME alone has typical values, KEY=VALUE sets a parameter for all its axes, '
           'KEY.AXIS=VALUE for one; parameters without a value are neutral')
 """What an option may be, for help texts."""
-_SIMILARITY = 0.4
-"""Smallest similarity of a suggested name, as `difflib` counts it; chosen."""
 
 
 def with_effects(sensor: Sensor, texts: Sequence[str]) -> Sensor:
     """Add effects to a sensor, or change their parameters."""
-    stated: dict[Coefficient, str] = {}
     for text in texts:
         name, _, rest = text.partition(':')
         try:
@@ -185,36 +180,29 @@ def with_effects(sensor: Sensor, texts: Sequence[str]) -> Sensor:
             if rest else coefficients.typical(effect, sensor.axes)
         for part in filter(None, rest.split(',')):
             key, _, number = (word.strip() for word in part.partition('='))
-            coefficient = Coefficient(name, *key.split('.', 1))
-            if coefficient in stated:
-                raise UserError(f'--effect {text}: {key} of {name} is stated twice, also in '
-                                f'{stated[coefficient]}; keep one')
-            stated[coefficient] = text
-            values[coefficient.parameter] = _value(effect, values, sensor.axes, key, number, text)
+            parameter, _, axis = key.partition('.')
+            values[parameter] = _value(effect, values, sensor.axes, parameter, axis, number, text)
         effects = sensor.effects if name in sensor.effects else (*sensor.effects, name)
         sensor = replace(sensor, effects=effects, values={**sensor.values, name: values})
     return sensor
 
 
-def _value(effect: Effect, values: Mapping[str, np.ndarray], axes: str, key: str, number: str,
-           text: str) -> np.ndarray:
+def _value(effect: Effect, values: Mapping[str, np.ndarray], axes: str, name: str, axis: str,
+           number: str, text: str) -> np.ndarray:
     """Return one parameter with a new value for all its axes or one; `text` is the option."""
-    name, _, axis = key.partition('.')
     parameters = {parameter.name: parameter for parameter in effect.parameters}
     if name not in parameters:
-        near = get_close_matches(name, parameters, 1, _SIMILARITY) or [*parameters]
-        raise UserError(f'--effect {text}: {effect.name} has no parameter {name!r}; did you mean '
-                        f'{near[0]}?')
+        raise UserError(f'--effect {text}: {effect.name} has no parameter {name!r}, but '
+                        f'{", ".join(parameters)}')
     parameter = parameters[name]
     try:
         value = float(number)
     except ValueError:
-        raise UserError(f'--effect {text}: {number!r} is not a number; {name} is in '
-                        f'{parameter.unit}, written without the unit') from None
+        value = math.nan
     if not parameter.lower <= value <= parameter.upper:
-        raise UserError(f'--effect {text}: {value:g} {parameter.unit} is outside '
-                        f'{parameter.lower:g} to {parameter.upper:g} {parameter.unit}; a typical '
-                        f'{name} is {parameter.scale:g}')
+        raise UserError(f'--effect {text}: {number!r} is not a number from {parameter.lower:g} to '
+                        f'{parameter.upper:g} ({parameter.unit}); a typical {name} is '
+                        f'{parameter.scale:g}')
     if not (parameter.axes or axis):
         return np.array(value)
     chosen = [i for i, a in enumerate(axes) if a in parameter.axes and axis in ('', a)]
@@ -248,7 +236,7 @@ def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace],
         note(f'{parser.prog}: {" ".join(str(error).split())}', error.paste)
         return 1
     except KeyboardInterrupt:
-        note(f'{parser.prog}: interrupted; nothing was written')
+        note(f'{parser.prog}: interrupted')
         return 130
 
 
@@ -279,7 +267,7 @@ def check_least(options: argparse.Namespace, **least: float) -> None:
     for name, lowest in least.items():
         value = getattr(options, name)
         if value is not None and not value >= lowest:
-            raise UserError(f'--{name} {value}: must be at least {lowest:g}')
+            raise UserError(f'--{name.replace("_", "-")} {value}: must be at least {lowest:g}')
 
 
 def refuse_same_file(output: str, source: str) -> None:
@@ -308,16 +296,13 @@ def read(tool: str, path: str, reading: ReadingOptions = AS_IT_IS) -> Recording:
     return read
 
 
-class ShowDone(Protocol):
-    """Shows how much is done."""
-
-    def __call__(self, done: float, stage: str = '') -> None:
-        """Show a fraction."""
-
-
 @contextmanager
-def progress(title: str) -> Iterator[ShowDone]:
-    """Show a progress bar on a terminal where rich is installed, else nothing."""
+def progress(title: str) -> Iterator[Callable[..., None]]:
+    """
+    Show a progress bar on a terminal where rich is installed, else nothing.
+
+    Yield what takes the share that is done, and the name of the stage.
+    """
     drawn = bar(sys.stderr, _BAR_COLUMNS, '{task.percentage:3.0f} %', 'TimeElapsedColumn',
                 'TimeRemainingColumn')
     if drawn is None:
@@ -327,7 +312,6 @@ def progress(title: str) -> Iterator[ShowDone]:
         task = drawn.add_task(title, total=1.0)
 
         def show(done: float, stage: str = '') -> None:
-            """Show a fraction; see `ShowDone`."""
             # A plan that grows does not take the bar back.
             drawn.update(task, completed=max(done, drawn.tasks[task].completed),
                          description=stage or title)

@@ -82,20 +82,13 @@ def _details() -> str:
 def diagnose(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     begin_s = monotonic()
-    count = len(options.recording)
-    for is_wrong, message in (
-            (options.seed < 0, f'--seed {options.seed}: must not be negative'),
-            (not 0 < options.material < float('inf'),
-             f'--material {options.material:g}: must be positive'),
-            (options.self_check < 0, f'--self-check {options.self_check}: must not be negative'),
-            (options.sim and count > 1,
-             f'--sim {options.sim}: goes with one recording, but {count} are given'),
-            (options.urdf and (options.sim or count > 1),
-             f'--urdf {options.urdf}: goes with one recording, and without --sim'),
-            (options.align and not (options.sim or options.urdf),
-             '--align: shifts --sim or a robot, and neither is given')):
-        if is_wrong:
-            raise UserError(message)
+    cli.check_least(options, seed=0, self_check=0, material=1e-6)
+    references = bool(options.sim) + bool(options.urdf)
+    if references and references + len(options.recording) > 2:
+        raise UserError(f'--sim {options.sim}, --urdf {options.urdf}: one of them goes with one '
+                        f'recording, but {len(options.recording)} are given')
+    if options.align and not (options.sim or options.urdf):
+        raise UserError('--align: shifts --sim or a robot, and neither is given')
     reading = cli.reading_options(options)
     population = calibration_store.read_population(options.prior) if options.prior else None
     unit = quantity(options.quantity) if options.quantity else None
@@ -149,11 +142,9 @@ def _write(options: argparse.Namespace, diagnosis: Diagnosis, subject: str, line
         parameter_file.as_text(diagnosis.report.sensor, lines)
     if parameters:
         write_text(folder / 'params.yaml', parameters)
-    steps = _next_steps(options, diagnosis)
-    if isinstance(steps, str):
-        steps = [NextStep('simulate with these parameters', steps)] if steps else []
     write_text(folder / 'report.html', page.page(diagnosis, page.Run(
-        subject, Path(options.params or parameter_file.nominal_path()).name, steps, parameters)))
+        subject, Path(options.params or parameter_file.nominal_path()).name,
+        _next_steps(options, diagnosis), parameters)))
     return report
 
 
@@ -169,48 +160,30 @@ def _subject(recordings: list[Recording], sensor: Sensor, sim: str | None) -> st
             f'{simulated}')
 
 
-def _next_steps(options: argparse.Namespace, diagnosis: Diagnosis) -> str | list[NextStep]:
+def _next_steps(options: argparse.Namespace, diagnosis: Diagnosis) -> list[NextStep]:
     """Return what to record, how to diagnose that, and how to simulate what was found."""
     if diagnosis.report is None:
-        return ''
-    verdict = diagnosis.report.verdict
+        return []
     params = cli.quoted(Path(options.output) / 'params.yaml')
-    simulate = cli.command('simulate', f'rich --params {params} -o sim.csv')
-    if diagnosis.report.next_experiment is None:
-        return simulate
-    proposal = diagnosis.report.next_experiment
-    if proposal.concerns_reference:
-        return [NextStep(f'record next.csv: {proposal.manoeuvre}, {proposal.why}',
-                         proposal.command),
-                NextStep('simulate the sensor without the errors of the reference', simulate)]
-    steps, then = [NextStep(f'record next.csv: {proposal.manoeuvre}, {proposal.why}; simulated, '
-                            'it is', proposal.command)], ''
-    if proposal.beside_simulator:
+    proposal, steps = diagnosis.report.next_experiment, []
+    if proposal is not None:
         both = ', and next_simulated.csv in the simulator' if options.sim else ''
-        steps, then = [], (f'record next.csv{both}: '
-                           f'{proposal.manoeuvre}, {proposal.why}; then ')
-    if verdict.status in ('explained', 'partly'):
-        steps += [NextStep(f'{then}diagnose the recording: the effects should close its gap, too',
-                           _diagnose_command(options, params, [])),
-                  NextStep('simulate with the effects', simulate)]
-    else:
-        given = options.params and cli.quoted(options.params)
-        together = '' if options.sim or options.urdf else ' together with this one'
-        steps.append(NextStep(f'{then}diagnose it{together}',
-                              _diagnose_command(options, given, options.recording)))
-    return steps
-
-
-def _diagnose_command(options: argparse.Namespace, params: str | None, recordings: list[str]
-                      ) -> str:
-    """Return the command that diagnoses the next recording, alone or with others."""
-    words = [cli.quoted(*([] if options.sim or options.urdf else recordings), 'next.csv')]
-    words += [f'--params {params}'] if params else []
-    words += ['--sim next_simulated.csv'] if options.sim else []
-    words += [f'--urdf {cli.quoted(options.urdf)} --frame {cli.quoted(options.frame)}'] \
-        if options.urdf else []
-    output = f'{options.output}{"_2" if options.output[-1].isdigit() else "2"}'
-    return cli.command('diagnose', ' '.join([*words, f'-o {cli.quoted(output)}']))
+        steps.append(NextStep(f'record next.csv{both}: {proposal.manoeuvre}, {proposal.why}',
+                              '' if proposal.beside_simulator else proposal.command))
+    if proposal is not None and not proposal.concerns_reference:
+        is_closed = diagnosis.report.verdict.status in ('explained', 'partly')
+        is_alone = is_closed or options.sim or options.urdf
+        words = [cli.quoted(*([] if is_alone else options.recording), 'next.csv')]
+        if is_closed or options.params:
+            words.append(f'--params {params if is_closed else cli.quoted(options.params)}')
+        words += ['--sim next_simulated.csv'] if options.sim else []
+        words += [f'--urdf {cli.quoted(options.urdf)} --frame {cli.quoted(options.frame)}'] \
+            if options.urdf else []
+        words.append(f'-o {cli.quoted(options.output + "_2")}')
+        steps.append(NextStep('diagnose it' if is_alone else 'diagnose it together with this one',
+                              cli.command('diagnose', ' '.join(words))))
+    return [*steps, NextStep('simulate the sensor as it was found', cli.command(
+        'simulate', f'rich --params {params} -o sim.csv'))]
 
 
 def main() -> int:

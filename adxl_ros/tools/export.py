@@ -28,9 +28,6 @@ _EXAMPLES = {
 FORMATS = dict(sorted(exports.FORMATS.items()))
 """All formats by name."""
 
-_NAMED_PARTS = 3
-"""Number of parts that the screen names; chosen: the file lists all."""
-
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
@@ -85,10 +82,8 @@ def _result_lines(exported: exports.Export, format_name: str, held: list[str]) -
     lines = [f'Sensor {exported.sensor.serial} for {format_name}. '
              f'The file holds: {", ".join(held)}.']
     if lost:
-        named = [f'{name} {exports.size_text(exported.sizes_mg[name])}'
-                 for name in lost[:_NAMED_PARTS]]
-        further = f' and {len(lost) - _NAMED_PARTS} more' if len(lost) > _NAMED_PARTS else ''
-        lines += [f'Its model lacks, mg rms in the manoeuvre rich: {", ".join(named)}{further}.',
+        sizes = [f'{name} {exports.size_text(exported.sizes_mg[name])}' for name in lost]
+        lines += [f'Its model lacks, mg rms in the manoeuvre rich: {", ".join(sizes)}.',
                   f'Together {exports.size_text(exported.remaining_mg)} mg rms, without noise and '
                   'steps of the ADC.']
     return lines

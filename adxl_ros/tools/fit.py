@@ -83,13 +83,10 @@ def _details() -> str:
 
 def fit(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
-    if options.journal and len(options.recording) != 1:
-        raise UserError(f'--journal {options.journal}: names the rests of one recording, but '
-                        f'{len(options.recording)} are given')
+    if sum(map(bool, (options.journal, options.poses, options.recording[1:]))) > 1:
+        raise UserError('--journal and --poses: one of them names the rests of one recording')
     if options.report or options.dcc:
         html_page.check_libraries()
-    if options.poses and (options.journal or len(options.recording) != 1):
-        raise UserError(f'--poses {options.poses}: goes with one recording, and without --journal')
     laboratory = gum.read_laboratory(options.dcc_data)
     population = calibration_store.read_population(options.prior) if options.prior else None
     records = sweep_journal.poses_to_fit(sweep_journal.read(options.journal).entries) \

@@ -6,20 +6,26 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from contextlib import nullcontext
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
-import shlex
 from time import monotonic
 
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.files import calibration_store
 from adxl_ros.files.recording_columns import NO_UNIT
 from adxl_ros.fleet.inputs import find_sources, stated_by
-from adxl_ros.fleet.row import make_recipe, reason_kind, Recipe, Row, task_names, TASKS
-from adxl_ros.fleet.run import only_client, Plan, plan, Results, Selection, since_text, work
-from adxl_ros.report.page import as_utf_8, without_secrets
+from adxl_ros.fleet.row import (
+    as_date,
+    make_recipe,
+    OUTCOMES,
+    reason_kind,
+    Row,
+    task_names,
+    TASKS,
+)
+from adxl_ros.fleet.run import only_client, Plan, plan, Results, work
+from adxl_ros.report.page import command_of_this_process
 from adxl_ros.report.quantities import counted, duration, file_size
 from adxl_ros.report.screen import wrapped
 from adxl_ros.tools import command_line as cli
@@ -34,8 +40,6 @@ _EXAMPLES = {
     'what it would cost': 'manifest.csv -o results --dry-run',
 }
 """Examples of arguments, by their purpose."""
-_FEWEST_HOURS = 0.1
-"""Core hours below which a plan has seconds or minutes, h. Chosen: six minutes."""
 _UNITS = 5
 """Units that a plan names. Chosen: one or two lines."""
 _REASON_COLUMNS = 12
@@ -88,60 +92,39 @@ def fleet(options: argparse.Namespace) -> int:
     if missing:
         raise UserError(f'{PROG} needs {" and ".join(missing)}; {install_hint(*missing)}')
     begin_s = monotonic()
-    selection = Selection(options.only_failed, options.since and since_text(options.since),
-                          options.limit)
+    since = as_date(options.since)
+    if options.since and not since:
+        raise UserError(f'--since {options.since}: expected a date, for example 2026-11-01')
     tasks = task_names(options.do)
     sources = find_sources(options.input)
     recipe = make_recipe(tasks, options.params, (source.params for source in sources),
                          options.store, cli.reading_options(options))
     folder = Path(options.output)
-    if not options.dry_run:
-        cli.make_folder(folder)
-    with nullcontext() if options.dry_run else only_client(folder):
+    selection = (options.only_failed, since, options.limit)
+    if options.dry_run:
         results = Results(folder)
-        to_do = plan(sources, recipe, results, selection)
-        _warn_of_replaced(to_do, results, recipe.tasks)
-        if not options.dry_run:
-            return _worked(options, recipe, results, to_do, begin_s)
-    cli.print_end(_plan_lines(to_do, len(sources)), [], _command(options, options.only_failed))
-    return 0
-
-
-def _worked(options: argparse.Namespace, recipe: Recipe, results: Results, to_do: Plan,
-            begin_s: float) -> int:
-    rows: list[Row] = []
-    is_interrupted = False
-    try:
-        if to_do.todo:
-            shared = (recipe, frozenset(results.known))
-            with open_pool(options.scheduler, options.jobs, shared) as pool, \
-                    cli.progress(PROG) as show:
-                for row in work(pool, to_do.todo, recipe, results, options.retries, show):
-                    rows.append({name: row[name] for name in _SHOWN})
-    except KeyboardInterrupt:
-        is_interrupted = True
-    files = _written(Path(options.output), results)
-    if is_interrupted:
-        cli.note(f'{PROG}: interrupted; the same command continues')
-        return 130
+        cli.print_end(_plan_lines(plan(sources, recipe, results, *selection), results), [],
+                      command_of_this_process().replace(' --dry-run', ''))
+        return 0
+    cli.make_folder(folder)
+    with only_client(folder):
+        results = Results(folder)
+        to_do, rows = plan(sources, recipe, results, *selection), []
+        try:
+            if to_do.todo:
+                shared = (recipe, frozenset(results.known))
+                with open_pool(options.scheduler, options.jobs, shared) as pool, \
+                        cli.progress(PROG) as show:
+                    for row in work(pool, to_do.todo, recipe, results, options.retries, show):
+                        rows.append({name: row[name] for name in _SHOWN})
+        finally:
+            # Ctrl-C leaves table and page of what is done.
+            files = _written(folder, results)
     took_s = monotonic() - begin_s
     is_repeated = any(row['outcome'] == 'crashed' or row['refused_by'] == 'stage' for row in rows)
     cli.print_end([*_result_lines(rows, to_do, took_s), ''], files,
-                  _command(options, True) if is_repeated else '', took_s)
+                  f'{command_of_this_process()} --only-failed' if is_repeated else '', took_s)
     return 1 if rows and not any(row['outcome'] == 'done' for row in rows) else 0
-
-
-def _warn_of_replaced(to_do: Plan, results: Results, tasks: Sequence[str]) -> None:
-    """Warn where rows of other tasks leave table and page, as a recording has one row there."""
-    before = [results.newest[source.url].row['tasks'] for source in to_do.todo
-              if source.url in results.newest]
-    missing = [name for name in TASKS
-               if name not in tasks and any(name in earlier for earlier in before)]
-    if missing:
-        together = ','.join(name for name in TASKS if name in {*tasks, *missing})
-        count = sum(not set(missing).isdisjoint(earlier) for earlier in before)
-        cli.note(f'{PROG}: {counted(count, "recording")} will lose {" and ".join(missing)} in '
-                 f'table and page; --do {together} keeps them, or name another folder')
 
 
 def _written(folder: Path, results: Results) -> list[Path]:
@@ -155,19 +138,16 @@ def _written(folder: Path, results: Results) -> list[Path]:
     return [*files, folder / 'reports']
 
 
-def _plan_lines(to_do: Plan, count: int) -> list[str]:
-    stated = iter(stated_by([source for source, serial in zip(to_do.todo, to_do.serials)
-                             if not serial]))
-    by_unit = Counter(serial or next(stated)[0] for serial in to_do.serials)
-    unknown = by_unit.pop('', 0) + by_unit.pop(NO_UNIT, 0)
-    largest = ', '.join(f'{serial} ({number})' for serial, number in by_unit.most_common(_UNITS))
-    rows = {'found': f'{counted(count, "recording")}', 'done already': f'{to_do.done}',
-            'left out': _left_out(to_do),
-            'core hours': f'{to_do.core_hours:.3g}' if not 0 < to_do.core_hours < _FEWEST_HOURS
-            else f'below {_FEWEST_HOURS}: {duration(3600 * to_do.core_hours)}',
-            'units': f'{len(by_unit)}{":" if by_unit else ""} {largest}'
-            f'{", ..." if len(by_unit) > _UNITS else ""}',
-            'unknown unit': f'{counted(unknown, "recording")}' if unknown else ''}
+def _plan_lines(to_do: Plan, results: Results) -> list[str]:
+    known = {url: entry.row['serial'] for url, entry in results.newest.items()}
+    units = Counter(source.serial or stated or known.get(source.url) or NO_UNIT
+                    for source, (stated, _) in zip(to_do.todo, stated_by(to_do.todo)))
+    unknown = units.pop(NO_UNIT, 0)
+    largest = ', '.join(f'{serial} ({number})' for serial, number in units.most_common(_UNITS))
+    rows = {'done already': str(to_do.done), 'left out': _left_out(to_do),
+            'core hours': f'{to_do.core_hours:.3g}',
+            'units': f'{len(units)}: {largest}{", ..." if len(units) > _UNITS else ""}',
+            'unknown unit': counted(unknown, 'recording')}
     return [f'{counted(len(to_do.todo), "recording")} to do, {file_size(to_do.size_bytes)}, about '
             f'{duration(3600 * to_do.core_hours)} of one core', '',
             *(f' {name:13}{text}' for name, text in rows.items() if text), '']
@@ -178,15 +158,11 @@ def _left_out(to_do: Plan) -> str:
 
 
 def _result_lines(rows: Sequence[Row], to_do: Plan, took_s: float) -> list[str]:
-    outcomes = Counter(row['outcome'] for row in rows)
-    parts = [f'{outcomes[name]} {name}' for name in ('done', 'refused', 'crashed')
-             if outcomes[name] or name == 'done']
     if not rows:
         return [f'Nothing to do: {counted(to_do.done, "recording")} had a row before',
-                *([f' left out  {_left_out(to_do)}'] if to_do.outside else [])]
-    lines = [f'{counted(len(rows), "recording")}: {", ".join(parts)}'
-             + (f'; {to_do.done} had their row before' if to_do.done else ''), '']
-    worked_s = sum(row['seconds'] or 0.0 for row in rows)
+                f' left out  {_left_out(to_do)}' * bool(to_do.outside)]
+    outcomes = Counter(row['outcome'] for row in rows)
+    parts = [f'{outcomes[name]} {name}' for name in OUTCOMES if outcomes[name] or name == 'done']
     statuses = Counter(row['status'] for row in rows if row['status'])
     figures = {
         'units': str(len({row['serial'] for row in rows if row['serial']})),
@@ -194,35 +170,19 @@ def _result_lines(rows: Sequence[Row], to_do: Plan, took_s: float) -> list[str]:
         'not sound': str(sum(row['is_sound'] is False for row in rows)),
         'left out': _left_out(to_do),
         'verdicts': ', '.join(f'{count} {name}' for name, count in statuses.most_common()),
-        'computed': f'{duration(worked_s)} of workers in {duration(took_s)}'}
-    lines += [f' {name:11}{value}' for name, value in figures.items() if value]
-    return lines + _reason_lines(rows)
-
-
-def _reason_lines(rows: Iterable[Row]) -> list[str]:
-    """Return the most frequent kinds of refusals, each by an example."""
+        'computed': f'{duration(sum(row["seconds"] or 0.0 for row in rows))} of workers in '
+                    f'{duration(took_s)}'}
     kinds: dict[tuple[str, str], list[str]] = {}
     for row in rows:
         if row['refusal']:
             kinds.setdefault((row['refused_by'], reason_kind(row)), []).append(row['refusal'])
     ordered = sorted(kinds.items(), key=lambda item: -len(item[1]))
-    lines = [line for (task, _), texts in ordered[:_MOST_REASONS]
-             for line in wrapped(f' {len(texts):>9}  {task}: {texts[0]}', _REASON_COLUMNS)]
-    others = len(ordered) - _MOST_REASONS
-    lines += [f'{"":{_REASON_COLUMNS}}and {counted(others, "other reason")}'] \
-        if others > 0 else []
-    return ['', ' refused by', *lines] if lines else []
-
-
-def _command(options: argparse.Namespace, only_failed: bool) -> str:
-    """Return the command that does what --dry-run shows, or that repeats what failed."""
-    inputs = [without_secrets(as_utf_8(word)) for word in options.input]
-    words = [*inputs, '--do', options.do, '-o', options.output]
-    for name in ('params', 'store', 'scheduler', 'jobs', 'retries', 'since', 'limit'):
-        value = getattr(options, name)
-        words += [f'--{name}', str(value)] if value != parser().get_default(name) else []
-    words += ['--only-failed'] if only_failed else []
-    return cli.command(PROG, shlex.join(words) + cli.reading_text(options))
+    reasons = [line for (task, _), texts in ordered[:_MOST_REASONS]
+               for line in wrapped(f' {len(texts):>9}  {task}: {texts[0]}', _REASON_COLUMNS)]
+    return [f'{counted(len(rows), "recording")}: {", ".join(parts)}'
+            + (f'; {to_do.done} had their row before' if to_do.done else ''), '',
+            *(f' {name:11}{value}' for name, value in figures.items() if value),
+            *(['', ' refused by'] if reasons else []), *reasons]
 
 
 def main() -> int:

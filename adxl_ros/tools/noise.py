@@ -15,7 +15,6 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.atomic_write import write_bytes, write_text
 from adxl_ros.files.csv_file import csv_writer
-from adxl_ros.files.parameter_file import float_text
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import ONE_SIDED
@@ -27,9 +26,10 @@ from adxl_ros.report.screen import row
 from adxl_ros.signals import axis_noise
 from adxl_ros.signals.allan_deviation import StillStretch
 from adxl_ros.signals.axis_noise import AxisNoise, RecordingNoise, settings, TERMS
-from adxl_ros.signals.noise_parameters import Drift, Estimate
+from adxl_ros.signals.noise_parameters import Estimate
 from adxl_ros.tools import command_line as cli
 import numpy as np
+import yaml
 
 MICRO_G = 1e6 / G0_MPS2
 """1 m/s² in µg."""
@@ -44,6 +44,8 @@ _LARGEST_FILLED = 0.01
 NAMES = {'white': 'white noise N', 'instability': 'bias instability B', 'walk': 'random walk K'}
 """Names of the terms."""
 
+_YAML_COLUMNS = 60
+"""Columns after which a list is wrapped; its last number may be beyond."""
 _UNITS = {'white': 'm/s^2/sqrt(Hz)', 'instability': 'm/s^2', 'walk': 'm/s^2/sqrt(s)'}
 """Units of the terms in JSON."""
 
@@ -104,86 +106,60 @@ def _paste_lines(result: RecordingNoise) -> list[str]:
     for program, entries in settings(result.axes, result.rest.rate_hz).items():
         lines.append(f'# {program}')
         for name, values, unit in entries:
-            texts = [float_text(float(f'{value:.{6 if value >= 1 else 3}g}')) for value in values]
-            if len(texts) == 1:
-                lines.append(f'{name}: {texts[0]}  # {unit}')
-            else:
-                rows = [', '.join(texts[i:i + 3]) for i in range(0, len(texts), 3)]
-                lines += [f'{name}:  # {unit}',
-                          *('  [' + ',\n   '.join(rows) + ']').split('\n')]
+            rounded = [float(f'{value:.{6 if value >= 1 else 3}g}') for value in values]
+            is_one = len(rounded) == 1
+            lines += [f'# {unit}', *yaml.safe_dump(
+                {name: rounded[0] if is_one else rounded}, width=_YAML_COLUMNS,
+                default_flow_style=False if is_one else None).splitlines()]
     return lines
 
 
 def _warnings(result: RecordingNoise) -> list[str]:
     rest, texts = result.rest, []
     if rest.motion_s:
-        texts.append(f'{_motion(rest)} Used is the longest rest, {duration(rest.span_s)} of '
-                     f'{duration(rest.recorded_s)}. Record again without touching the sensor.')
+        begin_s, end_s = rest.motion_s[0][:2]
+        texts.append(f'not still or interrupted {len(rest.motion_s)} times, first from '
+                     f'{begin_s:.5g} s to {end_s:.5g} s. Used is the longest rest, '
+                     f'{duration(rest.span_s)} of {duration(rest.recorded_s)}. Record again '
+                     'without touching the sensor.')
     if rest.filled > _LARGEST_FILLED * rest.count:
         texts.append(f'{rest.filled} samples ({100 * rest.filled / rest.count:.2g} %) are '
                      'missing. They are filled by straight lines, which lowers N.')
-    texts += _too_short(result)
     for noise in result.axes:
-        if noise.drift is not None:
-            texts.append(_drift_text(rest, noise.axis, noise.drift))
-        if noise.is_coarse:
-            texts.append(f'{noise.axis}: samples change in steps of '
-                         f'{noise.resolution * MICRO_G:.3g} µg, which hide the noise. N, B and K '
-                         'are upper limits. Choose a smaller range.')
-        if len(noise.fit.lines_hz):
-            band = dict.fromkeys(f'{hz:.3g}' for hz in noise.fit.lines_hz[[0, -1]])
-            texts.append(f'{noise.axis}: the power at {" to ".join(band)} Hz is that of a line, '
-                         'and left out. Look for a fan, mains or a person nearby.')
-        if not noise.fit.white.is_seen:
-            texts.append(f'{noise.axis}: N is not determined. A parameter file keeps the figure '
-                         'of --params, or states no white noise.')
-        if noise.sample_std > _LARGEST_STD_MPS2:
-            texts.append(f'{noise.axis}: one sample has a noise of {noise.sample_std:.2g} m/s², '
-                         f'expected less than {_LARGEST_STD_MPS2:g}. The sensor seems to '
-                         'vibrate.')
+        texts += [f'{noise.axis}: {text}' for text in _axis_warnings(rest, noise)]
     return texts
 
 
-def _motion(rest: StillStretch) -> str:
-    first = rest.motion_s[0]
-    others = len(rest.motion_s) - 1
-    repeated = {0: '', 1: ' and once again'}.get(others, f' and at {others} further times')
-    return f'not still or interrupted from {first[0]:.5g} s to {first[1]:.5g} s{repeated}.'
-
-
-def _too_short(result: RecordingNoise) -> list[str]:
-    """Return which terms the time does not show, and how long it must be."""
+def _axis_warnings(rest: StillStretch, noise: AxisNoise) -> list[str]:
     texts = []
     for term, name in enumerate(TERMS):
-        needed_s = {noise.axis: noise.fit.needed_s(term) for noise in result.axes
-                    if not (noise.estimates[term].is_seen or noise.is_coarse)}
-        if needed_s:
-            longest_s = max(needed_s.values())
-            advice = 'The other terms hide it, in longer recordings, too.' \
-                if longest_s == np.inf else 'To see half of the limit above, record about ' \
-                f'{duration(60 * np.ceil(longest_s / 60))}.'
-            texts.append(f'{duration(result.rest.span_s)} is too short to see the {NAMES[name]} '
-                         f'of {", ".join(needed_s)}. {advice}')
+        if not (noise.estimates[term].is_seen or noise.is_coarse):
+            needed_s = noise.fit.needed_s(term)
+            texts.append(f'{duration(rest.span_s)} is too short to see the {NAMES[name]}. ' + (
+                'The other terms hide it, in longer recordings, too.' if np.isinf(needed_s) else
+                f'To see half of the limit above, record about {duration(needed_s)}.'))
+    if noise.drift is not None:
+        is_thermal = noise.drift.follows == 'temperature'
+        size = noise.drift.size * MICRO_G * (1 if is_thermal else 3600)
+        instability, walk = (_interval(estimate.scaled(MICRO_G)) for estimate in (
+            noise.drift.without.instability, noise.drift.without.walk))
+        texts.append(f'drifts by {size:+.3g} µg/{"K, with the temperature" if is_thermal else "h"}'
+                     f'. B and K contain this drift. Without it B is {instability} µg, and K is '
+                     f'{walk} µg/√s.')
+    if noise.is_coarse:
+        texts.append(f'samples change in steps of {noise.resolution * MICRO_G:.3g} µg, which hide '
+                     'the noise. N, B and K are upper limits. Choose a smaller range.')
+    if len(noise.fit.lines_hz):
+        first_hz, last_hz = noise.fit.lines_hz[[0, -1]]
+        texts.append(f'the power at {first_hz:.3g} to {last_hz:.3g} Hz is that of a line, and '
+                     'left out. Look for a fan, mains or a person nearby.')
+    if not noise.fit.white.is_seen:
+        texts.append('N is not determined. A parameter file keeps the figure of --params, or '
+                     'states no white noise.')
+    if noise.sample_std > _LARGEST_STD_MPS2:
+        texts.append(f'one sample has a noise of {noise.sample_std:.2g} m/s², expected less than '
+                     f'{_LARGEST_STD_MPS2:g}. The sensor seems to vibrate.')
     return texts
-
-
-def _micro_or_milli_g(size_mps2: float) -> str:
-    """Return a drift with its sign in µg or mg."""
-    size = size_mps2 * MICRO_G
-    return f'{size:+.3g} µg' if abs(size) < 1000 else f'{size / 1000:+.3g} mg'
-
-
-def _drift_text(rest: StillStretch, axis: str, drift: Drift) -> str:
-    """Return what an axis follows, and its noise without this drift."""
-    if rest.temperature_c is not None and drift.follows == 'temperature':
-        text = (f'follows the temperature by {_micro_or_milli_g(drift.size)}/K '
-                f'({np.ptp(rest.temperature_c):.2g} K in all)')
-    else:
-        text = f'drifts by {_micro_or_milli_g(3600 * drift.size)}/h'
-    without = [_interval(estimate.scaled(MICRO_G))
-               for estimate in (drift.without.instability, drift.without.walk)]
-    return (f'{axis}: {text}. B and K contain this drift. Without it B is {without[0]} µg, and K '
-            f'is {without[1]} µg/√s.')
 
 
 def _as_json(result: RecordingNoise) -> dict[str, Any]:

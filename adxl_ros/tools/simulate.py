@@ -8,7 +8,6 @@ import argparse
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
-from difflib import get_close_matches
 from pathlib import Path
 import sys
 
@@ -106,9 +105,7 @@ def simulate(options: argparse.Namespace) -> int:
 def _check(options: argparse.Namespace) -> None:
     names = (*TRAJECTORIES, 'imu')
     if options.trajectory not in names and not Path(options.trajectory).exists():
-        near = get_close_matches(options.trajectory, names, 1)
-        parser().error(f'{options.trajectory}: neither a trajectory nor a recording'
-                       f'{f"; did you mean {near[0]}?" if near else ""}; the trajectories are '
+        parser().error(f'{options.trajectory}: neither a recording nor one of the trajectories '
                        f'{", ".join(names)}')
     if not options.output and not options.port:
         parser().error('the following arguments are required: -o, or --port')
@@ -116,8 +113,7 @@ def _check(options: argparse.Namespace) -> None:
     if options.rate is not None and not bounds['lower'] <= options.rate <= bounds['upper']:
         raise UserError(f'--rate {options.rate:g}: outside {bounds["lower"]:g} to '
                         f'{bounds["upper"]:g} Hz')
-    if options.seed < 0:
-        raise UserError(f'--seed {options.seed}: must be 0 or more')
+    cli.check_least(options, seed=0)
     # The name of a trajectory is no file, though a file of that name may be written.
     source = options.force if options.trajectory in names else options.trajectory
     if options.output and source:
@@ -187,16 +183,13 @@ def _board_output(stack: ExitStack, sensor: Sensor, port: str) -> Output:
 
 
 def _print_end(options: argparse.Namespace, sensor: Sensor, duration_s: float) -> None:
-    effects = f' with {", ".join(sensor.effects)}' if sensor.effects else ', no effects'
     result = (f'Simulated {options.trajectory}: {duration_s:.4g} s at {sensor.rate_hz:.4g} Hz, '
-              f'axes {sensor.axes}. Sensor {sensor.serial}{effects}.')
-    if not options.output:
-        cli.print_end([result], [])
-        return
+              f'axes {sensor.axes}. Sensor {sensor.serial}, effects: '
+              f'{", ".join(sensor.effects) or "none"}.')
     params = f' --params {cli.quoted(options.params)}' if options.params else ''
     tool, output = ('fit', 'unit.yaml') if options.trajectory == 'sweep' else ('diagnose', 'gap')
-    cli.print_end([result], [options.output], cli.command(
-        tool, f'{cli.quoted(options.output)}{params} -o {output}'))
+    cli.print_end([result], filter(None, [options.output]), cli.command(
+        tool, f'{cli.quoted(options.output)}{params} -o {output}') if options.output else '')
 
 
 def main() -> int:

@@ -253,7 +253,7 @@ def test_every_fault_changes_a_recording(name):
 
 
 def test_the_command_commits_and_scores(run_tool, tmp_path, monkeypatch):
-    monkeypatch.setattr(trials, 'plans', partial(plans, seconds=(60.0, 62.0)))
+    monkeypatch.setattr(trials, 'plans', partial(plans, seconds=(40.0, 42.0)))
     sealed = run_tool('blind', '--seal', 'dir', '--trials', 1, '--seed', 156)
     assert sealed.returncode == 0, sealed.stderr
     digest = json.loads((tmp_path / 'dir' / 'seal.json').read_text())['sha256_of_salt_and_labels']

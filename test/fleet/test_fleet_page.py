@@ -60,7 +60,7 @@ def test_the_page_names_what_is_wrong(page):
     text = page.locator('body').inner_text()
     assert '12 of 12 units with a serial number B… have temperature_bias, and 0 of the 48 ' \
         'others: a bad batch.' in text
-    assert 'recorded in /data/stage2 have stage_eccentricity' in text
+    assert 'recorded in /data/stage2… have stage_eccentricity' in text
     assert page.locator('.multiples figure').first.locator('h3').inner_text().startswith('A-0003')
     trace = page.locator('[data-figure=trend-0]').evaluate('plot => plot.data.map(t => t.name)')
     assert 'recording' in trace and 'line' in trace

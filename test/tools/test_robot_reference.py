@@ -20,7 +20,7 @@ from robots import encoded, urdf
 from units import nominal
 
 pytest.importorskip('pinocchio')
-RATE_HZ, STEP_RAD, SPAN_S = 100.0, 1e-5, 80.0
+RATE_HZ, STEP_RAD, SPAN_S = 50.0, 1e-5, 60.0
 WRIST = [('0 0 1', '0 0 0.3'), ('0 1 0', '0.2 0 0.1'), ('1 0 0', '0.3 0 0')]
 FILE = {'rate_hz': RATE_HZ, 'noise_density_g_per_rthz': np.full(3, 1e-4)}
 
