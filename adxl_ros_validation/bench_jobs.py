@@ -21,11 +21,13 @@ import subprocess
 import sys
 import tempfile
 import time
+from typing import Any
 
 from adxl_ros.calibrate.fits.gravity_fit import fit_gravity
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import Recording, sensor_info
+from adxl_ros.links.support import wire_format
 from adxl_ros.model import coefficients, signal_chain
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import library
@@ -33,11 +35,12 @@ from adxl_ros.model.sensor import Sensor, to_nominal_mps2, with_axes
 from adxl_ros.nodes.jobs import executable
 from adxl_ros.signals.allan_deviation import AllanStream, CellMeans
 from adxl_ros.simulate.response import simulate
+from adxl_ros.simulate.sensor_model import SensorModel
 from adxl_ros.simulate.trajectories import rich, sweep
 import numpy as np
 import scipy
 
-_PACKAGES = ('numpy', 'scipy', 'pyarrow', 'pandas', 'rosbags', 'allantools')
+_PACKAGES = ('numpy', 'scipy', 'pyarrow', 'polars', 'pandas', 'rosbags', 'allantools', 'mujoco')
 """Libraries whose versions the table states."""
 
 
@@ -128,6 +131,10 @@ _EFFECTS = ('bias', 'scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z'
 """Effects of the units that `apply` corrects, with twenty coefficients on two axes."""
 _TOOLS = ('simulate', 'fit', 'apply', 'noise', 'check', 'diagnose', 'export', 'blind', 'reproduce')
 """Tools whose `--help` is measured."""
+_FREE_BODY = """<mujoco><option timestep="0.001"/><worldbody><body><freejoint/>
+<geom size="0.1"/><site name="s"/></body></worldbody>
+<sensor><accelerometer site="s"/></sensor></mujoco>"""
+"""A falling body with an accelerometer."""
 
 
 def offline_jobs(hours: float) -> Iterator[Job]:
@@ -137,7 +144,7 @@ def offline_jobs(hours: float) -> Iterator[Job]:
         sensor = parameter_file.load(parameter_file.nominal_path())
         columns = simulate(sensor, sweep(np.random.default_rng(0)), 0)
         del columns['time_s']
-        yield from _reading(folder, sensor, _recording(sensor, columns, _ROWS))
+        yield from _reading_and_writing(folder, sensor, _recording(sensor, columns, _ROWS))
         yield _applying(folder, sensor, columns)
         values = {name: coefficients.typical(effect, 'xyz') for name, effect in library().items()}
         full = replace(with_axes(sensor, 'xyz'), rate_hz=_RATE_HZ, effects=tuple(values),
@@ -145,7 +152,7 @@ def offline_jobs(hours: float) -> Iterator[Job]:
         motion = replace(rich(np.random.default_rng(0)), duration_s=600.0)
         yield Job(f'simulate, {motion.duration_s:g} s at 1 kHz, 3 axes, {len(values)} effects',
                   lambda: simulate(full, motion, 0), 1.0, rounds=3)
-        yield from (make() for make in (_gravity_fit, _allan))
+        yield from (make() for make in (_gravity_fit, _allan, _frames, _in_the_loop))
         commands = [[executable(name), '--help'] for name in _TOOLS]
         yield Job(f'--help of {len(commands)} tools', lambda: [
             subprocess.run(command, check=True, capture_output=True) for command in commands],
@@ -162,10 +169,14 @@ def _recording(sensor: Sensor, columns: dict[str, np.ndarray], rows: int) -> Rec
     return Recording('bench', np.arange(rows) / _RATE_HZ, repeated, sensor_info(sensor))
 
 
-def _reading(folder: Path, sensor: Sensor, samples: Recording) -> Iterator[Job]:
+def _reading_and_writing(folder: Path, sensor: Sensor, samples: Recording) -> Iterator[Job]:
     csv, mcap = folder / 'read.csv', folder / 'read.mcap'
     recording.write(csv, replace(samples, info={}), sensor)
     recording.write(mcap, samples, sensor)
+
+    def write_by_pyarrow() -> None:
+        table = import_module('pyarrow').table({'time_s': samples.time_s, **samples.columns})
+        import_module('pyarrow.csv').write_csv(table, folder / 'theirs.csv')
 
     def read_by_rosbags() -> None:
         types = import_module('rosbags.typesys')
@@ -175,7 +186,11 @@ def _reading(folder: Path, sensor: Sensor, samples: Recording) -> Iterator[Job]:
                 store.deserialize_cdr(raw, connection.msgtype)
 
     yield Job(f'read CSV, {_ROWS} rows', lambda: recording.read(csv), 1.5, {
-        'pyarrow': lambda: import_module('pyarrow.csv').read_csv(csv)})
+        'pyarrow': lambda: import_module('pyarrow.csv').read_csv(csv),
+        'polars': lambda: import_module('polars').read_csv(csv)})
+    yield Job(f'write CSV, {_ROWS} rows',
+              lambda: recording.write(folder / 'ours.csv', samples, sensor), 0.0,
+              {'pyarrow': write_by_pyarrow})
     yield Job(f'read MCAP, {2 * _ROWS} messages', lambda: recording.read(mcap), 0.25,
               {'rosbags': read_by_rosbags})
 
@@ -277,3 +292,36 @@ def _allan() -> Job:
     return Job(f'Allan deviation, {len(samples)} samples', ours, 1.0, {
         'allantools': lambda: import_module('allantools').oadev(
             samples, rate=_RATE_HZ, data_type='freq', taus='octave')})
+
+
+def _frames() -> Job:
+    encoder = wire_format.Encoder(wire_format.BoardInfo(_RATE_HZ, 16, 3, 5.0, 'bench'))
+    codes, count = np.random.default_rng(0).integers(1, 65535, (10, 3)), 2000
+    # A frame has ten samples, which take 10 ms.
+    stream = b''.join(encoder.sample_frame(10_000 * k, 10 * k, codes) for k in range(count))
+
+    def ours() -> None:
+        for _ in range(10):
+            for raw in wire_format.Splitter().split(stream):
+                wire_format.decode(raw)
+
+    return Job(f'decode {10 * count} frames of the serial link', ours)
+
+
+def _in_the_loop() -> Job:
+    """Step a sensor in the loop, beside a step of a simulator with its own accelerometer."""
+    path, steps = parameter_file.nominal_path(), 2000
+
+    def ours() -> None:
+        model = SensorModel(path)
+        for _ in range(steps):
+            model(np.array([0.0, 0.0, G0_MPS2]), 1 / _RATE_HZ)
+
+    def by_mujoco() -> None:
+        mujoco: Any = import_module('mujoco')
+        model = mujoco.MjModel.from_xml_string(_FREE_BODY)
+        data = mujoco.MjData(model)
+        for _ in range(steps):
+            mujoco.mj_step(model, data)
+
+    return Job(f'{steps} steps of a sensor in the loop', ours, 0.0, {'mujoco': by_mujoco})

@@ -16,7 +16,8 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.files.atomic_write import write_bytes, write_text
 from adxl_ros.files.recording_columns import recorded_unit
-from adxl_ros.model.constants import Z_90
+from adxl_ros.model import signal_chain
+from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import package_version
 from adxl_ros.report.figures import png, pyplot
@@ -105,7 +106,8 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> _Re
                          unit.fitted['physical'], unit.poses)
     for name, figure in (('misalignment', draw_misalignment(*results['paper'][0].directions)),
                          ('tilt', draw_tilt(results['paper'][0])),
-                         ('motion', draw_motion(unit.fitted, experiments.shaken(truth, first)))):
+                         ('motion', draw_motion(unit.fitted, experiments.shaken(truth, first))),
+                         ('components', draw_components(truth, unit.fitted))):
         write_bytes(pictures / f'{name}.png', png(figure))
     drawn = 'one unit' if sensor.effects else f'{options.units} units'
     made = (f'adxl_ros {package_version()}, {date.today()}, {drawn} on each stage, '
@@ -193,6 +195,32 @@ def draw_motion(units: dict[str, Sensor], shaken: tuple[np.ndarray, np.ndarray, 
                                          f'about an offset of {offset:.1f}')
         axis.legend(fontsize=8, loc='upper right')
     row[0].set(ylabel='acceleration along x, mm/s²')
+    return figure
+
+
+def draw_components(truth: Sensor, units: dict[str, Sensor]) -> Any:
+    """Draw figure 13: what each part of the model does to the response at alpha 45°, beta 90°."""
+    reach, linear, fitted = np.linspace(-0.4, 0.4, 81), units['linear'], units['physical']
+    pose = [reach * G0_MPS2, np.full(81, -np.sqrt(0.5) * truth.local_gravity_mps2),
+            np.full(81, np.sqrt(0.5) * truth.local_gravity_mps2)]
+    bias = ('bias', 'scale_factor', 'cross_axis', 'cross_axis_z')
+    steps = (('linear model', linear, linear.effects), ('+ bias (10 to 13)', fitted, bias),
+             ('+ scale factor (15)', fitted, (*bias, 'scale_factor_z')),
+             ('+ misalignment (18)', fitted, fitted.effects),
+             ('actual response', truth, truth.effects))
+    actual = signal_chain.static_response(truth)(pose)[0]
+    figure, (response, difference) = pyplot().subplots(1, 2, figsize=(14, 5), layout='constrained')
+    for label, unit, effects in steps:
+        part = replace(unit, effects=effects, values={e: unit.values[e] for e in effects})
+        volts = signal_chain.static_response(part)(pose)[0]
+        style: dict[str, Any] = {'color': 'k', 'ls': ':'} if unit is truth else {}
+        response.plot(reach, volts, label=label, **style)
+        difference.plot(reach, 1e3 * (volts - actual), label=label, **style)
+    response.set(xlabel='acceleration along x, g', ylabel='x output, V',
+                 title='fig. 13: response at alpha = 45°, beta = 90°')
+    difference.set(xlabel='acceleration along x, g', ylabel='minus the actual response, mV',
+                   title='the same, minus the actual response')
+    response.legend(fontsize=8)
     return figure
 
 

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a diagnosis answered, and whether it is right."""
+"""What a diagnosis answered, whether it is right, and answers of reference methods."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
-from itertools import combinations, permutations
+from itertools import combinations, permutations, product
 import math
 from typing import Any
 
 from adxl_ros_validation.blind import trials
-from adxl_ros_validation.blind.faults import KINDS
+from adxl_ros_validation.blind.faults import KINDS, KNOWN
 from adxl_ros_validation.blind.simulator import G0
 from adxl_ros_validation.blind.trials import Label
 import numpy as np
@@ -178,3 +179,61 @@ def true_parameters(label: Label) -> dict[str, float]:
             true |= {f'{name}.{part}.{axis}': float(value)
                      for axis, value in zip(unit.axes, values)}
     return true
+
+
+COMPONENTS = (*KNOWN, UNKNOWN)
+"""What can be named: the library's effects, and an effect outside the library."""
+
+Diagnosis = frozenset[str]
+"""Components that one diagnosis calls faulty."""
+
+
+def pair_utility(diagnosis: Diagnosis, true: Diagnosis) -> float:
+    """
+    Return the utility of one diagnosis ω where ω* is true.
+
+    It is 1 − n(N + 1)/(f(n + 1)) − n̄(N̄ + 1)/(f(n̄ + 1)). Of the f components, n are in ω alone,
+    n̄ in ω* alone, N in ω, and N̄ = f − N not in ω. Each term is the share of the components that
+    a repair tests in vain: among those in ω, and then among the others.
+    """
+    f, size = len(COMPONENTS), len(diagnosis)
+    blamed, missed = len(diagnosis - true), len(true - diagnosis)
+    return 1 - blamed * (size + 1) / (f * (blamed + 1)) \
+        - missed * (f - size + 1) / (f * (missed + 1))
+
+
+def utility(group: Collection[Diagnosis], true: Collection[Diagnosis]) -> float:
+    """
+    Return the normalised utility of an ambiguity group D where T is the true one.
+
+    It is m(D, T) / m(T, T), where m is the mean of `pair_utility` over all pairs of a diagnosis of
+    the first group and one of the second.
+    """
+    if not group:
+        return 0.0
+
+    def mean(first: Collection[Diagnosis]) -> float:
+        return sum(pair_utility(a, b) for a in first for b in true) / (len(first) * len(true))
+
+    return mean(group) / mean(true)
+
+
+def answered_group(answer: Answer) -> set[Diagnosis]:
+    """Return the diagnoses of a verdict: its certain effects with one effect of each group."""
+    if answer.status == 'failed':
+        return set()
+    return {answer.certain | set(choice) for choice in product(*answer.groups)}
+
+
+def true_group(label: Label) -> set[Diagnosis]:
+    """
+    Return the smallest diagnoses that a recording supports, by the ideal observer.
+
+    Each effect can be replaced by one that the recording cannot separate from it. Effects that the
+    ideal observer does not see are missing, as the competition uses diagnoses of the least size.
+    """
+    choices = [[UNKNOWN if label.group == 'outside' else fault['effect'], *fault['inseparable']]
+               for fault in label.faults
+               if fault['power'] >= VISIBLE_POWER and label.group != 'zero']
+    diagnoses = map(frozenset, product(*choices))
+    return {diagnosis for diagnosis in diagnoses if len(diagnosis) == len(choices)}

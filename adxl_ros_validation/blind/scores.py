@@ -44,6 +44,7 @@ class Trial(NamedTuple):
         """Return what is known of it, and what the scores count."""
         label, answer, gaps = self
         truth, named, top = grading.truth(label), answer.named, sorted(answer.top)
+        groups = grading.answered_group(answer), grading.true_group(label)
         right = grading.verdict_right(answer, label)
         rivals = label.faults[0]['inseparable'] if label.faults else ()
         return {
@@ -66,7 +67,8 @@ class Trial(NamedTuple):
                 fault['power'] * fault['told'] >= grading.CERTAIN_POWER for fault in label.faults),
             'material': grading.material(answer, label),
             'limit_holds': grading.limit_holds(answer, label),
-            'brier': grading.brier(answer, label),
+            'brier': grading.brier(answer, label), 'utility': grading.utility(*groups),
+            'has_effect': any(groups[1]),
             'harm': gaps is not None and gaps['harm_ci'][0] > _HARM * gaps['floor'],
             'inside': self._inside(), **self._closed()}
 

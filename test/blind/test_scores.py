@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scores of the blind check: what counts, and whether a bar is met."""
+"""Scores of the blind check: the competition's utility, and what counts."""
 
 from adxl_ros_validation.blind import grading, scores
-from adxl_ros_validation.blind.grading import Answer
+from adxl_ros_validation.blind.grading import Answer, COMPONENTS, pair_utility, utility
 from adxl_ros_validation.blind.trials import Label
 import pytest
 
@@ -14,6 +14,43 @@ def label(group, effects=(), power=1.0, inseparable=()):
                'power': power, 'told': 1.0, 'inseparable': list(inseparable)} for name in effects]
     return Label('r0', group, tuple(effects), (1, 2, 3), (90.0, 200.0), 'rich', 'xyz', 0.01,
                  faults, 1.0)
+
+
+def diagnoses(*effects):
+    return {frozenset(words.split()) for words in effects}
+
+
+def test_utility_of_one_diagnosis():
+    """The extremes are those of the competition, and a wrong blame costs a test in vain."""
+    f = len(COMPONENTS)
+    every, nothing, bias = frozenset(COMPONENTS), frozenset(), frozenset({'bias'})
+    assert pair_utility(bias, bias) == pair_utility(nothing, nothing) == 1
+    assert pair_utility(every, nothing) == pytest.approx(0)
+    assert pair_utility(nothing, every) == pytest.approx(0)
+    assert pair_utility(bias, nothing) == pytest.approx(1 - 1 / f)
+    assert pair_utility(nothing, bias) == pytest.approx(1 - (f + 1) / (2 * f))
+    assert pair_utility(frozenset({'gravity'}), bias) == pytest.approx(1 - 1 / f - 1 / 2)
+
+
+def test_utility_of_ambiguity_groups():
+    """The true group is best; more and fewer diagnoses lose, and a failure has none."""
+    true = diagnoses('bias', 'gravity')
+    assert utility(true, true) == 1
+    assert utility(diagnoses('supply', 'gravity'), true) < 1
+    assert utility(diagnoses('bias', 'gravity', 'supply'), true) < 1
+    assert utility(diagnoses('bias', 'gravity', 'supply'), diagnoses('bias')) < utility(
+        diagnoses('bias', 'gravity'), diagnoses('bias')) < 1
+    assert utility(set(), true) == 0
+
+
+def test_true_group_has_what_the_ideal_observer_cannot_separate():
+    single = label('single', ['bias'], inseparable=['gravity', 'supply'])
+    assert grading.true_group(single) == diagnoses('bias', 'gravity', 'supply')
+    assert grading.true_group(label('single', ['bias'], 0.1)) == diagnoses('')
+    assert grading.true_group(label('zero', ['bias'])) == diagnoses('')
+    assert grading.true_group(label('outside', ['creep'])) == diagnoses('unknown')
+    pair = label('pair', ['bias', 'gravity'], inseparable=['supply'])
+    assert grading.true_group(pair) == diagnoses('bias gravity', 'bias supply', 'supply gravity')
 
 
 def said(status, *effects, **words):
