@@ -323,8 +323,10 @@ def _header(lines: Sequence[str], delimiter: str, count: int) -> tuple[int, list
 def _names(line: str, delimiter: str, count: int) -> list[str] | None:
     """Return the fields of a line if they can be names, also in a comment; else None."""
     text = _COMMENT.sub('', line, count=1)
-    for mark in (delimiter, ','):
+    for mark in dict.fromkeys((delimiter, ',', '\t', ';')):
         fields = _fields(text, mark)
+        # A row of samples may end in a delimiter, and its header not.
+        fields += [''] * (len(fields) == count - 1 and count > 2)
         if len(fields) == count and any(fields) and not _numbers(text, mark):
             return fields
     return None

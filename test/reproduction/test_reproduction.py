@@ -73,7 +73,7 @@ def test_the_command_writes_the_page_and_its_plots(run_tool, tmp_path):
     page = (tmp_path / 'reproduction.md').read_text(encoding='utf-8')
     assert 'Table I' in done.stdout
     assert '20.8' in page and 'Cramér-Rao bound' in page
-    for figure in ('sweep', 'misalignment', 'tilt', 'motion'):
+    for figure in ('sweep', 'misalignment', 'tilt', 'motion', 'components'):
         assert f'(reproduction/{figure}.png)' in page
         assert (tmp_path / 'reproduction' / f'{figure}.png').stat().st_size > 20_000
 
