@@ -82,7 +82,7 @@ def recording_noise(read: Callable[[], Iterable[Recording]], params: str | None,
         raise UserError('the recording holds no samples')
     sensor = load_sensor(params, first)
     unit = unit_of(sensor, first.stream_info, first.axes)
-    rest = longest_rest(read, unit)
+    rest = longest_rest(read, unit, first)
     variances = noise_parameters.coefficient_variances(len(rest.means), rest.step_s)
     noises = []
     for i, axis in enumerate(unit.axes):
