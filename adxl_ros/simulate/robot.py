@@ -165,18 +165,12 @@ def _free_flyer(base: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     (x, q), (dx, dq), (ddx, ddq) = ((b[:, :3], b[:, 3:]) for b in base)
     norm = np.linalg.norm(q, axis=1, keepdims=True)
     q, dq, ddq = q / norm, dq / norm, ddq / norm
-    inverse = q * [-1, -1, -1, 1]
-    omega, alpha = (2 * _product(inverse, d)[:, :3] for d in (dq, ddq))
-    velocity, acceleration = (Rotation.from_quat(inverse).apply(d) for d in (dx, ddx))
+    v, w = q[:, :3], q[:, 3:]
+    # Twice the vector part of the products of the inverse quaternion and the derivatives
+    omega, alpha = (2 * (w * d[:, :3] - v * d[:, 3:] - np.cross(v, d[:, :3])) for d in (dq, ddq))
+    velocity, acceleration = (Rotation.from_quat(q).apply(d, inverse=True) for d in (dx, ddx))
     return (np.hstack([x, q]), np.hstack([velocity, omega]),
             np.hstack([acceleration - np.cross(omega, velocity), alpha]))
-
-
-def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return products of quaternions x, y, z, w, (n, 4)."""
-    va, wa, vb, wb = a[:, :3], a[:, 3:], b[:, :3], b[:, 3:]
-    return np.hstack([wa * vb + wb * va + np.cross(va, vb),
-                      wa * wb - np.sum(va * vb, axis=1, keepdims=True)])
 
 
 class RobotPath(ForcePath):
