@@ -171,9 +171,6 @@ class Response:
         self._tail = grid[-(2 * POINTS):]
         if aligned:
             index = nearest.astype(np.intp) - first
-            every = (int(index[-1]) - int(index[0])) // max(len(index) - 1, 1)
-            if every and np.array_equal(np.arange(index[0], index[-1] + 1, every), index):
-                return grid[index[0]:index[-1] + 1:every], signals
             return grid[index], signals
         key = (first, steps.tobytes())
 
