@@ -198,7 +198,8 @@ def _axis_json(noise: AxisNoise) -> dict[str, Any]:
     terms = {name: {'value': estimate.value if estimate.is_seen else None,
                     'ci': [estimate.low, estimate.high], 'unit': _UNITS[name]}
              for name, estimate in zip(TERMS, noise.estimates)}
-    return {**terms, 'rounding': noise.rounding, 'density_g_per_rthz': axis_noise.density_g_per_rthz(noise),
+    return {**terms, 'rounding': noise.rounding,
+            'density_g_per_rthz': axis_noise.density_g_per_rthz(noise),
             'sample_std_mps2': noise.sample_std, 'resolution_mps2': noise.resolution,
             'lowest': {'tau_s': noise.lowest_s, 'deviation_mps2': noise.lowest},
             'fitted_below_hz': noise.fit.highest_hz}
