@@ -12,7 +12,7 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import partial
 import logging
@@ -24,8 +24,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 import signal
 import sys
-from threading import Thread
-from time import monotonic, sleep
+from threading import local, Thread
 from typing import Any, cast, NamedTuple
 from uuid import uuid4
 import warnings
@@ -41,8 +40,6 @@ _FEWEST_TASKS = 4
 """Tasks that are submitted to a cluster at least. Chosen: one that grows by demand sees it."""
 _CONNECT_S = 20.0
 """Time in which a scheduler must answer, s; chosen."""
-_RECONNECT_S = 600.0
-"""Time in which a scheduler that was lost must be back, s. Chosen: a node restarts in minutes."""
 _FETCH_S = 60.0
 """Time in which a cluster must deliver a result, s; chosen: some MB over a slow line."""
 _WAIT_S = 1.0
@@ -56,10 +53,6 @@ class WorkerDied(Exception):
         return 'the worker ended while it ran the task'
 
 
-class PoolLost(Exception):
-    """All tasks are lost, and the pool must be renewed."""
-
-
 class Pool(Executor):
     """Workers, and how many tasks are submitted to them at once."""
 
@@ -69,9 +62,6 @@ class Pool(Executor):
         """Return what a task that ended returned, and what it raised."""
         error = future.exception()
         return (None, error) if error else (future.result(), None)
-
-    def renew(self) -> None:
-        """Make the pool usable after all its tasks were lost."""
 
     def kill(self) -> None:
         """End all workers at once."""
@@ -105,70 +95,50 @@ class Processes(Pool):
         self.slots = _TASKS_PER_WORKER * count
         self._shared = shared
         self._is_killed = False
-        self._todo: SimpleQueue[tuple[Future, tuple] | None] = SimpleQueue()
-        self._processes: dict[int, Any] = {}
-        self._threads = [Thread(target=self._serve, args=(number,), daemon=True)
-                         for number in range(count)]
-        for thread in self._threads:
-            thread.start()
+        self._processes: list[Any] = []
+        self._threads = ThreadPoolExecutor(count)
+        self._own = local()  # Process and pipe of a thread; a process ends with its pipe
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
         """Give a task to the first worker that is free."""
-        future: Future = Future()
-        future.set_running_or_notify_cancel()
-        self._todo.put((future, (partial(fn, **kwargs), args)))
-        return future
+        return self._threads.submit(self._run, partial(fn, **kwargs), args)
 
-    def _serve(self, number: int) -> None:
-        """Pass tasks to a process, which is started again when it ends, until there are none."""
-        pipe: Connection | None = None
-        while (item := self._todo.get()) is not None:
-            future, task = item
-            try:
-                if pipe is None or not self._processes[number].is_alive():
-                    pipe = self._start(number)
-                pipe.send(task)
-                value, error = pipe.recv()
-            except (EOFError, OSError):
-                pipe, value, error = None, None, WorkerDied()
-            except Exception as problem:
-                # The task or its error cannot be sent.
-                value, error = None, problem
-            if error is not None:
-                future.set_exception(error)
-            else:
-                future.set_result(value)
-        if pipe is not None:
-            pipe.close()
-            self._processes[number].join()
+    def _run(self, *task: Any) -> Any:
+        """Run a task in the process of this thread, which is started again where it ended."""
+        own = self._own
+        try:
+            if getattr(own, 'pipe', None) is None or not own.process.is_alive():
+                own.process, own.pipe = self._start()
+            own.pipe.send(task)
+            value, error = own.pipe.recv()
+        except (EOFError, OSError):
+            own.pipe = None
+            raise WorkerDied from None
+        if error is not None:
+            raise error
+        return value
 
-    def _start(self, number: int) -> Connection:
+    def _start(self) -> tuple[Any, Connection]:
         """Start a process; the only other end of its pipe is in it, so that its end shows."""
         context = get_context('spawn')
         pipe, other = context.Pipe()
         process = context.Process(target=_work, args=(other, self._shared))
         process.start()
         other.close()
-        self._processes[number] = process
+        self._processes.append(process)
         if self._is_killed:
             process.terminate()
-        return pipe
+        return process, pipe
 
     def kill(self) -> None:
         """End all workers at once; they remove their temporary files."""
         self._is_killed = True
-        for process in list(self._processes.values()):
+        for process in self._processes:
             process.terminate()
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the workers after their tasks."""
-        with suppress(Empty):
-            while cancel_futures:
-                self._todo.get_nowait()
-        for _ in self._threads:
-            self._todo.put(None)
-        for thread in self._threads * wait:
-            thread.join()
+        self._threads.shutdown(wait, cancel_futures=cancel_futures)
 
 
 def _work(pipe: Connection, shared: tuple) -> None:
@@ -202,7 +172,7 @@ class Cluster(Pool):
 
     def __init__(self, address: str, shared: tuple = ()) -> None:
         try:
-            import distributed  # noqa: F401
+            import distributed
         except ImportError:
             raise UserError(f'--scheduler needs Dask; {install_hint("distributed")}') from None
         # A lost scheduler is reported by this module, in one line.
@@ -210,20 +180,14 @@ class Cluster(Pool):
                      'tornado.application'):
             logging.getLogger(name).setLevel(logging.CRITICAL)
         warnings.filterwarnings('ignore', 'Sending large graph')
-        self._address, self._values = address, shared
-        self._slots = _FEWEST_TASKS
+        self._address, self._slots = address, _FEWEST_TASKS
         try:
-            self._connect()
+            self._client = distributed.Client(address, timeout=_CONNECT_S, set_as_default=False)
         except (OSError, ValueError) as error:
             raise UserError(f'--scheduler {address}: no scheduler answers: {one_line(error)}'
                             ) from None
-
-    def _connect(self) -> None:
-        """Connect to the scheduler, and give it what all tasks share."""
-        from distributed import Client
-        self._client = Client(self._address, timeout=_CONNECT_S, set_as_default=False)
         # The cluster makes it again where all workers that have it end.
-        self._shared = self._client.submit(tuple, self._values, key=f'shared-{uuid4().hex}')
+        self._shared = self._client.submit(tuple, shared, key=f'shared-{uuid4().hex}')
 
     @property
     def slots(self) -> int:  # type: ignore[override]
@@ -240,36 +204,21 @@ class Cluster(Pool):
             return self._client.submit(lambda shared: fn(*shared, *args, **kwargs), self._shared,
                                        key=f'task-{uuid4().hex}')
         except (OSError, RuntimeError, ClosedClientError):
-            # The client is closed, or closes.
-            lost: Future = Future()
-            lost.set_exception(PoolLost())
-            return lost
+            raise self._lost() from None
 
     def end(self, future: Any) -> tuple[Any, BaseException | None]:
-        """Return what a task returned and raised; where it cannot be fetched, the pool is lost."""
+        """Return what a task returned and raised."""
         from distributed.scheduler import KilledWorker
         try:
             return future.result(timeout=_FETCH_S), None
         except (Exception, asyncio.CancelledError) as error:
             if getattr(future, 'status', 'error') != 'error':
-                return None, PoolLost()
+                raise self._lost() from None
             return None, WorkerDied() if isinstance(error, KilledWorker) else error
 
-    def renew(self) -> None:
-        """Connect again to a scheduler that was lost."""
-        end_s = monotonic() + _RECONNECT_S
-        while True:
-            self.shutdown()
-            try:
-                self._connect()
-                return
-            except (OSError, ValueError) as error:
-                if monotonic() > end_s:
-                    raise UserError(
-                        f'--scheduler {self._address}: was lost, and is not back after '
-                        f'{_RECONNECT_S / 60:.0f} min ({one_line(error)}); the same command '
-                        'continues') from None
-                sleep(1.0)
+    def _lost(self) -> UserError:
+        return UserError(f'--scheduler {self._address}: was lost; start it again, and the same '
+                         'command continues')
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Leave the cluster, which runs on; tasks are given up."""
@@ -292,8 +241,7 @@ def finished_tasks(pool: Pool, work: Callable[..., Any], tasks: Iterable[tuple],
     Run tasks in parallel; each gives one result, in the order in which they end.
 
     A task that raises, or whose worker ends, is repeated after all others. A `UserError` is not:
-    it would come again. After the loss of a pool its tasks are submitted again, which does not
-    count.
+    it would come again.
     """
     todo = ((arguments, 1) for arguments in tasks)
     again: deque[tuple[tuple, int]] = deque()
@@ -309,23 +257,18 @@ def finished_tasks(pool: Pool, work: Callable[..., Any], tasks: Iterable[tuple],
                 future.add_done_callback(ended.put)
             if not running:
                 return
-            try:
+            with suppress(Empty):
                 future = ended.get(timeout=_WAIT_S)
                 arguments, attempt = running.pop(future)
-            except (Empty, KeyError):  # KeyError: a task of a pool that was lost
-                continue
-            value, error = pool.end(future)
-            if isinstance(error, PoolLost):
-                again.extend([(arguments, attempt), *running.values()])
-                running.clear()
-                pool.renew()
-            elif error is None or isinstance(error, UserError) or attempt > retries:
-                yield Finished(arguments, value, error, attempt)
-            else:
-                again.append((arguments, attempt + 1))
+                value, error = pool.end(future)
+                if error is None or isinstance(error, UserError) or attempt > retries:
+                    yield Finished(arguments, value, error, attempt)
+                else:
+                    again.append((arguments, attempt + 1))
     finally:
         for future in running:
-            future.cancel()
+            with suppress(Exception):  # of a scheduler that is gone
+                future.cancel()
 
 
 def for_each(pool: Pool, work: Callable[..., Any], jobs: Iterable[Callable[[], tuple]],

@@ -115,7 +115,7 @@ class LiveStream:
     def collected(self) -> np.ndarray:
         """Return the forces since `collect` in the frame of the case, m/s², (n, 3)."""
         forces = self._forces or []
-        return np.reshape(forces[:], (-1, 3)) @ np.array(self._mounting.rows)
+        return np.reshape(forces[:], (-1, 3)) @ self._mounting.rows
 
     def stop_collecting(self) -> None:
         """Forget the kept forces."""

@@ -221,31 +221,20 @@ def play(x: np.ndarray, half_width: float, memory: dict[str, Any]) -> np.ndarray
     """
     if not half_width or not len(x):
         return x
-    if x.ndim > 1:
-        return _play_side_by_side(x, half_width, memory)
+    rows = x.reshape(len(x), -1)
     length = ceil(np.sqrt(len(x)) / 3)
-    padded = np.concatenate([x, np.full(-len(x) % length, x[-1])])
-    stretches = np.ascontiguousarray(padded.reshape(-1, length).T)
+    padded = np.concatenate([rows, np.repeat(rows[-1:], -len(x) % length, axis=0)])
+    stretches = np.ascontiguousarray(padded.reshape(-1, length, rows.shape[1]).swapaxes(0, 1))
     # low[n] and high[n] are the clamp that the first n + 1 steps of each stretch combine to.
     low, high = stretches - half_width, stretches + half_width
     for n in range(1, length):
         np.maximum(low[n], np.minimum(high[n], high[n - 1]), out=high[n])
         np.maximum(low[n], np.minimum(high[n], low[n - 1]), out=low[n])
-    output = memory.get('output', float(x[0]))
+    output = memory.get('output', rows[0])
     starts = []
-    for bottom, top in zip(low[-1].tolist(), high[-1].tolist()):
+    for bottom, top in zip(low[-1], high[-1]):
         starts.append(output)
-        output = max(bottom, min(top, output))
+        output = np.maximum(bottom, np.minimum(top, output))
     memory['output'] = output
-    return np.maximum(low, np.minimum(high, starts)).T.ravel()[:len(x)]
-
-
-def _play_side_by_side(x: np.ndarray, half_width: float, memory: dict[str, Any]) -> np.ndarray:
-    """Run operators side by side, step by step; see `play`."""
-    output = memory.get('output', x[0])
-    outputs = np.empty_like(x)
-    for n, inputs in enumerate(x):
-        output = outputs[n] = np.maximum(inputs - half_width,
-                                         np.minimum(inputs + half_width, output))
-    memory['output'] = output
-    return outputs
+    outputs = np.maximum(low, np.minimum(high, starts)).swapaxes(0, 1)
+    return outputs.reshape(-1, rows.shape[1])[:len(x)].reshape(x.shape)

@@ -11,10 +11,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import atan2, cos, hypot, sin
+from math import atan2, hypot
+from typing import Any
 
 from adxl_ros.model.effects.base import ARRAYS, Components, Joint, Maths, Value
 import numpy as np
+import scipy
 
 UPRIGHT = (0.0, 0.0, 1.0)
 """The vertical in the frame of a level base, a unit vector."""
@@ -290,49 +292,34 @@ class Mounting:
         return any(self.rpy_rad)
 
     @cached_property
-    def rows(self) -> tuple[Vector, Vector, Vector]:
-        """Return the rows of R."""
-        roll, pitch, yaw = self.rpy_rad
-        sr, cr, sp, cp = sin(roll), cos(roll), sin(pitch), cos(pitch)
-        sy, cy = sin(yaw), cos(yaw)
-        return ((cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
-                (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
-                (-sp, cp * sr, cp * cr))
+    def rotation(self) -> Any:
+        """Return R as a `Rotation` of scipy."""
+        return scipy.spatial.transform.Rotation.from_euler('xyz', self.rpy_rad)
 
     @cached_property
-    def inverse_quaternion(self) -> tuple[float, float, float, float]:
-        """Return the quaternion x, y, z, w of Rᵀ, from the robot to the case."""
-        roll, pitch, yaw = (angle / 2 for angle in self.rpy_rad)
-        sr, cr, sp, cp = sin(roll), cos(roll), sin(pitch), cos(pitch)
-        sy, cy = sin(yaw), cos(yaw)
-        return (-(sr * cp * cy - cr * sp * sy), -(cr * sp * cy + sr * cp * sy),
-                -(cr * cp * sy - sr * sp * cy), cr * cp * cy + sr * sp * sy)
+    def rows(self) -> np.ndarray:
+        """Return R, (3, 3)."""
+        return self.rotation.as_matrix()
 
     def rotate(self, vector: Sequence[float]) -> list[float]:
         """Return a vector of the case in the frame of the robot."""
-        x, y, z = vector
-        return [a * x + b * y + c * z for a, b, c in self.rows]
+        return (self.rows @ vector).tolist()
 
     def rotate_covariance(self, covariance: Sequence[float]) -> tuple[float, ...]:
         """Return the covariance R·C·Rᵀ; both are xx, xy, xz, yy, yz, zz."""
         xx, xy, xz, yy, yz, zz = covariance
-        half = [(a * xx + b * xy + c * xz, a * xy + b * yy + c * yz, a * xz + b * yz + c * zz)
-                for a, b, c in self.rows]
-        return tuple(sum(h * r for h, r in zip(half[i], self.rows[j]))
-                     for i in range(3) for j in range(i, 3))
+        turned = self.rotate_matrix((xx, xy, xz, xy, yy, yz, xz, yz, zz))
+        return *turned[:3], *turned[4:6], turned[8]
 
     def rotate_matrix(self, covariance: Sequence[float]) -> tuple[float, ...]:
         """Return the covariance R·C·Rᵀ; both have 9 numbers, row by row."""
-        matrix = np.reshape(covariance, (3, 3))
-        rotation = np.array(self.rows)
-        return tuple((rotation @ matrix @ rotation.T).ravel().tolist())
+        turned = self.rows @ np.reshape(covariance, (3, 3)) @ self.rows.T
+        return tuple(turned.ravel().tolist())
 
     def rotate_orientation(self, quaternion: Sequence[float]) -> tuple[float, ...]:
         """Return the orientation of the robot from that of the case."""
-        ax, ay, az, aw = quaternion
-        bx, by, bz, bw = self.inverse_quaternion
-        return (aw * bx + ax * bw + ay * bz - az * by, aw * by - ax * bz + ay * bw + az * bx,
-                aw * bz + ax * by - ay * bx + az * bw, aw * bw - ax * bx - ay * by - az * bz)
+        case = scipy.spatial.transform.Rotation.from_quat(quaternion)
+        return tuple((case * self.rotation.inv()).as_quat().tolist())
 
     def levelled(self, force_mps2: Sequence[float]) -> Mounting:
         """

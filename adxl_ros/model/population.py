@@ -116,14 +116,10 @@ def _combined(sensor: Sensor, population: Population, prior: Prior) -> Posterior
     total = sensor.covariance[np.ix_(places, places)] + np.diag(prior.std ** 2)
     square = float(departure @ np.linalg.solve(total, departure))
     chance = float(scipy.special.chdtrc(len(places), square))
-    distance = departure / np.sqrt(np.diag(total))
     if chance < STRANGER_CHANCE:
-        farthest = int(np.abs(distance).argmax())
         return Posterior(sensor, (
             f'{sensor.serial} is not of {population.name}: χ² {square:.3g} for {len(places)} '
-            f'coefficients (probability {_chance_text(chance)}); '
-            f'{_words(prior.names[farthest])} is {abs(distance[farthest]):.1f} standard '
-            'deviations from its mean. The prior is not used'), True)
+            f'coefficients, probability {chance:.2g}. The prior is not used'), True)
     gain = np.linalg.solve(total, sensor.covariance[places]).T
     covariance = sensor.covariance - gain @ sensor.covariance[places]
     values = get(sensor, sensor.covariance_names) + gain @ departure
@@ -131,13 +127,4 @@ def _combined(sensor: Sensor, population: Population, prior: Prior) -> Posterior
                    covariance=(covariance + covariance.T) / 2)
     return Posterior(unit, (
         f'{population.name} is the prior of {len(places)} coefficients: χ² {square:.3g}, '
-        f'probability {_chance_text(chance)}'))
-
-
-def _words(name: Coefficient) -> str:
-    """Return a coefficient for people."""
-    return f'{"zero-g" if name.effect == "bias" else "scale factor"} {name.axis}'
-
-
-def _chance_text(chance: float) -> str:
-    return f'{chance:.2g}' if chance >= STRANGER_CHANCE else f'< {STRANGER_CHANCE:g}'
+        f'probability {chance:.2g}'))

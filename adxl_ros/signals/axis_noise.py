@@ -82,7 +82,7 @@ def recording_noise(read: Callable[[], Iterable[Recording]], params: str | None,
         raise UserError('the recording holds no samples')
     sensor = load_sensor(params, first)
     unit = unit_of(sensor, first.stream_info, first.axes)
-    rest = longest_rest(read, unit)
+    rest = longest_rest(read, unit, first)
     variances = noise_parameters.coefficient_variances(len(rest.means), rest.step_s)
     noises = []
     for i, axis in enumerate(unit.axes):
@@ -162,10 +162,6 @@ def with_noise(sensor: Sensor, noises: list[AxisNoise]) -> Sensor:
         values.pop(effect, None)
         if sizes.any():
             values[effect] = {name: sizes}
-    if 'bias_walk' in values:
-        values['bias_walk']['return_per_s'] = np.array(
-            [1 / noise.fit.correlation.value if noise.fit.correlation else 0.0
-             for noise in noises])
     kept = [name for name in sensor.effects if name in values]
     changed: dict[str, Any] = {
         'effects': (*kept, *(name for name in values if name not in kept)), 'values': values,

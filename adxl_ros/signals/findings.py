@@ -136,16 +136,12 @@ def _sample_faults(contents: RecordingContents) -> list[str]:
         faults.append(f'no axis changes for {contents.held_s:.3g} s; the driver repeats a sample')
     length_g = contents.length_g
     if length_g is not None and not _LENGTHS_G[0] < length_g < _LENGTHS_G[1]:
+        unit = likely_unit(length_g * G0_MPS2)
+        hint = f'the readings seem to be in {unit}: state it by --columns' if unit else \
+            'check unit and scale factor'
         faults.append(f'at rest the specific force is {length_g * G0_MPS2:.3g} m/s², expected '
-                      f'{G0_MPS2:.3g}{_unit_hint(length_g)}')
+                      f'{G0_MPS2:.3g}; {hint}')
     return faults
-
-
-def _unit_hint(length_g: float) -> str:
-    """Return which unit the readings seem to have; empty where none fits."""
-    unit = likely_unit(length_g * G0_MPS2)
-    return f'; the readings seem to be in {unit}: state it by --columns' if unit else \
-        '; check unit and scale factor'
 
 
 def _remarks(contents: RecordingContents) -> list[str]:

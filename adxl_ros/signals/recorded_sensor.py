@@ -19,6 +19,7 @@ from adxl_ros.model.sensor import Sensor, to_volts, with_axes
 from adxl_ros.signals import block_statistics as stats
 from adxl_ros.signals.block_statistics import Spans
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 import scipy
 
 
@@ -281,12 +282,10 @@ def estimate_filter(rests: Iterable[np.ndarray], rate_hz: float, rc_s: float, ls
 def _mean_periodogram(rests: Iterable[np.ndarray], window: np.ndarray) -> tuple[np.ndarray, int]:
     """Return the mean periodogram of all segments, V², and their number."""
     size = len(window)
-    parts = [volts[begin:begin + size] for volts in rests
-             for begin in range(0, len(volts) - size + 1, size // 2)]
-    total = np.zeros(size // 2 + 1)
-    for part in parts:
-        total += np.abs(np.fft.rfft(window * (part - part.mean()))) ** 2
-    return total / max(len(parts), 1), len(parts)
+    parts = np.concatenate([np.empty((0, size)), *(
+        sliding_window_view(volts, size)[::size // 2] for volts in rests if len(volts) >= size)])
+    spectra = np.fft.rfft(window * (parts - parts.mean(axis=1, keepdims=True)))
+    return (np.abs(spectra) ** 2).sum(axis=0) / max(len(parts), 1), len(parts)
 
 
 def _expected(x: np.ndarray, lags: np.ndarray) -> np.ndarray:

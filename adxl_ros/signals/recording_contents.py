@@ -191,11 +191,8 @@ class _Stamps:
 
     def __init__(self, first: Recording) -> None:
         if len(first) < 2:
-            left_out = sum(first.bad_stamps)
-            hint = f': the stamps of {left_out} samples do not increase; --rate HZ stamps by ' \
-                'index' if left_out else ''
             raise UserError(f'{first.path}: {len(first)} sample with a usable stamp; at least 2 '
-                            f'are needed{hint}')
+                            'are needed; --rate HZ stamps by index')
         time_s = first.time_s
         self.burst = burst_samples(time_s)
         self.period_s = period_s(time_s)
@@ -263,43 +260,36 @@ class _Axis:
 
     def __init__(self, name: str, period_s: float) -> None:
         self._name, self._period_s = name, period_s
-        # By sign: largest value times the sign, and how often the axis stays there in motion
-        self._largest = dict.fromkeys((-1.0, 1.0), -np.inf)
-        self._clipped = dict.fromkeys((-1.0, 1.0), 0)
+        # Largest value of minus the samples and of the samples, and how often they stay there
+        self._largest, self._clipped = [-np.inf, -np.inf], [0, 0]
         self._held = _Held(_STUCK_S / period_s)
 
     def feed(self, values: np.ndarray) -> None:
         """Add further samples, m/s², behind the last one before, (1 + n,)."""
         steps = np.abs(np.diff(values))
         self._held.feed(steps != 0)
-        smooth = _CLIPPED_CODES * float(steps[steps > 0].min(initial=np.inf))
-        for sign in self._largest:
-            largest = float((sign * values).max())
-            if largest < self._largest[sign]:
-                continue
-            if largest > self._largest[sign]:
-                self._largest[sign], self._clipped[sign] = largest, 0
-            self._clipped[sign] += sum(
-                self._is_clipped(sign * values, largest, first, stop, smooth)
-                for first, stop in true_runs(sign * values == largest)
-                if stop - first >= _CLIPPED_SAMPLES)
+        smallest = float(steps[steps > 0].min(initial=np.inf))
+        drop = max(_CLIPPED_STEP_G * G0_MPS2, _CLIPPED_CODES * smallest)
+        for side, signed in enumerate((-values, values)):
+            largest = float(signed.max())
+            if largest > self._largest[side]:
+                self._largest[side], self._clipped[side] = largest, 0
+            if largest == self._largest[side]:
+                self._clipped[side] += sum(
+                    self._moves(signed, largest - drop, first, stop)
+                    for first, stop in true_runs(signed == largest)
+                    if stop - first >= _CLIPPED_SAMPLES)
 
-    def _is_clipped(self, values: np.ndarray, largest: float, first: int, stop: int,
-                    smooth: float) -> bool:
-        """Return whether the axis moves before or after it stays at its largest value."""
-        def drop(count: int) -> float:
-            """Return how far the axis falls within `count` samples before or after."""
-            beside = np.append(values[max(first - count, 0):first], values[stop:stop + count])
-            return largest - float(beside.min(initial=largest))
-
-        window = min(stop - first, round(_CLIPPED_WINDOW_S / self._period_s))
-        step = _CLIPPED_STEP_G * G0_MPS2
-        return drop(1) > step or drop(max(window, 1)) > max(step, smooth)
+    def _moves(self, values: np.ndarray, low: float, first: int, stop: int) -> bool:
+        """Return whether the axis is below a value soon before or after some samples."""
+        window = max(min(stop - first, round(_CLIPPED_WINDOW_S / self._period_s)), 1)
+        beside = np.append(values[max(first - window, 0):first], values[stop:stop + window])
+        return bool((beside < low).any())
 
     def result(self) -> AxisRange:
         """Return the range of the axis."""
-        return AxisRange(self._name, -self._largest[-1.0], self._largest[1.0],
-                         sum(self._clipped.values()), not self._held.changes,
+        return AxisRange(self._name, -self._largest[0], self._largest[1],
+                         sum(self._clipped), not self._held.changes,
                          self._held.samples * self._period_s)
 
 

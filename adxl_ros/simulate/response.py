@@ -171,9 +171,6 @@ class Response:
         self._tail = grid[-(2 * POINTS):]
         if aligned:
             index = nearest.astype(np.intp) - first
-            every = (int(index[-1]) - int(index[0])) // max(len(index) - 1, 1)
-            if every and np.array_equal(np.arange(index[0], index[-1] + 1, every), index):
-                return grid[index[0]:index[-1] + 1:every], signals
             return grid[index], signals
         key = (first, steps.tobytes())
 
@@ -377,49 +374,17 @@ class PartSizes:
         self._stamps_s = np.arange(count) / self._sensor.rate_hz
         self._memo = ChainMemo()
 
-    def effects_mg(self, effects: Collection[str], show: Callable[[float], None]
-                   ) -> dict[str, float]:
-        """Return the size of each effect."""
-        sizes = {}
-        for number, name in enumerate(effects):
-            show(number / len(effects))
-            needs = effect_named(name).needs
-            sensor = self._sensor if {Need.ADC, Need.NOISE} & set(needs) else self._quiet()
-            sizes[name] = self._change_mg(sensor, _without(sensor, [name]))
-        return sizes
-
-    def filter_mg(self) -> float:
-        """Return the rms of what the RC filter changes, mg."""
-        return self._change_mg(self._quiet(), _unfiltered(self._quiet()))
-
-    def remaining_mg(self, held: Collection[str], is_filtered: bool) -> float:
-        """Return the size of all that some effects leave out."""
-        sensor = self._quiet()
-        other = _without(sensor, [name for name in sensor.effects if name not in held])
-        return self._change_mg(sensor, other if is_filtered else _unfiltered(other))
-
-    def _quiet(self) -> Sensor:
-        """Return the sensor with invisible white noise and steps."""
-        sensor = self._sensor
-        return replace(sensor, adc_bits=_FINE_BITS if sensor.adc_bits else 0,
-                       noise_density_g_per_rthz=_QUIET * sensor.noise_density_g_per_rthz)
-
-    def _change_mg(self, sensor: Sensor, other: Sensor) -> float:
-        """Return the rms of the difference of two sensors, mg."""
+    def change_mg(self, effects: Collection[str], is_filtered: bool = True) -> float:
+        """Return the rms of what some effects change, and the filter, too, if it is left out."""
+        sensor, needs = self._sensor, [set(effect_named(name).needs) for name in effects]
+        if not needs or not all({Need.ADC, Need.NOISE} & each for each in needs):
+            sensor = replace(sensor, adc_bits=_FINE_BITS if sensor.adc_bits else 0,
+                             noise_density_g_per_rthz=_QUIET * sensor.noise_density_g_per_rthz)
+        other = replace(sensor, values={**sensor.values, **{
+            name: neutral(effect_named(name), sensor.axes) for name in effects}})
+        if other.rc_s and not is_filtered:
+            other = replace(other, rc_resistance_ohm=_SHORT_RC_S / other.rc_capacitance_f)
         volts = [Response(unit, self._motion, _SEED).whole(self._stamps_s, self._memo)
                  for unit in (sensor, other)]
         change_g = (volts[0] - volts[1]) / sensor.nominal_scale_v_per_g
         return float(1e3 * np.sqrt(np.mean(change_g ** 2)))
-
-
-def _without(sensor: Sensor, effects: Collection[str]) -> Sensor:
-    """Return the sensor with some effects at their neutral values."""
-    return replace(sensor, values={**sensor.values, **{
-        name: neutral(effect_named(name), sensor.axes) for name in effects}})
-
-
-def _unfiltered(sensor: Sensor) -> Sensor:
-    """Return the sensor without its filter."""
-    if not sensor.rc_s:
-        return sensor
-    return replace(sensor, rc_resistance_ohm=_SHORT_RC_S / sensor.rc_capacitance_f)

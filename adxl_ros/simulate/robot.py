@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
-from difflib import get_close_matches
 from functools import cached_property
 import os
 from typing import Any
@@ -95,18 +94,12 @@ class Robot:
         except Exception as error:
             raise UserError(f'{urdf}: no URDF that pinocchio reads: {one_line(error)}') from None
         if not model.existFrame(frame):
-            frames = [f.name for f in model.frames if f.name != 'universe']
-            near = get_close_matches(frame, frames, 3, 0.3) or frames[:5]
-            raise UserError(f'{urdf}: no frame {frame}; it has {len(frames)}, such as '
-                            f'{", ".join(near)}')
+            raise UserError(f'{urdf}: no frame {frame}; it has '
+                            f'{", ".join(f.name for f in model.frames)}')
         chain = [model.names[i] for i in model.supports[model.frames[model.getFrameId(frame)]
                                                         .parentJoint] if i]
         self.joints = tuple(chain[moves:])  # Names of the joints between base and frame
         fixed = [i for i in range(1, model.njoints) if model.names[i] not in chain]
-        # Range of those joints that do not turn without end, rad or m
-        self.ranges = {name: float((model.upperPositionLimit - model.lowerPositionLimit)[
-            joint.idx_q]) for name in self.joints
-            if (joint := model.joints[model.getJointId(name)]).nq == 1}
         self._model = pinocchio.buildReducedModel(model, fixed, pinocchio.neutral(model))
         self._data = self._model.createData()
         self._frame = self._model.getFrameId(frame)
@@ -165,18 +158,12 @@ def _free_flyer(base: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     (x, q), (dx, dq), (ddx, ddq) = ((b[:, :3], b[:, 3:]) for b in base)
     norm = np.linalg.norm(q, axis=1, keepdims=True)
     q, dq, ddq = q / norm, dq / norm, ddq / norm
-    inverse = q * [-1, -1, -1, 1]
-    omega, alpha = (2 * _product(inverse, d)[:, :3] for d in (dq, ddq))
-    velocity, acceleration = (Rotation.from_quat(inverse).apply(d) for d in (dx, ddx))
+    v, w = q[:, :3], q[:, 3:]
+    # Twice the vector part of the products of the inverse quaternion and the derivatives
+    omega, alpha = (2 * (w * d[:, :3] - v * d[:, 3:] - np.cross(v, d[:, :3])) for d in (dq, ddq))
+    velocity, acceleration = (Rotation.from_quat(q).apply(d, inverse=True) for d in (dx, ddx))
     return (np.hstack([x, q]), np.hstack([velocity, omega]),
             np.hstack([acceleration - np.cross(omega, velocity), alpha]))
-
-
-def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return products of quaternions x, y, z, w, (n, 4)."""
-    va, wa, vb, wb = a[:, :3], a[:, 3:], b[:, :3], b[:, 3:]
-    return np.hstack([wa * vb + wb * va + np.cross(va, vb),
-                      wa * wb - np.sum(va * vb, axis=1, keepdims=True)])
 
 
 class RobotPath(ForcePath):
@@ -374,11 +361,6 @@ def _tracks(robot: Robot, readings: Readings) -> list[tuple[np.ndarray, np.ndarr
     tracks = []
     for name in robot.joints:
         times, values = readings.joints[name]
-        # A joint may be stated within a turn.
-        if len(values) and np.ptp(values) > robot.ranges.get(name, np.inf) + 2 * np.pi:
-            raise UserError(
-                f'{readings.path}: {name} is at {values.min():.4g} to {values.max():.4g}, but '
-                f'{robot.urdf} lets it move by {robot.ranges[name]:.3g} rad or m; convert it')
         tracks.append((name, times, np.unwrap(values)))
     if readings.base is not None:
         times, pose = readings.base

@@ -8,7 +8,6 @@ from bisect import bisect_left
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from math import factorial
 from types import MappingProxyType
 
 from adxl_ros.model.effects.base import Components
@@ -188,8 +187,9 @@ class SmoothedPath:
                 del self._windows[min(self._windows)]
             spline = smoothing_spline(*self._part(window), self._strength, self._step,
                                       self._degree, self._knot_s, not self._is_seen)
-            self._windows[window] = _polynomials(spline) \
-                if spline.k and len(spline.t) <= _MAX_PIECES else spline
+            # Polynomials are evaluated faster, but need more memory.
+            self._windows[window] = scipy.interpolate.PPoly.from_spline(spline) \
+                if spline.k == _DEGREE and len(spline.t) <= _MAX_PIECES else spline
         return self._windows[window]
 
     def _part(self, window: int) -> tuple[np.ndarray, np.ndarray]:
@@ -227,18 +227,6 @@ def smoothing_spline(time_s: np.ndarray, reading: np.ndarray, strength: float, s
     return scipy.interpolate.BSpline(window.knots, window.mean + (window.bounded_coefficients(
         strength, np.where(_moving(reading), 0.0, _REST_WEIGHT), step / 2)
         if is_bounded else window.coefficients(strength)), _DEGREE)
-
-
-def _polynomials(spline: scipy.interpolate.BSpline) -> scipy.interpolate.PPoly:
-    """
-    Return a spline as polynomials, which are evaluated faster but need more memory.
-
-    `PPoly.from_spline` does the same up to degree 5.
-    """
-    begins = spline.t[spline.k:-spline.k - 1]
-    coefficients = [spline(begins, order) / factorial(order)
-                    for order in range(spline.k, -1, -1)]
-    return scipy.interpolate.PPoly(np.array(coefficients), spline.t[spline.k:-spline.k])
 
 
 def visible_step(reading: np.ndarray, step: float) -> float:

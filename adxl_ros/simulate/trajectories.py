@@ -71,18 +71,13 @@ class SweptSine:
         t, k = time_s[active] - self._begin_s, self._k
         omega = self._omega * np.exp(k * t)
         phase = (omega - self._omega) / k
-        sine, cosine = np.sin(phase), np.cos(phase)
-        amplitude = _SHAKE_MPS2 / omega ** 2
         w0, w1, w2 = (self._window(t, i) for i in range(3))
-        e0, e1 = amplitude * w0, amplitude * (w1 - 2 * k * w0)
-        if order == 0:
-            values[active] = -e0 * sine
-        elif order == 1:
-            values[active] = -e1 * sine - e0 * omega * cosine
-        else:
-            e2 = amplitude * (w2 - 4 * k * w1 + 4 * k * k * w0)
-            values[active] = ((e0 * omega ** 2 - e2) * sine
-                              - (2 * e1 + k * e0) * omega * cosine)
+        # E and its derivatives, and those of E·exp(iφ)
+        e0, e1, e2 = (_SHAKE_MPS2 / omega ** 2 * w for w in (
+            w0, w1 - 2 * k * w0, w2 - 4 * k * w1 + 4 * k * k * w0))
+        turning = (e0, e1 + 1j * omega * e0,
+                   e2 + 2j * omega * e1 + (1j * k * omega - omega ** 2) * e0)[order]
+        values[active] = -(turning * np.exp(1j * phase)).imag
         return values
 
 

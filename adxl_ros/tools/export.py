@@ -59,15 +59,19 @@ def _sized(sensor: Sensor, options: argparse.Namespace, holds: Mapping[str, str]
     """Simulate the sizes of all parts of a sensor."""
     parts = PartSizes(sensor, TRAJECTORIES['rich'](np.random.default_rng(0)))
     stage = exports.stage_effects(sensor)
-    sizes_mg = parts.effects_mg([name for name in sensor.effects if name not in stage], show)
+    sizes_mg = {}
+    for number, name in enumerate(own := [name for name in sensor.effects if name not in stage]):
+        show(number / len(own))
+        sizes_mg[name] = parts.change_mg([name])
     axes = exports.axes(sensor)
     sizes_mg[exports.WHITE_NOISE] = _rms_mg([axis.noise_std_mps2 for axis in axes])
     if sensor.adc_bits:
         sizes_mg[exports.STEPS] = _rms_mg([axis.step_mps2 / np.sqrt(12) for axis in axes])
     if sensor.rc_s:
-        sizes_mg[exports.FILTER] = parts.filter_mg()
+        sizes_mg[exports.FILTER] = parts.change_mg([], False)
     return exports.Export(sensor, Path(options.params).name, holds, sizes_mg,
-                          parts.remaining_mg({*holds, *stage}, exports.FILTER in holds))
+                          parts.change_mg([name for name in own if name not in holds],
+                                          exports.FILTER in holds))
 
 
 def _rms_mg(values_mps2: list[float]) -> float:

@@ -38,6 +38,7 @@ def test_equal_to_allantools(count: int, portions: tuple[int, int]) -> None:
 def test_memory_does_not_grow_with_the_stream(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(allan_deviation, '_LONGEST', 1 << 12)
     monkeypatch.setattr(allan_deviation, '_MOST_CELLS', 1 << 10)
+    monkeypatch.setattr(allan_deviation, '_AT_ONCE', 1 << 10)
     block = np.random.default_rng(3).standard_normal((8192, 3))
     stream, cells, peaks = AllanStream(3), CellMeans(3), []
     tracemalloc.start()

@@ -132,7 +132,7 @@ def test_a_recorded_specific_force_passes_through_the_chain(run_tool, tmp_path):
 
 
 @pytest.mark.parametrize('args, message', [
-    (('rich', '--effect', 'lever_am'), 'did you mean lever_arm?'),
+    (('rich', '--effect', 'lever_am'), "unknown effect 'lever_am'; known: "),
     (('rich', '--effect', 'lever_arm:zm=1'), "no parameter 'zm', but x_m, y_m, z_m"),
     (('rich', '--effect', 'lever_arm:z_m=3'), "'3' is not a number from -2 to 2 (m)"),
     (('rich', '--effect', 'lever_arm:z_m.x=1'), 'it is one number'),

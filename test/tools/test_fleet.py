@@ -256,7 +256,12 @@ def test_a_cluster_makes_the_same_table(tmp_path):
                 time.sleep(0.05)
             kill()
         _, error = client.communicate(timeout=_LONG_WAIT_S)
-    assert (client.returncode, error) == (0, '')
+        assert client.returncode == 1
+        assert 'was lost; start it again, and the same command continues' in error
+        assert error.count('\n') == 1
+        again = run_executable('fleet', *words, '-o', 'out', '--scheduler', cluster.address,
+                               cwd=tmp_path)
+        assert (again.returncode, again.stderr) == (0, '')
     calm = run_executable('fleet', *words, '-o', 'calm', '--jobs', 2, cwd=tmp_path)
     assert calm.returncode == 0, calm.stderr
     assert without_timing(table_of(tmp_path / 'out')) == \

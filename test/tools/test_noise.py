@@ -131,7 +131,7 @@ def test_a_few_lost_samples_are_filled_and_a_long_gap_is_not(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(('change', 'reason'), [
-    ('stuck', 'az_mps2 never changes;'), ('stuck half way', 'az_mps2 never changes from '),
+    ('stuck', 'az_mps2 never changes'), ('stuck half way', 'az_mps2 never changes'),
     ('short', 'record longer')])
 def test_refusals_are_one_line(tmp_path: Path, change: str, reason: str) -> None:
     time_s, accel = samples(5.0 if change == 'short' else 60.0)

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from difflib import get_close_matches
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -40,7 +39,5 @@ def effect_named(name: str) -> Effect:
     """Return the effect of that name."""
     effects = library()
     if name not in effects:
-        near = get_close_matches(name, effects, 1)
-        hint = f'did you mean {near[0]}?' if near else f'known: {", ".join(sorted(effects))}'
-        raise UserError(f'unknown effect {name!r}; {hint}')
+        raise UserError(f'unknown effect {name!r}; known: {", ".join(sorted(effects))}')
     return effects[name]
