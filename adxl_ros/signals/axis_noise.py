@@ -162,6 +162,10 @@ def with_noise(sensor: Sensor, noises: list[AxisNoise]) -> Sensor:
         values.pop(effect, None)
         if sizes.any():
             values[effect] = {name: sizes}
+    if 'bias_walk' in values:
+        values['bias_walk']['return_per_s'] = np.array(
+            [1 / noise.fit.correlation.value if noise.fit.correlation else 0.0
+             for noise in noises])
     kept = [name for name in sensor.effects if name in values]
     changed: dict[str, Any] = {
         'effects': (*kept, *(name for name in values if name not in kept)), 'values': values,

@@ -7,12 +7,13 @@ The points of an Allan deviation are correlated, so a line through them has no s
 The fit therefore takes the cosine transform of the means of short cells. There a random walk and
 white noise have independent coefficients of known variance, and 1/f noise nearly so. The fit
 maximises the likelihood of the coefficients. The intervals are those of the profile likelihood.
-Lines of a fan or of mains are left out first.
+Lines of a fan or of mains are left out first, and a walk that ends in bounds is a Gauss-Markov
+process (IEEE Std 952, annex B).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -38,8 +39,16 @@ searched. Chosen: it changes the likelihood of no recording."""
 _OCTAVE_PROBABILITY = 1e-3
 """Probability by chance, below which an octave shows a filter, or a group exceeds its
 neighbours. Chosen: with ten octaves one healthy recording in a hundred."""
+_BOUND_PROBABILITY = 1e-2
+"""Probability by chance, below which a walk has bounds. Chosen: one healthy recording in a
+hundred; where bounds are missed, the interval of K is too low."""
 _FEWEST_NEIGHBOURS = 8
 """Fewest groups within an octave on both sides that show the level beside a line. Chosen."""
+_BOUND_STEP = 2 ** 0.5
+"""Ratio of correlation times that are tried. Chosen: the likelihood changes little between."""
+_SHORTEST_BOUND = 10.0
+"""Shortest correlation time, by that of the highest frequency. Chosen: a shorter one is taken for
+a filter of white noise."""
 _MARGIN_OCTAVES = 2
 """Octaves below a filter's effect that are left out. Chosen: the effect falls by 16 in power."""
 _FEWEST = 32
@@ -76,7 +85,11 @@ class NoiseFit:
     # White noise N, u/√Hz: the density over positive and negative frequencies is N²
     white: Estimate
     instability: Estimate  # Bias instability B, u: the density is B²/(2π·f)
-    walk: Estimate  # Random walk K, u/√s: the density is K²/(2π·f)²
+    # Random walk K, u/√s: the density is K²/(2π·f)², or K²/((2π·f)² + 1/T²) with bounds
+    walk: Estimate
+    # Correlation time T of a bounded walk (first-order Gauss-Markov), s, whose standard deviation
+    # is K·√(T/2); None where no bounds show
+    correlation: Estimate | None
     highest: int  # Number of cosine coefficients of the fit, from the lowest
     highest_hz: float  # Frequency of the last one, Hz
     kept: np.ndarray  # Groups of coefficients without lines, bool
@@ -115,9 +128,16 @@ class NoiseFit:
 
     def lines(self, tau_s: np.ndarray) -> np.ndarray:
         """Return the Allan deviations of N, B and K at times, s, (k,), in u, (3, k)."""
+        walk = np.sqrt(tau_s / 3)
+        if self.correlation is not None:
+            # IEEE Std 952, equation C.19; for short times its terms cancel.
+            time_s = self.correlation.value
+            x = tau_s / time_s
+            terms = 1 - (3 - 4 * np.exp(-x) + np.exp(-2 * x)) / (2 * x)
+            walk = np.where(x > 1e-3, time_s * np.sqrt(np.abs(terms) / tau_s), walk)
         return np.stack([self.white.value / np.sqrt(tau_s),
                          np.full(len(tau_s), FLOOR * self.instability.value),
-                         self.walk.value * np.sqrt(tau_s / 3)])
+                         self.walk.value * walk])
 
 
 @dataclass(frozen=True)
@@ -160,6 +180,12 @@ class _Groups:
                 break
             kept &= ~(line | np.append(line[1:], False) | np.append(False, line[:-1]))
         return kept
+
+    def bounded(self, correlation_s: float, span_s: float) -> _Groups:
+        """Return the groups with a bounded walk, in recordings of `span_s`."""
+        cycle = np.pi * correlation_s / span_s * (self.first + (self.count - 1) / 2)
+        return replace(self, shapes=self.shapes * np.column_stack(
+            [np.ones((len(cycle), 2)), 1 / (1 + cycle ** -2.0)]))
 
 
 def coefficients(means: np.ndarray) -> np.ndarray:
@@ -208,16 +234,43 @@ def fit_noise(means: np.ndarray, step_s: float, variances: np.ndarray | None = N
     kept = everything.without_lines() if like is None else like.kept
     groups = everything.where(kept)
     span_s = len(means) * step_s
-    highest = _highest(groups, len(means)) if like is None else like.highest
+    highest = _highest(groups, len(means), span_s) if like is None else like.highest
     used = groups.below(highest)
-    theta, likelihood = _fit(used)
-    white, instability, walk = (_interval(used, theta, likelihood, term) for term in range(3))
+    models, correlation = _walks(used, span_s, highest)
+    theta, likelihood = _best(models)
+    white, instability, walk = (_interval(models, theta, likelihood, term) for term in range(3))
     excess = everything.count * everything.power / (everything.shapes @ theta)
     is_line = ~kept & (scipy.stats.chi2.sf(excess, everything.count)
                        < _OCTAVE_PROBABILITY / len(kept))
     lines_hz = (everything.first + everything.count / 2)[is_line] / (2 * span_s)
-    return NoiseFit(white, instability, walk, highest, highest / (2 * span_s), kept,
+    return NoiseFit(white, instability, walk, correlation, highest, highest / (2 * span_s), kept,
                     lines_hz, likelihood)
+
+
+def _walks(groups: _Groups, span_s: float, highest: int
+           ) -> tuple[list[_Groups], Estimate | None]:
+    """
+    Return the groups with the walks that the interval of its correlation time holds.
+
+    A walk without bounds is one of its own, which bounds must contradict.
+    """
+    count = int(np.log(highest / _SHORTEST_BOUND) / np.log(_BOUND_STEP))
+    times_s = span_s * _BOUND_STEP ** np.arange(-count, 5.0)
+    models = [groups.bounded(time_s, span_s) for time_s in times_s]
+    likelihoods = np.array([_fit(model)[1] for model in models])
+    free = _fit(groups)[1]
+    if 2 * (likelihoods.max() - free) < scipy.stats.chi2.isf(_BOUND_PROBABILITY, 1):
+        return [groups], None
+    inside = np.flatnonzero(2 * (likelihoods.max() - likelihoods) < _DROP)
+    low, high = max(inside[0] - 1, 0), min(inside[-1] + 1, len(times_s) - 1)
+    return models[low:high + 1], Estimate(float(times_s[likelihoods.argmax()]),
+                                          float(times_s[low]), float(times_s[high]))
+
+
+def _best(models: list[_Groups], fixed: int | None = None, value: float = 0.0
+          ) -> tuple[np.ndarray, float]:
+    """Return the most likely fit of several models; see `_fit`."""
+    return max((_fit(model, fixed, value) for model in models), key=lambda fit: fit[1])
 
 
 def _grouped(power: np.ndarray, variances: np.ndarray) -> _Groups:
@@ -271,17 +324,17 @@ def _fit(groups: _Groups, fixed: int | None = None, value: float = 0.0
     return theta, likelihood
 
 
-def _interval(groups: _Groups, theta: np.ndarray, likelihood: float, term: int) -> Estimate:
-    """Return a term with the ends of its interval by the profile likelihood."""
+def _interval(models: list[_Groups], theta: np.ndarray, likelihood: float, term: int) -> Estimate:
+    """Return a term with the ends of its interval by the profile likelihood over models."""
     def excess(logarithm: float) -> float:
         """Return twice the drop of the profile likelihood, minus its limit."""
-        return 2 * (likelihood - _fit(groups, term, np.exp(logarithm))[1]) - _DROP
+        return 2 * (likelihood - _best(models, term, np.exp(logarithm))[1]) - _DROP
 
-    scale = float(np.min(groups.shapes @ theta / groups.shapes[:, term]))
+    scale = float(np.min(models[0].shapes @ theta / models[0].shapes[:, term]))
     best = float(theta[term])
     low = 0.0
     begin = np.log(best if best > 0 else scale * _SMALLEST)
-    if best > 0 and 2 * (likelihood - _fit(groups, term, 0.0)[1]) > _DROP:
+    if best > 0 and 2 * (likelihood - _best(models, term, 0.0)[1]) > _DROP:
         bottom = begin - 1.0
         while excess(bottom) < 0:
             bottom -= 1.0
@@ -293,12 +346,15 @@ def _interval(groups: _Groups, theta: np.ndarray, likelihood: float, term: int) 
     return Estimate(*(float(np.sqrt(square)) for square in (best, low, high)))
 
 
-def _highest(groups: _Groups, count: int) -> int:
+def _highest(groups: _Groups, count: int, span_s: float) -> int:
     """Return the number of the coefficient at which the fit stops: where a filter shows."""
     stop = count
     while stop > 2 * _FEWEST:
         lower = groups.below(max(stop // 2, _FEWEST))
         octave = groups.where((groups.first >= stop // 2) & (groups.first + groups.count <= stop))
+        _, correlation = _walks(lower, span_s, stop // 2)
+        if correlation is not None:
+            lower, octave = (part.bounded(correlation.value, span_s) for part in (lower, octave))
         if _is_expected(octave, lower, _fit(lower)[0]):
             break
         stop //= 2

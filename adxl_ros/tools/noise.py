@@ -61,9 +61,7 @@ def _tables(result: RecordingNoise) -> list[str]:
     rows = [row((' axis', *(NAMES[term] for term in TERMS)), wide),
             row(('', 'µg/√Hz (90 %)', 'µg (90 %)', 'µg/√s (90 %)'), wide)]
     rows += [row((f' {noise.axis}', *_micro_g_intervals(noise)), wide) for noise in result.axes]
-    if any(noise.fit.walk.is_seen for noise in result.axes):
-        rows.append(f' K holds for times up to {duration(result.rest.span_s)}, those of the '
-                    'recording.')
+    rows += _walk_lines(result)
     rows += ['', row(('', 'N', 'B', 'K', 'N by sample', 'K by sample', 'datasheet'), narrow),
              row((' axis', 'm/s²/√Hz', 'm/s²', 'm/s²/√s', 'm/s²', 'm/s²', 'µg/√Hz'), narrow)]
     rate = np.sqrt(result.rest.rate_hz)
@@ -78,6 +76,21 @@ def _tables(result: RecordingNoise) -> list[str]:
 
 def _micro_g_intervals(noise: AxisNoise) -> list[str]:
     return [_interval(estimate.scaled(MICRO_G)) for estimate in noise.estimates]
+
+
+def _walk_lines(result: RecordingNoise) -> list[str]:
+    """Return the bounds of the walks, and for which times K holds."""
+    rows = []
+    for noise in result.axes:
+        time_s, walk = noise.fit.correlation, noise.fit.walk
+        if time_s is not None:
+            std = MICRO_G * walk.value * np.sqrt(time_s.value / 2)
+            rows.append(f' {noise.axis}: the walk has bounds, {std:.3g} µg rms; correlation time '
+                        f'{_interval(time_s)} s')
+    if any(noise.fit.walk.is_seen for noise in result.axes):
+        rows.append(f' K holds for times up to {duration(result.rest.span_s)}, those of the '
+                    'recording.')
+    return rows
 
 
 def _interval(estimate: Estimate) -> str:
@@ -174,8 +187,10 @@ def _axis_json(noise: AxisNoise) -> dict[str, Any]:
     terms = {name: {'value': estimate.value if estimate.is_seen else None,
                     'ci': [estimate.low, estimate.high], 'unit': _UNITS[name]}
              for name, estimate in zip(TERMS, noise.estimates)}
-    return {**terms, 'rounding': noise.rounding,
-            'density_g_per_rthz': axis_noise.density_g_per_rthz(noise),
+    time_s = noise.fit.correlation
+    return {**terms, 'correlation_s': time_s and {'value': time_s.value,
+                                                  'ci': [time_s.low, time_s.high]},
+            'rounding': noise.rounding, 'density_g_per_rthz': axis_noise.density_g_per_rthz(noise),
             'sample_std_mps2': noise.sample_std, 'resolution_mps2': noise.resolution,
             'lowest': {'tau_s': noise.lowest_s, 'deviation_mps2': noise.lowest},
             'fitted_below_hz': noise.fit.highest_hz}
