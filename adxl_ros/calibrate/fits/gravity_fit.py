@@ -43,17 +43,8 @@ _OUTLIER_CHANCE = 0.01
 """Probability of a false outlier among all rests of a fit without outliers."""
 _MAX_OUTLIERS = 0.25
 """Largest share of outliers. Chosen: more of them are a fault of the recording."""
-_OUTLIER_RANGE_G = 0.03
-"""Range of the magnitude of an outlier, g. Chosen: the size of a knock or of a hand's motion."""
-_LTS_STARTS = 20
-"""Number of starts of the least trimmed squares, with ten rests each. Chosen: one of them is
-likely to be free of outliers."""
-_LTS_FIRST_STEPS = 4
-"""Gauss-Newton steps with the rests of a start."""
-_LTS_STEPS = 11
-"""Gauss-Newton steps with the rests that fit best."""
-_LTS_MAX_DEVIATIONS = 5.0
-"""Largest residual of a rest that belongs to the best fit of most rests, standard deviations."""
+_MAX_DEVIATIONS = 5.0
+"""Largest residual of a rest with which the search for outliers begins, standard deviations."""
 _MIN_REMAINDER = 1e-9
 """Lower bound of 1 − leverage, as a divisor."""
 _OTHER_SENSOR_G = 0.3
@@ -200,30 +191,29 @@ def _inliers(rests: NominalRests, fit: Callable[[np.ndarray], _Estimate]) -> np.
     """
     Mark the rests that fit the others, (k,) bool.
 
-    Rests leave or return, one at a time, by their studentised distance from the fit to the
-    others. One search begins with all rests. Another begins with the best fit to most rests,
-    where outliers cannot mask one another. The result with the greater likelihood counts.
+    The search begins with the rests near the fit with the least sum of absolute errors, where
+    outliers cannot mask one another. Then rests leave or return, one at a time, by their
+    studentised distance from the fit to the others, until each kept rest fits and each other does
+    not.
     """
     count = len(rests.mean)
     max_outliers = min(int(_MAX_OUTLIERS * count), count - MIN_RESTS)
-    everything = np.ones(count, bool)
     if max_outliers < 1:
-        return everything
-    results = [_exchanged(rests, begin, fit, max_outliers)
-               for begin in (everything, _robust_inliers(rests, max_outliers))]
-    return min(results, key=lambda kept: _negative_log_likelihood(rests, kept, fit))
-
-
-def _exchanged(rests: NominalRests, kept: np.ndarray, fit: Callable[[np.ndarray], _Estimate],
-               max_outliers: int) -> np.ndarray:
-    """Let rests leave or return until each kept rest fits and each other does not, (k,) bool."""
-    kept = kept.copy()
+        return np.ones(count, bool)
+    robust = scipy.optimize.least_squares(
+        lambda p: _residual(rests, p), np.zeros(len(NAMES)),
+        lambda p: gravity_model.magnitude_jacobian(rests.mean, p), loss='soft_l1',
+        f_scale=gravity_model.TRIAL_STD_G)
+    size = np.abs(robust.fun)
+    freedom = max(count - max_outliers - len(NAMES), 1)
+    variance = np.sum(np.sort(size)[:count - max_outliers] ** 2) / freedom
+    kept = size <= _MAX_DEVIATIONS * np.sqrt(
+        variance + magnitude_variance(rests, robust.x).mean())
     for _ in range(2 * max_outliers):
         distance = _studentised(rests, kept, fit(kept))
-        freedom = max(kept.sum() - MIN_RESTS, 1)
-        limit = -scipy.special.stdtrit(freedom, _OUTLIER_CHANCE / (2 * len(kept)))
-        excluded = np.where(kept, np.inf, distance)
-        included = np.where(kept, distance, 0)
+        limit = -scipy.special.stdtrit(max(kept.sum() - MIN_RESTS, 1),
+                                       _OUTLIER_CHANCE / (2 * count))
+        excluded, included = np.where(kept, np.inf, distance), np.where(kept, distance, 0)
         if excluded.min() <= limit:
             kept[excluded.argmin()] = True
         elif included.max() > limit and (~kept).sum() < max_outliers:
@@ -231,39 +221,6 @@ def _exchanged(rests: NominalRests, kept: np.ndarray, fit: Callable[[np.ndarray]
         else:
             break
     return kept
-
-
-def _negative_log_likelihood(rests: NominalRests, kept: np.ndarray,
-                             fit: Callable[[np.ndarray], _Estimate]) -> float:
-    """Return −ln of the residual likelihood; outliers are uniform within `_OUTLIER_RANGE_G`."""
-    parameters, excess_g2, _ = fit(kept)
-    variance = magnitude_variance(rests[kept], parameters).mean() + excess_g2
-    count, outliers = len(kept), (~kept).sum()
-    log_choices = (scipy.special.gammaln(count + 1) - scipy.special.gammaln(outliers + 1)
-                   - scipy.special.gammaln(count - outliers + 1))
-    return float((kept.sum() - len(NAMES)) / 2 * np.log(variance * 2 * np.pi * np.e)
-                 + outliers * np.log(_OUTLIER_RANGE_G) + log_choices)
-
-
-def _robust_inliers(rests: NominalRests, max_outliers: int) -> np.ndarray:
-    """
-    Mark the rests that are near the best fit to all but `max_outliers` rests, (k,) bool.
-
-    This is least trimmed squares: each start fits a few rests, then repeatedly the rests that
-    its fit suits best (Rousseeuw and Van Driessen 2006). All starts run side by side.
-    """
-    count = len(rests.mean)
-    rng = np.random.default_rng(0)
-    few = np.array([rng.choice(count, MIN_RESTS, replace=False) for _ in range(_LTS_STARTS)])
-    parameters = gravity_model.regularised_fit(
-        rests[few], np.zeros((_LTS_STARTS, len(NAMES))), _LTS_FIRST_STEPS)
-    parameters = gravity_model.regularised_fit(rests, parameters, _LTS_STEPS, count - max_outliers)
-    squares = np.sort(_residual(rests, parameters) ** 2, axis=1)
-    trimmed_sums = np.nan_to_num(squares[:, :count - max_outliers].sum(axis=1), nan=np.inf)
-    best = parameters[trimmed_sums.argmin()]
-    freedom = max(count - max_outliers - len(NAMES), 1)
-    std = np.sqrt(trimmed_sums.min() / freedom + magnitude_variance(rests, best).mean())
-    return np.abs(_residual(rests, best)) <= _LTS_MAX_DEVIATIONS * std
 
 
 def _studentised(rests: NominalRests, kept: np.ndarray, estimate: _Estimate) -> np.ndarray:
