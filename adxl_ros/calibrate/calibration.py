@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from adxl_ros.calibrate.fits import full_model, gravity_fit, linear, term_selection, thermal_fit
-from adxl_ros.calibrate.fits.linearisation import volts_covariance
 from adxl_ros.calibrate.poses import at_a_rail, Poses, predicted_volts, reference_force
 from adxl_ros.calibrate.report import acceptance, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment
@@ -287,12 +286,9 @@ either recording, far below a new mounting."""
 _MAX_ZERO_G_SHIFT_G = 0.02
 """Largest shift of the zero-g between recordings, g. Chosen: a healthy unit may shift by so much
 between two days."""
-_MIN_DEVIATIONS = 6.0
-"""Smallest turn or shift that counts, in its standard deviations. Chosen: never by chance."""
-_MIN_EIGENVALUE_RATIO = 1e-10
-"""Smallest relative eigenvalue of the information whose direction counts as determined."""
-_MIN_VARIANCE = 1e-30
-"""Lower bound of the variance of a turn, rad², or shift, g², so that it can be a divisor."""
+_MIN_SINGULAR_VALUE = 0.05
+"""Smallest relative singular value of a change that poses show. Chosen: poses about one direction
+show no turn about it."""
 
 
 class _ContradictionError(UserError):
@@ -303,40 +299,27 @@ def _require_one_mounting(full: full_model.FullFit, recordings: Sequence[Recorde
     """
     Refuse recordings if the mounting or the zero-g of one of them differs.
 
-    A turn of the case and a shift of the zero-g of each axis are fitted by least squares to the
-    residuals of each recording about the common fit.
+    A turn of the case, rad, (3,), and a shift of the zero-g, g, (m,), are fitted by least squares
+    to the residuals of each recording about the common fit.
     """
-    axes = full.unit.axes
+    unit, axes = full.unit, full.unit.axes
     limits = np.repeat([_MAX_TURN_RAD, _MAX_ZERO_G_SHIFT_G], [3, len(axes)])
-    for recording in recordings:
-        changes, std = _turn_and_shifts(full, recording.poses)
-        deviations = np.where(np.abs(changes) > limits, np.abs(changes) / std, 0.0)
-        worst = int(np.argmax(deviations))
-        if deviations[worst] <= _MIN_DEVIATIONS:
-            continue
-        change = f'case is turned by {np.degrees(changes[worst]):.2f} deg about {AXES[worst]}' \
-            if worst < 3 else \
-            f'zero-g of {axes[worst - 3]} is shifted by {1e3 * changes[worst]:.2f} mg'
-        raise _ContradictionError(
-            f'{recording.source}: {change} from the fit of all recordings '
-            f'({deviations[worst]:.0f} standard deviations): another unit or another '
-            'mounting; fit this recording separately')
-
-
-def _turn_and_shifts(full: full_model.FullFit, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
-    """Fit the turn of the case, rad, (3,), and the zero-g shifts, g, (m,); values and std."""
-    unit = full.unit
-    force = reference_force(poses, unit.local_gravity_mps2)
-    by_force = np.moveaxis(signal_chain.jacobian(
-        signal_chain.analog_response(unit), force, poses.environment), 2, 0)
-    turned = np.stack([np.cross(axis, np.column_stack(force)) for axis in np.eye(3)], axis=2)
-    shifted = np.broadcast_to(np.diag(unit.scale_v_per_g),
-                              (len(poses), len(unit.axes), len(unit.axes)))
-    information, gradient = volts_covariance(unit, poses, full.stage).normal_equations(
-        np.concatenate([by_force @ turned, shifted], axis=2),
-        poses.volts - predicted_volts(unit, poses))
-    covariance = np.linalg.pinv(information, rcond=_MIN_EIGENVALUE_RATIO)
-    return covariance @ gradient, np.sqrt(np.maximum(np.diag(covariance), _MIN_VARIANCE))
+    for source, poses in ((recording.source, recording.poses) for recording in recordings):
+        force = reference_force(poses, unit.local_gravity_mps2)
+        by_force = np.moveaxis(signal_chain.jacobian(
+            signal_chain.analog_response(unit), force, poses.environment), 2, 0)
+        turned = np.stack([np.cross(axis, np.column_stack(force)) for axis in np.eye(3)], axis=2)
+        shifted = np.tile(np.diag(unit.scale_v_per_g), (len(poses), 1, 1))
+        design = np.concatenate([by_force @ turned, shifted], axis=2).reshape(-1, len(limits))
+        residual_v = (poses.volts - predicted_volts(unit, poses)).ravel()
+        changes = np.linalg.lstsq(design, residual_v, _MIN_SINGULAR_VALUE)[0]
+        worst = int(np.argmax(np.abs(changes) / limits))
+        if abs(changes[worst]) > limits[worst]:
+            change = f'case is turned by {np.degrees(changes[worst]):.2f} deg about ' \
+                f'{AXES[worst]}' if worst < 3 else \
+                f'zero-g of {axes[worst - 3]} is shifted by {1e3 * changes[worst]:.2f} mg'
+            raise _ContradictionError(f'{source}: {change} from the fit of all recordings: another '
+                                      'unit or another mounting; fit this recording separately')
 
 
 def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, data_sha256: str,
@@ -381,11 +364,6 @@ def _turn_on_lines(fitted: Sensor, recordings: Sequence[Poses]) -> list[str]:
         fitted.axes, np.std(changes_mg, axis=0, ddof=1)))
     return [f'turn-on to turn-on: the zero-g scatters by {by_axis} mg (standard deviation over '
             f'{len(on_stage)} recordings)']
-
-
-_RIVAL_SHARE = 0.5
-"""Gain of an effect, divided by that of the best one, from which the two are not separated.
-Chosen: neither form is exact."""
 
 
 def calibrate_thermal(base: Sensor, poses: Poses, source: str, data_sha256: str = '',
@@ -443,9 +421,7 @@ def _history_lines(fit: thermal_fit.ThermalFit) -> list[str]:
     effect = fit.history.effect
     if not effect:
         return ['warming and cooling agree: no thermal_lag, no thermal_hysteresis']
-    unit = 's' if effect == 'thermal_lag' else 'K'
-    line = f'warming and cooling differ: {effect} ({fit.history.shape:.3g} {unit})'
-    rivals = [other for other, gain in fit.gains.items()
-              if other != effect and gain > _RIVAL_SHARE * fit.gains[effect]]
-    return [line, *(f'{other} explains it nearly as well: these blocks do not separate them'
-                    for other in rivals)]
+    gains = ', '.join(f'{name} {gain:.0f}' for name, gain in fit.gains.items())
+    return [f'warming and cooling differ: {effect} '
+            f'({fit.history.shape:.3g} {"s" if effect == "thermal_lag" else "K"}); gain by effect, '
+            f'nats: {gains}']

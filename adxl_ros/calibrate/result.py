@@ -33,8 +33,6 @@ import numpy as np
 
 _SAME_BETA_RAD = 1e-3
 """Smaller changes of beta are no step of the sweep, rad. Chosen: below any step of a plan."""
-_MAX_PLANES_LISTED = 12
-"""Largest count of planes that are listed one by one."""
 _SAME_FIT_TOLERANCE = 1e-6
 """Largest relative difference of coefficients of the same fit: the rounding in a file."""
 
@@ -157,17 +155,16 @@ def _sweep_text(poses: Poses) -> str:
     fitted = poses.subset(~poses.check)
     if not np.isfinite(fitted.alpha_rad).all():
         return f'{len(fitted)} rests in directions of its own, against gravity'
-    alpha = [float(np.degrees(fitted.alpha_rad[plane].mean()))
-             for plane in planes(fitted.alpha_rad)]
-    alpha_text = ', '.join(f'{a:.0f}' for a in alpha) if len(alpha) <= _MAX_PLANES_LISTED else \
-        f'{len(alpha)} planes from {alpha[0]:.0f} to {alpha[-1]:.0f}'
-    lowest, highest = np.degrees([fitted.beta_rad.min(), fitted.beta_rad.max()])
+    first, last, lowest, highest = np.degrees([
+        fitted.alpha_rad.min(), fitted.alpha_rad.max(), fitted.beta_rad.min(),
+        fitted.beta_rad.max()])
     changes = np.diff(fitted.beta_rad)
     steps = np.abs(changes)[np.abs(changes) > _SAME_BETA_RAD]
     step = np.degrees(np.median(steps)) if steps.size else 0.0
     both_ways = (changes > _SAME_BETA_RAD).any() and (changes < -_SAME_BETA_RAD).any()
     # Without a colon: ros2 param reads the text as YAML again.
-    return (f'{len(fitted)} poses, alpha {alpha_text} deg; beta {lowest:.0f} to {highest:.0f} '
+    return (f'{len(fitted)} poses, {len(planes(fitted.alpha_rad))} planes alpha from '
+            f'{first:.0f} to {last:.0f} deg; beta {lowest:.0f} to {highest:.0f} '
             f'deg, steps of {step:.0f}, {"both directions" if both_ways else "one direction"}')
 
 

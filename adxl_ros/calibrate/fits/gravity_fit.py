@@ -113,7 +113,7 @@ def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor,
     ------
     UserError
         The rests do not determine the parameters, or do not read gravity. The message names the
-        coefficients and rests to add.
+        coefficients.
 
     """
     rests = gravity_model.nominal_rests(mean_v, std_v, sensor)
@@ -273,11 +273,9 @@ def _require_determined(rests: NominalRests, parameters: np.ndarray, excess_g2: 
         ', '.join(map(str, missing))
     reason = f'do not determine {names}' if missing else f'are too few, at least {MIN_RESTS}'
     scatter = f' and scatter by {1e3 * np.sqrt(excess_g2):.2g} mg' if excess_g2 else ''
-    rests_needed = gravity_model.rests_to_add(
-        max(MIN_RESTS - count, 0), information, parameters, rests.gravity_g,
-        gravity_model.TRIAL_STD_G ** 2 + excess_g2)
     raise UserError(f'gravity: without their angles (fit --poses), the {count} rests {reason}'
-                    f'{scatter}{_other_sensor(rests)}; add rests with {", ".join(rests_needed)}')
+                    f'{scatter}{_other_sensor(rests)}; add rests with each axis up and down, and '
+                    'with two axes equally up')
 
 
 def _other_sensor(rests: NominalRests) -> str:

@@ -321,17 +321,14 @@ class Passed:
 
     def advice(self) -> str:
         """Return what to do next, for people."""
-        half_c = (self.middles_c[1] - self.middles_c[0]) / 2
-        open_warm, open_cool = self.middles_c[~self.warming], self.middles_c[~self.cooling]
         if self.complete:
             return 'both directions are covered'
-        warms = len(open_warm) and (self.rises or not len(open_cool))
-        parts = open_warm if warms else open_cool
-        cool, warm = (f'cool it to {parts[0] - half_c:.0f} °C',
-                      f'warm it to {parts[-1] + half_c:.0f} °C')
-        # The other end first, unless the temperature already moves there.
-        order = (cool, warm) if warms else (warm, cool)
-        return order[1] if bool(warms) == self.rises else ', then '.join(order)
+        half_c = (self.middles_c[1] - self.middles_c[0]) / 2
+        warms = not self.warming.all() and (self.rises or self.cooling.all())
+        parts = self.middles_c[~(self.warming if warms else self.cooling)]
+        low, high = f'{parts[0] - half_c:.0f}', f'{parts[-1] + half_c:.0f}'
+        return f'warm it from {low} to {high} °C' if warms else \
+            f'cool it from {high} to {low} °C'
 
 
 def passed(temperatures_c: np.ndarray, range_c: tuple[float, float]) -> Passed:

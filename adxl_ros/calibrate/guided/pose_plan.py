@@ -179,16 +179,8 @@ def by_plane(targets: Sequence[Target], accepted: Collection[int]) -> tuple[Cove
 
 def by_orientation(covered: np.ndarray) -> tuple[Coverage, ...]:
     """Count the covered orientations, (26,) bool, by faces, edges and corners."""
-    sides = np.count_nonzero(gravity_model.CANDIDATES, axis=1)
-    return tuple(Coverage(name, int(covered[sides == count].sum()), int((sides == count).sum()))
-                 for count, name in _SIDES.items())
-
-
-def faces(covered: np.ndarray) -> str:
-    """Name the faces among the covered orientations, (26,) bool."""
-    sides = np.count_nonzero(gravity_model.CANDIDATES, axis=1)
-    return ' '.join(gravity_model.name_up(int(number))
-                    for number in np.flatnonzero(covered & (sides == 1)))
+    groups = [(name, covered[gravity_model.AXES_UP == count]) for count, name in _SIDES.items()]
+    return tuple(Coverage(name, int(part.sum()), len(part)) for name, part in groups)
 
 
 def _groups(target: Target, previous: Target | None) -> list[str]:

@@ -169,7 +169,7 @@ class HandRests(Guide):
         rests = nominal_rests(mean_v, std_v, self.sensor)
         self._parameters = np.zeros(len(NAMES))
         if records:
-            self._parameters = gravity_model.regularised_fit(rests, self._parameters, _STEPS)
+            self._parameters = gravity_model.regularised_fit(rests, _STEPS)
         information = gravity_model.posterior_information(
             rests, self._parameters, gravity_model.TRIAL_STD_G ** 2)
         values, to_units = gravity_model.effect_values(self._parameters, self.sensor)
@@ -181,14 +181,11 @@ class HandRests(Guide):
                               covariance=covariance, covariance_names=NAMES)
         force = force_g(rests.mean, self._parameters)
         self.covered = gravity_model.covered(force / np.linalg.norm(force, axis=1, keepdims=True))
-        self._gain, _ = gravity_model.information_gain(information, self._parameters,
-                                                       rests.gravity_g)
         self._choose_next_up()
 
     def _choose_next_up(self) -> None:
         """Choose the orientation to ask for."""
-        available = ~self.covered & ~self._skipped
-        self.next_up = gravity_model.next_up(self._gain, available, self.up())
+        self.next_up = gravity_model.next_up(~self.covered & ~self._skipped, self.up())
 
     def _fault(self, record: PoseRecord) -> str:
         """Return why a rest is refused, or ''."""
@@ -253,8 +250,7 @@ class HandGuide(HandRests):
     def estimate_contents(self) -> Estimate:
         """Return what the rests determine so far, for the screen."""
         return Estimate(
-            coverage=pose_plan.by_orientation(self.covered),
-            covered_faces=pose_plan.faces(self.covered), coefficients=self.rows,
+            coverage=pose_plan.by_orientation(self.covered), coefficients=self.rows,
             tilt_error_deg=running_estimate.degrees_or_none(self.tilt_error_rad()))
 
     def tilt_error_rad(self) -> float:
