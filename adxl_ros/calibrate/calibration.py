@@ -161,11 +161,10 @@ def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: s
         **acceptance.provenance_entries(assessment, errors)})
     summary = acceptance.summary_lines(
         fitted, assessment, acceptance.held_out_lines(errors, len(poses) - len(outliers)))
-    budget = acceptance.budget_lines(assessment) if assessment else []
     return CalibrationResult(
         nominal=sensor, fitted=fitted, summary=summary, poses=poses, assessments=assessments,
         held_out=errors, outliers=outliers, warnings=[*warnings, *fit.notes],
-        details=[*budget, *fit_lines])
+        details=fit_lines)
 
 
 def _check_polarity(sensor: Sensor, poses: Poses) -> None:
@@ -318,8 +317,9 @@ def _require_one_mounting(full: full_model.FullFit, recordings: Sequence[Recorde
             change = f'case is turned by {np.degrees(changes[worst]):.2f} deg about ' \
                 f'{AXES[worst]}' if worst < 3 else \
                 f'zero-g of {axes[worst - 3]} is shifted by {1e3 * changes[worst]:.2f} mg'
-            raise _ContradictionError(f'{source}: {change} from the fit of all recordings: another '
-                                      'unit or another mounting; fit this recording separately')
+            raise _ContradictionError(
+                f'{source}: {change} from the fit of all recordings: another unit or another '
+                'mounting; fit this recording separately')
 
 
 def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, data_sha256: str,
@@ -350,7 +350,7 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, d
         fitted, assessment, acceptance.gravity_lines(fit, poses.time_s[:, 0]))
     return CalibrationResult(
         nominal=sensor, fitted=fitted, summary=summary, poses=poses, assessments=(assessment,),
-        gravity_fit=fit, warnings=warnings, details=acceptance.budget_lines(assessment))
+        gravity_fit=fit, warnings=warnings)
 
 
 def _turn_on_lines(fitted: Sensor, recordings: Sequence[Poses]) -> list[str]:
@@ -393,7 +393,6 @@ def calibrate_thermal(base: Sensor, poses: Poses, source: str, data_sha256: str 
         *_slope_lines(fitted, fit),
         'residual ' + ', '.join(f'{axis} {value * 1e3:.2g}' for axis, value in zip(
             base.axes, fit.residual_g)) + ' mg rms',
-        *_history_lines(fit),
         f'expected error of the zero-g over {low_c:.0f} to {high_c:.0f} °C: {error_mg:.2g} mg',
         f'zero-g stays as calibrated at {calibrated_c:.1f} °C']
     if not has_scale:
@@ -412,16 +411,3 @@ def _slope_lines(fitted: Sensor, fit: thermal_fit.ThermalFit) -> list[str]:
         lines.append(f'  {axis}  {with_half_width(k * 1e3, std[slope] * 1e3)} mg/K at 25 °C, '
                      f'{with_half_width(k2 * 1e6, std[curvature] * 1e6)} µg/K²')
     return lines
-
-
-def _history_lines(fit: thermal_fit.ThermalFit) -> list[str]:
-    """Say which dependence on the history the blocks support."""
-    if not fit.gains:
-        return ['history of the temperature: not tested, it needs warming and cooling']
-    effect = fit.history.effect
-    if not effect:
-        return ['warming and cooling agree: no thermal_lag, no thermal_hysteresis']
-    gains = ', '.join(f'{name} {gain:.0f}' for name, gain in fit.gains.items())
-    return [f'warming and cooling differ: {effect} '
-            f'({fit.history.shape:.3g} {"s" if effect == "thermal_lag" else "K"}); gain by effect, '
-            f'nats: {gains}']

@@ -47,9 +47,6 @@ _MAX_DEVIATIONS = 5.0
 """Largest residual of a rest with which the search for outliers begins, standard deviations."""
 _MIN_REMAINDER = 1e-9
 """Lower bound of 1 − leverage, as a divisor."""
-_OTHER_SENSOR_G = 0.3
-"""Range of the magnitudes by nominal values, g, from which those are wrong. Chosen: errors within
-PRIOR_STD make less."""
 _MIN_GRAVITY_RATIO = 0.5
 """Smallest ratio of the measured magnitude to local gravity; a smaller one is a wrong unit."""
 _MAX_GRAVITY_RATIO = 2.0
@@ -274,16 +271,5 @@ def _require_determined(rests: NominalRests, parameters: np.ndarray, excess_g2: 
     reason = f'do not determine {names}' if missing else f'are too few, at least {MIN_RESTS}'
     scatter = f' and scatter by {1e3 * np.sqrt(excess_g2):.2g} mg' if excess_g2 else ''
     raise UserError(f'gravity: without their angles (fit --poses), the {count} rests {reason}'
-                    f'{scatter}{_other_sensor(rests)}; add rests with each axis up and down, and '
+                    f'{scatter}; add rests with each axis up and down, and '
                     'with two axes equally up')
-
-
-def _other_sensor(rests: NominalRests) -> str:
-    """Return that the nominal values seem to be those of another sensor; empty if they fit."""
-    if not len(rests.mean):
-        return ''
-    low_g, high_g = np.quantile(np.linalg.norm(rests.mean, axis=1), [0.1, 0.9])
-    if high_g - low_g < _OTHER_SENSOR_G:
-        return ''
-    return (f', and read {low_g:.2f} to {high_g:.2f} g: zero-g and scale factor are those of '
-            'another sensor, so that --params needs the file of this one')

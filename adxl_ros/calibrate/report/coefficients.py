@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 from adxl_ros.files import calibration_store
 from adxl_ros.model.coefficients import get, parameter_of, with_neutral
@@ -124,19 +123,10 @@ def rounded(row: Comparison, value: float) -> str:
     return f'{round(value, places) + 0.0:.{places}f}'
 
 
-class _Quantity(NamedTuple):
-    """A quantity that is compared between calibrations."""
-
-    label: str  # Its name for people
-    field: str  # Field of a sensor that holds it
-    parameter: Coefficient  # The fitted parameter
-    unit: str  # Unit of a change
-
-
-_QUANTITIES = (
-    _Quantity('zero-g', 'zero_g_v', Coefficient('bias', 'offset_v'), 'mg'),
-    _Quantity('scale factor', 'scale_v_per_g', Coefficient('scale_factor', 'offset_v_per_g'),
-              'permille'))
+_QUANTITIES = {
+    'zero-g': ('zero_g_v', Coefficient('bias', 'offset_v'), 'mg'),
+    'scale factor': ('scale_v_per_g', Coefficient('scale_factor', 'offset_v_per_g'), 'permille')}
+"""Field of a sensor, fitted parameter, and unit of a change of what calibrations compare."""
 
 
 @dataclass(frozen=True)
@@ -160,57 +150,35 @@ class DriftHistory:
         return DriftHistory(tuple(by_data.values()) if len(by_data) > 1 else ())
 
     def table(self) -> tuple[list[str], list[list[str]]]:
-        """Return head and rows: each calibration, and its change from the one before."""
-        head, rows = ['date', 'id', 'model', 'temperature, °C'], [
+        """Return head and rows, a row for each calibration."""
+        head = ['date', 'id', 'model', 'temperature, °C', *(
+            f'{label} {axis}' for label in _QUANTITIES for axis in self.sensors[-1].axes)]
+        return head, [
             [date, calibration_store.calibration_id(sensor), sensor.model,
-             sensor.provenance.get('temperature_c', '-')]
+             sensor.provenance.get('temperature_c', '-'),
+             *(f'{value:.5f}' for value in (*sensor.zero_g_v, *sensor.scale_v_per_g))]
             for date, sensor in zip(self.dates, self.sensors)]
-        for number, quantity in enumerate(_QUANTITIES):
-            drift, _ = self.series(number)
-            for d, axis in enumerate(self.sensors[-1].axes):
-                head.append(f'{quantity.label} {axis}')
-                changes = ['', *(f' ({change:+.2f} {quantity.unit})'
-                                 for change in np.diff(drift[:, d]))]
-                for row, sensor, change in zip(rows, self.sensors, changes):
-                    row.append(f'{getattr(sensor, quantity.field)[d]:.5f}{change}')
-        return head, rows
 
     def changes(self) -> str:
         """State the changes since the calibration before that exceed their intervals."""
         before, now = self.sensors[-2:]
         changes = []
-        for number, quantity in enumerate(_QUANTITIES):
-            drift, std = self.series(number)
-            half_widths = Z_90 * np.hypot(*std[-2:])
-            changes += [f'{quantity.label} of {axis} changed by {change:+.2f} +- '
-                        f'{half_width:.2f} {quantity.unit}' for axis, change, half_width
-                        in zip(now.axes, -drift[-2], half_widths) if abs(change) > half_width]
-        identity = calibration_store.calibration_id(before)
-        earlier, later = map(calibration_store.date_of, (before, now))
-        since = f'Since {identity}' if earlier is None or later is None else \
-            f'In {(later - earlier).total_seconds() / 86400:.1f} days since {identity}'
+        for label, (field, parameter, unit) in _QUANTITIES.items():
+            differences = getattr(now, field) - getattr(before, field)
+            for d, axis in enumerate(now.axes):
+                name, scale = replace(parameter, axis=axis), 1e3 / now.scale_v_per_g[d]
+                variance = sum(float(sensor.covariance[i, i]) for sensor in (before, now)
+                               for i, own in enumerate(sensor.covariance_names) if own == name)
+                change, half_width = scale * differences[d], scale * Z_90 * variance ** 0.5
+                if abs(change) > half_width:
+                    changes.append(f'{label} of {axis} changed by {change:+.2f} +- '
+                                   f'{half_width:.2f} {unit}')
+        since = f'Since {calibration_store.calibration_id(before)}, {self.dates[-2]}'
         return f'{since}: {"; ".join(changes)}.' if changes else \
-            f'{since} nothing has changed beyond the 90 % intervals.'
+            f'{since}, nothing has changed beyond the 90 % intervals.'
 
     @property
     def dates(self) -> list[str]:
         """Return the dates of the calibrations, as text."""
         return [sensor.provenance.get('date', f'no. {i}')[:16].replace('T', ' ')
                 for i, sensor in enumerate(self.sensors, 1)]
-
-    def series(self, quantity: int) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Return the drift of a quantity relative to the newest calibration.
-
-        quantity: 0 for zero-g, mg, 1 for scale factor, permille; returns: differences and
-        standard deviations of the values, (k, m) each.
-        """
-        chosen, newest = _QUANTITIES[quantity], self.sensors[-1]
-        drift, std = [], []
-        for sensor in self.sensors:
-            change = getattr(sensor, chosen.field) - getattr(newest, chosen.field)
-            drift.append(change / newest.scale_v_per_g * 1e3)
-            by_name = dict(zip(sensor.covariance_names, np.sqrt(np.diag(sensor.covariance))))
-            std.append([by_name.get(replace(chosen.parameter, axis=axis), 0.0)
-                        for axis in sensor.axes] / sensor.scale_v_per_g * 1e3)
-        return np.array(drift), np.array(std)

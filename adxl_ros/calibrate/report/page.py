@@ -66,15 +66,14 @@ def write(folder: str | os.PathLike, result: CalibrationResult,
 
 
 def draw(path: str | os.PathLike, result: CalibrationResult) -> None:
-    """Write the plots of a calibrated unit as PNG."""
-    if result.gravity_fit is not None:
-        write_bytes(path, figures.png(_gravity_rests(result.name, result.gravity_fit)))
-    else:
-        draw_sweep(path, result.nominal, _paper_sensor(result), result.poses)
+    """Write figures 2 to 8 of the paper for a unit as PNG."""
+    draw_sweep(path, result.nominal, _paper_sensor(result), result.poses)
 
 
 def _paper_sensor(result: CalibrationResult) -> Sensor:
     """Return the unit by a model that the paper's figures can show."""
+    if result.gravity_fit is not None:
+        raise UserError('they need the angles of a stage')
     return result.fitted if result.fitted.model in ('physical', 'full') else \
         linear.fit_physical(result.nominal, result.poses.subset(~result.poses.check))
 
@@ -93,8 +92,6 @@ def page(result: CalibrationResult, past: Sequence[Sensor],
     elif assessment is not None and errors is not None:
         drawn['errors'] = _pose_errors(
             errors, assessment, result.poses.subset(result.inliers), fitted.axes)
-    if history.sensors:
-        drawn['drift'] = _drift(history)
     pictures, fault, paper_model = _paper_figures(result)
     temperature_c = fitted.envelope.temperature_c
     return html_page.render('adxl_ros.calibrate.report', 'calibration.html', {
@@ -234,26 +231,17 @@ def _coefficients(fitted: Sensor) -> list[dict[str, Any]]:
 
 def _paper_figures(result: CalibrationResult) -> tuple[list[str], str, str]:
     """Return the figures of the paper as URLs, else why there are none, and their model."""
-    if result.gravity_fit is not None:
-        return [], '', ''
-    pictures = [_held_out_plot(result.held_out, result.poses.subset(result.inliers))] \
-        if result.held_out else []
-    fault, model = '', 'physical'
     try:
         unit = _paper_sensor(result)
-        model = unit.model
-        pictures += [_sweep(result.nominal, unit, result.poses, pair) for pair in _PANELS]
+        return [html_page.picture_url(_sweep(result.nominal, unit, result.poses, pair))
+                for pair in _PANELS], '', unit.model
     except UserError as error:
-        fault = str(error)
-    return [html_page.picture_url(drawn) for drawn in pictures], fault, model
+        return [], str(error), 'physical'
 
 
 _BAND_COLOUR = 'rgba(31,95,191,0.12)'
 _ROOM = {'l': 8, 'r': 12, 't': 36, 'b': 8}
 """Margins with room for a legend, pixels."""
-_DATES = 4
-"""Largest number of dates at an axis. Chosen: they fit beside each other on a phone."""
-
 
 def _pose_errors(errors: held_out.HeldOutErrors, assessment: Assessment, poses: Poses, axes: str
                  ) -> Figure:
@@ -272,12 +260,8 @@ def _pose_errors(errors: held_out.HeldOutErrors, assessment: Assessment, poses: 
     for trace in traces[1:]:
         trace['marker']['symbol'] = symbols
     tilt_deg = np.degrees(errors.errors.tilt_rad)
-    if not np.isfinite(tilt_deg).any():
-        return figures.figure(traces, 320, margin=_ROOM,
-                              xaxis={'title': {'text': 'held-out pose'}},
-                              yaxis={'title': {'text': 'acceleration, mg'}})
     # The tilt error has two components: 90 % of its lengths are within √(ln 10) of the rms.
-    high_deg = float(np.degrees(np.sqrt(assessment.tilt.expected * np.log(10))))
+    high_deg = float(np.degrees(np.sqrt(np.nan_to_num(assessment.tilt.expected) * np.log(10))))
     traces += [_band(len(number), 0.0, high_deg, 2),
                _dots(number, tilt_deg, 'tilt', '#6b46a8', labels, '°', 2)]
     return figures.figure(
@@ -295,28 +279,6 @@ def _gravity_errors(fit: GravityFit) -> Figure:
         'held out', AXIS_COLOURS['x'])]
     return figures.figure(traces, 320, margin=_ROOM, xaxis={'title': {'text': 'rest'}},
                           yaxis={'title': {'text': 'magnitude minus gravity, mg'}})
-
-
-def _drift(history: DriftHistory) -> Figure:
-    """Draw zero-g and scale factor of a unit over its calibrations, relative to the newest."""
-    traces, layout, dates = [], {}, history.dates
-    number_of = np.arange(len(dates))
-    labelled = np.unique(np.linspace(0, len(dates) - 1, _DATES).astype(int))
-    for number, label in enumerate(('zero-g, mg', 'scale factor, ‰'), 1):
-        values, std = history.series(number - 1)
-        for d, axis in enumerate(history.sensors[-1].axes):
-            trace = figures.points(number_of, values[:, d], Z_90 * std[:, d], axis,
-                                   AXIS_COLOURS[axis])
-            traces.append(trace | {'mode': 'lines+markers', 'text': dates,
-                                   'hovertemplate': '%{text}: %{y:.3~g}',
-                                   'showlegend': number == 1, 'legendgroup': axis,
-                                   'yaxis': axis_number('y', number)})
-        layout[axis_number('yaxis', number)] = {
-            'title': {'text': label}, 'domain': [0.54, 1] if number == 1 else [0, 0.46]}
-    return figures.figure(
-        traces, 340, margin=_ROOM, **layout,
-        xaxis={'anchor': 'y2', 'tickvals': labelled.tolist(),
-               'ticktext': [dates[i][:10] for i in labelled]})
 
 
 def _band(count: int, low: float, high: float, panel: int) -> Figure:
@@ -342,8 +304,6 @@ _FINE_G = np.linspace(-1, 1, 201)
 """Specific force at which curves are drawn, g."""
 _VERTICAL = np.sin(np.radians(89))
 """Smallest sine of alpha in the plane alpha = 90°; chosen: stages are better than 1°."""
-_MARKERS = 'os^D'
-"""Markers of models, in order."""
 
 
 def draw_sweep(path: str | os.PathLike, sensor: Sensor, fitted: Sensor, poses: Poses) -> None:
@@ -387,12 +347,11 @@ def _draw_panel(axis: Any, panel: int, d: int, model: str, poses: Poses, force_g
     name, other = ('x', 'y') if d == 0 else ('y', 'x')
     along_g, x_label = force_g[:, d], f'{name} reference, g'
     if panel in (0, 1, 3):
-        everything = np.ones(len(poses), bool)
         y_label = f'{name} output minus linear, mV'
         title = f'figs. 5, 7: measured ● and {model} model ─' if panel == 3 else \
             f'fig. {panel + 2}: paths, forth ● and back ◁'
         backward = np.gradient(poses.beta_rad) < 0
-        chosen = np.flatnonzero(everything if panel else vertical)
+        chosen = np.flatnonzero(vertical | (panel > 0))
         for plane in planes(poses.alpha_rad[chosen]):
             index = chosen[np.sort(plane)]
             label = f'{np.degrees(poses.alpha_rad[index]).mean():.0f}°'
@@ -426,40 +385,3 @@ def _draw_panel(axis: Any, panel: int, d: int, model: str, poses: Poses, force_g
                           'fig. 6: zero-g against z (12, 13)') if panel == 4 else \
             (f'{name} scale factor, V/g', 'fig. 8: scale factor against z (15, 17)')
     axis.set(xlabel=x_label, ylabel=y_label, title=title)
-
-
-def _gravity_rests(name: str, fit: GravityFit) -> Any:
-    """Draw the error of the magnitude of gravity in each rest, before and after the fit."""
-    figure, axes = figures.pyplot().subplots(1, 2, figsize=(12, 4.5), layout='constrained')
-    rests = np.arange(1, len(fit.residual_mps2) + 1)
-    for axis, values, title in ((axes[0], fit.before_mps2, 'nominal'),
-                                (axes[1], fit.residual_mps2, 'calibrated')):
-        mg = values / G0_MPS2 * 1e3
-        axis.axhline(0, color='0.7', lw=0.8)
-        axis.errorbar(rests, mg, yerr=Z_90 * fit.expected_mps2 / G0_MPS2 * 1e3, fmt='o', ms=4,
-                      lw=1)
-        axis.set(title=f'{title}: rms {np.sqrt(np.mean(mg ** 2)):.2f} mg', xlabel='rest',
-                 ylabel='magnitude minus gravity, mg')
-    figure.suptitle(f'{name}: {len(rests)} rests (bars: 90 %, expected)')
-    return figure
-
-
-def _held_out_plot(models: Sequence[held_out.HeldOutErrors], poses: Poses) -> Any:
-    """Draw the errors on held-out poses, model by model, as in figure 10 of the paper."""
-    figure, axes = figures.pyplot().subplots(1, 3, figsize=(13, 4), layout='constrained')
-    for i, model in enumerate(models):
-        errors = model.errors
-        alpha_deg = np.degrees(poses.alpha_rad[model.pose_index])
-        accel_mg = np.sqrt(np.mean(errors.accel_mps2 ** 2, axis=1)) / G0_MPS2 * 1e3
-        for axis, values in zip(axes, (np.degrees(errors.alpha_rad), np.degrees(errors.beta_rad),
-                                       accel_mg)):
-            axis.plot(alpha_deg, np.abs(values), _MARKERS[i % 4], ms=4, mfc='none', color=f'C{i}',
-                      label=model.model)
-    for axis, label in zip(axes, ('|error of alpha|, deg', '|error of beta|, deg',
-                                  'error of acceleration, mg')):
-        axis.set(xlabel='alpha of the pose, deg', ylabel=label, yscale='log')
-        # A tiny error by chance must not compress the scale.
-        axis.set_ylim(bottom=1e-6 * axis.get_ylim()[1])
-        axis.grid(alpha=0.3)
-    axes[0].legend(fontsize=8)
-    return figure
