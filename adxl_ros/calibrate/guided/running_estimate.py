@@ -80,8 +80,8 @@ class RunningEstimate:
         measured_g, expected_g = ((v - sensor.zero_g_v) / sensor.scale_v_per_g
                                   for v in (volts, expected_v))
         return (f'{sensor.axes[axis]} reads {signed_text(measured_g[axis])} g where '
-                f'{signed_text(expected_g[axis])} g was expected: check the pose and the '
-                'mounting, and whether an axis is inverted or swapped')
+                f'{signed_text(expected_g[axis])} g was expected: axis inverted or '
+                'swapped, or another pose; check wiring, mounting and pose')
 
     def with_poses(self, targets: Sequence[Target]) -> RunningEstimate:
         """Predict the covariance of the estimate after further poses."""

@@ -296,8 +296,7 @@ def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
         if accel != FAIL:
             tilt_deg = float(provenance['own_tilt_deg'])
             lines = [f'tilt error {tilt_deg:.2g}°, more than {limit} causes']
-        lines.append('More poses, longer ones or a richer model reduce it; else sensor, stage or '
-                     'poses are worse than stated: do not use this file.')
+        lines.append('Take more poses or a richer model; else do not use this file.')
     elif outcome == NOT_SHOWN:
         open_names = ', '.join(map(str, open_coefficients(fitted)))
         lines.append(f'Other poses may have a larger error: {open_names} not determined.'
