@@ -279,11 +279,11 @@ def _fit_linear(sensor: Sensor, poses: Poses, population: Population | None) -> 
         raise UserError(f'{error}; {combined.line}') from None
 
 
-_MAX_TURN_RAD = np.radians(0.3)
-"""Largest turn of the case between recordings, rad. Chosen: above the 0.1° of the stage's level in
-either recording, far below a new mounting."""
-_MAX_ZERO_G_SHIFT_G = 0.02
-"""Largest shift of the zero-g between recordings, g. Chosen: a healthy unit may shift by so much
+_MAX_TURN_DEG = 0.3
+"""Largest turn of the case between recordings, degrees. Chosen: above the 0.1° of the stage's level
+in either recording, far below a new mounting."""
+_MAX_ZERO_G_SHIFT_MG = 20.0
+"""Largest shift of the zero-g between recordings, mg. Chosen: a healthy unit may shift by so much
 between two days."""
 _MIN_SINGULAR_VALUE = 0.05
 """Smallest relative singular value of a change that poses show. Chosen: poses about one direction
@@ -301,24 +301,22 @@ def _require_one_mounting(full: full_model.FullFit, recordings: Sequence[Recorde
     A turn of the case, rad, (3,), and a shift of the zero-g, g, (m,), are fitted by least squares
     to the residuals of each recording about the common fit.
     """
-    unit, axes = full.unit, full.unit.axes
-    limits = np.repeat([_MAX_TURN_RAD, _MAX_ZERO_G_SHIFT_G], [3, len(axes)])
-    for source, poses in ((recording.source, recording.poses) for recording in recordings):
+    unit, count = full.unit, 3 + len(full.unit.axes)
+    for recording in recordings:
+        poses = recording.poses
         force = reference_force(poses, unit.local_gravity_mps2)
         by_force = np.moveaxis(signal_chain.jacobian(
             signal_chain.analog_response(unit), force, poses.environment), 2, 0)
         turned = np.stack([np.cross(axis, np.column_stack(force)) for axis in np.eye(3)], axis=2)
         shifted = np.tile(np.diag(unit.scale_v_per_g), (len(poses), 1, 1))
-        design = np.concatenate([by_force @ turned, shifted], axis=2).reshape(-1, len(limits))
+        design = np.concatenate([by_force @ turned, shifted], axis=2).reshape(-1, count)
         residual_v = (poses.volts - predicted_volts(unit, poses)).ravel()
         changes = np.linalg.lstsq(design, residual_v, _MIN_SINGULAR_VALUE)[0]
-        worst = int(np.argmax(np.abs(changes) / limits))
-        if abs(changes[worst]) > limits[worst]:
-            change = f'case is turned by {np.degrees(changes[worst]):.2f} deg about ' \
-                f'{AXES[worst]}' if worst < 3 else \
-                f'zero-g of {axes[worst - 3]} is shifted by {1e3 * changes[worst]:.2f} mg'
+        turn_deg, shift_mg = np.degrees(np.abs(changes[:3]).max()), 1e3 * np.abs(changes[3:]).max()
+        if turn_deg > _MAX_TURN_DEG or shift_mg > _MAX_ZERO_G_SHIFT_MG:
             raise _ContradictionError(
-                f'{source}: {change} from the fit of all recordings: another unit or another '
+                f'{recording.source}: the case is turned by {turn_deg:.2f} deg and the zero-g is '
+                f'shifted by {shift_mg:.2f} mg from the fit of all recordings: another unit or another '
                 'mounting; fit this recording separately')
 
 

@@ -28,7 +28,7 @@ from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force, tilt
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.report.quantities import decimals
+from adxl_ros.report.quantities import with_half_width
 import numpy as np
 
 _ROUNDS = 2
@@ -181,17 +181,10 @@ def coefficient_rows(names: Sequence[Coefficient], values: np.ndarray, std: np.n
         unit = parameter_of(names[place[0]]).unit
         rows.append(CoefficientRow(
             f'{name}, {unit}' if unit else str(name),
-            tuple(f'{names[i].axis or names[i].parameter} {_interval(values[i], Z_90 * std[i])}'
-                  for i in place),
+            tuple(f'{names[i].axis or names[i].parameter} '
+                  + with_half_width(values[i], Z_90 * std[i]).replace('+-', '±') for i in place),
             float(np.min(1 - np.clip(std[place] / prior[place], 0, 1)))))
     return tuple(rows)
-
-
-def _interval(value: float, half_width: float) -> str:
-    """Return a value, with the decimals of one digit of the half width of its interval."""
-    places = decimals(10 * half_width)
-    # A sum with 0 has no negative zero.
-    return f'{round(value, places) + 0.0:+.{places}f} ± {half_width:.{places}f}'
 
 
 _SPARE_READINGS = 40

@@ -112,12 +112,10 @@ class SessionSettings:
         interrupted = sweep_journal.unfinished(self.journal, self.head(unit))
         if interrupted is None:
             return ''
-        if interrupted.obstacle:
-            return (f'{self.journal} holds {interrupted.poses} poses of an interrupted '
-                    f'calibration, which cannot go on: {interrupted.obstacle}. Begin again (n; '
-                    'the file is kept), or abort (a) and restore the old setting?')
+        choices = f'which cannot go on: {interrupted.obstacle}. Restore the old setting (a)' \
+            if interrupted.obstacle else 'of this unit. Go on with them (y)'
         return (f'{self.journal} holds {interrupted.poses} poses of an interrupted calibration '
-                'of this unit. Go on with them (y), or begin again (n; they are kept)?')
+                f'{choices}, or begin again (n; they are kept)?')
 
 
 def _degrees(angle_rad: float) -> float:
@@ -199,8 +197,7 @@ class Session:
             self.guide.take(record)
             yield f'pose {record.pose + 1} is on disk'
         if unverified > len(self.guide.to_verify):
-            yield 'this pose reads the same as before; one more pose checks the mounting' \
-                if self.guide.to_verify else 'the sensor is mounted as it was'
+            yield 'the sensor is mounted as it was'
 
     def estimate(self) -> Estimate:
         """Return what the poses determine so far; it is computed once for each pose."""

@@ -16,7 +16,7 @@ from adxl_ros.calibrate.guided import guide, pose_plan, running_estimate, screen
 from adxl_ros.calibrate.guided.guide import Dwell, EncoderTrack, Guide, NextPose
 from adxl_ros.calibrate.guided.pose_plan import Course, MOVE_S, Target
 from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, Phase, StageMode, Status
-from adxl_ros.calibrate.pose_extraction import angle_tolerance_rad, SettingTracker
+from adxl_ros.calibrate.poses import angle_tolerance_rad, SettingTracker
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import JournalEntry, MountingUnchecked, PoseRecord, PoseSkipped
 from adxl_ros.model.sensor import Sensor
@@ -76,9 +76,9 @@ class StageSweep(Guide):
         self.has_arrived = has_arrived
 
     def verify(self) -> None:
-        """Take earlier poses again before others, to check the mounting."""
+        """Take the newest pose again before others, to check the mounting."""
         if self.course.target is not None and self.accepted:
-            self.to_verify = pose_plan.to_take_again(list(self.accepted.values()))
+            self.to_verify = [max(self.accepted.values(), key=lambda record: record.stop_ns)]
             self.go(self.to_verify[0].pose)
 
     def capture(self) -> str:
@@ -250,8 +250,8 @@ def _verify_mounting(sweep: StageSweep, record: PoseRecord) -> None:
     if change:
         sweep.refuse(f'{change}; or turn the stage to where it was, and capture again')
         return
-    del sweep.to_verify[0]
-    sweep.go(sweep.to_verify[0].pose if sweep.to_verify else sweep.course.next_open())
+    sweep.to_verify = []
+    sweep.go(sweep.course.next_open())
 
 
 class StageGuide(StageSweep):

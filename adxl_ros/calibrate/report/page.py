@@ -16,12 +16,10 @@ import re
 from typing import Any
 
 from adxl_ros.calibrate.fits import linear
-from adxl_ros.calibrate.fits.gravity_fit import GravityFit
 from adxl_ros.calibrate.poses import planes, Poses, reference_force
-from adxl_ros.calibrate.report import acceptance, coefficients, gum, held_out
+from adxl_ros.calibrate.report import acceptance, gum, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
-from adxl_ros.calibrate.report.coefficients import DriftHistory
-from adxl_ros.calibrate.result import CalibrationResult
+from adxl_ros.calibrate.result import CalibrationResult, compare, DriftHistory, rounded
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.atomic_write import write_bytes, write_text
@@ -30,7 +28,7 @@ from adxl_ros.model.coefficients import get
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report import figures, page as html_page
-from adxl_ros.report.figures import AXIS_COLOURS, axis_number, Figure, QUIET_COLOUR
+from adxl_ros.report.figures import AXIS_COLOURS, Figure
 import numpy as np
 
 FILES = ('report.html', 'calibration.png')
@@ -87,11 +85,16 @@ def page(result: CalibrationResult, past: Sequence[Sensor],
     errors, assessment = errors_of.get(fitted.model), row_of.get(fitted.model)
     history, rows = DriftHistory.from_store(fitted, past), _coefficients(fitted)
     drawn: dict[str, Figure] = {}
-    if result.gravity_fit is not None:
-        drawn['errors'] = _gravity_errors(result.gravity_fit)
+    to_mg = 1e3 / G0_MPS2
+    if (fit := result.gravity_fit) is not None:
+        drawn['errors'] = _error_figure(
+            result.inliers, to_mg * fit.held_out_mps2[:, None], Z_90 * to_mg * fit.expected_mps2,
+            'x', 'rest', 'magnitude minus gravity, mg')
     elif assessment is not None and errors is not None:
-        drawn['errors'] = _pose_errors(
-            errors, assessment, result.poses.subset(result.inliers), fitted.axes)
+        half_mg = np.full(errors.pose_count, Z_90 * to_mg * assessment.accel.expected ** 0.5)
+        drawn['errors'] = _error_figure(
+            held_out.determining_alpha(errors.errors), to_mg * errors.errors.accel_mps2, half_mg,
+            fitted.axes, 'held-out pose', 'error of acceleration, mg')
     pictures, fault, paper_model = _paper_figures(result)
     temperature_c = fitted.envelope.temperature_c
     return html_page.render('adxl_ros.calibrate.report', 'calibration.html', {
@@ -104,7 +107,6 @@ def page(result: CalibrationResult, past: Sequence[Sensor],
         'file_name': re.sub(r'[^\w.-]+', '_', fitted.serial) + '.yaml',
         'download': html_page.download_url(parameter_file.as_text(fitted, result.comments())),
         'figures': drawn,
-        'open_circles': errors.poses_without_alpha if errors else 0,
         'sphere': _sphere(result),
         'coefficients': rows,
         'beyond': [row for row in rows if row['outcome'] == _BEYOND],
@@ -206,13 +208,13 @@ def _coefficients(fitted: Sensor) -> list[dict[str, Any]]:
     departures = get(fitted, fitted.covariance_names)
     rows = []
     for row, name, value, half_width in zip(
-            coefficients.compare(fitted, fitted), fitted.covariance_names, departures,
+            compare(fitted, fitted), fitted.covariance_names, departures,
             half_widths):
         typical, maximum = fitted.datasheet.get(name.without_axis, (0.0, 0.0))
         largest = max(typical, maximum, abs(value) + half_width, 1e-12) * _BEYOND_WHISKER
         unit = '' if row.unit == '1' else f' {row.unit}'
-        text = f'{coefficients.rounded(row, row.fitted)} ± ' \
-            f'{coefficients.rounded(row, row.half_width)}{unit}'
+        text = f'{rounded(row, row.fitted)} ± ' \
+            f'{rounded(row, row.half_width)}{unit}'
         # The lower end of the interval decides.
         lower = abs(value) - half_width
         beyond = '' if not (typical or maximum) else _BEYOND if 0 < maximum < lower else \
@@ -239,65 +241,13 @@ def _paper_figures(result: CalibrationResult) -> tuple[list[str], str, str]:
         return [], str(error), 'physical'
 
 
-_BAND_COLOUR = 'rgba(31,95,191,0.12)'
-_ROOM = {'l': 8, 'r': 12, 't': 36, 'b': 8}
-"""Margins with room for a legend, pixels."""
-
-def _pose_errors(errors: held_out.HeldOutErrors, assessment: Assessment, poses: Poses, axes: str
-                 ) -> Figure:
-    """Draw the errors at the held-out poses with the band that 90 % of them should be in."""
-    number = np.arange(1, errors.pose_count + 1)
-    held = poses.subset(errors.pose_index)
-    angles_deg = np.degrees([held.alpha_rad, held.beta_rad])
-    labels = [f'pose {i}, alpha {alpha:.1f}°, beta {beta:.1f}°'
-              for i, (alpha, beta) in enumerate(angles_deg.T, 1)]
-    accel_mg = errors.errors.accel_mps2 / G0_MPS2 * 1e3
-    half_mg = Z_90 * 1e3 * float(np.sqrt(assessment.accel.expected)) / G0_MPS2
-    traces = [_band(len(number), -half_mg, half_mg, 1)]
-    symbols = np.where(held_out.determining_alpha(errors.errors), 'circle', 'circle-open').tolist()
-    traces += [_dots(number, accel_mg[:, d], f'{axis}', AXIS_COLOURS[axis], labels, 'mg', 1)
-               for d, axis in enumerate(axes)]
-    for trace in traces[1:]:
-        trace['marker']['symbol'] = symbols
-    tilt_deg = np.degrees(errors.errors.tilt_rad)
-    # The tilt error has two components: 90 % of its lengths are within √(ln 10) of the rms.
-    high_deg = float(np.degrees(np.sqrt(np.nan_to_num(assessment.tilt.expected) * np.log(10))))
-    traces += [_band(len(number), 0.0, high_deg, 2),
-               _dots(number, tilt_deg, 'tilt', '#6b46a8', labels, '°', 2)]
-    return figures.figure(
-        traces, 440, margin=_ROOM, xaxis={'title': {'text': 'held-out pose'}, 'anchor': 'y2'},
-        yaxis={'title': {'text': 'acceleration, mg'}, 'domain': [0.54, 1]},
-        yaxis2={'title': {'text': 'tilt, °'}, 'domain': [0, 0.46], 'rangemode': 'tozero'})
-
-
-def _gravity_errors(fit: GravityFit) -> Figure:
-    """Draw the error of the magnitude of gravity at each rest, and its expected 90 % bars."""
-    used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
-    scale = 1e3 / G0_MPS2
-    traces = [figures.points(
-        used + 1, scale * fit.held_out_mps2[used], Z_90 * scale * fit.expected_mps2[used],
-        'held out', AXIS_COLOURS['x'])]
-    return figures.figure(traces, 320, margin=_ROOM, xaxis={'title': {'text': 'rest'}},
-                          yaxis={'title': {'text': 'magnitude minus gravity, mg'}})
-
-
-def _band(count: int, low: float, high: float, panel: int) -> Figure:
-    """Draw the band of the expected errors in a panel."""
-    edges = [0.5, count + 0.5]
-    return figures.line(
-        [*edges, *edges[::-1]], [low, low, high, high], 'expected 90 %', QUIET_COLOUR,
-        fill='toself', fillcolor=_BAND_COLOUR, hoverinfo='skip', xaxis='x',
-        yaxis=axis_number('y', panel), showlegend=panel == 1,
-        line={'color': QUIET_COLOUR, 'width': 0.5})
-
-
-def _dots(number: np.ndarray, values: np.ndarray, name: str, colour: str, labels: list[str],
-          unit: str, panel: int) -> Figure:
-    """Draw one error of each pose in a panel."""
-    return {'type': 'scatter', 'mode': 'markers', 'x': number.tolist(),
-            'y': figures.rounded(values), 'name': name, 'text': labels, 'xaxis': 'x',
-            'yaxis': axis_number('y', panel), 'marker': {'color': colour, 'size': 7},
-            'hovertemplate': '%{text}: %{y:.3~g} ' + unit + '<extra>' + name + '</extra>'}
+def _error_figure(used: np.ndarray, errors_mg: np.ndarray, half_mg: np.ndarray, names: str,
+                  x_label: str, y_label: str) -> Figure:
+    """Draw the held-out errors, (k, m), of the poses used with bars of the expected 90 %."""
+    traces = [figures.points(np.flatnonzero(used) + 1, errors_mg[used, d], half_mg[used], name,
+                             AXIS_COLOURS[name[0]]) for d, name in enumerate(names)]
+    return figures.figure(traces, 320, margin={'l': 8, 'r': 12, 't': 36, 'b': 8},
+                          xaxis={'title': {'text': x_label}}, yaxis={'title': {'text': y_label}})
 
 
 _FINE_G = np.linspace(-1, 1, 201)

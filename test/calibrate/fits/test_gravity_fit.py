@@ -4,7 +4,7 @@
 
 from dataclasses import replace
 
-from adxl_ros.calibrate.fits import gravity_model
+from adxl_ros.calibrate.fits import gravity_fit
 from adxl_ros.calibrate.fits.gravity_fit import fit_gravity, NAMES
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
@@ -81,12 +81,12 @@ def test_jacobian_against_differences():
     rng = np.random.default_rng(1)
     mean, estimate = directions(rng, 20) * 1.05, rng.normal(0, 0.05, 9)
     step = 1e-6
-    for k, column in enumerate(gravity_model.magnitude_jacobian(mean, estimate).T):
+    for k, column in enumerate(gravity_fit.magnitude_jacobian(mean, estimate).T):
         up, down = estimate.copy(), estimate.copy()
         up[k] += step
         down[k] -= step
-        wanted = (gravity_model.magnitude(mean, up)
-                  - gravity_model.magnitude(mean, down)) / (2 * step)
+        wanted = (gravity_fit.magnitude(mean, up)
+                  - gravity_fit.magnitude(mean, down)) / (2 * step)
         assert column == pytest.approx(wanted, abs=1e-9)
 
 
