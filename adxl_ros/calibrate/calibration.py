@@ -280,8 +280,8 @@ def _fit_linear(sensor: Sensor, poses: Poses, population: Population | None) -> 
 
 
 _MAX_TURN_DEG = 0.3
-"""Largest turn of the case between recordings, degrees. Chosen: above the 0.1° of the stage's level
-in either recording, far below a new mounting."""
+"""Largest turn of the case between recordings, degrees. Chosen: above the 0.1° of the stage's
+level in either recording, far below a new mounting."""
 _MAX_ZERO_G_SHIFT_MG = 20.0
 """Largest shift of the zero-g between recordings, mg. Chosen: a healthy unit may shift by so much
 between two days."""
@@ -316,8 +316,8 @@ def _require_one_mounting(full: full_model.FullFit, recordings: Sequence[Recorde
         if turn_deg > _MAX_TURN_DEG or shift_mg > _MAX_ZERO_G_SHIFT_MG:
             raise _ContradictionError(
                 f'{recording.source}: the case is turned by {turn_deg:.2f} deg and the zero-g is '
-                f'shifted by {shift_mg:.2f} mg from the fit of all recordings: another unit or another '
-                'mounting; fit this recording separately')
+                f'shifted by {shift_mg:.2f} mg from the fit of all recordings: another unit or '
+                'another mounting; fit this recording separately')
 
 
 def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, data_sha256: str,
@@ -391,6 +391,9 @@ def calibrate_thermal(base: Sensor, poses: Poses, source: str, data_sha256: str 
         *_slope_lines(fitted, fit),
         'residual ' + ', '.join(f'{axis} {value * 1e3:.2g}' for axis, value in zip(
             base.axes, fit.residual_g)) + ' mg rms',
+        f'warming and cooling differ: {fit.history} ({fit.shape:.3g} '
+        f'{"s" if fit.history == "thermal_lag" else "K"})' if fit.history else
+        'no thermal_lag or thermal_hysteresis shows',
         f'expected error of the zero-g over {low_c:.0f} to {high_c:.0f} °C: {error_mg:.2g} mg',
         f'zero-g stays as calibrated at {calibrated_c:.1f} °C']
     if not has_scale:

@@ -39,13 +39,15 @@ def test_simulate_fit_and_apply_make_one_path(run_tool, tmp_path):
 
 def test_a_resting_recording_is_fitted_over_temperature(run_tool, tmp_path):
     done = run_tool('simulate', 'soak', '--rate', 5, '--effect', 'temperature_bias:per_k=4e-4',
-                    '-o', 'oven.csv')
+                    '--effect', 'thermal_lag:per_k=4e-4,tau_s=50', '-o', 'oven.csv')
     assert done.returncode == 0, done.stderr
     done = run_tool('fit', 'oven.csv', '--effect', 'temperature_bias', '-o', 'warm.yaml')
     assert done.returncode == 0, done.stderr
     assert 'expected error of the zero-g over 10 to 40 °C' in done.stdout
     warm = parameter_file.load(tmp_path / 'warm.yaml')
+    assert {'temperature_bias', 'thermal_lag'} <= set(warm.effects)
     np.testing.assert_allclose(warm.values['temperature_bias']['per_k'], 4e-4, rtol=0.05)
+    assert float(warm.values['thermal_lag']['tau_s']) == pytest.approx(50.0, rel=0.15)
     done = run_tool('fit', 'oven.csv', '--effect', 'temperature_bias', '-o', 'b.yaml',
                     '--report', 'page')
     assert done.returncode == 1 and '--report page: a fit over temperature' in done.stderr

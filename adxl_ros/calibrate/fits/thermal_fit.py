@@ -19,12 +19,12 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
 from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.filters import play
+from adxl_ros.model.filters import loop, play, stop
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 import scipy
 
-EFFECTS = ('temperature_bias', 'temperature_scale')
+EFFECTS = ('temperature_bias', 'temperature_scale', 'thermal_lag', 'thermal_hysteresis')
 """Effects that the fit knows."""
 _TURN_G = 0.1
 """Change of the output, g, from which the sensor was turned. Chosen: 6°, and above any zero-g over
@@ -38,6 +38,15 @@ _FEWEST_BLOCKS = 12
 """Fewest blocks of an orientation. Chosen: twice the coefficients of one axis."""
 PRIOR_WIDTH = 5.0
 """Prior standard deviation of a coefficient divided by its typical size, as in the diagnosis."""
+_LAGS_S = np.geomspace(10.0, 1000.0, 7)
+"""Time constants of `thermal_lag` that are tried, s. Chosen: each is twice the one before."""
+_REACHES = np.geomspace(0.02, 0.5, 6)
+"""Reaches of `thermal_hysteresis` that are tried, divided by the range of temperature. Chosen: a
+loop whose reach is larger has no corner in the range."""
+_STEP = 0.02
+"""Step of the derivative by a shape, divided by its value. Chosen: smooth."""
+_SMALLEST_GAIN = 5.0
+"""Gain in half of the BIC from which a dependence on the history counts. Chosen: odds of 150."""
 _LARGEST_CORRELATION = 0.95
 """Largest correlation of neighbouring blocks. Chosen: beyond it the drift is a random walk."""
 _ITERATIONS = 4
@@ -51,6 +60,8 @@ class ThermalFit:
     names: tuple[Coefficient, ...]  # Coefficients, (p,)
     values: np.ndarray  # Their values, (p,), each in the unit of its parameter
     covariance: np.ndarray  # Their covariance, (p, p)
+    history: str  # `thermal_lag` or `thermal_hysteresis`, where the blocks support one, else ''
+    shape: float  # Its time constant, s, or its reach, K
     residual_g: np.ndarray  # Rms residual of each axis, g, (m,)
     span_c: tuple[float, float]  # Lowest and highest temperature, °C
 
@@ -74,13 +85,13 @@ class ThermalFit:
         return worst
 
 
-def fit(sensor: Sensor, blocks: Poses) -> ThermalFit:
+def fit(sensor: Sensor, blocks: Poses, with_history: bool = True) -> ThermalFit:
     """
     Fit slope and curvature of the zero-g over temperature; refuse blocks that do not show them.
 
     The zero-g of each orientation is free, because the pose is unknown. Neighbouring residuals
-    are correlated (AR(1), by Cochrane and Orcutt). What depends on the history of the temperature
-    (lag, hysteresis) is part of the residual.
+    are correlated (AR(1), by Cochrane and Orcutt). An effect of the history, `thermal_lag` or
+    `thermal_hysteresis`, is kept where it gains enough, and only after a reversal.
     """
     temperature_c, axes = blocks.temperature_c, sensor.axes
     if len(temperature_c) < _FEWEST_BLOCKS:
@@ -92,14 +103,55 @@ def fit(sensor: Sensor, blocks: Poses) -> ThermalFit:
     outputs_g = (blocks.volts - sensor.zero_g_v) / sensor.scale_v_per_g
     turned = np.abs(np.diff(outputs_g, axis=0)).max(axis=1) > _TURN_G
     orientation = np.concatenate([[0], np.cumsum(turned)])
-    solved = [_fit_axis(axis, temperature_c, output_g, orientation)
-              for axis, output_g in zip(axes, outputs_g.T)]
+    span_k = float(np.ptp(temperature_c))
+
+    def fitted(history: str, shape: float) -> list[_Axis]:
+        # The output of a history, and its derivative by the shape.
+        low, output, high = (_history_output(blocks, history, shape * (1 + step))
+                             for step in (-_STEP, 0.0, _STEP)) if history else np.zeros((3, 1))
+        by_shape = (high - low) / (2 * _STEP * shape) if history else output
+        return [_fit_axis(axis, temperature_c, output_g, orientation, history, output, by_shape)
+                for axis, output_g in zip(axes, outputs_g.T)]
+
+    def score(history: str, shape: float) -> float:
+        """Return half of the BIC, as a gain."""
+        penalty = 0.5 * np.log(outputs_g.size) * (len(axes) + 1 if history else 0)
+        return sum(axis.log_likelihood for axis in fitted(history, shape)) - float(penalty)
+
+    best, highest = ('', 0.0), score('', 0.0) + _SMALLEST_GAIN
+    branch = stop(temperature_c, span_k * _REACHES[1], {})
+    if with_history and branch.max() > 0.5 and branch.min() < -0.5:
+        for history, shapes in (('thermal_lag', _LAGS_S),
+                                ('thermal_hysteresis', _REACHES * span_k)):
+            likeliest = int(np.argmax([score(history, shape) for shape in shapes]))
+            bounds = np.log(shapes[[max(likeliest - 1, 0), min(likeliest + 1, len(shapes) - 1)]])
+            search = scipy.optimize.minimize_scalar(
+                lambda logarithm, history=history: -score(history, float(np.exp(logarithm))),
+                bounds=bounds, method='bounded', options={'xatol': 0.01})
+            if -search.fun > highest:
+                best, highest = (history, float(np.exp(search.x))), -search.fun
+    solved = fitted(*best)
     return ThermalFit(
         tuple(name for axis in solved for name in axis.names),
         np.concatenate([axis.values for axis in solved]),
-        scipy.linalg.block_diag(*(axis.covariance for axis in solved)),
+        scipy.linalg.block_diag(*(axis.covariance for axis in solved)), *best,
         np.array([axis.residual_g for axis in solved]),
         (float(temperature_c.min()), float(temperature_c.max())))
+
+
+def _history_output(blocks: Poses, effect: str, shape: float) -> np.ndarray:
+    """Return the output of an effect of the history of size 1, g, (k,)."""
+    temperature_c, time_s = blocks.temperature_c, blocks.time_s.mean(axis=1)
+    if effect == 'thermal_hysteresis':
+        return -loop(temperature_c, shape, {})
+    # The filter 1/(1 + τ·s), exact for straight lines between the samples.
+    steps_s = np.diff(time_s)
+    decay = np.exp(-steps_s / shape)
+    ramp = (1 - decay) * shape / np.maximum(steps_s, np.finfo(float).tiny)
+    lagging_c = [temperature_c[0]]
+    for d, r, before, now in zip(decay, ramp, temperature_c, temperature_c[1:]):
+        lagging_c.append(d * lagging_c[-1] + (r - d) * before + (1 - r) * now)
+    return np.array(lagging_c) - temperature_c
 
 
 class _Axis(NamedTuple):
@@ -109,10 +161,11 @@ class _Axis(NamedTuple):
     values: np.ndarray
     covariance: np.ndarray
     residual_g: float
+    log_likelihood: float
 
 
-def _fit_axis(axis: str, temperature_c: np.ndarray, output_g: np.ndarray, orientation: np.ndarray
-              ) -> _Axis:
+def _fit_axis(axis: str, temperature_c: np.ndarray, output_g: np.ndarray, orientation: np.ndarray,
+              history: str, history_g: np.ndarray, by_shape: np.ndarray) -> _Axis:
     """Fit one axis, the correlation of neighbouring blocks included."""
     warmer_k, correlation = temperature_c - NOMINAL_TEMPERATURE_C, 0.0
     columns = {('temperature_bias', 'per_k'): warmer_k,
@@ -123,6 +176,8 @@ def _fit_axis(axis: str, temperature_c: np.ndarray, output_g: np.ndarray, orient
     # The orientations must separate the scale factor of an axis from its zero-g.
     if float(np.ptp(forces_g)) > _SCALE_FORCES_G:
         columns['temperature_scale', 'per_k'] = forces_g[orientation] * warmer_k
+    if history:
+        columns[history, _SIZES[history]] = history_g
     names = [Coefficient(*name, axis) for name in columns]
     design = np.column_stack([*columns.values(), free])
     begins = np.diff(orientation, prepend=-1) > 0
@@ -144,11 +199,21 @@ def _fit_axis(axis: str, temperature_c: np.ndarray, output_g: np.ndarray, orient
         correlation = float(np.clip(neighbours, 0.0, _LARGEST_CORRELATION))
     degrees = max(len(output_g) - design.shape[1], 1)
     variance_g2 = max(float(rest @ rest) / degrees, np.finfo(float).tiny)
+    if history:
+        # The shape is uncertain, too.
+        design = np.column_stack([design, values[len(names) - 1] * by_shape])
     white, white_free = np.hsplit(whitened(design), [len(names)])
     white = white - white_free @ np.linalg.lstsq(white_free, white, rcond=None)[0]
     precision = white.T @ white / variance_g2 + np.diag([
         (PRIOR_WIDTH * parameter_of(name).scale) ** -2.0 for name in names])
-    return _Axis(names, values[:len(names)], np.linalg.inv(precision), float(np.std(residual_g)))
+    likelihood = -0.5 * len(output_g) * np.log(variance_g2) + 0.5 * np.log(1 - correlation ** 2)
+    return _Axis(names, values[:len(names)], np.linalg.inv(precision), float(np.std(residual_g)),
+                 float(likelihood))
+
+
+_SIZES = {'thermal_lag': 'per_k', 'thermal_hysteresis': 'half_width_g'}
+_SHAPES = {'thermal_lag': 'tau_s', 'thermal_hysteresis': 'reach_k'}
+"""Size and shape of each effect of the history."""
 
 
 def applied(base: Sensor, fitted: ThermalFit, calibrated_c: float) -> Sensor:
@@ -158,13 +223,15 @@ def applied(base: Sensor, fitted: ThermalFit, calibrated_c: float) -> Sensor:
     calibrated_c: temperature at which the zero-g of the unit was calibrated, °C.
     """
     names, effects = fitted.names, dict.fromkeys(name.effect for name in fitted.names)
-    replaced = {*EFFECTS, 'thermal_lag', 'thermal_hysteresis'}
-    kept = [i for i, name in enumerate(base.covariance_names) if name.effect not in replaced]
+    kept = [i for i, name in enumerate(base.covariance_names) if name.effect not in EFFECTS]
     kept_names = tuple(base.covariance_names[i] for i in kept)
-    dropped = replaced - set(effects)
+    dropped = set(EFFECTS) - set(effects)
     before = replace(base, effects=tuple(e for e in base.effects if e not in dropped),
                      values={e: v for e, v in base.values.items() if e not in dropped})
     sensor = put(with_neutral(before, [*effects, 'bias']), names, fitted.values)
+    if fitted.history:
+        sensor = put(sensor, [Coefficient(fitted.history, _SHAPES[fitted.history])],
+                     np.array([fitted.shape]))
     joint = np.eye(len(kept) + len(names))
     biases = [Coefficient('bias', 'offset_v', axis) for axis in base.axes]
     shifts_v = [_zero_g_v(base, d, calibrated_c) - _zero_g_v(sensor, d, calibrated_c)

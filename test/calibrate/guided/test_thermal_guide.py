@@ -107,6 +107,18 @@ def test_the_range_is_covered_in_both_directions_and_the_file_has_the_slopes(beg
     assert parameter_file.load(session.settings.output).effects == fitted.effects
 
 
+@pytest.mark.parametrize('option, parameter, value', [
+    ('thermal_lag:per_k=4e-4,tau_s=20', 'tau_s', 20.0),
+    ('thermal_hysteresis:half_width_g=3e-3,reach_k=4', 'reach_k', 4.0)])
+def test_a_loop_is_fitted_where_warming_and_cooling_differ(begin, option, parameter, value):
+    session = begin(80.0)
+    play(session, *recorded('temperature_bias:per_k=4e-4', option))
+    fitted = session.finish().fitted
+    name = option.split(':')[0]
+    assert name in fitted.effects
+    assert float(fitted.values[name][parameter]) == pytest.approx(value, rel=0.15)
+
+
 def test_an_interrupted_calibration_keeps_its_blocks(begin):
     session = begin()
     stamps_ns, volts, temperatures_c = recorded('temperature_bias:per_k=4e-4', seconds=200.0)
