@@ -347,6 +347,10 @@ class SettingTracker:
         """Add an encoder reading."""
         self._readings.append((stamp_ns, (alpha_rad, beta_rad)))
 
+    def between(self, first_ns: int, last_ns: int) -> np.ndarray:
+        """Return the encoder's angles alpha and beta between two stamps, rad, (n, 2)."""
+        return _between(self._readings, first_ns - 1, last_ns)
+
     def command(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
         """Add a command, which is in force from its stamp on."""
         before = self._commands[-1][1] if self._commands else (np.nan, np.nan)

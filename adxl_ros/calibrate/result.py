@@ -106,11 +106,6 @@ class CalibrationResult:
             bool(np.allclose(get(saved, names), get(fitted, names), rtol=_SAME_FIT_TOLERANCE))
 
     @property
-    def name(self) -> str:
-        """Return the serial number and the sources of the poses."""
-        return f'{self.fitted.serial} ({self.fitted.provenance["source"]})'
-
-    @property
     def inliers(self) -> np.ndarray:
         """Mark the poses that are no outliers, (k,) bool; only these are in `held_out`."""
         return ~np.isin(np.arange(len(self.poses)), self.outliers)

@@ -81,11 +81,7 @@ class SessionSettings:
         error_rad = running_estimate.expected_tilt_error_rad(unit, self.capture.dwell_s, targets)
         if not np.isfinite(error_rad):
             return text
-        text += f', expected tilt error {np.degrees(error_rad):.2g}°'
-        if self.plan_kind == 'quick' and error_rad > self.tilt_error_rad:
-            text += f' (sweep.tilt_error_deg is {np.degrees(self.tilt_error_rad):.2g}°, ' \
-                    'which this stage and this dwell cannot reach)'
-        return text
+        return f'{text}, expected tilt error {np.degrees(error_rad):.2g}°'
 
     def head(self, unit: Sensor) -> dict[str, Any]:
         """Return the settings and values, by key, that an interrupted calibration must share."""
