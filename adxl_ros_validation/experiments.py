@@ -8,11 +8,10 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
-from adxl_ros.calibrate import pose_extraction
 from adxl_ros.calibrate.fits import full_model, linear, term_selection
 from adxl_ros.calibrate.fits.linearisation import StageError
 from adxl_ros.calibrate.guided.pose_plan import sweep
-from adxl_ros.calibrate.poses import Poses, stage_force
+from adxl_ros.calibrate.poses import estimate_filters, extract_poses, Poses, stage_force
 from adxl_ros.compensate import inversions
 from adxl_ros.files.recording_columns import Recording, sensor_info
 from adxl_ros.files.sweep_journal import PoseRecord
@@ -240,7 +239,7 @@ def poses_at(truth: Sensor, read_rad: np.ndarray, seed: int
                    stop_ns=round(end_s * 1e9), samples=samples, mean_v=(), std_v=(),
                    alpha_rad=alpha_rad, beta_rad=beta_rad)
         for number, (end_s, (alpha_rad, beta_rad)) in enumerate(zip(ends_s, on_grid))]
-    return pose_extraction.extract_poses(recording, bare(truth), records), true, recording
+    return extract_poses(recording, bare(truth), records), true, recording
 
 
 def calibrated(truth: Sensor, seed: int, models: Sequence[str] = tuple(MODELS)) -> Run:
@@ -251,7 +250,7 @@ def calibrated(truth: Sensor, seed: int, models: Sequence[str] = tuple(MODELS)) 
     nominal = bare(truth)
     fitted = {name: MODELS[name](nominal, poses) for name in models}
     if 'full' in fitted:
-        noise = pose_extraction.estimate_filters(recording, nominal, poses)
+        noise = estimate_filters(recording, nominal, poses)
         fitted['full'], _ = recorded_sensor.with_filter(fitted['full'], [noise])
     return Run(truth, fitted, poses, true)
 

@@ -10,7 +10,8 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from adxl_ros.calibrate import calibration, pose_extraction
+from adxl_ros.calibrate import calibration
+from adxl_ros.calibrate.poses import extract_poses
 from adxl_ros.calibrate.report import acceptance, page as unit_page
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
@@ -76,7 +77,7 @@ def _of_recordings(sensor: Sensor, paths: Sequence[str], folder: Path) -> _Repro
         read = cli.read('reproduce', path)
         unit = recorded_unit(unit, read)
         recordings.append(calibration.RecordedPoses(
-            Path(path).name, pose_extraction.extract_poses(read, unit)))
+            Path(path).name, extract_poses(read, unit)))
     result = calibration.calibrate(unit, recordings, 'full')
     cli.make_folder(folder / FIGURES)
     unit_page.draw(folder / FIGURES / 'sweep.png', result)

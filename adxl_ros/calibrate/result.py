@@ -4,6 +4,7 @@
 The result of a calibration: the fitted unit with its provenance, validity range and report.
 
 - Its coefficients as lines of text, and its files.
+- Comparison of fitted coefficients with the true ones of a simulated unit, and drift of a unit.
 """
 
 from __future__ import annotations
@@ -17,24 +18,24 @@ import os
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
 from adxl_ros.calibrate.poses import planes, Poses
 from adxl_ros.calibrate.report.acceptance import Assessment
-from adxl_ros.calibrate.report.coefficients import compare
 from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.atomic_write import keep_previous
 from adxl_ros.files.recording_columns import NO_UNIT
-from adxl_ros.model.coefficients import get
+from adxl_ros.model.coefficients import get, parameter_of, with_neutral
+from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.covariance import leverage
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.effects.element import OTHER_AXIS
 from adxl_ros.model.sensor import Envelope, Sensor, STRETCH
 from adxl_ros.process import package_version
+from adxl_ros.report.quantities import decimals, mg_text
 import numpy as np
 
 _SAME_BETA_RAD = 1e-3
 """Smaller changes of beta are no step of the sweep, rad. Chosen: below any step of a plan."""
-_MAX_PLANES_LISTED = 12
-"""Largest count of planes that are listed one by one."""
 _SAME_FIT_TOLERANCE = 1e-6
 """Largest relative difference of coefficients of the same fit: the rounding in a file."""
 
@@ -105,11 +106,6 @@ class CalibrationResult:
             bool(np.allclose(get(saved, names), get(fitted, names), rtol=_SAME_FIT_TOLERANCE))
 
     @property
-    def name(self) -> str:
-        """Return the serial number and the sources of the poses."""
-        return f'{self.fitted.serial} ({self.fitted.provenance["source"]})'
-
-    @property
     def inliers(self) -> np.ndarray:
         """Mark the poses that are no outliers, (k,) bool; only these are in `held_out`."""
         return ~np.isin(np.arange(len(self.poses)), self.outliers)
@@ -157,17 +153,16 @@ def _sweep_text(poses: Poses) -> str:
     fitted = poses.subset(~poses.check)
     if not np.isfinite(fitted.alpha_rad).all():
         return f'{len(fitted)} rests in directions of its own, against gravity'
-    alpha = [float(np.degrees(fitted.alpha_rad[plane].mean()))
-             for plane in planes(fitted.alpha_rad)]
-    alpha_text = ', '.join(f'{a:.0f}' for a in alpha) if len(alpha) <= _MAX_PLANES_LISTED else \
-        f'{len(alpha)} planes from {alpha[0]:.0f} to {alpha[-1]:.0f}'
-    lowest, highest = np.degrees([fitted.beta_rad.min(), fitted.beta_rad.max()])
+    first, last, lowest, highest = np.degrees([
+        fitted.alpha_rad.min(), fitted.alpha_rad.max(), fitted.beta_rad.min(),
+        fitted.beta_rad.max()])
     changes = np.diff(fitted.beta_rad)
     steps = np.abs(changes)[np.abs(changes) > _SAME_BETA_RAD]
     step = np.degrees(np.median(steps)) if steps.size else 0.0
     both_ways = (changes > _SAME_BETA_RAD).any() and (changes < -_SAME_BETA_RAD).any()
     # Without a colon: ros2 param reads the text as YAML again.
-    return (f'{len(fitted)} poses, alpha {alpha_text} deg; beta {lowest:.0f} to {highest:.0f} '
+    return (f'{len(fitted)} poses, {len(planes(fitted.alpha_rad))} planes alpha from '
+            f'{first:.0f} to {last:.0f} deg; beta {lowest:.0f} to {highest:.0f} '
             f'deg, steps of {step:.0f}, {"both directions" if both_ways else "one direction"}')
 
 
@@ -200,3 +195,166 @@ def _unmodelled_slope(fitted: Sensor, effect: str) -> float:
         return 0.0
     typical, _ = fitted.datasheet.get(Coefficient(effect, 'per_k'), (0.0, 0.0))
     return typical or effect_named(effect).parameters[0].scale
+
+
+_ABSOLUTE = {'bias.offset_v': 'nominal_zero_g_v',
+             'scale_factor.offset_v_per_g': 'nominal_scale_v_per_g'}
+"""Parameters that are departures from a nominal value, and the field of that value."""
+_LABELS = {
+    'bias.offset_v': 'zero-g',
+    'scale_factor.offset_v_per_g': 'scale factor',
+    'misalignment.alpha_rad': 'misalignment alpha',
+    'misalignment.beta_rad': 'misalignment beta',
+    'cross_axis.linear': 'zero-g, {other}',
+    'cross_axis.quadratic_per_g': 'zero-g, {other}²',
+    'cross_axis_z.linear': 'zero-g, {other}',
+    'cross_axis_z.quadratic_per_g': 'zero-g, {other}²',
+    'scale_factor_cross.linear_per_g': 'scale, {other}',
+    'scale_factor_z.linear_per_g': 'scale, {other}',
+    'scale_factor_z.quadratic_per_g2': 'scale, {other}²',
+    'nonlinearity.cubic_per_g2': 'cubic',
+}
+"""Parameters in words; {other} is the axis that acts on the measured axis."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A fitted coefficient and its true value."""
+
+    name: str  # 'effect.parameter', as in the parameter file
+    axis: str  # 'x', 'y' or 'z'; empty for a coefficient of all axes
+    label: str  # The coefficient in words
+    unit: str  # Unit of the values: degrees for an angle, else the unit of the parameter
+    fitted: float  # The fitted value. Zero-g and scale factor are absolute, in V and V/g.
+    half_width: float  # Half of the 90 % interval
+    truth: float  # The true value; 0 for an effect that the unit does not have
+
+    @property
+    def inside(self) -> bool:
+        """Return whether the 90 % interval contains the true value."""
+        return abs(self.fitted - self.truth) <= self.half_width
+
+
+def compare(fitted: Sensor, truth: Sensor) -> list[Comparison]:
+    """
+    Compare each fitted coefficient with the true one, in the order of the fit.
+
+    A misalignment and a linear cross-axis term are the same to first order, so that the true unit
+    must have the gauge of the fits: no linear cross-axis terms.
+    """
+    names, rows = fitted.covariance_names, []
+    truth = with_neutral(truth, [name.effect for name in names])
+    half_widths = Z_90 * np.sqrt(np.diag(fitted.covariance))
+    for name, *values in zip(names, get(fitted, names), half_widths, get(truth, names)):
+        key, unit, scale = str(name.without_axis), parameter_of(name).unit, 1.0
+        if key in _ABSOLUTE:
+            nominal = getattr(fitted, _ABSOLUTE[key])[fitted.axes.index(name.axis)]
+            values[0], values[2] = values[0] + nominal, values[2] + nominal
+        if unit == 'rad':
+            unit, scale = '°', float(np.degrees(1.0))
+        acts = name.axis and name.effect in OTHER_AXIS
+        other = AXES[OTHER_AXIS[name.effect][AXES.index(name.axis)]] if acts else ''
+        rows.append(Comparison(
+            key, name.axis, _LABELS.get(key, key).format(other=other), unit.replace('^2', '²'),
+            *(float(scale * value) for value in values)))
+    return rows
+
+
+def errors_in_words(fitted: Sensor) -> str:
+    """Return the largest errors of the uncalibrated sensor, for people."""
+    offset_g = (fitted.zero_g_v - fitted.nominal_zero_g_v) / fitted.nominal_scale_v_per_g
+    gain = fitted.scale_v_per_g / fitted.nominal_scale_v_per_g - 1
+    first, second = int(np.argmax(np.abs(offset_g))), int(np.argmax(np.abs(gain)))
+    shift, slope = ('much' if error > 0 else 'little'
+                    for error in (offset_g[first], gain[second]))
+    return (f'Uncalibrated, {fitted.axes[first]} reads {mg_text(abs(offset_g[first]) * G0_MPS2)} '
+            f'too {shift}, and {fitted.axes[second]} {abs(100 * gain[second]):.2g} % too '
+            f'{slope}.')
+
+
+_LONGEST_LABEL = 26
+"""Columns that a coefficient's name may take, so that its line has at most 79."""
+_COVERED = 0.9
+"""Share of the 90 % intervals that contain the true value if the intervals are right."""
+
+
+def truth_table(comparisons: Sequence[Comparison]) -> list[str]:
+    """Lay out each fitted coefficient beside the true one, in 79 columns."""
+    longest = max((len(row.label) for row in comparisons), default=0)
+    width = max(min(longest + 1, _LONGEST_LABEL), len('coefficient'))
+    lines = [f' {"coefficient":{width}}     fitted (90 %) {"":16}true']
+    for row in comparisons:
+        truth = '0' if row.truth == 0 else rounded(row, row.truth)
+        lines.append(f' {row.label[:width]:{width}} {row.axis:1} {rounded(row, row.fitted):>10} ± '
+                     f'{rounded(row, row.half_width):8} {row.unit:5} {truth:>10}   '
+                     f'{"ok" if row.inside else "MISSED"}')
+    inside = sum(row.inside for row in comparisons)
+    return [*lines, f' ({inside} of {len(comparisons)} inside their 90 % intervals; about '
+            f'{_COVERED * len(comparisons):.0f} are expected)']
+
+
+def rounded(row: Comparison, value: float) -> str:
+    """Write a value with the decimals that show two digits of the interval."""
+    places = decimals(row.half_width)
+    return f'{round(value, places) + 0.0:.{places}f}'
+
+
+_QUANTITIES = {
+    'zero-g': ('zero_g_v', Coefficient('bias', 'offset_v'), 'mg'),
+    'scale factor': ('scale_v_per_g', Coefficient('scale_factor', 'offset_v_per_g'), 'permille')}
+"""Field of a sensor, fitted parameter, and unit of a change of what calibrations compare."""
+
+
+@dataclass(frozen=True)
+class DriftHistory:
+    """Calibrations of one unit, oldest first."""
+
+    # The stored calibrations, then the newest. Empty where the newest is the only one.
+    sensors: tuple[Sensor, ...]
+
+    @staticmethod
+    def from_store(newest: Sensor, stored: Sequence[Sensor]) -> DriftHistory:
+        """Append the newest calibration to the stored ones of other data and the same axes."""
+        by_data: dict[str, Sensor] = {}
+        for sensor in (*stored, newest):
+            # Two fits of the same data show no drift: only the last one counts.
+            if sensor.axes == newest.axes:
+                data = sensor.provenance.get('data_sha256') or \
+                    calibration_store.calibration_id(sensor)
+                by_data.pop(data, None)
+                by_data[data] = sensor
+        return DriftHistory(tuple(by_data.values()) if len(by_data) > 1 else ())
+
+    def table(self) -> tuple[list[str], list[list[str]]]:
+        """Return head and rows, a row for each calibration."""
+        head = ['date', 'id', 'model', 'temperature, °C', *(
+            f'{label} {axis}' for label in _QUANTITIES for axis in self.sensors[-1].axes)]
+        return head, [
+            [date, calibration_store.calibration_id(sensor), sensor.model,
+             sensor.provenance.get('temperature_c', '-'),
+             *(f'{value:.5f}' for value in (*sensor.zero_g_v, *sensor.scale_v_per_g))]
+            for date, sensor in zip(self.dates, self.sensors)]
+
+    def changes(self) -> str:
+        """State the changes since the calibration before that exceed their intervals."""
+        before, now = self.sensors[-2:]
+        changes = []
+        for label, (field, parameter, unit) in _QUANTITIES.items():
+            differences = getattr(now, field) - getattr(before, field)
+            for d, axis in enumerate(now.axes):
+                name, scale = replace(parameter, axis=axis), 1e3 / now.scale_v_per_g[d]
+                variance = sum(float(sensor.covariance[i, i]) for sensor in (before, now)
+                               for i, own in enumerate(sensor.covariance_names) if own == name)
+                change, half_width = scale * differences[d], scale * Z_90 * variance ** 0.5
+                if abs(change) > half_width:
+                    changes.append(f'{label} of {axis} changed by {change:+.2f} +- '
+                                   f'{half_width:.2f} {unit}')
+        since = f'Since {calibration_store.calibration_id(before)}, {self.dates[-2]}'
+        return f'{since}: {"; ".join(changes)}.' if changes else \
+            f'{since}, nothing has changed beyond the 90 % intervals.'
+
+    @property
+    def dates(self) -> list[str]:
+        """Return the dates of the calibrations, as text."""
+        return [sensor.provenance.get('date', f'no. {i}')[:16].replace('T', ' ')
+                for i, sensor in enumerate(self.sensors, 1)]

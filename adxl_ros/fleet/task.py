@@ -339,13 +339,14 @@ class _Job:
 
     def _fit(self) -> None:
         """Fit a calibration to the recording alone."""
-        from adxl_ros.calibrate import calibration, pose_extraction  # the client needs none
+        from adxl_ros.calibrate import calibration  # the client needs none
+        from adxl_ros.calibrate.poses import estimate_filters, extract_poses
         read = self._recording
         sensor, _ = measure_unstated(load_sensor(self.params, read), read)
         unit = recorded_unit(sensor, read)
-        poses = pose_extraction.extract_poses(read, unit, None)
+        poses = extract_poses(read, unit, None)
         recorded = calibration.RecordedPoses(
-            Path(self.source.url).name, poses, pose_extraction.estimate_filters(read, unit, poses))
+            Path(self.source.url).name, poses, estimate_filters(read, unit, poses))
         result = calibration.calibrate(unit, [recorded], None, (), self.staged.content)
         fitted = result.fitted
         stds = dict(zip(fitted.covariance_names, np.sqrt(np.diag(fitted.covariance)).tolist()))

@@ -20,7 +20,7 @@ from adxl_ros.calibrate.guided import pose_plan
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import acceptance, held_out as unseen
 from adxl_ros.calibrate.report.acceptance import acceptance_lines, screen_table
-from adxl_ros.calibrate.report.coefficients import compare, truth_table
+from adxl_ros.calibrate.result import compare, truth_table
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording, sweep_journal
 from adxl_ros.model.effects import effect_named

@@ -125,8 +125,7 @@ def _progress(progress: screen.Progress | None, estimate: screen.Estimate | None
         f'{_bar(closed / progress.total)} {progress.accepted} done, {skipped}'
         f'{max(progress.total - closed, 0)} left{time}'), ''
     covered = ', '.join(f'{row.group} {row.accepted}/{row.total}' for row in estimate.coverage)
-    faces = f' ({estimate.covered_faces} up)' if estimate.covered_faces else ''
-    yield 'coverage', covered + faces, ''
+    yield 'coverage', covered, ''
     if estimate.range_error:
         yield 'error', estimate.range_error, ''
     elif estimate.tilt_error_deg is None:

@@ -8,11 +8,11 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from adxl_ros.calibrate import calibration, pose_extraction
+from adxl_ros.calibrate import calibration
 from adxl_ros.calibrate.fits import thermal_fit
-from adxl_ros.calibrate.poses import Poses, with_table_angles
+from adxl_ros.calibrate.poses import estimate_filters, extract_poses, Poses, with_table_angles
 from adxl_ros.calibrate.report import gum, page
-from adxl_ros.calibrate.report.coefficients import errors_in_words
+from adxl_ros.calibrate.result import errors_in_words
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, sweep_journal
 from adxl_ros.files.calibration_store import sha256
@@ -115,11 +115,11 @@ def fit(options: argparse.Namespace) -> int:
                     raise UserError(f'--prior {options.prior}: a fit over temperature takes '
                                     'none; leave it out')
                 break
-            poses = pose_extraction.extract_poses(read, unit, records)
+            poses = extract_poses(read, unit, records)
             if options.poses:
                 poses = with_table_angles(poses, read_pose_table(options.poses), read.epoch_ns)
             recordings.append(calibration.RecordedPoses(
-                Path(path).name, poses, pose_extraction.estimate_filters(read, unit, poses)))
+                Path(path).name, poses, estimate_filters(read, unit, poses)))
         assert unit is not None, 'argparse asks for a recording'
         show(0.3, 'fit')
         sha = sha256(options.recording)

@@ -35,7 +35,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Coefficient, Parameter, Place, Role
+from adxl_ros.model.effects.base import Coefficient, Place, Role
 from adxl_ros.model.gauss_newton import gauss_newton, halve_until, Iterate
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -103,8 +103,6 @@ _SHAPE_STEPS = 60
 """Number of trial values on each side of the typical one: from 1/19 to 19 times that value."""
 _FINE_SHAPES = 15
 """Number of trial values between the neighbours of the likeliest value."""
-_SHAPE_STARTS = 3
-"""Number of starts of the fit for a shape parameter."""
 
 
 @dataclass(frozen=True)
@@ -145,9 +143,6 @@ def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] | None = None, m
     """
     Fit the terms to the poses by maximum likelihood.
 
-    A shape parameter makes the likelihood multimodal. The fit then has several starts, and the
-    result with the greatest likelihood counts.
-
     Parameters
     ----------
     sensor
@@ -182,51 +177,35 @@ def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] | None = None, m
         start = sensor
     unit = with_neutral(with_neutral(start, effects), ['base_tilt'])
     names, stated = fitted_coefficients(unit.axes, terms), StageError(sensor.stage_std_rad)
-    fits, failure = [], None
-    for start in _starts(unit, poses, names, stated, effects):
-        try:
-            require_determined(start, poses, names, stated, max_open)
-            fits.append(_Search(start, poses, names, stated).run())
-        except UserError as error:
-            failure = failure or error
-    if not fits:
-        assert failure is not None
-        raise failure
-    return min(fits, key=lambda fit: fit.deviance)
+    start = _likeliest_shapes(unit, poses, names, stated, effects)
+    require_determined(start, poses, names, stated, max_open)
+    return _Search(start, poses, names, stated).run()
 
 
-def _starts(unit: Sensor, poses: Poses, names: tuple[Coefficient, ...], stated: StageError,
-            effects: Sequence[str]) -> list[Sensor]:
+def _likeliest_shapes(unit: Sensor, poses: Poses, names: tuple[Coefficient, ...],
+                      stated: StageError, effects: Sequence[str]) -> Sensor:
     """
-    Return the units from which a fit begins.
+    Give the shape parameters (periods, time constants) of effects their likeliest values.
 
-    The volts are nearly linear in all coefficients except shape parameters (periods, time
-    constants). Shape parameters are searched over their range; the likeliest values are starts.
+    The volts are nearly linear in all other coefficients. The likelihood by a shape parameter has
+    several maxima, so that its whole range is searched, and then the interval of the best value.
     """
-    def likeliest(effect: str, parameter: Parameter, values: np.ndarray) -> list[Sensor]:
-        """Return units with values within the bounds of a parameter, the likeliest first."""
+    shapes = [(name, parameter) for name in effects for parameter in effect_named(name).parameters
+              if effect_named(name).invertible and parameter.role is Role.SHAPE
+              and not parameter.held]
+    for effect, parameter in shapes:
         of_effect = unit.values[effect]
-        shape = np.shape(of_effect[parameter.name])
-        units = [replace(unit, values={
-            **unit.values, effect: {**of_effect, parameter.name: np.full(shape, value)}})
-            for value in values if parameter.lower <= value <= parameter.upper]
-        misfit = [linearised(trial, poses, names, prior_precision(names)).misfit(stated)
-                  for trial in units]
-        return [units[i] for i in np.argsort(misfit)]
-
-    starts = [unit]
-    for effect in filter(lambda name: effect_named(name).invertible, effects):
-        for parameter in effect_named(effect).parameters:
-            if parameter.role is not Role.SHAPE or parameter.held:
-                continue
-            steps = np.arange(-_SHAPE_STEPS, _SHAPE_STEPS + 1)
-            best, *others = likeliest(
-                effect, parameter, parameter.scale * _SHAPE_STEP ** steps)[:_SHAPE_STARTS]
-            value = float(np.ravel(best.values[effect][parameter.name])[0])
-            finer = likeliest(effect, parameter,
-                              value * _SHAPE_STEP ** np.linspace(-1, 1, _FINE_SHAPES))
-            starts += [finer[0], *others]
-    return starts
+        shape, value = np.shape(of_effect[parameter.name]), parameter.scale
+        for steps in (np.arange(-_SHAPE_STEPS, _SHAPE_STEPS + 1),
+                      np.linspace(-1, 1, _FINE_SHAPES)):
+            values = value * _SHAPE_STEP ** steps
+            units = [replace(unit, values={
+                **unit.values, effect: {**of_effect, parameter.name: np.full(shape, trial)}})
+                for trial in values if parameter.lower <= trial <= parameter.upper]
+            unit = min(units, key=lambda trial: linearised(
+                trial, poses, names, prior_precision(names)).misfit(stated))
+            value = float(np.ravel(unit.values[effect][parameter.name])[0])
+    return unit
 
 
 class _Search:

@@ -7,6 +7,8 @@ At rest the specific force has the magnitude of local gravity in every pose. Zer
 and three angles between the sensing axes are fitted: V = zero-g + scale·(Θ·f/g₀) with Θ of
 equations 18 and 19. A common turn of all three axes, which has three angles, does not change the
 magnitude. The gauge therefore holds Θx on the case's x and Θy in its x-y plane.
+
+- Directions in which a sensor is held by hand, and their names.
 """
 
 from __future__ import annotations
@@ -14,15 +16,197 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from itertools import product
 from typing import NamedTuple
 
-from adxl_ros.calibrate.fits import gravity_model
-from adxl_ros.calibrate.fits.gravity_model import magnitude_variance, NAMES, NominalRests
 from adxl_ros.errors import UserError
-from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 import scipy
+
+NAMES = (*(Coefficient('bias', 'offset_v', axis) for axis in AXES),
+         *(Coefficient('scale_factor', 'offset_v_per_g', axis) for axis in AXES),
+         Coefficient('misalignment', 'beta_rad', 'y'),
+         Coefficient('misalignment', 'alpha_rad', 'z'),
+         Coefficient('misalignment', 'beta_rad', 'z'))
+"""The nine coefficients. In the fits of gravity they are zero-g shifts in g, relative changes of
+the scale factor and angles in rad: the "parameters" below, (9,)."""
+PRIOR_STD = 0.1
+"""Prior standard deviation of each parameter. Chosen: ten times the tolerances of datasheets."""
+DETERMINED_STD = 0.01
+"""Standard deviation below which a parameter counts as determined: 10 mg, 1 % or 0.6°, the usual
+tolerances of datasheets."""
+TRIAL_STD_G = 1e-4
+"""Standard deviation of a rest's magnitude before the excess is estimated, g."""
+_ROUNDING_STD_G = 1e-9
+"""Standard deviation of a mean by rounding alone, g, so that no weight is infinite."""
+_MAX_VALUE = 0.5
+"""Largest magnitude of a parameter in an iteration. Chosen: five prior standard deviations."""
+_PRIOR_INFORMATION = np.eye(len(NAMES)) / PRIOR_STD ** 2
+"""Inverse covariance of the prior about 0, (9, 9)."""
+
+
+@dataclass(frozen=True)
+class NominalRests:
+    """k rests, converted by the nominal zero-g and scale factor."""
+
+    mean: np.ndarray  # Means, g, (k, 3)
+    variance: np.ndarray  # Variances of the means, g², (k, 3)
+    gravity_g: float  # Local gravity, g
+
+    def __getitem__(self, part: np.ndarray) -> NominalRests:
+        return NominalRests(self.mean[part], self.variance[part], self.gravity_g)
+
+
+def nominal_rests(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor) -> NominalRests:
+    """Convert means of rests and their standard deviations, V, (k, 3), by nominal values."""
+    scale = sensor.nominal_scale_v_per_g
+    return NominalRests((mean_v - sensor.nominal_zero_g_v) / scale,
+                        (std_v / scale) ** 2 + _ROUNDING_STD_G ** 2,
+                        sensor.local_gravity_mps2 / G0_MPS2)
+
+
+def effect_values(parameters: np.ndarray, sensor: Sensor
+                  ) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
+    """Return the values of the effects, and the factor from each parameter to its coefficient."""
+    scale = sensor.nominal_scale_v_per_g
+    units = np.concatenate([scale, scale, np.ones(3)])
+    values = parameters * units
+    return {'bias': {'offset_v': values[:3]}, 'scale_factor': {'offset_v_per_g': values[3:6]},
+            'misalignment': {'alpha_rad': np.array([0.0, 0.0, values[7]]),
+                             'beta_rad': np.array([0.0, values[6], values[8]])}}, units
+
+
+def _sensing_axes(parameters: np.ndarray) -> np.ndarray:
+    """Return the directions of the sensing axes in the gauge, rows Θx, Θy, Θz, (3, 3)."""
+    (sy, sa, sb), (cy, ca, cb) = np.sin(parameters[6:]), np.cos(parameters[6:])
+    return np.array([[1.0, 0.0, 0.0], [-sy, cy, 0.0], [sb, -sa * cb, ca * cb]])
+
+
+def force_g(mean: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+    """Return the specific force of rests in the case, g, (k, 3), by their means, g, (k, 3)."""
+    sensed = (mean - parameters[:3]) / (1 + parameters[3:6])
+    return np.asarray(sensed @ np.linalg.inv(_sensing_axes(parameters)).T)
+
+
+def magnitude(mean: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+    """Return the magnitudes of rests, g, (k,), by their means, g, (k, 3)."""
+    return np.linalg.norm(force_g(mean, parameters), axis=1)
+
+
+class Linearised(NamedTuple):
+    """Magnitudes of k rests to first order."""
+
+    magnitude: np.ndarray  # Magnitudes, g, (k,)
+    by_output: np.ndarray  # Derivatives by the means, (k, 3)
+    jacobian: np.ndarray  # Derivatives by the parameters, (k, 9)
+
+
+def linearised(mean: np.ndarray, parameters: np.ndarray) -> Linearised:
+    """Return the magnitudes with their derivatives; `mean` by nominal values, g, (k, 3)."""
+    scale = 1 + parameters[3:6]
+    sensed = (mean - parameters[:3]) / scale
+    inverse = np.linalg.inv(_sensing_axes(parameters))
+    force = sensed @ inverse.T
+    length = np.linalg.norm(force, axis=1)
+    by_sensed = force / length[:, None] @ inverse
+    by_output = by_sensed / scale
+    # ∂Θ/∂angle: of Θy by its angle, of Θz by both of its angles.
+    (sy, sa, sb), (cy, ca, cb) = np.sin(parameters[6:]), np.cos(parameters[6:])
+    turned = np.array([[-cy, -sy, 0.0], [0.0, -ca * cb, -sa * cb], [cb, sa * sb, -ca * sb]])
+    by_angle = -by_sensed[:, [1, 2, 2]] * (force @ turned.T)
+    return Linearised(length, by_output, np.hstack([-by_output, -by_output * sensed, by_angle]))
+
+
+def magnitude_jacobian(mean: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+    """Differentiate the magnitudes by the parameters, (k, 9)."""
+    return linearised(mean, parameters).jacobian
+
+
+def magnitude_variance(rests: NominalRests, parameters: np.ndarray) -> np.ndarray:
+    """Return the variance of each magnitude by the noise of the means, g², (k,)."""
+    return np.sum(linearised(rests.mean, parameters).by_output ** 2 * rests.variance, axis=1)
+
+
+def regularised_fit(rests: NominalRests, steps: int) -> np.ndarray:
+    """Fit rests with the prior by Gauss-Newton steps from 0; return the parameters."""
+    parameters = np.zeros(len(NAMES))
+    for _ in range(steps):
+        length, _, rows = linearised(rests.mean, parameters)
+        weighted = rows.T / (magnitude_variance(rests, parameters).mean() + TRIAL_STD_G ** 2)
+        gradient = weighted @ (rests.gravity_g - length) - parameters / PRIOR_STD ** 2
+        step = np.linalg.solve(weighted @ rows + _PRIOR_INFORMATION, gradient)
+        parameters = np.clip(parameters + step, -_MAX_VALUE, _MAX_VALUE)
+    return parameters
+
+
+def fisher_information(rests: NominalRests, parameters: np.ndarray, excess_g2: float
+                       ) -> np.ndarray:
+    """
+    Return the Fisher information of rests about the parameters, without the prior, (9, 9).
+
+    excess_g2: variance of the magnitudes beyond the noise of the means, g².
+    """
+    if not len(rests.mean):
+        return np.zeros((len(NAMES), len(NAMES)))
+    rows = magnitude_jacobian(rests.mean, parameters)
+    return rows.T @ (rows / (magnitude_variance(rests, parameters) + excess_g2)[:, None])
+
+
+def posterior_information(rests: NominalRests, parameters: np.ndarray, excess_g2: float
+                          ) -> np.ndarray:
+    """Return the information of prior and rests about the parameters, (9, 9)."""
+    return _PRIOR_INFORMATION + fisher_information(rests, parameters, excess_g2)
+
+
+def undetermined(information: np.ndarray) -> list[Coefficient]:
+    """Name the coefficients that the information, (9, 9), does not determine."""
+    std = np.sqrt(np.diag(np.linalg.inv(information)))
+    return [name for name, parameter_std in zip(NAMES, std) if parameter_std > DETERMINED_STD]
+
+
+CANDIDATES = np.array([signs for signs in product((0, 1, -1), repeat=3) if any(signs)])
+"""Faces, edges and corners of a cube, one of which points up, (26, 3)."""
+UP = CANDIDATES / np.linalg.norm(CANDIDATES, axis=1, keepdims=True)
+"""The candidates as unit vectors, (26, 3)."""
+_COVERED_COS = np.cos(np.radians(22.0))
+"""Cosine of the angle up to which a rest covers a direction: half of the 45° to the next one."""
+AXES_UP = np.count_nonzero(CANDIDATES, axis=1)
+"""Number of axes that are not horizontal, (26,): 1 for a face, 2 for an edge, 3 for a corner."""
+
+
+def covered(up: np.ndarray) -> np.ndarray:
+    """Mark the candidates that rests in the directions `up`, (k, 3), cover, (26,) bool."""
+    return np.any(up @ UP.T > _COVERED_COS, axis=0) if len(up) else np.zeros(len(UP), bool)
+
+
+def next_up(available: np.ndarray, now: np.ndarray | None) -> int | None:
+    """
+    Choose the candidate to turn to: the nearest face, without one the nearest edge, then corner.
+
+    available: whether a candidate may be chosen, (26,); now: direction that points up at present,
+    (3,), if known.
+    """
+    nearness = UP @ (np.zeros(3) if now is None else now)
+    cost = np.where(available, AXES_UP - 0.4 * nearness, np.inf)
+    return int(cost.argmin()) if available.any() else None
+
+
+def name_up(candidate: int) -> str:
+    """Name what points up: '+x', or '+x and −y equally' for an edge."""
+    axes = [('+' if sign > 0 else '−') + axis for axis, sign in zip(AXES, CANDIDATES[candidate])
+            if sign]
+    return axes[0] if len(axes) == 1 else f'{" and ".join(axes)} equally'
+
+
+def points_up(candidate: int) -> str:
+    """Return a sentence: '+x points up', '+x and −y point up equally'."""
+    name = name_up(candidate)
+    return f'{name.removesuffix(" equally")} point up equally' if ' and ' in name else \
+        f'{name} points up'
+
 
 MIN_RESTS = len(NAMES) + 1
 """Smallest count of rests: one more than coefficients, so that residuals show the error."""
@@ -43,22 +227,10 @@ _OUTLIER_CHANCE = 0.01
 """Probability of a false outlier among all rests of a fit without outliers."""
 _MAX_OUTLIERS = 0.25
 """Largest share of outliers. Chosen: more of them are a fault of the recording."""
-_OUTLIER_RANGE_G = 0.03
-"""Range of the magnitude of an outlier, g. Chosen: the size of a knock or of a hand's motion."""
-_LTS_STARTS = 20
-"""Number of starts of the least trimmed squares, with ten rests each. Chosen: one of them is
-likely to be free of outliers."""
-_LTS_FIRST_STEPS = 4
-"""Gauss-Newton steps with the rests of a start."""
-_LTS_STEPS = 11
-"""Gauss-Newton steps with the rests that fit best."""
-_LTS_MAX_DEVIATIONS = 5.0
-"""Largest residual of a rest that belongs to the best fit of most rests, standard deviations."""
+_MAX_DEVIATIONS = 5.0
+"""Largest residual of a rest with which the search for outliers begins, standard deviations."""
 _MIN_REMAINDER = 1e-9
 """Lower bound of 1 − leverage, as a divisor."""
-_OTHER_SENSOR_G = 0.3
-"""Range of the magnitudes by nominal values, g, from which those are wrong. Chosen: errors within
-PRIOR_STD make less."""
 _MIN_GRAVITY_RATIO = 0.5
 """Smallest ratio of the measured magnitude to local gravity; a smaller one is a wrong unit."""
 _MAX_GRAVITY_RATIO = 2.0
@@ -122,10 +294,10 @@ def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor,
     ------
     UserError
         The rests do not determine the parameters, or do not read gravity. The message names the
-        coefficients and rests to add.
+        coefficients.
 
     """
-    rests = gravity_model.nominal_rests(mean_v, std_v, sensor)
+    rests = nominal_rests(mean_v, std_v, sensor)
     _require_determined(rests, np.zeros(len(NAMES)), 0.0)
     fits = cache(lambda mask: _fit(rests[np.frombuffer(mask, bool)]))
 
@@ -138,11 +310,11 @@ def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor,
     _require_determined(rests[kept], parameters, excess_g2)
     variance = magnitude_variance(rests, parameters) + excess_g2
     covariance = np.linalg.inv(
-        gravity_model.fisher_information(rests[kept], parameters, excess_g2))
+        fisher_information(rests[kept], parameters, excess_g2))
     # An excess that ν rests determine widens its share of the variance by ν/(ν − 2).
     covariance *= 1 + excess_g2 / variance[kept].mean() * 2 / max(
         kept.sum() - len(NAMES) - 2, 1)
-    values, units = gravity_model.effect_values(parameters, sensor)
+    values, units = effect_values(parameters, sensor)
     residual = _residual(rests, parameters)
     return GravityFit(
         values=values, covariance=covariance * np.outer(units, units),
@@ -157,7 +329,7 @@ def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor,
 
 def _residual(rests: NominalRests, parameters: np.ndarray) -> np.ndarray:
     """Return magnitude minus local gravity, g, (k,), or (s, k) for s sets of parameters."""
-    return gravity_model.magnitude(rests.mean, parameters) - rests.gravity_g
+    return magnitude(rests.mean, parameters) - rests.gravity_g
 
 
 def _solve(rests: NominalRests, start: np.ndarray, variance: np.ndarray
@@ -167,7 +339,7 @@ def _solve(rests: NominalRests, start: np.ndarray, variance: np.ndarray
     # `least_squares` calls the same routine of MINPACK, and takes twice the time around it.
     parameters, _, _, _, status = scipy.optimize.leastsq(
         lambda p: _residual(rests, p) / std, start,
-        Dfun=lambda p: gravity_model.magnitude_jacobian(rests.mean, p) / std[:, None],
+        Dfun=lambda p: magnitude_jacobian(rests.mean, p) / std[:, None],
         full_output=True, xtol=_TOLERANCE, ftol=_TOLERANCE, gtol=_TOLERANCE, diag=_UNSCALED)
     return parameters, status in _CONVERGED
 
@@ -200,30 +372,29 @@ def _inliers(rests: NominalRests, fit: Callable[[np.ndarray], _Estimate]) -> np.
     """
     Mark the rests that fit the others, (k,) bool.
 
-    Rests leave or return, one at a time, by their studentised distance from the fit to the
-    others. One search begins with all rests. Another begins with the best fit to most rests,
-    where outliers cannot mask one another. The result with the greater likelihood counts.
+    The search begins with the rests near the fit with the least sum of absolute errors, where
+    outliers cannot mask one another. Then rests leave or return, one at a time, by their
+    studentised distance from the fit to the others, until each kept rest fits and each other does
+    not.
     """
     count = len(rests.mean)
     max_outliers = min(int(_MAX_OUTLIERS * count), count - MIN_RESTS)
-    everything = np.ones(count, bool)
     if max_outliers < 1:
-        return everything
-    results = [_exchanged(rests, begin, fit, max_outliers)
-               for begin in (everything, _robust_inliers(rests, max_outliers))]
-    return min(results, key=lambda kept: _negative_log_likelihood(rests, kept, fit))
-
-
-def _exchanged(rests: NominalRests, kept: np.ndarray, fit: Callable[[np.ndarray], _Estimate],
-               max_outliers: int) -> np.ndarray:
-    """Let rests leave or return until each kept rest fits and each other does not, (k,) bool."""
-    kept = kept.copy()
+        return np.ones(count, bool)
+    robust = scipy.optimize.least_squares(
+        lambda p: _residual(rests, p), np.zeros(len(NAMES)),
+        lambda p: magnitude_jacobian(rests.mean, p), loss='soft_l1',
+        f_scale=TRIAL_STD_G)
+    size = np.abs(robust.fun)
+    freedom = max(count - max_outliers - len(NAMES), 1)
+    variance = np.sum(np.sort(size)[:count - max_outliers] ** 2) / freedom
+    kept = size <= _MAX_DEVIATIONS * np.sqrt(
+        variance + magnitude_variance(rests, robust.x).mean())
     for _ in range(2 * max_outliers):
         distance = _studentised(rests, kept, fit(kept))
-        freedom = max(kept.sum() - MIN_RESTS, 1)
-        limit = -scipy.special.stdtrit(freedom, _OUTLIER_CHANCE / (2 * len(kept)))
-        excluded = np.where(kept, np.inf, distance)
-        included = np.where(kept, distance, 0)
+        limit = -scipy.special.stdtrit(max(kept.sum() - MIN_RESTS, 1),
+                                       _OUTLIER_CHANCE / (2 * count))
+        excluded, included = np.where(kept, np.inf, distance), np.where(kept, distance, 0)
         if excluded.min() <= limit:
             kept[excluded.argmin()] = True
         elif included.max() > limit and (~kept).sum() < max_outliers:
@@ -233,46 +404,13 @@ def _exchanged(rests: NominalRests, kept: np.ndarray, fit: Callable[[np.ndarray]
     return kept
 
 
-def _negative_log_likelihood(rests: NominalRests, kept: np.ndarray,
-                             fit: Callable[[np.ndarray], _Estimate]) -> float:
-    """Return −ln of the residual likelihood; outliers are uniform within `_OUTLIER_RANGE_G`."""
-    parameters, excess_g2, _ = fit(kept)
-    variance = magnitude_variance(rests[kept], parameters).mean() + excess_g2
-    count, outliers = len(kept), (~kept).sum()
-    log_choices = (scipy.special.gammaln(count + 1) - scipy.special.gammaln(outliers + 1)
-                   - scipy.special.gammaln(count - outliers + 1))
-    return float((kept.sum() - len(NAMES)) / 2 * np.log(variance * 2 * np.pi * np.e)
-                 + outliers * np.log(_OUTLIER_RANGE_G) + log_choices)
-
-
-def _robust_inliers(rests: NominalRests, max_outliers: int) -> np.ndarray:
-    """
-    Mark the rests that are near the best fit to all but `max_outliers` rests, (k,) bool.
-
-    This is least trimmed squares: each start fits a few rests, then repeatedly the rests that
-    its fit suits best (Rousseeuw and Van Driessen 2006). All starts run side by side.
-    """
-    count = len(rests.mean)
-    rng = np.random.default_rng(0)
-    few = np.array([rng.choice(count, MIN_RESTS, replace=False) for _ in range(_LTS_STARTS)])
-    parameters = gravity_model.regularised_fit(
-        rests[few], np.zeros((_LTS_STARTS, len(NAMES))), _LTS_FIRST_STEPS)
-    parameters = gravity_model.regularised_fit(rests, parameters, _LTS_STEPS, count - max_outliers)
-    squares = np.sort(_residual(rests, parameters) ** 2, axis=1)
-    trimmed_sums = np.nan_to_num(squares[:, :count - max_outliers].sum(axis=1), nan=np.inf)
-    best = parameters[trimmed_sums.argmin()]
-    freedom = max(count - max_outliers - len(NAMES), 1)
-    std = np.sqrt(trimmed_sums.min() / freedom + magnitude_variance(rests, best).mean())
-    return np.abs(_residual(rests, best)) <= _LTS_MAX_DEVIATIONS * std
-
-
 def _studentised(rests: NominalRests, kept: np.ndarray, estimate: _Estimate) -> np.ndarray:
     """Return the distance of each rest from the fit to the others by its std, (k,)."""
     parameters, excess_g2, _ = estimate
     variance = magnitude_variance(rests, parameters) + excess_g2
     covariance = np.linalg.inv(
-        gravity_model.posterior_information(rests[kept], parameters, excess_g2))
-    jacobian = gravity_model.magnitude_jacobian(rests.mean, parameters)
+        posterior_information(rests[kept], parameters, excess_g2))
+    jacobian = magnitude_jacobian(rests.mean, parameters)
     leverage = np.einsum('ki,ij,kj->k', jacobian, covariance, jacobian) / variance
     distance = np.abs(_residual(rests, parameters)) / np.sqrt(variance)
     inside = distance / np.sqrt(np.maximum(1 - leverage, _MIN_REMAINDER))
@@ -308,27 +446,14 @@ def _require_determined(rests: NominalRests, parameters: np.ndarray, excess_g2: 
         raise UserError(f'gravity: the rests read {measured * G0_MPS2:.3g} m/s², not '
                         f'{rests.gravity_g * G0_MPS2:.3g}: correct nominal_zero_g_v, '
                         'nominal_scale_v_per_g or local_gravity_mps2')
-    information = gravity_model.posterior_information(rests, parameters, excess_g2)
-    missing = gravity_model.undetermined(information)
+    information = posterior_information(rests, parameters, excess_g2)
+    missing = undetermined(information)
     if count >= MIN_RESTS and not missing:
         return
     names = 'all nine coefficients' if len(missing) == len(NAMES) else \
         ', '.join(map(str, missing))
     reason = f'do not determine {names}' if missing else f'are too few, at least {MIN_RESTS}'
     scatter = f' and scatter by {1e3 * np.sqrt(excess_g2):.2g} mg' if excess_g2 else ''
-    rests_needed = gravity_model.rests_to_add(
-        max(MIN_RESTS - count, 0), information, parameters, rests.gravity_g,
-        gravity_model.TRIAL_STD_G ** 2 + excess_g2)
     raise UserError(f'gravity: without their angles (fit --poses), the {count} rests {reason}'
-                    f'{scatter}{_other_sensor(rests)}; add rests with {", ".join(rests_needed)}')
-
-
-def _other_sensor(rests: NominalRests) -> str:
-    """Return that the nominal values seem to be those of another sensor; empty if they fit."""
-    if not len(rests.mean):
-        return ''
-    low_g, high_g = np.quantile(np.linalg.norm(rests.mean, axis=1), [0.1, 0.9])
-    if high_g - low_g < _OTHER_SENSOR_G:
-        return ''
-    return (f', and read {low_g:.2f} to {high_g:.2f} g: zero-g and scale factor are those of '
-            'another sensor, so that --params needs the file of this one')
+                    f'{scatter}; add rests with each axis up and down, and '
+                    'with two axes equally up')

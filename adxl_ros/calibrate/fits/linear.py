@@ -77,14 +77,12 @@ def fit(sensor: Sensor, poses: Poses, may_be_open: bool = False) -> Sensor:
         if not ((reference_g[used] > 0).any() and (reference_g[used] < 0).any()):
             used = np.ones(len(volts), bool)
         span_g = np.ptp(reference_g[used])
-        if may_be_open and span_g < _MIN_SPAN_G:
-            lines[d], of_axis = _fit_open_line(reference_g, volts, std_v, nominal[d])
-        elif used.sum() < 2 or span_g < _MIN_SPAN_G:
+        is_open = may_be_open and span_g < _MIN_SPAN_G
+        if not is_open and (used.sum() < 2 or span_g < _MIN_SPAN_G):
             raise UserError(f'{axis}: its reference spans {span_g:.2f} g over {used.sum()} poses, '
                             'which does not determine the scale factor; add poses with the axis '
                             'up and down')
-        else:
-            lines[d], of_axis = _fit_line(reference_g, volts, std_v, used)
+        lines[d], of_axis = _fit_line(reference_g, volts, std_v, used, nominal[d], is_open)
         covariance[np.ix_([d, count + d], [d, count + d])] = of_axis
     values = {'bias': {'offset_v': lines[:, 0] - sensor.nominal_zero_g_v},
               'scale_factor': {'offset_v_per_g': lines[:, 1] - sensor.nominal_scale_v_per_g}}
@@ -94,26 +92,25 @@ def fit(sensor: Sensor, poses: Poses, may_be_open: bool = False) -> Sensor:
                    covariance=covariance, covariance_names=tuple(names))
 
 
-def _fit_line(reference_g: np.ndarray, volts: np.ndarray, std_v: np.ndarray, used: np.ndarray
-              ) -> tuple[np.ndarray, np.ndarray]:
-    """Fit zero-g and scale factor to the poses used; values, (2,), and covariance, (2, 2)."""
-    design = np.column_stack([np.ones(len(volts)), reference_g])
-    line = np.linalg.lstsq(design[used], volts[used], rcond=None)[0]
-    residual = volts - design @ line
-    variance = max(np.sum(residual ** 2) / max(len(volts) - 2, 1), np.mean(std_v ** 2))
-    return line, variance * np.linalg.inv(design[used].T @ design[used])
+def _fit_line(reference_g: np.ndarray, volts: np.ndarray, std_v: np.ndarray, used: np.ndarray,
+              nominal: np.ndarray, is_open: bool) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Fit zero-g and scale factor to the poses used; values, (2,), and covariance, (2, 2).
 
-
-def _fit_open_line(reference_g: np.ndarray, volts: np.ndarray, std_v: np.ndarray,
-                   nominal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fit a line that its poses do not determine, by a prior about the nominal one."""
+    Where they may stay open, they have a wide prior about the nominal ones.
+    """
     design = np.column_stack([np.ones(len(volts)), reference_g])
-    residual = volts - design @ nominal
-    variance = max(float(np.var(residual, ddof=min(1, len(volts) - 1))),
-                   float(np.mean(std_v ** 2)))
-    prior = np.diag([_OPEN_STD_V ** -2, _OPEN_STD_V_PER_G ** -2])
-    covariance = np.linalg.inv(design.T @ design / variance + prior)
-    return nominal + covariance @ (design.T @ residual) / variance, covariance
+    departure = volts - design @ nominal
+    line = np.zeros(2) if is_open else np.linalg.lstsq(design[used], departure[used],
+                                                       rcond=None)[0]
+    residual, freedom = departure - design @ line, len(volts) - (1 if is_open else 2)
+    variance = max(np.sum((residual - is_open * residual.mean()) ** 2) / max(freedom, 1),
+                   np.mean(std_v ** 2))
+    prior = is_open * np.diag([_OPEN_STD_V ** -2, _OPEN_STD_V_PER_G ** -2])
+    covariance = np.linalg.inv(design[used].T @ design[used] / variance + prior)
+    if is_open:
+        line = covariance @ (design.T @ departure) / variance
+    return nominal + line, covariance
 
 
 EFFECTS = ('bias', 'scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z',

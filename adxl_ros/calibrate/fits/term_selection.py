@@ -184,10 +184,6 @@ NOT_CONVERGED = ('the fit did not converge: coefficients and intervals are those
 """Line of a fit that did not converge."""
 _MAX_WARMING_K = 3.0
 """Range of temperature beyond which the report warns, K: 0.3 mg by the datasheet's 0.1 mg/°C."""
-_TYPICAL_DRIFT_MG_PER_K = 0.1
-"""Typical drift of the zero-g, mg/°C (ADXL203 datasheet)."""
-_MIN_POSE_SHARE = 0.1
-"""Ratio of the stage error by pose to that by setting from which it is reported."""
 _BAD_STAGE_RATIO = 1.5
 """Ratio of the estimated to the stated stage error from which the report warns."""
 _MIN_STAGE_EXCESS_RAD = 1e-5
@@ -240,20 +236,17 @@ def warnings(full: full_model.FullFit, poses: Poses) -> list[str]:
         lines.append(f'outliers, left out: pose {", ".join(named)}')
     change_k = np.ptp(poses.environment.temperature_c)
     if change_k > _MAX_WARMING_K and 'temperature_bias' not in full.fitted.effects:
-        lines.append(
-            f'temperature moved by {change_k:.1f} degC, which the model ignores: typically up to '
-            f'{_TYPICAL_DRIFT_MG_PER_K * change_k:.1f} mg; keep it steady, or fit --effect '
-            'temperature_bias')
+        lines.append(f'temperature moved by {change_k:.1f} degC, which the model ignores; keep it '
+                     'steady, or fit --effect temperature_bias')
     return lines
 
 
 def _stage_lines(full: full_model.FullFit) -> list[str]:
     setting_deg = np.degrees(full.stage.setting_rad * full.stage.joints)
     pose_deg = np.degrees(full.stage.pose_rad * full.stage.joints)
-    by_pose = f'; {pose_deg[0]:.2g} and {pose_deg[1]:.2g} deg rms by pose' \
-        if pose_deg[0] > _MIN_POSE_SHARE * setting_deg[0] else ''
     lines = [f'stage error: alpha {setting_deg[0]:.2g}, beta {setting_deg[1]:.2g} deg rms by '
-             f'setting{by_pose} (stated {np.degrees(full.stated_std_rad):.2g} deg)']
+             f'setting, {pose_deg[0]:.2g} and {pose_deg[1]:.2g} deg by pose (stated '
+             f'{np.degrees(full.stated_std_rad):.2g} deg)']
     std = np.sqrt(np.diag(np.linalg.inv(full.information)))
     values = [f'{name} {with_half_width(float(value), Z_90 * value_std)} {parameter_of(name).unit}'
               for name, value, value_std in zip(full.names, get(full.unit, full.names), std)

@@ -10,7 +10,7 @@ Zero-g over temperature, fitted to a sensor that rests while it warms and cools.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import chain, pairwise
+from itertools import pairwise
 from typing import NamedTuple
 
 from adxl_ros.calibrate.poses import Poses
@@ -40,24 +40,17 @@ PRIOR_WIDTH = 5.0
 """Prior standard deviation of a coefficient divided by its typical size, as in the diagnosis."""
 _LAGS_S = np.geomspace(10.0, 1000.0, 7)
 """Time constants of `thermal_lag` that are tried, s. Chosen: each is twice the one before."""
-_REACHES = tuple(np.geomspace(0.02, 0.5, 6))
+_REACHES = np.geomspace(0.02, 0.5, 6)
 """Reaches of `thermal_hysteresis` that are tried, divided by the range of temperature. Chosen: a
 loop whose reach is larger has no corner in the range."""
+_STEP = 0.02
+"""Step of the derivative by a shape, divided by its value. Chosen: smooth."""
 _SMALLEST_GAIN = 5.0
 """Gain in half of the BIC from which a dependence on the history counts. Chosen: odds of 150."""
 _LARGEST_CORRELATION = 0.95
 """Largest correlation of neighbouring blocks. Chosen: beyond it the drift is a random walk."""
 _ITERATIONS = 4
 """Iterations over coefficients and correlation. Chosen: they no longer change then."""
-_RELATIVE_STEP = 0.02
-"""Step of the derivative by a shape, divided by its value. Chosen: smooth."""
-
-
-class History(NamedTuple):
-    """A dependence on the history of the temperature."""
-
-    effect: str = ''  # `thermal_lag` or `thermal_hysteresis`; '' for none
-    shape: float = 0.0  # Its time constant, s, or its reach, K
 
 
 @dataclass(frozen=True)
@@ -67,8 +60,8 @@ class ThermalFit:
     names: tuple[Coefficient, ...]  # Coefficients, (p,)
     values: np.ndarray  # Their values, (p,), each in the unit of its parameter
     covariance: np.ndarray  # Their covariance, (p, p)
-    history: History  # The supported dependence on the history
-    gains: dict[str, float]  # Gain of each tried history in half of the BIC, by effect
+    history: str  # `thermal_lag` or `thermal_hysteresis`, where the blocks support one, else ''
+    shape: float  # Its time constant, s, or its reach, K
     residual_g: np.ndarray  # Rms residual of each axis, g, (m,)
     span_c: tuple[float, float]  # Lowest and highest temperature, °C
 
@@ -100,160 +93,127 @@ def fit(sensor: Sensor, blocks: Poses, with_history: bool = True) -> ThermalFit:
     are correlated (AR(1), by Cochrane and Orcutt). An effect of the history, `thermal_lag` or
     `thermal_hysteresis`, is kept where it gains enough, and only after a reversal.
     """
-    model = _Model(sensor, blocks)
-    tried = [model.best_shape('thermal_lag', _LAGS_S),
-             model.best_shape('thermal_hysteresis', np.array(_REACHES) * model.span_k)] \
-        if with_history and model.reverses else []
-    plain = model.score(History())
-    gains = {history.effect: model.score(history) - plain for history in tried}
-    best = max(tried, key=lambda history: gains[history.effect], default=History())
-    return model.solve(best if gains.get(best.effect, 0) > _SMALLEST_GAIN else History(), gains)
+    temperature_c, axes = blocks.temperature_c, sensor.axes
+    if len(temperature_c) < _FEWEST_BLOCKS:
+        raise UserError(f'thermal: {len(temperature_c)} blocks at rest with a temperature, at '
+                        f'least {_FEWEST_BLOCKS} are needed; record for longer')
+    if np.ptp(temperature_c) < _SMALLEST_SPAN_K:
+        raise UserError(f'thermal: the temperature changes by {np.ptp(temperature_c):.1f} K, at '
+                        f'least {_SMALLEST_SPAN_K:g} K are needed; warm or cool the sensor')
+    outputs_g = (blocks.volts - sensor.zero_g_v) / sensor.scale_v_per_g
+    turned = np.abs(np.diff(outputs_g, axis=0)).max(axis=1) > _TURN_G
+    orientation = np.concatenate([[0], np.cumsum(turned)])
+    span_k = float(np.ptp(temperature_c))
+
+    def fitted(history: str, shape: float) -> list[_Axis]:
+        # The output of a history, and its derivative by the shape.
+        low, output, high = (_history_output(blocks, history, shape * (1 + step))
+                             for step in (-_STEP, 0.0, _STEP)) if history else np.zeros((3, 1))
+        by_shape = (high - low) / (2 * _STEP * shape) if history else output
+        return [_fit_axis(axis, temperature_c, output_g, orientation, history, output, by_shape)
+                for axis, output_g in zip(axes, outputs_g.T)]
+
+    def score(history: str, shape: float) -> float:
+        """Return half of the BIC, as a gain."""
+        penalty = 0.5 * np.log(outputs_g.size) * (len(axes) + 1 if history else 0)
+        return sum(axis.log_likelihood for axis in fitted(history, shape)) - float(penalty)
+
+    best, highest = ('', 0.0), score('', 0.0) + _SMALLEST_GAIN
+    branch = stop(temperature_c, span_k * _REACHES[1], {})
+    if with_history and branch.max() > 0.5 and branch.min() < -0.5:
+        for history, shapes in (('thermal_lag', _LAGS_S),
+                                ('thermal_hysteresis', _REACHES * span_k)):
+            likeliest = int(np.argmax([score(history, shape) for shape in shapes]))
+            bounds = np.log(shapes[[max(likeliest - 1, 0), min(likeliest + 1, len(shapes) - 1)]])
+            search = scipy.optimize.minimize_scalar(
+                lambda logarithm, history=history: -score(history, float(np.exp(logarithm))),
+                bounds=bounds, method='bounded', options={'xatol': 0.01})
+            if -search.fun > highest:
+                best, highest = (history, float(np.exp(search.x))), -search.fun
+    solved = fitted(*best)
+    return ThermalFit(
+        tuple(name for axis in solved for name in axis.names),
+        np.concatenate([axis.values for axis in solved]),
+        scipy.linalg.block_diag(*(axis.covariance for axis in solved)), *best,
+        np.array([axis.residual_g for axis in solved]),
+        (float(temperature_c.min()), float(temperature_c.max())))
+
+
+def _history_output(blocks: Poses, effect: str, shape: float) -> np.ndarray:
+    """Return the output of an effect of the history of size 1, g, (k,)."""
+    temperature_c, time_s = blocks.temperature_c, blocks.time_s.mean(axis=1)
+    if effect == 'thermal_hysteresis':
+        return -loop(temperature_c, shape, {})
+    # The filter 1/(1 + τ·s), exact for straight lines between the samples.
+    steps_s = np.diff(time_s)
+    decay = np.exp(-steps_s / shape)
+    ramp = (1 - decay) * shape / np.maximum(steps_s, np.finfo(float).tiny)
+    lagging_c = [temperature_c[0]]
+    for d, r, before, now in zip(decay, ramp, temperature_c, temperature_c[1:]):
+        lagging_c.append(d * lagging_c[-1] + (r - d) * before + (1 - r) * now)
+    return np.array(lagging_c) - temperature_c
 
 
 class _Axis(NamedTuple):
-    """Least squares of one axis: design, coefficients, correlation, variance and residual."""
+    """Coefficients of one axis with their covariance, and the rms residual."""
 
-    design: np.ndarray
+    names: list[Coefficient]
     values: np.ndarray
-    correlation: float
-    variance_g2: float
-    residual_g: np.ndarray
+    covariance: np.ndarray
+    residual_g: float
+    log_likelihood: float
 
 
-class _Model:
-    """The design of all axes."""
+def _fit_axis(axis: str, temperature_c: np.ndarray, output_g: np.ndarray, orientation: np.ndarray,
+              history: str, history_g: np.ndarray, by_shape: np.ndarray) -> _Axis:
+    """Fit one axis, the correlation of neighbouring blocks included."""
+    warmer_k, correlation = temperature_c - NOMINAL_TEMPERATURE_C, 0.0
+    columns = {('temperature_bias', 'per_k'): warmer_k,
+               ('temperature_bias', 'per_k2'): warmer_k ** 2}
+    # The zero-g of each orientation has the last columns.
+    free = (orientation[:, None] == np.arange(orientation[-1] + 1)).astype(float)
+    forces_g = output_g @ free / free.sum(axis=0)
+    # The orientations must separate the scale factor of an axis from its zero-g.
+    if float(np.ptp(forces_g)) > _SCALE_FORCES_G:
+        columns['temperature_scale', 'per_k'] = forces_g[orientation] * warmer_k
+    if history:
+        columns[history, _SIZES[history]] = history_g
+    names = [Coefficient(*name, axis) for name in columns]
+    design = np.column_stack([*columns.values(), free])
+    begins = np.diff(orientation, prepend=-1) > 0
 
-    def __init__(self, sensor: Sensor, blocks: Poses) -> None:
-        self._sensor, self._blocks = sensor, blocks
-        temperature_c = blocks.temperature_c
-        if len(temperature_c) < _FEWEST_BLOCKS:
-            raise UserError(f'thermal: {len(temperature_c)} blocks at rest with a temperature, '
-                            f'at least {_FEWEST_BLOCKS} are needed; record for longer')
-        self.span_k = float(np.ptp(temperature_c))
-        if self.span_k < _SMALLEST_SPAN_K:
-            raise UserError(f'thermal: the temperature changes by {self.span_k:.1f} K, at least '
-                            f'{_SMALLEST_SPAN_K:g} K are needed; warm or cool the sensor')
-        self._outputs_g = (blocks.volts - sensor.zero_g_v) / sensor.scale_v_per_g
-        turned = np.abs(np.diff(self._outputs_g, axis=0)).max(axis=1) > _TURN_G
-        self._orientation = np.concatenate([[0], np.cumsum(turned)])
-        branch = stop(temperature_c, self.span_k * _REACHES[1], {})
-        self.reverses = bool(branch.max() > 0.5 and branch.min() < -0.5)
-
-    def score(self, history: History) -> float:
-        """Return half of the BIC's log likelihood term minus its penalty."""
-        axes = [self._solved(d, history) for d in range(len(self._sensor.axes))]
-        count = sum(len(a.residual_g) for a in axes)
-        likelihood = sum(-0.5 * len(a.residual_g) * np.log(a.variance_g2)
-                         + 0.5 * np.log(1 - a.correlation ** 2) for a in axes)
-        coefficients = len(axes) + 1 if history.effect else 0
-        return float(likelihood - 0.5 * coefficients * np.log(count))
-
-    def best_shape(self, effect: str, shapes: np.ndarray) -> History:
-        """Return the history of an effect with its most probable shape."""
-        scores = [self.score(History(effect, shape)) for shape in shapes]
-        best = int(np.argmax(scores))
-        low, high = np.log([shapes[max(best - 1, 0)], shapes[min(best + 1, len(shapes) - 1)]])
-        minimum = scipy.optimize.minimize_scalar(
-            lambda logarithm: -self.score(History(effect, float(np.exp(logarithm)))),
-            bounds=(low, high), method='bounded', options={'xatol': 0.01})
-        shape = float(np.exp(minimum.x)) if -minimum.fun > scores[best] else shapes[best]
-        return History(effect, shape)
-
-    def solve(self, history: History, gains: dict[str, float]) -> ThermalFit:
-        """Return values and covariance of all coefficients, the shape among them."""
-        axes = self._sensor.axes
-        solved = [self._solved(d, history) for d in range(len(axes))]
-        by_axis = [[Coefficient(*name, axis) for name in self._columns(d, history)]
-                   for d, axis in enumerate(axes)]
-        names = list(chain.from_iterable(by_axis))
-        values = np.concatenate([a.values[:len(own)] for a, own in zip(solved, by_axis)])
-        if history.effect:
-            names.append(Coefficient(history.effect, _SHAPES[history.effect]))
-            values = np.append(values, history.shape)
-            step = _RELATIVE_STEP * history.shape
-            above, below = (self._history(history._replace(shape=history.shape + s))
-                            for s in (step, -step))
-            by_shape = (above - below) / (2 * step)
-        precision = np.diag([(PRIOR_WIDTH * parameter_of(name).scale) ** -2.0 for name in names])
-        for a, own in zip(solved, by_axis):
-            columns, free = np.hsplit(a.design, [len(own)])
-            place = [names.index(name) for name in own]
-            if history.effect:
-                # The last coefficient of an axis is the size of the history.
-                columns = np.column_stack([columns, a.values[len(own) - 1] * by_shape])
-                place.append(len(names) - 1)
-            white, white_free = (self._whitened(v, a.correlation) for v in (columns, free))
-            white = white - white_free @ np.linalg.lstsq(white_free, white, rcond=None)[0]
-            precision[np.ix_(place, place)] += white.T @ white / a.variance_g2
-        return ThermalFit(
-            tuple(names), values, np.linalg.inv(precision), history, gains,
-            np.array([float(np.std(a.residual_g)) for a in solved]),
-            (float(self._blocks.temperature_c.min()), float(self._blocks.temperature_c.max())))
-
-    def _columns(self, d: int, history: History) -> dict[tuple[str, str], np.ndarray]:
-        """Return the columns of one axis by effect and parameter, g per unit, (k,) each."""
-        warmer_k = self._blocks.temperature_c - NOMINAL_TEMPERATURE_C
-        columns = {('temperature_bias', 'per_k'): warmer_k,
-                   ('temperature_bias', 'per_k2'): warmer_k ** 2}
-        forces_g = np.array([self._outputs_g[self._orientation == i, d].mean()
-                             for i in range(self._orientation[-1] + 1)])
-        # The orientations must separate the scale factor of an axis from its zero-g.
-        if float(np.ptp(forces_g)) > _SCALE_FORCES_G:
-            columns['temperature_scale', 'per_k'] = forces_g[self._orientation] * warmer_k
-        if history.effect:
-            columns[history.effect, _SIZES[history.effect]] = self._history(history)
-        return columns
-
-    def _history(self, history: History) -> np.ndarray:
-        """Return the output of an effect of size 1, g, (k,)."""
-        temperature_c = self._blocks.temperature_c
-        if history.effect == 'thermal_lag':
-            return _lagging(self._blocks.time_s.mean(axis=1), temperature_c, history.shape) \
-                - temperature_c
-        return -loop(temperature_c, history.shape, {})
-
-    def _solved(self, d: int, history: History) -> _Axis:
-        """Fit one axis, its correlation among neighbours included."""
-        output_g, correlation = self._outputs_g[:, d], 0.0
-        # The zero-g of each orientation has the last columns.
-        design = np.column_stack([*self._columns(d, history).values(), self._orientation[:, None]
-                                  == np.arange(self._orientation[-1] + 1)])
-        for _ in range(_ITERATIONS):
-            white, target = (self._whitened(v, correlation) for v in (design, output_g))
-            size = np.sqrt((white ** 2).sum(axis=0))
-            values = np.linalg.lstsq(white / size, target, rcond=None)[0] / size
-            residual_g = output_g - design @ values
-            neighbours = residual_g[1:] @ residual_g[:-1] / max(residual_g @ residual_g,
-                                                                np.finfo(float).tiny)
-            rest = target - white @ values
-            correlation = float(np.clip(neighbours, 0.0, _LARGEST_CORRELATION))
-        degrees = max(len(output_g) - design.shape[1], 1)
-        variance_g2 = max(float(rest @ rest) / degrees, np.finfo(float).tiny)
-        return _Axis(design, values, correlation, variance_g2, residual_g)
-
-    def _whitened(self, values: np.ndarray, correlation: float) -> np.ndarray:
+    def whitened(values: np.ndarray) -> np.ndarray:
         """Return what neighbouring blocks do not predict; an orientation begins anew."""
-        begins = np.diff(self._orientation, prepend=-1) > 0
         white = values - correlation * np.roll(values, 1, axis=0)
         white[begins] = values[begins] * np.sqrt(1 - correlation ** 2)
         return white
 
+    for _ in range(_ITERATIONS):
+        white, target = whitened(design), whitened(output_g)
+        size = np.sqrt((white ** 2).sum(axis=0))
+        values = np.linalg.lstsq(white / size, target, rcond=None)[0] / size
+        residual_g = output_g - design @ values
+        rest = target - white @ values
+        neighbours = residual_g[1:] @ residual_g[:-1] / max(residual_g @ residual_g,
+                                                            np.finfo(float).tiny)
+        correlation = float(np.clip(neighbours, 0.0, _LARGEST_CORRELATION))
+    degrees = max(len(output_g) - design.shape[1], 1)
+    variance_g2 = max(float(rest @ rest) / degrees, np.finfo(float).tiny)
+    if history:
+        # The shape is uncertain, too.
+        design = np.column_stack([design, values[len(names) - 1] * by_shape])
+    white, white_free = np.hsplit(whitened(design), [len(names)])
+    white = white - white_free @ np.linalg.lstsq(white_free, white, rcond=None)[0]
+    precision = white.T @ white / variance_g2 + np.diag([
+        (PRIOR_WIDTH * parameter_of(name).scale) ** -2.0 for name in names])
+    likelihood = -0.5 * len(output_g) * np.log(variance_g2) + 0.5 * np.log(1 - correlation ** 2)
+    return _Axis(names, values[:len(names)], np.linalg.inv(precision), float(np.std(residual_g)),
+                 float(likelihood))
+
 
 _SIZES = {'thermal_lag': 'per_k', 'thermal_hysteresis': 'half_width_g'}
-"""Size of each effect of the history."""
 _SHAPES = {'thermal_lag': 'tau_s', 'thermal_hysteresis': 'reach_k'}
-"""Shape of each effect of the history."""
-
-
-def _lagging(time_s: np.ndarray, values: np.ndarray, tau_s: float) -> np.ndarray:
-    """Filter by 1/(1 + τ·s), exactly for straight lines between the samples, (k,)."""
-    steps_s = np.diff(time_s)
-    decay = np.exp(-steps_s / tau_s)
-    ramp = (1 - decay) * tau_s / np.maximum(steps_s, np.finfo(float).tiny)
-    output = [values[0]]
-    for d, r, before, now in zip(decay, ramp, values, values[1:]):
-        output.append(d * output[-1] + (r - d) * before + (1 - r) * now)
-    return np.array(output)
+"""Size and shape of each effect of the history."""
 
 
 def applied(base: Sensor, fitted: ThermalFit, calibrated_c: float) -> Sensor:
@@ -265,10 +225,13 @@ def applied(base: Sensor, fitted: ThermalFit, calibrated_c: float) -> Sensor:
     names, effects = fitted.names, dict.fromkeys(name.effect for name in fitted.names)
     kept = [i for i, name in enumerate(base.covariance_names) if name.effect not in EFFECTS]
     kept_names = tuple(base.covariance_names[i] for i in kept)
-    dropped = [e for e in base.effects if e in EFFECTS and e not in effects]
+    dropped = set(EFFECTS) - set(effects)
     before = replace(base, effects=tuple(e for e in base.effects if e not in dropped),
                      values={e: v for e, v in base.values.items() if e not in dropped})
     sensor = put(with_neutral(before, [*effects, 'bias']), names, fitted.values)
+    if fitted.history:
+        sensor = put(sensor, [Coefficient(fitted.history, _SHAPES[fitted.history])],
+                     np.array([fitted.shape]))
     joint = np.eye(len(kept) + len(names))
     biases = [Coefficient('bias', 'offset_v', axis) for axis in base.axes]
     shifts_v = [_zero_g_v(base, d, calibrated_c) - _zero_g_v(sensor, d, calibrated_c)
@@ -321,17 +284,14 @@ class Passed:
 
     def advice(self) -> str:
         """Return what to do next, for people."""
-        half_c = (self.middles_c[1] - self.middles_c[0]) / 2
-        open_warm, open_cool = self.middles_c[~self.warming], self.middles_c[~self.cooling]
         if self.complete:
             return 'both directions are covered'
-        warms = len(open_warm) and (self.rises or not len(open_cool))
-        parts = open_warm if warms else open_cool
-        cool, warm = (f'cool it to {parts[0] - half_c:.0f} °C',
-                      f'warm it to {parts[-1] + half_c:.0f} °C')
-        # The other end first, unless the temperature already moves there.
-        order = (cool, warm) if warms else (warm, cool)
-        return order[1] if bool(warms) == self.rises else ', then '.join(order)
+        half_c = (self.middles_c[1] - self.middles_c[0]) / 2
+        warms = not self.warming.all() and (self.rises or self.cooling.all())
+        parts = self.middles_c[~(self.warming if warms else self.cooling)]
+        low, high = f'{parts[0] - half_c:.0f}', f'{parts[-1] + half_c:.0f}'
+        return f'warm it from {low} to {high} °C' if warms else \
+            f'cool it from {high} to {low} °C'
 
 
 def passed(temperatures_c: np.ndarray, range_c: tuple[float, float]) -> Passed:

@@ -214,7 +214,6 @@ class EncoderTrack:
     def __init__(self) -> None:
         self.newest_ns: int | None = None  # Stamp of the newest reading, ns
         self.angles_rad: tuple[float, float] | None = None  # Newest alpha and beta, rad
-        self._readings: deque[tuple[int, float, float]] = deque(maxlen=_KEPT_READINGS)
         # Stamps of the readings minus those of the newest samples, s
         self.offsets_s: deque[float] = deque(maxlen=_KEPT_OFFSETS)
 
@@ -224,9 +223,6 @@ class EncoderTrack:
         if sample_ns is not None:
             self.offsets_s.append((stamp_ns - sample_ns) * 1e-9)
         restarted = went_back(self.newest_ns, stamp_ns)
-        if restarted:
-            self._readings.clear()
-        self._readings.append((stamp_ns, alpha_rad, beta_rad))
         self.newest_ns, self.angles_rad = stamp_ns, (alpha_rad, beta_rad)
         return restarted
 
@@ -248,19 +244,6 @@ class EncoderTrack:
             return 'nothing on stage/joint_states'
         silent_s = (sample_ns - self.newest_ns) * 1e-9
         return f'nothing on stage/joint_states for {silent_s:.0f} s' if silent_s > SILENT_S else ''
-
-    def between(self, first_ns: int, last_ns: int) -> np.ndarray:
-        """Return the angles alpha and beta between two stamps, rad, (n, 2)."""
-        inside = [angles_rad for stamp_ns, *angles_rad in self._readings
-                  if first_ns <= stamp_ns <= last_ns]
-        return np.array(inside).reshape(-1, 2)
-
-    def mean_between(self, first_ns: int, last_ns: int) -> tuple[float, float]:
-        """Average the angles between two stamps, rad; without any, take the newest ones."""
-        inside = self.between(first_ns, last_ns)
-        alpha_rad, beta_rad = np.mean(
-            inside if len(inside) else np.array([self.angles_rad]), axis=0)
-        return float(alpha_rad), float(beta_rad)
 
 
 class NextPose(NamedTuple):

@@ -12,11 +12,10 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
-from adxl_ros.calibrate.fits import gravity_model
+from adxl_ros.calibrate.fits import gravity_fit
 from adxl_ros.calibrate.guided.screen_contents import Coverage
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import PoseRecord
-from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -179,16 +178,8 @@ def by_plane(targets: Sequence[Target], accepted: Collection[int]) -> tuple[Cove
 
 def by_orientation(covered: np.ndarray) -> tuple[Coverage, ...]:
     """Count the covered orientations, (26,) bool, by faces, edges and corners."""
-    sides = np.count_nonzero(gravity_model.CANDIDATES, axis=1)
-    return tuple(Coverage(name, int(covered[sides == count].sum()), int((sides == count).sum()))
-                 for count, name in _SIDES.items())
-
-
-def faces(covered: np.ndarray) -> str:
-    """Name the faces among the covered orientations, (26,) bool."""
-    sides = np.count_nonzero(gravity_model.CANDIDATES, axis=1)
-    return ' '.join(gravity_model.name_up(int(number))
-                    for number in np.flatnonzero(covered & (sides == 1)))
+    groups = [(name, covered[count == gravity_fit.AXES_UP]) for count, name in _SIDES.items()]
+    return tuple(Coverage(name, int(part.sum()), len(part)) for name, part in groups)
 
 
 def _groups(target: Target, previous: Target | None) -> list[str]:
@@ -207,8 +198,6 @@ _CHANGE_G = 0.003
 """Largest change of a repeated pose beyond noise and stage error, g; chosen: a turn of 0.17°."""
 _NOISE_STDS = 3.0
 """Standard deviations of the noise in the limit of a change; chosen: exceeded once in 400."""
-_ACROSS_COSINE = 0.94
-"""Cosine of 20°: two poses whose verticals are closer do not show each turn of the mounting."""
 
 
 def angle_fault(target: Target, alpha_rad: float, beta_rad: float, tolerance_rad: float) -> str:
@@ -272,23 +261,6 @@ def _degrees(angle_rad: float) -> str:
 def signed_text(value: float) -> str:
     """Return a value as text, with its sign."""
     return f'{value:+.2f}'.replace('-', '−')
-
-
-def to_take_again(records: Sequence[PoseRecord]) -> list[PoseRecord]:
-    """
-    Choose the poses of a journal that show the mounting when they are taken again.
-
-    A turn about the vertical of the newest pose does not show there. The pose whose vertical is
-    nearest to 90° from it comes second, if there is one.
-    """
-    def alignment(record: PoseRecord) -> float:
-        verticals = [np.array(specific_force(pose.alpha_rad, pose.beta_rad, 1.0))
-                     for pose in (record, newest)]
-        return abs(float(verticals[0] @ verticals[1]))
-
-    newest = max(records, key=lambda record: record.stop_ns)
-    across = min(records, key=alignment)
-    return [newest, across] if alignment(across) < _ACROSS_COSINE else [newest]
 
 
 def changed(sensor: Sensor, before: PoseRecord, now: PoseRecord, tolerance_rad: float) -> str:

@@ -15,9 +15,8 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 import math
 
-from adxl_ros.calibrate.fits import gravity_model, thermal_fit
-from adxl_ros.calibrate.fits.gravity_fit import MIN_RESTS
-from adxl_ros.calibrate.fits.gravity_model import force_g, NAMES, nominal_rests
+from adxl_ros.calibrate.fits import gravity_fit, thermal_fit
+from adxl_ros.calibrate.fits.gravity_fit import force_g, MIN_RESTS, NAMES, nominal_rests
 from adxl_ros.calibrate.fits.thermal_fit import PARTS
 from adxl_ros.calibrate.guided import pose_plan, running_estimate
 from adxl_ros.calibrate.guided.guide import Dwell, Guide, NewestSamples, NextPose, went_back
@@ -66,7 +65,7 @@ class HandRests(Guide):
                  accepted: Sequence[PoseRecord] = ()) -> None:
         super().__init__(sensor, accepted)
         self._span_c = temperature_span_c
-        self._skipped = np.zeros(len(gravity_model.UP), bool)
+        self._skipped = np.zeros(len(gravity_fit.UP), bool)
         self._begin_stream()
         self._update_estimate()
 
@@ -125,7 +124,7 @@ class HandRests(Guide):
         if self.next_up is None:
             return 'there is no direction left to skip'
         self._skipped[self.next_up] = True
-        skipped = gravity_model.name_up(self.next_up)
+        skipped = gravity_fit.name_up(self.next_up)
         self._choose_next_up()
         return f'{skipped} up is left out'
 
@@ -169,26 +168,23 @@ class HandRests(Guide):
         rests = nominal_rests(mean_v, std_v, self.sensor)
         self._parameters = np.zeros(len(NAMES))
         if records:
-            self._parameters = gravity_model.regularised_fit(rests, self._parameters, _STEPS)
-        information = gravity_model.posterior_information(
-            rests, self._parameters, gravity_model.TRIAL_STD_G ** 2)
-        values, to_units = gravity_model.effect_values(self._parameters, self.sensor)
+            self._parameters = gravity_fit.regularised_fit(rests, _STEPS)
+        information = gravity_fit.posterior_information(
+            rests, self._parameters, gravity_fit.TRIAL_STD_G ** 2)
+        values, to_units = gravity_fit.effect_values(self._parameters, self.sensor)
         covariance = np.linalg.inv(information) * np.outer(to_units, to_units)
         self.rows = running_estimate.coefficient_rows(
             NAMES, self._parameters * to_units, np.sqrt(np.diag(covariance)),
-            gravity_model.PRIOR_STD * to_units)
+            gravity_fit.PRIOR_STD * to_units)
         self.fitted = replace(self.sensor, effects=tuple(values), values=values,
                               covariance=covariance, covariance_names=NAMES)
         force = force_g(rests.mean, self._parameters)
-        self.covered = gravity_model.covered(force / np.linalg.norm(force, axis=1, keepdims=True))
-        self._gain, _ = gravity_model.information_gain(information, self._parameters,
-                                                       rests.gravity_g)
+        self.covered = gravity_fit.covered(force / np.linalg.norm(force, axis=1, keepdims=True))
         self._choose_next_up()
 
     def _choose_next_up(self) -> None:
         """Choose the orientation to ask for."""
-        available = ~self.covered & ~self._skipped
-        self.next_up = gravity_model.next_up(self._gain, available, self.up())
+        self.next_up = gravity_fit.next_up(~self.covered & ~self._skipped, self.up())
 
     def _fault(self, record: PoseRecord) -> str:
         """Return why a rest is refused, or ''."""
@@ -220,13 +216,13 @@ class HandGuide(HandRests):
         """Name the direction to turn to, for people."""
         if self.next_up is None:
             return 'turn it to any direction not yet covered, and hold it still'
-        return f'turn it so that {gravity_model.points_up(self.next_up)}, and hold it still'
+        return f'turn it so that {gravity_fit.points_up(self.next_up)}, and hold it still'
 
     def next_pose(self) -> NextPose:
         """Return the direction to announce."""
         values: dict[str, str | float] = {'pose': str(self.pose_number)}
         if self.next_up is not None:
-            values |= zip(('up_x', 'up_y', 'up_z'), gravity_model.UP[self.next_up].tolist())
+            values |= zip(('up_x', 'up_y', 'up_z'), gravity_fit.UP[self.next_up].tolist())
         return NextPose(self.destination(), values, None)
 
     def status(self) -> Status:
@@ -245,7 +241,7 @@ class HandGuide(HandRests):
         """Return the progress of the calibration, for the screen."""
         up = self.up()
         position = '' if up is None else \
-            f'{gravity_model.points_up(int(np.argmax(gravity_model.UP @ up)))} now'
+            f'{gravity_fit.points_up(int(np.argmax(gravity_fit.UP @ up)))} now'
         return Progress(
             number=self.pose_number, destination=self.destination(), position=position,
             accepted=len(self.accepted), total=ENOUGH_RESTS)
@@ -253,8 +249,7 @@ class HandGuide(HandRests):
     def estimate_contents(self) -> Estimate:
         """Return what the rests determine so far, for the screen."""
         return Estimate(
-            coverage=pose_plan.by_orientation(self.covered),
-            covered_faces=pose_plan.faces(self.covered), coefficients=self.rows,
+            coverage=pose_plan.by_orientation(self.covered), coefficients=self.rows,
             tilt_error_deg=running_estimate.degrees_or_none(self.tilt_error_rad()))
 
     def tilt_error_rad(self) -> float:

@@ -11,13 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations, product
 import math
 
 from adxl_ros.calibrate.fits import full_model, linearisation
 from adxl_ros.calibrate.fits.linearisation import linearised, StageError
 from adxl_ros.calibrate.guided import pose_plan
-from adxl_ros.calibrate.guided.pose_plan import angle_fault, signed_text, Target
+from adxl_ros.calibrate.guided.pose_plan import signed_text, Target
 from adxl_ros.calibrate.guided.screen_contents import CoefficientRow
 from adxl_ros.calibrate.poses import coefficient_jacobian, Poses, predicted_volts
 from adxl_ros.calibrate.report import held_out
@@ -29,7 +28,7 @@ from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force, tilt
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.report.quantities import decimals
+from adxl_ros.report.quantities import with_half_width
 import numpy as np
 
 _ROUNDS = 2
@@ -44,12 +43,6 @@ _OUTLIER_STDS = 3.5
 """Residual from which a pose is refused, standard deviations; chosen: one of 2000 by chance."""
 _MODEL_STD_G = 5e-3
 """Standard deviation of further model errors, g; chosen: it accepts twice the datasheet limits."""
-_SAME_READING_G = 0.2
-"""Largest difference of readings that count as equal when a mistake is named, g; chosen."""
-_WIRING_POSES = 4
-"""Poses after which the wiring of the axes counts as right; chosen: all axes have moved."""
-_EXPLAINED_STDS = 3.0
-"""Largest residual of angles that explain volts, standard deviations; chosen: the usual 3."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +66,8 @@ class RunningEstimate:
 
     def reading_fault(self, target: Target, volts: np.ndarray, tolerance_rad: float) -> str:
         """Refuse a pose whose mean, V, (m,), is an outlier to the prediction by earlier poses."""
-        sensor, pose = self.unit, self._pose(target.alpha_rad, target.beta_rad)
+        sensor, pose = self.unit, Poses.without_volts(
+            np.array([target.alpha_rad]), np.array([target.beta_rad]), self.pose_std_v)
         slope = coefficient_jacobian(sensor, pose, self.names)[0]
         variance = np.diag(slope @ self.covariance @ slope.T + linearisation.volts_covariance(
             sensor, pose, self.stage).blocks[0])
@@ -85,32 +79,9 @@ class RunningEstimate:
         axis = int(residual_stds.argmax())
         measured_g, expected_g = ((v - sensor.zero_g_v) / sensor.scale_v_per_g
                                   for v in (volts, expected_v))
-        finding = (f'{sensor.axes[axis]} reads {signed_text(measured_g[axis])} g where '
-                   f'{signed_text(expected_g[axis])} g was expected')
-        # After some good poses the wiring is right, but the operator may still be wrong.
-        is_wiring_unproven = self.poses < _WIRING_POSES
-        if is_wiring_unproven and _is_crossed(measured_g, expected_g):
-            return f'{finding}: axis inverted or swapped; check wiring, mounting and pose'
-        advice = ', or take the pose before again' if self.poses and is_wiring_unproven else ''
-        if distance := self._distance(target, pose, volts, slack_v, tolerance_rad):
-            return f'{finding}: by the sensor, {distance}; check the pose and the mounting{advice}'
-        return f'{finding}; check the pose, the mounting and the wiring{advice}'
-
-    def _distance(self, target: Target, pose: Poses, volts: np.ndarray, slack_v: np.ndarray,
-                  tolerance_rad: float) -> str:
-        """Return how far from a target the volts show the stage; '' if no angles explain them."""
-        errors = held_out.pose_errors(self.unit, replace(
-            pose, volts=volts[None], std_v=slack_v[None]))
-        excess_g = np.linalg.norm(errors.force_mps2) / self.unit.local_gravity_mps2 - 1
-        if abs(excess_g) > _EXPLAINED_STDS * np.max(slack_v / self.unit.nominal_scale_v_per_g):
-            return ''
-        # An angle that the volts do not show counts as the target's.
-        alpha_rad, beta_rad = np.nan_to_num([errors.alpha_rad[0], errors.beta_rad[0]])
-        return angle_fault(target, target.alpha_rad + alpha_rad, target.beta_rad + beta_rad,
-                           tolerance_rad)
-
-    def _pose(self, alpha_rad: float, beta_rad: float) -> Poses:
-        return Poses.without_volts(np.array([alpha_rad]), np.array([beta_rad]), self.pose_std_v)
+        return (f'{sensor.axes[axis]} reads {signed_text(measured_g[axis])} g where '
+                f'{signed_text(expected_g[axis])} g was expected: axis inverted or '
+                'swapped, or another pose; check wiring, mounting and pose')
 
     def with_poses(self, targets: Sequence[Target]) -> RunningEstimate:
         """Predict the covariance of the estimate after further poses."""
@@ -137,16 +108,6 @@ class RunningEstimate:
     def rows(self) -> tuple[CoefficientRow, ...]:
         """Return the coefficients for the screen."""
         return coefficient_rows(self.names, get(self.unit, self.names), self.std, self.prior)
-
-
-def _is_crossed(measured_g: np.ndarray, expected_g: np.ndarray) -> bool:
-    """Return whether axes with other signs, or in another order, read the expected values."""
-    def is_expected(values_g: np.ndarray) -> bool:
-        return bool(np.abs(values_g - expected_g).max() < _SAME_READING_G)
-
-    return not is_expected(measured_g) and any(
-        is_expected(np.array(signs) * order) for signs, order in product(
-            product((1, -1), repeat=len(measured_g)), permutations(measured_g)))
 
 
 def from_records(sensor: Sensor, records: Sequence[PoseRecord], dwell_s: float,
@@ -220,17 +181,10 @@ def coefficient_rows(names: Sequence[Coefficient], values: np.ndarray, std: np.n
         unit = parameter_of(names[place[0]]).unit
         rows.append(CoefficientRow(
             f'{name}, {unit}' if unit else str(name),
-            tuple(f'{names[i].axis or names[i].parameter} {_interval(values[i], Z_90 * std[i])}'
-                  for i in place),
+            tuple(f'{names[i].axis or names[i].parameter} '
+                  + with_half_width(values[i], Z_90 * std[i]).replace('+-', '±') for i in place),
             float(np.min(1 - np.clip(std[place] / prior[place], 0, 1)))))
     return tuple(rows)
-
-
-def _interval(value: float, half_width: float) -> str:
-    """Return a value, with the decimals of one digit of the half width of its interval."""
-    places = decimals(10 * half_width)
-    # A sum with 0 has no negative zero.
-    return f'{round(value, places) + 0.0:+.{places}f} ± {half_width:.{places}f}'
 
 
 _SPARE_READINGS = 40

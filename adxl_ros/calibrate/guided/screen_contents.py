@@ -162,7 +162,6 @@ class Estimate:
     tilt_error_deg: float | None = None
     # The same after all poses; None where the number of poses is not fixed
     final_tilt_error_deg: float | None = None
-    covered_faces: str = ''  # Faces of the sensor that have pointed up, for people
     # Expected error over a range of temperature, for people; '' for other calibrations
     range_error: str = ''
 

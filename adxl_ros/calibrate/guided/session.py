@@ -81,11 +81,7 @@ class SessionSettings:
         error_rad = running_estimate.expected_tilt_error_rad(unit, self.capture.dwell_s, targets)
         if not np.isfinite(error_rad):
             return text
-        text += f', expected tilt error {np.degrees(error_rad):.2g}°'
-        if self.plan_kind == 'quick' and error_rad > self.tilt_error_rad:
-            text += f' (sweep.tilt_error_deg is {np.degrees(self.tilt_error_rad):.2g}°, ' \
-                    'which this stage and this dwell cannot reach)'
-        return text
+        return f'{text}, expected tilt error {np.degrees(error_rad):.2g}°'
 
     def head(self, unit: Sensor) -> dict[str, Any]:
         """Return the settings and values, by key, that an interrupted calibration must share."""
@@ -112,12 +108,10 @@ class SessionSettings:
         interrupted = sweep_journal.unfinished(self.journal, self.head(unit))
         if interrupted is None:
             return ''
-        if interrupted.obstacle:
-            return (f'{self.journal} holds {interrupted.poses} poses of an interrupted '
-                    f'calibration, which cannot go on: {interrupted.obstacle}. Begin again (n; '
-                    'the file is kept), or abort (a) and restore the old setting?')
+        choices = f'which cannot go on: {interrupted.obstacle}. Restore the old setting (a)' \
+            if interrupted.obstacle else 'of this unit. Go on with them (y)'
         return (f'{self.journal} holds {interrupted.poses} poses of an interrupted calibration '
-                'of this unit. Go on with them (y), or begin again (n; they are kept)?')
+                f'{choices}, or begin again (n; they are kept)?')
 
 
 def _degrees(angle_rad: float) -> float:
@@ -199,8 +193,7 @@ class Session:
             self.guide.take(record)
             yield f'pose {record.pose + 1} is on disk'
         if unverified > len(self.guide.to_verify):
-            yield 'this pose reads the same as before; one more pose checks the mounting' \
-                if self.guide.to_verify else 'the sensor is mounted as it was'
+            yield 'the sensor is mounted as it was'
 
     def estimate(self) -> Estimate:
         """Return what the poses determine so far; it is computed once for each pose."""

@@ -16,7 +16,7 @@ from adxl_ros.calibrate.guided import guide, pose_plan, running_estimate, screen
 from adxl_ros.calibrate.guided.guide import Dwell, EncoderTrack, Guide, NextPose
 from adxl_ros.calibrate.guided.pose_plan import Course, MOVE_S, Target
 from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, Phase, StageMode, Status
-from adxl_ros.calibrate.pose_extraction import angle_tolerance_rad, SettingTracker
+from adxl_ros.calibrate.poses import angle_tolerance_rad, SettingTracker
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import JournalEntry, MountingUnchecked, PoseRecord, PoseSkipped
 from adxl_ros.model.sensor import Sensor
@@ -46,7 +46,7 @@ class StageSweep(Guide):
         self.course = Course(targets, self.accepted, skipped)
         self.encoder = EncoderTrack()
         self._resumed = len(self.accepted)
-        self._tracker = SettingTracker(angle_tolerance_rad(sensor), accepted)
+        self.tracker = SettingTracker(angle_tolerance_rad(sensor), accepted)
         self.estimate = running_estimate.from_records(sensor, self.poses_to_fit(),
                                                       settings.dwell_s)
         self.go(self.course.index)
@@ -68,7 +68,7 @@ class StageSweep(Guide):
         target = self.course.target
         # In stage mode encoder an operator or a program gives the commands.
         if target is not None and self.settings.stage_mode is not StageMode.ENCODER:
-            self._tracker.command(self.newest_ns or 0, target.alpha_rad, target.beta_rad)
+            self.tracker.command(self.newest_ns or 0, target.alpha_rad, target.beta_rad)
 
     def restart_dwell(self, has_arrived: bool) -> None:
         """Average from the next sample on."""
@@ -76,9 +76,9 @@ class StageSweep(Guide):
         self.has_arrived = has_arrived
 
     def verify(self) -> None:
-        """Take earlier poses again before others, to check the mounting."""
+        """Take the newest pose again before others, to check the mounting."""
         if self.course.target is not None and self.accepted:
-            self.to_verify = pose_plan.to_take_again(list(self.accepted.values()))
+            self.to_verify = [max(self.accepted.values(), key=lambda record: record.stop_ns)]
             self.go(self.to_verify[0].pose)
 
     def capture(self) -> str:
@@ -127,9 +127,9 @@ class StageSweep(Guide):
         """Take the angles of the stage."""
         if self.encoder.read(stamp_ns, alpha_rad, beta_rad, self.newest_ns):
             # A stage that has restarted may have moved in between.
-            self._tracker.lose_track()
+            self.tracker.lose_track()
         if self.uses_encoder:
-            self._tracker.read(stamp_ns, alpha_rad, beta_rad)
+            self.tracker.read(stamp_ns, alpha_rad, beta_rad)
         target = self.course.target
         if not self.moves_itself or target is None:
             return
@@ -142,7 +142,7 @@ class StageSweep(Guide):
     def read_command(self, alpha_rad: float, beta_rad: float) -> None:
         """Take a command that somebody gave the stage; in other modes the targets are these."""
         if self.settings.stage_mode is StageMode.ENCODER:
-            self._tracker.command(self.newest_ns or 0, alpha_rad, beta_rad)
+            self.tracker.command(self.newest_ns or 0, alpha_rad, beta_rad)
 
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
         """Take samples: their stamps, ns, (n,), and volts, (n, m)."""
@@ -153,7 +153,7 @@ class StageSweep(Guide):
             self._new_refusal = f'imu/data_raw went back in time by {back_s:.0f} s: the pose ' \
                 'begins again'
             self.verify()
-            self._tracker.lose_track()
+            self.tracker.lose_track()
             self.encoder.offsets_s.clear()
             self.since_ns, self.dwell, self.has_arrived = None, Dwell(self.sensor, 0), False
         self.newest_ns = int(stamps_ns[-1])
@@ -182,9 +182,13 @@ class StageSweep(Guide):
                 self.refuse(f'{silence}; capture again when it is back')
             return None
         span = record.start_ns, record.stop_ns
-        angles_rad = self.encoder.mean_between(*span) if self.uses_encoder else \
-            (target.alpha_rad, target.beta_rad)
-        settings_of_joints = self._tracker.settings(*span, *angles_rad)
+        angles_rad = target.alpha_rad, target.beta_rad
+        if self.uses_encoder:
+            readings_rad = self.tracker.between(*span)
+            alpha_rad, beta_rad = readings_rad.mean(axis=0).tolist() if len(readings_rad) else \
+                self.encoder.angles_rad or angles_rad
+            angles_rad = alpha_rad, beta_rad
+        settings_of_joints = self.tracker.settings(*span, *angles_rad)
         record = replace(
             self.with_ambient(record), alpha_rad=angles_rad[0], beta_rad=angles_rad[1],
             check=target.check, alpha_setting=settings_of_joints[0],
@@ -201,7 +205,7 @@ class StageSweep(Guide):
         """Count a pose that is on disk, and go on to the next open one."""
         self.accepted[record.pose] = record
         self.course.skipped.discard(record.pose)
-        self._tracker.take(record.start_ns, record.stop_ns, record.alpha_rad, record.beta_rad)
+        self.tracker.take(record.start_ns, record.stop_ns, record.alpha_rad, record.beta_rad)
         self.estimate = running_estimate.from_records(
             self.sensor, self.poses_to_fit(), self.settings.dwell_s, self.estimate)
         self.go(self.course.next_open())
@@ -219,7 +223,7 @@ def _fault(sweep: StageSweep, record: PoseRecord, rest: Rest) -> str:
         now_rad = sweep.encoder.angles_rad or (record.alpha_rad, record.beta_rad)
         fault = pose_plan.angle_fault(
             sweep.course.targets[record.pose], *now_rad, settings.near_rad) or \
-            pose_plan.motion_fault(sweep.encoder.between(record.start_ns, record.stop_ns),
+            pose_plan.motion_fault(sweep.tracker.between(record.start_ns, record.stop_ns),
                                    settings.tolerance_rad)
     elif settings.stage_mode is StageMode.MANUAL:
         # Without an encoder the first rest shows where the operator captured.
@@ -250,8 +254,8 @@ def _verify_mounting(sweep: StageSweep, record: PoseRecord) -> None:
     if change:
         sweep.refuse(f'{change}; or turn the stage to where it was, and capture again')
         return
-    del sweep.to_verify[0]
-    sweep.go(sweep.to_verify[0].pose if sweep.to_verify else sweep.course.next_open())
+    sweep.to_verify = []
+    sweep.go(sweep.course.next_open())
 
 
 class StageGuide(StageSweep):
@@ -329,10 +333,7 @@ class StageGuide(StageSweep):
             return Status(Phase.REST, f'{place}: waiting for samples{since}', late)
         if stillness.at_rest:
             return Status(Phase.DWELL, f'{place}: averaging', late)
-        advice = '; if nothing touches it, sensor.noise_density_g_per_rthz is too low for this ' \
-            'unit' if late and stillness.statistic == 'rms' else ''
-        return Status(Phase.REST, f'{place}: {stillness.describe_mps2(self.sensor)}{since}'
-                      f'{advice}', late)
+        return Status(Phase.REST, f'{place}: {stillness.describe_mps2(self.sensor)}{since}', late)
 
     def progress(self) -> screen_contents.Progress:
         """Return the progress of the sweep, for the screen."""

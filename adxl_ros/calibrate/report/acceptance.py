@@ -30,8 +30,6 @@ FAIL = 'FAIL'
 """Outcome: the error exceeds the limit."""
 NOT_SHOWN = 'NOT SHOWN'
 """Outcome: the error is within the limit, but its 90 % interval is not."""
-_CHANCE_SHARE = 0.2
-"""Largest relative difference of expected and measured mean square without a comment; chosen."""
 _UPPER_QUANTILE = 0.95
 """Probability of the upper end of a 90 % interval."""
 _NONLINEARITY = Coefficient('nonlinearity', 'cubic_per_g2')
@@ -52,16 +50,6 @@ class Assessment:
     accel_noise: str
     tilt_datasheet: str = ''
     tilt_noise: str = ''
-
-    @property
-    def datasheet(self) -> str:
-        """Return the worse outcome of acceleration and tilt against the datasheet."""
-        return _worse(self.accel_datasheet, self.tilt_datasheet)
-
-    @property
-    def noise(self) -> str:
-        """Return the worse outcome of acceleration and tilt against the noise."""
-        return _worse(self.accel_noise, self.tilt_noise)
 
     @property
     def limited_by(self) -> str:
@@ -150,24 +138,6 @@ def nonlinearity_mps2(sensor: Sensor) -> float:
     """Return the typical nonlinearity at full scale by the datasheet, m/s²; 0 if not stated."""
     typical, _ = sensor.datasheet.get(_NONLINEARITY, (0.0, 0.0))
     return typical * sensor.range_g ** 3 * G0_MPS2
-
-
-def budget_lines(assessment: Assessment) -> list[str]:
-    """State the parts of the acceleration error of the saved model."""
-    accel = assessment.accel
-    part = {name: f'{name} {rms_mg(getattr(accel, name)):.3f}'
-            for name in ('noise', 'stage', 'coefficients', 'model')}
-    if assessment.model == 'gravity':
-        # The coefficients' part holds for a direction, the measured error for a magnitude.
-        return [f'gravity: {part["noise"]} mg, {part["model"]} mg; {part["coefficients"]} mg in '
-                'each direction']
-    # The covariance predicts the mean over many fits, of which this is one.
-    by_chance = abs(accel.expected - accel.measured) >= _CHANCE_SHARE * accel.measured
-    lines = [f'expected {rms_mg(accel.expected):.3f} mg = {", ".join(part.values())} (squares '
-             f'add); measured {rms_mg(accel.measured):.3f} mg'
-             + (', which differs by chance' if by_chance else '')]
-    return lines if accel.separable else \
-        [*lines, 'no pose was visited twice: stage and model are inseparable']
 
 
 def _two_digits(value: float) -> str:
@@ -326,28 +296,15 @@ def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
         if accel != FAIL:
             tilt_deg = float(provenance['own_tilt_deg'])
             lines = [f'tilt error {tilt_deg:.2g}°, more than {limit} causes']
-        lines.append(
-            'One axis does not see the force across it: align it, or accept this error.'
-            if len(fitted.axes) == 1 else
-            'More poses, or longer ones, reduce it.' if kind != 'datasheet' else
-            'Sensor, stage or poses are worse than stated: do not use this file.'
-            if 'cross_axis_z' in fitted.effects else
-            'More terms may reduce it, which needs a sweep on a stage; or a pose is wrong.')
+        lines.append('Take more poses or a richer model; else do not use this file.')
     elif outcome == NOT_SHOWN:
-        lines.append(_doubt(fitted))
+        open_names = ', '.join(map(str, open_coefficients(fitted)))
+        lines.append(f'Other poses may have a larger error: {open_names} not determined.'
+                     if open_names else 'The poses are too few to show that it is within.')
     if 'span_s' in provenance:
         lines.append(f'By rests within {duration(float(provenance["span_s"]))}; a longer drift is '
                      'not in this figure.')
     return outcome, lines
-
-
-def _doubt(fitted: Sensor) -> str:
-    """Return why an error within its limit does not suffice."""
-    if names := open_coefficients(fitted):
-        return f'Other poses may have a larger error: {", ".join(map(str, names))} not determined.'
-    if fitted.provenance.get('converged') == 'no':
-        return 'The fit did not converge, so that other poses may have a larger error.'
-    return 'The check poses are too few to show that the error is within it.'
 
 
 def open_coefficients(fitted: Sensor) -> list[Coefficient]:

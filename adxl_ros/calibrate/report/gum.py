@@ -18,10 +18,9 @@ import re
 from typing import Any, NamedTuple
 
 from adxl_ros.calibrate.poses import Poses, reference_force
-from adxl_ros.calibrate.report import acceptance, gum, held_out
+from adxl_ros.calibrate.report import acceptance, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
-from adxl_ros.calibrate.report.coefficients import compare
-from adxl_ros.calibrate.result import CalibrationResult
+from adxl_ros.calibrate.result import CalibrationResult, compare
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.parameter_file import compose
@@ -290,6 +289,9 @@ _LABORATORY = {
     'laboratory_country': 'ZZ', 'customer_country': 'ZZ', 'place': 'other',
     'responsible': NOT_STATED, 'manufacturer': NOT_STATED, 'stage': NOT_STATED, 'identifier': ''}
 """Texts of a laboratory's file, and what stands for those that are missing; ZZ is no country."""
+_FORMS = {'country': ('[A-Z]{2}', 'code of two capitals such as DE'),
+          'place': ('|'.join(PLACES), f'place such as {", ".join(PLACES)}')}
+"""Pattern of a laboratory's texts, and its name in a message, by the end of their keys."""
 _UNITS = {'V': 'volt', 'rad': 'radian', '°': 'degree', 'K': 'kelvin', 's': 'second', 'm': 'metre'}
 """Units of D-SI; all others count as 1."""
 _ACCELERATION = r'\metre\second\tothe{-2}'
@@ -299,22 +301,20 @@ def read_laboratory(path: str | os.PathLike | None) -> dict[str, Any]:
     """Read the texts and the standard uncertainties of a laboratory's YAML file; None has none."""
     node = compose(path) if path is not None else None
     given = yaml.constructor.SafeConstructor().construct_document(node) if node else {}
-    known = (*_LABORATORY, *gum.STATED)
+    known = (*_LABORATORY, *STATED)
     unknown = [str(name) for name in given if name not in known] if isinstance(given, dict) else \
         ['no mapping']
     if unknown:
         raise UserError(f'{path}: found {", ".join(unknown)}; expected a mapping with some of '
                         f'{", ".join(known)}')
     for name, value in given.items():
-        if name in gum.STATED:
-            if not isinstance(value, (int, float)) or not 0 <= value < math.inf:
-                raise UserError(f'{path}: {name}: {value!r} is no number such as 1.0e-5')
-        elif not isinstance(value, str) or not value.strip():
-            raise UserError(f'{path}: {name}: {value!r} is no text')
-        elif name.endswith('country') and not re.fullmatch('[A-Z]{2}', value):
-            raise UserError(f'{path}: {name}: {value!r} is no code of two capitals such as DE')
-        elif name == 'place' and value not in PLACES:
-            raise UserError(f'{path}: place: {value!r} is none of {", ".join(PLACES)}')
+        pattern, form = next((rule for end, rule in _FORMS.items() if name.endswith(end)),
+                             (r'.*\S.*', 'text'))
+        is_right = isinstance(value, (int, float)) and 0 <= value < math.inf \
+            if name in STATED else isinstance(value, str) and re.fullmatch(pattern, value, re.S)
+        if not is_right:
+            form = 'number such as 1.0e-5' if name in STATED else form
+            raise UserError(f'{path}: {name}: {value!r} is no {form}')
     return {**_LABORATORY, **given}
 
 
@@ -323,7 +323,7 @@ def _quantity(name: str, values: Any, unit: str, std: Any = None, about: str = '
     """Describe a quantity of one value, or of a list, with the expanded uncertainty of each."""
     return {'name': name, 'about': about, 'kind': kind, 'unit': unit,
             'numbers': _numbers(values), 'is_list': np.ndim(values) > 0,
-            'expanded': '' if std is None else _numbers(gum.K * np.asarray(std))}
+            'expanded': '' if std is None else _numbers(K * np.asarray(std))}
 
 
 def _numbers(values: Any) -> str:
@@ -346,7 +346,7 @@ def si_unit(unit: str) -> tuple[str, float]:
 
 def write(path: str | os.PathLike, result: CalibrationResult, laboratory: dict[str, Any]) -> None:
     """Write the certificate of a calibration against a stage, by the template of its elements."""
-    found = gum.uncertainty(result, laboratory)
+    found = uncertainty(result, laboratory)
     if found is None:
         raise UserError(f'{path}: a certificate states errors at stage angles, and no pose with '
                         'angles was kept out of the fit; leave --dcc out')
@@ -356,14 +356,14 @@ def write(path: str | os.PathLike, result: CalibrationResult, laboratory: dict[s
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     fitted = result.fitted
     write_text(path, environment.get_template('certificate.xml').render(
-        namespaces=NAMESPACES, schema_version=SCHEMA_VERSION, not_stated=NOT_STATED, k=gum.K,
-        rule=gum.RULE, method=f'{gum.MEANING} {gum.MODEL}', fitted=fitted,
+        namespaces=NAMESPACES, schema_version=SCHEMA_VERSION, not_stated=NOT_STATED, k=K,
+        rule=RULE, method=f'{MEANING} {MODEL}', fitted=fitted,
         provenance=fitted.provenance, step_deg=np.degrees(fitted.stage_resolution_rad),
         laboratory={name: ' '.join(str(words).split()) for name, words in laboratory.items()},
         decisions=[_decision(found, row) for row in found.decisions], **_results(fitted, found)))
 
 
-def _decision(found: Uncertainty, row: gum.Decision) -> dict[str, Any]:
+def _decision(found: Uncertainty, row: Decision) -> dict[str, Any]:
     """State a decision, with the figures that it follows from."""
     word = {PASS: 'pass', FAIL: 'fail'}.get(
         row.outcome, 'conditionalPass' if row.error <= row.limit else 'conditionalFail')
@@ -396,7 +396,7 @@ def _results(fitted: Sensor, found: Uncertainty) -> dict[str, list[Any]]:
     budget = [_quantity(cells[0], row.contribution_mps2[worst, axis], _ACCELERATION, None,
                         f'standard uncertainty {cells[1]}, sensitivity {cells[2]}, degrees of '
                         f'freedom {cells[4]}')
-              for cells, row in zip(gum.budget_rows(found), found.inputs)]
+              for cells, row in zip(budget_rows(found), found.inputs)]
     conditions = [_quantity('local gravity', fitted.local_gravity_mps2, _ACCELERATION)]
     conditions += [_quantity(f'{name} temperature', value + 273.15, r'\kelvin') for name, value in
                    zip(('lowest', 'highest'), fitted.envelope.temperature_c or ())]

@@ -94,11 +94,6 @@ class HeldOutErrors:
         """Return the number of held-out poses."""
         return len(self.errors.accel_mps2)
 
-    @property
-    def poses_without_alpha(self) -> int:
-        """Return the number of held-out poses that do not determine alpha."""
-        return int(np.isnan(self.errors.alpha_rad).sum())
-
 
 def pose_errors(sensor: Sensor, poses: Poses, stage: Sensor | None = None) -> PoseErrors:
     """

@@ -16,12 +16,10 @@ import re
 from typing import Any
 
 from adxl_ros.calibrate.fits import linear
-from adxl_ros.calibrate.fits.gravity_fit import GravityFit
 from adxl_ros.calibrate.poses import planes, Poses, reference_force
-from adxl_ros.calibrate.report import acceptance, coefficients, gum, held_out
+from adxl_ros.calibrate.report import acceptance, gum, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
-from adxl_ros.calibrate.report.coefficients import DriftHistory
-from adxl_ros.calibrate.result import CalibrationResult
+from adxl_ros.calibrate.result import CalibrationResult, compare, DriftHistory, rounded
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.atomic_write import write_bytes, write_text
@@ -30,7 +28,7 @@ from adxl_ros.model.coefficients import get
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report import figures, page as html_page
-from adxl_ros.report.figures import AXIS_COLOURS, axis_number, Figure, QUIET_COLOUR
+from adxl_ros.report.figures import AXIS_COLOURS, Figure
 import numpy as np
 
 FILES = ('report.html', 'calibration.png')
@@ -66,15 +64,14 @@ def write(folder: str | os.PathLike, result: CalibrationResult,
 
 
 def draw(path: str | os.PathLike, result: CalibrationResult) -> None:
-    """Write the plots of a calibrated unit as PNG."""
-    if result.gravity_fit is not None:
-        write_bytes(path, figures.png(_gravity_rests(result.name, result.gravity_fit)))
-    else:
-        draw_sweep(path, result.nominal, _paper_sensor(result), result.poses)
+    """Write figures 2 to 8 of the paper for a unit as PNG."""
+    draw_sweep(path, result.nominal, _paper_sensor(result), result.poses)
 
 
 def _paper_sensor(result: CalibrationResult) -> Sensor:
     """Return the unit by a model that the paper's figures can show."""
+    if result.gravity_fit is not None:
+        raise UserError('they need the angles of a stage')
     return result.fitted if result.fitted.model in ('physical', 'full') else \
         linear.fit_physical(result.nominal, result.poses.subset(~result.poses.check))
 
@@ -88,13 +85,16 @@ def page(result: CalibrationResult, past: Sequence[Sensor],
     errors, assessment = errors_of.get(fitted.model), row_of.get(fitted.model)
     history, rows = DriftHistory.from_store(fitted, past), _coefficients(fitted)
     drawn: dict[str, Figure] = {}
-    if result.gravity_fit is not None:
-        drawn['errors'] = _gravity_errors(result.gravity_fit)
+    to_mg = 1e3 / G0_MPS2
+    if (fit := result.gravity_fit) is not None:
+        drawn['errors'] = _error_figure(
+            result.inliers, to_mg * fit.held_out_mps2[:, None], Z_90 * to_mg * fit.expected_mps2,
+            'x', 'rest', 'magnitude minus gravity, mg')
     elif assessment is not None and errors is not None:
-        drawn['errors'] = _pose_errors(
-            errors, assessment, result.poses.subset(result.inliers), fitted.axes)
-    if history.sensors:
-        drawn['drift'] = _drift(history)
+        half_mg = np.full(errors.pose_count, Z_90 * to_mg * assessment.accel.expected ** 0.5)
+        drawn['errors'] = _error_figure(
+            held_out.determining_alpha(errors.errors), to_mg * errors.errors.accel_mps2, half_mg,
+            fitted.axes, 'held-out pose', 'error of acceleration, mg')
     pictures, fault, paper_model = _paper_figures(result)
     temperature_c = fitted.envelope.temperature_c
     return html_page.render('adxl_ros.calibrate.report', 'calibration.html', {
@@ -107,7 +107,6 @@ def page(result: CalibrationResult, past: Sequence[Sensor],
         'file_name': re.sub(r'[^\w.-]+', '_', fitted.serial) + '.yaml',
         'download': html_page.download_url(parameter_file.as_text(fitted, result.comments())),
         'figures': drawn,
-        'open_circles': errors.poses_without_alpha if errors else 0,
         'sphere': _sphere(result),
         'coefficients': rows,
         'beyond': [row for row in rows if row['outcome'] == _BEYOND],
@@ -209,13 +208,13 @@ def _coefficients(fitted: Sensor) -> list[dict[str, Any]]:
     departures = get(fitted, fitted.covariance_names)
     rows = []
     for row, name, value, half_width in zip(
-            coefficients.compare(fitted, fitted), fitted.covariance_names, departures,
+            compare(fitted, fitted), fitted.covariance_names, departures,
             half_widths):
         typical, maximum = fitted.datasheet.get(name.without_axis, (0.0, 0.0))
         largest = max(typical, maximum, abs(value) + half_width, 1e-12) * _BEYOND_WHISKER
         unit = '' if row.unit == '1' else f' {row.unit}'
-        text = f'{coefficients.rounded(row, row.fitted)} ± ' \
-            f'{coefficients.rounded(row, row.half_width)}{unit}'
+        text = f'{rounded(row, row.fitted)} ± ' \
+            f'{rounded(row, row.half_width)}{unit}'
         # The lower end of the interval decides.
         lower = abs(value) - half_width
         beyond = '' if not (typical or maximum) else _BEYOND if 0 < maximum < lower else \
@@ -234,116 +233,27 @@ def _coefficients(fitted: Sensor) -> list[dict[str, Any]]:
 
 def _paper_figures(result: CalibrationResult) -> tuple[list[str], str, str]:
     """Return the figures of the paper as URLs, else why there are none, and their model."""
-    if result.gravity_fit is not None:
-        return [], '', ''
-    pictures = [_held_out_plot(result.held_out, result.poses.subset(result.inliers))] \
-        if result.held_out else []
-    fault, model = '', 'physical'
     try:
         unit = _paper_sensor(result)
-        model = unit.model
-        pictures += [_sweep(result.nominal, unit, result.poses, pair) for pair in _PANELS]
+        return [html_page.picture_url(_sweep(result.nominal, unit, result.poses, pair))
+                for pair in _PANELS], '', unit.model
     except UserError as error:
-        fault = str(error)
-    return [html_page.picture_url(drawn) for drawn in pictures], fault, model
+        return [], str(error), 'physical'
 
 
-_BAND_COLOUR = 'rgba(31,95,191,0.12)'
-_ROOM = {'l': 8, 'r': 12, 't': 36, 'b': 8}
-"""Margins with room for a legend, pixels."""
-_DATES = 4
-"""Largest number of dates at an axis. Chosen: they fit beside each other on a phone."""
-
-
-def _pose_errors(errors: held_out.HeldOutErrors, assessment: Assessment, poses: Poses, axes: str
-                 ) -> Figure:
-    """Draw the errors at the held-out poses with the band that 90 % of them should be in."""
-    number = np.arange(1, errors.pose_count + 1)
-    held = poses.subset(errors.pose_index)
-    angles_deg = np.degrees([held.alpha_rad, held.beta_rad])
-    labels = [f'pose {i}, alpha {alpha:.1f}°, beta {beta:.1f}°'
-              for i, (alpha, beta) in enumerate(angles_deg.T, 1)]
-    accel_mg = errors.errors.accel_mps2 / G0_MPS2 * 1e3
-    half_mg = Z_90 * 1e3 * float(np.sqrt(assessment.accel.expected)) / G0_MPS2
-    traces = [_band(len(number), -half_mg, half_mg, 1)]
-    symbols = np.where(held_out.determining_alpha(errors.errors), 'circle', 'circle-open').tolist()
-    traces += [_dots(number, accel_mg[:, d], f'{axis}', AXIS_COLOURS[axis], labels, 'mg', 1)
-               for d, axis in enumerate(axes)]
-    for trace in traces[1:]:
-        trace['marker']['symbol'] = symbols
-    tilt_deg = np.degrees(errors.errors.tilt_rad)
-    if not np.isfinite(tilt_deg).any():
-        return figures.figure(traces, 320, margin=_ROOM,
-                              xaxis={'title': {'text': 'held-out pose'}},
-                              yaxis={'title': {'text': 'acceleration, mg'}})
-    # The tilt error has two components: 90 % of its lengths are within √(ln 10) of the rms.
-    high_deg = float(np.degrees(np.sqrt(assessment.tilt.expected * np.log(10))))
-    traces += [_band(len(number), 0.0, high_deg, 2),
-               _dots(number, tilt_deg, 'tilt', '#6b46a8', labels, '°', 2)]
-    return figures.figure(
-        traces, 440, margin=_ROOM, xaxis={'title': {'text': 'held-out pose'}, 'anchor': 'y2'},
-        yaxis={'title': {'text': 'acceleration, mg'}, 'domain': [0.54, 1]},
-        yaxis2={'title': {'text': 'tilt, °'}, 'domain': [0, 0.46], 'rangemode': 'tozero'})
-
-
-def _gravity_errors(fit: GravityFit) -> Figure:
-    """Draw the error of the magnitude of gravity at each rest, and its expected 90 % bars."""
-    used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
-    scale = 1e3 / G0_MPS2
-    traces = [figures.points(
-        used + 1, scale * fit.held_out_mps2[used], Z_90 * scale * fit.expected_mps2[used],
-        'held out', AXIS_COLOURS['x'])]
-    return figures.figure(traces, 320, margin=_ROOM, xaxis={'title': {'text': 'rest'}},
-                          yaxis={'title': {'text': 'magnitude minus gravity, mg'}})
-
-
-def _drift(history: DriftHistory) -> Figure:
-    """Draw zero-g and scale factor of a unit over its calibrations, relative to the newest."""
-    traces, layout, dates = [], {}, history.dates
-    number_of = np.arange(len(dates))
-    labelled = np.unique(np.linspace(0, len(dates) - 1, _DATES).astype(int))
-    for number, label in enumerate(('zero-g, mg', 'scale factor, ‰'), 1):
-        values, std = history.series(number - 1)
-        for d, axis in enumerate(history.sensors[-1].axes):
-            trace = figures.points(number_of, values[:, d], Z_90 * std[:, d], axis,
-                                   AXIS_COLOURS[axis])
-            traces.append(trace | {'mode': 'lines+markers', 'text': dates,
-                                   'hovertemplate': '%{text}: %{y:.3~g}',
-                                   'showlegend': number == 1, 'legendgroup': axis,
-                                   'yaxis': axis_number('y', number)})
-        layout[axis_number('yaxis', number)] = {
-            'title': {'text': label}, 'domain': [0.54, 1] if number == 1 else [0, 0.46]}
-    return figures.figure(
-        traces, 340, margin=_ROOM, **layout,
-        xaxis={'anchor': 'y2', 'tickvals': labelled.tolist(),
-               'ticktext': [dates[i][:10] for i in labelled]})
-
-
-def _band(count: int, low: float, high: float, panel: int) -> Figure:
-    """Draw the band of the expected errors in a panel."""
-    edges = [0.5, count + 0.5]
-    return figures.line(
-        [*edges, *edges[::-1]], [low, low, high, high], 'expected 90 %', QUIET_COLOUR,
-        fill='toself', fillcolor=_BAND_COLOUR, hoverinfo='skip', xaxis='x',
-        yaxis=axis_number('y', panel), showlegend=panel == 1,
-        line={'color': QUIET_COLOUR, 'width': 0.5})
-
-
-def _dots(number: np.ndarray, values: np.ndarray, name: str, colour: str, labels: list[str],
-          unit: str, panel: int) -> Figure:
-    """Draw one error of each pose in a panel."""
-    return {'type': 'scatter', 'mode': 'markers', 'x': number.tolist(),
-            'y': figures.rounded(values), 'name': name, 'text': labels, 'xaxis': 'x',
-            'yaxis': axis_number('y', panel), 'marker': {'color': colour, 'size': 7},
-            'hovertemplate': '%{text}: %{y:.3~g} ' + unit + '<extra>' + name + '</extra>'}
+def _error_figure(used: np.ndarray, errors_mg: np.ndarray, half_mg: np.ndarray, names: str,
+                  x_label: str, y_label: str) -> Figure:
+    """Draw the held-out errors, (k, m), of the poses used with bars of the expected 90 %."""
+    traces = [figures.points(np.flatnonzero(used) + 1, errors_mg[used, d], half_mg[used], name,
+                             AXIS_COLOURS[name[0]]) for d, name in enumerate(names)]
+    return figures.figure(traces, 320, margin={'l': 8, 'r': 12, 't': 36, 'b': 8},
+                          xaxis={'title': {'text': x_label}}, yaxis={'title': {'text': y_label}})
 
 
 _FINE_G = np.linspace(-1, 1, 201)
 """Specific force at which curves are drawn, g."""
 _VERTICAL = np.sin(np.radians(89))
 """Smallest sine of alpha in the plane alpha = 90°; chosen: stages are better than 1°."""
-_MARKERS = 'os^D'
-"""Markers of models, in order."""
 
 
 def draw_sweep(path: str | os.PathLike, sensor: Sensor, fitted: Sensor, poses: Poses) -> None:
@@ -387,12 +297,11 @@ def _draw_panel(axis: Any, panel: int, d: int, model: str, poses: Poses, force_g
     name, other = ('x', 'y') if d == 0 else ('y', 'x')
     along_g, x_label = force_g[:, d], f'{name} reference, g'
     if panel in (0, 1, 3):
-        everything = np.ones(len(poses), bool)
         y_label = f'{name} output minus linear, mV'
         title = f'figs. 5, 7: measured ● and {model} model ─' if panel == 3 else \
             f'fig. {panel + 2}: paths, forth ● and back ◁'
         backward = np.gradient(poses.beta_rad) < 0
-        chosen = np.flatnonzero(everything if panel else vertical)
+        chosen = np.flatnonzero(vertical | (panel > 0))
         for plane in planes(poses.alpha_rad[chosen]):
             index = chosen[np.sort(plane)]
             label = f'{np.degrees(poses.alpha_rad[index]).mean():.0f}°'
@@ -426,40 +335,3 @@ def _draw_panel(axis: Any, panel: int, d: int, model: str, poses: Poses, force_g
                           'fig. 6: zero-g against z (12, 13)') if panel == 4 else \
             (f'{name} scale factor, V/g', 'fig. 8: scale factor against z (15, 17)')
     axis.set(xlabel=x_label, ylabel=y_label, title=title)
-
-
-def _gravity_rests(name: str, fit: GravityFit) -> Any:
-    """Draw the error of the magnitude of gravity in each rest, before and after the fit."""
-    figure, axes = figures.pyplot().subplots(1, 2, figsize=(12, 4.5), layout='constrained')
-    rests = np.arange(1, len(fit.residual_mps2) + 1)
-    for axis, values, title in ((axes[0], fit.before_mps2, 'nominal'),
-                                (axes[1], fit.residual_mps2, 'calibrated')):
-        mg = values / G0_MPS2 * 1e3
-        axis.axhline(0, color='0.7', lw=0.8)
-        axis.errorbar(rests, mg, yerr=Z_90 * fit.expected_mps2 / G0_MPS2 * 1e3, fmt='o', ms=4,
-                      lw=1)
-        axis.set(title=f'{title}: rms {np.sqrt(np.mean(mg ** 2)):.2f} mg', xlabel='rest',
-                 ylabel='magnitude minus gravity, mg')
-    figure.suptitle(f'{name}: {len(rests)} rests (bars: 90 %, expected)')
-    return figure
-
-
-def _held_out_plot(models: Sequence[held_out.HeldOutErrors], poses: Poses) -> Any:
-    """Draw the errors on held-out poses, model by model, as in figure 10 of the paper."""
-    figure, axes = figures.pyplot().subplots(1, 3, figsize=(13, 4), layout='constrained')
-    for i, model in enumerate(models):
-        errors = model.errors
-        alpha_deg = np.degrees(poses.alpha_rad[model.pose_index])
-        accel_mg = np.sqrt(np.mean(errors.accel_mps2 ** 2, axis=1)) / G0_MPS2 * 1e3
-        for axis, values in zip(axes, (np.degrees(errors.alpha_rad), np.degrees(errors.beta_rad),
-                                       accel_mg)):
-            axis.plot(alpha_deg, np.abs(values), _MARKERS[i % 4], ms=4, mfc='none', color=f'C{i}',
-                      label=model.model)
-    for axis, label in zip(axes, ('|error of alpha|, deg', '|error of beta|, deg',
-                                  'error of acceleration, mg')):
-        axis.set(xlabel='alpha of the pose, deg', ylabel=label, yscale='log')
-        # A tiny error by chance must not compress the scale.
-        axis.set_ylim(bottom=1e-6 * axis.get_ylim()[1])
-        axis.grid(alpha=0.3)
-    axes[0].legend(fontsize=8)
-    return figure

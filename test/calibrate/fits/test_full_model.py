@@ -133,17 +133,16 @@ def test_a_simpler_model_is_fitted_if_the_full_one_is_not_determined():
     assert fit.warnings[-1].startswith('not physical: ')
 
 
-@pytest.mark.parametrize('change, words', [
-    (lambda truth: put(truth, [Coefficient('misalignment', 'alpha_rad', axis) for axis in 'xy'],
-                       truth.values['misalignment']['alpha_rad'] + [0.02, 0.02]),
-     'case is turned by'),
-    (lambda truth: put(truth, [Coefficient('bias', 'offset_v', 'x')],
-                       truth.values['bias']['offset_v'][:1] + 0.08), 'zero-g of . is shifted by')])
-def test_recordings_that_contradict_each_other_are_refused(change, words):
+@pytest.mark.parametrize('change', [
+    lambda truth: put(truth, [Coefficient('misalignment', 'alpha_rad', axis) for axis in 'xy'],
+                      truth.values['misalignment']['alpha_rad'] + [0.02, 0.02]),
+    lambda truth: put(truth, [Coefficient('bias', 'offset_v', 'x')],
+                      truth.values['bias']['offset_v'][:1] + 0.08)])
+def test_recordings_that_contradict_each_other_are_refused(change):
     rng = np.random.default_rng(12)
     truth = drawn(rng, nominal(), TERMS)
     parts = [swept(rng, unit, check_poses=0) for unit in (truth, truth, change(truth))]
-    with pytest.raises(UserError, match=rf'{words} .* standard deviations\): another unit'):
+    with pytest.raises(UserError, match='turned by .* shifted by .* mg .*: another unit'):
         calibration.calibrate(
             nominal(), [calibration.RecordedPoses(f'{name}.csv', part)
                         for name, part in zip('abc', parts)], 'full')

@@ -4,7 +4,7 @@
 
 from dataclasses import replace
 
-from adxl_ros.calibrate.fits import gravity_model
+from adxl_ros.calibrate.fits import gravity_fit
 from adxl_ros.calibrate.fits.gravity_fit import fit_gravity, NAMES
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
@@ -81,12 +81,12 @@ def test_jacobian_against_differences():
     rng = np.random.default_rng(1)
     mean, estimate = directions(rng, 20) * 1.05, rng.normal(0, 0.05, 9)
     step = 1e-6
-    for k, column in enumerate(gravity_model.magnitude_jacobian(mean, estimate).T):
+    for k, column in enumerate(gravity_fit.magnitude_jacobian(mean, estimate).T):
         up, down = estimate.copy(), estimate.copy()
         up[k] += step
         down[k] -= step
-        wanted = (gravity_model.magnitude(mean, up)
-                  - gravity_model.magnitude(mean, down)) / (2 * step)
+        wanted = (gravity_fit.magnitude(mean, up)
+                  - gravity_fit.magnitude(mean, down)) / (2 * step)
         assert column == pytest.approx(wanted, abs=1e-9)
 
 
@@ -144,17 +144,17 @@ def test_outliers_are_named(count, knocks, size_g):
     assert np.median(worst) < 4e-4
 
 
-@pytest.mark.parametrize('poses, names, advice', [
-    (SIX, 'misalignment.beta_rad.y, misalignment.alpha_rad.z, misalignment.beta_rad.z', ' and '),
+@pytest.mark.parametrize('poses, names', [
+    (SIX, 'misalignment.beta_rad.y, misalignment.alpha_rad.z, misalignment.beta_rad.z'),
     (np.tile(SIX, (3, 1)),
-     'misalignment.beta_rad.y, misalignment.alpha_rad.z, misalignment.beta_rad.z', ' and '),
-    (np.tile([[0.6, 0.0, 0.8]], (20, 1)), 'all nine coefficients', 'z down'),
-    (np.zeros((0, 3)), 'all nine coefficients', 'x up'),
+     'misalignment.beta_rad.y, misalignment.alpha_rad.z, misalignment.beta_rad.z'),
+    (np.tile([[0.6, 0.0, 0.8]], (20, 1)), 'all nine coefficients'),
+    (np.zeros((0, 3)), 'all nine coefficients'),
     (np.column_stack([np.cos(np.arange(20)), np.sin(np.arange(20)), np.zeros(20)]),
      'bias.offset_v.z, scale_factor.offset_v_per_g.z, misalignment.alpha_rad.z, '
-     'misalignment.beta_rad.z', 'z up'),
+     'misalignment.beta_rad.z'),
 ])
-def test_undetermined_parameters_are_refused(poses, names, advice):
+def test_undetermined_parameters_are_refused(poses, names):
     rng = np.random.default_rng(8)
     sensor, _ = unit(rng)
     means, errors = rested(rng, sensor, poses)
@@ -164,28 +164,7 @@ def test_undetermined_parameters_are_refused(poses, names, advice):
     assert text.startswith(f'gravity: without their angles (fit --poses), the {len(poses)} rests '
                            'do not determine ')
     assert f'{names}; add rests with ' in text
-    assert advice in text.split('add rests with')[1]
     assert '\n' not in text
-
-
-def test_the_advised_poses_are_sufficient():
-    rng = np.random.default_rng(9)
-    sensor, truth = unit(rng)
-    few = directions(rng, 24) * [1, 1, 0.02]
-    few[:, 2] = np.abs(few[:, 2])
-    for poses in (few / np.linalg.norm(few, axis=1, keepdims=True), SIX[:4], directions(rng, 9)):
-        with pytest.raises(UserError) as refused:
-            fit_gravity(*rested(rng, sensor, poses), bare(sensor))
-        added = []
-        for pose in str(refused.value).split('add rests with ')[1].split(', '):
-            vector = np.zeros(3)
-            for part in pose.split(' and '):
-                axis, way = part.split()
-                vector['xyz'.index(axis)] = 1 if way == 'up' else -1
-            added.append(vector / np.linalg.norm(vector))
-        poses = np.concatenate([poses, added])
-        fit = fit_gravity(*rested(rng, sensor, poses), bare(sensor))
-        assert np.abs(parameters(fit) - truth).max() < 0.02
 
 
 def unweighted_fit(means, errors, sensor):

@@ -83,7 +83,7 @@ def play(session, stamps_ns, volts, temperatures_c):
 
 def test_the_range_is_covered_in_both_directions_and_the_file_has_the_slopes(begin):
     session = begin()
-    assert session.guide.destination() == 'warm it to 40 °C'
+    assert session.guide.destination() == 'warm it from 10 to 40 °C'
     assert session.guide.estimate_contents().range_error == 'not known yet over 10 to 40 °C'
     play(session, *recorded('temperature_bias:per_k=4e-4'))
     assert session.guide.next_pose() is None

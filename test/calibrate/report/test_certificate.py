@@ -176,7 +176,7 @@ def test_units_of_the_si(unit, expected):
 @pytest.mark.parametrize(('text', 'words'), [
     ('labor: x', 'labor'), ('- x', 'a mapping'),
     ('customer_country: Germany', 'two capitals'),
-    ('place: here', 'none of laboratory'), ('responsible: 7', '7 is no text'),
+    ('place: here', 'no place such as laboratory'), ('responsible: 7', '7 is no text'),
     ('gravity_std_mps2: high', 'no number')])
 def test_a_bad_file_of_a_laboratory_is_refused(tmp_path, text, words):
     (tmp_path / 'lab.yaml').write_text(text)

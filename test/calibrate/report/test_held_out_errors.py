@@ -126,11 +126,10 @@ def test_outcomes_of_the_acceptance(parts, outcome):
         1 / G0_MPS2 / nominal().range_g ** 3, 0.0)})
     budget = ErrorBudget(*parts)
     assessment = acceptance.assess('full', ErrorBudgets(budget, budget), sensor)
-    assert assessment.accel_datasheet == assessment.datasheet == outcome
+    assert assessment.accel_datasheet == outcome
     tilted = acceptance.assess('full', ErrorBudgets(
         ErrorBudget(1.0, 0.0, 0.9, 0.1, 0.0, 0.2), replace(budget, tilt_per_axis=1.0)), sensor)
     assert (tilted.accel_datasheet, tilted.tilt_datasheet) == ('PASS', outcome)
-    assert tilted.datasheet == outcome
     if len(parts) == 7:
         assert assessment.limited_by == 'stage or model'
     else:
