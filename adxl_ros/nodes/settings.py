@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from difflib import get_close_matches
 from itertools import chain
 from typing import Any
 
@@ -14,7 +15,7 @@ from adxl_ros.files.parameter_file import SENSOR_FIELDS
 from adxl_ros.files.recording_columns import NO_UNIT
 from adxl_ros.links.support import base
 from adxl_ros.nodes import parameters
-from adxl_ros.nodes.parameters import declare, Kind, nearest, parameter, parameter_error, Spec
+from adxl_ros.nodes.parameters import declare, Kind, parameter, parameter_error, Spec
 from adxl_ros.nodes.rclpy_internals import given_parameters
 import numpy as np
 from rclpy.node import Node
@@ -265,22 +266,13 @@ def check_given_parameters(node: Node) -> None:
     for name, _ in given_parameters(node):
         if name not in names and not name.startswith(_FREE_PREFIXES):
             raise parameter_error(name, 'no node has a parameter of this name; did you mean '
-                                  f'{nearest(name, names)}?')
+                                  f'{get_close_matches(name, sorted(names), 1, 0.0)[0]}?')
 
 
 def link_specs(link: str) -> list[Spec]:
     """Return the parameters of a link, `link.type` aside."""
     return [Spec(f'{LINK}{option.name}', option.default, **option.metadata)
             for option in fields(base.link_module(link).Settings)]
-
-
-def links_by_parameter() -> dict[str, list[str]]:
-    """Return the links that have a parameter, by its name."""
-    links: dict[str, list[str]] = {}
-    for link in base.link_names():
-        for spec in link_specs(link):
-            links.setdefault(spec.name, []).append(link)
-    return links
 
 
 def given_link(node: Node) -> dict[str, Any]:
@@ -295,15 +287,10 @@ def declare_driver(node: Node, serial: str) -> tuple[DriverSettings, base.LinkMo
 
     No real unit gets simulated data: a link must then be named.
     """
-    given, links = [f'{LINK}{name}' for name in given_link(node)], links_by_parameter()
-    is_chosen = _TYPE in given
-    for name in given:
-        if not is_chosen and name not in links:
-            raise parameter_error(name, 'is no parameter of any link; did you mean '
-                                  f'{nearest(name, [_TYPE, *links])}?')
+    given = [f'{LINK}{name}' for name in given_link(node)]
     reason = f'{given[0]} is given' if given else \
         f'the sensor is the unit {serial}' if serial != NO_UNIT else ''
-    if reason and not is_chosen:
+    if reason and _TYPE not in given:
         devices = [name for name in base.link_names() if name != base.DEFAULT_LINK]
         raise parameter_error(_TYPE, f'is not set, but {reason}; set it to {", ".join(devices)}, '
                               f'or to {base.DEFAULT_LINK} for a simulated sensor')
@@ -312,8 +299,7 @@ def declare_driver(node: Node, serial: str) -> tuple[DriverSettings, base.LinkMo
     own = [_TYPE, *(spec.name for spec in specs)]
     for name in given:
         if name not in own:
-            hint = f'link.type {" or ".join(links[name])} has it' if name in links else \
-                f'did you mean {nearest(name, own)}?'
-            raise parameter_error(name, f'the link {settings.link} has no such parameter; {hint}')
+            raise parameter_error(name, f'the link {settings.link} has no such parameter; it has '
+                                  f'{", ".join(own)}')
     values = {spec.name.removeprefix(LINK): declare(node, spec) for spec in specs}
     return settings, module, module.Settings(**values)
