@@ -226,9 +226,8 @@ class SerialLink(base.DeviceLink):
             self._receive()
         while self._arrivals:
             frame, arrived_ns = self._arrivals[0]
-            if isinstance(frame, BoardInfo) and frame != self._info:
-                if self._stamper.flush():
-                    break  # the samples in the stamper belong to the previous board
+            if isinstance(frame, BoardInfo) and frame != self._info and self._stamper.flush():
+                break  # the samples in the stamper belong to the previous board
             self._arrivals.popleft()
             if isinstance(frame, BoardInfo):
                 self._on_info(frame)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Run the main job: a simulated sweep, and a real recording, through the live graph."""
+"""Run the main job: a simulated sweep through the live graph."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ import subprocess
 import sys
 import time
 
-from adxl_ros.calibrate.fits import gravity_fit, linear
+from adxl_ros.calibrate.fits import linear
 from adxl_ros.calibrate.guided import pose_plan
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.calibrate.report import acceptance, held_out as unseen
+from adxl_ros.calibrate.report import held_out as unseen
 from adxl_ros.calibrate.report.acceptance import acceptance_lines, screen_table
 from adxl_ros.calibrate.report.coefficients import compare, truth_table
 from adxl_ros.errors import UserError
-from adxl_ros.files import parameter_file, recording, sweep_journal
+from adxl_ros.files import parameter_file, sweep_journal
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes import jobs
@@ -33,7 +33,6 @@ import numpy as np
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from std_srvs.srv import Trigger
 
 _FIT_S = 600.0
 """Longest time of a fit, s; chosen: far above the seconds that a fit takes."""
@@ -76,8 +75,7 @@ _UNATTENDED = {'autostart': True, 'screen': False,
                'qos_overrides./imu/data_raw.subscription.depth': _QUEUE}
 """Parameters of a calibration that nobody controls and that loses no sample: at many times real
 time, a best-effort subscriber loses samples on a busy machine."""
-_EXAMPLES = {'the simulated sensor': '-o demo_output',
-             'a real recording, too': '--real imu.csv -o demo_output'}
+_EXAMPLES = {'the simulated sensor': '-o demo_output'}
 """Examples of arguments, by their purpose."""
 NEXT_PAGE = 'docs/start/tilt.md'
 """Page that a user reads next."""
@@ -92,7 +90,6 @@ class DemoGraph:
         self.reports: dict[str, dict[str, str]] = {}  # Newest diagnostics by node
         self._node = Node('demo')
         self._node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
-        self._finish = self._node.create_client(Trigger, 'calibration/finish')
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
 
@@ -100,14 +97,6 @@ class DemoGraph:
         for status in message.status:
             self.reports[status.name.split(':')[0]] = {
                 'message': status.message, **{pair.key: pair.value for pair in status.values}}
-
-    def finish(self) -> str:
-        """Let the calibration fit what it has; return its answer."""
-        future = self._finish.call_async(Trigger.Request())
-        self._executor.spin_until_future_complete(future, timeout_sec=_FIT_S)
-        if not future.done():
-            raise UserError(f'calibration/finish: no answer for {_FIT_S:g} s')
-        return future.result().message
 
     def start(self, name: str, params_file: Path, parameters: Mapping[str, object]) -> None:
         """Start a node that follows the clock of the driver."""
@@ -117,12 +106,6 @@ class DemoGraph:
             command += ['-p', f'{key}:={json.dumps(value, ensure_ascii=False, default=str)}']
         with self._log.open('ab') as log:
             self._processes[name] = subprocess.Popen(command, stdout=log, stderr=log)
-
-    def start_calibration(self, params_file: Path, parameters: Mapping[str, object]) -> None:
-        """Start a calibration that writes the output, and keeps a copy beside it."""
-        self.start('calibration', params_file, {
-            **_UNATTENDED, **parameters, 'output': self._output,
-            'store': self._output.parent / 'calibrations'})
 
     def close(self) -> None:
         """End the nodes."""
@@ -147,24 +130,16 @@ class DemoGraph:
                 what = f'the node {ended[0]} has ended' if ended else message or 'no progress'
                 raise UserError(f'{what}; see {self._log}')
 
-    def show_accepted(self, step: jobs.Step, unit: str) -> int:
-        """Show and return how many poses the journal has so far."""
-        count = len(sweep_journal.accepted_poses(_entries(self._output)))
-        if count:
-            step.show(f'{count}{unit}', count)
-        return count
+    def entries(self) -> list[sweep_journal.JournalEntry]:
+        """Return the entries of the journal; none while it has no head."""
+        with suppress(UserError):
+            return sweep_journal.read(_journal(self._output)).entries
+        return []
 
     def fitted_poses(self) -> list[sweep_journal.PoseRecord]:
         """Return the poses of the fit; the journal has them when everything is written."""
-        return [pose for entry in _entries(self._output)
+        return [pose for entry in self.entries()
                 if isinstance(entry, sweep_journal.Fitted) for pose in entry.rests or ()]
-
-
-def _entries(output: Path) -> list[sweep_journal.JournalEntry]:
-    """Return the entries of a journal; none while it has no head."""
-    with suppress(UserError):
-        return sweep_journal.read(_journal(output)).entries
-    return []
 
 
 def _journal(output: Path) -> Path:
@@ -193,8 +168,6 @@ def main() -> int:
     parser = program_parser('demo', __doc__, _EXAMPLES)
     parser.add_argument('-o', dest='output', metavar='DIR', default='demo_output', type=Path,
                         help='folder of pages and calibrations (default demo_output)')
-    parser.add_argument('--real', metavar='CSV', type=Path,
-                        help='a three-axis recording turned by hand, calibrated too')
     parser.add_argument('--speed', type=float, default=_SPEED,
                         help=f'sensor time per real time (default {_SPEED:g})')
     parser.add_argument('--seed', type=int, default=_SEED,
@@ -205,16 +178,11 @@ def main() -> int:
             parser.error(f'--{name}: {value} is not between {lowest} and {highest}')
     jobs.use_own_graph()
     try:
-        # A recording that cannot be read is refused before the sweep.
-        length_s = 0.0 if options.real is None else \
-            float(np.ptp(recording.read(options.real).time_s))
         try:
             options.output.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UserError(f'{options.output}: {error.strerror}') from None
         _run_sweep(options.output, options.speed, options.seed)
-        if options.real is not None:
-            _run_recording(options.output, options.real, length_s)
         _print('', *file_lines({'Next': f'your own sensor: {NEXT_PAGE}'}))
     except UserError as error:
         print(f'demo: {error}', file=sys.stderr)
@@ -239,14 +207,17 @@ def _run_sweep(folder: Path, speed: float, seed: int) -> None:
     with open_graph(output) as graph:
         graph.start('driver', unit, _KEEPING | {'link.type': 'sim', 'link.speed': speed})
         graph.start('stage', nominal, {'delay_s': _DELAY_S, 'seed': seed})
-        graph.start_calibration(nominal, {
-            'report': report, 'sweep.planes_deg': _PLANES_DEG, 'sweep.step_deg': _STEP_DEG,
+        graph.start('calibration', nominal, {
+            **_UNATTENDED, 'output': output, 'store': folder / 'calibrations', 'report': report,
+            'sweep.planes_deg': _PLANES_DEG, 'sweep.step_deg': _STEP_DEG,
             'sweep.check_poses': _CHECK_POSES})
         total = len(pose_plan.guided(np.radians(_PLANES_DEG).tolist(),
                                      float(np.radians(_STEP_DEG)), _CHECK_POSES))
         with jobs.Step('1/3 sweep', 'starting', total) as step:
             def accepted() -> int:
-                return graph.show_accepted(step, f' of {total} poses')
+                count = len(sweep_journal.accepted_poses(graph.entries()))
+                step.show(f'{count} of {total} poses', count)
+                return count
             graph.wait(lambda: accepted() == total, accepted, _SILENT_S)
         fitting = f'{total - _CHECK_POSES} poses'
         with jobs.Step('2/3 fit', fitting) as step:
@@ -285,33 +256,6 @@ def _held_out_errors(nominal: Sensor, fitted: Sensor, poses: Poses
               fitted.model: fitted}
     return [unseen.summarise(model, unseen.pose_errors(sensor, held_out))
             for model, sensor in models.items()]
-
-
-def _run_recording(folder: Path, path: Path, length_s: float) -> None:
-    """Calibrate a recorded sensor against gravity, replayed through the graph."""
-    output, report = folder / f'{path.stem}.yaml', folder / path.stem
-    _print('', title(f'Real recording {path.name}: a sensor turned by hand',
-                     length_s / _SPEED + _OVERHEAD_S), '')
-    nominal_path = parameter_file.nominal_path()
-    with open_graph(output) as graph:
-        graph.start_calibration(nominal_path, {'report': report, 'mode': 'gravity'})
-        graph.start('driver', nominal_path, _KEEPING | {
-            'link.type': 'replay', 'link.recording': path, 'link.speed': _SPEED})
-        with jobs.Step('1/2 replay', 'starting') as step:
-            graph.wait(lambda: graph.reports.get('driver', {}).get('link_state') == 'ended',
-                       lambda: graph.show_accepted(step, ' rests'), _SILENT_S)
-            rests = graph.show_accepted(step, ' rests')
-        with jobs.Step('2/2 fit', f'{rests} rests, magnitude of gravity'):
-            answer = graph.finish()
-            if not output.exists():
-                raise UserError(f'{path}: {answer}')
-            poses = Poses.from_records(graph.fitted_poses())
-            graph.close()
-    fitted = parameter_file.load(output)
-    nominal = replace(fitted.without_covariance(), effects=(), values={})
-    _print('', *acceptance.gravity_lines(
-        gravity_fit.fit_gravity(poses.volts, poses.std_v, nominal), poses.time_s[:, 0]), '',
-           *file_lines({'Page': report / 'report.html', 'Calibration': output}))
 
 
 def title(text: str, seconds: float) -> str:
