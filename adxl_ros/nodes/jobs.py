@@ -101,8 +101,6 @@ _NAME_WIDTH = 11
 """Columns of the name of a step."""
 _TEXT_WIDTH = 16
 """Columns of the text beside a bar."""
-_TENTHS = 10
-"""Largest number of lines of a step where nothing is drawn."""
 _LINE_WIDTH = 69
 """Columns of a line without a bar, before its time."""
 
@@ -140,13 +138,13 @@ class Step(LiveLine):
     """
     One step of a job while it runs: a line with the time and, where the total is known, a bar.
 
-    Where nothing can be drawn, there is a line for each tenth of the total, and one at the end.
+    Where nothing can be drawn, there is one line at the end.
     """
 
     def __init__(self, name: str, text: str, total: int = 0) -> None:
         columns = (_BAR_WIDTH, '{task.percentage:3.0f} %') if total else ()
         super().__init__(*columns, '{task.elapsed:4.0f} s', total=total)
-        self._name, self._total, self._begin_s, self._tenth = name, total, time.monotonic(), 0
+        self._name, self._total, self._begin_s = name, total, time.monotonic()
         self.show(text)
 
     def __enter__(self) -> Step:
@@ -159,18 +157,9 @@ class Step(LiveLine):
         line = f' {self._name:{_NAME_WIDTH}} {text:{width}}'
         self._plain = line + share
         super().show(line, done)
-        tenth = _TENTHS * done // self._total if self._total else 0
-        if self._tenth < tenth < _TENTHS:
-            self._print()
-        self._tenth = max(tenth, self._tenth)
 
     def __exit__(self, kind: object, *_: object) -> None:
         """Stop drawing; a step that has failed leaves no line."""
-        if kind is None:
-            self._print()
-        self.close()
-
-    def _print(self) -> None:
-        """Print the line with its time where nothing is drawn."""
-        if self._progress is None:
+        if kind is None and self._progress is None:
             print(f'{self._plain} {time.monotonic() - self._begin_s:4.0f} s', flush=True)
+        self.close()
