@@ -130,12 +130,8 @@ _LOOK_S = 0.5
 """Time between two looks at who publishes and, where it is unknown, at the sensor, s; chosen."""
 _LEVELS = {State.REFUSED: Level.ERROR, State.COMPENSATING: Level.OK}
 """Levels of the states; all others are warnings."""
-_EXAMPLES = {
-    'the newest calibration of the unit in the store': '',
-    'a calibration by its file': '--ros-args -p calibration:=unit.yaml',
-    'a sensor that moves, without the lag of its filter':
-        '--ros-args -p calibration:=unit.yaml -p undo_filter:=true',
-}
+_EXAMPLES = {'the newest calibration of the unit in the store': '',
+             'a calibration by its file': '--ros-args -p calibration:=unit.yaml'}
 """Examples of arguments, by their purpose."""
 
 

@@ -144,12 +144,9 @@ _FAREWELL_S = 0.5
 """Time for which the last command is repeated at the end, s; chosen: the stage has it then."""
 _COMMAND_QUEUE = 10
 """Commands that are kept for a slow subscriber; chosen."""
-_EXAMPLES = {
-    'a simulated stage, driver and stage running': '',
-    'a unit by its parameter file, within limits':
-        '--ros-args --params-file unit.yaml -p limits.rate_deg_s:=10.0 '
-        "-p 'limits.beta_deg:=[-90.0,90.0]'",
-}
+_EXAMPLES = {'a unit by its parameter file, within limits':
+             '--ros-args --params-file unit.yaml -p limits.rate_deg_s:=10.0 '
+             "-p 'limits.beta_deg:=[-90.0,90.0]'"}
 """Examples of arguments, by their purpose."""
 
 

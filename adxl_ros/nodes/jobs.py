@@ -23,10 +23,6 @@ _FIRST_DOMAIN = 60
 """First ROS domain of jobs; chosen: beyond those that robots use."""
 _DOMAINS = 40
 """Number of ROS domains of jobs; chosen: the last one is below 101, the last safe one."""
-_USER_TIME = 11
-"""Place of the user time in /proc/PID/stat, from 0, behind the command's name (man 5 proc)."""
-_SYSTEM_TIME = 12
-"""Place of the system time, counted in the same way."""
 
 
 def use_own_graph() -> None:
@@ -63,8 +59,9 @@ def stop(processes: Sequence[subprocess.Popen]) -> None:
 
 def cpu_time_s(pid: int) -> float:
     """Return the time that a process has spent on a core so far, s."""
+    # Behind the name of the command, its user and system time are fields 11 and 12 (man 5 proc).
     fields = Path(f'/proc/{pid}/stat').read_text().rsplit(')', 1)[1].split()
-    return (int(fields[_USER_TIME]) + int(fields[_SYSTEM_TIME])) / os.sysconf('SC_CLK_TCK')
+    return sum(map(int, fields[11:13])) / os.sysconf('SC_CLK_TCK')
 
 
 @contextmanager

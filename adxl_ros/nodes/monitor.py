@@ -124,12 +124,8 @@ _PAUSE_S = 600.0
 """Shortest time between two automatic diagnoses, s; chosen: each may cost minutes of a core."""
 _EXAMPLES = {
     'a sensor on a stage': '--ros-args --params-file unit.yaml',
-    'a sensor beside its simulation': '--ros-args --params-file unit.yaml -p reference:=imu '
-    '-p reference_topic:=/sim/imu',
     'a sensor on a robot': '--ros-args --params-file unit.yaml -p reference:=robot '
-    '-p urdf:=robot.urdf',
-    'one false alarm a year at most': '--ros-args -p false_alarms_per_day:=0.0027',
-}
+    '-p urdf:=robot.urdf'}
 """Examples of arguments, by their purpose."""
 
 

@@ -214,10 +214,7 @@ _STYLES = {Log.WARN: 'ansiyellow', Log.ERROR: 'ansired', Log.FATAL: 'ansired'}
 """Styles of log lines by level."""
 _PLAIN = 'ansibrightblack'
 """Style of other log lines."""
-_EXAMPLES = {
-    'the screen of a calibration that runs elsewhere': '',
-    'in the namespace of the sensor': '--ros-args -r __ns:=/arm',
-}
+_EXAMPLES = {'in the namespace of the sensor': '--ros-args -r __ns:=/arm'}
 """Examples of arguments, by their purpose."""
 
 

@@ -252,12 +252,8 @@ class StageBridge:
         return Level.OK, 'at rest' if is_there else 'on the way'
 
 
-_EXAMPLES = {
-    'the simulated stage': '',
-    'the bridge to a controller of ros2_control':
-        '--ros-args -p stage.type:=trajectory '
-        '-p bridge.alpha.joint:=tilt -p bridge.beta.joint:=turn',
-}
+_EXAMPLES = {'the bridge to a controller of ros2_control': '--ros-args -p stage.type:=trajectory '
+             '-p bridge.alpha.joint:=tilt -p bridge.beta.joint:=turn'}
 """Examples of arguments, by their purpose."""
 
 
