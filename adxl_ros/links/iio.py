@@ -333,24 +333,20 @@ def _assign_roles(device: Any, entries: Sequence[str], axes: str) -> dict[str, A
                     if channel.type.name in ('IIO_VOLTAGE', 'IIO_ACCEL')]
         entries = [channel.id for channel
                    in sorted(measured, key=lambda channel: channel.index)[:len(axes)]]
-    roles: list[str] = []
-    assigned = []
+    assigned: dict[str, Any] = {}
     for entry in entries:
         role, equals, name = entry.rpartition('=')
         named = [channel for channel in inputs
                  if name in (channel.id, labels[channel.id], channel.name)]
         if not named:
-            available = ', '.join(f'{key} ({label})' if label else key
-                                  for key, label in labels.items())
             raise UserError(f'link.channels: {_name(device)} has no channel {name!r}; it has '
-                            f'{available} in its buffer')
+                            f'{", ".join(labels)} in its buffer')
         if not equals:
-            free = [candidate for candidate in order if candidate not in roles]
+            free = [candidate for candidate in order if candidate not in assigned]
             role = name if name in free or not free else free[0]
-        roles.append(role)
-        assigned.append(named[0])
-    base.check_roles(roles, axes)
-    return dict(zip(roles, assigned))
+        assigned[role] = named[0]
+    base.check_roles([*assigned], axes)
+    return assigned
 
 
 def _label(channel: Any) -> str:

@@ -37,9 +37,6 @@ _INFO_WAIT_S = 1.5
 """Longest time without an info frame after opening, s. Derived: a board sends one each second."""
 _COMMAND_PAUSE_S = 0.5
 """Shortest time between two commands, s. Chosen: a board has answered by then."""
-_COMMANDS = 3
-"""Commands that a board gets before it counts as one that does not obey. Chosen: noise may damage
-one of them."""
 _SILENT_FRAMES = 3
 """A board also counts as silent only after this many times its longest frame."""
 _MAX_BYTES_PER_S = 4e6
@@ -147,7 +144,7 @@ def _conversion(info: BoardInfo, roles: Sequence[str], axes: str, settings: Sett
 
 class _FrameSize:
     """
-    Asks a board for frames that are as short as the latency, unless it does not obey.
+    Asks a board for frames that are as short as the latency, until it obeys.
 
     Only a device that has sent a frame gets bytes: another one could take them for its own
     commands. A board answers with its info frame, so that the first samples need not wait.
@@ -155,17 +152,13 @@ class _FrameSize:
 
     def __init__(self, settings: Settings, port: _Port) -> None:
         self._settings, self._port = settings, port
-        self._newest = self._sent = self._ignored = 0
+        self._newest = self._sent = 0
         self._due_s = 0.0
         self.duration_s = 0.0  # Duration of the newest frame, s
 
     def take(self, count: int, rate_hz: float) -> None:
         """Take the number of samples of a frame, and their rate."""
         self._newest, self.duration_s = count, count / rate_hz
-
-    def forget(self) -> None:
-        """Begin again with a board that may obey."""
-        self._ignored = 0
 
     def command(self, info: BoardInfo | None) -> None:
         """Send a command where the newest frame is not as it shall be."""
@@ -177,14 +170,12 @@ class _FrameSize:
             wanted = wire_format.samples_that_fit(
                 self._settings.samples_together(info.rate_hz), info, self._port.uart_bytes_per_s)
             if count == wanted:
-                self._ignored = 0
                 return
             latency_us = max(latency_us, round(wanted / info.rate_hz * 1e6))
         now_s = time.monotonic()
-        if self._ignored < _COMMANDS and now_s >= self._due_s:
+        if now_s >= self._due_s:
             self._port.write(wire_format.encode_command(self._sent, latency_us))
             self._sent += 1
-            self._ignored += 1
             self._due_s = now_s + _COMMAND_PAUSE_S
 
 
@@ -284,7 +275,6 @@ class SerialLink(base.DeviceLink):
             # The port opens again, perhaps on another board: an incomplete frame stays incomplete.
             self._splitter.restart()
             self._counter.reopened()
-            self._size.forget()
             return
         arrived_ns = time.monotonic_ns()
         samples = 0
@@ -321,7 +311,6 @@ class SerialLink(base.DeviceLink):
         if not changed and not info.flags & wire_format.AFTER_RESET:
             return
         self._info, self._conversion, self._misfit = info, None, ''
-        self._size.forget()
         self._counter.restart(info.rate_hz)
         axes = self._declared.axes
         roles = self._stated_roles or [

@@ -164,8 +164,8 @@ class Investigate(Node):
         self._settings = own = declare_all(self, InvestigateSettings)
         alpha_deg = low_and_high('limits.alpha_deg', own.alpha_deg, (0.0, 180.0))
         beta_deg = low_and_high('limits.beta_deg', own.beta_deg, (0.0, 360.0))
-        self._limits = limits = StageLimits(_radians(alpha_deg), _radians(beta_deg),
-                                            float(np.radians(own.rate_deg_s)))
+        alpha_rad, beta_rad = np.radians([alpha_deg, beta_deg]).tolist()
+        self._limits = limits = StageLimits(alpha_rad, beta_rad, float(np.radians(own.rate_deg_s)))
         self._commands = topics.create_publisher(self, JointState, 'stage/command', _COMMAND_QUEUE)
         self.create_service(Trigger, '~/abort', self._on_abort)
         topics.create_subscription(self, JointState, 'stage/joint_states', self._on_stage,
@@ -280,11 +280,6 @@ class Investigate(Node):
             values |= {'hypothesis': ' '.join(best.effects) or 'no gap',
                        'probability': best.probability}
         return Status(level, status.text, self._sensor.serial, values)
-
-
-def _radians(range_deg: tuple[float, float]) -> tuple[float, float]:
-    low_rad, high_rad = np.radians(range_deg).tolist()
-    return low_rad, high_rad
 
 
 def _work(node: Investigate, executor: Executor) -> None:

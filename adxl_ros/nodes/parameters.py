@@ -173,20 +173,14 @@ def _paths() -> list[str]:
 
 def _entries(path: str) -> Iterator[tuple[str, str, yaml.Node]]:
     """Yield the pattern of the node's name, the parameter's name and its value in a file."""
-    def inside(tree: yaml.Node | None, section: str, key: str | None
-               ) -> Iterator[tuple[str, str, yaml.Node]]:
-        if not isinstance(tree, yaml.MappingNode):
-            if key is not None and tree is not None:
-                yield section, key, tree
-            return
-        for name, value in tree.value:
-            if key is not None:
-                yield from inside(value, section, f'{key}.{name.value}'.lstrip('.'))
-            elif name.value == 'ros__parameters':
-                yield from inside(value, section, '')
-            else:
-                yield from inside(value, f'{section}/{name.value.strip("/")}', None)
-    return inside(parameter_file.compose(path), '', None)
+    def inside(tree: yaml.Node | None, keys: list[str]) -> Iterator[tuple[str, str, yaml.Node]]:
+        if isinstance(tree, yaml.MappingNode):
+            for key, value in tree.value:
+                yield from inside(value, [*keys, key.value])
+        elif tree is not None and 'ros__parameters' in keys:
+            i = keys.index('ros__parameters')
+            yield ''.join(f'/{key.strip("/")}' for key in keys[:i]), '.'.join(keys[i + 1:]), tree
+    return inside(parameter_file.compose(path), [])
 
 
 def check_params_files() -> None:
