@@ -79,8 +79,8 @@ makes up its samples, and the queue of imu/data_raw holds them at 1 kHz."""
 _DISCOVERY_NS = 300_000_000
 """Time after which a new subscriber is sure to receive, ns; chosen."""
 _CLOCK_SEARCH_NS = 1_000_000_000
-"""Time before the first sample in which another clock is looked for, ns; chosen: nodes find each
-other within it."""
+"""Time between two searches for another clock, and before the first sample, ns; chosen: nodes find
+each other within it."""
 _QUEUE = 5000
 """Messages of the stage that are kept between two reads."""
 _LOG_INTERVAL_S = 1.0
@@ -99,6 +99,7 @@ class LinkReader:
         self._now_ns: int | None = None
         self._subscribed_ns = 0
         self._ticked_ns = self._opened_ns = time.monotonic_ns()
+        self._search_ns = self._opened_ns + _CLOCK_SEARCH_NS
         self._due_s = time.monotonic()
         self._newest_ns: int | None = None
         self._stage: topics.Inbox | None = None
@@ -191,6 +192,9 @@ class LinkReader:
         """Publish the samples that are due."""
         steady_ns = time.monotonic_ns()
         step_ns, self._ticked_ns = steady_ns - self._ticked_ns, steady_ns
+        if self._output.is_clock and steady_ns >= self._search_ns:
+            self._search_ns = steady_ns + _CLOCK_SEARCH_NS
+            self._output.follow_other_clock()
         if self._now_ns is None:
             if not self._may_begin(step_ns):
                 return
@@ -208,7 +212,6 @@ class LinkReader:
         if self._output.is_clock:
             if self._ticked_ns - self._opened_ns < _CLOCK_SEARCH_NS:
                 return False
-            self._output.follow_other_clock()
         elif not self._ros.now().nanoseconds:
             return False
         self._subscribed_ns = self._subscribed_ns + step_ns if self._output.subscribed() else 0

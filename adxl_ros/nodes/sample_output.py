@@ -100,8 +100,11 @@ class Tally:
 
 _REFERENCE_QUEUE = 1000
 """References that are kept for a slow subscriber: 10 s of stage angles."""
-_PERIOD_NS = 10_000_000
-"""Time between two messages of a reference, ns; chosen: 100 Hz, as a stage's controller sends."""
+_STAGE_PERIOD_NS = 10_000_000
+"""Longest time between two messages with the same stage angles, ns; chosen: 100 Hz, as a stage's
+controller sends."""
+_SCALAR_PERIOD_NS = 1_000_000_000
+"""Longest time between two messages with the same temperature or supply, ns; chosen."""
 
 _STAGE = 'stage/joint_states'
 """Topic of the stage angles, which have several columns."""
@@ -119,7 +122,8 @@ class References:
         self._columns = {_STAGE: [*self._joints]} if self._joints else {}
         self._columns |= {topic: [column] for topic, (column, _) in _SCALARS.items()
                           if column in columns}
-        self._periods = dict.fromkeys(self._columns, -1)  # Period of the newest message by topic
+        self._published = {topic: (-1, np.full(len(of_topic), np.inf))
+                           for topic, of_topic in self._columns.items()}
         self._publishers = {topic: topics.create_publisher(
             node, JointState if topic == _STAGE else _SCALARS[topic][1], topic, _REFERENCE_QUEUE)
             for topic in self._columns}
@@ -131,19 +135,30 @@ class References:
 
     def publish(self, stamps_ns: np.ndarray, columns: Mapping[str, np.ndarray]) -> None:
         """
-        Publish the first values of each period.
+        Publish values that have changed, and others once in a period.
 
         stamps_ns: stamps, ns, (n,); columns: values by column, (n,); NaN where there is none.
         """
+        if not len(stamps_ns):
+            return
         for topic, publisher in self._publishers.items():
             values = np.column_stack([columns[column] for column in self._columns[topic]])
-            rows = np.flatnonzero(np.isfinite(values).any(axis=1))
-            periods = np.append(self._periods[topic], stamps_ns[rows] // _PERIOD_NS)
-            self._periods[topic] = periods[-1]
-            for i in rows[np.diff(periods) != 0]:
+            for i in self._new_rows(topic, stamps_ns, values):
                 message = self._message(topic, values[i].tolist())
                 message.header.stamp = topics.stamp(stamps_ns[i])
                 publisher.publish(message)
+
+    def _new_rows(self, topic: str, stamps_ns: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return the rows of values, (n, k), that differ from the row before or begin a period."""
+        rows = np.flatnonzero(np.isfinite(values).any(axis=1))
+        if not len(rows):
+            return rows
+        period_ns = _STAGE_PERIOD_NS if topic == _STAGE else _SCALAR_PERIOD_NS
+        values, period = values[rows], stamps_ns[rows] // period_ns
+        last_period, last = self._published[topic]
+        changed = (np.diff(values, axis=0, prepend=last[None]) != 0).any(axis=1)
+        self._published[topic] = int(period[-1]), values[-1]
+        return rows[changed | (np.diff(period, prepend=last_period) != 0)]
 
     def _message(self, topic: str, values: list[float]) -> Any:
         """Make the message of the joints that have a value, or of a temperature or supply."""
