@@ -50,7 +50,7 @@ class Argument(NamedTuple):
         # A list of numbers has a unit; names with commas stay one text.
         kind = str if default == () and not self.spec.unit else type(default)
         try:
-            return {int: int, float: float, tuple: _numbers}.get(kind, str)(text)
+            return _CONVERSIONS.get(kind, str)(text)
         except ValueError:
             raise UserError(f'{self.name}:={text}: expected a number, or numbers with commas '
                             'where it is a list') from None
@@ -59,6 +59,9 @@ class Argument(NamedTuple):
 def _numbers(text: str) -> list[float]:
     return [float(part) for part in text.strip('[]').split(',')]
 
+
+_CONVERSIONS: dict[type, Callable[[str], Any]] = {int: int, float: float, tuple: _numbers}
+"""Conversions of an argument by the type of the default."""
 
 def arguments(own: type, *parameters: str, **renamed: str) -> tuple[Argument, ...]:
     """

@@ -88,7 +88,8 @@ def test_a_parameter_of_another_link_is_refused(start, link, parameter, words):
 
 @pytest.mark.parametrize('rule, words', [
     ('link.type:=seral', "driver: link.type: 'seral' is not one of sim, iio, replay, serial"),
-    ('driver:sensor.rate_hz:=-4.0', 'driver: sensor.rate_hz: -4.0 is refused; expected DOUBLE, 0.01 to 1'),
+    ('driver:sensor.rate_hz:=-4.0',
+     'driver: sensor.rate_hz: -4.0 is refused; expected DOUBLE, 0.01 to 1'),
     ('stamp_offset:=1', 'driver: stamp_offset: 1 is refused; expected DOUBLE, -10 to 10, s; '
      'write 1.0')])
 def test_the_error_of_an_argument_names_no_file(start, unit, rule, words):
