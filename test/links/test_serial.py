@@ -315,7 +315,8 @@ def test_a_socket_is_a_port():
 @pytest.mark.parametrize('settings, reason', [
     ({'port': ''}, 'link.port: names no port'),
     ({'channels': 'x,w'}, 'channels are x, w; expected'),
-    ({'channels': 'x'}, 'expected each of x, y'), ({'temperature_v_per_c': 0.0}, 'temperature_v_per')])
+    ({'channels': 'x'}, 'expected each of x, y'),
+    ({'temperature_v_per_c': 0.0}, 'temperature_v_per')])
 def test_settings_that_cannot_work_are_refused(settings, reason):
     with pytest.raises(UserError, match=reason):
         serial.open_link(nominal(), serial.Settings(**{'port': '/dev/null', **settings}))
