@@ -106,7 +106,7 @@ install/.built: .venv/.ready $(sources)
 real := $(wildcard ../shared/real/mpu9150_0.csv)
 
 demo: build
-	./run demo -o demo_output $(if $(real),--real $(real))
+	./run demo -o demo_output
 
 # In test/, so that Python imports the installed package and not the sources beside it.
 pytest = cd test && OPENBLAS_NUM_THREADS=1 ../run --exec python -m pytest -q

@@ -4,10 +4,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from datetime import datetime, timezone
+from datetime import datetime, timedelta, timezone
 from enum import auto, Enum
+from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,9 +22,6 @@ from adxl_ros.model.sensor import Sensor
 _STALE_S = 60.0
 """Age from which a temperature or supply counts as unknown, s; chosen: a room warms by less than
 0.1 K in that time."""
-_CLOCK_TOLERANCE_DAYS = 0.01
-"""Largest difference of two clocks, days; chosen: a quarter of an hour. A calibration that is
-dated further ahead comes from the future."""
 _SHORTEST_SILENCE_S = 0.5
 """Shortest interval in which samples are missed, s; chosen. A report on a change of level may
 follow the last one by less than a sample period."""
@@ -50,16 +48,6 @@ class Status(NamedTuple):
 
     state: State  # The state
     text: str  # The state in one line for people, with its reason
-
-
-class Topics(NamedTuple):
-    """Full names of the topics, for messages."""
-
-    # data_raw, sensor_info, temperature, supply: Name of the topic
-    data_raw: str
-    sensor_info: str
-    temperature: str
-    supply: str
 
 
 @dataclass(frozen=True)
@@ -90,8 +78,9 @@ class CompensationPolicy:
     sensor: Sensor  # The sensor whose coefficients are used
     source: str  # Where the coefficients come from
 
-    def __init__(self, paper: bool, store: str, topics: Topics) -> None:
-        self._paper, self._store, self._topics = paper, store, topics
+    def __init__(self, paper: bool, store: str, full_name: Callable[[str], str]) -> None:
+        """Prepare; `full_name` gives the full name of a topic, for messages."""
+        self._paper, self._store, self._full_name = paper, store, full_name
         self._warnings: set[str] = set()
         self.stored_path = ''  # File that was taken from the store, '' if none was
         # What the stream states of itself (`sensor_info`), None before it does
@@ -163,22 +152,22 @@ class CompensationPolicy:
 
     def status(self, interval: Interval, newer: Path | None, calibration: str) -> Status:
         """Return the state of the stream: the first one that holds."""
-        counts, topics = interval.counts, self._topics
+        counts, samples = interval.counts, self._full_name('imu/data_raw')
+        no_info = f'nothing on {self._full_name("sensor_info")}'
         is_silent = not counts.get('received') and interval.duration_s > _SHORTEST_SILENCE_S
         is_newer = newer is not None and not self.is_named(calibration)
         unknown = self._unknown_surroundings(interval)
         states = (
             (self.refusal, State.REFUSED, f'publishing nothing: {self.refusal}'),
-            (is_silent, State.SILENT, f'no samples on {topics.data_raw}'),
+            (is_silent, State.SILENT, f'no samples on {samples}'),
             (interval.obstacle, State.UNKNOWN,
-             f'publishing nothing yet: nothing on {topics.sensor_info}, and {topics.data_raw} '
-             f'does not show its sensor: {interval.obstacle}'),
+             f'publishing nothing yet: {no_info}, and {samples} does not show its sensor: '
+             f'{interval.obstacle}'),
             (counts.get('dropped'), State.DROPPING,
              f'{counts.get("dropped")} samples dropped that no force explains'),
             (counts.get('saturated'), State.SATURATED,
              f'{counts.get("saturated")} samples with the ADC at its rail'),
-            (self.info is None, State.NOT_CONFIRMED,
-             f'unit not confirmed: nothing on {topics.sensor_info}'),
+            (self.info is None, State.NOT_CONFIRMED, f'unit not confirmed: {no_info}'),
             (unknown, State.SURROUNDINGS_UNKNOWN, unknown),
             (not self.sensor.effects, State.NOT_CALIBRATED,
              'not calibrated: the datasheet values apply'),
@@ -193,57 +182,42 @@ class CompensationPolicy:
 
     def _unknown_surroundings(self, interval: Interval) -> str:
         """Name an effect whose temperature or supply nobody publishes, or return ''."""
-        topics = {'temperature_c': self._topics.temperature, 'supply_v': self._topics.supply}
+        topics = {'temperature_c': 'temperature', 'supply_v': 'supply'}
         for effect in map(effect_named, self.sensor.effects):
-            for name in effect.follows:
-                if name not in topics:
-                    continue
-                if name not in interval.surroundings:
-                    nominal = getattr(NOMINAL_ENVIRONMENT, name)
-                    return f'{effect.name} is taken at {nominal:g}: nothing on {topics[name]}'
-                if interval.ages_s[name] > _STALE_S:
-                    return (f'{effect.name} is taken at {interval.surroundings[name]:g}: nothing '
-                            f'on {topics[name]} for {interval.ages_s[name]:.0f} s')
+            for name in topics.keys() & set(effect.follows):
+                if interval.ages_s.get(name, inf) > _STALE_S:
+                    value = interval.surroundings.get(name, getattr(NOMINAL_ENVIRONMENT, name))
+                    return (f'{effect.name} is taken at {value:g}: nothing on '
+                            f'{self._full_name(topics[name])}')
         return ''
 
     def values(self, interval: Interval, newer: Path | None) -> dict[str, Any]:
         """Return what diagnostics report of the calibration in use."""
         sensor = self.sensor
         date = calibration_store.date_of(sensor) if sensor.effects else None
-        age_days = None if date is None else \
-            (datetime.now(timezone.utc) - date).total_seconds() / 86400
+        age = datetime.now(timezone.utc) - date if date else None
         return {
             'unit': self._unit(), 'calibration': self.source, 'serial': sensor.serial,
             'axes': sensor.axes, 'model': sensor.model, 'effects': ', '.join(sensor.effects),
             'calibration_id': calibration_store.calibration_id(sensor) if sensor.effects else '',
-            'age_days': '' if age_days is None else round(age_days, 3),
-            'validity': self._validity(interval, age_days), 'newer': str(newer or ''),
+            'age_days': '' if age is None else round(age / timedelta(days=1), 3),
+            'validity': self._validity(interval), 'newer': str(newer or ''),
             **{f'provenance.{key}': value for key, value in sensor.provenance.items()}}
 
     def _unit(self) -> str:
-        if self.refusal:
-            return 'several' if self.refusal == self.mixture else 'other'
-        if self.info is None:
-            return 'not confirmed'
+        if self.refusal or self.info is None:
+            return 'other' if self.refusal else 'not confirmed'
         # A stream or a file without a serial number goes with every unit.
         return 'no serial number' if NO_UNIT in (self.info.serial, self.sensor.serial) \
             else 'confirmed'
 
-    def _validity(self, interval: Interval, age_days: float | None) -> str:
-        sensor = self.sensor
-        if not sensor.effects:
+    def _validity(self, interval: Interval) -> str:
+        if not self.sensor.effects:
             return 'not calibrated'
         if self.refusal:
-            return self.refusal if self.refusal == self.mixture else \
-                f'of another unit: {self.refusal}'
+            return self.refusal
         if interval.counts.get('outside'):
             return f'outside: {"; ".join(interval.outside)}'
-        if age_days is not None and age_days < -_CLOCK_TOLERANCE_DAYS:
-            return 'dated in the future: the clock here, or there, is wrong'
-        if not sensor.covariance_names:
-            return 'within, as far as is known: it states no covariance'
-        if sensor.envelope.temperature_c is None \
-                or 'temperature_c' not in interval.surroundings \
-                or interval.ages_s['temperature_c'] > _STALE_S:
-            return 'valid, temperature not known'
-        return 'valid'
+        knows_temperature = self.sensor.envelope.temperature_c is not None \
+            and interval.ages_s.get('temperature_c', inf) <= _STALE_S
+        return 'valid' if knows_temperature else 'valid, temperature not known'

@@ -9,7 +9,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from math import ceil, isfinite
 import os
-import socket
 import time
 from typing import Any
 
@@ -25,11 +24,6 @@ _SILENT_S = 0.5
 """Time without a buffer after which a device counts as silent, s. Chosen: 250 buffers."""
 _SILENT_BUFFERS = 3
 """A device also counts as silent only after this many times the duration of its buffer."""
-_BATCH_S = 0.02
-"""Longest duration of the buffers that one read passes on together, s; chosen: passing twenty
-samples on costs little more than passing two."""
-_WAITING_SHARE = 0.5
-"""A buffer has waited for the reader if its read takes less than this share of its duration."""
 _DECISION_S = 0.5
 """Duration of late samples after which the clock of the device counts as stopped, s. Chosen: by
 then a busy machine has read what the kernel keeps, each buffer with an answer of its own."""
@@ -49,19 +43,10 @@ _MIN_KERNEL_BUFFERS = 4
 _MAX_KERNEL_BUFFERS = 320
 """Most buffers of the kernel; chosen: single samples at 1 kHz are kept as long as others, and its
 memory has a bound at high rates."""
-_ANSWERS = 20
-"""Answers of a device that are timed when it is opened."""
-_ROUND_TRIPS = 4.0
-"""Shortest duration of a buffer by the mean time of an answer. Chosen: each buffer needs one,
-so that the reads catch up with four times the sample rate after a delay."""
 _MAX_BUFFER = 2000
 """Most samples of a buffer."""
 _TIMEOUT_S = 1.0
 """Lateness after which a buffer will not come, s: the server was killed or stopped."""
-_IIOD_PORT = '30431'
-"""TCP port of iiod without another one in the URI."""
-_PROBE_S = 0.5
-"""Longest wait for the answer of an iiod, s; libiio itself waits for five seconds."""
 _CLOCK_ATTRIBUTE = 'current_timestamp_clock'
 """Attribute of the kernel that selects the clock of the time stamps."""
 _MAX_STAMP_NS = 2 ** 62
@@ -114,7 +99,6 @@ class IioLink(base.DeviceLink):
         self._adc: dict[str, float] = {}
         self._connections = self._repeated = 0
         self._newest_ns = -1
-        self._is_behind = False
         self._last_buffer_s = time.monotonic()
 
     def read(self, now_ns: int) -> base.Samples:
@@ -124,7 +108,7 @@ class IioLink(base.DeviceLink):
                 self._open()
         else:
             try:
-                self._receive(self._stream)
+                self._add(*self._stream.read())
             except (_ReadError, UserError) as error:
                 # After a time-out the stream is not reliable: everything is opened again.
                 self._error = str(error)
@@ -183,16 +167,6 @@ class IioLink(base.DeviceLink):
                 self._stamper.clock = IdentityMap()
             self._stamper.restart(1e9 / stream.rate_hz)
             self._newest_ns = -1
-
-    def _receive(self, stream: _Stream) -> None:
-        """Read a buffer; where two in a row have waited for the reader, those behind them, too."""
-        for _ in range(max(round(_BATCH_S / stream.buffer_s), 1)):
-            began_s = time.monotonic()
-            self._add(*stream.read())
-            was_behind = self._is_behind
-            self._is_behind = time.monotonic() - began_s < _WAITING_SHARE * stream.buffer_s
-            if not (was_behind and self._is_behind):
-                return
 
     def _add(self, device_ns: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
         """Pass the samples of a buffer on, without those that came before."""
@@ -261,9 +235,7 @@ class _Stream:
         axis = next(column for column in columns if column.role in sensor.axes)
         self.rate_hz = rate_hz = _set_rate(context, device, columns, sensor.rate_hz)
         self.adc = {'rate_hz': rate_hz, **axis.adc()}
-        count = min(max(settings.samples_together(rate_hz),
-                        ceil(_ROUND_TRIPS * _answer_s(axis.channel) * rate_hz)),
-                    _MAX_BUFFER)
+        count = min(settings.samples_together(rate_hz), _MAX_BUFFER)
         self.buffer_s = count / rate_hz
         self._columns = [*columns]
         for channel in [self._timestamp, *(column.channel for column in self._columns)]:
@@ -302,7 +274,6 @@ class _Stream:
 def _open_stream(settings: Settings, entries: Sequence[str], sensor: Sensor) -> _Stream:
     iio = import_libiio()
     try:
-        _probe(settings.uri)
         with _quiet_stderr():
             context = iio.Context(settings.uri)
     except (OSError, ValueError) as error:
@@ -327,20 +298,6 @@ def _quiet_stderr() -> Iterator[None]:
         os.dup2(original, 2)
         os.close(original)
         os.close(nothing)
-
-
-def _probe(uri: str) -> None:
-    """Check that an iiod answers."""
-    kind, _, address = uri.partition(':')
-    if kind != 'ip':
-        return
-    host, colon, port = address.rpartition(':')
-    if not colon or (':' in host and not host.endswith(']')):
-        host, port = address, _IIOD_PORT
-    with socket.create_connection((host.strip('[]'), int(port)), _PROBE_S) as connection:
-        connection.sendall(b'VERSION\r\n')
-        if not connection.recv(64):
-            raise OSError('the other side has closed')
 
 
 def _name(device: Any) -> str:
@@ -376,24 +333,20 @@ def _assign_roles(device: Any, entries: Sequence[str], axes: str) -> dict[str, A
                     if channel.type.name in ('IIO_VOLTAGE', 'IIO_ACCEL')]
         entries = [channel.id for channel
                    in sorted(measured, key=lambda channel: channel.index)[:len(axes)]]
-    roles: list[str] = []
-    assigned = []
+    assigned: dict[str, Any] = {}
     for entry in entries:
         role, equals, name = entry.rpartition('=')
         named = [channel for channel in inputs
                  if name in (channel.id, labels[channel.id], channel.name)]
         if not named:
-            available = ', '.join(f'{key} ({label})' if label else key
-                                  for key, label in labels.items())
             raise UserError(f'link.channels: {_name(device)} has no channel {name!r}; it has '
-                            f'{available} in its buffer')
+                            f'{", ".join(labels)} in its buffer')
         if not equals:
-            free = [candidate for candidate in order if candidate not in roles]
+            free = [candidate for candidate in order if candidate not in assigned]
             role = name if name in free or not free else free[0]
-        roles.append(role)
-        assigned.append(named[0])
-    base.check_roles(roles, axes)
-    return dict(zip(roles, assigned))
+        assigned[role] = named[0]
+    base.check_roles([*assigned], axes)
+    return assigned
 
 
 def _label(channel: Any) -> str:
@@ -428,26 +381,12 @@ def _column(role: str, channel: Any, sensor: Sensor, supply_scale: float) -> _Co
 
 
 def _number(channel: Any, name: str) -> float:
-    try:
+    text = 'missing'
+    with suppress(KeyError, OSError, ValueError):
         text = channel.attrs[name].value
-    except KeyError:
-        raise UserError(f'{channel.id} has no attribute {name}: its volts are not known'
-                        ) from None
-    except OSError as error:
-        raise UserError(f'{channel.id}: its attribute {name} cannot be read: {base.reason(error)}'
-                        ) from None
-    with suppress(ValueError):
         if isfinite(float(text)):
             return float(text)
     raise UserError(f'{channel.id}: its attribute {name} is {text!r}, not a number')
-
-
-def _answer_s(channel: Any) -> float:
-    """Return how long a device takes for an answer, s: to what the scale of a channel is."""
-    began_s = time.perf_counter()
-    for _ in range(_ANSWERS):
-        _number(channel, 'scale')
-    return (time.perf_counter() - began_s) / _ANSWERS
 
 
 def _select_monotonic_clock(device: Any) -> bool:

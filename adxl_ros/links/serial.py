@@ -37,9 +37,6 @@ _INFO_WAIT_S = 1.5
 """Longest time without an info frame after opening, s. Derived: a board sends one each second."""
 _COMMAND_PAUSE_S = 0.5
 """Shortest time between two commands, s. Chosen: a board has answered by then."""
-_COMMANDS = 3
-"""Commands that a board gets before it counts as one that does not obey. Chosen: noise may damage
-one of them."""
 _SILENT_FRAMES = 3
 """A board also counts as silent only after this many times its longest frame."""
 _MAX_BYTES_PER_S = 4e6
@@ -109,7 +106,7 @@ class _Conversion:
     # Value of a channel is gain · code + offset, V or degC, (m,)
     gain: np.ndarray
     offset: np.ndarray
-    axes: slice | list[int]  # Channels of the axes of the sensor
+    axes: list[int]  # Channels of the axes of the sensor
     references: Mapping[str, int]  # Channel of each reference by column
     steps_ns: np.ndarray  # Times of the samples of a frame after its first one, ns, int64, (256,)
     max_code: int  # Largest code
@@ -138,11 +135,8 @@ def _conversion(info: BoardInfo, roles: Sequence[str], axes: str, settings: Sett
         elif role == base.TEMPERATURE:
             gain[i] /= settings.temperature_v_per_c
             offset[i] = -settings.temperature_zero_v / settings.temperature_v_per_c
-    places = [roles.index(axis) for axis in axes]
-    # A slice takes no copy.
-    together = slice(places[0], places[0] + len(axes))
     return _Conversion(
-        gain, offset, together if places == list(range(len(roles)))[together] else places,
+        gain, offset, [roles.index(axis) for axis in axes],
         {column: roles.index(role) for role, column in base.COLUMNS.items() if role in roles},
         np.rint(np.arange(wire_format.MAX_COUNT + 1) * (1e9 / info.rate_hz)).astype(np.int64),
         2 ** info.bits - 1)
@@ -150,7 +144,7 @@ def _conversion(info: BoardInfo, roles: Sequence[str], axes: str, settings: Sett
 
 class _FrameSize:
     """
-    Asks a board for frames that are as short as the latency, unless it does not obey.
+    Asks a board for frames that are as short as the latency, until it obeys.
 
     Only a device that has sent a frame gets bytes: another one could take them for its own
     commands. A board answers with its info frame, so that the first samples need not wait.
@@ -158,17 +152,13 @@ class _FrameSize:
 
     def __init__(self, settings: Settings, port: _Port) -> None:
         self._settings, self._port = settings, port
-        self._newest = self._sent = self._ignored = 0
+        self._newest = self._sent = 0
         self._due_s = 0.0
         self.duration_s = 0.0  # Duration of the newest frame, s
 
     def take(self, count: int, rate_hz: float) -> None:
         """Take the number of samples of a frame, and their rate."""
         self._newest, self.duration_s = count, count / rate_hz
-
-    def forget(self) -> None:
-        """Begin again with a board that may obey."""
-        self._ignored = 0
 
     def command(self, info: BoardInfo | None) -> None:
         """Send a command where the newest frame is not as it shall be."""
@@ -177,35 +167,16 @@ class _FrameSize:
             return
         latency_us = round(self._settings.latency_ms * 1e3)
         if info is not None:
-            wanted = self._possible(info)
+            wanted = wire_format.samples_that_fit(
+                self._settings.samples_together(info.rate_hz), info, self._port.uart_bytes_per_s)
             if count == wanted:
-                self._ignored = 0
                 return
             latency_us = max(latency_us, round(wanted / info.rate_hz * 1e6))
         now_s = time.monotonic()
-        if self._ignored < _COMMANDS and now_s >= self._due_s:
+        if now_s >= self._due_s:
             self._port.write(wire_format.encode_command(self._sent, latency_us))
             self._sent += 1
-            self._ignored += 1
             self._due_s = now_s + _COMMAND_PAUSE_S
-
-    def why_long(self, info: BoardInfo) -> str:
-        """Return why frames are longer than `link.latency_ms`; '' where they are not."""
-        settings, frame_ms = self._settings, self.duration_s * 1e3
-        if frame_ms <= settings.latency_ms:
-            return ''
-        possible = self._possible(info)
-        if possible > settings.samples_together(info.rate_hz):
-            possible_ms = min(possible / info.rate_hz * 1e3, frame_ms)
-            return (f' in frames of {possible_ms:.3g} ms: {settings.baud} Bd carry none of '
-                    f'{settings.latency_ms:g} ms')
-        if self._ignored >= _COMMANDS:
-            return f' in frames of {frame_ms:.3g} ms: the firmware does not obey link.latency_ms'
-        return ''
-
-    def _possible(self, info: BoardInfo) -> int:
-        return wire_format.samples_that_fit(self._settings.samples_together(info.rate_hz), info,
-                                            self._port.uart_bytes_per_s)
 
 
 class SerialLink(base.DeviceLink):
@@ -229,7 +200,7 @@ class SerialLink(base.DeviceLink):
         self._arrivals: deque[tuple[BoardInfo | SampleFrame, int]] = deque()
         self._info: BoardInfo | None = None
         self._conversion: _Conversion | None = None
-        self._misfit = self._version_error = ''
+        self._misfit = ''
         self._counter = wire_format.FrameCounter()
         self._stamper = Stamper(ClockMap(settings.delay), self.references)
         self._size = _FrameSize(settings, self._port)
@@ -246,10 +217,8 @@ class SerialLink(base.DeviceLink):
             self._receive()
         while self._arrivals:
             frame, arrived_ns = self._arrivals[0]
-            if isinstance(frame, BoardInfo) and frame != self._info:
-                self._stamper.flush()
-                if self._stamper.waiting:
-                    break  # the samples in the stamper belong to the previous board
+            if isinstance(frame, BoardInfo) and frame != self._info and self._stamper.flush():
+                break  # the samples in the stamper belong to the previous board
             self._arrivals.popleft()
             if isinstance(frame, BoardInfo):
                 self._on_info(frame)
@@ -279,8 +248,8 @@ class SerialLink(base.DeviceLink):
 
     def _condition(self) -> tuple[base.Level, str]:
         """Return level and text of the status: the first fault of port, frames and channels."""
-        if self._port.error or self._version_error:
-            return base.Level.ERROR, self._port.error or self._version_error
+        if self._port.error:
+            return base.Level.ERROR, self._port.error
         now_s, port, info = time.monotonic(), self._settings.port, self._info
         opened_s = max(self._port.opened_s, self._created_s)
         if info is None and now_s - opened_s < _INFO_WAIT_S:
@@ -290,19 +259,14 @@ class SerialLink(base.DeviceLink):
         if silent_s > max(_SILENT_S, long_s):
             return base.Level.WARN, f'{port}: {_SILENT}'
         if now_s - self._last_frame_s > max(_NO_FRAME_S, long_s):
-            return base.Level.WARN, (f'{port}: bytes, but no frame of wire format 1: is link.baud '
-                                     f'({self._settings.baud}) that of the board?')
+            return base.Level.WARN, (
+                f'{port}: bytes, but no frame of wire format 1: is link.baud '
+                f'({self._settings.baud}) that of the board, and its firmware of this version?')
         if self._misfit:
             return base.Level.ERROR, self._misfit
         if info is None:
             return base.Level.WARN, f'{port}: waiting for the info frame of the board'
-        axes = self._declared.axes
-        unused = [] if self._stated_roles else [axis for axis in AXES[:info.channels]
-                                                if axis not in axes]
-        text = f'streaming{self._size.why_long(info)}'
-        return base.Level.OK, text if not unused else (
-            f'{text}; the channel of {", ".join(unused)} is not used: sensor.axes is {axes} '
-            '(link.channels can say that it is the supply)')
+        return base.Level.OK, 'streaming'
 
     def _receive(self) -> None:
         """Read bytes and queue the frames that they complete."""
@@ -311,7 +275,6 @@ class SerialLink(base.DeviceLink):
             # The port opens again, perhaps on another board: an incomplete frame stays incomplete.
             self._splitter.restart()
             self._counter.reopened()
-            self._size.forget()
             return
         arrived_ns = time.monotonic_ns()
         samples = 0
@@ -326,14 +289,9 @@ class SerialLink(base.DeviceLink):
     def _decoded(self, raw: bytes) -> BoardInfo | SampleFrame | None:
         try:
             frame = wire_format.decode(raw)
-        except wire_format.VersionError as error:
-            self._version_error = (f'{self._settings.port}: the board speaks {error}, this '
-                                   'driver reads 1; use the firmware of this version')
-            return None
         except wire_format.WireError:
             self._counts['bad_frames'] += 1
             return None
-        self._version_error = ''
         self._counts['frames'] += 1
         self._last_frame_s = time.monotonic()
         self._port.confirm()
@@ -353,7 +311,6 @@ class SerialLink(base.DeviceLink):
         if not changed and not info.flags & wire_format.AFTER_RESET:
             return
         self._info, self._conversion, self._misfit = info, None, ''
-        self._size.forget()
         self._counter.restart(info.rate_hz)
         axes = self._declared.axes
         roles = self._stated_roles or [

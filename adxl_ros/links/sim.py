@@ -15,6 +15,7 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import JOINTS, Motion
 from adxl_ros.simulate.response import Response
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline
 
 _AHEAD_NS = 50_000_000
 """Length of a block of samples, ns. Chosen: a block costs less than its samples one by one."""
@@ -188,21 +189,12 @@ class SimulatedSensor:
         position = np.array([knot.position[joint] for knot in self._knots])
         velocity = np.array([knot.velocity[joint] for knot in self._knots])
         before = (np.searchsorted(knots, stamps) - 1).clip(0)
-        after = (before + 1).clip(max=len(knots) - 1)
-        step_ns = knots[after] - knots[before]
-        held = (step_ns <= 0) | (step_ns > _GAP_NS)
-        h = np.where(held, 1, step_ns) * 1e-9
-        u = np.where(held, 0.0, (stamps - knots[before]) * 1e-9 / h)
-        p0, p1 = position[before], position[after]
-        v0 = np.where(held, 0.0, velocity[before] * h)
-        v1 = velocity[after] * h
-        # p(u) = p0 + v0 u + a u² + b u³ with p(1) = p1 and p'(1) = v1, u in steps.
-        a, b = 3 * (p1 - p0) - 2 * v0 - v1, 2 * (p0 - p1) + v0 + v1
-        if order == 0:
-            return p0 + u * (v0 + u * (a + u * b))
-        if order == 1:
-            return np.where(held, 0.0, v0 + u * (2 * a + 3 * u * b)) / h
-        return np.where(held, 0.0, (2 * a + 6 * u * b) / h) / h
+        step_ns = np.diff(knots, append=knots[-1])[before]
+        held = position[before] if order == 0 else np.zeros(len(stamps))
+        if len(knots) == 1:
+            return held
+        spline = CubicHermiteSpline((knots - self._origin_ns) * 1e-9, position, velocity)
+        return np.where((step_ns > 0) & (step_ns <= _GAP_NS), spline(time_s, order), held)
 
 
 def _resting(position: tuple[float, ...]) -> _Knot:

@@ -4,8 +4,7 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from math import ceil, inf
 import time
@@ -27,17 +26,11 @@ samples of the calibration node."""
 _FIRST = 50
 """Samples with even stamps that determine the rate, before the first one is published; chosen:
 0.25 s at 200 Hz."""
-_FIRST_UNEVEN = 400
-"""Samples with uneven stamps that do; chosen: a jitter of a whole period leaves 2 %."""
 _FIRST_S = 1.0
-"""Simulated time after which fewer samples determine the rate, s; chosen: for slow simulators."""
+"""Simulated time after which other samples determine the rate, s; chosen: for uneven stamps and
+slow simulators."""
 _MIN_FIRST = 5
 """Fewest samples that determine a rate; chosen: four differences survive one lost sample."""
-_BLOCK = 100
-"""Samples after which the rate is measured again; chosen."""
-_RATE_TOLERANCE = 0.03
-"""Largest relative change of the rate that is no change, beside the part of a block that a long
-step is; chosen: far above the error of a rate."""
 _STEP_SCATTER = 0.45
 """Largest departure of 99 % of the steps from whole periods, periods, where longer steps show lost
 samples; chosen: from half a period on, jitter looks like loss."""
@@ -142,7 +135,7 @@ class EmulatedSensor(base.DeviceLink):
 
     Stamps are those of the simulator, so that a pause and any real-time factor need nothing. The
     chain runs at the rate of the stream, which its first samples determine. A reset of the
-    simulation and a new rate put the sensor at its power-on.
+    simulation puts the sensor at its power-on.
     """
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
@@ -158,7 +151,7 @@ class EmulatedSensor(base.DeviceLink):
         effects = tuple(name for name in sensor.effects if name not in left_out)
         self._unit = replace(sensor, effects=effects,
                              values={name: sensor.values[name] for name in effects})
-        self._counts = dict.fromkeys(('resets', 'rate_changes', 'gaps', 'late', 'not_finite'), 0)
+        self._counts = dict.fromkeys(('resets', 'gaps', 'late', 'not_finite'), 0)
         self._publishers: int | None = None
         self._mixture = ''
         self._heard_s = time.monotonic()
@@ -211,8 +204,6 @@ class EmulatedSensor(base.DeviceLink):
         events = (base.Event(f'not emulated: {self._left_out}', int(bool(self._left_out))),
                   base.Event('the simulation was reset; the sensor is at its power-on',
                              counts['resets']),
-                  base.Event('the rate of the simulator changed; the sensor is at its power-on',
-                             counts['rate_changes']),
                   base.Event(f'{self.imu_topic}: a sample is not a number; check the simulation',
                              counts['not_finite']))
         return base.LinkStatus(*self._condition(), counts, events)
@@ -236,8 +227,6 @@ class EmulatedSensor(base.DeviceLink):
         self._chain = None
         self._held.clear()
         self._last: _Ideal | None = None
-        self._stamps_ns: deque[int] = deque(maxlen=_BLOCK)
-        self._since = 0
 
     def _sense(self, ideal: _Ideal) -> None:
         """Hold a sample for the chain, or drop it; a reset and a long gap begin anew."""
@@ -261,11 +250,15 @@ class EmulatedSensor(base.DeviceLink):
     def _has_chain(self) -> bool:
         """Return whether there is a chain; it is made once the held samples show the rate."""
         if self._chain is None and self._held:
-            count, time_s = len(self._held), _seconds([held.stamp_ns for held in self._held])
+            stamps_ns = np.array([held.stamp_ns for held in self._held])
+            count, time_s = len(stamps_ns), (stamps_ns - stamps_ns[0]) * 1e-9
             is_long = time_s[-1] >= _FIRST_S and count >= _MIN_FIRST
-            if is_long or count >= _FIRST_UNEVEN or (count >= _FIRST and is_even(time_s)):
+            if is_long or (count >= _FIRST and is_even(time_s)):
                 rate_hz = stamped_rate_hz(time_s)
-                self._shows_losses = _show_losses(np.diff(time_s) * rate_hz)
+                # Where steps of the stamps are whole periods, longer ones show losses.
+                steps = np.diff(time_s) * rate_hz
+                self._shows_losses = bool(np.quantile(
+                    np.abs(steps - np.rint(steps).clip(1)), 0.99) < _STEP_SCATTER)
                 self.sensor = replace(self._unit, rate_hz=rate_hz)
                 self._period_ns = 1e9 / rate_hz
                 self._longest_ns = max(_MAX_FILLED_NS, _LATE_PERIODS * self._period_ns)
@@ -290,26 +283,10 @@ class EmulatedSensor(base.DeviceLink):
                            for k in range(1, steps)]
             places.append(len(forces))
             forces.append(ideal.force)
-            self._stamps_ns.append(ideal.stamp_ns)
             self._last = ideal
         volts = self._chain(np.array(forces), self._temperature_c)
         self._made += zip(self._held, volts[places])
-        self._since += len(self._held)
         self._held.clear()
-        if self._since >= _BLOCK:
-            self._since = 0
-            self._check_rate(1e9 / self._period_ns)
-
-    def _check_rate(self, rate_hz: float) -> None:
-        """Measure the rate of the newest samples; start again if the simulator has another one."""
-        time_s = _seconds(self._stamps_ns)
-        steps = np.diff(time_s) * rate_hz
-        self._shows_losses = _show_losses(steps)
-        # A burst at the end of the block may belong to it or not.
-        tolerance = _RATE_TOLERANCE + max(np.quantile(steps, 0.99) - 1, 0) / _BLOCK
-        if abs(rate_hz / stamped_rate_hz(time_s) - 1) > tolerance:
-            self._counts['rate_changes'] += 1
-            self._restart()
 
 
 def _in_case(fields: dict[str, np.ndarray], case: scipy.spatial.transform.Rotation | None
@@ -332,12 +309,3 @@ def _in_case(fields: dict[str, np.ndarray], case: scipy.spatial.transform.Rotati
         fields['orientation'] = (orientation * case).as_quat()
     return fields
 
-
-def _seconds(stamps_ns: Sequence[int]) -> np.ndarray:
-    """Return stamps, ns, (n,), as times since the first one, s."""
-    return (np.array(stamps_ns) - stamps_ns[0]) * 1e-9
-
-
-def _show_losses(steps: np.ndarray) -> bool:
-    """Return whether steps of stamps, periods, (n,), are whole periods, so that losses show."""
-    return bool(np.quantile(np.abs(steps - np.rint(steps).clip(1)), 0.99) < _STEP_SCATTER)

@@ -46,11 +46,8 @@ _STAGE_QUEUE = 1000
 _CHECK_POSES = {'full': 16, 'quick': 8}
 """Check poses by kind of the pose plan; chosen: about a tenth, or a fifth, of the poses."""
 _EXAMPLES = {
-    'a sweep on a stage, with a screen': '--ros-args -p output:=unit.yaml',
-    'a stage that is turned by hand':
-        '--ros-args -p stage.mode:=manual -p output:=unit.yaml',
-    'a three-axis sensor without a stage': '--ros-args -p mode:=gravity -p output:=unit.yaml',
-}
+    'a stage that is turned by hand': '--ros-args -p stage.mode:=manual -p output:=unit.yaml',
+    'a three-axis sensor without a stage': '--ros-args -p mode:=gravity -p output:=unit.yaml'}
 """Examples of arguments, by their purpose."""
 _SAMPLES = 'imu/data_raw'
 """Topic of the samples, relative to the namespace of the node."""

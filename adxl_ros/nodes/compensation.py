@@ -9,11 +9,11 @@ The topic tilt has three angles in a Vector3Stamped, so tf2 must not transform i
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from math import isfinite
 
 from adxl_ros.compensate import inversions
-from adxl_ros.compensate.compensation_policy import CompensationPolicy, Interval, State, Topics
+from adxl_ros.compensate.compensation_policy import CompensationPolicy, Interval, State
 from adxl_ros.compensate.live_stream import COUNTS, LiveStream
 from adxl_ros.errors import UserError
 from adxl_ros.files import imu_message, parameter_file
@@ -56,10 +56,8 @@ class MountingParameters:
         self._node, self._stream = node, stream
         self._frame_id = settings.mounting_frame_id
         self._waiting: Future | None = None
-        self._mount(_mounting(settings.rpy_rad, parameters.parameter_error))
-        # The file of the parameters has no part in what is set while the node runs.
-        parameters.on_change(node, _RPY, lambda value: _mounting(
-            value, lambda name, reason: UserError(f'{name}: {reason}')), self._mount)
+        self._mount(_mounting(settings.rpy_rad))
+        parameters.on_change(node, _RPY, _mounting, self._mount)
         # The answer comes after a second of samples, which the node takes meanwhile.
         node.create_service(Trigger, '~/level', self._on_level,
                             callback_group=ReentrantCallbackGroup())
@@ -86,13 +84,9 @@ class MountingParameters:
             return response
         rpy_rad = [round(angle, 6) for angle in levelled.rpy_rad]
         self._node.set_parameters([Parameter(_RPY, value=rpy_rad)])
-        degrees = ', '.join(f'{np.degrees(angle):.2f}' for angle in rpy_rad)
         response.success = True
-        yaml = f'[{", ".join(f"{angle:.6f}" for angle in rpy_rad)}]'
-        response.message = (
-            f'level: roll, pitch, yaw of the case are {degrees} deg, until this node ends; to '
-            f"keep them, start it with -p '{_RPY}:={yaml}', or write '/**: {{ros__parameters: "
-            f"{{{_RPY}: {yaml}}}}}' into a file and start it with --params-file")
+        response.message = (f"level, until this node ends; to keep it, start it with -p '{_RPY}:="
+                            f"[{', '.join(f'{angle:.6f}' for angle in rpy_rad)}]'")
         self._node.get_logger().info(response.message)
         return response
 
@@ -121,14 +115,11 @@ def level(mounting: Mounting, forces_mps2: np.ndarray, sensor: Sensor) -> Mounti
     return mounting.levelled(mean_mps2.tolist())
 
 
-def _mounting(rpy_rad: Sequence[float], refusal: Callable[[str, str], UserError]) -> Mounting:
+def _mounting(rpy_rad: Sequence[float]) -> Mounting:
     """Return the mounting of a parameter; refuse what is not three angles in rad."""
-    if len(rpy_rad) != 3 or not np.isfinite(rpy_rad).all():
-        raise refusal(_RPY, f'{list(rpy_rad)} is not roll, pitch and yaw in rad')
-    if np.abs(rpy_rad).max() > 2 * np.pi:
-        in_rad = ', '.join(f'{angle:.6g}' for angle in np.radians(rpy_rad))
-        raise refusal(_RPY, f'{list(rpy_rad)} is more than a turn in rad; if it is in degrees, '
-                      f'write [{in_rad}]')
+    if len(rpy_rad) != 3 or not np.abs(rpy_rad).max() <= 2 * np.pi:
+        raise parameters.parameter_error(_RPY, f'{list(rpy_rad)} is not roll, pitch and yaw in '
+                                         'rad, each within a turn')
     roll, pitch, yaw = map(float, rpy_rad)
     return Mounting((roll, pitch, yaw))
 
@@ -139,12 +130,8 @@ _LOOK_S = 0.5
 """Time between two looks at who publishes and, where it is unknown, at the sensor, s; chosen."""
 _LEVELS = {State.REFUSED: Level.ERROR, State.COMPENSATING: Level.OK}
 """Levels of the states; all others are warnings."""
-_EXAMPLES = {
-    'the newest calibration of the unit in the store': '',
-    'a calibration by its file': '--ros-args -p calibration:=unit.yaml',
-    'a sensor that moves, without the lag of its filter':
-        '--ros-args -p calibration:=unit.yaml -p undo_filter:=true',
-}
+_EXAMPLES = {'the newest calibration of the unit in the store': '',
+             'a calibration by its file': '--ros-args -p calibration:=unit.yaml'}
 """Examples of arguments, by their purpose."""
 
 
@@ -177,9 +164,7 @@ class Compensation(Node):
             paper, settings.undo_filter, self._publish, tilt.publish,
             settings.orientation == 'keep', free.publish if free else None,
             settings.output_rate_hz)
-        self._policy = CompensationPolicy(paper, settings.store, Topics(**{
-            name.replace('imu/', ''): self.resolve_topic_name(name)
-            for name in ('imu/data_raw', 'sensor_info', 'temperature', 'supply')}))
+        self._policy = CompensationPolicy(paper, settings.store, self.resolve_topic_name)
         self._samples = topics.Inbox(self, Imu, 'imu/data_raw', _DEPTH)
         self._flat = parameters.given_sensor(self)
         own = parameters.make_sensor(self._flat, may_measure=True), (

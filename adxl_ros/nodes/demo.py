@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Run the main job: a simulated sweep, and a real recording, through the live graph."""
+"""Run the main job: a simulated sweep through the live graph."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 import json
 import math
@@ -14,15 +14,14 @@ import subprocess
 import sys
 import time
 
-from adxl_ros.calibrate.fits import gravity_fit, linear
-from adxl_ros.calibrate.fits.full_model import default_terms
+from adxl_ros.calibrate.fits import linear
 from adxl_ros.calibrate.guided import pose_plan
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.calibrate.report import acceptance, held_out as unseen
+from adxl_ros.calibrate.report import held_out as unseen
 from adxl_ros.calibrate.report.acceptance import acceptance_lines, screen_table
 from adxl_ros.calibrate.result import compare, truth_table
 from adxl_ros.errors import UserError
-from adxl_ros.files import parameter_file, recording, sweep_journal
+from adxl_ros.files import parameter_file, sweep_journal
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes import jobs
@@ -34,7 +33,6 @@ import numpy as np
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from std_srvs.srv import Trigger
 
 _FIT_S = 600.0
 """Longest time of a fit, s; chosen: far above the seconds that a fit takes."""
@@ -77,8 +75,7 @@ _UNATTENDED = {'autostart': True, 'screen': False,
                'qos_overrides./imu/data_raw.subscription.depth': _QUEUE}
 """Parameters of a calibration that nobody controls and that loses no sample: at many times real
 time, a best-effort subscriber loses samples on a busy machine."""
-_EXAMPLES = {'the simulated sensor': '-o demo_output',
-             'a real recording, too': '--real imu.csv -o demo_output'}
+_EXAMPLES = {'the simulated sensor': '-o demo_output'}
 """Examples of arguments, by their purpose."""
 NEXT_PAGE = 'docs/start/tilt.md'
 """Page that a user reads next."""
@@ -87,13 +84,12 @@ NEXT_PAGE = 'docs/start/tilt.md'
 class DemoGraph:
     """The nodes that the demonstration runs, each in a process of its own."""
 
-    def __init__(self, log: Path) -> None:
-        self._log = log
+    def __init__(self, output: Path) -> None:
+        self._output, self._log = output, output.with_suffix('.log')
         self._processes: dict[str, subprocess.Popen] = {}
         self.reports: dict[str, dict[str, str]] = {}  # Newest diagnostics by node
         self._node = Node('demo')
         self._node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
-        self._finish = self._node.create_client(Trigger, 'calibration/finish')
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
 
@@ -101,14 +97,6 @@ class DemoGraph:
         for status in message.status:
             self.reports[status.name.split(':')[0]] = {
                 'message': status.message, **{pair.key: pair.value for pair in status.values}}
-
-    def finish(self) -> str:
-        """Let the calibration fit what it has; return its answer."""
-        future = self._finish.call_async(Trigger.Request())
-        self._executor.spin_until_future_complete(future, timeout_sec=_FIT_S)
-        if not future.done():
-            raise UserError(f'calibration/finish: no answer for {_FIT_S:g} s')
-        return future.result().message
 
     def start(self, name: str, params_file: Path, parameters: Mapping[str, object]) -> None:
         """Start a node that follows the clock of the driver."""
@@ -118,12 +106,6 @@ class DemoGraph:
             command += ['-p', f'{key}:={json.dumps(value, ensure_ascii=False, default=str)}']
         with self._log.open('ab') as log:
             self._processes[name] = subprocess.Popen(command, stdout=log, stderr=log)
-
-    def start_calibration(self, params_file: Path, output: Path, parameters: Mapping[str, object]
-                          ) -> None:
-        """Start a calibration that writes a file, and keeps a copy beside it."""
-        self.start('calibration', params_file, {**_UNATTENDED, **parameters, 'output': output,
-                                                'store': output.parent / 'calibrations'})
 
     def close(self) -> None:
         """End the nodes."""
@@ -138,29 +120,41 @@ class DemoGraph:
         while not finished():
             self._executor.spin_once(timeout_sec=_POLL_S)
             message = self.reports.get('calibration', {}).get('message', '')
-            ended = [name for name, process in self._processes.items()
-                     if process.poll() is not None]
-            if ended:
-                raise UserError(f'the node {ended[0]} has ended; see {self._log}')
-            if message.startswith('cannot finish'):
-                raise UserError(f'{message}; see {self._log}')
             # The message counts seconds of silence, too, which are no progress.
             if (news := progress() or message) != newest:
                 newest, changed_s = news, time.monotonic()
-            if time.monotonic() - changed_s > silent_s:
-                raise UserError(f'no progress for {silent_s:g} s; the calibration reported: '
-                                f'{message or "nothing"}; see {self._log}')
+            ended = [name for name, process in self._processes.items()
+                     if process.poll() is not None]
+            if ended or message.startswith('cannot finish') \
+                    or time.monotonic() - changed_s > silent_s:
+                what = f'the node {ended[0]} has ended' if ended else message or 'no progress'
+                raise UserError(f'{what}; see {self._log}')
+
+    def entries(self) -> list[sweep_journal.JournalEntry]:
+        """Return the entries of the journal; none while it has no head."""
+        with suppress(UserError):
+            return sweep_journal.read(_journal(self._output)).entries
+        return []
+
+    def fitted_poses(self) -> list[sweep_journal.PoseRecord]:
+        """Return the poses of the fit; the journal has them when everything is written."""
+        return [pose for entry in self.entries()
+                if isinstance(entry, sweep_journal.Fitted) for pose in entry.rests or ()]
+
+
+def _journal(output: Path) -> Path:
+    """Return the journal of the calibration that writes a parameter file."""
+    return output.with_name(f'{output.name}.journal')
 
 
 @contextmanager
 def open_graph(output: Path) -> Iterator[DemoGraph]:
     """Yield a graph for a parameter file that is to be written, and end its nodes at the end."""
-    log = output.with_suffix('.log')
     # Results of an earlier demonstration would pass for those of this one.
-    for path in (output, _journal(output), log):
+    for path in (output, _journal(output), output.with_suffix('.log')):
         path.unlink(missing_ok=True)
     rclpy.init(args=[])
-    graph = DemoGraph(log)
+    graph = DemoGraph(output)
     try:
         yield graph
     finally:
@@ -174,8 +168,6 @@ def main() -> int:
     parser = program_parser('demo', __doc__, _EXAMPLES)
     parser.add_argument('-o', dest='output', metavar='DIR', default='demo_output', type=Path,
                         help='folder of pages and calibrations (default demo_output)')
-    parser.add_argument('--real', metavar='CSV', type=Path,
-                        help='a three-axis recording turned by hand, calibrated too')
     parser.add_argument('--speed', type=float, default=_SPEED,
                         help=f'sensor time per real time (default {_SPEED:g})')
     parser.add_argument('--seed', type=int, default=_SEED,
@@ -186,16 +178,11 @@ def main() -> int:
             parser.error(f'--{name}: {value} is not between {lowest} and {highest}')
     jobs.use_own_graph()
     try:
-        # A recording that cannot be read is refused before the sweep.
-        length_s = 0.0 if options.real is None else \
-            float(np.ptp(recording.read(options.real).time_s))
         try:
             options.output.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UserError(f'{options.output}: {error.strerror}') from None
         _run_sweep(options.output, options.speed, options.seed)
-        if options.real is not None:
-            _run_recording(options.output, options.real, length_s)
         _print('', *file_lines({'Next': f'your own sensor: {NEXT_PAGE}'}))
     except UserError as error:
         print(f'demo: {error}', file=sys.stderr)
@@ -220,16 +207,29 @@ def _run_sweep(folder: Path, speed: float, seed: int) -> None:
     with open_graph(output) as graph:
         graph.start('driver', unit, _KEEPING | {'link.type': 'sim', 'link.speed': speed})
         graph.start('stage', nominal, {'delay_s': _DELAY_S, 'seed': seed})
-        graph.start_calibration(nominal, output, {
-            'report': report, 'sweep.planes_deg': _PLANES_DEG, 'sweep.step_deg': _STEP_DEG,
+        graph.start('calibration', nominal, {
+            **_UNATTENDED, 'output': output, 'store': folder / 'calibrations', 'report': report,
+            'sweep.planes_deg': _PLANES_DEG, 'sweep.step_deg': _STEP_DEG,
             'sweep.check_poses': _CHECK_POSES})
-        poses = _show_sweep(graph, output)
+        total = len(pose_plan.guided(np.radians(_PLANES_DEG).tolist(),
+                                     float(np.radians(_STEP_DEG)), _CHECK_POSES))
+        with jobs.Step('1/3 sweep', 'starting', total) as step:
+            def accepted() -> int:
+                count = len(sweep_journal.accepted_poses(graph.entries()))
+                step.show(f'{count} of {total} poses', count)
+                return count
+            graph.wait(lambda: accepted() == total, accepted, _SILENT_S)
+        fitting = f'{total - _CHECK_POSES} poses'
+        with jobs.Step('2/3 fit', fitting) as step:
+            graph.wait(output.exists)
+            step.show(f'{fitting}, {parameter_file.load(output).model} model')
+        with jobs.Step('3/3 check', f'{_CHECK_POSES} poses that the fit has not seen'):
+            graph.wait(lambda: bool(graph.fitted_poses()))
+            graph.close()
+        poses = Poses.from_records(graph.fitted_poses())
     fitted = parameter_file.load(output)
-    expected = {*default_terms(fitted.axes), *truth.effects}
     _print('', *screen_table(_held_out_errors(sensor, fitted, poses)), '',
-           *truth_table(compare(fitted, truth)), '', *acceptance_lines(fitted),
-           *[f'       The fit has the term {effect}, which this unit does not have.'
-             for effect in fitted.effects if effect not in expected], '',
+           *truth_table(compare(fitted, truth)), '', *acceptance_lines(fitted), '',
            *file_lines({'Page': report / 'report.html', 'Calibration': output}))
 
 
@@ -258,58 +258,6 @@ def _held_out_errors(nominal: Sensor, fitted: Sensor, poses: Poses
             for model, sensor in models.items()]
 
 
-def _show_sweep(graph: DemoGraph, output: Path) -> Poses:
-    """Show the sweep, the fit and the check while they run; return the poses."""
-    total = len(pose_plan.guided(np.radians(_PLANES_DEG).tolist(), float(np.radians(_STEP_DEG)),
-                                 _CHECK_POSES))
-    with jobs.Step('1/3 sweep', 'starting', total) as step:
-        def accepted() -> int:
-            return _show_accepted(step, output, f' of {total} poses')
-        graph.wait(lambda: accepted() == total, accepted, _SILENT_S)
-    fitting = f'{total - _CHECK_POSES} poses'
-    with jobs.Step('2/3 fit', fitting) as step:
-        graph.wait(output.exists)
-        step.show(f'{fitting}, {parameter_file.load(output).model} model')
-    with jobs.Step('3/3 check', f'{_CHECK_POSES} poses that the fit has not seen'):
-        graph.wait(lambda: bool(_fitted_poses(output)))
-        graph.close()
-    return Poses.from_records(_fitted_poses(output))
-
-
-def _run_recording(folder: Path, path: Path, length_s: float) -> None:
-    """Calibrate a recorded sensor against gravity, replayed through the graph."""
-    output, report = folder / f'{path.stem}.yaml', folder / path.stem
-    _print('', title(f'Real recording {path.name}: a sensor turned by hand',
-                     length_s / _SPEED + _OVERHEAD_S), '')
-    nominal_path = parameter_file.nominal_path()
-    with open_graph(output) as graph:
-        graph.start_calibration(nominal_path, output, {'report': report, 'mode': 'gravity'})
-        graph.start('driver', nominal_path, _KEEPING | {
-            'link.type': 'replay', 'link.recording': path, 'link.speed': _SPEED})
-        poses = _show_replay(graph, output, path)
-    fitted = parameter_file.load(output)
-    nominal = replace(fitted.without_covariance(), effects=(), values={})
-    _print('', *acceptance.gravity_lines(
-        gravity_fit.fit_gravity(poses.volts, poses.std_v, nominal), poses.time_s[:, 0]), '',
-           *file_lines({'Page': report / 'report.html', 'Calibration': output}))
-
-
-def _show_replay(graph: DemoGraph, output: Path, path: Path) -> Poses:
-    """Show the replay of a recording and the fit while they run; return the rests."""
-    with jobs.Step('1/2 replay', 'starting') as step:
-        graph.wait(lambda: graph.reports.get('driver', {}).get('link_state') == 'ended',
-                   lambda: _show_accepted(step, output, ' rests'), _SILENT_S)
-        rests = _show_accepted(step, output, ' rests')
-    with jobs.Step('2/2 fit', f'{rests} rests') as step:
-        answer = graph.finish()
-        if not output.exists():
-            raise UserError(f'{path}: {answer}')
-        poses = Poses.from_records(_fitted_poses(output))
-        step.show(f'{len(poses)} rests, magnitude of gravity')
-        graph.close()
-    return poses
-
-
 def title(text: str, seconds: float) -> str:
     """Return a title with the time, s, that its part takes."""
     takes = f'{seconds / 60:.0f} min' if seconds >= 90 else f'{math.ceil(seconds / 10) * 10} s'
@@ -324,30 +272,3 @@ def file_lines(values: dict[str, object]) -> list[str]:
 def _print(*lines: str) -> None:
     """Print lines; PASS and FAIL are coloured in a terminal."""
     print(*map(coloured, lines), sep='\n', flush=True)
-
-
-def _journal(output: Path) -> Path:
-    """Return the journal of the calibration that writes a parameter file."""
-    return output.with_name(f'{output.name}.journal')
-
-
-def _show_accepted(step: jobs.Step, output: Path, unit: str) -> int:
-    """Show and return how many poses the journal has so far."""
-    count = len(sweep_journal.accepted_poses(_entries(output)))
-    if count:
-        step.show(f'{count}{unit}', count)
-    return count
-
-
-def _fitted_poses(output: Path) -> list[sweep_journal.PoseRecord]:
-    """Return the poses that were fitted; the journal has them when everything is written."""
-    fits = [entry for entry in _entries(output) if isinstance(entry, sweep_journal.Fitted)]
-    return list(fits[0].rests or ()) if fits else []
-
-
-def _entries(output: Path) -> list[sweep_journal.JournalEntry]:
-    """Return the entries of the journal; none while it has no head."""
-    try:
-        return sweep_journal.read(_journal(output)).entries
-    except UserError:
-        return []

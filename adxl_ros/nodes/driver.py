@@ -21,12 +21,9 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 _SIMULATED = f'SIMULATED sensor (link.type: {base.DEFAULT_LINK})'
 """Words of log and diagnostics where no sensor is read."""
 _EXAMPLES = {
-    'a simulated sensor': '',
     'a board on a serial port': '--ros-args -p link.type:=serial -p link.port:=/dev/ttyACM0',
-    'an ADC of the kernel': '--ros-args -p link.type:=iio -p link.device:=ads8688',
     "a realistic sensor on a simulator's ideal one": '--ros-args -p link.type:=topic -p '
-    'link.topic:=/imu -p use_sim_time:=true --params-file gap/params.yaml',
-}
+    'link.topic:=/imu -p use_sim_time:=true --params-file gap/params.yaml'}
 """Examples of arguments, by their purpose."""
 
 
@@ -73,7 +70,6 @@ class Driver(LifecycleNode):
         self._simulates = self._link == base.DEFAULT_LINK
         self._tally = Tally(STEADY.now().nanoseconds)
         self._fault = ''
-        self._refusal: UserError | None = None
         self._announces = not own.autostart
         self._output: SampleOutput | None = None
         self._reader: LinkReader | None = None
@@ -82,8 +78,8 @@ class Driver(LifecycleNode):
             self._announce('unconfigured')
         elif self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
             self.trigger_activate()
-        if self._refusal is not None:
-            raise self._refusal
+        if self._fault:
+            raise UserError(self._fault)
         self._announces = True
 
     def configure(self) -> None:
@@ -123,11 +119,7 @@ class Driver(LifecycleNode):
                 # A signal has ended the context, and whatever was being made failed by that.
                 return TransitionCallbackReturn.FAILURE
             if isinstance(error, UserError):
-                if self._announces:
-                    self._fail(error)
-                else:
-                    # Links wait for a device that is away: only the parameters can be wrong.
-                    self._refusal = error
+                self._fail(error)
                 return TransitionCallbackReturn.FAILURE
             self._fault = f'the driver has failed: {one_line(error)}'
             self.get_logger().fatal(traceback.format_exc())
@@ -152,8 +144,10 @@ class Driver(LifecycleNode):
     def _fail(self, error: UserError) -> None:
         """Report why there are no samples, and stay up."""
         self._fault = str(error)
-        self.get_logger().error(self._fault)
-        self._diagnostics.notice(Level.ERROR)
+        # During the start the node ends with it: the parameters are wrong.
+        if self._announces:
+            self.get_logger().error(self._fault)
+            self._diagnostics.notice(Level.ERROR)
 
     def _status(self) -> Status:
         link = self._link_status()

@@ -14,7 +14,7 @@ from textwrap import wrap
 from adxl_ros.files.bag_writer import LiveBag
 from adxl_ros.investigate import diagnosis_round
 from adxl_ros.investigate.diagnosis_round import Answer, Outcome, OutputFolder
-from adxl_ros.investigate.investigation import Investigation, State, Status as Situation
+from adxl_ros.investigate.investigation import Investigation, State
 from adxl_ros.investigate.manoeuvres import CATALOGUE, Pose, StageLimits
 from adxl_ros.links.support.base import Watchdog
 from adxl_ros.nodes import topics
@@ -38,38 +38,17 @@ _INDENT = 11 * ' '
 """Spaces in place of the time at the beginning of a line."""
 _MOST_NAMED = 3
 """Largest number of hypotheses in a line; chosen: a reader keeps them in mind."""
-_SMALLEST_SHOWN = 0.01
-"""Probability below which a hypothesis is not named. Chosen: the smallest number that is shown."""
-
-
-def opening_lines(folder: Path, limits: StageLimits, minutes: float) -> list[str]:
-    """Return what is about to happen."""
-    ranges = ', '.join(f'{joint} {low:.0f} to {high:.0f}°' for joint, (low, high) in (
-        ('alpha', np.degrees(limits.alpha_rad)), ('beta', np.degrees(limits.beta_rad))))
-    return [f'Investigation into {folder}, manoeuvres of {minutes:g} minutes at most',
-            f'Stage within {ranges}, {np.degrees(limits.rate_rad_s):.3g}°/s', '']
 
 
 def answer_lines(minutes: float, answer: Answer) -> list[str]:
     """Return the probabilities after a diagnosis, and what follows."""
-    named = [hypothesis for hypothesis in answer.hypotheses[:_MOST_NAMED]
-             if hypothesis.probability >= _SMALLEST_SHOWN]
-    parts = [f'{diagnosis_round.hypothesis_text(h.effects)} {percent(h.probability)}'
-             for h in named]
-    others = 1 - sum(hypothesis.probability for hypothesis in named)
-    if others >= _SMALLEST_SHOWN / 2:
-        parts.append(f'others {percent(others)}')
-    lines = wrap(f'{minutes:5.1f} min  {"  ".join(parts)}', COLUMNS, subsequent_indent=_INDENT)
+    named = '  '.join(f'{diagnosis_round.hypothesis_text(h.effects)} {percent(h.probability)}'
+                      for h in answer.hypotheses[:_MOST_NAMED])
+    lines = wrap(f'{minutes:5.1f} min  {named}', COLUMNS, subsequent_indent=_INDENT)
     if answer.outcome is Outcome.GO_ON:
         lines += wrap(f'next: {CATALOGUE[answer.manoeuvre].text}', COLUMNS,
                       initial_indent=_INDENT, subsequent_indent=_INDENT)
     return lines
-
-
-def status_line(status: Situation) -> str:
-    """Return one line about what happens now."""
-    remaining = f', {status.remaining_s:.0f} s left' if status.state is State.MOVING else ''
-    return f'{status.minutes:5.1f} min{remaining}  {status.text}'[:COLUMNS]
 
 
 def closing_lines(investigation: Investigation, folder: OutputFolder) -> list[str]:
@@ -165,12 +144,9 @@ _FAREWELL_S = 0.5
 """Time for which the last command is repeated at the end, s; chosen: the stage has it then."""
 _COMMAND_QUEUE = 10
 """Commands that are kept for a slow subscriber; chosen."""
-_EXAMPLES = {
-    'a simulated stage, driver and stage running': '',
-    'a unit by its parameter file, within limits':
-        '--ros-args --params-file unit.yaml -p limits.rate_deg_s:=10.0 '
-        "-p 'limits.beta_deg:=[-90.0,90.0]'",
-}
+_EXAMPLES = {'a unit by its parameter file, within limits':
+             '--ros-args --params-file unit.yaml -p limits.rate_deg_s:=10.0 '
+             "-p 'limits.beta_deg:=[-90.0,90.0]'"}
 """Examples of arguments, by their purpose."""
 
 
@@ -188,8 +164,8 @@ class Investigate(Node):
         self._settings = own = declare_all(self, InvestigateSettings)
         alpha_deg = low_and_high('limits.alpha_deg', own.alpha_deg, (0.0, 180.0))
         beta_deg = low_and_high('limits.beta_deg', own.beta_deg, (0.0, 360.0))
-        self._limits = limits = StageLimits(_radians(alpha_deg), _radians(beta_deg),
-                                            float(np.radians(own.rate_deg_s)))
+        alpha_rad, beta_rad = np.radians([alpha_deg, beta_deg]).tolist()
+        self._limits = limits = StageLimits(alpha_rad, beta_rad, float(np.radians(own.rate_deg_s)))
         self._commands = topics.create_publisher(self, JointState, 'stage/command', _COMMAND_QUEUE)
         self.create_service(Trigger, '~/abort', self._on_abort)
         topics.create_subscription(self, JointState, 'stage/joint_states', self._on_stage,
@@ -216,7 +192,12 @@ class Investigate(Node):
     def begin(self) -> None:
         """Wait for sensor and stage; the files are made when both are there."""
         self._screen = LiveLine()
-        self._print(opening_lines(self._folder.path, self._limits, self._settings.minutes))
+        ranges = ', '.join(f'{joint} {low:.0f} to {high:.0f}°' for joint, (low, high) in (
+            ('alpha', np.degrees(self._limits.alpha_rad)),
+            ('beta', np.degrees(self._limits.beta_rad))))
+        self._print([f'Investigation into {self._folder.path}: {ranges}, '
+                     f'{np.degrees(self._limits.rate_rad_s):.3g}°/s, '
+                     f'{self._settings.minutes:g} minutes at most', ''])
         self._recorder.listen()
         self.create_timer(_POLL_S, self._poll, clock=topics.STEADY)
 
@@ -244,7 +225,9 @@ class Investigate(Node):
                 header=Header(stamp=self.get_clock().now().to_msg()), name=['alpha', 'beta'],
                 position=list(command), velocity=list(investigation.speed or ())))
         if self._screen is not None:
-            self._screen.show(status_line(investigation.status()))
+            status = investigation.status()
+            left = f', {status.remaining_s:.0f} s left' if status.state is State.MOVING else ''
+            self._screen.show(f'{status.minutes:5.1f} min{left}  {status.text}'[:COLUMNS])
         if investigation.has_ended:
             self._end(investigation)
 
@@ -297,11 +280,6 @@ class Investigate(Node):
             values |= {'hypothesis': ' '.join(best.effects) or 'no gap',
                        'probability': best.probability}
         return Status(level, status.text, self._sensor.serial, values)
-
-
-def _radians(range_deg: tuple[float, float]) -> tuple[float, float]:
-    low_rad, high_rad = np.radians(range_deg).tolist()
-    return low_rad, high_rad
 
 
 def _work(node: Investigate, executor: Executor) -> None:

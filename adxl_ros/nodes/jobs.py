@@ -23,10 +23,6 @@ _FIRST_DOMAIN = 60
 """First ROS domain of jobs; chosen: beyond those that robots use."""
 _DOMAINS = 40
 """Number of ROS domains of jobs; chosen: the last one is below 101, the last safe one."""
-_USER_TIME = 11
-"""Place of the user time in /proc/PID/stat, from 0, behind the command's name (man 5 proc)."""
-_SYSTEM_TIME = 12
-"""Place of the system time, counted in the same way."""
 
 
 def use_own_graph() -> None:
@@ -63,8 +59,9 @@ def stop(processes: Sequence[subprocess.Popen]) -> None:
 
 def cpu_time_s(pid: int) -> float:
     """Return the time that a process has spent on a core so far, s."""
+    # Behind the name of the command, its user and system time are fields 11 and 12 (man 5 proc).
     fields = Path(f'/proc/{pid}/stat').read_text().rsplit(')', 1)[1].split()
-    return (int(fields[_USER_TIME]) + int(fields[_SYSTEM_TIME])) / os.sysconf('SC_CLK_TCK')
+    return sum(map(int, fields[11:13])) / os.sysconf('SC_CLK_TCK')
 
 
 @contextmanager
@@ -101,8 +98,6 @@ _NAME_WIDTH = 11
 """Columns of the name of a step."""
 _TEXT_WIDTH = 16
 """Columns of the text beside a bar."""
-_TENTHS = 10
-"""Largest number of lines of a step where nothing is drawn."""
 _LINE_WIDTH = 69
 """Columns of a line without a bar, before its time."""
 
@@ -140,13 +135,13 @@ class Step(LiveLine):
     """
     One step of a job while it runs: a line with the time and, where the total is known, a bar.
 
-    Where nothing can be drawn, there is a line for each tenth of the total, and one at the end.
+    Where nothing can be drawn, there is one line at the end.
     """
 
     def __init__(self, name: str, text: str, total: int = 0) -> None:
         columns = (_BAR_WIDTH, '{task.percentage:3.0f} %') if total else ()
         super().__init__(*columns, '{task.elapsed:4.0f} s', total=total)
-        self._name, self._total, self._begin_s, self._tenth = name, total, time.monotonic(), 0
+        self._name, self._total, self._begin_s = name, total, time.monotonic()
         self.show(text)
 
     def __enter__(self) -> Step:
@@ -159,18 +154,9 @@ class Step(LiveLine):
         line = f' {self._name:{_NAME_WIDTH}} {text:{width}}'
         self._plain = line + share
         super().show(line, done)
-        tenth = _TENTHS * done // self._total if self._total else 0
-        if self._tenth < tenth < _TENTHS:
-            self._print()
-        self._tenth = max(tenth, self._tenth)
 
     def __exit__(self, kind: object, *_: object) -> None:
         """Stop drawing; a step that has failed leaves no line."""
-        if kind is None:
-            self._print()
-        self.close()
-
-    def _print(self) -> None:
-        """Print the line with its time where nothing is drawn."""
-        if self._progress is None:
+        if kind is None and self._progress is None:
             print(f'{self._plain} {time.monotonic() - self._begin_s:4.0f} s', flush=True)
+        self.close()

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-import difflib
 import time
 from typing import Any, NamedTuple
 
@@ -19,7 +18,6 @@ from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction, Shutd
 from launch.events.process import ProcessExited
 from launch.launch_context import LaunchContext
 from launch.launch_description import LaunchDescription
-from launch.logging import get_logger
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
@@ -31,8 +29,6 @@ _MOST_REFUSALS = 3
 """Failed starts of a node after which a launch ends; chosen: a device may come late once."""
 _REFUSALS_S = 60.0
 """Time within which failed starts count, s; chosen: three starts on a slow machine."""
-_LEAST_LIKENESS = 0.6
-"""Smallest likeness of a misspelt name, by difflib; chosen: `params` is like `params_file`."""
 _PUSHED = 'ros_namespace'
 """Where launch_ros keeps the namespace that a launch file around this one has pushed."""
 
@@ -45,33 +41,27 @@ class Argument(NamedTuple):
 
     def declared(self) -> DeclareLaunchArgument:
         """Return the action that declares it; an empty value leaves the parameter as it is."""
-        links = settings.links_by_parameter().get(self.spec.name)
-        used_by = f'{" and ".join(links)}: ' if links else ''
-        return declared(self.name, '', f'{used_by}{self.spec.meaning}; not given: as in '
-                        'params_file, or the default', *('',) * bool(self.spec.choices),
-                        *self.spec.choices)
+        return declared(self.name, '', f'{self.spec.meaning}; not given: as in params_file, or '
+                        'the default', *('',) * bool(self.spec.choices), *self.spec.choices)
 
     def value(self, text: str) -> Any:
         """Return the value of the parameter."""
         default = self.spec.default
         # A list of numbers has a unit; names with commas stay one text.
         kind = str if default == () and not self.spec.unit else type(default)
-        convert, expected = _KINDS.get(kind, (str, ''))
         try:
-            return convert(text)
+            return _CONVERSIONS.get(kind, str)(text)
         except ValueError:
-            raise UserError(f'{self.name}:={text}: expected {expected}') from None
+            raise UserError(f'{self.name}:={text}: expected a number, or numbers with commas '
+                            'where it is a list') from None
 
 
 def _numbers(text: str) -> list[float]:
     return [float(part) for part in text.strip('[]').split(',')]
 
 
-_KINDS: dict[type, tuple[Callable[[str], Any], str]] = {
-    int: (int, 'a whole number'), float: (float, 'a number'),
-    tuple: (_numbers, 'numbers with commas, such as 30,60,90')}
-"""Conversion of an argument, and what is expected, by the type of the default."""
-
+_CONVERSIONS: dict[type, Callable[[str], Any]] = {int: int, float: float, tuple: _numbers}
+"""Conversions of an argument by the type of the default."""
 
 def arguments(own: type, *parameters: str, **renamed: str) -> tuple[Argument, ...]:
     """
@@ -125,24 +115,8 @@ def common_arguments(*own: Argument) -> list[DeclareLaunchArgument]:
 
 def describe(arguments: Sequence[DeclareLaunchArgument],
              make_nodes: Callable[[LaunchContext], list[Action]]) -> LaunchDescription:
-    """Describe a launch, which warns of misspelt arguments."""
-    return LaunchDescription([
-        *arguments,
-        OpaqueFunction(function=_warn_of_misspelt, args=[[part.name for part in arguments]]),
-        OpaqueFunction(function=make_nodes)])
-
-
-def _warn_of_misspelt(context: LaunchContext, names: Sequence[str]) -> None:
-    """
-    Warn of misspelt arguments, which ros2 launch ignores without a message.
-
-    They are no error: a launch file that includes this one may have arguments of its own.
-    """
-    for name in sorted(context.launch_configurations.keys() - {*names, _PUSHED}):
-        near = difflib.get_close_matches(name, names, 1, _LEAST_LIKENESS)
-        if near:
-            get_logger('launch.user').warning(
-                f'{name}:=... is no argument of this launch; did you mean {near[0]}?')
+    """Describe a launch by its arguments and what makes its nodes."""
+    return LaunchDescription([*arguments, OpaqueFunction(function=make_nodes)])
 
 
 def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, Any],

@@ -14,7 +14,6 @@ from adxl_ros.files import cdr
 from adxl_ros.links.support.base import ImuLink, Level, Link, LinkStatus, StageLink
 from adxl_ros.nodes import topics
 from adxl_ros.nodes.sample_output import References, SampleOutput
-from rclpy.clock import ROSClock
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, JointState, Temperature
 
@@ -27,12 +26,7 @@ _PAUSE_S = 0.004
 """Time between two looks at the samples, s. At 1 kHz four of them then share a run of the chain,
 which costs as much as ten samples."""
 _LOOK_S = 1.0
-"""Time between two looks at publishers and clock of the samples, s; chosen."""
-_FOREIGN_S = 60.0
-"""Distance from the clock of the node at which stamps are of another clock, s; chosen."""
-_FOREIGN_LOOKS = 5
-"""Looks at such stamps in a row before a warning. Chosen: within it nodes find each other, and a
-reset of the simulator reaches samples and /clock."""
+"""Time between two looks at the publishers of the samples, s; chosen."""
 
 
 class SimulatorInput:
@@ -41,7 +35,6 @@ class SimulatorInput:
     def __init__(self, node: Node, link: ImuLink) -> None:
         self._node, self._link = node, link
         self.frame_id = ''  # Frame of the newest samples
-        self._foreign_looks = 0  # Newest looks in a row at stamps of another clock
         self._due_s = self._looked_s = time.monotonic()
         self._inbox = topics.Inbox(node, Imu, link.imu_topic, _SIMULATOR_QUEUE)
         self._temperature = topics.create_subscription(
@@ -59,26 +52,14 @@ class SimulatorInput:
         self._inbox.wait()
         self._due_s = time.monotonic() + _PAUSE_S
         raws = self._inbox.take()
-        is_due = self._due_s > self._looked_s + _LOOK_S
-        if not raws or is_due:
+        if not raws or self._due_s > self._looked_s + _LOOK_S:
             topic = self._node.resolve_topic_name(self._link.imu_topic)
             self._link.sense_publishers(self._node.count_publishers(topic), self._inbox.fault())
             self._looked_s = self._due_s
         if raws:
             stamps_ns, fields = topics.decoded(raws, cdr.imu, **_FIELDS)
             self.frame_id = cdr.imu(raws[-1]).texts['frame_id']
-            if is_due:
-                self._look_at_clock(int(stamps_ns[-1]))
             self._link.sense_imu(stamps_ns, fields)
-
-    def _look_at_clock(self, stamp_ns: int) -> None:
-        """Warn once of samples that go on to be of another clock than the node's."""
-        away_s = (self._node.get_clock().now().nanoseconds - stamp_ns) * 1e-9
-        self._foreign_looks = self._foreign_looks + 1 if abs(away_s) > _FOREIGN_S else 0
-        if self._foreign_looks == _FOREIGN_LOOKS:
-            self._node.get_logger().warning(
-                f'{self._link.imu_topic}: stamps are {away_s:+.0f} s from the clock of this '
-                'node; set use_sim_time:=true, and let the simulator publish /clock')
 
 
 _PERIOD_S = 0.004
@@ -113,9 +94,7 @@ class LinkReader:
                  on_error: Callable[[UserError], None], on_level: Callable[[Level], None]) -> None:
         self._node, self._link, self._output, self._settings = node, link, output, settings
         self._on_level = on_level
-        ros = node.get_clock()
-        assert isinstance(ros, ROSClock), 'the clock of a node is that of ROS'
-        self._ros = ros
+        self._ros: Any = node.get_clock()
         self._is_real_time = False
         self._now_ns: int | None = None
         self._subscribed_ns = 0
@@ -130,9 +109,6 @@ class LinkReader:
             if isinstance(link, ImuLink):
                 self._simulator = SimulatorInput(node, link)
                 on_close.callback(self._simulator.destroy)
-            elif link.live and node.get_parameter('use_sim_time').value:
-                node.get_logger().warning('use_sim_time: a real device lives in real time; its '
-                                          'samples are stamped by the system clock')
             self._references = References(node, output.frame_id, link.references)
             on_close.callback(self._references.destroy)
             status = link.status()

@@ -29,67 +29,40 @@ from rclpy.node import Node
 from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
 from std_srvs.srv import Trigger
 
-_TOGETHER_NS = 120_000_000_000
-"""Time within which changes are one event, ns; chosen: slow axes are found later."""
+
+def gap_status(live: LiveGap, likely: DiagnosisResult | None, window_s: float) -> Status:
+    """Return text, level and values of the gap, its newest change, and the newest diagnosis."""
+    gaps, changed = live.report(), live.changes[-1:]
+    text = 'comparing; the first result takes some seconds'
+    values: dict[str, object] = {'window_s': window_s, 'changes': len(live.changes)}
+    if gaps:
+        text = ', '.join(f'{name} {", ".join(parts)} mg' for name, parts in {
+            'gap': [f'{gap.axis} {gap.gap.value:.3g}' for gap in gaps],
+            'floor': [f'{gap.axis} {gap.floor.value:.3g}' for gap in gaps]}.items())
+    for change in changed:
+        since = iso_time(change.since_ns)
+        text += f'; changed since {since}: {change.text()}'
+        values |= {'changed_since': since, 'changed_since_s': change.since_ns * 1e-9,
+                   'detected_s': change.detected_ns * 1e-9}
+    if likely is not None:
+        named = f'likely {" or ".join(likely.effects)} ({percent(likely.probability)})'
+        text += f'; {named if likely.effects else likely.text}'
+        values |= {'likely_effect': ', '.join(likely.effects),
+                   'probability': likely.probability, 'report': likely.report}
+    is_fine = gaps and not changed and not any(gap.is_open for gap in gaps)
+    return Status(Level.OK if is_fine else Level.WARN, text, live.sensor.serial, values)
 
 
-class GapState:
-    """What the monitor knows at one moment: text, level and values of its reports."""
-
-    def __init__(self, live: LiveGap, obstacle: str, likely: DiagnosisResult | None,
-                 window_s: float) -> None:
-        """Put together why nothing is compared, if so, the gap, and the newest diagnosis."""
-        gaps, serial = live.report(), live.sensor.serial
-        newest_ns = max((change.since_ns for change in live.changes), default=0)
-        event = sorted((change for change in live.changes
-                        if newest_ns - change.since_ns < _TOGETHER_NS),
-                       key=lambda change: change.since_ns)
-        is_fine = gaps and not (obstacle or event or any(gap.is_open for gap in gaps))
-        text = 'comparing; the first result takes some seconds'
-        values: dict[str, object] = {'window_s': window_s, 'changes': len(live.changes)}
-        if gaps:
-            gap_mg, floor_mg = (', '.join(
-                f'{gap.axis} {getattr(gap, name).value:.3g}' for gap in gaps)
-                for name in ('gap', 'floor'))
-            text = f'gap {gap_mg} mg, floor {floor_mg} mg'
-        if event:
-            latest = {(change.axis, change.quantity): change.text() for change in event}
-            since = iso_time(event[0].since_ns)
-            text += f'; changed since {since}: {", ".join(latest.values())}'
-            values |= {'changed_since': since, 'changed_since_s': event[0].since_ns * 1e-9,
-                       'detected_s': event[0].detected_ns * 1e-9}
-        if likely is not None:
-            named = f'likely {" or ".join(likely.effects)} ({percent(likely.probability)})'
-            text += f'; {named if likely.effects else likely.text}'
-            values |= {'likely_effect': ', '.join(likely.effects),
-                       'probability': likely.probability, 'report': likely.report}
-        self.summary = Status(Level.OK if is_fine else Level.WARN, obstacle or text, serial,
-                              values)
-        # By axis; nothing where nothing is compared
-        self.axes = {} if obstacle else {gap.axis: _axis_status(gap, serial) for gap in gaps}
-        self._stamp = topics.stamp(live.newest_ns)
-
-    def message(self) -> DiagnosticArray:
-        """Return the message of the topic `gap`: the summary, then one status for each axis."""
-        parts = {'gap': self.summary} | {
-            f'gap: {axis}': status for axis, status in self.axes.items()}
-        array = DiagnosticArray(status=[topics.status_message(*part) for part in parts.items()])
-        array.header.stamp = self._stamp
-        return array
-
-
-def _axis_status(gap: AxisGap, serial: str) -> Status:
+def axis_status(gap: AxisGap, serial: str) -> Status:
     """Return the gap of an axis; `explained` is absent where nothing is to explain."""
     values: dict[str, object] = {'offset_mg': gap.offset_mg, 'floor_source': gap.floor_source}
     for name, interval in (('gap', gap.gap), ('floor', gap.floor)):
         values |= {f'{name}_mg': interval.value, f'{name}_low_mg': interval.low,
                    f'{name}_high_mg': interval.high}
-    text = (f'gap {gap.gap.value:.3g} mg ({gap.gap.low:.3g} to {gap.gap.high:.3g}), floor '
-            f'{gap.floor.value:.3g} mg')
     if gap.explained is not None:
         values['explained'] = gap.explained
-        text += f'; the parameters explain {100 * gap.explained:.0f} %'
-    return Status(Level.WARN if gap.is_open else Level.OK, text, serial, values)
+    return Status(Level.WARN if gap.is_open else Level.OK, f'gap {gap.gap.value:.3g} mg, floor '
+                  f'{gap.floor.value:.3g} mg', serial, values)
 
 
 _INPUT_QUEUE = 10000
@@ -151,12 +124,8 @@ _PAUSE_S = 600.0
 """Shortest time between two automatic diagnoses, s; chosen: each may cost minutes of a core."""
 _EXAMPLES = {
     'a sensor on a stage': '--ros-args --params-file unit.yaml',
-    'a sensor beside its simulation': '--ros-args --params-file unit.yaml -p reference:=imu '
-    '-p reference_topic:=/sim/imu',
     'a sensor on a robot': '--ros-args --params-file unit.yaml -p reference:=robot '
-    '-p urdf:=robot.urdf',
-    'one false alarm a year at most': '--ros-args -p false_alarms_per_day:=0.0027',
-}
+    '-p urdf:=robot.urdf'}
 """Examples of arguments, by their purpose."""
 
 
@@ -222,10 +191,9 @@ class Monitor(Node):
             return
         self._live = LiveGap(sensor, self._kind, self._settings)
         self._changed_ns, self._result = 0, None
-        effects = ', '.join(sensor.effects) or 'no effects'
         self.get_logger().info(
-            f'comparing {self.resolve_topic_name("imu/data_raw")} of {sensor.serial} ({effects}) '
-            f'with {self.resolve_topic_name(self._reference_topic)}')
+            f'comparing {self.resolve_topic_name("imu/data_raw")} of {sensor.serial} with '
+            f'{self.resolve_topic_name(self._reference_topic)}')
         if self._live.left_out:
             self.get_logger().warning(f'not predicted, for want of stage angles: '
                                       f'{", ".join(self._live.left_out)}')
@@ -311,25 +279,32 @@ class Monitor(Node):
             return f'{topics.silence(self, self._reference_topic)}: no reference'
         return self._live.obstacle
 
-    def _state(self) -> GapState:
-        """Return what is known now."""
-        return GapState(self._live, self._obstacle(), self._result, self._settings.window_s)
+    def _state(self) -> tuple[Status, dict[str, Status]]:
+        """Return what is known now: a summary, and the gap by axis unless nothing is compared."""
+        summary = gap_status(self._live, self._result, self._settings.window_s)
+        if obstacle := self._obstacle():
+            return replace(summary, level=Level.WARN, summary=obstacle), {}
+        return summary, {gap.axis: axis_status(gap, self._live.sensor.serial)
+                         for gap in self._live.report()}
 
     def _publish(self) -> None:
-        self._publisher.publish(self._state().message())
+        summary, axes = self._state()
+        parts = {'gap': summary} | {f'gap: {axis}': status for axis, status in axes.items()}
+        array = DiagnosticArray(status=[topics.status_message(*part) for part in parts.items()])
+        array.header.stamp = topics.stamp(self._live.newest_ns)
+        self._publisher.publish(array)
         if self._info is not None:
             self._diagnose_if_due()
 
     def _status(self) -> Status:
         """Return the state for /diagnostics, with counts."""
-        state = self._state()
-        values = {**state.summary.values, **{
-            f'{axis}_{key}': value for axis, status in state.axes.items()
-            for key, value in status.values.items()}}
+        summary, axes = self._state()
+        values = {**summary.values, **{f'{axis}_{key}': value for axis, status in axes.items()
+                                       for key, value in status.values.items()}}
         values |= {**self._live.counts, 'diagnosis_runs': self._run is not None,
                    'false_alarms_per_day': self._settings.false_alarms_per_day}
-        level = Level.ERROR if self._refusal or self._streams.fault() else state.summary.level
-        return replace(state.summary, level=level, values=values)
+        level = Level.ERROR if self._refusal or self._streams.fault() else summary.level
+        return replace(summary, level=level, values=values)
 
 
 def main() -> int:

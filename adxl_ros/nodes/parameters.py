@@ -10,9 +10,8 @@ which are those of its parameter file.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import field, fields
-from difflib import get_close_matches
 from itertools import pairwise
 from pathlib import Path
 import re
@@ -115,24 +114,14 @@ def declare(node: Node, spec: Spec) -> Any:
             name, '' if spec.default == () else spec.default, descriptor).value
     except ParameterException:
         given = dict(given_parameters(node)).get(name)
-        unit = spec.unit and f' {spec.unit}'
-        raise parameter_error(name, _type_error(given, kind) or f'{given!r} is out of range; it '
-                              f'must be {spec.limits}{unit}') from None
+        expected = ', '.join(filter(None, (kind.name, spec.limits, spec.unit)))
+        hint = f'; write {given}.0' if kind == Kind.DOUBLE and isinstance(given, int) else ''
+        raise parameter_error(name, f'{given!r} is refused; expected {expected}{hint}') from None
     if value is None:
         store_empty(node, name, kind, spec.empty)
     elif spec.choices and value not in spec.choices:
         raise parameter_error(name, f'{value!r} is not {spec.limits}')
     return value
-
-
-def _type_error(given: Any, expected: Kind) -> str:
-    """Return why a given value has a wrong type; '' where its type is right."""
-    kind = Kind.from_parameter_value(given)
-    if kind == expected:
-        return ''
-    if (kind, expected) == (Kind.INTEGER, Kind.DOUBLE):
-        return f'{given} is a whole number (INTEGER); a DOUBLE is expected: write {given}.0'
-    return f'{given!r} is of the type {kind.name}; expected {expected.name}'
 
 
 def numbers(name: str, given: Any, example: str) -> list[float]:
@@ -153,11 +142,6 @@ def low_and_high(name: str, given: Any, default: tuple[float, float]) -> tuple[f
     return values[0], values[1]
 
 
-def nearest(name: str, names: Iterable[str]) -> str:
-    """Return the name that is most like a misspelled one."""
-    return get_close_matches(name, sorted(names), 1, 0.0)[0]
-
-
 def parameter_error(key: str, reason: str) -> UserError:
     """Make the error of a parameter, with its place where it comes from a file."""
     return UserError(f'{_place_of(key)}{key}: {reason}')
@@ -168,7 +152,7 @@ def _place_of(key: str) -> str:
     Return the place of a parameter in the files: 'file:line:column: ', or ''.
 
     The last argument that gives a parameter counts. A parameter that none gives belongs to the
-    last file of a sensor, which has a format, or to the last file.
+    last file.
     """
     for flag, value in reversed(list(pairwise(sys.argv))):
         # A rule is [NODE:]NAME:=VALUE.
@@ -178,9 +162,7 @@ def _place_of(key: str) -> str:
             if flag == _FILE_FLAG else []
         if marks:
             return f'{value}:{marks[0].line + 1}:{marks[0].column + 1}: ' * (value in _paths())
-    files = sorted(_paths(), key=lambda path: any(
-        name == 'format' for _, name, _ in _entries(path)))
-    return f'{files[-1]}: ' if files else ''
+    return f'{_paths()[-1]}: ' if _paths() else ''
 
 
 def _paths() -> list[str]:
@@ -191,20 +173,14 @@ def _paths() -> list[str]:
 
 def _entries(path: str) -> Iterator[tuple[str, str, yaml.Node]]:
     """Yield the pattern of the node's name, the parameter's name and its value in a file."""
-    def inside(tree: yaml.Node | None, section: str, key: str | None
-               ) -> Iterator[tuple[str, str, yaml.Node]]:
-        if not isinstance(tree, yaml.MappingNode):
-            if key is not None and tree is not None:
-                yield section, key, tree
-            return
-        for name, value in tree.value:
-            if key is not None:
-                yield from inside(value, section, f'{key}.{name.value}'.lstrip('.'))
-            elif name.value == 'ros__parameters':
-                yield from inside(value, section, '')
-            else:
-                yield from inside(value, f'{section}/{name.value.strip("/")}', None)
-    return inside(parameter_file.compose(path), '', None)
+    def inside(tree: yaml.Node | None, keys: list[str]) -> Iterator[tuple[str, str, yaml.Node]]:
+        if isinstance(tree, yaml.MappingNode):
+            for key, value in tree.value:
+                yield from inside(value, [*keys, key.value])
+        elif tree is not None and 'ros__parameters' in keys:
+            i = keys.index('ros__parameters')
+            yield ''.join(f'/{key.strip("/")}' for key in keys[:i]), '.'.join(keys[i + 1:]), tree
+    return inside(parameter_file.compose(path), [])
 
 
 def check_params_files() -> None:

@@ -116,7 +116,4 @@ def given_parameters(node: Node) -> Iterable[tuple[str, Any]]:
 
 def start_error_text(error: BaseException) -> str:
     """Return the text of rclpy's refusal of its arguments: one line, without places in rcl."""
-    text = re.sub(r', at /\S+:\d+', '', one_line(error))
-    if 'parameter override rule' in text:
-        text = f"""{text}; a text with a colon needs quotes of its own: -p NAME:='"a:b"'"""
-    return text
+    return re.sub(r', at /\S+:\d+', '', one_line(error))

@@ -15,7 +15,6 @@ from contextlib import suppress
 from itertools import chain
 import os
 from pathlib import Path
-import re
 import signal
 import sys
 from typing import Any
@@ -140,14 +139,10 @@ def _spec_lines(specs: Iterable[Spec]) -> list[str]:
 
 def _value_text(value: Any) -> str:
     """Return a default as it is written on the command line; empty without one."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, float):
-        return f'{value:.6g}'
-    if isinstance(value, str | int):
-        return re.sub(f'^{re.escape(os.path.expanduser("~"))}', '~', str(value))
-    items = [_value_text(item) for item in value]
-    return f'[{", ".join(items)}]' if items else ''
+    if isinstance(value, list | tuple):
+        return f'[{", ".join(map(_value_text, value))}]' if value else ''
+    return f'{value:.6g}' if isinstance(value, float) else \
+        str(value).replace(os.path.expanduser('~'), '~')
 
 
 _SWITCH_S = 0.0005

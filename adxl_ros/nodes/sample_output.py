@@ -86,19 +86,16 @@ class Tally:
         new = totals.copy()
         new.subtract(self._reported)
         self._reported = totals
-        elapsed_ns, counts = new['sensor_ns'], self.counts
+        elapsed_ns = max(new['sensor_ns'], 0)
         values: dict[str, Any] = {
-            name: counts[name] for name in ('missing', 'saturated', 'samples')}
-        values |= {'missing_estimated': counts['estimated'], 'rate_hz': 0.0, 'speed': 0.0}
-        if elapsed_ns > 0:
-            values |= {'rate_hz': round(new['samples'] / elapsed_ns * 1e9, 3),
-                       'speed': round(elapsed_ns / new['steady_ns'], 3)}
+            'missing': totals['missing'], 'missing_estimated': totals['estimated'],
+            'saturated': totals['saturated'], 'samples': totals['samples'],
+            'rate_hz': round(new['samples'] / elapsed_ns * 1e9, 3) if elapsed_ns else 0.0,
+            'speed': round(elapsed_ns / new['steady_ns'], 3)}
         if self._newest_ns is not None:
             values['age_s'] = round((sensor_ns - self._newest_ns) * 1e-9, 6)
-        estimated = f', {new["estimated"]} of them estimated' if new['estimated'] else ''
         return values | self.ages.report(), ', '.join(
-            f'{new[name]} samples {name}{estimated * (name == "missing")}'
-            for name in ('missing', 'saturated') if new[name])
+            f'{new[name]} samples {name}' for name in ('missing', 'saturated') if new[name])
 
 
 _REFERENCE_QUEUE = 1000

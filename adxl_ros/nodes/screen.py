@@ -213,10 +213,7 @@ _STYLES = {Log.WARN: 'ansiyellow', Log.ERROR: 'ansired', Log.FATAL: 'ansired'}
 """Styles of log lines by level."""
 _PLAIN = 'ansibrightblack'
 """Style of other log lines."""
-_EXAMPLES = {
-    'the screen of a calibration that runs elsewhere': '',
-    'in the namespace of the sensor': '--ros-args -r __ns:=/arm',
-}
+_EXAMPLES = {'in the namespace of the sensor': '--ros-args -r __ns:=/arm'}
 """Examples of arguments, by their purpose."""
 
 
@@ -250,11 +247,7 @@ class Screen(Node):
         # A terminal that has hung up can be neither read nor drawn in.
         with held_output(), suppress(EOFError, OSError):
             application.run(begin, set_exception_handler=False, handle_sigint=False)
-        if self._node_pid:
-            return
-        if self._is_fresh():
-            print(f'while {self._target} runs, show it again: ros2 run adxl_ros screen')
-        elif self._contents.outcome:
+        if not self._node_pid and self._contents.outcome:
             # The screen is gone, and its last lines with it.
             print(f'{self._contents.outcome[0]}\n{self._contents.text}')
 
@@ -273,27 +266,13 @@ class Screen(Node):
                 self._application.exit()
 
     def _shown(self) -> ScreenContents:
-        """Return the newest contents, or what the screen waits for."""
-        if self._is_fresh():
+        """Return the newest contents, or what the screen waits for; a node that fits is silent."""
+        is_new = time.monotonic() - self._received_s < _SILENT_S or self._contents.phase == 'fit'
+        if self._received_s and is_new and rclpy.ok() \
+                and self.count_publishers(f'{self._target}/display'):
             return self._contents
-        text = f'waiting for {self._target}; is it running in this ROS domain?'
-        if self._received_s and self._is_there():
-            silent_s = time.monotonic() - self._received_s
-            text = f'nothing from {self._target} for {silent_s:.0f} s; waiting for it'
-        elif self._received_s:
-            text = f'{self._target} has ended; waiting until it is started again'
-        elif self._node_pid:
-            text = 'starting'
-        return replace(self._contents, phase='silent', text=text, keys=())
-
-    def _is_fresh(self) -> bool:
-        """Return whether the newest contents still hold; a node that fits publishes none."""
-        is_silent = time.monotonic() - self._received_s > _SILENT_S
-        return self._received_s > 0 and self._is_there() and (
-            not is_silent or self._contents.phase == 'fit')
-
-    def _is_there(self) -> bool:
-        return rclpy.ok() and self.count_publishers(f'{self._target}/display') > 0
+        return replace(self._contents, phase='silent', keys=(), text=f'waiting for '
+                       f'{self._target}; is it running in this ROS domain?')
 
     def _press(self, key: str) -> None:
         """Call the service of a key; the space captures, `finish` may need a second key."""

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from difflib import get_close_matches
 from itertools import chain
 from typing import Any
 
@@ -14,7 +15,7 @@ from adxl_ros.files.parameter_file import SENSOR_FIELDS
 from adxl_ros.files.recording_columns import NO_UNIT
 from adxl_ros.links.support import base
 from adxl_ros.nodes import parameters
-from adxl_ros.nodes.parameters import declare, Kind, nearest, parameter, parameter_error, Spec
+from adxl_ros.nodes.parameters import declare, Kind, parameter, parameter_error, Spec
 from adxl_ros.nodes.rclpy_internals import given_parameters
 import numpy as np
 from rclpy.node import Node
@@ -44,12 +45,11 @@ class DriverSettings:
     link: str = parameter('link.type', base.DEFAULT_LINK, 'where the samples come from',
                           choices=base.link_names())
     stamp_offset_s: float = parameter(
-        'stamp_offset', 0.0, 'delay of the sensor, such as that of its RC filter, that is taken '
-        'out of the stamps: they are earlier by this', 's', -10.0, 10.0)
-    frame_id: str = parameter('frame_id', '', 'frame of the case; empty: imu_link, or that of the '
-                              'samples of a simulator')
-    autostart: bool = parameter(
-        'autostart', True, 'configure and activate at the start; else a system manager does')
+        'stamp_offset', 0.0, 'delay of the sensor, such as that of its RC filter, by which the '
+        'stamps are earlier', 's', -10.0, 10.0)
+    frame_id: str = parameter('frame_id', '', 'frame of the case; empty: imu_link, or as a '
+                              'simulator states it')
+    autostart: bool = parameter('autostart', True, 'configure and activate at the start')
 
 
 @dataclass(frozen=True)
@@ -78,13 +78,11 @@ class SimulatedStageSettings:
     alpha_rad: float = parameter('alpha_rad', 0.0, 'position at the start', 'rad', -100.0, 100.0)
     beta_rad: float = parameter('beta_rad', 0.0, 'position at the start', 'rad', -100.0, 100.0)
     shift_m: float = parameter('shift_m', 0.0, 'position at the start', 'm', -10.0, 10.0)
-    seed: int = parameter('seed', 0, "seed of the positions within the encoder's step", '',
-                          *_SEEDS)
+    seed: int = parameter('seed', 0, "seed of the positions within an encoder's step", '', *_SEEDS)
 
 
 def _joint(name: str) -> Any:
-    return parameter(f'bridge.{name}.joint', Kind.STRING,
-                     f"the controller's name of the joint {name}")
+    return parameter(f'bridge.{name}.joint', Kind.STRING, f"the controller's name of {name}")
 
 
 def _sign(name: str) -> Any:
@@ -92,8 +90,8 @@ def _sign(name: str) -> Any:
 
 
 def _offset(name: str) -> Any:
-    return parameter(f'bridge.{name}.offset_rad', 0.0,
-                     f"angle {name} where the controller's joint is at 0", 'rad', -100.0, 100.0)
+    return parameter(f'bridge.{name}.offset_rad', 0.0, f"{name} where the controller's joint is "
+                     'at 0', 'rad', -100.0, 100.0)
 
 
 @dataclass(frozen=True)
@@ -121,8 +119,8 @@ class CalibrationSettings:
     mode: str = parameter('mode', 'stage', 'what the reference is',
                           choices=('stage', 'gravity', 'thermal'))
     autostart: bool = parameter('autostart', False, 'start without a call of ~/start')
-    resume: str = parameter('resume', 'ask', 'go on with an interrupted calibration; ask where '
-                            'there is a screen, else go on', choices=('ask', 'continue', 'anew'))
+    resume: str = parameter('resume', 'ask', 'go on with an interrupted calibration; without a '
+                            'screen, ask is continue', choices=('ask', 'continue', 'anew'))
     exit_when_done: bool = parameter('exit_when_done', False, 'end the node after a calibration: '
                                      'status 0 where it wrote its file, else 1')
     screen: bool = parameter('screen', True, 'show a screen, where the node runs in a terminal')
@@ -134,23 +132,20 @@ class CalibrationSettings:
     # A stage of 5 arcmin arrives within this default.
     tolerance_rad: float = parameter('stage.tolerance_rad', float(np.radians(0.2)),
                                      'arrived within this', 'rad', 1e-6, 0.2)
-    timeout_s: float = parameter('stage.timeout_s', 60.0,
-                                 'a pose that takes longer is said to be late', 's', 1.0, 86400.0)
+    timeout_s: float = parameter('stage.timeout_s', 60.0, 'time after which a pose is late', 's',
+                                 1.0, 86400.0)
     stage_mode: str = parameter(
-        'stage.mode', 'commanded', 'who turns the stage: commanded turns itself, encoder and '
-        'manual are turned by hand', choices=('commanded', 'encoder', 'manual'))
+        'stage.mode', 'commanded', 'commanded turns itself, encoder and manual are turned by hand',
+        choices=('commanded', 'encoder', 'manual'))
     near_deg: float = parameter('stage.near_deg', 2.0, 'a stage turned by hand is captured within '
                                 'this of the pose', 'deg', 0.01, 30.0)
-    temperature_span_c: float = parameter(
-        'sweep.temperature_span_c', 3.0, 'how far the temperature may be from that of the first '
-        'pose', 'degC', 0.1, 1000.0)
+    temperature_span_c: float = parameter('sweep.temperature_span_c', 3.0, 'largest change of the '
+                                          'temperature since the first pose', 'degC', 0.1, 1000.0)
     plan: str = parameter(
-        'sweep.plan', 'auto', 'poses: full (planes, 25 minutes), quick (about 38, the fewest for '
-        'sweep.tilt_error_deg), or auto: quick where the stage is turned by hand and no planes '
-        'are given', choices=('auto', 'full', 'quick'))
-    planes_deg: Any = parameter(
-        'sweep.planes_deg', (), 'planes alpha of the plan full, a list of numbers; empty: 30 to '
-        '150, or 0 to 180 for a sensor with a z axis', 'deg')
+        'sweep.plan', 'auto', 'full (planes, 25 minutes), quick (about 38 poses), or auto: quick '
+        'where a stage is turned by hand without planes', choices=('auto', 'full', 'quick'))
+    planes_deg: Any = parameter('sweep.planes_deg', (), 'planes alpha of the plan full; empty: 30 '
+                                'to 150, or 0 to 180 for a sensor with a z axis', 'deg')
     step_deg: float = parameter('sweep.step_deg', 30.0, 'step of beta of the plan full', 'deg',
                                 0.5, 90.0)
     check_poses: int = parameter('sweep.check_poses', -1, 'poses kept out of the fit for the '
@@ -158,7 +153,7 @@ class CalibrationSettings:
     tilt_error_deg: float = parameter('sweep.tilt_error_deg', 0.1, 'rms tilt error that the plan '
                                       'quick is to reach', 'deg', 1e-3, 10.0)
     range_c: Any = parameter('thermal.range_c', (), 'lowest and highest temperature that mode '
-                             'thermal is to cover, a list of numbers; empty: 0 to 50', 'degC')
+                             'thermal is to cover; empty: 0 to 50', 'degC')
     block_s: float = parameter('thermal.block_s', 10.0, 'length of a block of samples in mode '
                                'thermal', 's', 0.5, 600.0)
 
@@ -171,24 +166,19 @@ class CompensationSettings:
                                  'whole file or nothing of it', live=True)
     inverse: str = parameter('inverse', 'exact', "inverse of the model: exact, or the paper's "
                              'approximation', choices=('exact', 'paper'))
-    undo_filter: bool = parameter(
-        'undo_filter', False, 'take the RC filter out, amplitude and phase; a sample is published '
-        f'{HALF} samples late, with its own stamp')
-    orientation: str = parameter(
-        'orientation', 'keep', 'keep: a sample that states an orientation keeps it; tilt: '
-        'imu/data has that of the tilt', choices=('keep', 'tilt'))
-    store: str = parameter('store', _STORE, 'folder of calibrations, of which the newest of the '
-                           'unit is taken where none is named; empty: none')
+    undo_filter: bool = parameter('undo_filter', False, 'take the RC filter out; a sample is '
+                                  f'published {HALF} samples late, with its own stamp')
+    orientation: str = parameter('orientation', 'keep', 'of a sample that states one: keep it, or '
+                                 'that of the tilt', choices=('keep', 'tilt'))
+    store: str = parameter('store', _STORE, 'folder of calibrations, whose newest of the unit is '
+                           'used where none is named; empty: none')
     output_rate_hz: float = parameter(
-        'output_rate_hz', 0.0, 'rate of imu/data and tilt: one sample of so many is published as '
-        'it is, so that vibration above half of this rate folds into it; 0: every sample', 'Hz',
-        0.0, 1e5)
-    free_acceleration: bool = parameter(
-        'free_acceleration', False, 'publish imu/linear_acceleration_free: the acceleration '
-        'without gravity of samples that state an orientation')
-    rpy_rad: Any = parameter(
-        'mounting.rpy_rad', [0.0, 0.0, 0.0], 'roll, pitch and yaw of the case in the frame of the '
-        'robot, as in a URDF joint', 'rad', live=True)
+        'output_rate_hz', 0.0, 'one sample of so many is published as it is, so that vibration '
+        'above half of this rate folds into it; 0: every sample', 'Hz', 0.0, 1e5)
+    free_acceleration: bool = parameter('free_acceleration', False, 'publish imu/linear_'
+                                        'acceleration_free of samples that state an orientation')
+    rpy_rad: Any = parameter('mounting.rpy_rad', [0.0, 0.0, 0.0], 'roll, pitch and yaw of the '
+                             'case on the robot, as in a URDF joint', 'rad', live=True)
     mounting_frame_id: str = parameter('mounting.frame_id', 'base_link', 'frame of the robot, in '
                                        'the header where the case is turned')
 
@@ -199,10 +189,8 @@ class InvestigateSettings:
 
     output: str = parameter('output', 'investigation', 'folder of bag, report and parameters; a '
                             'number is added where it has a diagnosis')
-    alpha_deg: Any = parameter('limits.alpha_deg', (), 'lowest and highest angle of alpha, a list '
-                               'of numbers; empty: 0 to 180', 'deg')
-    beta_deg: Any = parameter('limits.beta_deg', (), 'lowest and highest angle of beta, a list of '
-                              'numbers; empty: 0 to 360', 'deg')
+    alpha_deg: Any = parameter('limits.alpha_deg', (), 'range of alpha; empty: 0 to 180', 'deg')
+    beta_deg: Any = parameter('limits.beta_deg', (), 'range of beta; empty: 0 to 360', 'deg')
     # The default is that of the bridge, 0.3 rad/s.
     rate_deg_s: float = parameter('limits.rate_deg_s', 17.0, 'largest rate of each joint', 'deg/s',
                                   0.1, 180.0)
@@ -228,13 +216,11 @@ class MonitorSettings:
                                             'reported changes that are none', '1/day', 1e-5, 10.0)
     history_s: float = parameter('history_s', 600.0, 'time that is kept for a diagnosis', 's',
                                  60.0, 3600.0)
-    wait_s: float = parameter(
-        'diagnose.wait_s', 120.0, 'time of samples that an automatic diagnosis needs; changes of '
-        'an axis within it are one', 's', 20.0, 3600.0)
+    wait_s: float = parameter('diagnose.wait_s', 120.0, 'time of samples that an automatic '
+                              'diagnosis needs', 's', 20.0, 3600.0)
     output: str = parameter('output', str(calibration_store.default_folder().with_name('monitor')),
                             'folder of the record of changes and of the diagnoses')
-    automatic: bool = parameter('diagnose.automatic', True,
-                                'diagnose a change, or a gap, once enough is seen')
+    automatic: bool = parameter('diagnose.automatic', True, 'diagnose a change, or an open gap')
     budget_s: float = parameter('diagnose.budget_s', 300.0, 'longest time of a diagnosis', 's',
                                 1.0, 3600.0)
 
@@ -244,8 +230,7 @@ class ScreenSettings:
     """The screen."""
 
     node: str = parameter('node', 'calibration', 'name of the calibration node')
-    node_pid: int = parameter('node_pid', 0, 'process of the node, if it has started this screen: '
-                              'both end together; 0: it has not')
+    node_pid: int = parameter('node_pid', 0, 'process of the node that has started this screen')
 
 
 NODES: dict[str, tuple[type, ...]] = {
@@ -265,22 +250,13 @@ def check_given_parameters(node: Node) -> None:
     for name, _ in given_parameters(node):
         if name not in names and not name.startswith(_FREE_PREFIXES):
             raise parameter_error(name, 'no node has a parameter of this name; did you mean '
-                                  f'{nearest(name, names)}?')
+                                  f'{get_close_matches(name, sorted(names), 1, 0.0)[0]}?')
 
 
 def link_specs(link: str) -> list[Spec]:
     """Return the parameters of a link, `link.type` aside."""
     return [Spec(f'{LINK}{option.name}', option.default, **option.metadata)
             for option in fields(base.link_module(link).Settings)]
-
-
-def links_by_parameter() -> dict[str, list[str]]:
-    """Return the links that have a parameter, by its name."""
-    links: dict[str, list[str]] = {}
-    for link in base.link_names():
-        for spec in link_specs(link):
-            links.setdefault(spec.name, []).append(link)
-    return links
 
 
 def given_link(node: Node) -> dict[str, Any]:
@@ -295,15 +271,10 @@ def declare_driver(node: Node, serial: str) -> tuple[DriverSettings, base.LinkMo
 
     No real unit gets simulated data: a link must then be named.
     """
-    given, links = [f'{LINK}{name}' for name in given_link(node)], links_by_parameter()
-    is_chosen = _TYPE in given
-    for name in given:
-        if not is_chosen and name not in links:
-            raise parameter_error(name, 'is no parameter of any link; did you mean '
-                                  f'{nearest(name, [_TYPE, *links])}?')
+    given = [f'{LINK}{name}' for name in given_link(node)]
     reason = f'{given[0]} is given' if given else \
         f'the sensor is the unit {serial}' if serial != NO_UNIT else ''
-    if reason and not is_chosen:
+    if reason and _TYPE not in given:
         devices = [name for name in base.link_names() if name != base.DEFAULT_LINK]
         raise parameter_error(_TYPE, f'is not set, but {reason}; set it to {", ".join(devices)}, '
                               f'or to {base.DEFAULT_LINK} for a simulated sensor')
@@ -312,8 +283,7 @@ def declare_driver(node: Node, serial: str) -> tuple[DriverSettings, base.LinkMo
     own = [_TYPE, *(spec.name for spec in specs)]
     for name in given:
         if name not in own:
-            hint = f'link.type {" or ".join(links[name])} has it' if name in links else \
-                f'did you mean {nearest(name, own)}?'
-            raise parameter_error(name, f'the link {settings.link} has no such parameter; {hint}')
+            raise parameter_error(name, f'the link {settings.link} has no such parameter; it has '
+                                  f'{", ".join(own)}')
     values = {spec.name.removeprefix(LINK): declare(node, spec) for spec in specs}
     return settings, module, module.Settings(**values)

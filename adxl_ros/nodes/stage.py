@@ -5,8 +5,6 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
-from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
@@ -27,6 +25,8 @@ _JUMP_NS = 1_000_000_000
 """Smallest jump of ROS time after which the motion goes on from there, ns; chosen."""
 _QUEUE = 1000
 """Poses that are kept for a slow subscriber: 10 s of ROS time."""
+_ANGLES = ('alpha', 'beta')
+"""Joints of a real stage."""
 
 
 class SimulatedStageNode:
@@ -120,8 +120,6 @@ _ARRIVED_RAD = 0.01
 """Largest distance from the goal of a joint that has arrived, rad; chosen."""
 _SHORTEST_S = 0.2
 """Shortest duration of a trajectory, s; chosen."""
-_TURN_RAD = 2 * np.pi
-"""One turn, rad."""
 _BRIDGE_QUEUE = 100
 """Positions that are kept for a slow subscriber; chosen: 1 s of a usual controller."""
 _COMMAND_QUEUE = 10
@@ -133,55 +131,30 @@ _DEFAULT_COMMANDS = {'trajectory': '/joint_trajectory_controller/joint_trajector
 """Usual topics of the controllers' commands, by kind."""
 
 
-@dataclass
-class _Joint:
-    """One joint of the stage, and how the controller counts its angle."""
-
-    name: str  # The controller's name of the joint
-    sign: int  # 1 or -1: the direction in which the controller counts
-    offset_rad: float  # Stage angle where the controller's joint is at 0, rad
-    angle_rad: float | None = None  # Stage angle, rad; None before the first joint state
-
-    def update(self, position_rad: float) -> None:
-        """Take an angle of the controller, rad, and unwrap it."""
-        angle = self.sign * position_rad + self.offset_rad
-        if self.angle_rad is not None:
-            # A controller that counts from −π to π jumps where the stage turns on.
-            angle += _TURN_RAD * np.round((self.angle_rad - angle) / _TURN_RAD)
-        self.angle_rad = float(angle)
-
-    def unwrap_to(self, goal_rad: float) -> None:
-        """
-        Add whole turns to the angle where the joint then is at its goal, rad.
-
-        The first angle of a controller that counts from −π to π does not determine how many turns
-        it has made, and such a controller may take the shorter way round.
-        """
-        if self.angle_rad is not None:
-            turns_rad = _TURN_RAD * round((goal_rad - self.angle_rad) / _TURN_RAD)
-            if abs(self.angle_rad + turns_rad - goal_rad) < _ARRIVED_RAD:
-                self.angle_rad += turns_rad
-
-
 class StageBridge:
-    """The way from this package's topics to the controller of a stage, and back."""
+    """
+    The way from this package's topics to the controller of a stage, and back.
+
+    Arrays have the angles of alpha and beta, NaN before the first joint state. Angle of the stage
+    = sign · angle of the controller + offset; whole turns follow from the angle before.
+    """
 
     def __init__(self, node: Node, kind: str) -> None:
         self._node, self._kind = node, kind
         own = declare_all(node, settings.BridgeSettings)
-        self._joints = {'alpha': _Joint(own.alpha_joint, own.alpha_sign, own.alpha_offset_rad),
-                        'beta': _Joint(own.beta_joint, own.beta_sign, own.beta_offset_rad)}
-        for name, joint in self._joints.items():
-            if not joint.name:
-                raise parameter_error(f'bridge.{name}.joint',
+        self._names = [own.alpha_joint, own.beta_joint]
+        self._signs = np.array([own.alpha_sign, own.beta_sign])
+        self._offsets_rad = np.array([own.alpha_offset_rad, own.beta_offset_rad])
+        for joint, name, sign in zip(_ANGLES, self._names, self._signs.tolist()):
+            if not name:
+                raise parameter_error(f'bridge.{joint}.joint',
                                       "is not set; name the controller's joint")
-            if joint.sign == 0:
-                raise parameter_error(f'bridge.{name}.sign', '0 is not 1 or -1')
+            if sign == 0:
+                raise parameter_error(f'bridge.{joint}.sign', '0 is not 1 or -1')
         self._states_topic = node.resolve_topic_name(own.joint_states)
         self._speed_rad_s = own.speed_rad_s
-        self._goal: dict[str, float] = {}
+        self._angles_rad, self._goal_rad = np.full(2, np.nan), np.full(2, np.nan)
         self._heard_ns = self._resend_ns = self._commanded_ns = self._late_ns = 0
-        self._controller_joints: set[str] = set()
         self._refusal = ''
         self._positions = topics.create_publisher(node, JointState, 'stage/joint_states',
                                                   _BRIDGE_QUEUE)
@@ -199,116 +172,88 @@ class StageBridge:
 
     def _on_command(self, message: JointState) -> None:
         positions = dict(zip(message.name, message.position))
-        if set(positions) - set(self._joints) or len(message.name) != len(message.position) \
-                or not np.isfinite(list(positions.values())).all():
-            self._refuse(f'stage/command: {positions}: expected finite positions of alpha and '
-                         'beta')
-            return
-        goal: dict[str, Any] = {
-            name: positions.get(name, self._goal.get(name, joint.angle_rad))
-            for name, joint in self._joints.items()}
-        if any(angle_rad is None for angle_rad in goal.values()):
-            self._refuse('stage/command: the position of the stage is not known yet')
+        before_rad = np.where(np.isfinite(self._goal_rad), self._goal_rad, self._angles_rad)
+        goal_rad = np.array([positions.get(name, angle) for name, angle
+                             in zip(_ANGLES, before_rad.tolist())])
+        if set(positions) - set(_ANGLES) or len(message.name) != len(message.position) \
+                or not np.isfinite([*goal_rad, *self._angles_rad]).all():
+            reason = f'stage/command: {positions}: expected finite positions of alpha and beta, ' \
+                     f'and first a position on {self._states_topic}'
+            if reason != self._refusal:
+                self._node.get_logger().warning(reason)
+            self._refusal = reason
+            self._diagnostics.notice(Level.WARN)
             return
         now_ns = STEADY.now().nanoseconds
+        is_new = not np.array_equal(goal_rad, self._goal_rad)
         # The calibration repeats its command: a controller would begin its trajectory each time.
-        if goal == self._goal and (self._arrived() or now_ns < self._resend_ns):
+        if not is_new and (self._arrived() or now_ns < self._resend_ns):
             return
-        # The longer way to the goal counts, or half a turn where it is unknown.
-        ways_rad = [abs(goal[name] - joint.angle_rad) for name, joint in self._joints.items()
-                    if joint.angle_rad is not None]
-        duration_s = max(max(ways_rad, default=np.pi) / self._speed_rad_s, _SHORTEST_S)
+        # The longer way to the goal counts.
+        duration_s = max(np.abs(goal_rad - self._angles_rad).max() / self._speed_rad_s,
+                         _SHORTEST_S)
         self._resend_ns = now_ns + round(duration_s * 1e9) + _GRACE_NS
-        if goal != self._goal:
+        if is_new:
             self._commanded_ns, self._late_ns = now_ns, self._resend_ns
-        self._goal, self._refusal = goal, ''
+        self._goal_rad, self._refusal = goal_rad, ''
         self._send(duration_s)
 
     def _send(self, duration_s: float) -> None:
         """Send the goal to the controller, as a motion of a duration, s."""
-        names = [joint.name for joint in self._joints.values()]
-        positions = [joint.sign * (self._goal[name] - joint.offset_rad)
-                     for name, joint in self._joints.items()]
+        positions = (self._signs * (self._goal_rad - self._offsets_rad)).tolist()
         if self._kind == 'joint_state':
-            message = JointState(name=names, position=positions)
+            message = JointState(name=self._names, position=positions)
             message.header.stamp = self._node.get_clock().now().to_msg()
         else:
             sec, nanosec = divmod(round(duration_s * 1e9), 10 ** 9)
             # A trajectory with the stamp 0 begins at once.
-            message = JointTrajectory(joint_names=names, points=[JointTrajectoryPoint(
+            message = JointTrajectory(joint_names=self._names, points=[JointTrajectoryPoint(
                 positions=positions, time_from_start=Duration(sec=sec, nanosec=nanosec))])
         self._commands.publish(message)
 
-    def _late(self) -> bool:
-        """Return whether the stage has not reached its goal in time."""
-        return bool(self._goal) and STEADY.now().nanoseconds > self._late_ns \
-            and not self._arrived()
-
     def _arrived(self) -> bool:
-        return all(joint.angle_rad is not None
-                   and abs(joint.angle_rad - self._goal[name]) < _ARRIVED_RAD
-                   for name, joint in self._joints.items())
+        return bool((np.abs(self._angles_rad - self._goal_rad) < _ARRIVED_RAD).all())
 
     def _on_states(self, message: JointState) -> None:
         positions = dict(zip(message.name, message.position))
-        self._controller_joints |= set(positions)
-        known = [joint for joint in self._joints.values()
-                 if np.isfinite(positions.get(joint.name, np.nan))]
-        for joint in known:
-            joint.update(positions[joint.name])
-        if self._late():
-            for name, joint in self._joints.items():
-                joint.unwrap_to(self._goal[name])
-        if not known or any(joint.angle_rad is None for joint in self._joints.values()):
+        angles_rad = self._offsets_rad + self._signs * [
+            positions.get(name, np.nan) for name in self._names]
+        # A controller that counts from −π to π jumps where the stage turns on.
+        turns = np.round((self._angles_rad - angles_rad) / (2 * np.pi))
+        angles_rad += 2 * np.pi * np.where(np.isfinite(turns), turns, 0.0)
+        known = np.isfinite(angles_rad)
+        self._angles_rad = np.where(known, angles_rad, self._angles_rad)
+        if not known.any() or not np.isfinite(self._angles_rad).all():
             return
         self._heard_ns = STEADY.now().nanoseconds
-        stage = JointState(name=list(self._joints),
-                           position=[joint.angle_rad for joint in self._joints.values()])
+        stage = JointState(name=list(_ANGLES), position=self._angles_rad.tolist())
         stage.header.stamp = message.header.stamp
         self._positions.publish(stage)
 
-    def _refuse(self, reason: str) -> None:
-        """Report why a command is refused."""
-        if reason != self._refusal:
-            self._node.get_logger().warning(reason)
-        self._refusal = reason
-        self._diagnostics.notice(Level.WARN)
-
     def _status(self) -> Status:
-        values = {name: joint.angle_rad for name, joint in self._joints.items()
-                  if joint.angle_rad is not None}
+        values = {name: angle for name, angle in zip(_ANGLES, self._angles_rad.tolist())
+                  if np.isfinite(angle)}
         return Status(*self._state(), self._kind, values)
 
     def _state(self) -> tuple[Level, str]:
         """Return the level and one line: the motion, or why there is none."""
-        missing = [joint.name for joint in self._joints.values() if joint.angle_rad is None]
         now_ns = STEADY.now().nanoseconds
         if self._refusal:
             return Level.WARN, f'refused {self._refusal}'
-        if missing and self._controller_joints:
-            return Level.ERROR, (
-                f'{self._states_topic}: no joint {", ".join(missing)}; it has '
-                f'{", ".join(sorted(self._controller_joints))}; correct bridge.alpha.joint and '
-                'bridge.beta.joint')
         if now_ns - self._heard_ns > _SILENT_NS:
-            return Level.WARN, f'nothing on {self._states_topic}; is the controller running?'
-        if not self._node.count_subscribers(self._commands.topic_name):
-            return Level.WARN, f'nobody listens to {self._commands.topic_name}'
-        if self._late():
-            angles = ', '.join(f'{name} is at {np.degrees(joint.angle_rad or 0.0):.1f}° of '
-                               f'{np.degrees(self._goal[name]):.1f}°'
-                               for name, joint in self._joints.items())
+            return Level.WARN, (f'nothing on {self._states_topic} of {" and ".join(self._names)}; '
+                                'is the controller running, and has it these joints?')
+        is_there = self._arrived() or np.isnan(self._goal_rad).any()
+        if not is_there and now_ns > self._late_ns:
+            angles = ', '.join(f'{name} is at {angle:.1f}° of {goal:.1f}°' for name, angle, goal in
+                               zip(_ANGLES, *np.degrees([self._angles_rad, self._goal_rad])))
             late_s = (now_ns - self._commanded_ns) * 1e-9
             return Level.WARN, f'the controller has not followed for {late_s:.0f} s: {angles}'
-        return Level.OK, 'on the way' if self._goal and not self._arrived() else 'at rest'
+        return Level.OK, 'at rest' if is_there else 'on the way'
 
 
-_EXAMPLES = {
-    'the simulated stage': '',
-    'the bridge to a controller of ros2_control':
-        '--ros-args -p stage.type:=trajectory '
-        '-p bridge.alpha.joint:=tilt -p bridge.beta.joint:=turn',
-}
+_EXAMPLES = {'the bridge to a controller of ros2_control': '--ros-args -p stage.type:=trajectory '
+             '-p bridge.alpha.joint:=tilt -p bridge.beta.joint:=turn'}
 """Examples of arguments, by their purpose."""
 
 

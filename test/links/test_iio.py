@@ -117,11 +117,13 @@ def test_a_digital_sensor_gives_pseudo_volts(served):
 
 @pytest.mark.parametrize('adc, settings, reason', [
     ({'channels': [{'id': 'voltage0', 'scale': None}, {'id': 'voltage1'}]}, {},
-     'voltage0: its attribute scale cannot be read'),
+     "voltage0: its attribute scale is 'missing', not a number"),
     ({'channels': [{'id': 'voltage0', 'scale': 'nan'}, {'id': 'voltage1'}]}, {}, "is 'nan'"),
-    ({'channels': [{'id': 'voltage0', 'offset': None}, {'id': 'voltage1'}]}, {}, 'offset cannot'),
-    ({}, {'channels': 'voltage0,voltage9'}, "no channel 'voltage9'; it has voltage0 (x)"),
-    ({}, {'channels': 'voltage0'}, 'no channel for y'), ({'unstamped': True}, {}, 'timestamp'),
+    ({'channels': [{'id': 'voltage0', 'offset': None}, {'id': 'voltage1'}]}, {},
+     "offset is 'missing'"),
+    ({}, {'channels': 'voltage0,voltage9'}, "no channel 'voltage9'; it has voltage0, "),
+    ({}, {'channels': 'voltage0'}, 'the channels are x; expected'),
+    ({'unstamped': True}, {}, 'timestamp'),
     ({}, {'device': 'ads9999'}, "'ads9999' is not there; with buffered channels there are: adc"),
     ({'channels': [{'id': 'temp'}, {'id': 'voltage1'}]}, {'channels': 'temp,voltage1'},
      'temp cannot be x')])

@@ -82,7 +82,6 @@ def test_jitter_and_lost_samples_leave_the_chain_running() -> None:
     assert np.abs(error_mps2 - to_nominal_mps2(0 * samples.volts, unit())).max() < 0.02
     assert link.sensor is not None
     assert link.sensor.rate_hz == pytest.approx(200, rel=0.01)
-    assert statistics(link)['rate_changes'] == 0
 
 
 def test_a_reset_puts_the_sensor_at_its_power_on() -> None:

@@ -114,7 +114,7 @@ def test_a_mounted_sensor_is_turned_into_the_frame_of_the_robot(camera: Camera, 
     answer = client.call_async(Trigger.Request())
     until(answer.done, 'the answer of ~/level')
     assert answer.result().success, answer.result().message
-    assert "to keep them, start it with -p 'mounting.rpy_rad:=[" in answer.result().message
+    assert "to keep it, start it with -p 'mounting.rpy_rad:=[" in answer.result().message
     until(lambda: abs(tilt[-1].vector.x) < 0.01, 'a level robot')
     # The orientation that the camera states is 2·atan2(0.6, 0.8) about x, whatever it measures.
     quaternion = data[-1].orientation

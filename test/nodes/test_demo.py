@@ -29,11 +29,9 @@ def test_steps_without_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(UserError), jobs.Step('3/3 check', '16 poses'):
         raise UserError('it fails')
     lines = out.getvalue().splitlines()
-    assert [line.split()[2] for line in lines[:10]] == [
-        '15', '30', '44', '59', '73', '88', '103', '117', '132', '146']
-    assert lines[9].split() == ['1/2', 'sweep', '146', 'of', '146', 'poses', '100', '%', '0', 's']
-    assert lines[10].split() == ['2/2', 'fit', '130', 'poses,', 'full', 'model', '0', 's']
-    assert len(lines) == 11 and max(map(len, lines)) <= 79
+    assert lines[0].split() == ['1/2', 'sweep', '146', 'of', '146', 'poses', '100', '%', '0', 's']
+    assert lines[1].split() == ['2/2', 'fit', '130', 'poses,', 'full', 'model', '0', 's']
+    assert len(lines) == 2 and max(map(len, lines)) <= 79
     assert '\x1b' not in out.getvalue()
 
 

@@ -34,17 +34,17 @@ def launch(start: Callable[..., Started]) -> Callable[..., Started]:
     ('robot', 'params_file:=none.yaml', 'none.yaml: cannot be read'),
     ('calibrate', 'params_file:=other.yaml', 'other.yaml: has no parameters of the node /driver'),
     ('robot', 'link_type:=seral', '"seral" is not valid'),
-    ('robot', 'link_baud:=fast', 'link_baud:=fast: expected a whole number'),
+    ('robot', 'link_baud:=fast', 'link_baud:=fast: expected a number'),
     ('robot', 'log_level:=loud', '"loud" is not valid'),
     ('calibrate', 'screen:=maybe', '"maybe" is not valid'),
     ('robot', 'output_rate_hz:=slow', 'output_rate_hz:=slow: expected a number'),
     ('robot', 'mounting_xyz_m:=0.1', 'mounting_xyz_m:=0.1: expected three numbers'),
     ('emulate', 'rpy_rad:=0.1', 'rpy_rad:=0.1: expected three numbers'),
-    ('emulate', 'seed:=odd', 'seed:=odd: expected a whole number'),
-    ('calibrate', 'sweep_planes_deg:=flat', 'sweep_planes_deg:=flat: expected numbers'),
+    ('emulate', 'seed:=odd', 'seed:=odd: expected a number'),
+    ('calibrate', 'sweep_planes_deg:=flat', 'sweep_planes_deg:=flat: expected a number'),
     ('calibrate', 'link_type:=serial', 'link_type is serial, but the stage would be simulated'),
     ('investigate', 'link_type:=serial', 'link_type is serial, but the stage would be simulated'),
-    ('investigate', 'limits_beta_deg:=wide', 'limits_beta_deg:=wide: expected numbers'),
+    ('investigate', 'limits_beta_deg:=wide', 'limits_beta_deg:=wide: expected a number'),
     ('calibrate', 'params_file:=serial.yaml', 'link_type is serial, but the stage would be')])
 def test_a_launch_refuses_bad_arguments(launch, tmp_path, name, argument, words):
     text = NOMINAL.read_text()
@@ -57,16 +57,6 @@ def test_a_launch_refuses_bad_arguments(launch, tmp_path, name, argument, words)
     assert words in launched.output()
     assert 'Traceback' not in launched.output()
     assert 'process started' not in launched.output()
-
-
-@pytest.mark.parametrize('name', ['robot', 'calibrate'])
-def test_a_launch_names_the_nearest_of_a_misspelt_argument(launch, name):
-    launched = launch(name, 'parms_file:=unit.yaml', 'frame_id:=case', 'link_baud:=fast')
-    assert launched.wait() == 1
-    output = launched.output()
-    assert 'parms_file:=... is no argument of this launch' in output
-    assert 'did you mean params_file?' in output
-    assert output.count('did you mean') == 1
 
 
 @pytest.mark.parametrize('name, arguments, starts, words', [
@@ -102,7 +92,6 @@ def test_the_arguments_count_before_the_file(launch, tmp_path, name, node):
         NOMINAL.read_text() + f'{node}:\n  ros__parameters:\n    link.type: serial\n')
     launched = launch(name, 'params_file:=own.yaml', 'link_type:=sim')
     launched.wait_for('active: link sim, unit nominal')
-    assert 'did you mean' not in launched.output()
 
 
 def test_a_robot_takes_the_imu_of_another_driver(launch):

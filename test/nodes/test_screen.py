@@ -67,7 +67,6 @@ def test_a_screen_drives_the_sweep_of_a_node_without_a_terminal(start, screen, t
     seen.press('q')
     assert seen.wait() == 0
     assert seen.restored()
-    assert 'while /calibration runs, show it again: ros2 run adxl_ros screen' in seen.text()
     _, entries = sweep_journal.read(tmp_path / 'unit.yaml.journal')
     poses = sweep_journal.accepted_poses(entries)
     # The screen causes no loss: every pose has all samples.
@@ -90,7 +89,7 @@ def test_a_screen_waits_for_its_node_and_survives_it(start, screen):
     node = start('calibration', *names)
     seen.wait_for('press b to begin', 'b  begin')
     node.popen.kill()
-    seen.wait_for('nothing from /bench/bridge for')
+    seen.wait_for('waiting for /bench/bridge')
     # Keys without a node do nothing.
     seen.press('b')
     node = start('calibration', *names, '-p', 'output:=second.yaml')
@@ -100,7 +99,7 @@ def test_a_screen_waits_for_its_node_and_survives_it(start, screen):
     seen.press('a')
     seen.wait_for('aborted', 'b  begin')
     assert node.stop() == 0
-    seen.wait_for('/bench/bridge has ended; waiting until it is started again')
+    seen.wait_for('waiting for /bench/bridge')
     seen.press('\x03')
     assert seen.wait() == 0
     assert seen.restored()

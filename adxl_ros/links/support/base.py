@@ -19,7 +19,6 @@ import time
 from typing import Any, cast, Protocol, runtime_checkable
 
 from adxl_ros.errors import one_line, UserError
-from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -327,8 +326,6 @@ TEMPERATURE = 'temperature'
 """Role of the channel with the temperature."""
 UNUSED = '-'
 """Role of a channel that is not read."""
-ROLES = (*AXES, SUPPLY, TEMPERATURE)
-"""All roles of channels that are read."""
 COLUMNS = {SUPPLY: 'supply_v', TEMPERATURE: 'temperature_c'}
 """Column of a recording by the role of a reference channel."""
 
@@ -347,15 +344,9 @@ def parse_channels(value: str | Sequence[str]) -> list[str]:
 
 def check_roles(roles: Sequence[str], axes: str) -> None:
     """Check that the channels make a sensor readable."""
-    for role in roles:
-        if role not in (*ROLES, UNUSED):
-            raise UserError(f'link.channels: {role!r} is none of {", ".join(ROLES)}, or - for '
-                            'a channel that is not used')
-        if role != UNUSED and list(roles).count(role) > 1:
-            raise UserError(f'link.channels: {role} is there twice')
-        if role in AXES and role not in axes:
-            raise UserError(f'link.channels: the sensor has no axis {role}: sensor.axes is {axes}')
-    lacking = [axis for axis in axes if axis not in roles]
-    if lacking:
-        raise UserError(f'link.channels: no channel for {", ".join(lacking)}: the channels are '
-                        f'{", ".join(roles) or "none"}, sensor.axes is {axes}')
+    used = [role for role in roles if role != UNUSED]
+    if not set(axes) <= set(used) <= {*axes, SUPPLY, TEMPERATURE} or len(set(used)) < len(used):
+        raise UserError(
+            f'link.channels: the channels are {", ".join(roles) or "none"}; expected each of '
+            f'{", ".join(axes)} (sensor.axes) once, supply and temperature at most once, and - '
+            'for a channel that is not used')

@@ -9,7 +9,6 @@ from contextlib import contextmanager, suppress
 import os
 from pathlib import Path
 import pty
-import stat
 import termios
 import time
 import tty
@@ -140,25 +139,21 @@ def check_sensor(sensor: Sensor) -> None:
 
 @contextmanager
 def open_terminal(port: str) -> Iterator[int]:
-    """Open the end of a terminal that a board writes to."""
-    path, fds = Path(port), []
-    is_new = not path.exists()
-    if not is_new and not stat.S_ISCHR(path.stat().st_mode):
-        raise UserError(f'--port {port}: is no terminal device; name one, or a path that does not '
-                        'exist for a new pseudo-terminal')
+    """Open a new pseudo-terminal, the end that a board writes to; its other end gets a name."""
+    path = Path(port)
+    if path.exists():
+        raise UserError(f'--port {port}: exists; name a path that does not')
+    board_fd, driver_fd = pty.openpty()
     try:
-        fds = [*pty.openpty()] if is_new else [os.open(
-            path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)]
-        tty.setraw(fds[-1])
-        os.set_blocking(fds[0], False)
-        if is_new:
-            path.unlink(missing_ok=True)  # the name of an earlier board
-            path.symlink_to(os.ttyname(fds[-1]))
-        yield fds[0]
+        tty.setraw(driver_fd)
+        os.set_blocking(board_fd, False)
+        path.unlink(missing_ok=True)  # the name of an earlier board
+        path.symlink_to(os.ttyname(driver_fd))
+        yield board_fd
     except (OSError, termios.error) as error:
         raise UserError(f'--port {port}: cannot be opened: {error}') from None
     finally:
-        if is_new and fds and path.is_symlink() and os.readlink(path) == os.ttyname(fds[-1]):
+        if path.is_symlink() and os.readlink(path) == os.ttyname(driver_fd):
             path.unlink()
-        for fd in fds:
-            os.close(fd)
+        os.close(board_fd)
+        os.close(driver_fd)

@@ -287,8 +287,6 @@ _TRIES = 3
 """Readings of which the least interrupted one counts."""
 _MAX_UNCERTAINTY_NS = 20_000
 """Uncertainty above which a reading is ignored, ns: the process was interrupted."""
-_GAIN = 0.05
-"""Share of a small difference that an update takes up."""
 
 
 class SystemClockMap:
@@ -296,21 +294,19 @@ class SystemClockMap:
 
     def __init__(self) -> None:
         self.steps = 0  # How often the system clock was set since the map began
-        self._offset_ns = float(_system_offset()[1])
+        self._offset_ns = _system_offset()[1]
 
     def update(self) -> None:
         """Follow the system clock."""
         uncertainty_ns, offset_ns = _system_offset()
         if uncertainty_ns > _MAX_UNCERTAINTY_NS:
             return
-        difference_ns = offset_ns - self._offset_ns
-        is_step = abs(difference_ns) >= _STEP_NS
-        self._offset_ns += difference_ns if is_step else _GAIN * difference_ns
-        self.steps += is_step
+        self.steps += abs(offset_ns - self._offset_ns) >= _STEP_NS
+        self._offset_ns = offset_ns
 
     def ros_ns(self, host_ns: np.ndarray) -> np.ndarray:
         """Return the ROS times of monotonic times, ns."""
-        return host_ns + round(self._offset_ns)
+        return host_ns + self._offset_ns
 
 
 def _system_offset() -> tuple[int, int]:
@@ -323,7 +319,7 @@ def _system_offset() -> tuple[int, int]:
 
 
 _PERIOD_NS = 100_000_000
-"""Period of the means of supply and temperature, ns. Chosen: both change slowly."""
+"""Time between two means of supply and temperature, ns. Chosen: both change slowly."""
 
 
 @dataclass(frozen=True)
@@ -334,37 +330,6 @@ class Block:
     volts: np.ndarray  # Output of the sensor by axis, V, (n, m)
     references: Mapping[str, np.ndarray]  # References that the device has, by column, (n,) each
     lost: int | None = None  # Samples lost before it; None where only time shows them
-
-
-class PeriodMeans:
-    """Replaces slow references by their means over 0.1 s, each at the next sample that comes."""
-
-    def __init__(self, columns: Sequence[str]) -> None:
-        self._held: dict[str, list[np.ndarray]] = {column: [] for column in columns}
-        self._period = 0
-
-    def thin(self, host_ns: np.ndarray, references: Mapping[str, np.ndarray]
-             ) -> dict[str, np.ndarray]:
-        """
-        Return the means of all columns in the first row of a period, and NaN in other rows.
-
-        host_ns: times of the samples, ns, (n,), ascending from call to call; references: values by
-        column, (n,) each.
-        """
-        period = int(host_ns[-1]) // _PERIOD_NS
-        means = dict.fromkeys(self._held, np.full(len(host_ns), np.nan))
-        if period != self._period:
-            self._period = period
-            for column, parts in self._held.items():
-                values = np.concatenate([*parts, np.empty(0)])
-                values = values[np.isfinite(values)]
-                parts.clear()
-                if len(values):
-                    means[column] = np.full(len(host_ns), np.nan)
-                    means[column][0] = values.mean()
-        for column, values in references.items():
-            self._held[column].append(values)
-        return means
 
 
 _FOLLOW_NS = 10_000_000
@@ -382,18 +347,13 @@ class Stamper:
         self.period_ns = 0.0  # Sample period, ns; 0 before the first `restart`
         self._system_clock = SystemClockMap()
         self._followed_ns = 0
-        self._means = PeriodMeans(references)
+        self._references, self._period = references, 0
         self._unstamped: list[Block] = []
         self._stamped: list[Samples] = []
         self._last_ns: int | None = None
         self._last_device_ns = 0
         self._new_clock = True
         self._counted = self._estimated = 0
-
-    @property
-    def waiting(self) -> bool:
-        """Whether `take` would return samples."""
-        return bool(self._stamped)
 
     def restart(self, period_ns: float) -> None:
         """Begin a new clock or device; time gives an estimate of the samples lost before."""
@@ -423,11 +383,12 @@ class Stamper:
         if self.clock.ready(arrived_ns):
             self._stamp()
 
-    def flush(self) -> None:
-        """Stamp all samples now, by what is known of the clock."""
+    def flush(self) -> bool:
+        """Stamp all samples now, by what is known of the clock; return whether there are any."""
         if self._unstamped:
             self.clock.ready(_FOREVER_NS)
             self._stamp()
+        return bool(self._stamped)
 
     def take(self, sensor: Sensor) -> Samples:
         """Return the samples of a sensor that were stamped since the last call."""
@@ -436,8 +397,6 @@ class Stamper:
         if not self._stamped:
             return no_samples(sensor, time.time_ns())
         parts, self._stamped = self._stamped, []
-        if len(parts) == 1:
-            return parts[0]
         return Samples(
             np.concatenate([part.stamp_ns for part in parts]),
             np.concatenate([part.volts for part in parts]),
@@ -475,7 +434,17 @@ class Stamper:
             self._last_ns = int(host_ns[-1])
             self._stamped.append(Samples(
                 self._system_clock.ros_ns(host_ns), block.volts, time.time_ns(),
-                self._counted + self._estimated, self._means.thin(host_ns, block.references),
+                self._counted + self._estimated, self._thin(host_ns, block.references),
                 self._estimated))
             self._counted = self._estimated = 0
         self._unstamped.clear()
+
+    def _thin(self, host_ns: np.ndarray, references: Mapping[str, np.ndarray]
+              ) -> dict[str, np.ndarray]:
+        """Return each reference by its mean in the first row after a period, and NaN elsewhere."""
+        thinned = {column: np.full(len(host_ns), np.nan) for column in self._references}
+        if (period := int(host_ns[-1]) // _PERIOD_NS) != self._period:
+            self._period = period
+            for column, values in references.items():
+                thinned[column][0] = values.mean()
+        return thinned

@@ -67,10 +67,6 @@ class WireError(Exception):
     """Bytes that are no frame of this format."""
 
 
-class VersionError(WireError):
-    """A whole frame of another version."""
-
-
 @dataclass(frozen=True)
 class BoardInfo:
     """How a board describes itself."""
@@ -205,32 +201,30 @@ def _checked_payload(raw: bytes) -> bytes:
     if len(payload) < _COMMAND.size or check != _CRC.pack(zlib.crc32(payload)):
         raise WireError('the CRC does not match')
     if payload[1] != VERSION:
-        raise VersionError(f'wire format {payload[1]}')
+        raise WireError(f'wire format {payload[1]}')
     return payload
 
 
 def _decode_info(payload: bytes) -> BoardInfo:
     if len(payload) != _INFO.size:
-        raise WireError(f'an info frame of {len(payload)} bytes')
+        raise WireError('no info frame')
     _, _, flags, _, rate_hz, bits, channels, vref_v, serial = _INFO.unpack(payload)
     name = serial.rstrip(b'\0')
     if not (RATES_HZ[0] <= rate_hz <= RATES_HZ[1] and _VREFS_V[0] <= vref_v <= _VREFS_V[1]
             and 1 <= bits <= MAX_BITS and 1 <= channels <= MAX_CHANNELS
             and all(32 <= byte < 127 for byte in name)):
-        raise WireError(f'an info frame with {rate_hz:g} Hz, {bits} bits, {channels} channels, '
-                        f'{vref_v:g} V, {name!r}')
+        raise WireError('an info frame beyond the bounds of the format')
     return BoardInfo(rate_hz, bits, channels, vref_v, name.decode('ascii').strip(), flags)
 
 
 def _decode_samples(payload: bytes) -> SampleFrame:
     if len(payload) < _SAMPLES.size:
-        raise WireError(f'a data frame of {len(payload)} bytes')
+        raise WireError('no frame of samples')
     (_, _, flags, sequence, time_us, index, overruns, count,
      channels) = _SAMPLES.unpack_from(payload)
     if (len(payload) != _SAMPLES.size + 2 * count * channels or not count
             or not 0 < channels <= MAX_CHANNELS or time_us > _MAX_TIME_US):
-        raise WireError(f'a data frame of {count} samples of {channels} channels in '
-                        f'{len(payload)} bytes at {time_us} us')
+        raise WireError('a frame of samples beyond the bounds of the format')
     codes = np.frombuffer(payload, '<u2', offset=_SAMPLES.size).reshape(count, channels)
     return SampleFrame(flags, sequence, time_us, index, overruns, codes)
 
