@@ -172,8 +172,7 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
         any(c.fading_hz is not None for c in model.comparisons), wanders,
         np.inf if floor.source == 'assumed' else floor.rms_mps2,
         {effects: h.sizeless for effects, h in search.found.items()})
-    detections = [d for d in _detections(checked, search.best, model.baseline, smallest_mps2)
-                  if not (wanders and d.effect in drift_effects())]
+    detections = _detections(checked, search.best, model.baseline, smallest_mps2)
     bases = [flexible_bases(c, v) for c, v in zip(compared, model.baseline_v)]
     verdict = rule.decide(
         evidence, lambda effects, drift: reproducible_rest(fits[effects][drift], bases),

@@ -30,48 +30,11 @@ _ITERATIONS = 3
 """Iterations over coefficients and noise. Chosen: the filters no longer change then."""
 _SMALLEST_SQUARES_V2 = 1e-300
 """Smallest sum of squares, V², whose logarithm is taken: above zero."""
-_CACHED_VALUES = 100_000
-"""Number of values that are filtered at once. Chosen: 0.8 MB stay in the cache of a processor."""
 _RIDGE = 1e-12
 """Ridge on the scaled precision. Chosen: columns that differ by a millionth are separable."""
 UNDETERMINED_SHARE, _UNDETERMINED_RATIO = 0.5, 3.0
 """A coefficient is not determined if its posterior standard deviation exceeds this share of the
 prior's, nor by some blocks if it exceeds that of all blocks by this factor. Chosen."""
-_SERIES = 16
-"""Series that are filtered together. Chosen: little memory beside all series."""
-
-
-@dataclass(frozen=True)
-class AngleErrorFilter:
-    """A filter that gives noise with errors of angles the spectrum of noise without them."""
-
-    rms_v: float  # Rms of the errors, V
-    pole: float  # Pole a of the noise
-    transition: np.ndarray  # Factor of the estimate of u from sample to sample, (n,)
-    gain: np.ndarray  # Gain of the estimate of u, 1/V, (n,)
-    weight: np.ndarray  # Change of the predicted sample by the estimate of u, V, (n,)
-    scale: np.ndarray  # Standard deviation of the noise divided by that of the innovation, (n,)
-
-    def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Filter k series, (k, n)."""
-        lower = np.ones((2, len(self.gain)))
-        lower[1, :-1] = -self.transition[1:]
-        filtered = np.empty_like(values)
-        for first in range(0, len(values), _SERIES):
-            part = values[first:first + _SERIES]
-            changes = part.copy()
-            changes[:, 1:] -= self.pole * part[:, :-1]
-            changes[:, 0] = 0.0
-            estimates = scipy.linalg.lapack.dtbtrs(lower, (changes * self.gain).T, uplo='L',
-                                                   diag='U')[0].T
-            changes[:, 1:] -= self.weight[1:] * estimates[:, :-1]
-            changes *= self.scale
-            changes[:, 0] = part[:, 0]
-            filtered[first:first + _SERIES] = scipy.signal.lfilter(
-                [1.0], [1.0, -self.pole], changes)
-        return filtered
-
-
 @dataclass(frozen=True)
 class Whitener:
     """A filter that makes noise white."""
@@ -80,9 +43,6 @@ class Whitener:
     log_prior: float  # Log prior probability of such noise, up to a constant
     effect: str  # Name of the drift effect that the filter is for
     density: float  # Density of the drift, in the unit of the effect's parameter
-    # Filter for the errors of angles and rounding; None where there are none, or where the drift
-    # exceeds them: they would take up a part of it
-    errors: AngleErrorFilter | None = None
 
     @property
     def spectrum(self) -> DriftSpectrum:
@@ -96,14 +56,12 @@ class Whitener:
         """Whether a unit without the effect may drift as much."""
         return self.density <= effect_named(self.effect).diagnosis.healthy_density
 
-    def continued(self, values: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Filter the next part of k series, (k, n); return it and the state, (s, k, 2)."""
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        """Filter k series, (k, n)."""
         if len(self.sections) > 1:
-            return scipy.signal.sosfilt(self.sections, values, zi=state)
+            return scipy.signal.sosfilt(self.sections, values)
         # The same recursion without a copy.
-        filtered, after = scipy.signal.lfilter(self.sections[0, :3], self.sections[0, 3:], values,
-                                               zi=state[0])
-        return filtered, after[None]
+        return scipy.signal.lfilter(self.sections[0, :3], self.sections[0, 3:], values)
 
 
 def drifts_among(effects: Iterable[str]) -> tuple[str, ...]:
@@ -121,8 +79,6 @@ class WhitenedChannel:
     block_grams: np.ndarray
     total_grams: np.ndarray  # Their sums over all blocks, V², (filters, k + 1, k + 1)
     counts: np.ndarray  # Samples by block, (blocks,)
-    # What the filter for errors of the reference adds to the log likelihood, (filters, blocks)
-    log_scales: np.ndarray
     log_priors: np.ndarray  # Log prior probability of each filter, (filters,)
     # Effect that the noise of each filter needs, '' for a healthy unit, (filters,)
     drift_effects: np.ndarray
@@ -142,33 +98,18 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
     data[0], data[1:] = residual_v, columns.T
     if not used.all():
         data = bridged(data.T, used).T
-    before = {id(f.errors): data if f.errors is None else f.errors(data)
-              for f in {id(f.errors): f for f in filters}.values()}
-    edges, unused = block_edges(len(used)), np.flatnonzero(~used)
-    grams = np.zeros((len(filters), BLOCKS if by_block else 1, len(data), len(data)))
-    states = [np.zeros((len(f.sections), len(data), 2)) for f in filters]
-    together = max(1, _CACHED_VALUES * BLOCKS // data.size)
-    for first in range(0, BLOCKS, together):
-        blocks = range(first, min(first + together, BLOCKS))
-        part = slice(edges[first], edges[blocks[-1] + 1])
-        values = {kind: np.ascontiguousarray(series[:, part]) for kind, series in before.items()}
-        dropped = unused[slice(*np.searchsorted(unused, [part.start, part.stop]))] - part.start
-        for i, whitener in enumerate(filters):
-            white, states[i] = whitener.continued(values[id(whitener.errors)], states[i])
-            # The first sample is a step from zero.
-            white[:, dropped if first else np.append(dropped, 0)] = 0.0
-            if not by_block:
-                grams[i, 0] += white @ white.T
-                continue
-            for b in blocks:
-                inside = white[:, edges[b] - part.start:edges[b + 1] - part.start]
-                np.matmul(inside, inside.T, out=grams[i, b])
+    edges = block_edges(len(used)) if by_block else np.array([0, len(used)])
+    # The first sample is a step from zero.
+    dropped = np.append(np.flatnonzero(~used), 0)
+    grams = np.zeros((len(filters), len(edges) - 1, len(data), len(data)))
+    for i, whitener in enumerate(filters):
+        white = whitener(data)
+        white[:, dropped] = 0.0
+        for b, (begin, end) in enumerate(pairwise(edges)):
+            np.matmul(white[:, begin:end], white[:, begin:end].T, out=grams[i, b])
     total = grams.sum(axis=1)
-    grams = grams if by_block else np.zeros((len(filters), 0, len(data), len(data)))
-    # The log determinant of the filter for errors, sample by sample.
-    log_scales = np.array([np.zeros(BLOCKS) if f.errors is None else np.add.reduceat(
-        np.where(used, np.log(f.errors.scale), 0.0), edges[:-1]) for f in filters])
-    return WhitenedChannel(column_ids, grams, total, used_by_block(used), log_scales,
+    grams = grams if by_block else grams[:, :0]
+    return WhitenedChannel(column_ids, grams, total, used_by_block(used),
                            np.array([f.log_prior for f in filters]),
                            np.array(['' if f.healthy else f.effect for f in filters]))
 
@@ -247,8 +188,8 @@ def fit_columns(channels: Sequence[WhitenedChannel], column_ids: Iterable[int],
     """
     ids = np.array(sorted(column_ids), int)
     chosen = np.ones(BLOCKS, bool) if blocks is None else blocks
-    # By channel: places of its columns among all, products, count of samples, log scales, and
-    # log priors of the filters
+    # By channel: places of its columns among all, products, count of samples, and log priors of
+    # the filters
     selected, filters = [], []
     for channel in channels:
         columns = np.flatnonzero(np.isin(channel.column_ids, ids))
@@ -259,8 +200,7 @@ def fit_columns(channels: Sequence[WhitenedChannel], column_ids: Iterable[int],
         log_priors = np.where(allowed | ~allowed.any(), channel.log_priors, -np.inf)
         selected.append((np.searchsorted(ids, channel.column_ids[columns]),
                          grams[:, rows[:, None], rows],
-                         max(float(channel.counts[chosen].sum()), 1.0),
-                         channel.log_scales[:, chosen].sum(axis=1), log_priors))
+                         max(float(channel.counts[chosen].sum()), 1.0), log_priors))
         filters.append(int(np.argmax(log_priors)))
     if start is not None:
         filters = list(start.filter_indices)
@@ -277,16 +217,16 @@ def fit_columns(channels: Sequence[WhitenedChannel], column_ids: Iterable[int],
         size = 1 / np.sqrt(np.diag(precision))
         factor = np.linalg.cholesky(precision * size[:, None] * size + _RIDGE * np.eye(len(ids)))
         values = size * scipy.linalg.cho_solve((factor, True), size * information)
-        for i, (places, grams, count, log_scales, log_priors) in enumerate(selected):
+        for i, (places, grams, count, log_priors) in enumerate(selected):
             v = np.concatenate([[1.0], -values[places]])
             squares_v2 = np.maximum(np.einsum('i,wij,j->w', v, grams, v), _SMALLEST_SQUARES_V2)
-            filters[i] = int(np.argmax(-count / 2 * np.log(squares_v2) + log_scales + log_priors))
+            filters[i] = int(np.argmax(-count / 2 * np.log(squares_v2) + log_priors))
             variance_v2[i] = squares_v2[filters[i]] / count
     covariance = scipy.linalg.cho_solve((factor, True), np.eye(len(ids))) * size[:, None] * size
     log_evidence = -0.5 * float(np.sum(prior_precision * values ** 2)) \
         - float(np.log(np.diag(factor) / size).sum()) + 0.5 * float(np.log(prior_precision).sum())
-    for (*_, count, log_scales, log_priors), variance, f in zip(selected, variance_v2, filters):
-        log_evidence += float(-count / 2 * (np.log(variance) + 1) + log_scales[f] + log_priors[f])
+    for (*_, count, log_priors), variance, f in zip(selected, variance_v2, filters):
+        log_evidence += float(-count / 2 * (np.log(variance) + 1) + log_priors[f])
     return LinearFit(ids, values, covariance, log_evidence, tuple(filters), variance_v2)
 
 

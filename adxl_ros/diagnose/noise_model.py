@@ -13,29 +13,20 @@ Alternating poles and zeros, one pair a decade, whiten 1/f noise below its corne
 density equals that of the white noise (Corsini and Saletti 1988, IEEE Trans. Instrum. Meas. 37).
 The variance of the innovations is fitted. The filter then depends only on the ratio of drift and
 noise, which is searched on a grid.
-
-Errors of followed angles, and rounding to codes coarser than the noise, are constant at rest and
-new after each move (errors in variables; Fuller 1987). The model is y = n + g·u. Here n is noise
-behind the RC filter, AR(1) with pole a, u has variance 1, u_t = φ_t·u_(t−1) + √(1 − φ_t²)·ξ_t, and
-g is its standard deviation in V. A Kalman filter predicts g·u; its innovations, scaled and
-filtered by 1/(1 − aL), have the spectrum of n. Where g is 0, samples stay as they are.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from math import sqrt
+from collections.abc import Sequence
+from dataclasses import dataclass
 
-from adxl_ros.diagnose.comparison import BaselineComparison, CachedPath, gravity_slopes
-from adxl_ros.diagnose.evidence import AngleErrorFilter, Whitener
+from adxl_ros.diagnose.comparison import BaselineComparison, gravity_slopes
+from adxl_ros.diagnose.evidence import Whitener
 from adxl_ros.model import noise
-from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.diagnosis_hints import DriftSpectrum
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import true_runs
-from adxl_ros.simulate.smoothed_paths import ForcePath
 import numpy as np
 import scipy
 
@@ -64,11 +55,6 @@ _LOWEST_NOISE_V = 1e-7
 of any ADC."""
 _TOP_OF_RATE = 0.25
 """Highest corner frequency of 1/f noise, divided by the sample rate. Chosen: half of Nyquist."""
-_SMALLEST_HELD_SHARE = 0.01
-"""Share of the rounding that is held, below which all of it is white. Chosen: the noise is then
-a third of a step, as in any unit whose ADC suits it."""
-
-
 @dataclass(frozen=True)
 class NoiseFloor:
     """Rms of what no model can predict, over samples and measured axes."""
@@ -191,71 +177,11 @@ def find_repeat(first: np.ndarray, second: np.ndarray, rate_hz: float, resolutio
         else None
 
 
-def angle_error_filter(comparison: BaselineComparison, axis: int) -> AngleErrorFilter | None:
-    """
-    Return the filter for one axis of a recording, by the Riccati recursion of the Kalman filter.
-
-    None where the errors of angles and rounding are 0.
-    """
-    sensor = comparison.sensor
-    rounding = noise.rounding(sensor, axis)
-    variance_v2, remembered_v2 = np.zeros(len(comparison)), np.zeros(len(comparison))
-    for part_v2, memory in _held_errors(comparison, axis, rounding.held_v2):
-        variance_v2 += part_v2
-        remembered_v2 += part_v2 * memory
-    if not variance_v2.any():
-        return None
-    pole, analog_v = _analog(comparison, axis)
-    noise_v2 = analog_v ** 2 * (1 - pole ** 2) + rounding.white_v2 * (1 + pole ** 2)
-    memories = np.divide(remembered_v2, variance_v2, where=variance_v2 > 0,
-                         out=np.ones(len(comparison)))
-    std_v = np.sqrt(variance_v2)
-    rows, variance, previous_v = [], 1.0, float(std_v[0])
-    for g, phi in zip(std_v.tolist(), memories.tolist()):
-        renewal2 = 1 - phi * phi
-        weight = g * phi - pole * previous_v
-        total_v2 = weight * weight * variance + g * g * renewal2 + noise_v2
-        gain = (phi * weight * variance + g * renewal2) / total_v2
-        rows.append((phi - gain * weight, gain, weight, sqrt(noise_v2 / total_v2)))
-        variance = phi * phi * variance + renewal2 - gain * gain * total_v2
-        previous_v = g
-    return AngleErrorFilter(float(np.sqrt(np.mean(variance_v2))), pole, *np.array(rows).T)
-
-
 def _analog(comparison: BaselineComparison, axis: int) -> tuple[float, float]:
     """Return pole of the RC filter and standard deviation of the analog noise, V."""
     rc_s = float(noise.electronics(comparison.sensor).rc_s[axis])
     return (float(np.exp(-comparison.dt_s / rc_s)) if rc_s else 0.0,
             max(float(noise.analog_std_v(comparison.sensor)[axis]), _LOWEST_NOISE_V))
-
-
-def _held_errors(comparison: BaselineComparison, axis: int, held_v2: float
-                 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """
-    Yield variance, V², (n,), and memory from sample to sample, (n,), of the errors that are held.
-
-    They are those of each joint, and of rounding: the rounding errors of two outputs that differ
-    by a small share x of a step have the correlation 1 − 6·x.
-    """
-    sensor, time_s, joints = comparison.sensor, comparison.time_s, comparison.joints or ()
-    slopes = gravity_slopes(*(joint(time_s) for joint in joints))[:, axis] if joints else ()
-    for joint, slope in zip(joints, slopes):
-        errors = joint.errors(time_s) if isinstance(joint, CachedPath) else None
-        if errors is not None:
-            # An error that grows, after a move, is a new one.
-            memory = np.exp(-errors.forgetting_per_s * comparison.dt_s)
-            memory[1:] *= np.minimum(errors.std[:-1] / errors.std[1:], 1.0)
-            v_per_rad = slope * sensor.scale_v_per_g[axis] * sensor.local_gravity_mps2 / G0_MPS2
-            yield (v_per_rad * errors.std) ** 2, memory
-    force = comparison.motion.force
-    if isinstance(force, ForcePath) and force.is_robot:
-        errors = force.errors(time_s, AXES.index(sensor.axes[axis]))
-        v_per_mps2 = sensor.scale_v_per_g[axis] / G0_MPS2
-        yield (v_per_mps2 * errors.std) ** 2, np.exp(-errors.forgetting_per_s * comparison.dt_s)
-    if held_v2 > _SMALLEST_HELD_SHARE * sensor.lsb_v ** 2 / 12:
-        simulated_v = comparison.simulated_v(sensor)[:, axis]
-        steps = np.abs(np.diff(simulated_v, prepend=simulated_v[:1])) / sensor.lsb_v
-        yield np.full(len(comparison), held_v2), np.exp(-6 * steps)
 
 
 def drift_effects() -> tuple[str, ...]:
@@ -270,9 +196,9 @@ def whiteners(comparisons: Sequence[BaselineComparison]) -> list[list[Whitener]]
 
 def _whiteners(comparison: BaselineComparison, axis: int) -> list[Whitener]:
     sensor, dt_s, span_s = comparison.sensor, comparison.dt_s, comparison.span_s
-    errors, scale = angle_error_filter(comparison, axis), float(sensor.scale_v_per_g[axis])
+    scale = float(sensor.scale_v_per_g[axis])
     a, std_v = _analog(comparison, axis)
-    step_v2 = noise.rounding(sensor, axis).white_v2
+    step_v2 = sensor.lsb_v ** 2 / 12
     by_spectrum = {effect_named(e).diagnosis.drift: e for e in drift_effects()}
     # Sections, effect and density of each filter.
     filters: list[tuple[np.ndarray, str, float]] = []
@@ -300,10 +226,8 @@ def _whiteners(comparison: BaselineComparison, axis: int) -> list[Whitener]:
             by_spectrum[DriftSpectrum.FLICKER], density))
         if corner_hz > top_hz:
             break
-    largest = np.inf if errors is None else errors.rms_v / scale
-    made = [Whitener(sections, -0.5 * (np.log10(density / _USUAL_DENSITY) / _DENSITY_DECADES) ** 2,
+    return [Whitener(sections, -0.5 * (np.log10(density / _USUAL_DENSITY) / _DENSITY_DECADES) ** 2,
                      effect, density) for sections, effect, density in filters]
-    return [replace(f, errors=errors) if f.healthy or f.density < largest else f for f in made]
 
 
 def expected_drift_g(spectrum: DriftSpectrum, density: float, span_s: float, rate_hz: float

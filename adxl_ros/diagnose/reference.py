@@ -15,7 +15,6 @@ from typing import Any
 
 from adxl_ros.diagnose.comparison import (
     BaselineComparison,
-    code_step_v,
     compare,
     Reference,
     SMALLEST_MOTION_G,
@@ -27,7 +26,7 @@ from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import true_runs
 from adxl_ros.simulate.motion import Motion
-from adxl_ros.simulate.smoothed_paths import BAND_LIMITED_DEGREE, ForcePath, KNOT_S
+from adxl_ros.simulate.smoothed_paths import BAND_LIMITED_DEGREE, ForcePath
 import numpy as np
 import scipy
 
@@ -76,14 +75,11 @@ some periods of a shaker."""
 _LARGEST_ERROR = 0.3
 """Error of the force by the spline, divided by the noise, up to which a window is used. Chosen: it
 adds 4 % to the noise."""
-_ENCODER_SQUARES = 3.0
-"""Mean square of what looks like motion by the steps of an encoder, divided by step²/12, that is
-accepted. Chosen: the steps are not white in slow motion."""
-_SAME_MOTION, _MOVES = 2.0, 3.0
-"""Ratio of recorded and simulated motion from which one is an alias, and motion, divided by the
-noise, from which that counts. Chosen: an alias below 0.2 of the rate has a ratio of 4."""
-_IMAGES = np.arange(-8, 9)
-"""Orders of the images of a spline that are summed. Chosen: the rest is below 1e-6."""
+_PEAK = 3.0
+"""Largest difference of two splines, divided by that limit. Chosen: peaks of noise."""
+_SAME_MOTION = 2.0
+"""Ratio of recorded and simulated motion from which one is an alias. Chosen: an alias below 0.2 of
+the rate has a ratio of 4."""
 _NAMED_PARTS = 4
 """Parts that a note names. Chosen: it stays one or two lines."""
 _FEWEST_WINDOWS, _BAND_HZ = 20, 2.0
@@ -114,13 +110,12 @@ class LeftOut:
 
     def text(self, time_s: np.ndarray) -> str:
         """Return the reason with the times, s, of the samples; `time_s` are those of all."""
-        step_s = float(np.median(np.diff(time_s)))
-        runs = [(float(time_s[a]), float(time_s[b - 1])) for a, b in true_runs(self.rows)]
-        total_s = sum(end - begin + step_s for begin, end in runs)
-        longest = sorted(sorted(runs, key=lambda run: run[0] - run[1])[:_NAMED_PARTS])
-        parts = ', '.join(f'{begin:.5g} to {end:.5g} s' for begin, end in longest)
-        others = f' and {len(runs) - len(longest)} more' if len(runs) > len(longest) else ''
-        return f'left out: {total_s:.3g} s ({parts}{others}): {self.reason}'
+        runs = true_runs(self.rows)
+        total_s = float(np.median(np.diff(time_s))) * self.rows.sum()
+        parts = ', '.join(f'{time_s[a]:.5g} to {time_s[b - 1]:.5g} s'
+                          for a, b in runs[:_NAMED_PARTS])
+        return f'left out: {total_s:.3g} s ({parts}{", ..." * (len(runs) > _NAMED_PARTS)}): ' \
+            f'{self.reason}'
 
 
 @dataclass(frozen=True)
@@ -400,96 +395,53 @@ def too_coarse(comparison: BaselineComparison, columns: dict[str, np.ndarray]) -
     sensor, time_s, force = comparison.sensor, comparison.time_s, comparison.motion.force
     noise_g = float(np.min(noise.analog_std_v(sensor) / sensor.scale_v_per_g))
     limit_g = _LARGEST_ERROR * max(noise_g, float(np.min(sensor.lsb_v / sensor.scale_v_per_g)))
-    # Name, times and readings of each reference, degree, derivative and knots of its spline, the
-    # largest error, and what to do
+    # Name, times and readings of each reference, degrees of its splines, and their derivative
     references: list[tuple] = []
     if isinstance(force, ForcePath) and force.is_robot:
         return _too_abrupt(comparison, force, noise_g)
     if isinstance(force, ForcePath):
-        references = [(
-            force.name, force.time_s, np.array(force(force.time_s)) / G0_MPS2, 3, 0, 0.0, limit_g,
-            '; write it at a higher rate, and switch off noise that the simulator adds')]
+        references = [(force.name, force.time_s, np.array(force(force.time_s)) / G0_MPS2,
+                       (3, 5), 0)]
     for joint, name in JOINTS.items() if comparison.joints else ():
         values = columns.get(name, np.zeros(0))
         read = np.isfinite(values)
-        if read.sum() < 2 or np.ptp(values[read]) == 0:
-            continue
-        step = sensor.stage_resolution_rad
-        spline = (BAND_LIMITED_DEGREE, 2, 0.0, limit_g) if joint == 'shift' else (
-            5, 0, KNOT_S if step else 0.0,
-            np.sqrt(limit_g ** 2 + _ENCODER_SQUARES * step ** 2 / 12))
-        unit = 1 / G0_MPS2 if joint == 'shift' else 1.0
-        references.append((name, time_s[read], values[None, read] * unit, *spline, ''))
+        if read.sum() > BAND_LIMITED_DEGREE and np.ptp(values[read]):
+            references.append(
+                (name, time_s[read], values[None, read] / G0_MPS2,
+                 (BAND_LIMITED_DEGREE - 2, BAND_LIMITED_DEGREE), 2) if joint == 'shift' else
+                (name, time_s[read], values[None, read], (3, 5), 0))
     left_out = []
-    for name, read_s, readings, degree, order, knots_s, largest_g, advice in references:
-        ignored = np.interp(read_s, time_s, ~comparison.used) > 0
-        error_g = np.max([_spline_error(read_s, values, degree, order, knots_s, ignored)
-                          for values in readings[:len(sensor.axes)]], axis=0)
-        coarse = np.interp(time_s, read_s, error_g) > largest_g
+    margin = np.ones(2 * round(_WINDOW_S / 2 * sensor.rate_hz) + 1)
+    for name, read_s, readings, degrees, order in references:
+        # Between the readings, where both splines agree, they show the motion.
+        middle_s = (read_s[1:] + read_s[:-1]) / 2
+        first, second = (scipy.interpolate.make_interp_spline(
+            read_s, readings[:len(sensor.axes)].T, k)(middle_s, order) for k in degrees)
+        error_g = np.interp(time_s, middle_s, np.abs(first - second).max(axis=1))
+        step_g = sensor.stage_resolution_rad if name in ('alpha_rad', 'beta_rad') else 0.0
+        coarse = comparison.used & (error_g > _PEAK * np.hypot(limit_g, step_g))
         if coarse.any():
-            coarse = _with_aliases(comparison, coarse, noise_g)
-            # The motion begins and ends within a window.
-            margin = round(_WINDOW_S / 2 * sensor.rate_hz)
-            coarse = np.convolve(coarse, np.ones(2 * margin + 1), 'same') > 0.5
+            coarse = np.convolve(_with_aliases(comparison, coarse, noise_g), margin, 'same') > 0.5
             rate_hz = 1 / float(np.median(np.diff(read_s)))
             left_out.append(LeftOut(
                 coarse, f'{name} moves too fast for its {rate_hz:.4g} readings a second (error '
-                f'up to {1e3 * error_g.max():.2g} mg){advice}'))
+                f'up to {1e3 * error_g[coarse].max():.2g} mg); read it at a higher rate'))
     return left_out
-
-
-def _spline_error(read_s: np.ndarray, values: np.ndarray, degree: int, order: int, knots_s: float,
-                  ignored: np.ndarray) -> np.ndarray:
-    """
-    Return how much a spline through readings may differ from what was read, by its spectrum.
-
-    A cardinal spline reproduces the frequency ν, in units of the rate, with the gain
-    sinc(ν)ⁿ/Σ sinc(ν + k)ⁿ, n = degree + 1. The other terms of the sum are its images. Beyond
-    half the rate of the knots nothing is followed.
-    """
-    step_s = float(np.median(np.diff(read_s)))
-    even_s = np.arange(read_s[0], read_s[-1] + step_s / 2, step_s)
-    size = max(round(_WINDOW_S / step_s), _SHORTEST_WINDOW) // 2 * 2
-    if len(even_s) < size:
-        return np.zeros(len(read_s))
-    even = scipy.interpolate.CubicSpline(read_s, values)(even_s)
-    # Differences keep slow motion from leaking into high frequencies.
-    differences = np.diff(even, 4, prepend=even[:2], append=even[-2:])[:len(even)]
-    differences[np.interp(even_s, read_s, ignored) > 0] = 0.0
-    frequency, at, power = scipy.signal.spectrogram(
-        differences, window='hann', nperseg=size, noverlap=size // 2, detrend=False)
-    cycles = frequency[1:] * max(knots_s / step_s, 1.0)
-    followed = np.minimum(cycles, 0.5)
-    weights = np.sinc(followed + _IMAGES[:, None]) ** (degree + 1)
-    weights /= weights.sum(axis=0)
-    images = weights * ((followed + _IMAGES[:, None]) / followed) ** order
-    images[_IMAGES == 0] = 1 - weights[_IMAGES == 0]
-    error = np.sqrt(np.sum(images ** 2, axis=0))
-    error = np.where(cycles > 0.5, np.maximum(error, 1.0), error)
-    gain = error * (2 * np.pi * frequency[1:] / step_s) ** order \
-        / (2 * np.sin(np.pi * frequency[1:])) ** 4
-    errors = np.sqrt(gain ** 2 @ power[1:] / size)
-    # A reading counts in all windows that hold it.
-    return np.interp(read_s, even_s[0] + step_s * at,
-                     scipy.ndimage.maximum_filter1d(errors, 3))
 
 
 def _with_aliases(comparison: BaselineComparison, coarse: np.ndarray, noise_g: float
                   ) -> np.ndarray:
-    """Extend samples to the neighbours that move otherwise than the simulator, (n,) bool."""
+    """Extend samples to the seconds beside them that move otherwise than simulated, (n,) bool."""
     sensor, signals_v = comparison.sensor, (comparison.volts,
                                             comparison.simulated_v(comparison.sensor))
     length = max(round(_WINDOW_S * sensor.rate_hz), _SHORTEST_WINDOW)
     part = np.minimum(np.arange(len(coarse)) // length, max(len(coarse) // length - 1, 0))
-    changes_v = [np.nan_to_num(np.diff(v, axis=0, prepend=v[:1])) for v in signals_v]
-    # Coarse codes jump by themselves.
-    scatter_g = max(noise_g, float((code_step_v(comparison.volts) / sensor.scale_v_per_g).max()))
-    recorded, simulated = (np.sqrt([np.bincount(part, c ** 2) / np.bincount(part)
-                                    for c in (v / sensor.scale_v_per_g).T]) for v in changes_v)
-    ratio = np.hypot(recorded, scatter_g) / np.hypot(simulated, scatter_g)
-    moves = np.maximum(recorded, simulated) > _MOVES * scatter_g
-    differs = np.any(moves & (np.abs(np.log(ratio)) > np.log(_SAME_MOTION)), axis=0)
-    touched, extended = np.bincount(part, coarse) > 0, coarse.copy()
+    recorded, simulated = (np.sqrt([
+        noise_g ** 2 + np.bincount(part, c ** 2) / np.bincount(part) for c in np.nan_to_num(
+            np.diff(v / sensor.scale_v_per_g, axis=0, prepend=0.0)).T]) for v in signals_v)
+    differs = np.any(np.abs(np.log(recorded / simulated)) > np.log(_SAME_MOTION), axis=0)
+    touched = np.bincount(part, coarse) > 0
+    extended = coarse.copy()
     for begin, end in true_runs(differs | touched):
         if touched[begin:end].any():
             extended |= (part >= begin) & (part < end) & differs[part]

@@ -221,27 +221,15 @@ def is_needed(evidence: Evidence, effects: frozenset[str], effect: str, rows: sl
     shares_form = any({*hints.form} & {*effect_named(e).diagnosis.form} for e in rest)
     share = _SHARE_OF_FORM if shares_form else _SHARE_OF_SET
     explained = float(evidence.gain(effects, _NOTHING, rows)[0])
-    # A branch of a loop differs in one pose.
-    by_pose = bool(hints.proof) and {*hints.proof} <= _SHOWN_BY_POSE \
-        and {d.value for d in hints.form} <= _POSE
+    by_pose = bool(hints.proof) and {*hints.proof} <= _SHOWN_BY_POSE
     return float(lost[0]) > max(evidence.material_power(float(by_pose)), share * explained)
 
 
 def minimal_sets(evidence: Evidence, rows: slice) -> list[frozenset[str]]:
-    """
-    Return the sets all of whose effects are needed, the most probable first.
-
-    Zero-g and scale factor are free beside every set. A filter that takes out errors of a
-    reference in motion adds no more to them than these errors.
-    """
+    """Return the sets all of whose effects are needed, the most probable first."""
     kept = [effects for effects in evidence.candidates
             if all(effects - {e} in evidence.candidates
                    and is_needed(evidence, effects, e, rows) for e in effects)]
-    free = [effects for effects in kept if evidence.errs_in_motion and effects
-            and all(effect_named(e).diagnosis.nuisance for e in effects)]
-    kept = [effects for effects in kept if effects in free or not any(
-        len(less) <= len(effects) and float(evidence.gain(effects, less, rows)[0])
-        <= evidence.material_power(1.0) for less in free)]
     return sorted(kept, key=lambda effects: -evidence.nats(
         (effects, HEALTHY), (_NOTHING, HEALTHY), rows)[0])
 
