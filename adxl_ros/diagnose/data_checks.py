@@ -39,9 +39,9 @@ _LONGEST_STEP_S = 0.5
 """Longest time between samples, s, that follow a moving stage. Chosen: the motion between two
 samples is unknown, and stamps in milliseconds are far beyond."""
 _EVEN_STAMPS, _LARGEST_SCATTER, _LARGEST_BURST = 0.01, 0.45, 64.0
-"""Deviations from a line, in samples: up to which stamps are even, by which a stamp still shows the
-number of its sample, and in bursts. Chosen: nothing shows in the slowest motion, below one half,
-and a buffer of a serial port."""
+"""Deviations from a line, in samples: up to which stamps are even, by which a stamp still shows
+the number of its sample, and in bursts. Chosen: nothing shows in the slowest motion, below half a
+sample, and a buffer of a serial port."""
 _BURSTS, _USUAL_STEPS = 0.5, 1.5
 """Median step of stamps in bursts over the mean step, and steps that count as one sample, in
 medians. Chosen: a few lost samples hardly change the one; halfway to two."""

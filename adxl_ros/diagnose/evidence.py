@@ -35,6 +35,41 @@ _RIDGE = 1e-12
 UNDETERMINED_SHARE, _UNDETERMINED_RATIO = 0.5, 3.0
 """A coefficient is not determined if its posterior standard deviation exceeds this share of the
 prior's, nor by some blocks if it exceeds that of all blocks by this factor. Chosen."""
+_SERIES = 16
+"""Series that are filtered together. Chosen: little memory beside all series."""
+
+
+@dataclass(frozen=True)
+class AngleErrorFilter:
+    """A filter that gives noise with errors of angles the spectrum of noise without them."""
+
+    rms_v: float  # Rms of the errors, V
+    pole: float  # Pole a of the noise
+    transition: np.ndarray  # Factor of the estimate of u from sample to sample, (n,)
+    gain: np.ndarray  # Gain of the estimate of u, 1/V, (n,)
+    weight: np.ndarray  # Change of the predicted sample by the estimate of u, V, (n,)
+    scale: np.ndarray  # Standard deviation of the noise divided by that of the innovation, (n,)
+
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        """Filter k series, (k, n)."""
+        lower = np.ones((2, len(self.gain)))
+        lower[1, :-1] = -self.transition[1:]
+        filtered = np.empty_like(values)
+        for first in range(0, len(values), _SERIES):
+            part = values[first:first + _SERIES]
+            changes = part.copy()
+            changes[:, 1:] -= self.pole * part[:, :-1]
+            changes[:, 0] = 0.0
+            estimates = scipy.linalg.lapack.dtbtrs(lower, (changes * self.gain).T, uplo='L',
+                                                   diag='U')[0].T
+            changes[:, 1:] -= self.weight[1:] * estimates[:, :-1]
+            changes *= self.scale
+            changes[:, 0] = part[:, 0]
+            filtered[first:first + _SERIES] = scipy.signal.lfilter(
+                [1.0], [1.0, -self.pole], changes)
+        return filtered
+
+
 @dataclass(frozen=True)
 class Whitener:
     """A filter that makes noise white."""
@@ -43,6 +78,9 @@ class Whitener:
     log_prior: float  # Log prior probability of such noise, up to a constant
     effect: str  # Name of the drift effect that the filter is for
     density: float  # Density of the drift, in the unit of the effect's parameter
+    # Filter for the errors of angles and rounding; None where there are none, or where the drift
+    # exceeds them: they would take up a part of it
+    errors: AngleErrorFilter | None = None
 
     @property
     def spectrum(self) -> DriftSpectrum:
@@ -57,7 +95,7 @@ class Whitener:
         return self.density <= effect_named(self.effect).diagnosis.healthy_density
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Filter k series, (k, n)."""
+        """Filter k series, (k, n), after the filter for errors."""
         if len(self.sections) > 1:
             return scipy.signal.sosfilt(self.sections, values)
         # The same recursion without a copy.
@@ -79,6 +117,8 @@ class WhitenedChannel:
     block_grams: np.ndarray
     total_grams: np.ndarray  # Their sums over all blocks, V², (filters, k + 1, k + 1)
     counts: np.ndarray  # Samples by block, (blocks,)
+    # What the filter for errors of the reference adds to the log likelihood, (filters, blocks)
+    log_scales: np.ndarray
     log_priors: np.ndarray  # Log prior probability of each filter, (filters,)
     # Effect that the noise of each filter needs, '' for a healthy unit, (filters,)
     drift_effects: np.ndarray
@@ -98,18 +138,23 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
     data[0], data[1:] = residual_v, columns.T
     if not used.all():
         data = bridged(data.T, used).T
-    edges = block_edges(len(used)) if by_block else np.array([0, len(used)])
+    before = {id(f.errors): data if f.errors is None else f.errors(data)
+              for f in {id(f.errors): f for f in filters}.values()}
+    edges = block_edges(len(used))
     # The first sample is a step from zero.
     dropped = np.append(np.flatnonzero(~used), 0)
-    grams = np.zeros((len(filters), len(edges) - 1, len(data), len(data)))
+    grams = np.zeros((len(filters), BLOCKS, len(data), len(data)))
     for i, whitener in enumerate(filters):
-        white = whitener(data)
+        white = whitener(before[id(whitener.errors)])
         white[:, dropped] = 0.0
         for b, (begin, end) in enumerate(pairwise(edges)):
             np.matmul(white[:, begin:end], white[:, begin:end].T, out=grams[i, b])
     total = grams.sum(axis=1)
     grams = grams if by_block else grams[:, :0]
-    return WhitenedChannel(column_ids, grams, total, used_by_block(used),
+    # The log determinant of the filter for errors, sample by sample.
+    log_scales = np.array([np.zeros(BLOCKS) if f.errors is None else np.add.reduceat(
+        np.where(used, np.log(f.errors.scale), 0.0), edges[:-1]) for f in filters])
+    return WhitenedChannel(column_ids, grams, total, used_by_block(used), log_scales,
                            np.array([f.log_prior for f in filters]),
                            np.array(['' if f.healthy else f.effect for f in filters]))
 
@@ -188,8 +233,8 @@ def fit_columns(channels: Sequence[WhitenedChannel], column_ids: Iterable[int],
     """
     ids = np.array(sorted(column_ids), int)
     chosen = np.ones(BLOCKS, bool) if blocks is None else blocks
-    # By channel: places of its columns among all, products, count of samples, and log priors of
-    # the filters
+    # By channel: places of its columns among all, products, count of samples, log scales, and
+    # log priors of the filters
     selected, filters = [], []
     for channel in channels:
         columns = np.flatnonzero(np.isin(channel.column_ids, ids))
@@ -200,7 +245,8 @@ def fit_columns(channels: Sequence[WhitenedChannel], column_ids: Iterable[int],
         log_priors = np.where(allowed | ~allowed.any(), channel.log_priors, -np.inf)
         selected.append((np.searchsorted(ids, channel.column_ids[columns]),
                          grams[:, rows[:, None], rows],
-                         max(float(channel.counts[chosen].sum()), 1.0), log_priors))
+                         max(float(channel.counts[chosen].sum()), 1.0),
+                         channel.log_scales[:, chosen].sum(axis=1), log_priors))
         filters.append(int(np.argmax(log_priors)))
     if start is not None:
         filters = list(start.filter_indices)
@@ -217,16 +263,16 @@ def fit_columns(channels: Sequence[WhitenedChannel], column_ids: Iterable[int],
         size = 1 / np.sqrt(np.diag(precision))
         factor = np.linalg.cholesky(precision * size[:, None] * size + _RIDGE * np.eye(len(ids)))
         values = size * scipy.linalg.cho_solve((factor, True), size * information)
-        for i, (places, grams, count, log_priors) in enumerate(selected):
+        for i, (places, grams, count, log_scales, log_priors) in enumerate(selected):
             v = np.concatenate([[1.0], -values[places]])
             squares_v2 = np.maximum(np.einsum('i,wij,j->w', v, grams, v), _SMALLEST_SQUARES_V2)
-            filters[i] = int(np.argmax(-count / 2 * np.log(squares_v2) + log_priors))
+            filters[i] = int(np.argmax(-count / 2 * np.log(squares_v2) + log_scales + log_priors))
             variance_v2[i] = squares_v2[filters[i]] / count
     covariance = scipy.linalg.cho_solve((factor, True), np.eye(len(ids))) * size[:, None] * size
     log_evidence = -0.5 * float(np.sum(prior_precision * values ** 2)) \
         - float(np.log(np.diag(factor) / size).sum()) + 0.5 * float(np.log(prior_precision).sum())
-    for (*_, count, log_priors), variance, f in zip(selected, variance_v2, filters):
-        log_evidence += float(-count / 2 * (np.log(variance) + 1) + log_priors[f])
+    for (*_, count, log_scales, log_priors), variance, f in zip(selected, variance_v2, filters):
+        log_evidence += float(-count / 2 * (np.log(variance) + 1) + log_scales[f] + log_priors[f])
     return LinearFit(ids, values, covariance, log_evidence, tuple(filters), variance_v2)
 
 

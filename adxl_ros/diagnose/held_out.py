@@ -80,7 +80,7 @@ class HeldOutFits:
                 v = np.concatenate([[1.0], -departures[columns.places]])
                 squares[held_out] += np.einsum('i,bij,j->b', v, columns.plain[held_out], v)
                 white = np.einsum('i,bij,j->b', v, channel.block_grams[f][held_out], v)
-                log_likelihood[held_out] -= 0.5 * (
+                log_likelihood[held_out] += channel.log_scales[f][held_out] - 0.5 * (
                     white / variance + channel.counts[held_out] * np.log(variance))
         return HeldOut(squares, log_likelihood, self.drift_mps2)
 

@@ -13,20 +13,29 @@ Alternating poles and zeros, one pair a decade, whiten 1/f noise below its corne
 density equals that of the white noise (Corsini and Saletti 1988, IEEE Trans. Instrum. Meas. 37).
 The variance of the innovations is fitted. The filter then depends only on the ratio of drift and
 noise, which is searched on a grid.
+
+Errors of followed angles are constant at rest and new after each move (errors in variables; Fuller
+1987). The model is y = n + g·u. Here n is noise behind the RC filter, AR(1) with pole a, u has
+variance 1, u_t = φ_t·u_(t−1) + √(1 − φ_t²)·ξ_t, and g is its standard deviation in V. A Kalman
+filter predicts g·u; its innovations, scaled and filtered by 1/(1 − aL), have the spectrum of n.
+Where g is 0, samples stay as they are.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from math import sqrt
 
 from adxl_ros.diagnose.comparison import BaselineComparison, gravity_slopes
-from adxl_ros.diagnose.evidence import Whitener
+from adxl_ros.diagnose.evidence import AngleErrorFilter, Whitener
 from adxl_ros.model import noise
+from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.diagnosis_hints import DriftSpectrum
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import true_runs
+from adxl_ros.simulate.smoothed_paths import ForcePath, SmoothedPath
 import numpy as np
 import scipy
 
@@ -55,6 +64,8 @@ _LOWEST_NOISE_V = 1e-7
 of any ADC."""
 _TOP_OF_RATE = 0.25
 """Highest corner frequency of 1/f noise, divided by the sample rate. Chosen: half of Nyquist."""
+
+
 @dataclass(frozen=True)
 class NoiseFloor:
     """Rms of what no model can predict, over samples and measured axes."""
@@ -177,11 +188,61 @@ def find_repeat(first: np.ndarray, second: np.ndarray, rate_hz: float, resolutio
         else None
 
 
+def angle_error_filter(comparison: BaselineComparison, axis: int) -> AngleErrorFilter | None:
+    """
+    Return the filter for one axis of a recording, by the Riccati recursion of the Kalman filter.
+
+    None where the errors of angles are 0.
+    """
+    variance_v2, remembered_v2 = np.zeros(len(comparison)), np.zeros(len(comparison))
+    for part_v2, memory in _angle_errors(comparison, axis):
+        variance_v2 += part_v2
+        remembered_v2 += part_v2 * memory
+    if not variance_v2.any():
+        return None
+    pole, analog_v = _analog(comparison, axis)
+    noise_v2 = analog_v ** 2 * (1 - pole ** 2) \
+        + comparison.sensor.lsb_v ** 2 / 12 * (1 + pole ** 2)
+    memories = np.divide(remembered_v2, variance_v2, where=variance_v2 > 0,
+                         out=np.ones(len(comparison)))
+    std_v = np.sqrt(variance_v2)
+    rows, variance, previous_v = [], 1.0, float(std_v[0])
+    for g, phi in zip(std_v.tolist(), memories.tolist()):
+        renewal2 = 1 - phi * phi
+        weight = g * phi - pole * previous_v
+        total_v2 = weight * weight * variance + g * g * renewal2 + noise_v2
+        gain = (phi * weight * variance + g * renewal2) / total_v2
+        rows.append((phi - gain * weight, gain, weight, sqrt(noise_v2 / total_v2)))
+        variance = phi * phi * variance + renewal2 - gain * gain * total_v2
+        previous_v = g
+    return AngleErrorFilter(float(np.sqrt(np.mean(variance_v2))), pole, *np.array(rows).T)
+
+
 def _analog(comparison: BaselineComparison, axis: int) -> tuple[float, float]:
     """Return pole of the RC filter and standard deviation of the analog noise, V."""
     rc_s = float(noise.electronics(comparison.sensor).rc_s[axis])
     return (float(np.exp(-comparison.dt_s / rc_s)) if rc_s else 0.0,
             max(float(noise.analog_std_v(comparison.sensor)[axis]), _LOWEST_NOISE_V))
+
+
+def _angle_errors(comparison: BaselineComparison, axis: int
+                  ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield variance, V², and memory from sample to sample, (n,) each, of errors of angles."""
+    sensor, time_s, joints = comparison.sensor, comparison.time_s, comparison.joints or ()
+    slopes = gravity_slopes(*(joint(time_s) for joint in joints))[:, axis] if joints else ()
+    for joint, slope in zip(joints, slopes):
+        errors = joint.errors(time_s) if isinstance(joint, SmoothedPath) else None
+        if errors is not None:
+            # An error that grows, after a move, is a new one.
+            memory = np.exp(-errors.forgetting_per_s * comparison.dt_s)
+            memory[1:] *= np.minimum(errors.std[:-1] / errors.std[1:], 1.0)
+            v_per_rad = slope * sensor.scale_v_per_g[axis] * sensor.local_gravity_mps2 / G0_MPS2
+            yield (v_per_rad * errors.std) ** 2, memory
+    force = comparison.motion.force
+    if isinstance(force, ForcePath) and force.is_robot:
+        errors = force.errors(time_s, AXES.index(sensor.axes[axis]))
+        v_per_mps2 = sensor.scale_v_per_g[axis] / G0_MPS2
+        yield (v_per_mps2 * errors.std) ** 2, np.exp(-errors.forgetting_per_s * comparison.dt_s)
 
 
 def drift_effects() -> tuple[str, ...]:
@@ -196,7 +257,7 @@ def whiteners(comparisons: Sequence[BaselineComparison]) -> list[list[Whitener]]
 
 def _whiteners(comparison: BaselineComparison, axis: int) -> list[Whitener]:
     sensor, dt_s, span_s = comparison.sensor, comparison.dt_s, comparison.span_s
-    scale = float(sensor.scale_v_per_g[axis])
+    errors, scale = angle_error_filter(comparison, axis), float(sensor.scale_v_per_g[axis])
     a, std_v = _analog(comparison, axis)
     step_v2 = sensor.lsb_v ** 2 / 12
     by_spectrum = {effect_named(e).diagnosis.drift: e for e in drift_effects()}
@@ -226,8 +287,10 @@ def _whiteners(comparison: BaselineComparison, axis: int) -> list[Whitener]:
             by_spectrum[DriftSpectrum.FLICKER], density))
         if corner_hz > top_hz:
             break
-    return [Whitener(sections, -0.5 * (np.log10(density / _USUAL_DENSITY) / _DENSITY_DECADES) ** 2,
+    largest = np.inf if errors is None else errors.rms_v / scale
+    made = [Whitener(sections, -0.5 * (np.log10(density / _USUAL_DENSITY) / _DENSITY_DECADES) ** 2,
                      effect, density) for sections, effect, density in filters]
+    return [replace(f, errors=errors) if f.healthy or f.density < largest else f for f in made]
 
 
 def expected_drift_g(spectrum: DriftSpectrum, density: float, span_s: float, rate_hz: float

@@ -22,7 +22,7 @@ from adxl_ros.diagnose.comparison import (
 from adxl_ros.files.recording_columns import JOINTS, Recording
 from adxl_ros.files.reference_alignment import LONGEST_MOVE_NS, USUAL_GAPS
 from adxl_ros.model import noise
-from adxl_ros.model.constants import G0_MPS2, Z_90
+from adxl_ros.model.constants import G0_MPS2, MAD_TO_STD, Z_90
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import true_runs
 from adxl_ros.simulate.motion import Motion
@@ -47,9 +47,8 @@ motion that repeats fits at several shifts."""
 _LARGEST_ERROR_RATIO = 0.5
 """A shift shows if it reduces 1 − correlation below this share. Chosen: noise that is not shifted
 keeps it."""
-_ROUNDS, _BLOCKS, _FINE_SAMPLES = 6, 10, 20_000
-"""Gauss-Newton steps, blocks and samples of the fine search. Chosen: the shift then changes by
-less than 1 µs, and the scatter of the blocks shows its error to 24 %."""
+_BLOCKS, _FINE_SAMPLES = 10, 20_000
+"""Blocks and samples of the fine search. Chosen: their scatter shows the error to 24 %."""
 _LONGEST_BRIDGE_S, _LONGEST_SLOW_BRIDGE_S, _SLOWEST_S = LONGEST_MOVE_NS / 1e9, 10.0, 1.0
 """Longest time without a reading that is bridged, s: of a joint as between messages of a bag; of
 temperature and supply; and of a slow encoder, whose readings are a move apart at most."""
@@ -75,8 +74,6 @@ some periods of a shaker."""
 _LARGEST_ERROR = 0.3
 """Error of the force by the spline, divided by the noise, up to which a window is used. Chosen: it
 adds 4 % to the noise."""
-_PEAK = 3.0
-"""Largest difference of two splines, divided by that limit. Chosen: peaks of noise."""
 _SAME_MOTION = 2.0
 """Ratio of recorded and simulated motion from which one is an alias. Chosen: an alias below 0.2 of
 the rate has a ratio of 4."""
@@ -85,10 +82,9 @@ _NAMED_PARTS = 4
 _FEWEST_WINDOWS, _BAND_HZ = 20, 2.0
 """Fewest windows, and width of the bands, Hz, by which fading is judged. Chosen: noise then has a
 coherence of 0.05, and a line of the mains is one value."""
-_MOTION, _COHERENCE, _GAIN, _FADED = 10.0, 0.5, 1.5, 0.5
-"""Power over noise from which motion shows; coherence from which a recording follows its
-reference; gain over it that no sensor has; and power of the reference, divided by the recorded
-one, below which it has faded. Chosen."""
+_MOTION, _FADED = 10.0, 0.5
+"""Power over noise from which motion shows, and power of the reference, even without the filter of
+the sensor, divided by the recorded one, below which it has faded. Chosen."""
 
 
 @dataclass(eq=False)
@@ -203,7 +199,7 @@ def _find_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> _Shif
             > _LARGEST_ERROR_RATIO * (1 - correlation[unshifted])):
         return None
     fine = _fine_shift(recording, sensor, force, float(lags_s[best]), float(correlation[best]))
-    return fine if fine is not None and abs(fine.late_s) > LARGEST_LATENCY_S else None
+    return fine if abs(fine.late_s) > LARGEST_LATENCY_S else None
 
 
 def correlations(first: np.ndarray, second: np.ndarray, smallest: int
@@ -233,37 +229,33 @@ def correlations(first: np.ndarray, second: np.ndarray, smallest: int
 
 
 def _fine_shift(recording: Recording, sensor: Sensor, force: ForcePath, late_s: float,
-                correlation: float) -> _Shift | None:
+                correlation: float) -> _Shift:
     """Fit shift, zero-g and scale factor to blocks of the recording, from a rough shift."""
     begin_s, end_s = force.time_s[0] - late_s, force.time_s[-1] - late_s
     comparison = compare(_between(recording, begin_s, end_s), sensor,
                          Motion(float(end_s - begin_s), force=force.shifted(-late_s)))
     time_s, volts = comparison.time_s, comparison.volts
     simulated_v = comparison.simulated_v(comparison.sensor)
-    slope_v = np.gradient(simulated_v, time_s, axis=0)
     # The ends may need values from outside.
     inside = np.isfinite(volts).all(axis=1) & (time_s > time_s[0] + LARGEST_LATENCY_S) \
         & (time_s < time_s[-1] - LARGEST_LATENCY_S)
     rows = np.flatnonzero(inside)[::max(1, len(recording) // _FINE_SAMPLES)]
-    more_s, scatter = 0.0, np.zeros(1)
-    for _ in range(_ROUNDS):
-        at_s = time_s[rows] + more_s
-        products, weights = np.zeros((2, _BLOCKS))
-        for measured, simulated, slope in zip(volts[rows].T, simulated_v.T, slope_v.T):
-            series = np.column_stack([measured, np.interp(at_s, time_s, simulated),
-                                      np.interp(at_s, time_s, slope)])
-            for i, part in enumerate(np.array_split(series, _BLOCKS)):
-                line = np.column_stack([np.ones(len(part)), part[:, 1]])
-                residual, rest = (part[:, [0, 2]] - line @ np.linalg.lstsq(
-                    line, part[:, [0, 2]])[0]).T
-                products[i] += residual @ rest
-                weights[i] += rest @ rest
-        if not weights.sum():
-            return None
-        step_s = float(products.sum() / weights.sum())
-        more_s += float(np.clip(step_s, -LARGEST_LATENCY_S, LARGEST_LATENCY_S))
-        scatter = (products - step_s * weights) / weights.sum()
-    return _Shift(late_s + more_s, float(np.sqrt(np.sum(scatter ** 2))), correlation)
+
+    def left_v2(more_s: float, part: np.ndarray) -> float:
+        """Return what zero-g and scale factor leave of a part after a further shift."""
+        left = 0.0
+        for measured, simulated in zip(volts[part].T, simulated_v.T):
+            line = np.column_stack([np.ones(len(part)), np.interp(
+                time_s[part] + more_s, time_s, simulated)])
+            left += float(np.sum((measured - line @ np.linalg.lstsq(line, measured)[0]) ** 2))
+        return left
+
+    more_s, *of_blocks = (float(scipy.optimize.minimize_scalar(
+        left_v2, bounds=(-LARGEST_LATENCY_S, LARGEST_LATENCY_S), args=(part,), method='bounded',
+        options={'xatol': 1e-6}).x) for part in (rows, *np.array_split(rows, _BLOCKS)))
+    # A block at rest shows no shift, so that the median scatter counts.
+    std_s = MAD_TO_STD * float(np.median(np.abs(np.subtract(of_blocks, more_s)))) / _BLOCKS ** 0.5
+    return _Shift(late_s + more_s, std_s, correlation)
 
 
 def _in_gaps(time_s: np.ndarray, read_s: np.ndarray, longest_s: float
@@ -419,7 +411,7 @@ def too_coarse(comparison: BaselineComparison, columns: dict[str, np.ndarray]) -
             read_s, readings[:len(sensor.axes)].T, k)(middle_s, order) for k in degrees)
         error_g = np.interp(time_s, middle_s, np.abs(first - second).max(axis=1))
         step_g = sensor.stage_resolution_rad if name in ('alpha_rad', 'beta_rad') else 0.0
-        coarse = comparison.used & (error_g > _PEAK * np.hypot(limit_g, step_g))
+        coarse = comparison.used & (error_g > np.hypot(limit_g, step_g))
         if coarse.any():
             coarse = np.convolve(_with_aliases(comparison, coarse, noise_g), margin, 'same') > 0.5
             rate_hz = 1 / float(np.median(np.diff(read_s)))
@@ -459,26 +451,19 @@ def fading_frequency_hz(comparison: BaselineComparison) -> float | None:
     if len(recorded_g) < _FEWEST_WINDOWS * size // 2:
         return None
 
-    def power(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return frequencies and means of cross spectra over bands, summed over axes."""
-        frequency_hz, products = scipy.signal.csd(first, second, sensor.rate_hz, nperseg=size,
-                                                  detrend='linear', axis=0)
-        band = max(round(_BAND_HZ / frequency_hz[1]), 1)
-        count = (len(frequency_hz) - 1) // band * band
-        return tuple(v[1:1 + count].reshape(-1, band).mean(axis=1)  # type: ignore[return-value]
-                     for v in (frequency_hz, products.sum(axis=1)))
-
-    frequency_hz, recorded = power(recorded_g, recorded_g)
-    simulated, shared = power(simulated_g, simulated_g)[1].real, power(simulated_g, recorded_g)[1]
-    stated = np.sum(noise.density_v2_per_hz(sensor, frequency_hz) / sensor.scale_v_per_g ** 2, 1)
+    frequency_hz = np.arange(size // 2 + 1) * sensor.rate_hz / size
+    band = max(round(_BAND_HZ * size / sensor.rate_hz), 1)
+    count = (size // 2) // band * band
+    stated = (noise.density_v2_per_hz(sensor, frequency_hz[1:]) / sensor.scale_v_per_g ** 2).sum(1)
     # Without its RC filter the sensor has this gain over its simulation.
     rc_s = float(np.max(noise.electronics(sensor).rc_s))
-    unfiltered = np.sqrt(1 + (2 * np.pi * frequency_hz * rc_s) ** 2)
-    moves = recorded.real > _MOTION * stated
-    follows = np.abs(shared) ** 2 > _COHERENCE * simulated * recorded.real
-    exceeds = moves & follows & (np.abs(shared) > _GAIN * unfiltered * simulated)
-    faded = simulated < _FADED * recorded.real
-    if not exceeds.any() or not faded[moves & (frequency_hz >= frequency_hz[exceeds][0])].all():
-        return None
-    followed = np.flatnonzero(moves & ~faded)
-    return float(frequency_hz[followed[-1] + 1 if len(followed) else 0])
+    unfiltered = 1 + (2 * np.pi * frequency_hz[1:] * rc_s) ** 2
+    recorded, simulated = (scipy.signal.welch(
+        v, sensor.rate_hz, nperseg=size, detrend='linear', axis=0)[1][1:].sum(axis=1)
+        for v in (recorded_g, simulated_g))
+    recorded, simulated, stated = (v[:count].reshape(-1, band).mean(axis=1) for v in (
+        recorded, simulated * unfiltered, stated))
+    moves = recorded > _MOTION * stated
+    followed = np.flatnonzero(moves & (simulated >= _FADED * recorded))
+    first = followed[-1] + 1 if len(followed) else 0
+    return float(frequency_hz[1 + first * band]) if moves[first:].any() else None

@@ -161,9 +161,8 @@ def rank(assessment: Assessment, sensor: Sensor, manoeuvres: Sequence[PlannedMan
     seen = {v.effect for v in model.variants} if model else set()
     considered = {e for h in next_experiment.leading(assessment.hypotheses) for e in h.effects}
     needed = sorted(considered | (set(library()) - seen))
-    dimensions = next_experiment.unknown_dimensions(report.verdict if report else None)
     responses = [next_experiment.predict(
-        next_experiment.Experiment(m.name, m.begin_s, m.motion), sensor, needed, dimensions)
+        next_experiment.Experiment(m.name, m.begin_s, m.motion), sensor, needed)
         for m in manoeuvres]
     excited = {effect for response in responses for effect in response.effects}
     # Effects that the samples could not show keep their prior odds over no gap.
@@ -172,7 +171,7 @@ def rank(assessment: Assessment, sensor: Sensor, manoeuvres: Sequence[PlannedMan
     for effect in sorted(excited - seen):
         weights.setdefault((effect,), unseen)
     complete = Assessment(normalised(weights), diagnosis)
-    worth = next_experiment.rank_responses(responses, complete.hypotheses, model, dimensions)
+    worth = next_experiment.rank_responses(responses, complete.hypotheses, model)
     on_the_mean = {e.name for e in candidates()}
     return Ranking(complete, worth, tuple(sorted(on_the_mean - excited - seen)))
 
