@@ -22,7 +22,6 @@ from adxl_ros.diagnose import (
 from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
 from adxl_ros.diagnose.data_checks import CheckedRecording, compare_checked
 from adxl_ros.diagnose.evidence import used_by_block
-from adxl_ros.diagnose.held_out import HeldOutFits, reproducible_rest
 from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
 from adxl_ros.diagnose.next_experiment import CouldShow, NextExperiment
 from adxl_ros.diagnose.noise_effects import Detection, NoiseComparison, NoiseRemainder
@@ -35,7 +34,13 @@ from adxl_ros.diagnose.residual_map import (
     ResidualCell,
 )
 from adxl_ros.diagnose.search import Hypothesis, linearise, Search
-from adxl_ros.diagnose.verdict import HEALTHY, MATERIAL_MG, Verdict
+from adxl_ros.diagnose.verdict import (
+    HEALTHY,
+    HeldOutFits,
+    MATERIAL_MG,
+    reproducible_rest,
+    Verdict,
+)
 from adxl_ros.files.recording_columns import check_unit, Recording
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
