@@ -116,7 +116,7 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
                      'Hz explains them: it is used']
     stated = left_out if comparison.joints else []
     comparison = _without(comparison, [
-        *stated, *reference.without_reading(comparison, recording.columns)])
+        *stated, *reference.without_reading(comparison)])
     # What moves too fast is looked for where the reference is stated.
     comparison = _without(comparison, reference.too_coarse(comparison, recording.columns))
     fading_hz = reference.fading_frequency_hz(comparison)

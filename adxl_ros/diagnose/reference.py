@@ -49,9 +49,9 @@ _LARGEST_ERROR_RATIO = 0.5
 keeps it."""
 _BLOCKS, _FINE_SAMPLES = 10, 20_000
 """Blocks and samples of the fine search. Chosen: their scatter shows the error to 24 %."""
-_LONGEST_BRIDGE_S, _LONGEST_SLOW_BRIDGE_S, _SLOWEST_S = LONGEST_MOVE_NS / 1e9, 10.0, 1.0
-"""Longest time without a reading that is bridged, s: of a joint as between messages of a bag; of
-temperature and supply; and of a slow encoder, whose readings are a move apart at most."""
+_LONGEST_BRIDGE_S, _SLOWEST_S = LONGEST_MOVE_NS / 1e9, 1.0
+"""Longest time without a reading that is bridged, s: of a joint as between messages of a bag, and
+of a slow encoder, whose readings are a move apart at most."""
 _BEFORE_S, _AFTER_S = 0.1, 0.3
 """Times that are left out beside a gap, s. Chosen: the spline is uncertain before it, and an RC
 filter of 15 Hz has settled after it."""
@@ -272,29 +272,19 @@ def _in_gaps(time_s: np.ndarray, read_s: np.ndarray, longest_s: float
                                    else 'left')))
 
 
-def without_reading(comparison: BaselineComparison, columns: dict[str, np.ndarray]
-                    ) -> list[LeftOut]:
-    """Find samples in gaps of another simulator, of temperature and of supply."""
-    time_s, force, left_out = comparison.time_s, comparison.motion.force, []
-    readings: dict[str, tuple[np.ndarray, float]] = {
-        name: (time_s[np.isfinite(columns[name])], _LONGEST_SLOW_BRIDGE_S)
-        for name in ('temperature_c', 'supply_v') if name in columns}
-    if isinstance(force, ForcePath):
-        readings[force.name] = force.time_s, _LONGEST_BRIDGE_S
-    for name, (read_s, longest_s) in readings.items():
-        if len(read_s) < 2:
-            continue
-        limit_s = max(longest_s, USUAL_GAPS * float(np.median(np.diff(read_s))))
-        beside = name not in columns
-        unknown = np.zeros(len(time_s), bool)
-        for begin, end in _in_gaps(time_s, read_s, limit_s):
-            if end > begin:
-                unknown |= (time_s >= time_s[begin] - beside * _BEFORE_S) & (
-                    time_s <= time_s[end - 1] + beside * _AFTER_S)
-        if unknown.any():
-            left_out.append(LeftOut(unknown, f'no reading of {name} for more than '
-                                    f'{limit_s:.3g} s'))
-    return left_out
+def without_reading(comparison: BaselineComparison) -> list[LeftOut]:
+    """Find samples in gaps of another simulator."""
+    time_s, force = comparison.time_s, comparison.motion.force
+    if not isinstance(force, ForcePath):
+        return []
+    limit_s = max(_LONGEST_BRIDGE_S, USUAL_GAPS * float(np.median(np.diff(force.time_s))))
+    unknown = np.zeros(len(time_s), bool)
+    for begin, end in _in_gaps(time_s, force.time_s, limit_s):
+        if end > begin:
+            unknown |= (time_s >= time_s[begin] - _BEFORE_S) \
+                & (time_s <= time_s[end - 1] + _AFTER_S)
+    return [LeftOut(unknown, f'no reading of {force.name} for more than {limit_s:.3g} s')] \
+        if unknown.any() else []
 
 
 def stated_poses(recording: Recording, sensor: Sensor) -> tuple[Recording, list[LeftOut]]:

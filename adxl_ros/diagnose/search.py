@@ -77,7 +77,6 @@ class Hypothesis:
     log_evidence: float  # Log evidence
     fit: LinearFit  # The last linear fit
     linearised: LinearisedHypothesis  # The hypothesis linearised at its values
-    converged: bool = True  # Whether the Gauss-Newton iteration has converged
 
     @property
     def sizeless(self) -> frozenset[str]:
@@ -228,8 +227,7 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
             in_rad, linear_model.smallest_angle_rad(), 0.0) ** 2),
         std > evidence.UNDETERMINED_SHARE * np.maximum(linearised.prior_std[:j],
                                                        np.abs(at_values)),
-        fit.log_evidence - fit.loss(at_values), fit, linearised,
-        solution.converged and solution.last.fit.log_evidence >= lowest_log_evidence)
+        fit.log_evidence - fit.loss(at_values), fit, linearised)
 
 
 class _Ranked(NamedTuple):

@@ -34,6 +34,7 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.investigate.manoeuvres import KIND_OF, plan_all, PlannedManoeuvre, Pose, StageLimits
 from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.report import quantities
 from adxl_ros.workers import Processes
 
 CERTAIN = 0.9
@@ -231,10 +232,8 @@ def hypothesis_text(effects: Sequence[str]) -> str:
 
 def listed(names: Sequence[str]) -> str:
     """Return the first names in a sentence, and how many others there are."""
-    others = len(names) - _LARGEST_NAMED
-    if others > 1:
-        return f'{", ".join(names[:_LARGEST_NAMED])} or {others} other hypotheses'
-    return ', '.join(names[:-1]) + ' or ' * (len(names) > 1) + names[-1]
+    more = [f'{len(names) - _LARGEST_NAMED} others'] * (len(names) > _LARGEST_NAMED)
+    return quantities.listed([*names[:_LARGEST_NAMED], *more], 'or')
 
 
 _NICENESS = 10

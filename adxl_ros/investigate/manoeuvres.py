@@ -148,21 +148,12 @@ CATALOGUE = {
         'rests', 'rest in poses that spread gravity over the sphere',
         [('rest', *pose) for pose in ((0, 0), (45, 0), (45, 120), (45, 240), (135, 240),
                                       (135, 120), (135, 0), (180, 0))]),
-    'rests_on_axes': Manoeuvre(
-        'rests', 'rest with each axis up and down',
-        [('rest', 90, beta_deg, 2.0) for beta_deg in (0, 90, 180, 270)]),
     'slow_turn_of_beta': Manoeuvre(
         'turns of beta', 'turn beta once, forth and back, slowly',
         [('full_turn', 'beta', 90.0, _SLOW_SHARE)]),
     'fast_turn_of_beta': Manoeuvre(
         'turns of beta', 'turn beta once, forth and back, at the limit of rate',
         [('full_turn', 'beta', 90.0)]),
-    'inclined_turn_of_beta': Manoeuvre(
-        'turns of beta', 'turn beta once at alpha 45°, forth and back, at the limit of rate',
-        [('full_turn', 'beta', 45.0)]),
-    'level_turn_of_beta': Manoeuvre(
-        'turns of beta', 'turn beta once with z upright, at the limit of rate',
-        [('full_turn', 'beta', 0.0)]),
     'slow_turn_of_alpha': Manoeuvre(
         'turns of alpha', 'turn alpha over its range, forth and back, slowly',
         [('full_turn', 'alpha', 45.0, _SLOW_SHARE)]),
