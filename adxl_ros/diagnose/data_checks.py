@@ -38,13 +38,10 @@ noise in a thousand samples."""
 _LONGEST_STEP_S = 0.5
 """Longest time between samples, s, that follow a moving stage. Chosen: the motion between two
 samples is unknown, and stamps in milliseconds are far beyond."""
-_EVEN_STAMPS, _LARGEST_SCATTER, _LARGEST_BURST = 0.01, 0.45, 64.0
-"""Deviations from a line, in samples: up to which stamps are even, by which a stamp still shows
-the number of its sample, and in bursts. Chosen: nothing shows in the slowest motion, below half a
-sample, and a buffer of a serial port."""
-_BURSTS, _USUAL_STEPS = 0.5, 1.5
-"""Median step of stamps in bursts over the mean step, and steps that count as one sample, in
-medians. Chosen: a few lost samples hardly change the one; halfway to two."""
+_EVEN_STAMPS, _LARGEST_SCATTER, _USUAL_STEPS = 0.01, 0.45, 1.5
+"""Deviations from a line, in samples, up to which stamps are even, and by which a stamp still shows
+the number of its sample; steps that count as one sample, in medians. Chosen: nothing shows in the
+slowest motion; below one half; halfway to two."""
 _SMALLEST_MOVE_RAD = 0.01
 """Range of an angle, rad, above which the stage moves. Chosen: beyond the jitter of an encoder."""
 _SAMPLES = 4000
@@ -166,23 +163,19 @@ def _check_clock(recording: Recording) -> None:
 
 def even_stamps(stamps_s: np.ndarray) -> np.ndarray | None:
     """
-    Return the even instants behind stamps that are rounded, that scatter, or that come in bursts.
+    Return the even instants behind stamps that are rounded or scatter; missing samples count.
 
-    Missing samples count, except in bursts, which look like them. None where the stamps are even,
-    or where no line explains them.
+    None where the stamps are even, or where no line explains them.
     """
-    steps_s, number = np.diff(stamps_s), np.arange(float(len(stamps_s)))
+    steps_s = np.diff(stamps_s)
     if len(steps_s) < 2 or steps_s.min() <= 0:
         return None
-    in_bursts = np.median(steps_s) < _BURSTS * steps_s.mean()
-    if not in_bursts:
-        step_s = float(np.mean(steps_s[steps_s < _USUAL_STEPS * np.median(steps_s)]))
-        number[1:] = np.cumsum(np.maximum(np.rint(steps_s / step_s), 1.0))
+    step_s = float(np.mean(steps_s[steps_s < _USUAL_STEPS * np.median(steps_s)]))
+    number = np.cumsum([0.0, *np.maximum(np.rint(steps_s / step_s), 1.0)])
     line = np.polynomial.Polynomial.fit(number, stamps_s - stamps_s[0], 1)
     time_s = stamps_s[0] + line(number)
     largest = np.abs(stamps_s - time_s).max() / line.deriv()(0.0)
-    return time_s if _EVEN_STAMPS < largest < (_LARGEST_BURST if in_bursts else _LARGEST_SCATTER) \
-        else None
+    return time_s if _EVEN_STAMPS < largest < _LARGEST_SCATTER else None
 
 
 def _check_encoder(recording: Recording, sensor: Sensor) -> None:
