@@ -40,8 +40,8 @@ _LONGEST_STEP_S = 0.5
 samples is unknown, and stamps in milliseconds are far beyond."""
 _EVEN_STAMPS, _LARGEST_SCATTER, _USUAL_STEPS = 0.01, 0.45, 1.5
 """Deviations from a line, in samples, up to which stamps are even, and by which a stamp still
-shows the number of its sample; steps that count as one sample, in medians. Chosen: nothing shows in the
-slowest motion; below one half; halfway to two."""
+shows the number of its sample; steps that count as one sample, in medians. Chosen: nothing shows
+in the slowest motion; below one half; halfway to two."""
 _SMALLEST_MOVE_RAD = 0.01
 """Range of an angle, rad, above which the stage moves. Chosen: beyond the jitter of an encoder."""
 _SAMPLES = 4000
