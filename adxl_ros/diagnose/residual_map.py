@@ -318,6 +318,12 @@ class GapInUnit(NamedTuple):
     after: float  # Recording and simulation by params.yaml
     floor: float  # Two simulations, one with noise
 
+    @property
+    def text(self) -> str:
+        """Return it for people."""
+        return (f'{self.quantity} {self.before:.3g} -> {self.after:.3g} {self.unit}; noise alone '
+                f'{self.floor:.3g}')
+
 
 def tilt_deg(time_s: np.ndarray, recorded: np.ndarray, simulated: np.ndarray) -> float:
     """Return the rms angle between the recorded and the simulated vector, deg."""

@@ -148,6 +148,9 @@ CATALOGUE = {
         'rests', 'rest in poses that spread gravity over the sphere',
         [('rest', *pose) for pose in ((0, 0), (45, 0), (45, 120), (45, 240), (135, 240),
                                       (135, 120), (135, 0), (180, 0))]),
+    'rests_on_axes': Manoeuvre(
+        'rests', 'rest with each axis up and down',
+        [('rest', 90, beta_deg, 2.0) for beta_deg in (0, 90, 180, 270)]),
     'slow_turn_of_beta': Manoeuvre(
         'turns of beta', 'turn beta once, forth and back, slowly',
         [('full_turn', 'beta', 90.0, _SLOW_SHARE)]),

@@ -123,8 +123,7 @@ def diagnose(options: argparse.Namespace) -> int:
         gap = gap_in(unit, diagnosis.full_rate, diagnosis.report.baseline,
                      diagnosis.report.sensor, options.seed) \
             if unit is not None and diagnosis.report is not None else None
-        lines += ['', f' in      {gap.quantity} {gap.before:.3g} -> {gap.after:.3g} {gap.unit}; '
-                  f'noise alone {gap.floor:.3g}'] if gap else []
+        lines += ['', f' in      {gap.text}'] if gap else []
         report = _write(options, diagnosis, subject, lines, gap)
     if options.json:
         print(json.dumps(report, indent=1, allow_nan=False))

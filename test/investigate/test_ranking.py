@@ -56,9 +56,9 @@ def worth(ranking):
 
 
 def test_fast_turns_show_an_arm_better_than_rests_and_slow_turns():
-    names = ('rests_on_sphere', 'fast_turn_of_beta', 'slow_turn_of_beta')
+    names = ('rests_on_axes', 'fast_turn_of_beta', 'slow_turn_of_beta')
     information = worth(rank(between(BEYOND, ('lever_arm',)), SENSOR, planned(*names)))
-    assert information['fast_turn_of_beta'] > information['rests_on_sphere']
+    assert information['fast_turn_of_beta'] > information['rests_on_axes']
     assert information['fast_turn_of_beta'] > information['slow_turn_of_beta']
 
 
