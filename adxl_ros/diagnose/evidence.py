@@ -30,6 +30,8 @@ _ITERATIONS = 3
 """Iterations over coefficients and noise. Chosen: the filters no longer change then."""
 _SMALLEST_SQUARES_V2 = 1e-300
 """Smallest sum of squares, V², whose logarithm is taken: above zero."""
+_CACHED_VALUES = 100_000
+"""Number of values that are filtered at once. Chosen: 0.8 MB stay in the cache of a processor."""
 _RIDGE = 1e-12
 """Ridge on the scaled precision. Chosen: columns that differ by a millionth are separable."""
 UNDETERMINED_SHARE, _UNDETERMINED_RATIO = 0.5, 3.0
@@ -94,12 +96,14 @@ class Whitener:
         """Whether a unit without the effect may drift as much."""
         return self.density <= effect_named(self.effect).diagnosis.healthy_density
 
-    def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Filter k series, (k, n), after the filter for errors."""
+    def continued(self, values: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Filter the next part of k series, (k, n); return it and the state, (s, k, 2)."""
         if len(self.sections) > 1:
-            return scipy.signal.sosfilt(self.sections, values)
+            return scipy.signal.sosfilt(self.sections, values, zi=state)
         # The same recursion without a copy.
-        return scipy.signal.lfilter(self.sections[0, :3], self.sections[0, 3:], values)
+        filtered, after = scipy.signal.lfilter(self.sections[0, :3], self.sections[0, 3:], values,
+                                               zi=state[0])
+        return filtered, after[None]
 
 
 def drifts_among(effects: Iterable[str]) -> tuple[str, ...]:
@@ -140,17 +144,27 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
         data = bridged(data.T, used).T
     before = {id(f.errors): data if f.errors is None else f.errors(data)
               for f in {id(f.errors): f for f in filters}.values()}
-    edges = block_edges(len(used))
-    # The first sample is a step from zero.
-    dropped = np.append(np.flatnonzero(~used), 0)
-    grams = np.zeros((len(filters), BLOCKS, len(data), len(data)))
-    for i, whitener in enumerate(filters):
-        white = whitener(before[id(whitener.errors)])
-        white[:, dropped] = 0.0
-        for b, (begin, end) in enumerate(pairwise(edges)):
-            np.matmul(white[:, begin:end], white[:, begin:end].T, out=grams[i, b])
+    edges, unused = block_edges(len(used)), np.flatnonzero(~used)
+    grams = np.zeros((len(filters), BLOCKS if by_block else 1, len(data), len(data)))
+    states = [np.zeros((len(f.sections), len(data), 2)) for f in filters]
+    together = max(1, _CACHED_VALUES * BLOCKS // data.size)
+    for first in range(0, BLOCKS, together):
+        blocks = range(first, min(first + together, BLOCKS))
+        part = slice(edges[first], edges[blocks[-1] + 1])
+        values = {kind: np.ascontiguousarray(series[:, part]) for kind, series in before.items()}
+        dropped = unused[slice(*np.searchsorted(unused, [part.start, part.stop]))] - part.start
+        for i, whitener in enumerate(filters):
+            white, states[i] = whitener.continued(values[id(whitener.errors)], states[i])
+            # The first sample is a step from zero.
+            white[:, dropped if first else np.append(dropped, 0)] = 0.0
+            if not by_block:
+                grams[i, 0] += white @ white.T
+                continue
+            for b in blocks:
+                inside = white[:, edges[b] - part.start:edges[b + 1] - part.start]
+                np.matmul(inside, inside.T, out=grams[i, b])
     total = grams.sum(axis=1)
-    grams = grams if by_block else grams[:, :0]
+    grams = grams if by_block else np.zeros((len(filters), 0, len(data), len(data)))
     # The log determinant of the filter for errors, sample by sample.
     log_scales = np.array([np.zeros(BLOCKS) if f.errors is None else np.add.reduceat(
         np.where(used, np.log(f.errors.scale), 0.0), edges[:-1]) for f in filters])

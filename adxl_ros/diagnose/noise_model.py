@@ -27,7 +27,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import sqrt
 
-from adxl_ros.diagnose.comparison import BaselineComparison, gravity_slopes
+from adxl_ros.diagnose.comparison import BaselineComparison, CachedPath, gravity_slopes
 from adxl_ros.diagnose.evidence import AngleErrorFilter, Whitener
 from adxl_ros.model import noise
 from adxl_ros.model.constants import AXES, G0_MPS2
@@ -35,7 +35,7 @@ from adxl_ros.model.diagnosis_hints import DriftSpectrum
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import true_runs
-from adxl_ros.simulate.smoothed_paths import ForcePath, SmoothedPath
+from adxl_ros.simulate.smoothed_paths import ForcePath
 import numpy as np
 import scipy
 
@@ -231,7 +231,7 @@ def _angle_errors(comparison: BaselineComparison, axis: int
     sensor, time_s, joints = comparison.sensor, comparison.time_s, comparison.joints or ()
     slopes = gravity_slopes(*(joint(time_s) for joint in joints))[:, axis] if joints else ()
     for joint, slope in zip(joints, slopes):
-        errors = joint.errors(time_s) if isinstance(joint, SmoothedPath) else None
+        errors = joint.errors(time_s) if isinstance(joint, CachedPath) else None
         if errors is not None:
             # An error that grows, after a move, is a new one.
             memory = np.exp(-errors.forgetting_per_s * comparison.dt_s)
