@@ -38,16 +38,10 @@ noise in a thousand samples."""
 _LONGEST_STEP_S = 0.5
 """Longest time between samples, s, that follow a moving stage. Chosen: the motion between two
 samples is unknown, and stamps in milliseconds are far beyond."""
-_ROUNDINGS_S, _ROUNDING_TOLERANCE = (0.1, 0.01, 1e-3, 1e-4, 1e-5, 1e-6), 0.01
-"""Steps that stamps may be rounded to, s, and deviation from a rounded stamp, in its steps.
-Chosen: decimals, and float64 seconds since 1970, which deviate by 0.2 µs."""
-_EVEN_STAMPS, _MENTIONED, _LARGEST_SCATTER, _LARGEST_BURST = 1e-4, 0.01, 0.45, 64.0
-"""Deviations from a line, in samples: up to which stamps are even, from which a note mentions it,
-by which a stamp still shows the number of its sample, and in bursts. Chosen: no interpolation,
-nothing shows in the slowest motion, below one half, and a buffer of a serial port."""
-_BURSTS, _USUAL_STEPS = 0.5, 1.5
-"""Median step of stamps in bursts over the mean step, and steps that count as one sample, in
-medians. Chosen: a few lost samples hardly change the one; halfway to two."""
+_EVEN_STAMPS, _LARGEST_SCATTER, _USUAL_STEPS = 0.01, 0.45, 1.5
+"""Deviations from a line, in samples, up to which stamps are even, and by which a stamp still
+shows the number of its sample; steps that count as one sample, in medians. Chosen: nothing shows
+in the slowest motion; below one half; halfway to two."""
 _SMALLEST_MOVE_RAD = 0.01
 """Range of an angle, rad, above which the stage moves. Chosen: beyond the jitter of an encoder."""
 _SAMPLES = 4000
@@ -75,9 +69,6 @@ correlation one must gain. Chosen: a recording started by hand, and the error by
 _JUMP_STEPS, _LARGEST_JUMP_SHARE = 20.0, 0.2
 """A step of the stamps of this many usual steps is a jump, and the share of the recording that
 jumps may have. Chosen: gaps of a lossy link are no fault of the clock."""
-_COARSE_CODES, _RAIL_SHARE = 3.0, 0.05
-"""Distance of codes, in stated steps, from which they are coarse, and share of the samples at one
-extreme value that is the end of the range. Chosen: a sensor at rest has one seldom."""
 _SMALLEST_RANGE_V, _SMALLEST_STEP_V, _DEAD_SHARE = 0.05, 1e-9, 1e-4
 """Range of an output that moves, V; step of an ADC that stands for none, V; and share of its
 simulated range that a wired axis covers. Chosen: 50 mg; rounding errors; any wrong unit."""
@@ -98,10 +89,8 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
     Raise DataFault where that is meaningless.
     """
     sensor, notes = replace(sensor, rate_hz=recording.rate_hz), list[str]()
-    even = even_stamps(recording.time_s)
-    if even is not None and even.certain:
-        recording, notes = replace(recording, time_s=even.time_s), even.notes
     _check_clock(recording)
+    even_s = even_stamps(recording.time_s)
     left_out: list[reference.LeftOut] = []
     if sim is not None:
         recording, sim, more = reference.align_force(recording, sensor, sim, may_shift)
@@ -115,13 +104,16 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
             sensor = replace(sensor, stage_resolution_rad=step_rad)
         recording, left_out = reference.stated_poses(recording, sensor)
     comparison = compare(recording, sensor, sim)
-    if even is not None and not even.certain and len(even.time_s) == len(recording):
-        evenly = compare(replace(recording, time_s=even.time_s), sensor, sim)
+    if even_s is not None and len(even_s) == len(recording):
+        # Samples may also have been taken unevenly, so that the simulation decides.
+        evenly = compare(replace(recording, time_s=even_s), sensor, sim)
         if _roughness(evenly) < _SAME_ROUGHNESS * _roughness(comparison):
-            comparison, notes = evenly, notes + even.notes
+            comparison = evenly
+            notes = [*notes, f'stamps are uneven, and an even rate of {evenly.sensor.rate_hz:.6g} '
+                     'Hz explains them: it is used']
     stated = left_out if comparison.joints else []
     comparison = _without(comparison, [
-        *stated, *reference.without_reading(comparison, recording.columns)])
+        *stated, *reference.without_reading(comparison)])
     # What moves too fast is looked for where the reference is stated.
     comparison = _without(comparison, reference.too_coarse(comparison, recording.columns))
     fading_hz = reference.fading_frequency_hz(comparison)
@@ -169,45 +161,21 @@ def _check_clock(recording: Recording) -> None:
                         'milliseconds by 1000')
 
 
-class EvenStamps(NamedTuple):
-    """The instants of samples that were taken evenly."""
+def even_stamps(stamps_s: np.ndarray) -> np.ndarray | None:
+    """
+    Return the even instants behind stamps that are rounded or scatter; missing samples count.
 
-    time_s: np.ndarray  # The instants, s, (n,)
-    # Whether rounding or bursts explain all deviations; otherwise the samples themselves may have
-    # been taken unevenly
-    certain: bool
-    notes: list[str]  # What was changed, for people; empty where it does not matter
-
-
-def even_stamps(stamps_s: np.ndarray) -> EvenStamps | None:
-    """Find the even instants behind stamps: rounded ones, ones that scatter, and bursts."""
-    steps_s, numbers = np.diff(stamps_s), [np.arange(len(stamps_s))]
+    None where the stamps are even, or where no line explains them.
+    """
+    steps_s = np.diff(stamps_s)
     if len(steps_s) < 2 or steps_s.min() <= 0:
         return None
-    in_bursts = np.median(steps_s) < _BURSTS * steps_s.mean()
-    if not in_bursts:
-        # Missing samples count; stamps that scatter by more than their steps look like them.
-        step_s = float(np.mean(steps_s[steps_s < _USUAL_STEPS * np.median(steps_s)]))
-        numbers.append(np.cumsum([0.0, *np.maximum(np.rint(steps_s / step_s), 1.0)]))
-        slope_s, begin_s = np.polyfit(numbers[1], stamps_s - stamps_s[0], 1)
-        again = np.rint((stamps_s - stamps_s[0] - begin_s) / slope_s)
-        numbers += [again] if np.diff(again).min() >= 1 else []
-    lines = []
-    for number in numbers:
-        slope_s, begin_s = np.polyfit(number, stamps_s - stamps_s[0], 1)
-        time_s = stamps_s[0] + begin_s + slope_s * number
-        lines.append((float(np.abs(stamps_s - time_s).max() / slope_s), float(slope_s), time_s))
-    largest, slope_s, time_s = min(lines, key=lambda line: line[0])
-    if not _EVEN_STAMPS < largest < (_LARGEST_BURST if in_bursts else _LARGEST_SCATTER):
-        return None
-    rounding_s = next((r for r in _ROUNDINGS_S if np.abs(
-        stamps_s / r - np.rint(stamps_s / r)).max() < _ROUNDING_TOLERANCE), 0.0)
-    rounded = largest * slope_s < (0.5 + _ROUNDING_TOLERANCE) * rounding_s
-    what = 'come in bursts' if in_bursts else f'are rounded to {rounding_s:g} s' if rounded \
-        else f'scatter by up to {1e3 * largest * slope_s:.3g} ms'
-    note = f'stamps {what}, and an even rate of {1 / slope_s:.6g} Hz explains them: it is used'
-    return EvenStamps(time_s, bool(in_bursts or rounded),
-                      [note] if largest > _MENTIONED else [])
+    step_s = float(np.mean(steps_s[steps_s < _USUAL_STEPS * np.median(steps_s)]))
+    number = np.cumsum([0.0, *np.maximum(np.rint(steps_s / step_s), 1.0)])
+    line = np.polynomial.Polynomial.fit(number, stamps_s - stamps_s[0], 1)
+    time_s = stamps_s[0] + line(number)
+    largest = np.abs(stamps_s - time_s).max() / line.deriv()(0.0)
+    return time_s if _EVEN_STAMPS < largest < _LARGEST_SCATTER else None
 
 
 def _check_encoder(recording: Recording, sensor: Sensor) -> None:
@@ -244,10 +212,8 @@ def _check_encoder(recording: Recording, sensor: Sensor) -> None:
     names = [list(JOINTS.values())[i] for i in in_degrees or (0, 1)
              if in_degrees or factors[i] < 0]
     if in_degrees:
-        places = {name: int(np.argmax(np.abs(angles_rad[:, i])))
-                  for name, i in zip(names, in_degrees)}
-        reached = ' and '.join(f'{name} is {recording.columns[name][rows[k]]:.4g} at '
-                               f'{recording.time_s[rows[k]]:.4g} s' for name, k in places.items())
+        reached = ' and '.join(f'{name} reaches {largest[i]:.4g}'
+                               for name, i in zip(names, in_degrees))
         raise DataFault('unit', f'{reached}: degrees in a column of radians (as degrees it fits '
                         f'the output, correlation {correlation:.2f}); multiply '
                         f'{" and ".join(names)} by π/180')
@@ -262,11 +228,9 @@ def _check_encoder(recording: Recording, sensor: Sensor) -> None:
             and abs(offset_g + 2 * zero_g) < abs(offset_g):
         return
     joined, inverted = (' and '.join(n) for n in (names, [sensor.axes[d] for d in mirrored]))
-    rival = f'the axis {inverted} is inverted' if len(mirrored) == len(names) else \
-        f'the sensor is mounted half a turn about z, with {inverted} mirrored'
     raise DataFault('encoder_sign', f'{joined}: opposite sign of the encoder (correlation '
                     f'{correlation:.2f} with the sign changed); change the sign of {joined}, '
-                    f'unless {rival}')
+                    f'unless the axis {inverted} is inverted')
 
 
 class CheckedRecording(NamedTuple):
@@ -354,14 +318,12 @@ def _check_range(comparison: BaselineComparison, finite: np.ndarray) -> None:
     sensor = comparison.sensor
     volts, simulated_v = (v[finite] for v in (comparison.volts, comparison.simulated_v(sensor)))
     lsb_v, range_v = max(sensor.lsb_v, _SMALLEST_STEP_V), np.ptp(volts, axis=0)
-    railed = 0.0
-    for axis_v, expected_v, step_v in zip(volts.T, simulated_v.T, code_step_v(volts)):
-        for rail_v in (axis_v.max(), axis_v.min()) if np.ptp(axis_v) > _SMALLEST_RANGE_V else ():
-            at_rail = np.abs(axis_v - rail_v) < lsb_v / 2
-            # Coarse codes repeat in an extreme pose, so that the simulation must differ, too.
-            if step_v > _COARSE_CODES * lsb_v:
-                at_rail &= np.abs(expected_v - rail_v) > step_v
-            railed = max(railed, at_rail.mean() * (at_rail.mean() > _RAIL_SHARE))
+    # Coarse codes repeat in an extreme pose, so that the simulation must differ, too.
+    step_v = np.maximum(code_step_v(volts), lsb_v)
+    railed = max(float(np.mean((np.abs(volts - rail_v) < lsb_v / 2)
+                               & (np.abs(simulated_v - rail_v) > step_v), axis=0)[
+        range_v > _SMALLEST_RANGE_V].max(initial=0.0))
+        for rail_v in (volts.max(axis=0), volts.min(axis=0)))
     if railed > _LARGEST_MISSING_SHARE:
         raise DataFault('saturated', f'{100 * railed:.0f} % of the samples are at the end of the '
                         'range; check supply, range and wiring')

@@ -22,7 +22,6 @@ from adxl_ros.diagnose import (
 from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
 from adxl_ros.diagnose.data_checks import CheckedRecording, compare_checked
 from adxl_ros.diagnose.evidence import used_by_block
-from adxl_ros.diagnose.held_out import HeldOutFits, reproducible_rest
 from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
 from adxl_ros.diagnose.next_experiment import CouldShow, NextExperiment
 from adxl_ros.diagnose.noise_effects import Detection, NoiseComparison, NoiseRemainder
@@ -35,7 +34,13 @@ from adxl_ros.diagnose.residual_map import (
     ResidualCell,
 )
 from adxl_ros.diagnose.search import Hypothesis, linearise, Search
-from adxl_ros.diagnose.verdict import HEALTHY, MATERIAL_MG, Verdict
+from adxl_ros.diagnose.verdict import (
+    HEALTHY,
+    HeldOutFits,
+    MATERIAL_MG,
+    reproducible_rest,
+    Verdict,
+)
 from adxl_ros.files.recording_columns import check_unit, Recording
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
@@ -50,9 +55,6 @@ import numpy as np
 ShowProgress = Callable[[str, float], None]
 """Called with number and name of the stage, and the fraction of the work that is done."""
 
-_STAGES = {'checks': 0.1, 'library of effects': 0.3, 'effects': 0.8, 'held-out figures': 0.9,
-           'report': 1.0}
-"""Stages, and the fraction of the usual run time after each. Measured at 250 Hz."""
 _DRIFT_LIMIT = 5.0
 """Expected mean square of a random walk about its mean, divided by the one in a recording, that
 one walk in 20 exceeds. Derived from the random walk."""
@@ -142,23 +144,18 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
         A recording is of another unit, or its reference cannot be followed.
 
     """
-    names, ends = list(_STAGES), [0.0, *_STAGES.values()]
-
-    def show(stage: str, share: float) -> None:
-        i = names.index(stage)
-        show_progress(f'{i + 1}/{len(names)} {stage}', ends[i] + share * (ends[i + 1] - ends[i]))
-
-    show('checks', 0.0)
+    show_progress('1/5 checks', 0.0)
     try:
         checked = check(recordings, sensor, sim, align)
     except DataFault as fault:
         return Diagnosis(fault.comparisons, fault=fault)
     compared = [c.search_comparison for c in checked]
-    model = build_linear_model(compared, noise_model.whiteners(compared),
-                               lambda share: show('library of effects', share))
+    model = build_linear_model(
+        compared, noise_model.whiteners(compared),
+        lambda share: show_progress('2/5 library of effects', 0.1 + 0.2 * share))
     search = Search(model)
-    search.run(lambda share: show('effects', share))
-    show('held-out figures', 0.0)
+    search.run(lambda share: show_progress('3/5 effects', 0.3 + 0.5 * share))
+    show_progress('4/5 held-out figures', 0.8)
     floor = noise_model.estimate([c.comparison for c in checked])
     counts = np.sum([used_by_block(c.used) for c in model.comparisons], axis=0)
     fits = _held_out(model, search, floor, max(counts.sum(), 1.0))
@@ -172,18 +169,17 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
         any(c.fading_hz is not None for c in model.comparisons), wanders,
         np.inf if floor.source == 'assumed' else floor.rms_mps2,
         {effects: h.sizeless for effects, h in search.found.items()})
-    detections = [d for d in _detections(checked, search.best, model.baseline, smallest_mps2)
-                  if not (wanders and d.effect in drift_effects())]
+    detections = _detections(checked, search.best, model.baseline, smallest_mps2)
     bases = [flexible_bases(c, v) for c, v in zip(compared, model.baseline_v)]
     verdict = rule.decide(
         evidence, lambda effects, drift: reproducible_rest(fits[effects][drift], bases),
         [d.effect for d in detections])
-    show('report', 0.0)
+    show_progress('5/5 report', 0.9)
     if verdict.status == 'no_gap' and not any(map(_could_show, model.comparisons)):
         verdict = replace(verdict, status='insufficient')
     report = _report(checked, model, search, verdict, detections, floor, evidence,
                      fits[verdict.best], seed)
-    show('report', 1.0)
+    show_progress('5/5 report', 1.0)
     return Diagnosis(tuple(model.comparisons), tuple(c.comparison for c in checked), None, report)
 
 

@@ -46,10 +46,6 @@ one."""
 _CLIPPED_SHARES = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3)
 """Shares of the samples that are clipped by the limits that are tried. Chosen: neighbours differ
 by factors of 1.5 to 2.5."""
-_CLIPPING_AMOUNT, _BEYOND_G = 0.3, 0.1
-"""Share of the change by a limit, on the linear model, below which the axis is not clipped there,
-and distance of its limit from the largest sample, g. Chosen: the levels differ by factors; five
-typical knees."""
 _SMALLEST_V = 1e-9
 """Change of the output, V, that is a rounding error."""
 _SIMULATED_SHARE = 0.5
@@ -85,18 +81,11 @@ class Variant:
     # Only for an effect with a limit: first values of its fit, by coefficient. The columns are
     # then the change of the output by these values, V.
     limit_start: dict[Coefficient, float] = field(default_factory=dict)
-    # The same for limits that clip no sample
-    limit_beyond: dict[Coefficient, float] = field(default_factory=dict)
 
     @property
     def key(self) -> tuple:
         """Return what distinguishes it from the others."""
         return self.effect, tuple(self.shape.items()), self.step
-
-    def first_limits(self, amounts: Mapping[Coefficient, float]) -> dict[Coefficient, float]:
-        """Return first values of a fit of limits; those that hardly clip begin beyond all."""
-        return self.limit_start | {name: value for name, value in self.limit_beyond.items()
-                                   if amounts.get(name, 0.0) < _CLIPPING_AMOUNT}
 
 
 def candidates() -> list[Effect]:
@@ -163,8 +152,6 @@ def _limit_variants(comparison: BaselineComparison, effect: Effect, limit: Param
              for p in effect.parameters if p.is_size
              for name in names_of(replace(effect, parameters=(p,)), axes)}
     magnitude_g = np.abs(baseline_v - sensor.zero_g_v) / sensor.scale_v_per_g
-    beyond = dict(zip(names, np.clip(magnitude_g.max(axis=0) + _BEYOND_G, limit.lower,
-                                     limit.upper)))
     for number, share in enumerate(_CLIPPED_SHARES):
         values = np.clip(np.quantile(magnitude_g, 1 - share, axis=0), limit.lower, limit.upper)
         change_v = comparison.simulated_v(put(with_effect, names, values)) - baseline_v
@@ -173,7 +160,7 @@ def _limit_variants(comparison: BaselineComparison, effect: Effect, limit: Param
             yield Variant(effect.name, {}, float(number), tuple(names[d] for d in clipped),
                           [[Column(clipped.index(d), change_v[:, d])] if d in clipped else []
                            for d in range(len(axes))],
-                          dict(zip(names, values)) | start, beyond)
+                          dict(zip(names, values)) | start)
 
 
 def _variant(comparison: BaselineComparison, effect: Effect, parameters: Sequence[Parameter],

@@ -23,7 +23,7 @@ from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
-from adxl_ros.diagnose import evidence, linear_model as linear, noise_effects
+from adxl_ros.diagnose import linear_model as linear, noise_effects
 from adxl_ros.diagnose.comparison import (
     at_search_rate,
     BaselineComparison,
@@ -33,15 +33,14 @@ from adxl_ros.diagnose.comparison import (
 )
 from adxl_ros.diagnose.linear_model import LinearModel
 from adxl_ros.diagnose.noise_model import expected_drift_g, whiteners
-from adxl_ros.diagnose.residual_map import flexible_bases
 from adxl_ros.diagnose.verdict import UNKNOWN, Verdict, WeightedHypothesis
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.coefficients import parameter_of, with_neutral
 from adxl_ros.model.constants import G0_MPS2
-from adxl_ros.model.diagnosis_hints import Detector, FormDimension, Manoeuvre
+from adxl_ros.model.diagnosis_hints import Detector, Manoeuvre
 from adxl_ros.model.effects import effect_named, library
-from adxl_ros.model.effects.base import Coefficient, Effect
+from adxl_ros.model.effects.base import Coefficient, Concern, Effect
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Motion
@@ -55,8 +54,6 @@ _RATE_HZ = 62.5
 _SMALLEST_PROBABILITY, _MOST_HYPOTHESES = 1e-3, 40
 """Probability of a hypothesis that leads the choice, and their largest number. Chosen: the others
 together are far below the 5 % that remain at the end; run time."""
-_UNKNOWN_G = 1e-3
-"""Rms of an unknown function, g. Chosen: the middle of those of the diagnosis."""
 _EVIDENCE_FACTOR = 0.3
 """Factor of the information, because no model of a sensor is exact (Miller and Dunson 2019)."""
 _OTHER_REFERENCE = 'ros2 run adxl_ros diagnose next.csv --sim next_simulated.csv -o next'
@@ -235,7 +232,7 @@ class ManoeuvreWorth(NamedTuple):
 
 
 Key = tuple
-"""Variant and coefficient of a column; dimension, channel and number of a flexible function."""
+"""Variant and coefficient of a column."""
 
 
 class PredictedResponse(NamedTuple):
@@ -253,20 +250,12 @@ class PredictedResponse(NamedTuple):
 
 
 def leading(hypotheses: Sequence[WeightedHypothesis]) -> tuple[WeightedHypothesis, ...]:
-    """Return the hypotheses that lead the choice of a manoeuvre, by falling probability."""
-    return tuple(h for h in hypotheses
-                 if h.probability > _SMALLEST_PROBABILITY)[:_MOST_HYPOTHESES]
+    """Return the known hypotheses that lead the choice of a manoeuvre, the most probable first."""
+    return tuple(h for h in hypotheses if h.probability > _SMALLEST_PROBABILITY
+                 and UNKNOWN not in h.effects)[:_MOST_HYPOTHESES]
 
 
-def unknown_dimensions(verdict: Verdict | None) -> tuple[FormDimension, ...]:
-    """Return the dimensions in which something unknown may act, or the usual ones."""
-    where = tuple(map(FormDimension, verdict.rest_follows if verdict else ()))
-    return where or (FormDimension.FORCE, FormDimension.DIRECTION, FormDimension.RATE,
-                     FormDimension.TIME)
-
-
-def predict(manoeuvre: Experiment, sensor: Sensor, effects: Sequence[str],
-            dimensions: Sequence[FormDimension]) -> PredictedResponse:
+def predict(manoeuvre: Experiment, sensor: Sensor, effects: Sequence[str]) -> PredictedResponse:
     """Simulate a manoeuvre with the baseline, and multiply its whitened sensitivities."""
     at_rate = replace(sensor, rate_hz=min(sensor.rate_hz, _RATE_HZ))
     parts = list(simulate_blocks(at_rate, manoeuvre.motion, 0, manoeuvre.begin_s))
@@ -274,28 +263,14 @@ def predict(manoeuvre: Experiment, sensor: Sensor, effects: Sequence[str],
     recording = Recording(manoeuvre.name, columns.pop('time_s'), columns)
     comparison = at_search_rate(compare(recording, at_rate))
     model = linear.build_linear_model([comparison], whiteners([comparison]), only=effects)
-    filters = linear.filters_for(model.filters, sensor.effects)
-    bases = flexible_bases(comparison, model.baseline_v[0])
-    places: dict[Key, int] = {}
-    keys, blocks = _keys(model), []
-    for number, channel in enumerate(model.columns):
-        functions = bases[number]
-        size_v = _UNKNOWN_G * float(comparison.sensor.scale_v_per_g[number])
-        shown: dict[Key, np.ndarray] = {keys[c.number]: c.values for c in channel
-                                        if c.number in keys}
-        shown |= {(d, number, i): size_v * values for d in dimensions if d in functions
-                  for i, values in enumerate(functions[d].T)}
-        whitener = filters[number][model.null_fit.filter_indices[number]]
-        values = np.array(list(shown.values())).T
-        grams = evidence.whiten_channel(np.zeros(len(values)), values, np.arange(len(shown)),
-                                        comparison.used, [whitener], by_block=False).total_grams
-        for key in shown:
-            places.setdefault(key, len(places))
-        blocks.append(([places[key] for key in shown],
-                       grams[0, 1:, 1:] / model.null_fit.innovation_variance_v2[number]))
+    keys = _keys(model)
+    places = {key: place for place, key in enumerate(keys.values())}
     gram = np.zeros((len(places), len(places)))
-    for ids, block in blocks:
-        gram[np.ix_(ids, ids)] += block
+    for channel, f, variance in zip(model.channels, model.null_fit.filter_indices,
+                                    model.null_fit.innovation_variance_v2):
+        shown = [i for i, number in enumerate(channel.column_ids) if number in keys]
+        ids = [places[keys[channel.column_ids[i]]] for i in shown]
+        gram[np.ix_(ids, ids)] += channel.total_grams[f][1:, 1:][np.ix_(shown, shown)] / variance
     return PredictedResponse(manoeuvre, model, places, gram)
 
 
@@ -307,12 +282,10 @@ def _keys(model: LinearModel) -> dict[int, Key]:
 
 
 def rank_responses(responses: Sequence[PredictedResponse],
-                   hypotheses: Sequence[WeightedHypothesis], model: LinearModel | None,
-                   dimensions: Sequence[FormDimension]
+                   hypotheses: Sequence[WeightedHypothesis], model: LinearModel | None
                    ) -> tuple[ManoeuvreWorth, ...]:
     """Rank manoeuvres by their expected information per minute."""
     leaders = leading(hypotheses)
-    named = next((h.effects for h in leaders if UNKNOWN not in h.effects), ())
 
     @cache
     def best_variant(effect: str) -> int | None:
@@ -323,13 +296,8 @@ def rank_responses(responses: Sequence[PredictedResponse],
 
     posteriors = []
     for hypothesis in leaders:
-        # Something unknown acts beside the best other hypothesis.
-        unknown = UNKNOWN in hypothesis.effects
-        effects = named if unknown else hypothesis.effects
-        functions = {*(dimensions if unknown else ()),
-                     *((FormDimension.TIME,) if evidence.drifts_among(effects) else ())}
-        seen = {e: i for e in effects if (i := best_variant(e)) is not None}
-        posteriors.append((_fitted(model, list(seen.values())), {*effects} - {*seen}, functions))
+        seen = {e: i for e in hypothesis.effects if (i := best_variant(e)) is not None}
+        posteriors.append((_fitted(model, list(seen.values())), {*hypothesis.effects} - {*seen}))
     total = sum(h.probability for h in leaders)
     probabilities = [h.probability / total for h in leaders]
     worth = [ManoeuvreWorth(r.manoeuvre, expected_information(
@@ -355,12 +323,11 @@ def _fitted(model: LinearModel | None, chosen: list[int]) -> _Fitted:
     return [keys[int(i)] for i in fit.column_ids], fit.values, fit.covariance
 
 
-def _belief(response: PredictedResponse, fitted: _Fitted, unseen: Collection[str],
-            functions: Collection[FormDimension]) -> Belief:
+def _belief(response: PredictedResponse, fitted: _Fitted, unseen: Collection[str]) -> Belief:
     """
     Return what a hypothesis knows of the columns of a manoeuvre.
 
-    Of `unseen` effects only the prior is known; unknown functions act in some dimensions.
+    Of `unseen` effects only the prior is known.
     """
     places, model, keys = response.places, response.linear_model, _keys(response.linear_model)
     columns, means, covariance = fitted
@@ -380,7 +347,6 @@ def _belief(response: PredictedResponse, fitted: _Fitted, unseen: Collection[str
     prior_std = model.prior(chosen)
     ids = {k for i in chosen for k in model.column_ids[i]} | set(model.nuisance_ids)
     stds = {places[keys[k]]: float(prior_std[k]) for k in ids if keys[k] in places}
-    stds |= {place: 1.0 for key, place in places.items() if key[0] in functions}
     more = np.diag([stds.get(place, 0.0) * (place not in at) for place in range(len(places))])
     return Belief(mean, np.hstack([root, more[:, more.any(axis=0)]]))
 
@@ -390,26 +356,20 @@ class ManoeuvreDescription(NamedTuple):
 
     text: str  # What to do, for people
     trajectory: str  # Name of the trajectory of `simulate`
-    robot_text: str  # What to do without a stage, for people
     remounted: bool = False  # Whether the sensor is remounted, turned by 180° about z
 
 
 MENU = {
     Manoeuvre.SHAKE: ManoeuvreDescription(
-        'shake along x from 2 to 40 Hz', 'shaker', 'shake from 2 to 40 Hz'),
+        'shake along x from 2 to 40 Hz', 'shaker'),
     Manoeuvre.SPEEDS: ManoeuvreDescription(
-        'turn two planes at two speeds, forth and back, with reversals', 'rich',
-        'turn at two speeds, forth and back, with reversals'),
+        'turn two planes at two speeds, forth and back, with reversals', 'rich'),
     Manoeuvre.PLANES: ManoeuvreDescription(
-        'sweep a second plane', 'tilt_both', 'tilt slowly in all directions'),
+        'sweep a second plane, or tilt in all directions', 'tilt_both'),
     Manoeuvre.REMOUNT: ManoeuvreDescription(
-        'remount the sensor turned by 180 deg about z, and sweep again', 'tilt_both',
-        'remount the sensor turned by 180 deg about z, and tilt in all directions', True),
-    Manoeuvre.HEAT: ManoeuvreDescription(
-        'dwell, heat and cool', 'soak', 'rest, heat and cool'),
-    Manoeuvre.SUPPLY: ManoeuvreDescription(
-        'step the supply at rest', 'soak', 'step the supply at rest'),
-}
+        'remount the sensor turned by 180 deg about z, and sweep again', 'tilt_both', True),
+    Manoeuvre.HEAT: ManoeuvreDescription('dwell, heat and cool', 'soak'),
+    Manoeuvre.SUPPLY: ManoeuvreDescription('step the supply at rest', 'soak')}
 """All manoeuvres. An effect names the one that reveals it best in its own file."""
 
 
@@ -435,25 +395,16 @@ def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], sensor
     """
     no_stage = model is not None and all(
         c.reference is Reference.SIMULATOR for c in model.comparisons)
-    # An error of the reference that another effect imitates.
-    same = next((g for g in verdict.groups if any(
-        effect_named(effect).diagnosis.imitated_by in g for effect in g)), None)
-    if same is not None:
+    if any(effect_named(e).concern is Concern.REFERENCE for e in verdict.named):
         return NextExperiment(
-            'another sensor beside the same reference',
-            f'because {" and ".join(same)} give the same samples, and what stays is of the '
-            'reference', _OTHER_REFERENCE, concerns_reference=True)
-    hints = [effect_named(effect).diagnosis for effect in verdict.effects]
-    if verdict.status == 'explained' and any(h.smooths_reference for h in hints):
-        return NextExperiment(
-            'the motion with less smoothing of the reference',
-            'because it lacks motion that the sensor has', _OTHER_REFERENCE,
+            'the motion beside another reference, or one with less smoothing',
+            'because the error may be of the reference', _OTHER_REFERENCE,
             concerns_reference=True)
     if verdict.groups:
-        ranked = _ranked_menu(verdict, sensor, model, seed, no_stage)
+        ranked = _ranked_menu(verdict, sensor, model, seed)
         group, best = verdict.groups[0], ranked[0].manoeuvre.name
         why = f'to separate {", ".join(group[:-1])} and {group[-1]}'
-        return _experiment(next(m for m in MENU if _text(m, no_stage) == best), why,
+        return _experiment(next(m for m, d in MENU.items() if d.text == best), why,
                            no_stage)._replace(menu=ranked)
     if verdict.status == 'no_gap' and not not_covered:
         return None
@@ -462,7 +413,7 @@ def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], sensor
         why = 'to show what the unknown part of the gap depends on'
     elif not_covered:
         why = f'because the recordings have no {", no ".join(not_covered)}'
-    revealed_by = [h.revealed_by for h in hints]
+    revealed_by = [effect_named(e).diagnosis.revealed_by for e in verdict.effects]
     most = max(MENU, key=revealed_by.count)
     if most not in revealed_by:
         most = Manoeuvre.SPEEDS if verdict.status == 'unknown' or not not_covered \
@@ -470,36 +421,31 @@ def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], sensor
     return _experiment(most, why, no_stage)
 
 
-def _ranked_menu(verdict: Verdict, sensor: Sensor, model: LinearModel | None, seed: int,
-                 no_stage: bool) -> tuple[ManoeuvreWorth, ...]:
+def _ranked_menu(verdict: Verdict, sensor: Sensor, model: LinearModel | None, seed: int
+                 ) -> tuple[ManoeuvreWorth, ...]:
     """Rank the whole menu by its expected information."""
     effects = sorted({effect for h in leading(verdict.hypotheses) for effect in h.effects})
-    dimensions, responses = unknown_dimensions(verdict), []
-    for manoeuvre, described in MENU.items():
+    responses = []
+    for described in MENU.values():
         motion = trajectories.TRAJECTORIES[described.trajectory](np.random.default_rng(seed))
         # At rest the pose is unknown, so that a baseline with effects of the stage has no place.
         with suppress(UserError):
             responses.append(predict(
-                Experiment(_text(manoeuvre, no_stage), 0.0, motion),
-                _remounted(sensor) if described.remounted else sensor, effects, dimensions))
-    return rank_responses(responses, verdict.hypotheses, model, dimensions)
-
-
-def _text(manoeuvre: Manoeuvre, no_stage: bool) -> str:
-    """Return what to do in a manoeuvre, for people."""
-    return MENU[manoeuvre].robot_text if no_stage else MENU[manoeuvre].text
+                Experiment(described.text, 0.0, motion),
+                _remounted(sensor) if described.remounted else sensor, effects))
+    return rank_responses(responses, verdict.hypotheses, model)
 
 
 def _experiment(manoeuvre: Manoeuvre, why: str, no_stage: bool) -> NextExperiment:
     """Describe a manoeuvre with its command."""
-    described, option, text = MENU[manoeuvre], '', _text(manoeuvre, no_stage)
+    described, option = MENU[manoeuvre], ''
     if no_stage:
-        return NextExperiment(text, why, _OTHER_REFERENCE, beside_simulator=True)
+        return NextExperiment(described.text, why, _OTHER_REFERENCE, beside_simulator=True)
     if described.remounted:
         effect = _remounting_effect()
         option = f' --effect {effect.name}:{effect.diagnosis.half_turn}={np.pi:.6f}'
-    return NextExperiment(
-        text, why, f'ros2 run adxl_ros simulate {described.trajectory}{option} -o next.csv')
+    return NextExperiment(described.text, why, f'ros2 run adxl_ros simulate '
+                          f'{described.trajectory}{option} -o next.csv')
 
 
 def _remounting_effect() -> Effect:

@@ -39,9 +39,6 @@ _LINE_PART_S, _LINE_BESIDE = 4.0, 4.0
 """Length of the parts of which the amplitude of a line is taken, s, and distance at which the
 power beside it is taken, in inverse parts. Chosen: the phase of the mains wanders little within
 it; beyond the main lobe of the window."""
-_HARMONICS, _HARMONIC_SHARE, _DISTINCT_HZ = (1, 2, 3), 0.2, 1.0
-"""Multiples of a line that are compared, smallest amplitude of a harmonic, divided by that of the
-line, and smallest distance of two lines, Hz. Chosen: mains hum has these, behind rectifiers."""
 SPIKE_STDS, _SPIKE_FEWEST, _SPIKE_NEIGHBOUR = 7.0, 3, 2
 """Deviation of a spike from its neighbours, in robust standard deviations, fewest spikes of an
 axis, and distance of the neighbours, samples. Chosen: normal noise exceeds it once in 4·10¹¹
@@ -63,11 +60,8 @@ samples. Chosen: two may be equal by rounding."""
 _REPEAT_PROBABILITIES = (0.05, 1e-3, 0.5)
 """Smallest assumed probability that a sample equals the last one on one axis, and on all of
 several axes; the largest one. Chosen: in 10⁵ samples, chance explains runs of 7, 3 and 30."""
-_BANDS, _LOWEST_EDGE_HZ, _TIMES_S, _SEGMENT_S = 5, 0.05, (0.1, 1.0, 10.0), 16.0
-"""Bands of frequency, smallest edge, Hz, averaging times of the Allan deviation, and segments of
-the simulated spectrum, s. Chosen: half a decade each; a period of 20 s; ten segments."""
-_LOWEST_POWER = 1e-6
-"""Smallest power of the simulated spectrum, divided by its largest. Chosen: rounding errors."""
+_BANDS, _LOWEST_EDGE_HZ = 5, 0.05
+"""Bands of frequency, and smallest edge, Hz. Chosen: half a decade each; a period of 20 s."""
 _DRAWS, _LONGEST_ALLAN_S, _ALLAN_WINDOWS = 4, 10.0, 10
 """Drawn recordings of a drift, and averaging time of its Allan deviation, s: at most so many times
 shorter than the recording. Chosen: fewer means scatter by more."""
@@ -316,38 +310,22 @@ class NoiseComparison:
 
     band_edges_hz: tuple[float, ...]  # Edges of the k bands of frequency, Hz, (k + 1,)
     power_ratio: tuple[float, ...]  # Recorded power divided by simulated power, for each band
-    averaging_times_s: tuple[float, ...]  # Averaging times of the Allan deviation, s, (j,)
-    allan_ratio: tuple[float, ...]  # Recorded Allan deviation divided by the simulated one, (j,)
-    # Log likelihood of the recorded spectrum under the simulated one (Whittle 1953)
-    log_likelihood: float
 
 
 def compare_noise(comparison: BaselineComparison, mean_sensor: Sensor, noise_sensor: Sensor,
                   seed: int) -> NoiseComparison:
     """Compare the residual after one sensor's mean output with the drawn noise of another."""
     rate_hz = comparison.sensor.rate_hz
-    recorded, simulated = (
-        (v - v.mean(axis=0)) / comparison.scale_v_per_mps2 for v in (
-            bridged(comparison.residual_v(mean_sensor), comparison.used),
-            bridged(comparison.simulated_noise_v(noise_sensor, seed), comparison.used)))
-    frequency_hz, power = scipy.signal.periodogram(recorded, rate_hz, axis=0)
-    _, simulated_power = scipy.signal.periodogram(simulated, rate_hz, axis=0)
+    recorded, simulated = (scipy.signal.periodogram(
+        bridged(v, comparison.used) / comparison.scale_v_per_mps2, rate_hz, axis=0)[1]
+        for v in (comparison.residual_v(mean_sensor),
+                  comparison.simulated_noise_v(noise_sensor, seed)))
+    frequency_hz = np.linspace(0, rate_hz / 2, len(recorded))
     edges_hz = np.geomspace(max(frequency_hz[1], _LOWEST_EDGE_HZ), rate_hz / 2, _BANDS + 1)
     edges_hz[0] = 0.0
     bands = [(frequency_hz > low) & (frequency_hz <= high) for low, high in pairwise(edges_hz)]
-    length = min(round(_SEGMENT_S * rate_hz), len(simulated))
-    welch_hz, level = scipy.signal.welch(simulated, rate_hz, nperseg=max(length, 8), axis=0)
-    expected = np.column_stack([np.interp(frequency_hz[1:], welch_hz[1:], v[1:])
-                                for v in level.T])
-    expected = np.maximum(expected, _LOWEST_POWER * expected.max())
-    times_s = [t for t in _TIMES_S if t * rate_hz >= 2 and t * 10 < len(recorded) / rate_hz]
-    allan = [[allan_deviation(v, round(t * rate_hz)) for v in (recorded, simulated)]
-             for t in times_s]
-    return NoiseComparison(
-        tuple(edges_hz.tolist()),
-        tuple(float(power[band].sum() / simulated_power[band].sum()) for band in bands),
-        tuple(times_s), tuple(float(np.sqrt(np.mean((a / b) ** 2))) for a, b in allan),
-        -float(np.sum(power[1:] / expected + np.log(expected))))
+    return NoiseComparison(tuple(edges_hz.tolist()), tuple(
+        float(recorded[band].sum() / simulated[band].sum()) for band in bands))
 
 
 def allan_deviation(values: np.ndarray, count: int) -> np.ndarray:
@@ -401,10 +379,7 @@ def noise_remainders(comparisons: Sequence[BaselineComparison], mean_sensor: Sen
     for key, pairs in values.items():
         recorded, simulated = np.sqrt(np.mean(np.square(np.array(pairs, float)), axis=0))
         axes = named_sensor.axes if len(recorded) == len(named_sensor.axes) else ''
-        of_same = [r for r in remainders if r.effect == key[0] and 'line' in key[1]]
-        # Harmonics of a line, which no effect models, count where they are large.
-        if not of_same or recorded.max() > _HARMONIC_SHARE * of_same[0].recorded.max():
-            remainders.append(NoiseRemainder(*key, axes, recorded, simulated))
+        remainders.append(NoiseRemainder(*key, axes, recorded, simulated))
     return remainders
 
 
@@ -426,13 +401,8 @@ def _statistics(comparison: BaselineComparison, detection: Detection, volts: np.
     detector = effect_named(detection.effect).diagnosis.detector
     finite = np.isfinite(volts).all(axis=1)
     if detector is Detector.MAINS_LINE:
-        seen_hz = [0.0]
-        for hz in (k * float(detection.values['frequency_hz']) for k in _HARMONICS):
-            alias_hz = abs((hz + sensor.rate_hz / 2) % sensor.rate_hz - sensor.rate_hz / 2)
-            if len(seen_hz) < 2 or min(abs(alias_hz - s) for s in seen_hz) > _DISTINCT_HZ:
-                seen_hz.append(alias_hz)
-                yield (f'line at {hz:.4g} Hz', 'm/s^2',
-                       line_amplitude_v(noise_v, time_s, hz) / scale)
+        hz = float(detection.values['frequency_hz'])
+        yield f'line at {hz:.4g} Hz', 'm/s^2', line_amplitude_v(noise_v, time_s, hz) / scale
     elif detector is Detector.NOISE_LEVEL:
         yield 'white noise', 'm/s^2', white_noise_v(noise_v, sensor) / scale
     elif detector is Detector.ISOLATED_SAMPLES:

@@ -14,11 +14,11 @@ density equals that of the white noise (Corsini and Saletti 1988, IEEE Trans. In
 The variance of the innovations is fitted. The filter then depends only on the ratio of drift and
 noise, which is searched on a grid.
 
-Errors of followed angles, and rounding to codes coarser than the noise, are constant at rest and
-new after each move (errors in variables; Fuller 1987). The model is y = n + g·u. Here n is noise
-behind the RC filter, AR(1) with pole a, u has variance 1, u_t = φ_t·u_(t−1) + √(1 − φ_t²)·ξ_t, and
-g is its standard deviation in V. A Kalman filter predicts g·u; its innovations, scaled and
-filtered by 1/(1 − aL), have the spectrum of n. Where g is 0, samples stay as they are.
+Errors of followed angles are constant at rest and new after each move (errors in variables; Fuller
+1987). The model is y = n + g·u. Here n is noise behind the RC filter, AR(1) with pole a, u has
+variance 1, u_t = φ_t·u_(t−1) + √(1 − φ_t²)·ξ_t, and g is its standard deviation in V. A Kalman
+filter predicts g·u; its innovations, scaled and filtered by 1/(1 − aL), have the spectrum of n.
+Where g is 0, samples stay as they are.
 """
 
 from __future__ import annotations
@@ -64,9 +64,6 @@ _LOWEST_NOISE_V = 1e-7
 of any ADC."""
 _TOP_OF_RATE = 0.25
 """Highest corner frequency of 1/f noise, divided by the sample rate. Chosen: half of Nyquist."""
-_SMALLEST_HELD_SHARE = 0.01
-"""Share of the rounding that is held, below which all of it is white. Chosen: the noise is then
-a third of a step, as in any unit whose ADC suits it."""
 
 
 @dataclass(frozen=True)
@@ -195,18 +192,17 @@ def angle_error_filter(comparison: BaselineComparison, axis: int) -> AngleErrorF
     """
     Return the filter for one axis of a recording, by the Riccati recursion of the Kalman filter.
 
-    None where the errors of angles and rounding are 0.
+    None where the errors of angles are 0.
     """
-    sensor = comparison.sensor
-    rounding = noise.rounding(sensor, axis)
     variance_v2, remembered_v2 = np.zeros(len(comparison)), np.zeros(len(comparison))
-    for part_v2, memory in _held_errors(comparison, axis, rounding.held_v2):
+    for part_v2, memory in _angle_errors(comparison, axis):
         variance_v2 += part_v2
         remembered_v2 += part_v2 * memory
     if not variance_v2.any():
         return None
     pole, analog_v = _analog(comparison, axis)
-    noise_v2 = analog_v ** 2 * (1 - pole ** 2) + rounding.white_v2 * (1 + pole ** 2)
+    noise_v2 = analog_v ** 2 * (1 - pole ** 2) \
+        + comparison.sensor.lsb_v ** 2 / 12 * (1 + pole ** 2)
     memories = np.divide(remembered_v2, variance_v2, where=variance_v2 > 0,
                          out=np.ones(len(comparison)))
     std_v = np.sqrt(variance_v2)
@@ -229,14 +225,9 @@ def _analog(comparison: BaselineComparison, axis: int) -> tuple[float, float]:
             max(float(noise.analog_std_v(comparison.sensor)[axis]), _LOWEST_NOISE_V))
 
 
-def _held_errors(comparison: BaselineComparison, axis: int, held_v2: float
-                 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """
-    Yield variance, V², (n,), and memory from sample to sample, (n,), of the errors that are held.
-
-    They are those of each joint, and of rounding: the rounding errors of two outputs that differ
-    by a small share x of a step have the correlation 1 − 6·x.
-    """
+def _angle_errors(comparison: BaselineComparison, axis: int
+                  ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield variance, V², and memory from sample to sample, (n,) each, of errors of angles."""
     sensor, time_s, joints = comparison.sensor, comparison.time_s, comparison.joints or ()
     slopes = gravity_slopes(*(joint(time_s) for joint in joints))[:, axis] if joints else ()
     for joint, slope in zip(joints, slopes):
@@ -252,10 +243,6 @@ def _held_errors(comparison: BaselineComparison, axis: int, held_v2: float
         errors = force.errors(time_s, AXES.index(sensor.axes[axis]))
         v_per_mps2 = sensor.scale_v_per_g[axis] / G0_MPS2
         yield (v_per_mps2 * errors.std) ** 2, np.exp(-errors.forgetting_per_s * comparison.dt_s)
-    if held_v2 > _SMALLEST_HELD_SHARE * sensor.lsb_v ** 2 / 12:
-        simulated_v = comparison.simulated_v(sensor)[:, axis]
-        steps = np.abs(np.diff(simulated_v, prepend=simulated_v[:1])) / sensor.lsb_v
-        yield np.full(len(comparison), held_v2), np.exp(-6 * steps)
 
 
 def drift_effects() -> tuple[str, ...]:
@@ -272,7 +259,7 @@ def _whiteners(comparison: BaselineComparison, axis: int) -> list[Whitener]:
     sensor, dt_s, span_s = comparison.sensor, comparison.dt_s, comparison.span_s
     errors, scale = angle_error_filter(comparison, axis), float(sensor.scale_v_per_g[axis])
     a, std_v = _analog(comparison, axis)
-    step_v2 = noise.rounding(sensor, axis).white_v2
+    step_v2 = sensor.lsb_v ** 2 / 12
     by_spectrum = {effect_named(e).diagnosis.drift: e for e in drift_effects()}
     # Sections, effect and density of each filter.
     filters: list[tuple[np.ndarray, str, float]] = []

@@ -131,7 +131,6 @@ def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> 
             for c in shown],
         'proofs': [{'effect': name, 'text': text} for name, (_, text) in proofs.items()],
         'figure_rows': rows, 'remainders': [row[:2] for row in words.remainder_rows(report)],
-        'converged': best.converged,
         'hypotheses': [[', '.join(h['effects']) or 'no gap', percent(h['probability'])]
                        for h in objects['hypotheses']],
         'not_covered': objects['not_covered'],

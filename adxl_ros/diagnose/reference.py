@@ -15,7 +15,6 @@ from typing import Any
 
 from adxl_ros.diagnose.comparison import (
     BaselineComparison,
-    code_step_v,
     compare,
     Reference,
     SMALLEST_MOTION_G,
@@ -23,11 +22,11 @@ from adxl_ros.diagnose.comparison import (
 from adxl_ros.files.recording_columns import JOINTS, Recording
 from adxl_ros.files.reference_alignment import LONGEST_MOVE_NS, USUAL_GAPS
 from adxl_ros.model import noise
-from adxl_ros.model.constants import G0_MPS2, Z_90
+from adxl_ros.model.constants import G0_MPS2, MAD_TO_STD, Z_90
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import true_runs
 from adxl_ros.simulate.motion import Motion
-from adxl_ros.simulate.smoothed_paths import BAND_LIMITED_DEGREE, ForcePath, KNOT_S
+from adxl_ros.simulate.smoothed_paths import BAND_LIMITED_DEGREE, ForcePath
 import numpy as np
 import scipy
 
@@ -48,12 +47,11 @@ motion that repeats fits at several shifts."""
 _LARGEST_ERROR_RATIO = 0.5
 """A shift shows if it reduces 1 − correlation below this share. Chosen: noise that is not shifted
 keeps it."""
-_ROUNDS, _BLOCKS, _FINE_SAMPLES = 6, 10, 20_000
-"""Gauss-Newton steps, blocks and samples of the fine search. Chosen: the shift then changes by
-less than 1 µs, and the scatter of the blocks shows its error to 24 %."""
-_LONGEST_BRIDGE_S, _LONGEST_SLOW_BRIDGE_S, _SLOWEST_S = LONGEST_MOVE_NS / 1e9, 10.0, 1.0
-"""Longest time without a reading that is bridged, s: of a joint as between messages of a bag; of
-temperature and supply; and of a slow encoder, whose readings are a move apart at most."""
+_BLOCKS, _FINE_SAMPLES = 10, 20_000
+"""Blocks and samples of the fine search. Chosen: their scatter shows the error to 24 %."""
+_LONGEST_BRIDGE_S, _SLOWEST_S = LONGEST_MOVE_NS / 1e9, 1.0
+"""Longest time without a reading that is bridged, s: of a joint as between messages of a bag, and
+of a slow encoder, whose readings are a move apart at most."""
 _BEFORE_S, _AFTER_S = 0.1, 0.3
 """Times that are left out beside a gap, s. Chosen: the spline is uncertain before it, and an RC
 filter of 15 Hz has settled after it."""
@@ -76,23 +74,17 @@ some periods of a shaker."""
 _LARGEST_ERROR = 0.3
 """Error of the force by the spline, divided by the noise, up to which a window is used. Chosen: it
 adds 4 % to the noise."""
-_ENCODER_SQUARES = 3.0
-"""Mean square of what looks like motion by the steps of an encoder, divided by step²/12, that is
-accepted. Chosen: the steps are not white in slow motion."""
-_SAME_MOTION, _MOVES = 2.0, 3.0
-"""Ratio of recorded and simulated motion from which one is an alias, and motion, divided by the
-noise, from which that counts. Chosen: an alias below 0.2 of the rate has a ratio of 4."""
-_IMAGES = np.arange(-8, 9)
-"""Orders of the images of a spline that are summed. Chosen: the rest is below 1e-6."""
+_SAME_MOTION = 2.0
+"""Ratio of recorded and simulated motion from which one is an alias. Chosen: an alias below 0.2 of
+the rate has a ratio of 4."""
 _NAMED_PARTS = 4
 """Parts that a note names. Chosen: it stays one or two lines."""
 _FEWEST_WINDOWS, _BAND_HZ = 20, 2.0
 """Fewest windows, and width of the bands, Hz, by which fading is judged. Chosen: noise then has a
 coherence of 0.05, and a line of the mains is one value."""
-_MOTION, _COHERENCE, _GAIN, _FADED = 10.0, 0.5, 1.5, 0.5
-"""Power over noise from which motion shows; coherence from which a recording follows its
-reference; gain over it that no sensor has; and power of the reference, divided by the recorded
-one, below which it has faded. Chosen."""
+_MOTION, _FADED = 10.0, 0.5
+"""Power over noise from which motion shows, and power of the reference, even without the filter of
+the sensor, divided by the recorded one, below which it has faded. Chosen."""
 
 
 @dataclass(eq=False)
@@ -114,13 +106,12 @@ class LeftOut:
 
     def text(self, time_s: np.ndarray) -> str:
         """Return the reason with the times, s, of the samples; `time_s` are those of all."""
-        step_s = float(np.median(np.diff(time_s)))
-        runs = [(float(time_s[a]), float(time_s[b - 1])) for a, b in true_runs(self.rows)]
-        total_s = sum(end - begin + step_s for begin, end in runs)
-        longest = sorted(sorted(runs, key=lambda run: run[0] - run[1])[:_NAMED_PARTS])
-        parts = ', '.join(f'{begin:.5g} to {end:.5g} s' for begin, end in longest)
-        others = f' and {len(runs) - len(longest)} more' if len(runs) > len(longest) else ''
-        return f'left out: {total_s:.3g} s ({parts}{others}): {self.reason}'
+        runs = true_runs(self.rows)
+        total_s = float(np.median(np.diff(time_s))) * self.rows.sum()
+        parts = ', '.join(f'{time_s[a]:.5g} to {time_s[b - 1]:.5g} s'
+                          for a, b in runs[:_NAMED_PARTS])
+        return f'left out: {total_s:.3g} s ({parts}{", ..." * (len(runs) > _NAMED_PARTS)}): ' \
+            f'{self.reason}'
 
 
 @dataclass(frozen=True)
@@ -208,7 +199,7 @@ def _find_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> _Shif
             > _LARGEST_ERROR_RATIO * (1 - correlation[unshifted])):
         return None
     fine = _fine_shift(recording, sensor, force, float(lags_s[best]), float(correlation[best]))
-    return fine if fine is not None and abs(fine.late_s) > LARGEST_LATENCY_S else None
+    return fine if abs(fine.late_s) > LARGEST_LATENCY_S else None
 
 
 def correlations(first: np.ndarray, second: np.ndarray, smallest: int
@@ -238,37 +229,33 @@ def correlations(first: np.ndarray, second: np.ndarray, smallest: int
 
 
 def _fine_shift(recording: Recording, sensor: Sensor, force: ForcePath, late_s: float,
-                correlation: float) -> _Shift | None:
+                correlation: float) -> _Shift:
     """Fit shift, zero-g and scale factor to blocks of the recording, from a rough shift."""
     begin_s, end_s = force.time_s[0] - late_s, force.time_s[-1] - late_s
     comparison = compare(_between(recording, begin_s, end_s), sensor,
                          Motion(float(end_s - begin_s), force=force.shifted(-late_s)))
     time_s, volts = comparison.time_s, comparison.volts
     simulated_v = comparison.simulated_v(comparison.sensor)
-    slope_v = np.gradient(simulated_v, time_s, axis=0)
     # The ends may need values from outside.
     inside = np.isfinite(volts).all(axis=1) & (time_s > time_s[0] + LARGEST_LATENCY_S) \
         & (time_s < time_s[-1] - LARGEST_LATENCY_S)
     rows = np.flatnonzero(inside)[::max(1, len(recording) // _FINE_SAMPLES)]
-    more_s, scatter = 0.0, np.zeros(1)
-    for _ in range(_ROUNDS):
-        at_s = time_s[rows] + more_s
-        products, weights = np.zeros((2, _BLOCKS))
-        for measured, simulated, slope in zip(volts[rows].T, simulated_v.T, slope_v.T):
-            series = np.column_stack([measured, np.interp(at_s, time_s, simulated),
-                                      np.interp(at_s, time_s, slope)])
-            for i, part in enumerate(np.array_split(series, _BLOCKS)):
-                line = np.column_stack([np.ones(len(part)), part[:, 1]])
-                residual, rest = (part[:, [0, 2]] - line @ np.linalg.lstsq(
-                    line, part[:, [0, 2]])[0]).T
-                products[i] += residual @ rest
-                weights[i] += rest @ rest
-        if not weights.sum():
-            return None
-        step_s = float(products.sum() / weights.sum())
-        more_s += float(np.clip(step_s, -LARGEST_LATENCY_S, LARGEST_LATENCY_S))
-        scatter = (products - step_s * weights) / weights.sum()
-    return _Shift(late_s + more_s, float(np.sqrt(np.sum(scatter ** 2))), correlation)
+
+    def left_v2(more_s: float, part: np.ndarray) -> float:
+        """Return what zero-g and scale factor leave of a part after a further shift."""
+        left = 0.0
+        for measured, simulated in zip(volts[part].T, simulated_v.T):
+            line = np.column_stack([np.ones(len(part)), np.interp(
+                time_s[part] + more_s, time_s, simulated)])
+            left += float(np.sum((measured - line @ np.linalg.lstsq(line, measured)[0]) ** 2))
+        return left
+
+    more_s, *of_blocks = (float(scipy.optimize.minimize_scalar(
+        left_v2, bounds=(-LARGEST_LATENCY_S, LARGEST_LATENCY_S), args=(part,), method='bounded',
+        options={'xatol': 1e-6}).x) for part in (rows, *np.array_split(rows, _BLOCKS)))
+    # A block at rest shows no shift, so that the median scatter counts.
+    std_s = MAD_TO_STD * float(np.median(np.abs(np.subtract(of_blocks, more_s)))) / _BLOCKS ** 0.5
+    return _Shift(late_s + more_s, std_s, correlation)
 
 
 def _in_gaps(time_s: np.ndarray, read_s: np.ndarray, longest_s: float
@@ -285,29 +272,19 @@ def _in_gaps(time_s: np.ndarray, read_s: np.ndarray, longest_s: float
                                    else 'left')))
 
 
-def without_reading(comparison: BaselineComparison, columns: dict[str, np.ndarray]
-                    ) -> list[LeftOut]:
-    """Find samples in gaps of another simulator, of temperature and of supply."""
-    time_s, force, left_out = comparison.time_s, comparison.motion.force, []
-    readings: dict[str, tuple[np.ndarray, float]] = {
-        name: (time_s[np.isfinite(columns[name])], _LONGEST_SLOW_BRIDGE_S)
-        for name in ('temperature_c', 'supply_v') if name in columns}
-    if isinstance(force, ForcePath):
-        readings[force.name] = force.time_s, _LONGEST_BRIDGE_S
-    for name, (read_s, longest_s) in readings.items():
-        if len(read_s) < 2:
-            continue
-        limit_s = max(longest_s, USUAL_GAPS * float(np.median(np.diff(read_s))))
-        beside = name not in columns
-        unknown = np.zeros(len(time_s), bool)
-        for begin, end in _in_gaps(time_s, read_s, limit_s):
-            if end > begin:
-                unknown |= (time_s >= time_s[begin] - beside * _BEFORE_S) & (
-                    time_s <= time_s[end - 1] + beside * _AFTER_S)
-        if unknown.any():
-            left_out.append(LeftOut(unknown, f'no reading of {name} for more than '
-                                    f'{limit_s:.3g} s'))
-    return left_out
+def without_reading(comparison: BaselineComparison) -> list[LeftOut]:
+    """Find samples in gaps of another simulator."""
+    time_s, force = comparison.time_s, comparison.motion.force
+    if not isinstance(force, ForcePath):
+        return []
+    limit_s = max(_LONGEST_BRIDGE_S, USUAL_GAPS * float(np.median(np.diff(force.time_s))))
+    unknown = np.zeros(len(time_s), bool)
+    for begin, end in _in_gaps(time_s, force.time_s, limit_s):
+        if end > begin:
+            unknown |= (time_s >= time_s[begin] - _BEFORE_S) \
+                & (time_s <= time_s[end - 1] + _AFTER_S)
+    return [LeftOut(unknown, f'no reading of {force.name} for more than {limit_s:.3g} s')] \
+        if unknown.any() else []
 
 
 def stated_poses(recording: Recording, sensor: Sensor) -> tuple[Recording, list[LeftOut]]:
@@ -400,96 +377,53 @@ def too_coarse(comparison: BaselineComparison, columns: dict[str, np.ndarray]) -
     sensor, time_s, force = comparison.sensor, comparison.time_s, comparison.motion.force
     noise_g = float(np.min(noise.analog_std_v(sensor) / sensor.scale_v_per_g))
     limit_g = _LARGEST_ERROR * max(noise_g, float(np.min(sensor.lsb_v / sensor.scale_v_per_g)))
-    # Name, times and readings of each reference, degree, derivative and knots of its spline, the
-    # largest error, and what to do
+    # Name, times and readings of each reference, degrees of its splines, and their derivative
     references: list[tuple] = []
     if isinstance(force, ForcePath) and force.is_robot:
         return _too_abrupt(comparison, force, noise_g)
     if isinstance(force, ForcePath):
-        references = [(
-            force.name, force.time_s, np.array(force(force.time_s)) / G0_MPS2, 3, 0, 0.0, limit_g,
-            '; write it at a higher rate, and switch off noise that the simulator adds')]
+        references = [(force.name, force.time_s, np.array(force(force.time_s)) / G0_MPS2,
+                       (3, 5), 0)]
     for joint, name in JOINTS.items() if comparison.joints else ():
         values = columns.get(name, np.zeros(0))
         read = np.isfinite(values)
-        if read.sum() < 2 or np.ptp(values[read]) == 0:
-            continue
-        step = sensor.stage_resolution_rad
-        spline = (BAND_LIMITED_DEGREE, 2, 0.0, limit_g) if joint == 'shift' else (
-            5, 0, KNOT_S if step else 0.0,
-            np.sqrt(limit_g ** 2 + _ENCODER_SQUARES * step ** 2 / 12))
-        unit = 1 / G0_MPS2 if joint == 'shift' else 1.0
-        references.append((name, time_s[read], values[None, read] * unit, *spline, ''))
+        if read.sum() > BAND_LIMITED_DEGREE and np.ptp(values[read]):
+            references.append(
+                (name, time_s[read], values[None, read] / G0_MPS2,
+                 (BAND_LIMITED_DEGREE - 2, BAND_LIMITED_DEGREE), 2) if joint == 'shift' else
+                (name, time_s[read], values[None, read], (3, 5), 0))
     left_out = []
-    for name, read_s, readings, degree, order, knots_s, largest_g, advice in references:
-        ignored = np.interp(read_s, time_s, ~comparison.used) > 0
-        error_g = np.max([_spline_error(read_s, values, degree, order, knots_s, ignored)
-                          for values in readings[:len(sensor.axes)]], axis=0)
-        coarse = np.interp(time_s, read_s, error_g) > largest_g
+    margin = np.ones(2 * round(_WINDOW_S / 2 * sensor.rate_hz) + 1)
+    for name, read_s, readings, degrees, order in references:
+        # Between the readings, where both splines agree, they show the motion.
+        middle_s = (read_s[1:] + read_s[:-1]) / 2
+        first, second = (scipy.interpolate.make_interp_spline(
+            read_s, readings[:len(sensor.axes)].T, k)(middle_s, order) for k in degrees)
+        error_g = np.interp(time_s, middle_s, np.abs(first - second).max(axis=1))
+        step_g = sensor.stage_resolution_rad if name in ('alpha_rad', 'beta_rad') else 0.0
+        coarse = comparison.used & (error_g > np.hypot(limit_g, step_g))
         if coarse.any():
-            coarse = _with_aliases(comparison, coarse, noise_g)
-            # The motion begins and ends within a window.
-            margin = round(_WINDOW_S / 2 * sensor.rate_hz)
-            coarse = np.convolve(coarse, np.ones(2 * margin + 1), 'same') > 0.5
+            coarse = np.convolve(_with_aliases(comparison, coarse, noise_g), margin, 'same') > 0.5
             rate_hz = 1 / float(np.median(np.diff(read_s)))
             left_out.append(LeftOut(
                 coarse, f'{name} moves too fast for its {rate_hz:.4g} readings a second (error '
-                f'up to {1e3 * error_g.max():.2g} mg){advice}'))
+                f'up to {1e3 * error_g[coarse].max():.2g} mg); read it at a higher rate'))
     return left_out
-
-
-def _spline_error(read_s: np.ndarray, values: np.ndarray, degree: int, order: int, knots_s: float,
-                  ignored: np.ndarray) -> np.ndarray:
-    """
-    Return how much a spline through readings may differ from what was read, by its spectrum.
-
-    A cardinal spline reproduces the frequency ν, in units of the rate, with the gain
-    sinc(ν)ⁿ/Σ sinc(ν + k)ⁿ, n = degree + 1. The other terms of the sum are its images. Beyond
-    half the rate of the knots nothing is followed.
-    """
-    step_s = float(np.median(np.diff(read_s)))
-    even_s = np.arange(read_s[0], read_s[-1] + step_s / 2, step_s)
-    size = max(round(_WINDOW_S / step_s), _SHORTEST_WINDOW) // 2 * 2
-    if len(even_s) < size:
-        return np.zeros(len(read_s))
-    even = scipy.interpolate.CubicSpline(read_s, values)(even_s)
-    # Differences keep slow motion from leaking into high frequencies.
-    differences = np.diff(even, 4, prepend=even[:2], append=even[-2:])[:len(even)]
-    differences[np.interp(even_s, read_s, ignored) > 0] = 0.0
-    frequency, at, power = scipy.signal.spectrogram(
-        differences, window='hann', nperseg=size, noverlap=size // 2, detrend=False)
-    cycles = frequency[1:] * max(knots_s / step_s, 1.0)
-    followed = np.minimum(cycles, 0.5)
-    weights = np.sinc(followed + _IMAGES[:, None]) ** (degree + 1)
-    weights /= weights.sum(axis=0)
-    images = weights * ((followed + _IMAGES[:, None]) / followed) ** order
-    images[_IMAGES == 0] = 1 - weights[_IMAGES == 0]
-    error = np.sqrt(np.sum(images ** 2, axis=0))
-    error = np.where(cycles > 0.5, np.maximum(error, 1.0), error)
-    gain = error * (2 * np.pi * frequency[1:] / step_s) ** order \
-        / (2 * np.sin(np.pi * frequency[1:])) ** 4
-    errors = np.sqrt(gain ** 2 @ power[1:] / size)
-    # A reading counts in all windows that hold it.
-    return np.interp(read_s, even_s[0] + step_s * at,
-                     scipy.ndimage.maximum_filter1d(errors, 3))
 
 
 def _with_aliases(comparison: BaselineComparison, coarse: np.ndarray, noise_g: float
                   ) -> np.ndarray:
-    """Extend samples to the neighbours that move otherwise than the simulator, (n,) bool."""
+    """Extend samples to the seconds beside them that move otherwise than simulated, (n,) bool."""
     sensor, signals_v = comparison.sensor, (comparison.volts,
                                             comparison.simulated_v(comparison.sensor))
     length = max(round(_WINDOW_S * sensor.rate_hz), _SHORTEST_WINDOW)
     part = np.minimum(np.arange(len(coarse)) // length, max(len(coarse) // length - 1, 0))
-    changes_v = [np.nan_to_num(np.diff(v, axis=0, prepend=v[:1])) for v in signals_v]
-    # Coarse codes jump by themselves.
-    scatter_g = max(noise_g, float((code_step_v(comparison.volts) / sensor.scale_v_per_g).max()))
-    recorded, simulated = (np.sqrt([np.bincount(part, c ** 2) / np.bincount(part)
-                                    for c in (v / sensor.scale_v_per_g).T]) for v in changes_v)
-    ratio = np.hypot(recorded, scatter_g) / np.hypot(simulated, scatter_g)
-    moves = np.maximum(recorded, simulated) > _MOVES * scatter_g
-    differs = np.any(moves & (np.abs(np.log(ratio)) > np.log(_SAME_MOTION)), axis=0)
-    touched, extended = np.bincount(part, coarse) > 0, coarse.copy()
+    recorded, simulated = (np.sqrt([
+        noise_g ** 2 + np.bincount(part, c ** 2) / np.bincount(part) for c in np.nan_to_num(
+            np.diff(v / sensor.scale_v_per_g, axis=0, prepend=0.0)).T]) for v in signals_v)
+    differs = np.any(np.abs(np.log(recorded / simulated)) > np.log(_SAME_MOTION), axis=0)
+    touched = np.bincount(part, coarse) > 0
+    extended = coarse.copy()
     for begin, end in true_runs(differs | touched):
         if touched[begin:end].any():
             extended |= (part >= begin) & (part < end) & differs[part]
@@ -507,26 +441,19 @@ def fading_frequency_hz(comparison: BaselineComparison) -> float | None:
     if len(recorded_g) < _FEWEST_WINDOWS * size // 2:
         return None
 
-    def power(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return frequencies and means of cross spectra over bands, summed over axes."""
-        frequency_hz, products = scipy.signal.csd(first, second, sensor.rate_hz, nperseg=size,
-                                                  detrend='linear', axis=0)
-        band = max(round(_BAND_HZ / frequency_hz[1]), 1)
-        count = (len(frequency_hz) - 1) // band * band
-        return tuple(v[1:1 + count].reshape(-1, band).mean(axis=1)  # type: ignore[return-value]
-                     for v in (frequency_hz, products.sum(axis=1)))
-
-    frequency_hz, recorded = power(recorded_g, recorded_g)
-    simulated, shared = power(simulated_g, simulated_g)[1].real, power(simulated_g, recorded_g)[1]
-    stated = np.sum(noise.density_v2_per_hz(sensor, frequency_hz) / sensor.scale_v_per_g ** 2, 1)
+    frequency_hz = np.arange(size // 2 + 1) * sensor.rate_hz / size
+    band = max(round(_BAND_HZ * size / sensor.rate_hz), 1)
+    count = (size // 2) // band * band
+    stated = (noise.density_v2_per_hz(sensor, frequency_hz[1:]) / sensor.scale_v_per_g ** 2).sum(1)
     # Without its RC filter the sensor has this gain over its simulation.
     rc_s = float(np.max(noise.electronics(sensor).rc_s))
-    unfiltered = np.sqrt(1 + (2 * np.pi * frequency_hz * rc_s) ** 2)
-    moves = recorded.real > _MOTION * stated
-    follows = np.abs(shared) ** 2 > _COHERENCE * simulated * recorded.real
-    exceeds = moves & follows & (np.abs(shared) > _GAIN * unfiltered * simulated)
-    faded = simulated < _FADED * recorded.real
-    if not exceeds.any() or not faded[moves & (frequency_hz >= frequency_hz[exceeds][0])].all():
-        return None
-    followed = np.flatnonzero(moves & ~faded)
-    return float(frequency_hz[followed[-1] + 1 if len(followed) else 0])
+    unfiltered = 1 + (2 * np.pi * frequency_hz[1:] * rc_s) ** 2
+    recorded, simulated = (scipy.signal.welch(
+        v, sensor.rate_hz, nperseg=size, detrend='linear', axis=0)[1][1:].sum(axis=1)
+        for v in (recorded_g, simulated_g))
+    recorded, simulated, stated = (v[:count].reshape(-1, band).mean(axis=1) for v in (
+        recorded, simulated * unfiltered, stated))
+    moves = recorded > _MOTION * stated
+    followed = np.flatnonzero(moves & (simulated >= _FADED * recorded))
+    first = followed[-1] + 1 if len(followed) else 0
+    return float(frequency_hz[1 + first * band]) if moves[first:].any() else None

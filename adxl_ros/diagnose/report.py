@@ -137,13 +137,9 @@ def _gap(diagnosis: Diagnosis, report: Report) -> dict[str, Any]:
     """Return the gap before and after, and the noise recording by recording."""
     closure, has_gap = report.closure, report.verdict.status not in _WITHOUT_GAP
     noise = [{'recording': comparison.name,
-              'log_likelihood_gain': _rounded(after.log_likelihood - before.log_likelihood),
               'bands_hz': _rounded(after.band_edges_hz),
               'power_ratio_before': _rounded(before.power_ratio),
-              'power_ratio_after': _rounded(after.power_ratio),
-              'allan_s': list(after.averaging_times_s),
-              'allan_ratio_before': _rounded(before.allan_ratio),
-              'allan_ratio_after': _rounded(after.allan_ratio)}
+              'power_ratio_after': _rounded(after.power_ratio)}
              for comparison, before, after in zip(diagnosis.comparisons, report.noise_before,
                                                   report.noise_after)]
     figures: dict[str, Any] = {'unit': 'm/s^2'}
@@ -261,7 +257,9 @@ def headline(diagnosis: Diagnosis) -> str:
     several = 'these recordings do' if len(diagnosis.comparisons) > 1 else 'this recording does'
     separate = f': {several} not separate them' if verdict.groups else ''
     noise = f' {NOISE_STAYS}' if is_only_noise(diagnosis.report) else ''
-    explained = f'Explained {sure} by {named}{separate}.{noise}{_of_reference(verdict)}'
+    of_reference = ' This is an error of the reference, not of the sensor.' \
+        if concern(verdict) == Concern.REFERENCE.value else ''
+    explained = f'Explained {sure} by {named}{separate}.{noise}{of_reference}'
     return {'no_gap': f'No gap {sure}: one above {mg_text(verdict.upper_limit_mps2)} would have '
                       'shown.',
             'insufficient': 'No verdict: neither motion nor temperature nor supply changes, so '
@@ -269,31 +267,14 @@ def headline(diagnosis: Diagnosis) -> str:
             'unknown': f'Unknown {sure}: no effect of the library explains {rest}.{follows}',
             'partly': f'Partly explained {sure}: {percent(share)} of the gap is {named}; '
                       f'{percent(1 - share)} ({rest}) is something else.{follows}'
-                      f'{_of_reference(verdict)}'}.get(verdict.status, explained)
+                      f'{of_reference}'}.get(verdict.status, explained)
 
 
 def concern(verdict: Verdict) -> str | None:
     """Return what a verdict is about, joined by 'and', within a group by 'or'; None for none."""
-    return ' and '.join(sorted(_concerns(verdict))) or None
-
-
-def _concerns(verdict: Verdict) -> set[str]:
-    """Return what each certain effect, and one of each group, is an error of."""
     groups = (*((e,) for e in verdict.effects), *verdict.groups)
-    return {' or '.join(sorted({effect_named(e).concern.value for e in g})) for g in groups}
-
-
-def _of_reference(verdict: Verdict) -> str:
-    """Return a sentence on what is the reference's in a verdict; empty where nothing is."""
-    reference = Concern.REFERENCE.value
-    if concern(verdict) == reference:
-        return f' This is an error of the {reference}, not of the sensor.'
-    certain = [e for e in verdict.effects if effect_named(e).concern is Concern.REFERENCE]
-    undecided = [c for c in _concerns(verdict) if ' or ' in c and reference in c]
-    sentences = [f' {listed(certain, "and")} is of the {reference}.'] if certain else []
-    return ''.join(sentences + [
-        f' The error is of the {c.replace(" or ", " or of the ")}; both give the same samples.'
-        for c in undecided])
+    return ' and '.join(sorted({' or '.join(sorted({effect_named(e).concern.value for e in g}))
+                                for g in groups})) or None
 
 
 def summary(diagnosis: Diagnosis) -> str:

@@ -10,7 +10,6 @@ held-out figures.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain, combinations
 from typing import NamedTuple
@@ -44,9 +43,9 @@ _HEALTHY_STDS = 3.0
 """Largest departure of a healthy unit, in standard deviations: one unit in 400 exceeds it."""
 LARGEST_SET = 3
 """Largest number of effects in a set. Chosen: one recording hardly separates more."""
-_SINGLES, _FITTED_SINGLES, _FURTHER, _COMPLETED, _OTHER_STARTS = 8, 5, 3, 4, 2
+_SINGLES, _FITTED_SINGLES, _FURTHER, _COMPLETED = 8, 5, 3, 4
 """Singles whose pairs are ranked, singles that are fitted, further effects beside the best set,
-sets that are fitted without each effect, and other shapes that are tried. Chosen: run time."""
+and sets that are fitted without each effect. Chosen: run time."""
 _IMMATERIAL = 0.01
 """Share of the gain of a set that a further effect must gain, so that a third one is looked for.
 Chosen: a third of what each effect of a set must explain."""
@@ -78,7 +77,6 @@ class Hypothesis:
     log_evidence: float  # Log evidence
     fit: LinearFit  # The last linear fit
     linearised: LinearisedHypothesis  # The hypothesis linearised at its values
-    converged: bool = True  # Whether the Gauss-Newton iteration has converged
 
     @property
     def sizeless(self) -> frozenset[str]:
@@ -229,17 +227,15 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
             in_rad, linear_model.smallest_angle_rad(), 0.0) ** 2),
         std > evidence.UNDETERMINED_SHARE * np.maximum(linearised.prior_std[:j],
                                                        np.abs(at_values)),
-        fit.log_evidence - fit.loss(at_values), fit, linearised,
-        solution.converged and solution.last.fit.log_evidence >= lowest_log_evidence)
+        fit.log_evidence - fit.loss(at_values), fit, linearised)
 
 
 class _Ranked(NamedTuple):
-    """Variants on the linear model: gain of log evidence, numbers, fit, and other shapes."""
+    """Variants on the linear model: gain of log evidence, numbers and fit."""
 
     gain: float
     chosen: tuple[int, ...]
     fit: LinearFit
-    others: tuple[_Ranked, ...] = ()
 
 
 class Search:
@@ -286,11 +282,9 @@ class Search:
             if 0 < len(best.effects) < LARGEST_SET:
                 self._add((*best.effects, effect), dict(zip(best.names, best.values)), {})
         show_share(0.8)
-        pairs = self._rank(self.model, (), list(combinations(sorted(
-            ranked.chosen[0] for ranked in singles[:_SINGLES]), 2)))[:_FURTHER]
-        for pair in pairs:
-            if pair.gain > max(singles[0].gain + _IMMATERIAL * pairs[0].gain,
-                               (1 - _HOPELESS_SHARE) * pairs[0].gain):
+        for pair in self._rank(self.model, (), list(combinations(sorted(
+                ranked.chosen[0] for ranked in singles[:_SINGLES]), 2)))[:_FURTHER]:
+            if pair.gain > (1 + _IMMATERIAL) * singles[0].gain:
                 self._fit(self.model, pair)
         for hypothesis in sorted(self.found.values(), key=lambda h: -h.log_evidence)[:_COMPLETED]:
             self._complete(hypothesis.effects)
@@ -321,68 +315,55 @@ class Search:
         """
         Fit sets of variants beside present ones on a linear model, by falling gain.
 
-        Of each set of effects the best variants are ranked, with the next best shapes.
+        Of each set of effects the best variants are ranked.
         """
         without = model.fit_variants(present) if present else model.null_fit
-        by_effects: dict[frozenset[str], list[_Ranked]] = {}
+        best: dict[frozenset[str], _Ranked] = {}
         for chosen in sets:
             effects = frozenset(model.variants[i].effect for i in chosen)
             if len(effects) == len(chosen):
                 fit = model.fit_variants([*present, *chosen], without)
-                by_effects.setdefault(effects, []).append(
-                    _Ranked(fit.log_evidence - without.log_evidence, chosen, fit))
-        ranked = []
-        for same in by_effects.values():
-            best, *others = sorted(same, key=lambda f: _start_loss(model, f) - f.gain)
-            ranked.append(best._replace(others=tuple(
-                f for f in others if 2 * f.gain > best.gain
-                and all(model.variants[i].shape for i in f.chosen))[:_OTHER_STARTS]))
-        return sorted(ranked, key=lambda f: -f.gain)
+                gain = fit.log_evidence - without.log_evidence
+                if effects not in best or gain > best[effects].gain:
+                    best[effects] = _Ranked(gain, chosen, fit)
+        return sorted(best.values(), key=lambda f: -f.gain)
 
-    def _fit(self, model: LinearModel, first: _Ranked, beside: Hypothesis | None = None) -> None:
-        """Fit a ranked set beside another one, from other shapes where it does not converge."""
+    def _fit(self, model: LinearModel, ranked: _Ranked, beside: Hypothesis | None = None) -> None:
+        """Fit a ranked set beside another one."""
         present = beside.effects if beside else ()
-        effects = (*present, *(model.variants[i].effect for i in first.chosen))
-        if first.gain < _WORTH_FITTING or frozenset(effects) in self.found:
+        effects = (*present, *(model.variants[i].effect for i in ranked.chosen))
+        if ranked.gain < _WORTH_FITTING or frozenset(effects) in self.found:
             return
-        for ranked in (first, *first.others):
-            start = dict(zip(beside.names, beside.values)) if beside else {}
-            shapes: dict[Coefficient, float] = {}
-            own = {k for i in ranked.chosen for k in model.column_ids[i]}
-            start |= {model.names[k]: float(v) for k, v in zip(
-                ranked.fit.column_ids, ranked.fit.values) if k in own}
-            for variant in (model.variants[i] for i in ranked.chosen):
-                # Limits and sizes start where the effect was simulated.
-                start |= {name: value - (0.0 if parameter_of(name).is_size
-                                         else parameter_of(name).scale)
-                          for name, value in variant.first_limits(start).items()}
-                start |= {name: float(np.clip(start.get(name, size), size / _NEAR_START,
-                                              size * _NEAR_START))
-                          for name, size in _stepped(variant).items()}
-                shapes |= {Coefficient(variant.effect, p): v for p, v in variant.shape.items()}
-            fitted = self._add(effects, start, shapes, self._lowest)
-            if fitted is not None and (fitted.converged or fitted.log_evidence < self._lowest):
-                break
+        start = dict(zip(beside.names, beside.values)) if beside else {}
+        shapes: dict[Coefficient, float] = {}
+        own = {k for i in ranked.chosen for k in model.column_ids[i]}
+        start |= {model.names[k]: float(v) for k, v in zip(
+            ranked.fit.column_ids, ranked.fit.values) if k in own}
+        for variant in (model.variants[i] for i in ranked.chosen):
+            # Limits and sizes start where the effect was simulated.
+            start |= {name: value - (0.0 if parameter_of(name).is_size
+                                     else parameter_of(name).scale)
+                      for name, value in variant.limit_start.items()}
+            start |= {name: float(np.clip(start.get(name, size), size / _NEAR_START,
+                                          size * _NEAR_START))
+                      for name, size in _stepped(variant).items()}
+            shapes |= {Coefficient(variant.effect, p): v for p, v in variant.shape.items()}
+        self._add(effects, start, shapes)
 
     def _add(self, effects: Iterable[str], start: Mapping[Coefficient, float],
-             shapes: Mapping[Coefficient, float], lowest: float | None = None
-             ) -> Hypothesis | None:
-        """Fit a set; None where it cannot be simulated, is singular or does not show."""
-        key, fitted = frozenset(effects), None
-        with suppress(UserError, np.linalg.LinAlgError):
+             shapes: Mapping[Coefficient, float], lowest: float | None = None) -> None:
+        """Fit and keep a set, unless it cannot be simulated, is singular or does not show."""
+        try:
             fitted = fit_hypothesis(self.model, tuple(effects), start, shapes,
                                     self._lowest if lowest is None else lowest)
-        if fitted is None:
-            return None
+        except (UserError, np.linalg.LinAlgError):
+            return
         # Recordings that are not much longer than a time constant do not show it.
         longest_s = max(c.span_s for c in self.model.comparisons)
         values = dict(zip(fitted.names, fitted.values))
-        if any(longest_s < _TIME_CONSTANTS * values.get(Coefficient(
+        if all(longest_s >= _TIME_CONSTANTS * values.get(Coefficient(
                 e, effect_named(e).diagnosis.time_constant), 0.0) for e in fitted.effects):
-            return None
-        if key not in self.found or fitted.log_evidence > self.found[key].log_evidence:
-            self.found[key] = fitted
-        return fitted
+            self.found[frozenset(effects)] = fitted
 
 
 def _identifiable(model: LinearModel) -> list[int]:
@@ -413,14 +394,3 @@ def _stepped(variant: Variant) -> dict[Coefficient, float]:
     """Return the sizes at which an effect that is far from linear was simulated."""
     return {name: variant.step * p.scale for name in variant.names
             if (p := parameter_of(name)).starts and p.is_size}
-
-
-def _start_loss(model: LinearModel, ranked: _Ranked) -> float:
-    """Return what log likelihood a fit loses at the sizes at which its effects were simulated."""
-    stepped: dict[Coefficient, float] = {}
-    for i in ranked.chosen:
-        stepped |= _stepped(model.variants[i])
-    fit = ranked.fit
-    return sum(0.5 * float((fit.values[k] - stepped[name]) ** 2 / fit.covariance[k, k])
-               for k, i in enumerate(fit.column_ids if stepped else ())
-               if (name := model.names[i]) in stepped)

@@ -34,6 +34,7 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.investigate.manoeuvres import KIND_OF, plan_all, PlannedManoeuvre, Pose, StageLimits
 from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.report import quantities
 from adxl_ros.workers import Processes
 
 CERTAIN = 0.9
@@ -161,9 +162,8 @@ def rank(assessment: Assessment, sensor: Sensor, manoeuvres: Sequence[PlannedMan
     seen = {v.effect for v in model.variants} if model else set()
     considered = {e for h in next_experiment.leading(assessment.hypotheses) for e in h.effects}
     needed = sorted(considered | (set(library()) - seen))
-    dimensions = next_experiment.unknown_dimensions(report.verdict if report else None)
     responses = [next_experiment.predict(
-        next_experiment.Experiment(m.name, m.begin_s, m.motion), sensor, needed, dimensions)
+        next_experiment.Experiment(m.name, m.begin_s, m.motion), sensor, needed)
         for m in manoeuvres]
     excited = {effect for response in responses for effect in response.effects}
     # Effects that the samples could not show keep their prior odds over no gap.
@@ -172,7 +172,7 @@ def rank(assessment: Assessment, sensor: Sensor, manoeuvres: Sequence[PlannedMan
     for effect in sorted(excited - seen):
         weights.setdefault((effect,), unseen)
     complete = Assessment(normalised(weights), diagnosis)
-    worth = next_experiment.rank_responses(responses, complete.hypotheses, model, dimensions)
+    worth = next_experiment.rank_responses(responses, complete.hypotheses, model)
     on_the_mean = {e.name for e in candidates()}
     return Ranking(complete, worth, tuple(sorted(on_the_mean - excited - seen)))
 
@@ -232,10 +232,8 @@ def hypothesis_text(effects: Sequence[str]) -> str:
 
 def listed(names: Sequence[str]) -> str:
     """Return the first names in a sentence, and how many others there are."""
-    others = len(names) - _LARGEST_NAMED
-    if others > 1:
-        return f'{", ".join(names[:_LARGEST_NAMED])} or {others} other hypotheses'
-    return ', '.join(names[:-1]) + ' or ' * (len(names) > 1) + names[-1]
+    more = [f'{len(names) - _LARGEST_NAMED} others'] * (len(names) > _LARGEST_NAMED)
+    return quantities.listed([*names[:_LARGEST_NAMED], *more], 'or')
 
 
 _NICENESS = 10

@@ -157,12 +157,6 @@ CATALOGUE = {
     'fast_turn_of_beta': Manoeuvre(
         'turns of beta', 'turn beta once, forth and back, at the limit of rate',
         [('full_turn', 'beta', 90.0)]),
-    'inclined_turn_of_beta': Manoeuvre(
-        'turns of beta', 'turn beta once at alpha 45°, forth and back, at the limit of rate',
-        [('full_turn', 'beta', 45.0)]),
-    'level_turn_of_beta': Manoeuvre(
-        'turns of beta', 'turn beta once with z upright, at the limit of rate',
-        [('full_turn', 'beta', 0.0)]),
     'slow_turn_of_alpha': Manoeuvre(
         'turns of alpha', 'turn alpha over its range, forth and back, slowly',
         [('full_turn', 'alpha', 45.0, _SLOW_SHARE)]),

@@ -168,4 +168,4 @@ def test_rounded_stamps_get_their_instants_back(lost):
     comparison = compare_checked(recorded, sensor, None, False)
     assert np.abs(comparison.time_s - true_s[kept]).max() < 2e-5
     assert comparison.sensor.rate_hz == pytest.approx(300.0, abs=1e-3)
-    assert 'rounded to 0.001 s' in comparison.notes[0]
+    assert 'even rate of 300 Hz' in comparison.notes[0]
