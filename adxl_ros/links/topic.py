@@ -308,4 +308,3 @@ def _in_case(fields: dict[str, np.ndarray], case: scipy.spatial.transform.Rotati
         orientation = scipy.spatial.transform.Rotation.from_quat(fields['orientation'])
         fields['orientation'] = (orientation * case).as_quat()
     return fields
-

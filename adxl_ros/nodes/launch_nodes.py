@@ -63,6 +63,7 @@ def _numbers(text: str) -> list[float]:
 _CONVERSIONS: dict[type, Callable[[str], Any]] = {int: int, float: float, tuple: _numbers}
 """Conversions of an argument by the type of the default."""
 
+
 def arguments(own: type, *parameters: str, **renamed: str) -> tuple[Argument, ...]:
     """
     Return arguments for parameters of a dataclass; those of the driver may be of any link.
