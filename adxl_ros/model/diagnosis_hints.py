@@ -147,12 +147,6 @@ class DiagnosisHints:
     # Name of the parameter, rad, that changes by π when the sensor is remounted by half a turn
     # about its z axis; empty for other effects
     half_turn: str = ''
-    # Name of the effect of the sensor that gives the same samples, so that no recording separates
-    # the two; empty for other effects
-    imitated_by: str = ''
-    # Whether the effect describes a reference that lacks fast motion. What no reference has cannot
-    # be simulated, and remains beside it.
-    smooths_reference: bool = False
     # Dimensions along which the form differs between real sensors. Empty where the form is exact,
     # as of geometry, of a clock and of a straight line, and for effects of the noise.
     form: tuple[FormDimension, ...] = ()

@@ -172,7 +172,7 @@ def lever_arm(signals: Signals, p: Parameters) -> None:
         exact=True,
         cause='The frame of the reference is turned against that of the sensor; state the '
               'rotation, or align the two.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, imitated_by='misalignment',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES,
                                  proof=(ProofVariable.CROSS_FORCE, ProofVariable.FORCE_Z)))
 def reference_frame(signals: Signals, p: Parameters) -> None:
     """
@@ -189,7 +189,7 @@ def reference_frame(signals: Signals, p: Parameters) -> None:
         exact=True,
         cause='The reference is late, or the stamps of the sensor are early; synchronise the '
               'clocks, or state the delay.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS, imitated_by='time_offset',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS,
                                  proof=(ProofVariable.FORCE_RATE,)))
 def reference_delay(signals: Signals, p: Parameters) -> None:
     """Delay of the reference: its stamps are late."""
@@ -246,7 +246,7 @@ def _restoring_gain(frequency_hz: np.ndarray, p: Parameters) -> np.ndarray:
         cause='The reference is smoother than the motion; use it with less smoothing, or compare '
               'slow motion only.',
         diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS, form=(FormDimension.LAG,),
-                                 smooths_reference=True, proof=(ProofVariable.FREQUENCY,)))
+                                 proof=(ProofVariable.FREQUENCY,)))
 def reference_filter(signals: Signals, p: Parameters) -> None:
     """
     Filter of the reference: it is smoother than the motion, as optical tracking is.
@@ -282,7 +282,7 @@ ROBOT_JOINTS = 8
         exact=True, needs=(Need.ROBOT,),
         cause='The zero of a joint is wrong, so that the robot stands otherwise than its encoders '
               'say; master the joint again.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, imitated_by='misalignment',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES,
                                  proof=(ProofVariable.CROSS_FORCE, ProofVariable.FORCE_Z)))
 def joint_offset(signals: Signals, p: Parameters) -> None:
     """Offsets of the joints of a robot: true angle minus reading."""
