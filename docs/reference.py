@@ -83,7 +83,7 @@ REPORT = {
     'gap.reference': 'rms error of the reference that returns with each pose',
     'gap.closed': '(before² − after²)/(before² − floor²), held out; `closed_ci`',
     'gap.not_in_reference': 'rms of motion that a smooth reference lacks',
-    'gap.noise': 'by recording and band: power of what is left, over that of the noise',
+    'gap.noise': 'by recording: spectrum and Allan deviation of what is left, over the noise',
     'explained': 'by how much the named effects lower the held-out mean square',
     'rest': 'by how much flexible functions lower it further',
     'rest_follows': 'what that rest follows, the strongest first',

@@ -60,8 +60,9 @@ samples. Chosen: two may be equal by rounding."""
 _REPEAT_PROBABILITIES = (0.05, 1e-3, 0.5)
 """Smallest assumed probability that a sample equals the last one on one axis, and on all of
 several axes; the largest one. Chosen: in 10⁵ samples, chance explains runs of 7, 3 and 30."""
-_BANDS, _LOWEST_EDGE_HZ = 5, 0.05
-"""Bands of frequency, and smallest edge, Hz. Chosen: half a decade each; a period of 20 s."""
+_BANDS, _LOWEST_EDGE_HZ, _TIMES_S = 5, 0.05, (0.1, 1.0, 10.0)
+"""Bands of frequency, smallest edge, Hz, and averaging times of the Allan deviation, s. Chosen:
+half a decade each; a period of 20 s."""
 _DRAWS, _LONGEST_ALLAN_S, _ALLAN_WINDOWS = 4, 10.0, 10
 """Drawn recordings of a drift, and averaging time of its Allan deviation, s: at most so many times
 shorter than the recording. Chosen: fewer means scatter by more."""
@@ -310,22 +311,32 @@ class NoiseComparison:
 
     band_edges_hz: tuple[float, ...]  # Edges of the k bands of frequency, Hz, (k + 1,)
     power_ratio: tuple[float, ...]  # Recorded power divided by simulated power, for each band
+    # Log likelihood of the recorded spectrum under the simulated power of each band (Whittle 1953)
+    log_likelihood: float
+    averaging_times_s: tuple[float, ...]  # Averaging times of the Allan deviation, s, (j,)
+    allan_ratio: tuple[float, ...]  # Recorded Allan deviation divided by the simulated one, (j,)
 
 
 def compare_noise(comparison: BaselineComparison, mean_sensor: Sensor, noise_sensor: Sensor,
                   seed: int) -> NoiseComparison:
     """Compare the residual after one sensor's mean output with the drawn noise of another."""
     rate_hz = comparison.sensor.rate_hz
-    recorded, simulated = (scipy.signal.periodogram(
-        bridged(v, comparison.used) / comparison.scale_v_per_mps2, rate_hz, axis=0)[1]
-        for v in (comparison.residual_v(mean_sensor),
-                  comparison.simulated_noise_v(noise_sensor, seed)))
+    series = [bridged(v, comparison.used) / comparison.scale_v_per_mps2
+              for v in (comparison.residual_v(mean_sensor),
+                        comparison.simulated_noise_v(noise_sensor, seed))]
+    recorded, simulated = (scipy.signal.periodogram(v, rate_hz, axis=0)[1] for v in series)
     frequency_hz = np.linspace(0, rate_hz / 2, len(recorded))
     edges_hz = np.geomspace(max(frequency_hz[1], _LOWEST_EDGE_HZ), rate_hz / 2, _BANDS + 1)
     edges_hz[0] = 0.0
     bands = [(frequency_hz > low) & (frequency_hz <= high) for low, high in pairwise(edges_hz)]
-    return NoiseComparison(tuple(edges_hz.tolist()), tuple(
-        float(recorded[band].sum() / simulated[band].sum()) for band in bands))
+    levels = [(recorded[band], simulated[band].mean(axis=0)) for band in bands if band.any()]
+    times_s = [t for t in _TIMES_S if t * rate_hz >= 2 and 10 * t < len(comparison) / rate_hz]
+    allan = [[allan_deviation(v, round(t * rate_hz)) for v in series] for t in times_s]
+    return NoiseComparison(
+        tuple(edges_hz.tolist()),
+        tuple(float(recorded[band].sum() / simulated[band].sum()) for band in bands),
+        -sum(float(np.sum(power / level + np.log(level))) for power, level in levels),
+        tuple(times_s), tuple(float(np.sqrt(np.mean((a / b) ** 2))) for a, b in allan))
 
 
 def allan_deviation(values: np.ndarray, count: int) -> np.ndarray:

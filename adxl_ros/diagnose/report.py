@@ -139,7 +139,11 @@ def _gap(diagnosis: Diagnosis, report: Report) -> dict[str, Any]:
     noise = [{'recording': comparison.name,
               'bands_hz': _rounded(after.band_edges_hz),
               'power_ratio_before': _rounded(before.power_ratio),
-              'power_ratio_after': _rounded(after.power_ratio)}
+              'power_ratio_after': _rounded(after.power_ratio),
+              'log_likelihood_gain': _rounded(after.log_likelihood - before.log_likelihood),
+              'allan_s': list(after.averaging_times_s),
+              'allan_ratio_before': _rounded(before.allan_ratio),
+              'allan_ratio_after': _rounded(after.allan_ratio)}
              for comparison, before, after in zip(diagnosis.comparisons, report.noise_before,
                                                   report.noise_after)]
     figures: dict[str, Any] = {'unit': 'm/s^2'}
