@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from adxl_ros.calibrate.fits import full_model, gravity_fit, linear, term_selection, thermal_fit
+from adxl_ros.calibrate.fits.linearisation import volts_covariance
 from adxl_ros.calibrate.poses import at_a_rail, Poses, predicted_volts, reference_force
 from adxl_ros.calibrate.report import acceptance, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment
@@ -279,15 +280,18 @@ def _fit_linear(sensor: Sensor, poses: Poses, population: Population | None) -> 
         raise UserError(f'{error}; {combined.line}') from None
 
 
-_MAX_TURN_DEG = 0.3
-"""Largest turn of the case between recordings, degrees. Chosen: above the 0.1° of the stage's
-level in either recording, far below a new mounting."""
-_MAX_ZERO_G_SHIFT_MG = 20.0
-"""Largest shift of the zero-g between recordings, mg. Chosen: a healthy unit may shift by so much
+_MAX_TURN_RAD = np.radians(0.3)
+"""Largest turn of the case between recordings, rad. Chosen: above the 0.1° of the stage's level in
+either recording, far below a new mounting."""
+_MAX_ZERO_G_SHIFT_G = 0.02
+"""Largest shift of the zero-g between recordings, g. Chosen: a healthy unit may shift by so much
 between two days."""
-_MIN_SINGULAR_VALUE = 0.05
-"""Smallest relative singular value of a change that poses show. Chosen: poses about one direction
-show no turn about it."""
+_MIN_DEVIATIONS = 6.0
+"""Smallest turn or shift that counts, in its standard deviations. Chosen: never by chance."""
+_MIN_EIGENVALUE_RATIO = 1e-10
+"""Smallest relative eigenvalue of the information whose direction counts as determined."""
+_MIN_VARIANCE = 1e-30
+"""Lower bound of the variance of a turn, rad², or shift, g², so that it can be a divisor."""
 
 
 class _ContradictionError(UserError):
@@ -298,26 +302,40 @@ def _require_one_mounting(full: full_model.FullFit, recordings: Sequence[Recorde
     """
     Refuse recordings if the mounting or the zero-g of one of them differs.
 
-    A turn of the case, rad, (3,), and a shift of the zero-g, g, (m,), are fitted by least squares
-    to the residuals of each recording about the common fit.
+    A turn of the case and a shift of the zero-g of each axis are fitted by least squares to the
+    residuals of each recording about the common fit.
     """
-    unit, count = full.unit, 3 + len(full.unit.axes)
+    axes = full.unit.axes
+    limits = np.repeat([_MAX_TURN_RAD, _MAX_ZERO_G_SHIFT_G], [3, len(axes)])
     for recording in recordings:
-        poses = recording.poses
-        force = reference_force(poses, unit.local_gravity_mps2)
-        by_force = np.moveaxis(signal_chain.jacobian(
-            signal_chain.analog_response(unit), force, poses.environment), 2, 0)
-        turned = np.stack([np.cross(axis, np.column_stack(force)) for axis in np.eye(3)], axis=2)
-        shifted = np.tile(np.diag(unit.scale_v_per_g), (len(poses), 1, 1))
-        design = np.concatenate([by_force @ turned, shifted], axis=2).reshape(-1, count)
-        residual_v = (poses.volts - predicted_volts(unit, poses)).ravel()
-        changes = np.linalg.lstsq(design, residual_v, _MIN_SINGULAR_VALUE)[0]
-        turn_deg, shift_mg = np.degrees(np.abs(changes[:3]).max()), 1e3 * np.abs(changes[3:]).max()
-        if turn_deg > _MAX_TURN_DEG or shift_mg > _MAX_ZERO_G_SHIFT_MG:
-            raise _ContradictionError(
-                f'{recording.source}: the case is turned by {turn_deg:.2f} deg and the zero-g is '
-                f'shifted by {shift_mg:.2f} mg from the fit of all recordings: another unit or '
-                'another mounting; fit this recording separately')
+        changes, std = _turn_and_shifts(full, recording.poses)
+        deviations = np.where(np.abs(changes) > limits, np.abs(changes) / std, 0.0)
+        worst = int(np.argmax(deviations))
+        if deviations[worst] <= _MIN_DEVIATIONS:
+            continue
+        change = f'case is turned by {np.degrees(changes[worst]):.2f} deg about {AXES[worst]}' \
+            if worst < 3 else \
+            f'zero-g of {axes[worst - 3]} is shifted by {1e3 * changes[worst]:.2f} mg'
+        raise _ContradictionError(
+            f'{recording.source}: {change} from the fit of all recordings '
+            f'({deviations[worst]:.0f} standard deviations): another unit or another '
+            'mounting; fit this recording separately')
+
+
+def _turn_and_shifts(full: full_model.FullFit, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
+    """Fit the turn of the case, rad, (3,), and the zero-g shifts, g, (m,); values and std."""
+    unit = full.unit
+    force = reference_force(poses, unit.local_gravity_mps2)
+    by_force = np.moveaxis(signal_chain.jacobian(
+        signal_chain.analog_response(unit), force, poses.environment), 2, 0)
+    turned = np.stack([np.cross(axis, np.column_stack(force)) for axis in np.eye(3)], axis=2)
+    shifted = np.broadcast_to(np.diag(unit.scale_v_per_g),
+                              (len(poses), len(unit.axes), len(unit.axes)))
+    information, gradient = volts_covariance(unit, poses, full.stage).normal_equations(
+        np.concatenate([by_force @ turned, shifted], axis=2),
+        poses.volts - predicted_volts(unit, poses))
+    covariance = np.linalg.pinv(information, rcond=_MIN_EIGENVALUE_RATIO)
+    return covariance @ gradient, np.sqrt(np.maximum(np.diag(covariance), _MIN_VARIANCE))
 
 
 def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, data_sha256: str,

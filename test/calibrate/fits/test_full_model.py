@@ -142,7 +142,7 @@ def test_recordings_that_contradict_each_other_are_refused(change):
     rng = np.random.default_rng(12)
     truth = drawn(rng, nominal(), TERMS)
     parts = [swept(rng, unit, check_poses=0) for unit in (truth, truth, change(truth))]
-    with pytest.raises(UserError, match='turned by .* shifted by .* mg .*: another unit'):
+    with pytest.raises(UserError, match=r'(turned|shifted) by .* standard dev.*: another unit'):
         calibration.calibrate(
             nominal(), [calibration.RecordedPoses(f'{name}.csv', part)
                         for name, part in zip('abc', parts)], 'full')
