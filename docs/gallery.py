@@ -8,9 +8,8 @@ import sys
 
 from adxl_ros.files import parameter_file
 from adxl_ros.model.constants import AXES
-from adxl_ros.model.diagnosis_hints import Manoeuvre
 from adxl_ros.model.effects import library
-from adxl_ros.model.effects.base import Coefficient, Effect, Need
+from adxl_ros.model.effects.base import Coefficient, Effect, Manoeuvre, Need
 from adxl_ros.model.sensor import put, Sensor, typical, with_axes
 from adxl_ros.simulate.motion import Held, Knots, Motion
 from adxl_ros.simulate.response import Columns, simulate

@@ -37,9 +37,8 @@ from adxl_ros.diagnose.verdict import UNKNOWN, Verdict, WeightedHypothesis
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import G0_MPS2
-from adxl_ros.model.diagnosis_hints import Detector, Manoeuvre
 from adxl_ros.model.effects import effect_named, library
-from adxl_ros.model.effects.base import Coefficient, Concern, Effect
+from adxl_ros.model.effects.base import Coefficient, Concern, Detector, Effect, Manoeuvre
 from adxl_ros.model.sensor import parameter_of, Sensor, with_neutral
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Motion
