@@ -24,7 +24,7 @@ import time
 from adxl_ros.diagnose.verdict import UNKNOWN
 from adxl_ros.files import parameter_file
 from adxl_ros.files.recording_columns import Recording
-from adxl_ros.investigate.diagnosis_round import Outcome, Question, run_round
+from adxl_ros.investigate.investigation import Outcome, Question, run_round
 from adxl_ros.investigate.manoeuvres import plan, plan_all, Pose, StageLimits
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Effect, Place
