@@ -102,11 +102,12 @@ install/.built: .venv/.ready $(sources)
 	    'did not build an ament package: does package.xml validate?' >&2; exit 1; }
 	@touch $@
 
-# Recordings of real sensors beside the clone take part.
+# A recording of a real sensor beside the clone is fitted, too.
 real := $(wildcard ../shared/real/mpu9150_0.csv)
 
 demo: build
 	./run demo -o demo_output
+	$(if $(real),./run fit $(real) -o demo_output/real.yaml)
 
 # In test/, so that Python imports the installed package and not the sources beside it.
 pytest = cd test && OPENBLAS_NUM_THREADS=1 ../run --exec python -m pytest -q

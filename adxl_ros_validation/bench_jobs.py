@@ -28,7 +28,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import Recording, sensor_info
 from adxl_ros.links.support import wire_format
-from adxl_ros.model import coefficients, signal_chain
+from adxl_ros.model import sensor as sensors, signal_chain
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2, with_axes
@@ -146,7 +146,7 @@ def offline_jobs(hours: float) -> Iterator[Job]:
         del columns['time_s']
         yield from _reading_and_writing(folder, sensor, _recording(sensor, columns, _ROWS))
         yield _applying(folder, sensor, columns)
-        values = {name: coefficients.typical(effect, 'xyz') for name, effect in library().items()}
+        values = {name: sensors.typical(effect, 'xyz') for name, effect in library().items()}
         full = replace(with_axes(sensor, 'xyz'), rate_hz=_RATE_HZ, effects=tuple(values),
                        values=values)
         motion = replace(rich(np.random.default_rng(0)), duration_s=600.0)
@@ -223,12 +223,12 @@ def _program(name: str, *arguments: str | Path) -> str:
 
 def _unit(sensor: Sensor, axes: str) -> Sensor:
     """Return a unit with six effects and a covariance of their coefficients."""
-    unit = coefficients.with_neutral(with_axes(sensor, axes), _EFFECTS)
+    unit = sensors.with_neutral(with_axes(sensor, axes), _EFFECTS)
     names = tuple(name for effect in _EFFECTS
-                  for name in coefficients.names_of(library()[effect], unit.axes))
-    typical = np.array([coefficients.parameter_of(name).scale for name in names])
-    return replace(coefficients.put(unit, names, 0.5 * typical), covariance_names=names,
-                   covariance=np.diag((0.05 * typical) ** 2))
+                  for name in sensors.names_of(library()[effect], unit.axes))
+    scales = np.array([sensors.parameter_of(name).scale for name in names])
+    return replace(sensors.put(unit, names, 0.5 * scales), covariance_names=names,
+                   covariance=np.diag((0.05 * scales) ** 2))
 
 
 def _long_applying(folder: Path, sensor: Sensor, kind: str, hours: float) -> Iterator[Job]:
@@ -256,9 +256,9 @@ def _gravity_fit() -> Job:
     """Fit nine coefficients with covariance to rests, beside plain least squares."""
     rng, fits, rests = np.random.default_rng(11), 10, 40  # A sweep by hand has 20 to 60 rests
     sensor = with_axes(parameter_file.load(parameter_file.nominal_path()), 'xyz')
-    unit = coefficients.with_neutral(sensor, ('bias', 'scale_factor', 'misalignment'))
-    names = coefficients.names_of(library()['bias'], 'xyz')
-    unit = coefficients.put(unit, names, [0.05, -0.03, 0.02])
+    unit = sensors.with_neutral(sensor, ('bias', 'scale_factor', 'misalignment'))
+    names = sensors.names_of(library()['bias'], 'xyz')
+    unit = sensors.put(unit, names, [0.05, -0.03, 0.02])
     drawn = rng.normal(size=(rests, 3))
     force = sensor.local_gravity_mps2 * drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
     std_v = np.full((rests, 3), 5e-5)  # 0.05 mg

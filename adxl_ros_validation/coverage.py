@@ -18,9 +18,8 @@ from adxl_ros.calibrate.fits.linearisation import StageError
 from adxl_ros.calibrate.guided import pose_plan, running_estimate
 from adxl_ros.calibrate.poses import Poses, predicted_volts
 from adxl_ros.model import noise
-from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
 from adxl_ros.model.constants import Z_90
-from adxl_ros.model.sensor import Sensor, with_axes
+from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_axes, with_neutral
 from adxl_ros_validation import experiments
 from adxl_ros_validation.blind.report import filled, markdown_table, terminal_table
 import numpy as np

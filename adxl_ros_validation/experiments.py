@@ -16,13 +16,12 @@ from adxl_ros.compensate import inversions
 from adxl_ros.files.recording_columns import Recording, sensor_info
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model import noise, signal_chain
-from adxl_ros.model.coefficients import get, typical, with_neutral
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Components
 from adxl_ros.model.kinematics import tilt
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import get, Sensor, typical, with_neutral
 from adxl_ros.signals import recorded_sensor
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Held, Motion

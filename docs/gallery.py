@@ -7,12 +7,10 @@ from pathlib import Path
 import sys
 
 from adxl_ros.files import parameter_file
-from adxl_ros.model.coefficients import put, typical
 from adxl_ros.model.constants import AXES
-from adxl_ros.model.diagnosis_hints import Manoeuvre
 from adxl_ros.model.effects import library
-from adxl_ros.model.effects.base import Coefficient, Effect, Need
-from adxl_ros.model.sensor import Sensor, with_axes
+from adxl_ros.model.effects.base import Coefficient, Effect, Manoeuvre, Need
+from adxl_ros.model.sensor import put, Sensor, typical, with_axes
 from adxl_ros.simulate.motion import Held, Knots, Motion
 from adxl_ros.simulate.response import Columns, simulate
 from adxl_ros.simulate.smoothed_paths import ForcePath

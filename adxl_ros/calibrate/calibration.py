@@ -18,11 +18,10 @@ from adxl_ros.calibrate.report.held_out import HeldOutErrors, rms_mg
 from adxl_ros.calibrate.result import CalibrationResult, envelope, with_provenance
 from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
-from adxl_ros.model.coefficients import get
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.population import Population, posterior
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import get, Sensor
 from adxl_ros.report.quantities import with_half_width
 from adxl_ros.signals.recorded_sensor import (
     CERTAIN_CORRELATION,

@@ -20,12 +20,11 @@ from adxl_ros.files.recording_columns import COMMANDS, JOINTS, Recording
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.files.tables import PoseTable
 from adxl_ros.model import signal_chain
-from adxl_ros.model.coefficients import get, parameter_of, put
 from adxl_ros.model.effects import base
 from adxl_ros.model.effects.base import Coefficient, Components, Environment, NOMINAL_ENVIRONMENT
 from adxl_ros.model.kinematics import specific_force, UPRIGHT
 from adxl_ros.model.noise import sample_std_v
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import get, parameter_of, put, Sensor
 from adxl_ros.signals import recorded_sensor
 from adxl_ros.signals.rest_detection import (
     datasheet_noise,

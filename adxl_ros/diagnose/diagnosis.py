@@ -43,10 +43,9 @@ from adxl_ros.diagnose.verdict import (
 )
 from adxl_ros.files.recording_columns import check_unit, Recording
 from adxl_ros.model import noise
-from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.sensor import Sensor, with_axes
+from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_axes, with_neutral
 from adxl_ros.report.quantities import Interval
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import simulate_at_stamps

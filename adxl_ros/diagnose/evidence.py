@@ -15,11 +15,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
-from adxl_ros.model.coefficients import parameter_of
-from adxl_ros.model.diagnosis_hints import DriftSpectrum
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Coefficient, Role
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.effects.base import Coefficient, DriftSpectrum, Role
+from adxl_ros.model.sensor import parameter_of, Sensor
 import numpy as np
 import scipy
 

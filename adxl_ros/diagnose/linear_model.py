@@ -24,11 +24,19 @@ from adxl_ros.diagnose import evidence
 from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
 from adxl_ros.diagnose.evidence import LinearFit, Whitener
 from adxl_ros.errors import UserError
-from adxl_ros.model.coefficients import names_of, parameter_of, put, with_neutral
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre, StraightLine
 from adxl_ros.model.effects import effect_named, library
-from adxl_ros.model.effects.base import ActsOn, Coefficient, Concern, Effect, Parameter, Role
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.effects.base import (
+    ActsOn,
+    Coefficient,
+    Concern,
+    DiagnosisHints,
+    Effect,
+    Manoeuvre,
+    Parameter,
+    Role,
+    StraightLine,
+)
+from adxl_ros.model.sensor import names_of, parameter_of, put, Sensor, with_neutral
 import numpy as np
 
 PRIOR_WIDTH = 5.0

@@ -36,12 +36,10 @@ from adxl_ros.diagnose.noise_model import expected_drift_g, whiteners
 from adxl_ros.diagnose.verdict import UNKNOWN, Verdict, WeightedHypothesis
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
-from adxl_ros.model.coefficients import parameter_of, with_neutral
 from adxl_ros.model.constants import G0_MPS2
-from adxl_ros.model.diagnosis_hints import Detector, Manoeuvre
 from adxl_ros.model.effects import effect_named, library
-from adxl_ros.model.effects.base import Coefficient, Concern, Effect
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.effects.base import Coefficient, Concern, Detector, Effect, Manoeuvre
+from adxl_ros.model.sensor import parameter_of, Sensor, with_neutral
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import simulate_blocks

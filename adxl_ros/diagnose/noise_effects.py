@@ -19,8 +19,8 @@ from adxl_ros.diagnose.comparison import at_search_rate, BaselineComparison, cod
 from adxl_ros.diagnose.evidence import bridged, drifts_among
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2, MAD_TO_STD
-from adxl_ros.model.diagnosis_hints import Detector
 from adxl_ros.model.effects import effect_named, library
+from adxl_ros.model.effects.base import Detector
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import true_runs
 from adxl_ros.simulate.response import Response

@@ -31,8 +31,8 @@ from adxl_ros.diagnose.comparison import BaselineComparison, CachedPath, gravity
 from adxl_ros.diagnose.evidence import AngleErrorFilter, Whitener
 from adxl_ros.model import noise
 from adxl_ros.model.constants import AXES, G0_MPS2
-from adxl_ros.model.diagnosis_hints import DriftSpectrum
 from adxl_ros.model.effects import effect_named, library
+from adxl_ros.model.effects.base import DriftSpectrum
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import true_runs
 from adxl_ros.simulate.smoothed_paths import ForcePath

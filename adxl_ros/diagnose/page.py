@@ -19,13 +19,11 @@ from adxl_ros.diagnose.evidence import bridged
 from adxl_ros.diagnose.next_experiment import by_effect
 from adxl_ros.diagnose.residual_map import BLOCK_S, ResidualCell, SIGNIFICANT_P
 from adxl_ros.model import noise
-from adxl_ros.model.coefficients import with_neutral
 from adxl_ros.model.constants import AXES, Z_90
-from adxl_ros.model.diagnosis_hints import ProofVariable as Over
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import ActsOn
+from adxl_ros.model.effects.base import ActsOn, ProofVariable as Over
 from adxl_ros.model.filters import low_pass
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import Sensor, with_neutral
 from adxl_ros.report import figures as plots, page as html_page
 from adxl_ros.report.figures import Figure, figure, line, rounded
 from adxl_ros.report.quantities import decimals, mg, mg_text, percent

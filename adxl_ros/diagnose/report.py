@@ -14,10 +14,10 @@ from adxl_ros.diagnose.next_experiment import by_effect, CouldShow, MENU
 from adxl_ros.diagnose.residual_map import SIGNIFICANT_P
 from adxl_ros.diagnose.search import Hypothesis
 from adxl_ros.diagnose.verdict import UNKNOWN, Verdict
-from adxl_ros.model.coefficients import fitted_of, get, parameter_of
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import ActsOn, Coefficient, Concern
+from adxl_ros.model.sensor import fitted_of, get, parameter_of
 from adxl_ros.report.quantities import (
     amplitude_text,
     Interval,

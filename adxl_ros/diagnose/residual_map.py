@@ -30,7 +30,7 @@ from adxl_ros.diagnose.comparison import (
 )
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.model.constants import AXES, G0_MPS2
-from adxl_ros.model.diagnosis_hints import FormDimension as Form
+from adxl_ros.model.effects.base import FormDimension as Form
 from adxl_ros.model.filters import loop, low_pass
 from adxl_ros.model.sensor import Sensor
 import numpy as np

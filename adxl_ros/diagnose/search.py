@@ -18,12 +18,11 @@ from adxl_ros.diagnose import evidence, linear_model as linear
 from adxl_ros.diagnose.evidence import LinearFit, LinearisedHypothesis, Whitener
 from adxl_ros.diagnose.linear_model import LinearModel, Variant
 from adxl_ros.errors import UserError
-from adxl_ros.model.coefficients import fitted_of, get, parameter_of, put, with_neutral
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.gauss_newton import gauss_newton, Iterate
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import fitted_of, get, parameter_of, put, Sensor, with_neutral
 import numpy as np
 
 _EVALUATIONS, _HALVINGS = 8, 2

@@ -27,8 +27,8 @@ from adxl_ros.diagnose.linear_model import LinearModel
 from adxl_ros.diagnose.noise_model import expected_drift_g
 from adxl_ros.diagnose.residual_map import Basis
 from adxl_ros.model.constants import G0_MPS2
-from adxl_ros.model.diagnosis_hints import FormDimension, ProofVariable
 from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import FormDimension, ProofVariable
 from adxl_ros.report.quantities import Interval
 import numpy as np
 import scipy

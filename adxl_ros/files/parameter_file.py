@@ -17,10 +17,9 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import write_text
-from adxl_ros.model.coefficients import names_of, neutral
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Effect, Parameter, Role
-from adxl_ros.model.sensor import Envelope, Sensor
+from adxl_ros.model.sensor import Envelope, names_of, neutral, Sensor
 import numpy as np
 import yaml
 

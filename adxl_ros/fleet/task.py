@@ -41,9 +41,8 @@ from adxl_ros.fleet.row import (
     Row,
     sha256_of,
 )
-from adxl_ros.model.coefficients import get, parameter_of
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import get, parameter_of, Sensor
 from adxl_ros.process import package_version
 from adxl_ros.signals.axis_noise import recording_noise
 from adxl_ros.signals.findings import BLOCK_ROWS, check_recording, Findings

@@ -13,15 +13,347 @@ in all states. FINISHED has a verdict or has used its time; STOPPED was ended fr
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
 from enum import Enum
+from itertools import accumulate, chain, count
+import json
+import os
+from pathlib import Path
+import shlex
+import shutil
+from typing import Any
 
-from adxl_ros.errors import UserError
-from adxl_ros.investigate import diagnosis_round
-from adxl_ros.investigate.diagnosis_round import Answer, Outcome
-from adxl_ros.investigate.manoeuvres import CATALOGUE, CommandStream, plan, Pose, StageLimits
+from adxl_ros.diagnose import next_experiment, page
+from adxl_ros.diagnose.diagnosis import diagnose, Diagnosis
+from adxl_ros.diagnose.linear_model import candidates
+from adxl_ros.diagnose.report import as_json, screen_lines
+from adxl_ros.diagnose.verdict import normalised, UNKNOWN, WeightedHypothesis
+from adxl_ros.errors import one_line, UserError
+from adxl_ros.files import parameter_file, recording as recording_files
+from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.investigate.manoeuvres import (
+    CATALOGUE,
+    CommandStream,
+    KIND_OF,
+    plan,
+    plan_all,
+    PlannedManoeuvre,
+    Pose,
+    StageLimits,
+)
+from adxl_ros.model.effects import library
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.report import quantities
+from adxl_ros.workers import Processes
 import numpy as np
+
+CERTAIN = 0.9
+"""Probability of a hypothesis at which an investigation ends. Chosen: one error in ten."""
+_NOTHING = 0.6
+"""Prior probability of no gap; a single effect is as probable. Chosen: most units are healthy."""
+_SMALLEST_PER_MINUTE = 0.01
+"""Expected information per minute, nat/min, below which no manoeuvre separates anything. Chosen:
+ten minutes then change even odds by a tenth."""
+_LARGEST_NAMED = 4
+"""Largest number of hypotheses in a sentence. Chosen: a reader keeps four in mind."""
+
+
+class Outcome(Enum):
+    """
+    Why an investigation goes on or ends.
+
+    GO_ON: another manoeuvre follows. CERTAIN: a hypothesis has 90 %. NO_VISIBLE_GAP, INSEPARABLE:
+    no manoeuvre of this stage changes that there is no gap, or separates what remains. TIME_OVER:
+    the time does not suffice for a manoeuvre.
+    """
+
+    GO_ON = 'go_on'
+    CERTAIN = 'certain'
+    NO_VISIBLE_GAP = 'no_visible_gap'
+    INSEPARABLE = 'inseparable'
+    TIME_OVER = 'time_over'
+
+
+@dataclass(frozen=True)
+class Question:
+    """What a round begins with."""
+
+    pose: Pose  # Pose of the stage
+    minutes: float  # Time since the first sample, min
+    remaining_minutes: float  # Time that remains for manoeuvres, min
+    has_samples: bool  # Whether there are samples to diagnose
+    recorded: tuple[str, ...] = ()  # Names of the manoeuvres that have been recorded
+    verdict: str = ''  # Verdict of the round before; '' for none
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a round ends with."""
+
+    hypotheses: tuple[WeightedHypothesis, ...]  # Hypotheses by falling probability
+    outcome: Outcome  # Why the investigation goes on or ends
+    sentence: str = ''  # The result in one sentence; '' where it goes on
+    manoeuvre: str = ''  # Name of the next manoeuvre; '' at the end
+    information_per_minute: float = 0.0  # What it is expected to tell, nat/min
+    fault: str = ''  # Fault of the recording that makes a verdict impossible; '' without one
+    hidden: tuple[str, ...] = ()  # Effects that this stage cannot show
+    verdict: str = ''  # Status and effects of the diagnosis; '' without a verdict
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the answer as values of JSON."""
+        return {**vars(self), 'outcome': self.outcome.value,
+                'hypotheses': [[list(h.effects), h.probability] for h in self.hypotheses]}
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """Probabilities of the hypotheses, and the diagnosis that gives them."""
+
+    # Hypotheses by falling probability, which sums to 1; no effect means no gap
+    hypotheses: tuple[WeightedHypothesis, ...]
+    diagnosis: Diagnosis | None = None  # The diagnosis; None before there are samples enough
+
+    @property
+    def fault(self) -> str:
+        """Return the fault of the recording that makes a verdict impossible; '' without one."""
+        fault = self.diagnosis.fault if self.diagnosis else None
+        return '' if fault is None or fault.status == 'insufficient' else fault.message
+
+    @property
+    def verdict(self) -> str:
+        """Return status and effects of the diagnosis; '' without a verdict."""
+        report = self.diagnosis.report if self.diagnosis else None
+        verdict = report.verdict if report else None
+        return ' '.join([verdict.status, *verdict.effects]) if verdict else ''
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """The manoeuvres by what they are expected to tell per minute."""
+
+    assessment: Assessment  # The assessment, with the effects that only the manoeuvres can show
+    worth: tuple[next_experiment.ManoeuvreWorth, ...]  # Manoeuvres, the best first
+    # Effects that neither the samples nor a manoeuvre of this stage can show
+    hidden: tuple[str, ...]
+
+
+def run_round(question: Question, recordings: Sequence[Recording], sensor: Sensor,
+              limits: StageLimits, seed: int = 0) -> tuple[Answer, Diagnosis | None]:
+    """Diagnose the samples so far, and choose the next manoeuvre."""
+    assessment = _assess(recordings, sensor, seed)
+    hypotheses = assessment.hypotheses
+    if assessment.fault:
+        return Answer(hypotheses, Outcome.INSEPARABLE, fault=assessment.fault), \
+            assessment.diagnosis
+    if hypotheses[0].effects and hypotheses[0].probability >= CERTAIN:
+        # Effects that were not seen so far only take probability from no gap, so that the
+        # manoeuvres need not be simulated.
+        return decide(Ranking(assessment, (), ()), question, True), assessment.diagnosis
+    manoeuvres = plan_all(limits, question.pose, 60 * question.minutes)
+    in_time = [m for m in manoeuvres if m.minutes <= question.remaining_minutes]
+    ranking = rank(assessment, sensor, in_time or manoeuvres)
+    return decide(ranking, question, bool(in_time)), assessment.diagnosis
+
+
+def _assess(recordings: Sequence[Recording], sensor: Sensor, seed: int = 0) -> Assessment:
+    """Diagnose the samples; the probabilities are the prior ones where they are too few."""
+    diagnosis = diagnose(recordings, sensor, seed=seed) if recordings else None
+    if diagnosis is not None and diagnosis.report is not None:
+        return Assessment(diagnosis.report.verdict.hypotheses, diagnosis)
+    return Assessment(normalised({(): _NOTHING, (UNKNOWN,): 1 - _NOTHING}), diagnosis)
+
+
+def rank(assessment: Assessment, sensor: Sensor, manoeuvres: Sequence[PlannedManoeuvre]
+         ) -> Ranking:
+    """Rank manoeuvres by their expected information per minute, given the samples so far."""
+    diagnosis = assessment.diagnosis
+    report = diagnosis.report if diagnosis else None
+    model = report.linear_model if report else None
+    seen = {v.effect for v in model.variants} if model else set()
+    considered = {e for h in next_experiment.leading(assessment.hypotheses) for e in h.effects}
+    needed = sorted(considered | (set(library()) - seen))
+    responses = [next_experiment.predict(
+        next_experiment.Experiment(m.name, m.begin_s, m.motion), sensor, needed)
+        for m in manoeuvres]
+    excited = {effect for response in responses for effect in response.effects}
+    # Effects that the samples could not show keep their prior odds over no gap.
+    weights = {h.effects: h.probability for h in assessment.hypotheses}
+    unseen = weights.get((), 0.0) * (1 / max(len(excited | seen), 1))
+    for effect in sorted(excited - seen):
+        weights.setdefault((effect,), unseen)
+    complete = Assessment(normalised(weights), diagnosis)
+    worth = next_experiment.rank_responses(responses, complete.hypotheses, model)
+    on_the_mean = {e.name for e in candidates()}
+    return Ranking(complete, worth, tuple(sorted(on_the_mean - excited - seen)))
+
+
+def decide(ranking: Ranking, question: Question, has_time: bool) -> Answer:
+    """
+    Choose the next manoeuvre, or end.
+
+    A verdict that was the same in the round before is not expected to change by more of the same:
+    only manoeuvres of a kind that is not recorded yet follow it.
+    """
+    hypotheses, verdict = ranking.assessment.hypotheses, ranking.assessment.verdict
+    best = hypotheses[0]
+    following = [w for w in ranking.worth if w.per_minute > _SMALLEST_PER_MINUTE]
+    if verdict and verdict == question.verdict:
+        kinds = {KIND_OF[name] for name in question.recorded}
+        following = [w for w in following if KIND_OF[w.manoeuvre.name] not in kinds]
+    totals = accumulate(hypothesis.probability for hypothesis in hypotheses)
+    # The fewest that together have 90 %
+    named = hypotheses[:next((i for i, total in enumerate(totals, 1) if total >= CERTAIN), None)]
+    if best.effects and best.probability >= CERTAIN:
+        outcome = Outcome.CERTAIN
+    elif not following and not best.effects:
+        # The samples prefer no gap to each of these effects, so that they do not show it.
+        outcome = Outcome.NO_VISIBLE_GAP
+        named = tuple(h for h in hypotheses if len(h.effects) < 2 and UNKNOWN not in h.effects)
+    elif not following:
+        outcome = Outcome.INSEPARABLE
+    elif not has_time:
+        outcome = Outcome.TIME_OVER
+    else:
+        return Answer(hypotheses, Outcome.GO_ON, '', following[0].manoeuvre.name,
+                      following[0].per_minute, hidden=ranking.hidden, verdict=verdict)
+    return Answer(hypotheses, outcome, _sentence(outcome, named), hidden=ranking.hidden,
+                  verdict=verdict)
+
+
+def _sentence(outcome: Outcome, named: Sequence[WeightedHypothesis]) -> str:
+    """Return the result in one sentence with one number."""
+    percent = f'{100 * sum(h.probability for h in named):.0f} %'
+    names = listed([hypothesis_text(h.effects) for h in named])
+    return {
+        Outcome.CERTAIN: f'The recording shows {names}: {percent}.',
+        Outcome.NO_VISIBLE_GAP: f'There is no gap that this stage can show: {percent}.',
+        Outcome.INSEPARABLE: f'This stage cannot separate {names}: together {percent}.',
+        Outcome.TIME_OVER: f'The time is over; the recording shows {names}: together {percent}.',
+    }[outcome]
+
+
+def hypothesis_text(effects: Sequence[str]) -> str:
+    """Return a hypothesis for people."""
+    if not effects:
+        return 'no gap'
+    named = [e for e in effects if e != UNKNOWN]
+    return ' with '.join(named + ['something unknown'] * (UNKNOWN in effects))
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return the first names in a sentence, and how many others there are."""
+    more = [f'{len(names) - _LARGEST_NAMED} others'] * (len(names) > _LARGEST_NAMED)
+    return quantities.listed([*names[:_LARGEST_NAMED], *more], 'or')
+
+
+_NICENESS = 10
+"""Niceness of the process. Chosen: the node that records comes first."""
+_WITHOUT_DIAGNOSIS = {'bag', 'baseline.yaml', 'answer.json'}
+"""Files of an investigation that was stopped before its first diagnosis of samples."""
+
+
+class OutputFolder:
+    """The folder of an investigation."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path  # The folder
+        self.bag = path / 'bag'  # The recording, a rosbag2 directory
+        self.baseline = path / 'baseline.yaml'  # What the recording is compared with
+        self.parameters = path / 'params.yaml'  # The parameters with the effects that were found
+        self.report = path / 'report.html'  # The page of the diagnosis
+        self.answer = path / 'answer.json'  # The newest answer
+
+    @staticmethod
+    def free(path: Path) -> OutputFolder:
+        """Return the first of `path`, `path_2`, ... that has nothing, or no diagnosis yet."""
+        candidates = chain([path], (path.with_name(f'{path.name}_{n}') for n in count(2)))
+        return next(OutputFolder(p) for p in candidates if not p.exists() or (
+            p.is_dir() and {child.name for child in p.iterdir()} <= _WITHOUT_DIAGNOSIS))
+
+    def make(self, sensor: Sensor) -> None:
+        """Make the folder, and write the baseline; an investigation without diagnosis goes."""
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            if self.bag.exists():
+                shutil.rmtree(self.bag)
+        except OSError as error:
+            raise UserError(f'{self.path}: cannot make the folder: {error.strerror}; set output '
+                            'to another one') from None
+        parameter_file.save(self.baseline, sensor)
+
+
+def _write_diagnosis(folder: OutputFolder, diagnosis: Diagnosis, recording: Recording,
+                     with_page: bool) -> None:
+    """Write report and parameters of a diagnosis."""
+    subject = (f'{folder.bag.name} ({recording.time_s[-1] - recording.time_s[0]:.0f} s, '
+               f'{recording.rate_hz:.4g} Hz, {" ".join(recording.axes)})  minus  simulation of '
+               f'{folder.baseline.name}')
+    write_text(folder.path / 'report.json', _as_text(as_json(diagnosis)))
+    parameters = ''
+    if diagnosis.report is not None:
+        parameters = parameter_file.as_text(diagnosis.report.sensor,
+                                            screen_lines(diagnosis, subject))
+        write_text(folder.parameters, parameters)
+    if with_page:
+        steps = [('simulate with these parameters', 'ros2 run adxl_ros simulate rich --params '
+                  f'{folder.parameters} -o sim.csv')] if parameters else []
+        command = shlex.join(['ros2', 'run', 'adxl_ros', 'diagnose', str(folder.bag), '--params',
+                              str(folder.baseline), '-o', f'{folder.path}_again'])
+        write_text(folder.report, page.page(diagnosis, page.Run(
+            subject, folder.baseline.name, steps, parameters, command)))
+
+
+def _as_text(values: dict[str, Any]) -> str:
+    return json.dumps(values, indent=1, allow_nan=False) + '\n'
+
+
+class BackgroundDiagnoser:
+    """Diagnoses the bag of a folder in a process of its own."""
+
+    def __init__(self, folder: OutputFolder, limits: StageLimits, seed: int) -> None:
+        self._folder, self._limits, self._seed = folder, limits, seed
+        self._pool: Processes | None = None
+        self._answer: Future | None = None
+
+    def ask(self, question: Question) -> None:
+        """Start the process."""
+        self._folder.answer.unlink(missing_ok=True)
+        self._pool = Processes(1)
+        self._answer = self._pool.submit(_diagnose, self._folder, question, self._limits,
+                                         self._seed)
+        self._pool.shutdown(wait=False)
+
+    def answer(self) -> Answer | None:
+        """Return the answer, or None while the process runs."""
+        if self._answer is None or not self._answer.done():
+            return None
+        ended, self._answer = self._answer, None
+        try:
+            return ended.result()
+        except Exception as error:
+            raise UserError(f'the diagnosis failed: {one_line(error)}') from error
+
+    def cancel(self) -> None:
+        """End the process."""
+        if self._pool is not None and self._answer is not None:
+            self._pool.kill()
+
+
+def _diagnose(folder: OutputFolder, question: Question, limits: StageLimits, seed: int) -> Answer:
+    """Answer one question, and write the answer and the files of its diagnosis."""
+    os.nice(_NICENESS)
+    sensor = parameter_file.load(folder.baseline)
+    recordings = [recording_files.read(folder.bag)] if question.has_samples else []
+    answer, diagnosis = run_round(question, recordings, sensor, limits, seed)
+    if diagnosis is not None:
+        _write_diagnosis(folder, diagnosis, recordings[0],
+                         with_page=answer.outcome is not Outcome.GO_ON)
+    write_text(folder.answer, _as_text(answer.as_json()))
+    return answer
+
 
 _FIRST_REST_S = 1.0
 """Time for which samples and stage are there before the first question, s. Chosen: both topics
@@ -59,7 +391,7 @@ class Investigation:
     """The state machine."""
 
     def __init__(self, limits: StageLimits, longest_minutes: float,
-                 diagnoser: diagnosis_round.BackgroundDiagnoser,
+                 diagnoser: BackgroundDiagnoser,
                  show: Callable[[float, Answer], None] = lambda minutes, answer: None,
                  flush: Callable[[], None] = lambda: None) -> None:
         """Wait for sensor and stage."""
@@ -151,7 +483,7 @@ class Investigation:
         self.state, self._stream = State.DIAGNOSING, None
         self._asked_minutes = self._minutes()
         self._flush()
-        self._diagnoser.ask(diagnosis_round.Question(
+        self._diagnoser.ask(Question(
             self._command or self._limits.nearest(*pose), self._asked_minutes,
             max(self._longest_s - self.moved_s, 0.0) / 60, bool(self.answers),
             tuple(answer.manoeuvre for _, answer in self.answers),

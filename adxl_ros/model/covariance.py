@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
-from adxl_ros.model import coefficients, noise, signal_chain
+from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import (
@@ -25,7 +25,7 @@ from adxl_ros.model.effects.base import (
     Place,
     Value,
 )
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import get, parameter_of, put, Sensor
 from adxl_ros.model.signal_chain import ANALOG, analog_response, static_chain
 import numpy as np
 
@@ -306,8 +306,8 @@ def coefficient_tangent(sensor: Sensor) -> Callable[..., np.ndarray]:
 def _difference(sensor: Sensor, names: list[Coefficient]
                 ) -> tuple[Place, float, list[signal_chain.Chain]]:
     """Return where the chain changes with coefficients, by which step, and both chains."""
-    step = _RELATIVE_STEP * coefficients.parameter_of(names[0]).scale
-    values = coefficients.get(sensor, names)
-    pair = [static_chain(coefficients.put(sensor, names, values + sign * step))
+    step = _RELATIVE_STEP * parameter_of(names[0]).scale
+    values = get(sensor, names)
+    pair = [static_chain(put(sensor, names, values + sign * step))
             for sign in (1, -1)]
     return max(effect_named(names[0].effect).place, Place.MOUNTING), step, pair

@@ -14,9 +14,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from adxl_ros.model.coefficients import get, put, with_neutral
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import get, put, Sensor, with_neutral
 import numpy as np
 import scipy
 

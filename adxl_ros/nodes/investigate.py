@@ -12,9 +12,16 @@ import signal
 from textwrap import wrap
 
 from adxl_ros.files.bag_writer import LiveBag
-from adxl_ros.investigate import diagnosis_round
-from adxl_ros.investigate.diagnosis_round import Answer, Outcome, OutputFolder
-from adxl_ros.investigate.investigation import Investigation, State
+from adxl_ros.investigate.investigation import (
+    Answer,
+    BackgroundDiagnoser,
+    hypothesis_text,
+    Investigation,
+    listed,
+    Outcome,
+    OutputFolder,
+    State,
+)
 from adxl_ros.investigate.manoeuvres import CATALOGUE, Pose, StageLimits
 from adxl_ros.links.support.base import Watchdog
 from adxl_ros.nodes import topics
@@ -42,7 +49,7 @@ _MOST_NAMED = 3
 
 def answer_lines(minutes: float, answer: Answer) -> list[str]:
     """Return the probabilities after a diagnosis, and what follows."""
-    named = '  '.join(f'{diagnosis_round.hypothesis_text(h.effects)} {percent(h.probability)}'
+    named = '  '.join(f'{hypothesis_text(h.effects)} {percent(h.probability)}'
                       for h in answer.hypotheses[:_MOST_NAMED])
     lines = wrap(f'{minutes:5.1f} min  {named}', COLUMNS, subsequent_indent=_INDENT)
     if answer.outcome is Outcome.GO_ON:
@@ -63,7 +70,7 @@ def closing_lines(investigation: Investigation, folder: OutputFolder) -> list[st
         answer = investigation.answers[-1][1]
         result = [answer.sentence]
         if answer.hidden:
-            result.append(f'It cannot show {diagnosis_round.listed(answer.hidden)}.')
+            result.append(f'It cannot show {listed(answer.hidden)}.')
         following = f'simulate rich --params {parameters} -o sim.csv'
     return ['', *end_lines(result, files, following and f'ros2 run adxl_ros {following}')]
 
@@ -178,7 +185,7 @@ class Investigate(Node):
         self._folder = OutputFolder.free(Path(own.output))
         self._investigation = Investigation(
             limits, own.minutes,
-            diagnosis_round.BackgroundDiagnoser(self._folder, limits, own.seed),
+            BackgroundDiagnoser(self._folder, limits, own.seed),
             lambda minutes, answer: self._print(answer_lines(minutes, answer)),
             self._recorder.flush)
         self._screen: LiveLine | None = None

@@ -12,10 +12,9 @@ from pathlib import Path
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.files.recording_columns import Recording, stamped_rate_hz, VOLTS
-from adxl_ros.model.coefficients import names_of, put, with_neutral
 from adxl_ros.model.constants import AXES, MEASURED_AXES
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.sensor import Sensor, to_volts, with_axes
+from adxl_ros.model.sensor import names_of, put, Sensor, to_volts, with_axes, with_neutral
 from adxl_ros.signals import block_statistics as stats
 from adxl_ros.signals.block_statistics import Spans
 import numpy as np

@@ -12,7 +12,6 @@ from typing import Any, TypeVar
 
 from adxl_ros.files.recording_columns import Recording, REFERENCES
 from adxl_ros.model import noise
-from adxl_ros.model.coefficients import neutral
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import (
     Components,
@@ -25,7 +24,7 @@ from adxl_ros.model.effects.base import (
 )
 from adxl_ros.model.filters import first_order_recursion, low_pass
 from adxl_ros.model.kinematics import specific_force_in_motion
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import neutral, Sensor
 from adxl_ros.model.signal_chain import Chain
 from adxl_ros.simulate.motion import (
     check_needs,

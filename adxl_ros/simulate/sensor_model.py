@@ -17,13 +17,20 @@ from typing import Any
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.model import noise
-from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
 from adxl_ros.model.constants import AXES, NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Concern, Effect, Environment, Place
 from adxl_ros.model.filters import low_pass
 from adxl_ros.model.population import Population
-from adxl_ros.model.sensor import Sensor, to_nominal_mps2
+from adxl_ros.model.sensor import (
+    get,
+    names_of,
+    parameter_of,
+    put,
+    Sensor,
+    to_nominal_mps2,
+    with_neutral,
+)
 from adxl_ros.model.signal_chain import Chain
 from adxl_ros.simulate.motion import check_needs, lagrange_weights, Motion, POINTS
 import numpy as np

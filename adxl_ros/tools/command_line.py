@@ -28,10 +28,9 @@ from adxl_ros.files.column_mapping import (
     ReadingOptions,
 )
 from adxl_ros.files.recording_columns import Recording
-from adxl_ros.model import coefficients
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Effect
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import neutral, Sensor, typical
 from adxl_ros.process import ended_by_closed_output, package_version
 from adxl_ros.report.quantities import column_unit
 from adxl_ros.report.screen import bar, COLUMNS, end_lines, entry_list, NextStep
@@ -176,8 +175,8 @@ def with_effects(sensor: Sensor, texts: Sequence[str]) -> Sensor:
             effect = effect_named(name)
         except UserError as error:
             raise UserError(f'--effect {text}: {error}') from None
-        values = dict(sensor.values.get(name) or coefficients.neutral(effect, sensor.axes)) \
-            if rest else coefficients.typical(effect, sensor.axes)
+        values = dict(sensor.values.get(name) or neutral(effect, sensor.axes)) \
+            if rest else typical(effect, sensor.axes)
         for part in filter(None, rest.split(',')):
             key, _, number = (word.strip() for word in part.partition('='))
             parameter, _, axis = key.partition('.')

@@ -24,11 +24,11 @@ import time
 from adxl_ros.diagnose.verdict import UNKNOWN
 from adxl_ros.files import parameter_file
 from adxl_ros.files.recording_columns import Recording
-from adxl_ros.investigate.diagnosis_round import Outcome, Question, run_round
+from adxl_ros.investigate.investigation import Outcome, Question, run_round
 from adxl_ros.investigate.manoeuvres import plan, plan_all, Pose, StageLimits
-from adxl_ros.model.coefficients import fitted_of, parameter_of, put, with_neutral
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Effect, Place
+from adxl_ros.model.sensor import fitted_of, parameter_of, put, with_neutral
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import simulate
 from adxl_ros.simulate.trajectories import rich

@@ -6,10 +6,10 @@ from itertools import pairwise
 
 from adxl_ros.compensate import inversions
 from adxl_ros.model import noise, signal_chain
-from adxl_ros.model.coefficients import put, with_neutral
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.filters import low_pass
 from adxl_ros.model.kinematics import specific_force
+from adxl_ros.model.sensor import put, with_neutral
 from adxl_ros.simulate.motion import Held, Motion
 from adxl_ros.simulate.response import Response
 import numpy as np

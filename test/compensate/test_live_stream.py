@@ -7,10 +7,9 @@ from dataclasses import replace
 from adxl_ros.compensate import inversions
 from adxl_ros.compensate.live_stream import LiveStream
 from adxl_ros.model import signal_chain
-from adxl_ros.model.coefficients import put, with_neutral
 from adxl_ros.model.effects.base import Coefficient, Environment, NOMINAL_ENVIRONMENT
 from adxl_ros.model.kinematics import specific_force, UNKNOWN_ANGLE_RAD2
-from adxl_ros.model.sensor import Sensor, to_nominal_mps2
+from adxl_ros.model.sensor import put, Sensor, to_nominal_mps2, with_neutral
 from geometry_msgs.msg import Vector3Stamped
 import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message

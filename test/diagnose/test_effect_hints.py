@@ -6,9 +6,8 @@ import ast
 from pathlib import Path
 
 from adxl_ros import diagnose
-from adxl_ros.model.diagnosis_hints import FormDimension
 from adxl_ros.model.effects import library
-from adxl_ros.model.effects.base import ActsOn, Need, Place
+from adxl_ros.model.effects.base import ActsOn, FormDimension, Need, Place
 import pytest
 
 MODULES = sorted(Path(diagnose.__file__).parent.glob('*.py'))

@@ -83,7 +83,7 @@ BAD = {
     'other units': ("units: 'V, V/g, 1/g, rad'", "units: 'mV, mV/g'",
                     r":4:12: units: 'mV, mV/g', but coefficients are in 'V, V/g, 1/g, rad'"),
     'unknown effect': ('effects: [bias, scale_factor]', 'effects: [bais, scale_factor]',
-                       r":22:14: effects: unknown effect 'bais'; did you mean bias\?"),
+                       r":22:14: effects: unknown effect 'bais'; known: "),
     'an effect twice': ('effects: [bias, scale_factor]', 'effects: [bias, bias]',
                         r':22:14: effects: a name stands twice'),
     'no list of effects': ('effects: [bias, scale_factor]', 'effects: bias',

@@ -4,8 +4,7 @@
 
 from adxl_ros.diagnose.verdict import WeightedHypothesis
 from adxl_ros.errors import UserError
-from adxl_ros.investigate.diagnosis_round import Answer, Outcome
-from adxl_ros.investigate.investigation import Investigation, State
+from adxl_ros.investigate.investigation import Answer, Investigation, Outcome, State
 from adxl_ros.investigate.manoeuvres import Pose, StageLimits
 import numpy as np
 import pytest

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 from adxl_ros.diagnose.next_experiment import ManoeuvreWorth
 from adxl_ros.diagnose.verdict import WeightedHypothesis
-from adxl_ros.investigate.diagnosis_round import (
+from adxl_ros.investigate.investigation import (
     Assessment,
     decide,
     Outcome,

@@ -7,10 +7,10 @@ from functools import cache
 
 from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
-from adxl_ros.model.coefficients import get, names_of, parameter_of, put, typical, with_neutral
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import ActsOn, Coefficient, Need, Place
 from adxl_ros.model.filters import play, resonator
+from adxl_ros.model.sensor import get, names_of, parameter_of, put, typical, with_neutral
 from adxl_ros.simulate.motion import Held, Knots, Motion
 from adxl_ros.simulate.response import Response, simulate
 from adxl_ros.simulate.smoothed_paths import ForcePath

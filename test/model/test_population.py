@@ -5,9 +5,9 @@ from dataclasses import replace
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store
-from adxl_ros.model.coefficients import get, put, with_neutral
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.population import PooledCoefficient, Population, posterior
+from adxl_ros.model.sensor import get, put, with_neutral
 import numpy as np
 import pytest
 from units import nominal

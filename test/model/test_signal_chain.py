@@ -5,12 +5,11 @@
 from dataclasses import replace
 
 from adxl_ros.model import noise, signal_chain
-from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
 from adxl_ros.model.covariance import coefficient_tangent, force_covariance
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import ARRAYS, Coefficient, Environment, FLOATS, Need, Role
 from adxl_ros.model.kinematics import angles, roll_pitch_covariance, specific_force, tilt
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import get, names_of, parameter_of, put, Sensor, with_neutral
 from hypothesis import given, strategies as st
 import numpy as np
 import pytest

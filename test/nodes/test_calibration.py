@@ -5,7 +5,7 @@ import time
 
 from adxl_ros.files import parameter_file, recording, sweep_journal
 from adxl_ros.files.recording_columns import recorded_unit
-from adxl_ros.model.coefficients import with_neutral
+from adxl_ros.model.sensor import with_neutral
 from adxl_ros.simulate.motion import Held, Knots, Motion
 from adxl_ros.simulate.response import simulate
 from adxl_ros.tools.command_line import with_effects

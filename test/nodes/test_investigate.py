@@ -9,7 +9,7 @@ import signal
 
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.bag_messages import open_bag
-from adxl_ros.model.coefficients import with_neutral
+from adxl_ros.model.sensor import with_neutral
 from graph import Graph
 import numpy as np
 from processes import executable, wait_until

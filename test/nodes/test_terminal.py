@@ -172,7 +172,7 @@ def test_the_terminal_is_restored(terminal, how):
 def test_without_prompt_toolkit_there_are_plain_lines():
     done = run_without_extras("""
 import os
-from adxl_ros.nodes.display import open_screen
+from adxl_ros.nodes.calibration import open_screen
 sys.stdin.isatty = sys.stdout.isatty = lambda: True
 os.tcgetpgrp = lambda fd: os.getpgrp()
 print(open_screen('/calibration'))

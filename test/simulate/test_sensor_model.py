@@ -7,12 +7,11 @@ from time import process_time
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store
-from adxl_ros.model.coefficients import put
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.population import PooledCoefficient, Population
-from adxl_ros.model.sensor import to_nominal_mps2
+from adxl_ros.model.sensor import put, to_nominal_mps2
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.sensor_model import SensorModel

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.model import noise
-from adxl_ros.model.coefficients import put, typical, with_neutral
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import ActsOn, Coefficient, Need
+from adxl_ros.model.sensor import put, typical, with_neutral
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import simulate
 from adxl_ros.simulate.trajectories import rich, TRAJECTORIES

@@ -206,7 +206,7 @@ def test_volts_of_another_sensor(run_tool, tmp_path) -> None:
     options = proposed(done.stderr)
     assert options == ['--columns', 'time=t:s,x=Vx:v,y=Vy:v,z=Vz:v']
     done = run_tool('fit', 'log.csv', '-o', 'unit.yaml', *options)
-    assert '--params needs the file of this one' in done.stderr and done.stderr.count('\n') == 1
+    assert '--params needs the file of this sensor' in done.stderr and done.stderr.count('\n') == 1
     params = REPO / 'params' / 'adxl335.yaml'
     done = run_tool('fit', 'log.csv', '-o', 'unit.yaml', *options, '--params', params)
     assert done.returncode == 0, done.stderr

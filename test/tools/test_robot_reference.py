@@ -5,9 +5,8 @@
 import json
 
 from adxl_ros.files import parameter_file
-from adxl_ros.model.coefficients import get
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.sensor import to_nominal_mps2
+from adxl_ros.model.sensor import get, to_nominal_mps2
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.robot import Robot

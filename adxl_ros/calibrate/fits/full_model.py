@@ -32,12 +32,11 @@ from adxl_ros.calibrate.fits import linear, linearisation
 from adxl_ros.calibrate.fits.linearisation import Linearised, linearised, StageError
 from adxl_ros.calibrate.poses import angle_jacobian, Poses, predicted_volts
 from adxl_ros.errors import UserError
-from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Place, Role
 from adxl_ros.model.gauss_newton import gauss_newton, halve_until, Iterate
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import get, names_of, parameter_of, put, Sensor, with_neutral
 import numpy as np
 import scipy
 

@@ -13,11 +13,10 @@ from dataclasses import dataclass, replace
 from adxl_ros.calibrate.poses import angle_jacobian, planes, Poses, reference_force
 from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
-from adxl_ros.model.coefficients import get
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import get, Sensor
 import numpy as np
 
 AFFINE = ('bias', 'scale_factor', 'misalignment')

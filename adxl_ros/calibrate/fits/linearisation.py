@@ -22,9 +22,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from adxl_ros.calibrate.poses import angle_jacobian, coefficient_jacobian, Poses, predicted_volts
-from adxl_ros.model.coefficients import get
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import get, Sensor
 import numpy as np
 import scipy
 

@@ -22,10 +22,9 @@ from adxl_ros.calibrate.fits import full_model
 from adxl_ros.calibrate.fits.linear import AFFINE
 from adxl_ros.calibrate.fits.linearisation import Linearised, linearised
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.model.coefficients import get, parameter_of, with_neutral
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects import library
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import get, parameter_of, Sensor, with_neutral
 from adxl_ros.report.quantities import with_half_width
 import numpy as np
 import scipy

@@ -16,11 +16,10 @@ from typing import NamedTuple
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
-from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
 from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.filters import loop, play, stop
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_neutral
 import numpy as np
 import scipy
 

@@ -31,8 +31,7 @@ from adxl_ros.calibrate.guided.screen_contents import (
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import JournalEntry, PoseRecord
-from adxl_ros.model.coefficients import parameter_of
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import parameter_of, Sensor
 from adxl_ros.signals.rest_detection import datasheet_noise, RestFinder, Stillness
 import numpy as np
 

@@ -22,12 +22,11 @@ from adxl_ros.calibrate.poses import coefficient_jacobian, Poses, predicted_volt
 from adxl_ros.calibrate.report import held_out
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model import noise
-from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force, tilt
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_neutral
 from adxl_ros.report.quantities import with_half_width
 import numpy as np
 

@@ -15,11 +15,10 @@ from adxl_ros.calibrate.fits.gravity_fit import GravityFit
 from adxl_ros.calibrate.fits.linear import AFFINE
 from adxl_ros.calibrate.report import held_out
 from adxl_ros.calibrate.report.held_out import ErrorBudget, ErrorBudgets, HeldOutErrors, rms_mg
-from adxl_ros.model.coefficients import get, parameter_of
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import get, parameter_of, Sensor
 from adxl_ros.report.quantities import duration, with_half_width
 import numpy as np
 import scipy

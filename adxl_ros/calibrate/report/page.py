@@ -24,9 +24,8 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.atomic_write import write_bytes, write_text
 from adxl_ros.model import signal_chain
-from adxl_ros.model.coefficients import get
 from adxl_ros.model.constants import G0_MPS2, Z_90
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import get, Sensor
 from adxl_ros.report import figures, page as html_page
 from adxl_ros.report.figures import AXIS_COLOURS, Figure
 import numpy as np

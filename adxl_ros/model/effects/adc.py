@@ -2,20 +2,18 @@
 
 """The ADC, the link and the clock that stamps the samples."""
 
-from adxl_ros.model.diagnosis_hints import (
-    Detector,
-    DiagnosisHints,
-    FormDimension,
-    Manoeuvre,
-    ProofVariable,
-)
 from adxl_ros.model.effects.base import (
     ActsOn,
+    Detector,
+    DiagnosisHints,
     effect,
+    FormDimension,
+    Manoeuvre,
     Need,
     Parameter,
     Parameters,
     Place,
+    ProofVariable,
     Role,
     Signals,
 )

@@ -3,14 +3,20 @@
 """The electronics: zero-g, scale factor, supply, output stage and filter."""
 
 from adxl_ros.model.constants import NOMINAL_SUPPLY_V
-from adxl_ros.model.diagnosis_hints import (
+from adxl_ros.model.effects.base import (
     DiagnosisHints,
+    effect,
     FormDimension,
     Manoeuvre,
+    Need,
+    Parameter,
+    Parameters,
+    Place,
     ProofVariable,
+    Role,
+    Signals,
     StraightLine,
 )
-from adxl_ros.model.effects.base import effect, Need, Parameter, Parameters, Place, Role, Signals
 import numpy as np
 
 

@@ -2,8 +2,18 @@
 
 """The sensing element: dependence of its output on force along and across the axis."""
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
-from adxl_ros.model.effects.base import effect, Parameter, Parameters, Place, Role, Signals
+from adxl_ros.model.effects.base import (
+    DiagnosisHints,
+    effect,
+    FormDimension,
+    Manoeuvre,
+    Parameter,
+    Parameters,
+    Place,
+    ProofVariable,
+    Role,
+    Signals,
+)
 from adxl_ros.model.filters import low_pass, stop
 
 _IN_PLANE, _OUT_OF_PLANE = (1, 0, 0), (2, 2, 1)

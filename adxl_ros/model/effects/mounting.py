@@ -5,15 +5,18 @@
 from functools import lru_cache
 from typing import Any
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import (
     ARRAYS,
     Components,
+    DiagnosisHints,
     effect,
     FLOATS,
+    FormDimension,
+    Manoeuvre,
     Parameter,
     Parameters,
     Place,
+    ProofVariable,
     Role,
     Signals,
     Value,

@@ -7,20 +7,18 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import NamedTuple
 
-from adxl_ros.model.diagnosis_hints import (
+from adxl_ros.model.effects.base import (
+    ActsOn,
     Detector,
     DiagnosisHints,
     DriftSpectrum,
-    Manoeuvre,
-    ProofVariable,
-)
-from adxl_ros.model.effects.base import (
-    ActsOn,
     effect,
+    Manoeuvre,
     Need,
     Parameter,
     Parameters,
     Place,
+    ProofVariable,
     Role,
     Signals,
 )

@@ -10,15 +10,18 @@ into the one that acts.
 from math import cos, sin
 
 from adxl_ros.model.constants import AXES
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import (
     Components,
+    DiagnosisHints,
     effect,
+    FormDimension,
     Joint,
+    Manoeuvre,
     Need,
     Parameter,
     Parameters,
     Place,
+    ProofVariable,
     Role,
     Signals,
 )

@@ -3,8 +3,18 @@
 """Temperature: zero-g and scale factor that follow it, at once, late or by a loop."""
 
 from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
-from adxl_ros.model.effects.base import effect, Parameter, Parameters, Place, Role, Signals
+from adxl_ros.model.effects.base import (
+    DiagnosisHints,
+    effect,
+    FormDimension,
+    Manoeuvre,
+    Parameter,
+    Parameters,
+    Place,
+    ProofVariable,
+    Role,
+    Signals,
+)
 from adxl_ros.model.filters import loop, low_pass
 import numpy as np
 

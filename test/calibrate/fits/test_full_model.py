@@ -8,9 +8,9 @@ from adxl_ros.calibrate import calibration
 from adxl_ros.calibrate.fits import full_model, term_selection
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
-from adxl_ros.model.coefficients import get, put, with_neutral
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.sensor import get, put, with_neutral
 import numpy as np
 from pace import within
 import pytest

@@ -10,8 +10,8 @@ from adxl_ros.calibrate.guided.pose_plan import guided, Target
 from adxl_ros.calibrate.guided.rest_guides import HandGuide
 from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, Phase, StageMode
 from adxl_ros.calibrate.guided.stage_guide import MountingError, StageGuide
-from adxl_ros.model.coefficients import parameter_of
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.sensor import parameter_of
 import numpy as np
 import pytest
 from units import Bench, drawn, Fed, nominal, pose_record, swept

@@ -8,9 +8,8 @@ from adxl_ros.calibrate.guided.rest_guides import ThermalSettings
 from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, StageMode
 from adxl_ros.calibrate.guided.session import Session, SessionSettings
 from adxl_ros.files import parameter_file, sweep_journal
-from adxl_ros.model.coefficients import with_neutral
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.sensor import Envelope
+from adxl_ros.model.sensor import Envelope, with_neutral
 from adxl_ros.simulate.motion import Held, Motion
 from adxl_ros.simulate.response import simulate
 from adxl_ros.tools.command_line import with_effects

@@ -9,9 +9,9 @@ from adxl_ros.calibrate.fits.full_model import TERMS
 from adxl_ros.calibrate.report import acceptance, held_out
 from adxl_ros.calibrate.report.acceptance import acceptance_lines, screen_table
 from adxl_ros.calibrate.result import compare, truth_table
-from adxl_ros.model.coefficients import get, names_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.sensor import get, names_of, put, with_neutral
 import numpy as np
 import pytest
 from units import drawn, nominal
