@@ -59,10 +59,6 @@ _COMMENT = re.compile(r'\s*(#|//|%)')
 """Begin of a comment."""
 
 
-class NoNumbers(UserError):
-    """A table holds no numbers; it may be a list of something."""
-
-
 @dataclass(frozen=True)
 class Form:
     """How a text table is written."""
@@ -275,7 +271,7 @@ def find_form(path: str) -> Form:
         number = lines.index(written[0]) + 1  # a recording of the package without good samples
         return _named(_fields(written[0], ','), number, number + 1, ',', False)
     if form is None:
-        raise NoNumbers(f'{path}: the first {_HEAD_LINES} lines hold no row of numbers; expected '
+        raise UserError(f'{path}: the first {_HEAD_LINES} lines hold no row of numbers; expected '
                         'a header, and a line of numbers for each sample')
     return form
 

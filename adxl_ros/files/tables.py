@@ -17,7 +17,7 @@ from typing import Any
 
 from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files.column_mapping import Quantity, Table, TableBlock, unit_in_name, UNITS
-from adxl_ros.files.csv_file import find_form, NoNumbers, read_blocks
+from adxl_ros.files.csv_file import find_form, read_blocks
 from adxl_ros.model.kinematics import stage_angles
 import numpy as np
 
@@ -136,7 +136,7 @@ def _open_parquet(path: str) -> Table:
     names = tuple(each.name for each in schema if each.name in units
                   or kinds.is_integer(each.type) or kinds.is_floating(each.type))
     if not names:
-        raise NoNumbers(f'{path}: has no column of numbers')
+        raise UserError(f'{path}: has no column of numbers')
     return Table(path, names, blocks, units)
 
 

@@ -276,7 +276,7 @@ def _csv_rows(text: str, file: Iterable[str]) -> dict[int, dict[str, str]] | Non
              if line.strip() and not line.lstrip().startswith('#'))
     _, head = next(lines, (0, ''))
     delimiter = max(',;\t', key=head.count)
-    names = [name.strip().lower() for name in head.split(delimiter)]
+    names = [name.strip() for name in next(csv.reader([head.lower()], delimiter=delimiter))]
     if 'url' not in names:
         return None
     rows = {}

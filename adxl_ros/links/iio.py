@@ -333,7 +333,7 @@ def _assign_roles(device: Any, entries: Sequence[str], axes: str) -> dict[str, A
                     if channel.type.name in ('IIO_VOLTAGE', 'IIO_ACCEL')]
         entries = [channel.id for channel
                    in sorted(measured, key=lambda channel: channel.index)[:len(axes)]]
-    assigned: dict[str, Any] = {}
+    assigned: list[tuple[str, Any]] = []
     for entry in entries:
         role, equals, name = entry.rpartition('=')
         named = [channel for channel in inputs
@@ -342,11 +342,11 @@ def _assign_roles(device: Any, entries: Sequence[str], axes: str) -> dict[str, A
             raise UserError(f'link.channels: {_name(device)} has no channel {name!r}; it has '
                             f'{", ".join(labels)} in its buffer')
         if not equals:
-            free = [candidate for candidate in order if candidate not in assigned]
+            free = [candidate for candidate in order if candidate not in dict(assigned)]
             role = name if name in free or not free else free[0]
-        assigned[role] = named[0]
-    base.check_roles([*assigned], axes)
-    return assigned
+        assigned.append((role, named[0]))
+    base.check_roles([role for role, _ in assigned], axes)
+    return dict(assigned)
 
 
 def _label(channel: Any) -> str:

@@ -43,7 +43,7 @@ def _lines(results: list[Findings]) -> list[str]:
     """Return a line for each recording, then the details of one, or of those with a fault."""
     rows = []
     for name, *cells, verdict in (_HEAD, *map(_cells, results)):
-        short = textwrap.shorten(name, _NAME_COLUMNS - 1, placeholder='…')
+        short = name if len(name) < _NAME_COLUMNS else f'{name[:_NAME_COLUMNS - 2]}…'
         rows.append(' ' + row((short, *cells, f'  {verdict}'), _COLUMNS))
     for result in results:
         if len(results) == 1 or not result.is_sound:

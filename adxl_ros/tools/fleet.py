@@ -146,7 +146,7 @@ def _plan_lines(to_do: Plan, results: Results) -> list[str]:
     largest = ', '.join(f'{serial} ({number})' for serial, number in units.most_common(_UNITS))
     rows = {'done already': str(to_do.done), 'left out': _left_out(to_do),
             'core hours': f'{to_do.core_hours:.3g}',
-            'units': f'{len(units)}: {largest}{", ..." if len(units) > _UNITS else ""}',
+            'units': largest and f'{len(units)}: {largest}{", ..." * (len(units) > _UNITS)}',
             'unknown unit': counted(unknown, 'recording')}
     return [f'{counted(len(to_do.todo), "recording")} to do, {file_size(to_do.size_bytes)}, about '
             f'{duration(3600 * to_do.core_hours)} of one core', '',

@@ -60,8 +60,8 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--seed', type=int, default=0,
                        help='seed of noise and manoeuvre (default 0)')
     parse.add_argument('--port', metavar='PATH',
-                       help='act as a board: send the samples in real time to a new '
-                       'pseudo-terminal of this name')
+                       help='act as a board: send the samples in real time to a terminal device, '
+                       'or to a new pseudo-terminal of this name')
     parse.add_argument('-o', dest='output', metavar='RECORDING',
                        help='.csv, .mcap or a rosbag2 directory (optional with --port)')
     return parse

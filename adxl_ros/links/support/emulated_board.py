@@ -139,21 +139,21 @@ def check_sensor(sensor: Sensor) -> None:
 
 @contextmanager
 def open_terminal(port: str) -> Iterator[int]:
-    """Open a new pseudo-terminal, the end that a board writes to; its other end gets a name."""
-    path = Path(port)
-    if path.exists():
-        raise UserError(f'--port {port}: exists; name a path that does not')
-    board_fd, driver_fd = pty.openpty()
+    """Open the end of a terminal that a board writes to; a new one gets a name that is free."""
+    path, is_new = Path(port), not os.path.exists(port)
+    fds = [*pty.openpty()] if is_new else []
     try:
-        tty.setraw(driver_fd)
-        os.set_blocking(board_fd, False)
-        path.unlink(missing_ok=True)  # the name of an earlier board
-        path.symlink_to(os.ttyname(driver_fd))
-        yield board_fd
+        fds = fds or [os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)]
+        tty.setraw(fds[-1])
+        os.set_blocking(fds[0], False)
+        if is_new:
+            path.unlink(missing_ok=True)  # the name of an earlier board
+            path.symlink_to(os.ttyname(fds[-1]))
+        yield fds[0]
     except (OSError, termios.error) as error:
         raise UserError(f'--port {port}: cannot be opened: {error}') from None
     finally:
-        if path.is_symlink() and os.readlink(path) == os.ttyname(driver_fd):
+        if is_new and path.is_symlink() and os.readlink(path) == os.ttyname(fds[-1]):
             path.unlink()
-        os.close(board_fd)
-        os.close(driver_fd)
+        for fd in fds:
+            os.close(fd)
