@@ -43,6 +43,11 @@ _MIN_KERNEL_BUFFERS = 4
 _MAX_KERNEL_BUFFERS = 320
 """Most buffers of the kernel; chosen: single samples at 1 kHz are kept as long as others, and its
 memory has a bound at high rates."""
+_ANSWERS = 20
+"""Answers of a device that are timed when it is opened."""
+_ROUND_TRIPS = 4.0
+"""Shortest duration of a buffer by the mean time of an answer. Chosen: each buffer needs one,
+so that the reads catch up with four times the sample rate after a delay."""
 _MAX_BUFFER = 2000
 """Most samples of a buffer."""
 _TIMEOUT_S = 1.0
@@ -235,7 +240,8 @@ class _Stream:
         axis = next(column for column in columns if column.role in sensor.axes)
         self.rate_hz = rate_hz = _set_rate(context, device, columns, sensor.rate_hz)
         self.adc = {'rate_hz': rate_hz, **axis.adc()}
-        count = min(settings.samples_together(rate_hz), _MAX_BUFFER)
+        count = min(max(settings.samples_together(rate_hz),
+                        ceil(_ROUND_TRIPS * _answer_s(axis.channel) * rate_hz)), _MAX_BUFFER)
         self.buffer_s = count / rate_hz
         self._columns = [*columns]
         for channel in [self._timestamp, *(column.channel for column in self._columns)]:
@@ -387,6 +393,14 @@ def _number(channel: Any, name: str) -> float:
         if isfinite(float(text)):
             return float(text)
     raise UserError(f'{channel.id}: its attribute {name} is {text!r}, not a number')
+
+
+def _answer_s(channel: Any) -> float:
+    """Return how long a device takes for an answer, s: to what the scale of a channel is."""
+    began_s = time.perf_counter()
+    for _ in range(_ANSWERS):
+        _number(channel, 'scale')
+    return (time.perf_counter() - began_s) / _ANSWERS
 
 
 def _select_monotonic_clock(device: Any) -> bool:

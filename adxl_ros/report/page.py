@@ -75,8 +75,10 @@ _PASSWORD = re.compile(r'(?<=://)([^/@:\s]*):[^/@\s]*@')
 _QUERY = re.compile(r'(?<=://)([^\s?#\'"]*)\?([^\s#\'"]*)')
 """Place and query of an address."""
 _SECRET = re.compile(
-    r'x-(amz|goog)-|token|.key|key.|secret|sig|passw|pwd|credential|auth|jwt|googleaccessid'
-    r'|^(expires|policy|s[a-z]{1,2}|s[ak]oid|suoid|sktid|scid)$', re.IGNORECASE)
+    r'x-(amz|goog)-|token|[-_]key|(api|access)key|secret|signature|passw|pwd|credential|jwt'
+    r'|auth(?!ors?$)|googleaccessid'
+    r'|^(sig|expires|policy|s([evsprt]|pr|rt|ip|k[tesv]|dd|es)|s[ak]oid|suoid|sktid|scid)$',
+    re.IGNORECASE)
 """Part of a parameter's name that is secret, or belongs to a signature of S3, Google or Azure."""
 
 

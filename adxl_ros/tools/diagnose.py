@@ -85,8 +85,8 @@ def diagnose(options: argparse.Namespace) -> int:
     cli.check_least(options, seed=0, self_check=0, material=1e-6)
     references = bool(options.sim) + bool(options.urdf)
     if references and references + len(options.recording) > 2:
-        raise UserError(f'--sim {options.sim}, --urdf {options.urdf}: one of them goes with one '
-                        f'recording, but {len(options.recording)} are given')
+        raise UserError(f'{options.sim or options.urdf}: --sim or --urdf, one of them, goes with '
+                        f'one recording, but {len(options.recording)} are given')
     if options.align and not (options.sim or options.urdf):
         raise UserError('--align: shifts --sim or a robot, and neither is given')
     reading = cli.reading_options(options)

@@ -455,5 +455,5 @@ def _require_determined(rests: NominalRests, parameters: np.ndarray, excess_g2: 
     reason = f'do not determine {names}' if missing else f'are too few, at least {MIN_RESTS}'
     scatter = f' and scatter by {1e3 * np.sqrt(excess_g2):.2g} mg' if excess_g2 else ''
     raise UserError(f'gravity: without their angles (fit --poses), the {count} rests {reason}'
-                    f'{scatter}; add rests with each axis up and down, and with two axes equally up; '
-                    'if they have them, --params needs the file of this sensor')
+                    f'{scatter}; add rests with each axis up and down, and with two axes '
+                    'equally up; if they have them, --params needs the file of this sensor')
