@@ -75,8 +75,8 @@ _PASSWORD = re.compile(r'(?<=://)([^/@:\s]*):[^/@\s]*@')
 _QUERY = re.compile(r'(?<=://)([^\s?#\'"]*)\?([^\s#\'"]*)')
 """Place and query of an address."""
 _SECRET = re.compile(
-    r'x-(amz|goog)-|token|[-_]key|(api|access)key|secret|signature|passw|pwd|credential|jwt'
-    r'|auth(?!ors?$)|googleaccessid'
+    r'x-(amz|goog)-|token|[-_]key|key-pair|(api|access)key|secret|signature|passw|pwd|credential'
+    r'|jwt|auth(?!ors?$)|googleaccessid'
     r'|^(sig|expires|policy|s([evsprt]|pr|rt|ip|k[tesv]|dd|es)|s[ak]oid|suoid|sktid|scid)$',
     re.IGNORECASE)
 """Part of a parameter's name that is secret, or belongs to a signature of S3, Google or Azure."""
