@@ -202,9 +202,9 @@ class Investigate(Node):
         ranges = ', '.join(f'{joint} {low:.0f} to {high:.0f}°' for joint, (low, high) in (
             ('alpha', np.degrees(self._limits.alpha_rad)),
             ('beta', np.degrees(self._limits.beta_rad))))
-        self._print([f'Investigation into {self._folder.path}: {ranges}, '
-                     f'{np.degrees(self._limits.rate_rad_s):.3g}°/s, '
-                     f'{self._settings.minutes:g} minutes at most', ''])
+        self._print([f'Investigation into {self._folder.path}, manoeuvres of '
+                     f'{self._settings.minutes:g} minutes at most',
+                     f'Stage within {ranges}, {np.degrees(self._limits.rate_rad_s):.3g}°/s', ''])
         self._recorder.listen()
         self.create_timer(_POLL_S, self._poll, clock=topics.STEADY)
 
