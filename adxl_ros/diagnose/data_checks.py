@@ -38,10 +38,13 @@ noise in a thousand samples."""
 _LONGEST_STEP_S = 0.5
 """Longest time between samples, s, that follow a moving stage. Chosen: the motion between two
 samples is unknown, and stamps in milliseconds are far beyond."""
-_EVEN_STAMPS, _LARGEST_SCATTER, _USUAL_STEPS = 0.01, 0.45, 1.5
-"""Deviations from a line, in samples, up to which stamps are even, and by which a stamp still
-shows the number of its sample; steps that count as one sample, in medians. Chosen: nothing shows
-in the slowest motion; below one half; halfway to two."""
+_EVEN_STAMPS = 0.01
+"""Deviation from a line, in samples, up to which stamps are even. Chosen: nothing shows in the
+slowest motion."""
+_LARGEST_SCATTER = 0.45
+"""Deviation, in samples, by which a stamp still shows the number of its sample: below one half."""
+_USUAL_STEP = 1.5
+"""Largest step of one sample, in medians of all steps: halfway to two samples."""
 _SMALLEST_MOVE_RAD = 0.01
 """Range of an angle, rad, above which the stage moves. Chosen: beyond the jitter of an encoder."""
 _SAMPLES = 4000
@@ -170,7 +173,7 @@ def even_stamps(stamps_s: np.ndarray) -> np.ndarray | None:
     steps_s = np.diff(stamps_s)
     if len(steps_s) < 2 or steps_s.min() <= 0:
         return None
-    step_s = float(np.mean(steps_s[steps_s < _USUAL_STEPS * np.median(steps_s)]))
+    step_s = float(np.mean(steps_s[steps_s < _USUAL_STEP * np.median(steps_s)]))
     number = np.cumsum([0.0, *np.maximum(np.rint(steps_s / step_s), 1.0)])
     line = np.polynomial.Polynomial.fit(number, stamps_s - stamps_s[0], 1)
     time_s = stamps_s[0] + line(number)

@@ -324,8 +324,8 @@ def compare_noise(comparison: BaselineComparison, mean_sensor: Sensor, noise_sen
     series = [bridged(v, comparison.used) / comparison.scale_v_per_mps2
               for v in (comparison.residual_v(mean_sensor),
                         comparison.simulated_noise_v(noise_sensor, seed))]
-    recorded, simulated = (scipy.signal.periodogram(v, rate_hz, axis=0)[1] for v in series)
-    frequency_hz = np.linspace(0, rate_hz / 2, len(recorded))
+    (frequency_hz, recorded), (_, simulated) = (
+        scipy.signal.periodogram(v, rate_hz, axis=0) for v in series)
     edges_hz = np.geomspace(max(frequency_hz[1], _LOWEST_EDGE_HZ), rate_hz / 2, _BANDS + 1)
     edges_hz[0] = 0.0
     bands = [(frequency_hz > low) & (frequency_hz <= high) for low, high in pairwise(edges_hz)]

@@ -63,7 +63,8 @@ class Bag:
             yield from map(bytes, piece.messages[topic])
 
     def _messages(self, storage: Any, connections: list[Any]) -> Iterator[tuple[str, bytes, int]]:
-        from backports import zstd
+        if self._is_packed:
+            from backports import zstd
         # Without an index, rosbags would demand the messages in the order of time.
         read = storage.messages if getattr(storage, 'chunks', True) else storage.messages_scan
         for connection, log_ns, raw in read(connections) if connections else ():

@@ -443,8 +443,7 @@ def _drifts(unit: int, results: Sequence[QuantityResult], over_mg: float, age_da
         if place is None or not result.is_claimed[place]:
             continue
         slope, half = float(result.trends.slope[place]), float(result.half_width[place])
-        text = f'{quantity.label} ' \
-            f'{quantity.text(slope, slope - half, slope + half)} per year'
+        text = f'{quantity.label} {quantity.text(slope, slope - half, slope + half)} per year'
         days, reached_mg = np.inf, np.nan
         if quantity.is_force and (quantity.is_coefficient or slope > 0):
             # A coefficient is right at its calibration, and the gap shows what it is now.

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The investigation as a state machine, free of ROS.
+The investigation of a stage: its diagnoses, and the state machine that asks for them.
+
+A round diagnoses the samples so far in a process of its own, and names the manoeuvre that is
+expected to tell most per minute. `Investigation` goes from round to round, free of ROS:
 
     RECORDING → DIAGNOSING → MOVING → DIAGNOSING → … → FINISHED
     every state → STOPPED

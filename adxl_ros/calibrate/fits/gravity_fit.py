@@ -8,7 +8,7 @@ and three angles between the sensing axes are fitted: V = zero-g + scale·(Θ·f
 equations 18 and 19. A common turn of all three axes, which has three angles, does not change the
 magnitude. The gauge therefore holds Θx on the case's x and Θy in its x-y plane.
 
-- Directions in which a sensor is held by hand, and their names.
+Somebody who turns a sensor by hand is asked for the faces, edges and corners of a cube.
 """
 
 from __future__ import annotations
@@ -120,11 +120,6 @@ def linearised(mean: np.ndarray, parameters: np.ndarray) -> Linearised:
     return Linearised(length, by_output, np.hstack([-by_output, -by_output * sensed, by_angle]))
 
 
-def magnitude_jacobian(mean: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-    """Differentiate the magnitudes by the parameters, (k, 9)."""
-    return linearised(mean, parameters).jacobian
-
-
 def magnitude_variance(rests: NominalRests, parameters: np.ndarray) -> np.ndarray:
     """Return the variance of each magnitude by the noise of the means, g², (k,)."""
     return np.sum(linearised(rests.mean, parameters).by_output ** 2 * rests.variance, axis=1)
@@ -151,7 +146,7 @@ def fisher_information(rests: NominalRests, parameters: np.ndarray, excess_g2: f
     """
     if not len(rests.mean):
         return np.zeros((len(NAMES), len(NAMES)))
-    rows = magnitude_jacobian(rests.mean, parameters)
+    rows = linearised(rests.mean, parameters).jacobian
     return rows.T @ (rows / (magnitude_variance(rests, parameters) + excess_g2)[:, None])
 
 
@@ -339,7 +334,7 @@ def _solve(rests: NominalRests, start: np.ndarray, variance: np.ndarray
     # `least_squares` calls the same routine of MINPACK, and takes twice the time around it.
     parameters, _, _, _, status = scipy.optimize.leastsq(
         lambda p: _residual(rests, p) / std, start,
-        Dfun=lambda p: magnitude_jacobian(rests.mean, p) / std[:, None],
+        Dfun=lambda p: linearised(rests.mean, p).jacobian / std[:, None],
         full_output=True, xtol=_TOLERANCE, ftol=_TOLERANCE, gtol=_TOLERANCE, diag=_UNSCALED)
     return parameters, status in _CONVERGED
 
@@ -383,7 +378,7 @@ def _inliers(rests: NominalRests, fit: Callable[[np.ndarray], _Estimate]) -> np.
         return np.ones(count, bool)
     robust = scipy.optimize.least_squares(
         lambda p: _residual(rests, p), np.zeros(len(NAMES)),
-        lambda p: magnitude_jacobian(rests.mean, p), loss='soft_l1',
+        lambda p: linearised(rests.mean, p).jacobian, loss='soft_l1',
         f_scale=TRIAL_STD_G)
     size = np.abs(robust.fun)
     freedom = max(count - max_outliers - len(NAMES), 1)
@@ -410,7 +405,7 @@ def _studentised(rests: NominalRests, kept: np.ndarray, estimate: _Estimate) -> 
     variance = magnitude_variance(rests, parameters) + excess_g2
     covariance = np.linalg.inv(
         posterior_information(rests[kept], parameters, excess_g2))
-    jacobian = magnitude_jacobian(rests.mean, parameters)
+    jacobian = linearised(rests.mean, parameters).jacobian
     leverage = np.einsum('ki,ij,kj->k', jacobian, covariance, jacobian) / variance
     distance = np.abs(_residual(rests, parameters)) / np.sqrt(variance)
     inside = distance / np.sqrt(np.maximum(1 - leverage, _MIN_REMAINDER))

@@ -207,13 +207,11 @@ def _coefficients(fitted: Sensor) -> list[dict[str, Any]]:
     departures = get(fitted, fitted.covariance_names)
     rows = []
     for row, name, value, half_width in zip(
-            compare(fitted, fitted), fitted.covariance_names, departures,
-            half_widths):
+            compare(fitted, fitted), fitted.covariance_names, departures, half_widths):
         typical, maximum = fitted.datasheet.get(name.without_axis, (0.0, 0.0))
         largest = max(typical, maximum, abs(value) + half_width, 1e-12) * _BEYOND_WHISKER
         unit = '' if row.unit == '1' else f' {row.unit}'
-        text = f'{rounded(row, row.fitted)} ± ' \
-            f'{rounded(row, row.half_width)}{unit}'
+        text = f'{rounded(row, row.fitted)} ± {rounded(row, row.half_width)}{unit}'
         # The lower end of the interval decides.
         lower = abs(value) - half_width
         beyond = '' if not (typical or maximum) else _BEYOND if 0 < maximum < lower else \

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Descriptions of effects, and the signals of the chain that they change."""
+"""Descriptions of effects with hints for the diagnosis, and the signals that they change."""
 
 from __future__ import annotations
 
