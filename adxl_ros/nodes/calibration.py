@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Guide a calibration: announce poses, average at rest, fit, write the file; show it all."""
+"""Guide a calibration: command or announce poses, average at rest, fit, write the file."""
 
 from __future__ import annotations
 
