@@ -22,7 +22,7 @@ import subprocess
 from domain import BY_UDP, own_domain
 from hypothesis import settings
 from pages import opener, running_browser
-from processes import executable, REPO, run_in_process, Started
+from processes import executable, REPO, run_executable, run_in_process, Started
 import pytest
 
 # Each run has the same examples. New ones: make test ARGS='--hypothesis-profile search'
@@ -116,6 +116,32 @@ def start(ros_env: dict[str, str], tmp_path: Path) -> Iterator[Callable[..., Sta
 
 
 @pytest.fixture
+def refusal(ros_env: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+            capfd: pytest.CaptureFixture) -> Iterator[Callable[..., str]]:
+    """Give a function that runs a node in this process, which must refuse to start."""
+    import rclpy
+
+    def started(*_: object) -> None:
+        raise AssertionError('the node has started')
+
+    def run(name: str, *args: object, status: int = 1) -> str:
+        monkeypatch.setattr('adxl_ros.nodes.run_node._spin', started)
+        monkeypatch.setattr('adxl_ros.nodes.run_node._wake_in_time', lambda: None)
+        try:
+            done = run_in_process(name, *args, cwd=tmp_path)
+        finally:
+            rclpy.try_shutdown()
+        # What C++ logs goes by the file descriptor.
+        output = done.stderr + ''.join(capfd.readouterr())
+        assert (done.returncode, done.stdout) == (status, '') and 'Traceback' not in output, output
+        # A wrong usage is shown, too.
+        assert status == 2 or output.count('\n') == 1, output
+        return output
+
+    return run
+
+
+@pytest.fixture
 def run_tool(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess]:
     """Give a function of a name and arguments that runs a tool in `tmp_path`, in this process."""
     return partial(run_in_process, cwd=tmp_path)
@@ -138,6 +164,19 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
                 done.touch()
         return folder
     return make
+
+
+@pytest.fixture(scope='session')
+def help_of(made_once: Callable[..., Path]) -> Callable[[str], str]:
+    """Give a function that returns the help of an executable, which runs once for all tests."""
+    def fill(folder: Path) -> None:
+        # A path has no place to wrap at; no file of this one is written.
+        done = run_executable(folder.name.removeprefix('help_'), '--help',
+                              env=os.environ | {'ROS_HOME': '/ros'})
+        assert (done.returncode, done.stderr) == (0, '')
+        (folder / 'help.txt').write_text(done.stdout)
+
+    return lambda name: (made_once(f'help_{name}', fill) / 'help.txt').read_text()
 
 
 @pytest.fixture(scope='session')

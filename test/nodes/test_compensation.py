@@ -259,15 +259,13 @@ def test_best_effort_publishers_are_received(robot: Robot, start: Start, tmp_pat
     ('[2.0e-06, 1.0e-06, 1.0e-06, 3.0e-06]', '[2.0e-06, 9.0e-06, 9.0e-06, 3.0e-06]',
      'covariance: not positive'), ('rate_hz: 1000.0', 'rate_hz: 1000', 'rate_hz'),
     ('effects: [', 'effects: [[', 'not YAML')])
-def test_a_bad_file_ends_it_with_one_line(start: Start, tmp_path: Path, right: str, wrong: str,
-                                          message: str) -> None:
+def test_a_bad_file_ends_it_with_one_line(refusal: Callable, tmp_path: Path, right: str,
+                                          wrong: str, message: str) -> None:
     path = _saved(tmp_path, unit())
     text = path.read_text()
     assert right in text
     path.write_text(text.replace(right, wrong))
-    for process in [start(NODE, '--ros-args', *arguments) for arguments in (
-            ('--params-file', path), ('-p', f'calibration:={path}'))]:
-        assert process.wait() == 1
-        assert process.output().count('\n') == 1
-        assert f'{path}:' in process.output()
-        assert message in process.output()
+    for arguments in (('--params-file', path), ('-p', f'calibration:={path}')):
+        line = refusal(NODE, '--ros-args', *arguments)
+        assert f'{path}:' in line
+        assert message in line

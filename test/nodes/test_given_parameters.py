@@ -29,15 +29,6 @@ def unit(tmp_path: Path) -> Path:
     return tmp_path / 'unit.yaml'
 
 
-def refusal(start, name: str, *arguments: object) -> str:
-    """Start a node that must end with status 1; return the one line that it prints."""
-    node = start(name, ROS, *arguments)
-    assert node.wait() == 1
-    lines = node.output().splitlines()
-    assert len(lines) == 1, node.output()
-    return lines[0]
-
-
 def listed(graph: Graph, node: str) -> list[str]:
     return graph.call(ListParameters, f'{node}/list_parameters',
                       ListParameters.Request()).result.names
@@ -57,8 +48,8 @@ def test_a_driver_alone_warns_that_its_sensor_is_simulated(start):
     assert '[WARN]' in warning
 
 
-def test_the_file_of_a_unit_without_a_link_is_refused(start, unit):
-    line = refusal(start, 'driver', '--params-file', unit)
+def test_the_file_of_a_unit_without_a_link_is_refused(refusal, unit):
+    line = refusal('driver', ROS, '--params-file', unit)
     assert 'link.type: is not set, but the sensor is the unit 17' in line
     assert CHOICES in line
 
@@ -70,8 +61,8 @@ def test_the_file_of_a_unit_without_a_link_is_refused(start, unit):
     ('lnk.type:=serial', 'lnk.type: no node has a parameter of this name; did you mean link.type'),
     ('sensor.rate_herz:=100.0', 'did you mean sensor.rate_hz?'),
     ('frameid:=case', 'did you mean frame_id?')])
-def test_a_driver_that_may_mean_a_real_sensor_is_refused(start, parameter, words):
-    assert words in refusal(start, 'driver', '-p', parameter)
+def test_a_driver_that_may_mean_a_real_sensor_is_refused(refusal, parameter, words):
+    assert words in refusal('driver', ROS, '-p', parameter)
 
 
 @pytest.mark.parametrize('link, parameter, words', [
@@ -80,8 +71,8 @@ def test_a_driver_that_may_mean_a_real_sensor_is_refused(start, parameter, words
     ('serial', 'link.port:=""', 'names no port; set it to a device path or a pyserial URL'),
     ('iio', 'link.uri:=nowhere', 'is none of local:, ip:HOST, usb:..., serial:...'),
     ('sim', 'link.sped:=2.0', ' link.speed, ')])
-def test_a_parameter_of_another_link_is_refused(start, link, parameter, words):
-    line = refusal(start, 'driver', '-p', f'link.type:={link}', '-p', parameter)
+def test_a_parameter_of_another_link_is_refused(refusal, link, parameter, words):
+    line = refusal('driver', ROS, '-p', f'link.type:={link}', '-p', parameter)
     assert f'{parameter.split(":")[0]}: ' in line
     assert words in line
 
@@ -92,27 +83,27 @@ def test_a_parameter_of_another_link_is_refused(start, link, parameter, words):
      'driver: sensor.rate_hz: -4.0 is refused; expected DOUBLE, 0.01 to 1'),
     ('stamp_offset:=1', 'driver: stamp_offset: 1 is refused; expected DOUBLE, -10 to 10, s; '
      'write 1.0')])
-def test_the_error_of_an_argument_names_no_file(start, unit, rule, words):
-    line = refusal(start, 'driver', '--params-file', unit, '-p', 'link.type:=sim', '-p', rule)
+def test_the_error_of_an_argument_names_no_file(refusal, unit, rule, words):
+    line = refusal('driver', ROS, '--params-file', unit, '-p', 'link.type:=sim', '-p', rule)
     assert words in line
     assert 'unit.yaml' not in line
 
 
 @pytest.mark.parametrize('node', [
     'stage', 'calibration', 'compensation', 'investigate', 'monitor'])
-def test_an_unknown_parameter_of_a_file_is_refused_at_its_line(start, tmp_path, node):
+def test_an_unknown_parameter_of_a_file_is_refused_at_its_line(refusal, tmp_path, node):
     text = NOMINAL.read_text() + '    sweep: {dwel_s: 2.0}\n'
     (tmp_path / 'own.yaml').write_text(text)
-    line = refusal(start, node, '--params-file', 'own.yaml')
+    line = refusal(node, ROS, '--params-file', 'own.yaml')
     assert f'own.yaml:{text.count(chr(10))}:' in line
     assert 'sweep.dwel_s: no node has a parameter of this name; did you mean sweep.dwell_s' in line
 
 
 @pytest.mark.parametrize('node', ['driver', 'compensation'])
-def test_a_file_for_another_node_is_refused(start, tmp_path, node):
+def test_a_file_for_another_node_is_refused(refusal, tmp_path, node):
     text = NOMINAL.read_text().replace('/**:', 'other:')
     (tmp_path / 'other.yaml').write_text(text)
-    line = refusal(start, node, '--params-file', 'other.yaml')
+    line = refusal(node, ROS, '--params-file', 'other.yaml')
     assert f'other.yaml: has parameters of /other, but none of the node /{node}' in line
 
 

@@ -2,16 +2,15 @@
 
 """`--help` and `--version` of the nodes: what each declares, seen by no graph."""
 
-from functools import cache
-import os
+from collections.abc import Callable
+from pathlib import Path
 import re
-import subprocess
 
 from adxl_ros.links.support import base
 from adxl_ros.nodes.parameters import specs_of
 from adxl_ros.nodes.settings import link_specs, NODES
 from graph import Graph
-from processes import executable, run_executable
+from processes import executable, run_in_process
 import pytest
 from terminal import Terminal
 
@@ -22,32 +21,25 @@ def parts_of(text: str) -> dict[str, str]:
     return {part.split('\n')[0]: part for part in text.split('\n\n')}
 
 
-@cache
-def help_of(name: str) -> subprocess.CompletedProcess:
-    # A path has no place to wrap at; no file of this one is written.
-    return run_executable(name, '--help', env=os.environ | {'ROS_HOME': '/ros'})
-
-
 @pytest.mark.parametrize('name', PROGRAMS)
-def test_version(name: str, ros_env: dict[str, str]) -> None:
+def test_version(name: str, tmp_path: Path) -> None:
     ros_args = () if name in ('demo', 'bench') else ('--ros-args',)
-    done = run_executable(name, *ros_args, '--version', env=ros_env)
+    done = run_in_process(name, *ros_args, '--version', cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, '')
     assert re.fullmatch(r'adxl_ros \d+\.\d+\.\d+\n', done.stdout)
 
 
 @pytest.mark.parametrize('name', PROGRAMS)
-def test_help_has_examples_within_a_terminal(name: str, ros_env: dict[str, str]) -> None:
-    done = help_of(name)
-    assert (done.returncode, done.stderr) == (0, '')
-    assert f'    ros2 run adxl_ros {name}' in done.stdout.split('examples:')[1]
-    assert max(map(len, done.stdout.splitlines())) <= 79 and '\x1b' not in done.stdout
+def test_help_has_examples_within_a_terminal(name: str, help_of: Callable) -> None:
+    text = help_of(name)
+    assert f'    ros2 run adxl_ros {name}' in text.split('examples:')[1]
+    assert max(map(len, text.splitlines())) <= 79 and '\x1b' not in text
 
 
 @pytest.mark.parametrize('name', NODES)
 def test_help_lists_each_parameter_with_type_default_and_meaning(
-        name: str, ros_env: dict[str, str]) -> None:
-    text = help_of(name).stdout
+        name: str, help_of: Callable) -> None:
+    text = help_of(name)
     entries = re.findall(r'^  ([\w.]+)  (float|floats|int|bool|text|texts)(?:, .+)?\n {6}\S',
                          text, re.MULTILINE)
     listed = {entry[0] for entry in entries}
@@ -56,8 +48,8 @@ def test_help_lists_each_parameter_with_type_default_and_meaning(
     assert '/parameter_events' not in text and 'qos_overrides' not in text
 
 
-def test_help_of_the_driver_has_links_sensor_and_topics(ros_env: dict[str, str]) -> None:
-    parts = parts_of(help_of('driver').stdout)
+def test_help_of_the_driver_has_links_sensor_and_topics(help_of: Callable) -> None:
+    parts = parts_of(help_of('driver'))
     for link in base.link_names():
         for spec in link_specs(link):
             assert f'\n  {spec.name}  ' in parts[f'with link.type:={link}']

@@ -114,7 +114,5 @@ def test_a_signal_ends_a_screen_and_restores_its_terminal(screen, number):
     assert seen.restored()
 
 
-def test_a_screen_without_a_terminal_says_so(start):
-    node = start('screen')
-    assert node.wait() == 1
-    assert node.output() == 'screen: the screen needs a terminal; run it in one\n'
+def test_a_screen_without_a_terminal_says_so(refusal):
+    assert refusal('screen') == 'screen: the screen needs a terminal; run it in one\n'

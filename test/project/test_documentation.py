@@ -4,14 +4,14 @@
 
 from collections.abc import Callable
 from importlib.util import module_from_spec, spec_from_file_location
-import json
 from pathlib import Path
 import re
 import shlex
 import subprocess
 
 from adxl_ros.files import parameter_file
-from processes import REPO, run_executable, TOOLS
+from adxl_ros.nodes.settings import NODES
+from processes import REPO, TOOLS
 import pytest
 import rclpy
 from rclpy.context import Context
@@ -22,7 +22,7 @@ BY_HAND = [page for page in PAGES if 'measurements' not in page.parts
            and 'Made by `make reference`' not in page.read_text('utf-8')]
 MOST_WORDS = 24_000
 """Words of the pages by hand: what they have more, somebody has to read and to keep true."""
-NODES = ('driver', 'compensation', 'calibration', 'stage', 'monitor', 'investigate', 'screen')
+EXECUTABLES = (*TOOLS, *NODES, 'demo', 'bench')
 OPTIONS_OF_ALL = {'--help', '--version', '--ros-args'}
 
 
@@ -76,33 +76,23 @@ def test_an_argument_that_ros_does_not_parse() -> None:
         rclpy.init(args=['node', '--ros-args', '-p', 'link.uri:=local:'], context=Context())
 
 
-@pytest.fixture(scope='module')
-def helps(made_once: Callable) -> dict[str, str]:
-    """Return the help of each executable."""
-    def fill(folder: Path) -> None:
-        texts = {name: run_executable(name, '--help').stdout
-                 for name in (*TOOLS, *NODES, 'demo', 'bench')}
-        (folder / 'helps.json').write_text(json.dumps(texts))
-
-    return json.loads((made_once('helps', fill) / 'helps.json').read_text())
-
-
 @pytest.mark.parametrize('page', BY_HAND, ids=name_of)
-def test_options_and_parameters_exist(page: Path, helps: dict[str, str]) -> None:
+def test_options_and_parameters_exist(page: Path, help_of: Callable) -> None:
     """Each executable exists, and has the options and parameters with which it is called."""
     for words in commands(page):
         if words[:3] != ['ros2', 'run', 'adxl_ros']:
             continue
         name, *rest = words[3:]
-        assert name in helps, f'{name_of(page)}: {name} is no executable'
+        assert name in EXECUTABLES, f'{name_of(page)}: {name} is no executable'
+        text = help_of(name)
         cut = rest.index('--ros-args') if '--ros-args' in rest else len(rest)
         for word in rest[:cut]:
             if re.match('--[a-z]', word):
-                assert word in helps[name], f'{name_of(page)}: {name} has no {word}'
+                assert word in text, f'{name_of(page)}: {name} has no {word}'
         if name != 'screen':
             for flag, rule in zip(rest[cut:], rest[cut + 1:]):
                 key = rule.split(':=')[0]
-                assert flag != '-p' or key in helps[name] + ' use_sim_time', \
+                assert flag != '-p' or key in text + ' use_sim_time', \
                     f'{name_of(page)}: {name} has no parameter {key}'
 
 

@@ -110,7 +110,8 @@ def run_in_process(name: str, *args: object, cwd: Path) -> subprocess.CompletedP
     test_help_and_end.py runs the installed executables.
     """
     (tool,) = entry_points(group='console_scripts', name=name)
-    main, on_sigterm = tool.load(), signal.getsignal(signal.SIGTERM)
+    main = tool.load()
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     with (redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as err,
           pytest.MonkeyPatch.context() as patch):
         patch.chdir(cwd)
@@ -120,5 +121,6 @@ def run_in_process(name: str, *args: object, cwd: Path) -> subprocess.CompletedP
         except SystemExit as error:
             status = error.code
         finally:
-            signal.signal(signal.SIGTERM, on_sigterm)
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
     return subprocess.CompletedProcess(sys.argv, status, out.getvalue(), err.getvalue())

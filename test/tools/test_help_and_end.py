@@ -2,7 +2,7 @@
 
 """The installed tools: help, version, exit status, and what a run prints for people."""
 
-from functools import cache
+from collections.abc import Callable
 import os
 from pathlib import Path
 import re
@@ -18,13 +18,8 @@ COLUMNS = 79
 COLOUR = '\x1b['
 
 
-@cache
-def help_of(name: str) -> str:
-    return run_executable(name, '--help').stdout
-
-
 @pytest.mark.parametrize('name', TOOLS)
-def test_help_version_and_wrong_usage(name: str, tmp_path: Path) -> None:
+def test_help_version_and_wrong_usage(name: str, help_of: Callable, tmp_path: Path) -> None:
     text = help_of(name)
     assert text.startswith(f'usage: {name}')
     assert f'    ros2 run adxl_ros {name} ' in text.split('examples:')[1]
@@ -38,7 +33,7 @@ def test_help_version_and_wrong_usage(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('name', ['diagnose', 'fit', 'simulate'])
-def test_help_lists_the_effects(name: str) -> None:
+def test_help_lists_the_effects(name: str, help_of: Callable) -> None:
     listed = help_of(name).split('\neffects:\n')[1]
     names = set(re.findall(r'^  ([a-z_]+) ', listed, re.MULTILINE))
     assert names <= set(library())
