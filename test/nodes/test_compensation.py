@@ -233,9 +233,13 @@ def test_calibration_loads_a_complete_file_or_nothing(robot: Robot, start: Start
     assert 'read-only' in robot.assign(bias__offset_v=[0.0, 0.0])
 
 
-def test_parameters_are_described(robot: Robot, start: Start, tmp_path: Path) -> None:
+def test_parameters_are_described_and_best_effort_publishers_received(
+        robot: Robot, start: Start, tmp_path: Path) -> None:
     start(NODE, '--ros-args', '-p', f'calibration:={_saved(tmp_path, unit())}')
+    robot._raw = robot.graph.node.create_publisher(Imu, 'imu/data_raw', QoSProfile(
+        depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
     robot.connected()
+    robot.answer(output_of(unit(), pose(0.5, 0.5)))
     names = ['sensor.serial', 'bias.offset_v', 'calibration', 'sensor.rate_hz', 'effects']
     descriptors = robot.graph.call(DescribeParameters, f'{NODE}/describe_parameters',
                                    DescribeParameters.Request(names=names)).descriptors
@@ -243,14 +247,6 @@ def test_parameters_are_described(robot: Robot, start: Start, tmp_path: Path) ->
     assert [d.name for d in descriptors if not d.read_only] == ['calibration']
     assert descriptors[1].additional_constraints == '-2 to 2'
     assert descriptors[3].floating_point_range[0].to_value == 1e5
-
-
-def test_best_effort_publishers_are_received(robot: Robot, start: Start, tmp_path: Path) -> None:
-    start(NODE, '--ros-args', '--params-file', _saved(tmp_path, unit()))
-    robot._raw = robot.graph.node.create_publisher(Imu, 'imu/data_raw', QoSProfile(
-        depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
-    robot.connected()
-    robot.answer(output_of(unit(), pose(0.5, 0.5)))
 
 
 @pytest.mark.parametrize(('right', 'wrong', 'message'), [

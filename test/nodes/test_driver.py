@@ -13,12 +13,10 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from graph import accel, Graph, stamp_ns
 import numpy as np
 import pytest
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import DescribeParameters, ListParameters, SetParameters
 from rclpy.serialization import deserialize_message, serialize_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
-from units import NOMINAL, nominal
+from units import nominal
 
 ROS = '--ros-args'
 SIMULATED = 'SIMULATED sensor (link.type: sim)'
@@ -158,22 +156,3 @@ def test_beside_another_clock_the_driver_follows_it(start, option):
     ((ROS, '--params-file', 'nowhere.yaml'), 1), (('--speed', '3'), 2), ((ROS, '--sped', '3'), 2)])
 def test_an_invalid_start_ends_with_one_line(refusal, arguments, status):
     assert arguments[-1].split(':=')[-1] in refusal('driver', *arguments, status=status)
-
-
-def test_parameters_have_descriptions_and_are_read_only(start):
-    start('driver', ROS, '--params-file', NOMINAL)
-    with Graph() as graph:
-        names = graph.call(ListParameters, 'driver/list_parameters',
-                           ListParameters.Request()).result.names
-        stated = [n for n in names if not n.startswith(('qos_overrides', 'use_sim', 'start_type'))]
-        assert {'sensor.rate_hz', 'link.type', 'link.speed', 'frame_id'} <= set(stated)
-        descriptors = graph.call(DescribeParameters, 'driver/describe_parameters',
-                                 DescribeParameters.Request(names=stated)).descriptors
-        assert all(d.description and d.read_only for d in descriptors)
-        rate = next(d for d in descriptors if d.name == 'sensor.rate_hz').floating_point_range[0]
-        assert (rate.from_value, rate.to_value) == (0.01, 100000)
-        value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=500.0)
-        answer = graph.call(SetParameters, 'driver/set_parameters', SetParameters.Request(
-            parameters=[Parameter(name='sensor.rate_hz', value=value)])).results[0]
-        assert not answer.successful
-        assert 'read-only' in answer.reason

@@ -15,7 +15,7 @@ from adxl_ros.files import parameter_file
 from adxl_ros.links import iio
 from adxl_ros.links.support import emulated_board
 from adxl_ros.model.effects import effect_named
-from faults import byte_fault, Fault, IIO_FAULTS, run_fault, SERIAL_FAULTS
+from faults import Fault, IIO_FAULTS, RESET, run_fault, SERIAL_FAULTS
 from graph import accel, Graph
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import GetState
@@ -44,18 +44,12 @@ def lines(process):
 
 
 def test_every_fault_of_a_board_is_counted_exactly(start, tmp_path):
-    by_name = {fault.name: fault for fault in SERIAL_FAULTS}
-    faults = [*(byte_fault(kind, 1e-3) for kind in ('flip', 'lose', 'insert', 'burst')),
-              *(by_name[name] for name in (
-                  'wrong baud rate', '100 kB without a delimiter', '200 kB of noise',
-                  '137 samples lost by the board', 'unplugged for 1 s, in a read',
-                  'board and clock halted for 1 s', 'reader stopped for 3 s'))]
     with board_rig(tmp_path, {'banner': True, 'ppm': 60}) as rig:
         driver = start('driver', ROS, *rig.driver_parameters())
         rig.wait_for_samples(500, 30)
 
         def inject_all(rig, pid, duration_s):
-            for fault in faults:
+            for fault in SERIAL_FAULTS:
                 back_ns = fault.inject(rig, pid, duration_s)
                 assert not back_ns or rig.recovery_ms(back_ns) < RECOVERY_MS, fault.name
                 rig.wait_for_samples(100, 20, fault.name)
@@ -68,7 +62,7 @@ def test_every_fault_of_a_board_is_counted_exactly(start, tmp_path):
         assert report.estimated == 0
         assert np.percentile(np.abs(rig.errors), 90) < 20
 
-        outcome = run_fault(by_name['reset, away for 0.5 s'], rig, driver.popen.pid, 1.0)
+        outcome = run_fault(RESET, rig, driver.popen.pid, 1.0)
         report = outcome.report
         assert report.wrong == 0
         assert report.counted == report.estimated
@@ -140,9 +134,8 @@ def test_a_hostile_stream_costs_no_memory_and_disturbs_no_other_link(start, tmp_
         chunk = rng.bytes(1_000_000)
         bombs = b''.join(bytes([0xff]) * 254 + rng.bytes(3) for _ in range(4000))
         peer.settimeout(0.2)
-        sent = 0
-        end = time.monotonic() + 5
-        while time.monotonic() < end:
+        sent, end = 0, time.monotonic() + PATIENCE * 10
+        while sent < 5_000_000 and time.monotonic() < end:
             try:
                 sent += peer.send(chunk if sent % 2 else bombs)
             except TimeoutError:
@@ -152,7 +145,7 @@ def test_a_hostile_stream_costs_no_memory_and_disturbs_no_other_link(start, tmp_
             rig.graph.spin(0.01)
         after = memory_mib(hurt.popen.pid)
         report = rig.report()
-        assert sent > 5_000_000
+        assert sent >= 5_000_000
         assert (report.wrong, report.missing, report.counted) == (0, 0, 0)
         assert after - before < 8, f'{before} MiB before, {after} MiB after'
         assert hurt.popen.poll() is None

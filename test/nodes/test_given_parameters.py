@@ -5,14 +5,17 @@
 from pathlib import Path
 
 from adxl_ros.files import parameter_file
-from adxl_ros.nodes.parameters import sensor_keys, specs_of
+from adxl_ros.nodes.parameters import has_section, sensor_keys, specs_of
+from adxl_ros.nodes.rclpy_internals import given_parameters
 from adxl_ros.nodes.settings import NODES
 from diagnostic_msgs.msg import DiagnosticStatus
 from graph import Graph
 from lifecycle_msgs.msg import Transition
 import pytest
-from rcl_interfaces.srv import GetParameters, ListParameters
-from rclpy.parameter import parameter_value_to_python
+from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
+import rclpy
+from rclpy.context import Context
+from rclpy.parameter import Parameter, parameter_value_to_python
 from sensor_msgs.msg import Imu
 from units import NOMINAL, nominal
 
@@ -34,7 +37,7 @@ def listed(graph: Graph, node: str) -> list[str]:
                       ListParameters.Request()).result.names
 
 
-def test_a_driver_alone_warns_that_its_sensor_is_simulated(start):
+def test_a_driver_alone_warns_of_its_simulated_sensor_and_describes_its_parameters(start):
     driver = start('driver')
     driver.wait_for(SIMULATED)
     with Graph() as graph:
@@ -42,10 +45,22 @@ def test_a_driver_alone_warns_that_its_sensor_is_simulated(start):
         graph.spin_until(lambda: samples and graph.reports('driver', SIMULATED), 30, 'a sample')
         assert graph.diagnostics['driver'].level == DiagnosticStatus.WARN
         assert graph.value('driver', 'link_type') == 'sim'
+        stated = [name for name in listed(graph, 'driver')
+                  if not name.startswith(('qos_overrides', 'use_sim', 'start_type'))]
+        described = graph.call(DescribeParameters, 'driver/describe_parameters',
+                               DescribeParameters.Request(names=stated)).descriptors
+        answer, = graph.call(SetParameters, 'driver/set_parameters', SetParameters.Request(
+            parameters=[Parameter('sensor.rate_hz', value=500.0).to_parameter_msg()])).results
     info, warning = driver.output().splitlines()
     assert '[INFO]' in info
     assert 'active: link sim, unit nominal, 1000 Hz, topic /imu/data_raw' in info
     assert '[WARN]' in warning
+    assert all(d.description and d.read_only for d in described)
+    by_name = {d.name: d for d in described}
+    assert {'sensor.rate_hz', 'link.type', 'link.speed', 'frame_id'} <= set(by_name)
+    rate, = by_name['sensor.rate_hz'].floating_point_range
+    assert (rate.from_value, rate.to_value) == (0.01, 100000)
+    assert not answer.successful and 'read-only' in answer.reason
 
 
 def test_the_file_of_a_unit_without_a_link_is_refused(refusal, unit):
@@ -107,21 +122,18 @@ def test_a_file_for_another_node_is_refused(refusal, tmp_path, node):
     assert f'other.yaml: has parameters of /other, but none of the node /{node}' in line
 
 
-def test_the_sections_of_a_file_are_those_of_ros(start, tmp_path):
-    """The frame of the samples comes from the section, or the file is refused."""
-    drivers, topics = [], []
-    for number, section in enumerate(('/*', '/**/driver', 'driver', '/arm/driver', '/arm/**')):
-        path = tmp_path / f'{number}.yaml'
-        path.write_text(f'{section}:\n  ros__parameters:\n    frame_id: case\n')
-        namespace = '/arm' if 'arm' in section or '**' in section else '/'
-        topics.append(f'/samples_{number}')
-        drivers.append(start('driver', ROS, '--params-file', path, '-r', f'__ns:={namespace}',
-                             '-r', f'imu/data_raw:={topics[-1]}'))
-    with Graph() as graph:
-        samples = [graph.listen(Imu, topic) for topic in topics]
-        graph.spin_until(lambda: all(samples), 30, 'a sample of each')
-    assert {received[0].header.frame_id for received in samples} == {'case'}
-    assert all(driver.popen.poll() is None for driver in drivers)
+@pytest.mark.parametrize('section', ['/*', '/**/driver', 'driver', '/arm/driver', '/arm/**'])
+@pytest.mark.parametrize('namespace', ['/', '/arm', '/leg'])
+def test_the_sections_of_a_file_are_those_of_ros(ros_env, tmp_path, section, namespace):
+    path = str(tmp_path / 'own.yaml')
+    Path(path).write_text(f'{section}:\n  ros__parameters:\n    frame_id: case\n')
+    context = Context()
+    rclpy.init(args=[ROS, '--params-file', path, '-r', f'__ns:={namespace}'], context=context)
+    node = rclpy.create_node('driver', context=context, start_parameter_services=False)
+    assert has_section(path, node.get_fully_qualified_name()) \
+        == ('frame_id' in dict(given_parameters(node)))
+    node.destroy_node()
+    context.shutdown()
 
 
 def test_all_nodes_with_one_file(start, tmp_path):

@@ -90,6 +90,22 @@ def laboratory(start, tmp_path):
         yield made
 
 
+@pytest.fixture
+def in_terminal(ros_env, tmp_path):
+    """Give a function that starts an investigation in a terminal."""
+    opened = []
+
+    def begin(*options):
+        opened.append(Terminal(
+            [executable('investigate'), '--ros-args', '--params-file', 'nominal.yaml', *SIM,
+             *FAST, *LONG, *options], ros_env, tmp_path, columns=80))
+        return opened[-1]
+
+    yield begin
+    for terminal in opened:
+        terminal.close()
+
+
 def messages_of(bag):
     with open_bag(bag) as opened:
         return sum(1 for _ in opened.messages('/imu/data_raw'))
@@ -123,19 +139,25 @@ def test_an_investigation_ends_with_the_effect_of_the_unit(laboratory, tmp_path)
 
 @pytest.mark.kills
 def test_whatever_ends_an_investigation_leaves_the_stage_at_rest_and_the_bag_whole(
-        laboratory, tmp_path):
+        laboratory, in_terminal, tmp_path):
     """The stage would move on for many seconds; it comes to rest near its pose at the end."""
     def killed(node):
         os.kill(node.popen.pid, signal.SIGKILL)
 
-    def terminated(node):
-        os.kill(node.popen.pid, signal.SIGTERM)
-
     def aborted(_):
         assert laboratory.call(Trigger, '/investigate/abort', Trigger.Request()).success
 
-    for number, end in enumerate((killed, terminated, aborted)):
-        node = laboratory.investigate('-p', f'output:=run{number}', *LONG)
+    def interrupted(_):
+        terminal.wait_for(' s left')
+        terminal.press('\x03')
+        terminal.wait_for('Stopped without a verdict: Ctrl-C', ' wrote ')
+
+    for number, end in enumerate((killed, aborted, interrupted)):
+        if end is interrupted:
+            terminal = node = in_terminal('-p', f'output:=run{number}')
+            terminal.wait_for('0.0 min  no gap ', 'next: ', timeout_s=90)
+        else:
+            node = laboratory.investigate('-p', f'output:=run{number}', *LONG)
         laboratory.wait_for_motion()
         before = np.array(laboratory.states[-1].position[:2])
         end(node)
@@ -148,31 +170,14 @@ def test_whatever_ends_an_investigation_leaves_the_stage_at_rest_and_the_bag_who
             assert node.popen.returncode == -signal.SIGKILL
         else:
             assert node.popen.returncode == 1
-            assert 'Stopped without a verdict' in node.output()
+            assert end is interrupted or 'Stopped without a verdict' in node.output()
         read = recording.read(bag)
         assert bool(read.cut) is (end is killed)
         assert len(read) == messages_of(bag) > 1000
         assert np.diff(read.time_s).max() == pytest.approx(0.005, abs=1e-6)
     laboratory.check_commands(3)
-
-
-@pytest.mark.kills
-def test_a_terminal_shows_what_the_stage_does_until_ctrl_c(laboratory, ros_env, tmp_path):
-    terminal = Terminal(
-        [executable('investigate'), '--ros-args', '--params-file', 'nominal.yaml', *SIM, *FAST,
-         *LONG], ros_env, tmp_path, columns=80)
-    try:
-        terminal.wait_for('0.0 min  no gap ', 'next: ', timeout_s=90)
-        laboratory.wait_for_motion()
-        terminal.wait_for(' s left')
-        terminal.press('\x03')
-        terminal.wait_for('Stopped without a verdict: Ctrl-C', ' wrote ')
-        assert terminal.wait() == 1
-        assert ' s left' not in terminal.text()
-        assert max(map(len, terminal.text().splitlines())) < 80
-        laboratory.wait_for_rest()
-    finally:
-        terminal.close()
+    assert ' s left' not in terminal.text()
+    assert max(map(len, terminal.text().splitlines())) < 80
 
 
 @pytest.mark.parametrize('setting, reason', [

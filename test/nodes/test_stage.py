@@ -11,6 +11,7 @@ from sensor_msgs.msg import Imu, JointState
 
 ROS = '--ros-args'
 SIM_TIME = (ROS, '-p', 'use_sim_time:=true')
+QUICK = ('-p', 'slew_rate_rad_s:=2.0')
 STEP = np.radians(5 / 60)
 IDEAL = ('-p', 'sensor.noise_density_g_per_rthz:=[0.0,0.0,0.0]', '-p', 'sensor.axes:=xyz', '-p',
          'sensor.nominal_zero_g_v:=[2.5,2.5,2.5]', '-p',
@@ -65,7 +66,7 @@ def test_the_stage_reaches_its_command_and_publishes_its_encoder(start):
 @pytest.mark.parametrize('speed', [1.0, 5.0])
 def test_the_simulated_sensor_senses_the_true_angles(start, speed):
     clock = SIM_TIME if speed != 1 else (ROS,)
-    start('stage', *clock)
+    start('stage', *clock, *QUICK)
     start('driver', *clock, '-p', 'link.type:=sim', '-p', f'link.speed:={speed}', *IDEAL)
     with Commander() as graph:
         samples = graph.listen(Imu, 'imu/data_raw', raw=True)

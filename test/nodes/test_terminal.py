@@ -25,7 +25,7 @@ OTHERS = '\x1b[A\x1b[1;5A\x1bOA\x1bOS\x1b[[A\x1b[M af\x1b[<65;10;10M\x1b[15~\x1b
 """Arrow up, with Ctrl, of keypad mode; F4; F1 of a console; a mouse's wheel twice; F5; Alt-q."""
 
 
-SIGNALS = {'term': signal.SIGTERM, 'hup': signal.SIGHUP, 'kill': signal.SIGKILL}
+SIGNALS = {'term': signal.SIGTERM, 'kill': signal.SIGKILL}
 
 
 @pytest.fixture
@@ -149,7 +149,7 @@ def _tilt(screen):
 
 
 @pytest.mark.kills
-@pytest.mark.parametrize('how', ['ctrl-c', 'term', 'hup', 'kill', 'kill of the screen'])
+@pytest.mark.parametrize('how', ['ctrl-c', 'term', 'kill', 'kill of the screen'])
 def test_the_terminal_is_restored(terminal, how):
     seen = terminal()
     seen.wait_for('press b to begin')
@@ -163,7 +163,7 @@ def test_the_terminal_is_restored(terminal, how):
         seen.press('\x03')
     else:
         os.kill(seen.popen.pid, SIGNALS[how])
-    assert seen.wait() == (-SIGNALS[how] if how in ('hup', 'kill') else 0)
+    assert seen.wait() == (-signal.SIGKILL if how == 'kill' else 0)
     with Graph() as graph:
         graph.spin_until(lambda: seen.restored() and not Path(f'/proc/{screen}').exists(), 20,
                          'the terminal as it was')

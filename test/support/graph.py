@@ -43,6 +43,7 @@ class Graph:
     def __init__(self):
         self.got = defaultdict(list)
         self.diagnostics = {}
+        self._messages = defaultdict(set)
         self._context = Context()
         self._clients = {}
 
@@ -61,7 +62,9 @@ class Graph:
 
     def _diagnose(self, message):
         for status in message.status:
-            self.diagnostics[status.name.split(':')[0]] = status
+            name = status.name.split(':')[0]
+            self.diagnostics[name] = status
+            self._messages[name].add(status.message)
 
     def listen(self, kind, topic, depth=10000, latched=False, raw=False):
         qos = QoSProfile(depth=depth)
@@ -110,6 +113,10 @@ class Graph:
 
     def reports(self, node, text):
         return node in self.diagnostics and text in self.diagnostics[node].message
+
+    def has_reported(self, node, text):
+        """Return whether a node has said this at any time."""
+        return any(text in message for message in self._messages[node])
 
     def value(self, node, key):
         return {pair.key: pair.value for pair in self.diagnostics[node].values}[key]

@@ -159,11 +159,13 @@ class ClockMap:
         stamps = np.rint(self._line(device_ns)).astype(np.int64)
         newest_ns = self._newest_stamp_ns
         if newest_ns is not None and stamps[0] <= newest_ns:
-            # The new clock begins behind the stamps of the previous one: continue from those.
-            self._line_host_ns += newest_ns + 1 - int(stamps[0])
+            # The line begins behind the stamps so far: continue from those, at a distance that
+            # the next reading of the system clock does not turn round.
+            first_ns = newest_ns + _MAX_UNCERTAINTY_NS + 1
+            self._line_host_ns += first_ns - int(stamps[0])
             self._steer(int(device_ns[0]), _HORIZON_S)
             stamps = np.maximum(np.rint(self._line(device_ns)).astype(np.int64),
-                                newest_ns + 1 + np.arange(len(stamps)))
+                                first_ns + np.arange(len(stamps)))
         self._newest_stamp_ns = int(stamps[-1])
         return stamps
 
