@@ -116,6 +116,22 @@ def start(ros_env: dict[str, str], tmp_path: Path) -> Iterator[Callable[..., Sta
 
 
 @pytest.fixture
+def in_terminal(ros_env: dict[str, str], tmp_path: Path) -> Iterator[Callable]:
+    """Give a function that starts an executable, as `start` does, in a terminal of its own."""
+    from terminal import Terminal
+    opened: list[Terminal] = []
+
+    def begin(name: str, *args: object, **size: int) -> Terminal:
+        opened.append(Terminal([executable(name), *map(str, args)], ros_env, tmp_path, **size))
+        return opened[-1]
+
+    yield begin
+    for program in opened:
+        print(program.text())
+        program.close()
+
+
+@pytest.fixture
 def refusal(ros_env: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
             capfd: pytest.CaptureFixture) -> Iterator[Callable[..., str]]:
     """Give a function that runs a node in this process, which must refuse to start."""

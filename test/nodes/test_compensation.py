@@ -188,10 +188,11 @@ def test_without_a_file_the_nominal_sensor_applies(robot: Robot, start: Start) -
 
 def test_samples_of_two_drivers_are_not_mixed(robot: Robot, start: Start) -> None:
     graph = robot.graph
-    process = start('compensation')
-    start('driver')
+    slow = ('--ros-args', '-p', 'sensor.rate_hz:=100.0')
+    process = start('compensation', *slow)
+    start('driver', *slow)
     graph.spin_until(lambda: robot.data, 30.0, 'corrected samples')
-    second = start('driver', '--ros-args', '-r', '__node:=second')
+    second = start('driver', *slow, '-r', '__node:=second')
     robot.level(DiagnosticStatus.ERROR, 'nodes publish it, and their samples mix')
     graph.spin_until(lambda: graph.reports('second', 'nodes publish /imu/data_raw'), 10.0,
                      'the warning of a driver')

@@ -95,7 +95,8 @@ def test_sim_publishes_every_sample_as_documented(start):
     codes = to_volts(a[:, :2], sensor) / sensor.lsb_v
     assert np.abs(codes - np.rint(codes)).max() < 1e-6, 'volts are recovered exactly'
     assert driver.stop() == 0
-    info, warning = driver.output().splitlines()
+    info, warning, *others = driver.output().splitlines()
+    assert all('the clock jumped' in line for line in others), 'as on a busy machine'
     assert '[INFO]' in info
     assert 'active: link sim, unit A7, 1000 Hz, topic /imu/data_raw' in info
     assert '[WARN]' in warning
@@ -138,15 +139,16 @@ def test_beside_another_clock_the_driver_follows_it(start, option):
     def tick():
         now_s = 50 + time.monotonic() - begin_s
         clock.publish(Clock(clock=Time(sec=int(now_s), nanosec=int(now_s % 1 * 1e9))))
-        return len(samples) > 500 and graph.node.count_publishers('/clock') == 1 \
+        return len(samples) > 50 and graph.node.count_publishers('/clock') == 1 \
             and abs(stamp_ns(samples[-1]) - 1e9 * now_s) < 2e9
 
     with Graph() as graph:
         clock = graph.node.create_publisher(Clock, '/clock', 10)
         begin_s = time.monotonic()
         samples = graph.listen(Imu, 'imu/data_raw')
-        driver = start('driver', ROS, '-p', 'link.type:=sim', '-p', option)
-        graph.spin_until(tick, 30, '500 samples by the one clock')
+        driver = start('driver', ROS, '-p', 'link.type:=sim', '-p', option, '-p',
+                       'sensor.rate_hz:=100.0')
+        graph.spin_until(tick, 30, '50 samples by the one clock')
     assert 'another node publishes /clock: this driver follows it' in driver.output()
 
 

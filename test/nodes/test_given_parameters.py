@@ -51,7 +51,7 @@ def test_a_driver_alone_warns_of_its_simulated_sensor_and_describes_its_paramete
                                DescribeParameters.Request(names=stated)).descriptors
         answer, = graph.call(SetParameters, 'driver/set_parameters', SetParameters.Request(
             parameters=[Parameter('sensor.rate_hz', value=500.0).to_parameter_msg()])).results
-    info, warning = driver.output().splitlines()
+    info, warning, *_ = driver.output().splitlines()
     assert '[INFO]' in info
     assert 'active: link sim, unit nominal, 1000 Hz, topic /imu/data_raw' in info
     assert '[WARN]' in warning

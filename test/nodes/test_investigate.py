@@ -3,6 +3,7 @@
 """An investigation on a simulated stage: verdict, limits, bag, and how it leaves the stage."""
 
 from dataclasses import replace
+from functools import partial
 import json
 import os
 import signal
@@ -12,11 +13,10 @@ from adxl_ros.files.bag_messages import open_bag
 from adxl_ros.model.sensor import with_neutral
 from graph import Graph
 import numpy as np
-from processes import executable, wait_until
+from processes import wait_until
 import pytest
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
-from terminal import Terminal
 from units import nominal
 
 pytestmark = pytest.mark.long
@@ -54,9 +54,9 @@ class Laboratory(Graph):
         self.commands = self.listen(JointState, 'stage/command')
         return self
 
-    def investigate(self, *options):
-        return self._start('investigate', '--ros-args', '--params-file', 'nominal.yaml', *SIM,
-                           *FAST, *options)
+    def investigate(self, *options, start=None):
+        return (start or self._start)('investigate', '--ros-args', '--params-file',
+                                      'nominal.yaml', *SIM, *FAST, *options)
 
     def wait_for_motion(self):
         del self.states[:]
@@ -88,22 +88,6 @@ class Laboratory(Graph):
 def laboratory(start, tmp_path):
     with Laboratory(start, tmp_path) as made:
         yield made
-
-
-@pytest.fixture
-def in_terminal(ros_env, tmp_path):
-    """Give a function that starts an investigation in a terminal."""
-    opened = []
-
-    def begin(*options):
-        opened.append(Terminal(
-            [executable('investigate'), '--ros-args', '--params-file', 'nominal.yaml', *SIM,
-             *FAST, *LONG, *options], ros_env, tmp_path, columns=80))
-        return opened[-1]
-
-    yield begin
-    for terminal in opened:
-        terminal.close()
 
 
 def messages_of(bag):
@@ -154,7 +138,8 @@ def test_whatever_ends_an_investigation_leaves_the_stage_at_rest_and_the_bag_who
 
     for number, end in enumerate((killed, aborted, interrupted)):
         if end is interrupted:
-            terminal = node = in_terminal('-p', f'output:=run{number}')
+            terminal = node = laboratory.investigate(
+                '-p', f'output:=run{number}', *LONG, start=partial(in_terminal, columns=80))
             terminal.wait_for('0.0 min  no gap ', 'next: ', timeout_s=90)
         else:
             node = laboratory.investigate('-p', f'output:=run{number}', *LONG)

@@ -3,12 +3,9 @@
 """How long samples are collected, and how old they are when the nodes publish them."""
 
 
-from adxl_ros.errors import UserError
-from adxl_ros.links import iio
 from graph import Graph
 import numpy as np
-import pytest
-from rig import IioRig, SerialRig
+from rig import SerialRig
 
 ROS = '--ros-args'
 LONG_MS = 100.0
@@ -59,26 +56,3 @@ def test_a_board_sends_small_frames_and_stamps_stay_accurate(start, tmp_path):
             return np.median(np.abs(rig.errors[-1000:])) < 0.5
         graph.spin_until(accurate, 30, 'stamps within 0.5 ms')
     assert (report.wrong, report.missing, report.counted) == (0, 0, 0)
-
-
-def test_old_firmware_is_read_and_reported(start, tmp_path):
-    options = {'obeys': False, 'keeps': True}
-    with Graph() as graph, SerialRig(graph, tmp_path, options) as rig:
-        start('driver', ROS, *rig.driver_parameters())
-        graph.spin_until(lambda: graph.reports('driver', 'streaming')
-                         and graph.value('driver', 'frame_ms') == '10.0', 20, 'its frames')
-        rig.collect()
-        rig.begin_report()
-        report = rig.report()
-    assert (report.wrong, report.missing, report.counted) == (0, 0, 0)
-
-
-def test_the_buffers_of_an_iio_device_obey(start):
-    try:
-        iio.import_libiio()
-    except UserError as error:
-        pytest.skip(str(error))
-    with Graph() as graph, IioRig(graph) as rig:
-        start('driver', ROS, *rig.driver_parameters(), '-p', f'link.latency_ms:={LONG_MS}')
-        graph.spin_until(lambda: age_ms(graph, 'driver', 99) > 0.9 * LONG_MS, 30, 'long ages')
-        assert float(graph.value('driver', 'buffer_ms')) == pytest.approx(LONG_MS, rel=0.2)

@@ -13,7 +13,6 @@ from graph import Graph
 from processes import NEEDS_ROS2, Started, wait_until
 import pytest
 from rcl_interfaces.srv import GetParameters
-from terminal import Terminal
 from units import NOMINAL, nominal
 
 pytestmark = NEEDS_ROS2
@@ -133,9 +132,9 @@ def test_the_launch_of_a_calibration_ends_with_it(launch, tmp_path, output, stat
 
 
 @pytest.mark.parametrize('key, words', [('q', 'same command resumes'), ('', 'wrote unit.yaml')])
-def test_a_launch_shows_the_screen_in_its_terminal(ros_env, tmp_path, key, words):
-    seen = Terminal([shutil.which('ros2'), 'launch', 'adxl_ros', 'calibrate.launch.py',
-                     'output:=unit.yaml', 'screen:=true', *SHORT], ros_env, tmp_path)
+def test_a_launch_shows_the_screen_in_its_terminal(in_terminal, tmp_path, key, words):
+    seen = in_terminal(shutil.which('ros2'), 'launch', 'adxl_ros', 'calibrate.launch.py',
+                       'output:=unit.yaml', 'screen:=true', *SHORT)
     seen.wait_for('redo', timeout_s=60)
     assert '[INFO]' not in seen.text()
     seen.press(key)

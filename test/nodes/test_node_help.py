@@ -10,9 +10,8 @@ from adxl_ros.links.support import base
 from adxl_ros.nodes.parameters import specs_of
 from adxl_ros.nodes.settings import link_specs, NODES
 from graph import Graph
-from processes import executable, run_in_process
+from processes import run_in_process
 import pytest
-from terminal import Terminal
 
 PROGRAMS = (*NODES, 'demo', 'bench')
 
@@ -58,21 +57,19 @@ def test_help_of_the_driver_has_links_sensor_and_topics(help_of: Callable) -> No
     assert re.search(r'^  imu/data_raw +sensor_msgs/Imu$', parts['publishes'], re.MULTILINE)
 
 
-def test_help_opens_no_screen_and_is_not_seen(ros_env: dict[str, str], tmp_path) -> None:
+def test_help_opens_no_screen_and_is_not_seen(in_terminal: Callable, tmp_path) -> None:
     """A terminal, where a calibration opens its screen, shows the text and no more."""
     with Graph() as graph:
         seen: set[str] = set()
-        terminal = Terminal([executable('calibration'), '--help'], ros_env, tmp_path, lines=200)
-        try:
-            def ended() -> bool:
-                seen.update(graph.node.get_node_names())
-                return terminal.popen.poll() is not None
+        terminal = in_terminal('calibration', '--help', lines=200)
 
-            graph.spin_until(ended, 60.0, 'the help text')
-            screen = terminal.wait_for('~/capture std_srvs/Trigger')
-            assert terminal.popen.returncode == 0 and terminal.restored()
-        finally:
-            terminal.close()
+        def ended() -> bool:
+            seen.update(graph.node.get_node_names())
+            return terminal.popen.poll() is not None
+
+        graph.spin_until(ended, 60.0, 'the help text')
+        screen = terminal.wait_for('~/capture std_srvs/Trigger')
+        assert terminal.popen.returncode == 0 and terminal.restored()
     assert 'usage: calibration' in screen and b'\x1b[?1049h' not in terminal.raw
     assert 'calibration' not in seen
     assert {path.name for path in tmp_path.iterdir()} <= {'ros_log'}

@@ -9,9 +9,7 @@ from xml.etree import ElementTree
 
 from ament_index_python.packages import get_package_share_directory
 from graph import Graph
-from processes import executable
 import pytest
-from terminal import Terminal
 
 POLICY = os.path.join(get_package_share_directory('adxl_ros'), 'security', 'adxl_ros.policy.xml')
 ENCLAVES = {enclave.get('path'): enclave.find('profiles/profile')
@@ -51,22 +49,19 @@ def existing(graph, node):
 
 
 @pytest.fixture
-def run_node(start, ros_env, tmp_path):
+def run_node(start, in_terminal):
     """Give a function that starts a node with all topics that one set of parameters can give."""
     pty_fds = pty.openpty()
-    terminals = []
 
     def run(node):
         if node == 'screen':  # it needs a terminal
-            terminals.append(Terminal([executable(node)], ros_env, tmp_path))
+            in_terminal(node)
             return
         port = ('--ros-args', '-p', 'link.type:=serial', '-p', 'link.channels:=x,y,supply,'
                 'temperature', '-p', f'link.port:={os.ttyname(pty_fds[1])}')
         start(node, *(port if node == 'driver' else ()))
 
     yield run
-    for terminal in terminals:
-        terminal.close()
     for fd in pty_fds:
         os.close(fd)
 

@@ -2,6 +2,7 @@
 
 """The screen in a real terminal: its contents, its keys, and its end."""
 
+from functools import partial
 import os
 from pathlib import Path
 import re
@@ -10,12 +11,10 @@ import signal
 from adxl_ros.files import parameter_file, sweep_journal
 from graph import Graph, RELIABLE
 import numpy as np
-from processes import children, executable
+from processes import children
 import pytest
 from sensor_msgs.msg import JointState
-from terminal import Terminal
 from units import drawn, nominal
-from without_extras import run_without_extras
 
 FAST = ('-p', 'use_sim_time:=true')
 PLAN = ('-p', 'sweep.planes_deg:=[45.0, 90.0]', '-p',
@@ -29,22 +28,13 @@ SIGNALS = {'term': signal.SIGTERM, 'kill': signal.SIGKILL}
 
 
 @pytest.fixture
-def terminal(ros_env, tmp_path):
-    opened = []
-    base = nominal('xyz', serial='T1')
+def terminal(in_terminal, tmp_path):
+    base = nominal('xyz', serial='T1', rate_hz=200.0)
     parameter_file.save(tmp_path / 'truth.yaml', drawn(np.random.default_rng(3), base))
     parameter_file.save(tmp_path / 'bare.yaml', base)
 
-    def begin(*options, **size):
-        opened.append(Terminal(
-            [executable('calibration'), '--ros-args', '--params-file', tmp_path / 'bare.yaml',
-             *PLAN, *options], ros_env, tmp_path, **size))
-        return opened[-1]
-
-    yield begin
-    for program in opened:
-        print(program.text())
-        program.close()
+    return partial(in_terminal, 'calibration', '--ros-args', '--params-file',
+                   tmp_path / 'bare.yaml', *PLAN)
 
 
 class Hands(Graph):
@@ -80,7 +70,7 @@ def test_the_screen_guides_an_operator_through_a_sweep(start, terminal, tmp_path
     with Hands() as hands:
         seen = terminal(*FAST, '-p', 'stage.mode:=encoder')
         seen.wait_for('press b to begin; plan full: 22 poses, about 2 min, expected tilt error',
-                      'calibration of T1 (xyz) into unit.yaml', '1000 Hz')
+                      'calibration of T1 (xyz) into unit.yaml', '200 Hz')
         seen.press('b')
         screen = seen.wait_for('turn the stage to alpha 45.0°, beta 0.0°, then capture',
                                'alpha 0.00° (-45.00°)', '0 done, 22 left', 'tilt error',
@@ -140,7 +130,7 @@ def test_the_screen_guides_an_operator_through_a_sweep(start, terminal, tmp_path
     poses = sweep_journal.accepted_poses(entries)
     assert len(poses) == 5 and sweep_journal.skipped_poses(entries) == {4}
     # The screen causes no loss: every pose has all samples.
-    assert all(e.stop_ns - e.start_ns == 1_000_000 * (e.samples - 1) for e in poses)
+    assert all(e.stop_ns - e.start_ns == 5_000_000 * (e.samples - 1) for e in poses)
 
 
 def _tilt(screen):
@@ -167,15 +157,3 @@ def test_the_terminal_is_restored(terminal, how):
     with Graph() as graph:
         graph.spin_until(lambda: seen.restored() and not Path(f'/proc/{screen}').exists(), 20,
                          'the terminal as it was')
-
-
-def test_without_prompt_toolkit_there_are_plain_lines():
-    done = run_without_extras("""
-import os
-from adxl_ros.nodes.calibration import open_screen
-sys.stdin.isatty = sys.stdout.isatty = lambda: True
-os.tcgetpgrp = lambda fd: os.getpgrp()
-print(open_screen('/calibration'))
-""")
-    assert done.stdout == ("(None, 'no screen, plain lines: it needs prompt_toolkit; pip install "
-                           "prompt_toolkit')\n")

@@ -11,7 +11,6 @@ from pathlib import Path
 import re
 
 from adxl_ros.errors import install_hint
-from processes import REPO
 from without_extras import run_without_extras
 
 IMPORT_ALL = """
@@ -41,42 +40,37 @@ def test_every_core_module_imports() -> None:
     assert result['blocked'] == []
 
 
-def test_a_link_without_its_extra_names_the_package_to_install() -> None:
+def test_what_needs_an_extra_names_the_package_to_install() -> None:
     code = """
+import os
 from adxl_ros.errors import UserError
-from adxl_ros.files import parameter_file
-from adxl_ros.links.support import base
-for name, settings in (('serial', {'port': '/dev/null'}), ('iio', {})):
-    module = base.link_module(name)
-    try:
-        module.open_link(parameter_file.load(sys.argv[1]), module.Settings(**settings))
-    except UserError as error:
-        print(error)
-"""
-    nominal = REPO / 'params' / 'adxl203.yaml'
-    done = run_without_extras(code, str(nominal))
-    assert done.returncode == 0, done.stderr
-    serial, iio = done.stdout.splitlines()
-    assert 'pip install pyserial' in serial
-    assert "pip install 'pylibiio<1' and sudo apt install libiio0" in iio
-
-
-def test_what_needs_an_extra_names_it() -> None:
-    code = """
-from adxl_ros.errors import UserError
-from adxl_ros.files import bag_messages, tables
+from adxl_ros.files import bag_messages, parameter_file, tables
+from adxl_ros.links import iio, serial
+from adxl_ros.nodes.calibration import open_screen
 from adxl_ros.report import figures, page
+sensor = parameter_file.load(parameter_file.nominal_path())
 for use in (lambda: tables.open_table('log.ulg'), lambda: tables.open_table('log.parquet'),
-            bag_messages.import_rosbags, figures.pyplot, page.check_libraries):
+            bag_messages.import_rosbags, figures.pyplot, page.check_libraries,
+            lambda: serial.open_link(sensor, serial.Settings(port='/dev/null')),
+            lambda: iio.open_link(sensor, iio.Settings())):
     try:
         use()
     except UserError as error:
         print(error)
+sys.stdin.isatty = sys.stdout.isatty = lambda: True
+os.tcgetpgrp = lambda fd: os.getpgrp()
+print(*open_screen('/calibration'))
 """
-    lines = run_without_extras(code).stdout.splitlines()
-    assert len(lines) == 5
-    for line, name in zip(lines, ('pyulog', 'pyarrow', 'rosbags>=', 'matplotlib', 'plotly')):
+    done = run_without_extras(code)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert len(lines) == 8
+    for line, name in zip(lines, ('pyulog', 'pyarrow', 'rosbags>=', 'matplotlib', 'plotly',
+                                  'pyserial', "'pylibiio<1' and sudo apt install libiio0")):
         assert re.search(f'install .*{re.escape(name)}', line), line
+    # A calibration goes on.
+    assert lines[-1] == ('None no screen, plain lines: it needs prompt_toolkit; pip install '
+                         'prompt_toolkit')
 
 
 def test_a_csv_is_fitted(tmp_path: Path) -> None:

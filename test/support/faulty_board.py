@@ -19,8 +19,8 @@ when it is done:
     reset S             stop, and begin with count and clock at 0 after S seconds
     halt S              stop for S seconds with clock and count, then continue
 
-It obeys the commands of the host unless its options have "obeys": false. With "keeps": true it
-keeps what does not fit in the terminal, however long the driver is held up; else it loses that.
+It obeys the commands of the host. With "keeps": true in its options it keeps what does not fit in
+the terminal, however long the driver is held up; else it loses that.
 """
 
 from contextlib import suppress
@@ -76,7 +76,7 @@ class FaultyBoard:
         self.informed_ns = 0
         self.unsent = b''
         self.block = BLOCK
-        self.obeys, self.keeps = options.get('obeys', True), options.get('keeps', False)
+        self.keeps = options.get('keeps', False)
         self.received = Splitter()
         self.plug()
         if options.get('banner'):
@@ -122,9 +122,8 @@ class FaultyBoard:
         for raw in self.received.split(received):
             with suppress(WireError):
                 latency_s = decode_command(raw) * 1e-6
-                if self.obeys:
-                    self.block = min(samples_within(latency_s, self.rate), BLOCK)
-                    self.informed_ns = 0
+                self.block = min(samples_within(latency_s, self.rate), BLOCK)
+                self.informed_ns = 0
 
     def send_frame(self):
         k = np.arange(self.next_sample, self.next_sample + self.block)
