@@ -5,7 +5,7 @@
 from dataclasses import replace
 
 from adxl_ros.errors import UserError
-from adxl_ros.links.support import emulated_board
+from adxl_ros.links.support import emulated_board, stamping
 from adxl_ros.links.support.stamping import ClockMap
 from adxl_ros.links.support.wire_format import AFTER_RESET, FrameCounter, SampleFrame
 from hypothesis import given, settings, strategies as st
@@ -56,6 +56,21 @@ class DelayedFrames:
         stamps = np.concatenate(self.stamps)
         assert (np.diff(stamps) > 0).all(), 'stamps never go backwards'
         return (stamps - np.concatenate(self.truth)) / MS
+
+
+def test_stamps_go_forward_although_readings_of_the_system_clock_scatter(monkeypatch):
+    """A busy host reads the first samples late, and those that follow ever earlier."""
+    rng = np.random.default_rng(2)
+    monkeypatch.setattr(stamping, '_FOLLOW_NS', 0)
+    monkeypatch.setattr(stamping, '_system_offset', lambda: (20_000, rng.integers(-9999, 9999)))
+    stamper = stamping.Stamper(ClockMap(0.0), ())
+    stamper.restart(1e6)
+    late_ns = np.concatenate([np.linspace(300, 1, 400), np.ones(600)]) * MS
+    for k, late in enumerate(late_ns.tolist()):
+        device_ns = (2 * k + np.arange(2)) * MS
+        stamper.add(stamping.Block(device_ns, np.zeros((2, 2)), {}), int(device_ns[-1] + late))
+    stamps = stamper.take(nominal()).stamp_ns
+    assert len(stamps) == 2000 and (np.diff(stamps) > 0).all()
 
 
 @pytest.mark.parametrize('ppm, min_ms, max_ms, delay_s', [

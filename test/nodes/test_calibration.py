@@ -233,8 +233,9 @@ def test_a_resting_sensor_is_calibrated_over_temperature(start, tmp_path):
     with Graph() as graph:
         start('calibration', '--ros-args', '--params-file', tmp_path / 'base.yaml', *FAST,
               *LOSSLESS, '-p', 'qos_overrides./temperature.subscription.reliability:=reliable',
-              '-p', 'qos_overrides./temperature.subscription.depth:=1000', '-p', 'mode:=thermal', '-p', 'thermal.range_c:=[10.0, 40.0]', '-p',
-              'thermal.block_s:=4.0', '-p', 'autostart:=true', '-p', 'output:=warm.yaml')
+              '-p', 'qos_overrides./temperature.subscription.depth:=1000', '-p', 'mode:=thermal',
+              '-p', 'thermal.range_c:=[10.0, 40.0]', '-p', 'thermal.block_s:=4.0', '-p',
+              'autostart:=true', '-p', 'output:=warm.yaml')
         graph.spin_until(lambda: graph.reports('calibration', 'waiting for sensor_info'), 30, 'up')
         start('driver', '--ros-args', '--params-file', tmp_path / 'base.yaml', *FAST, '-p',
               'link.type:=replay', '-p', f'link.recording:={tmp_path / "oven.csv"}', '-p',

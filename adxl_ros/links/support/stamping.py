@@ -153,19 +153,17 @@ class ClockMap:
         """
         Map device times to host times.
 
-        device_ns: device times, ns, (n,) int64, ascending; returns: host times, ns, (n,) int64,
-        ascending within the call and from call to call.
+        device_ns: (n,) int64, ascending; returns: (n,) int64, ascending, from call to call, too.
         """
         stamps = np.rint(self._line(device_ns)).astype(np.int64)
         newest_ns = self._newest_stamp_ns
         if newest_ns is not None and stamps[0] <= newest_ns:
-            # The line begins behind the stamps so far: continue from those, at a distance that
-            # the next reading of the system clock does not turn round.
-            first_ns = newest_ns + _MAX_UNCERTAINTY_NS + 1
-            self._line_host_ns += first_ns - int(stamps[0])
+            # Continue from the stamps so far, further than a reading of the system clock may err.
+            newest_ns += _MAX_UNCERTAINTY_NS
+            self._line_host_ns += newest_ns + 1 - int(stamps[0])
             self._steer(int(device_ns[0]), _HORIZON_S)
             stamps = np.maximum(np.rint(self._line(device_ns)).astype(np.int64),
-                                first_ns + np.arange(len(stamps)))
+                                newest_ns + 1 + np.arange(len(stamps)))
         self._newest_stamp_ns = int(stamps[-1])
         return stamps
 
