@@ -11,7 +11,8 @@ from sensor_msgs.msg import Imu, JointState
 
 ROS = '--ros-args'
 SIM_TIME = (ROS, '-p', 'use_sim_time:=true')
-QUICK = ('-p', 'slew_rate_rad_s:=2.0')
+QUICK = ('-p', 'slew_rate_rad_s:=2.0', '-p',
+         'qos_overrides./stage/true_joint_states.publisher.depth:=10000')
 STEP = np.radians(5 / 60)
 IDEAL = ('-p', 'sensor.noise_density_g_per_rthz:=[0.0,0.0,0.0]', '-p', 'sensor.axes:=xyz', '-p',
          'sensor.nominal_zero_g_v:=[2.5,2.5,2.5]', '-p',

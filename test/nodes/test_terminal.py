@@ -117,7 +117,7 @@ def test_the_screen_guides_an_operator_through_a_sweep(start, terminal, tmp_path
         seen.wait_for('16 poses are open; press f again')
         assert not (tmp_path / 'unit.yaml.previous').exists()
         seen.press('f')
-        seen.wait_for('wrote unit.yaml', 'NOT SHOWN  no pose was kept out of the fit')
+        seen.wait_for('wrote unit.yaml', 'NOT SHOWN  no pose was kept out of the fit', 'b  begin')
         seen.press('b')
         seen.wait_for('unit.yaml.journal holds 5 poses of an interrupted calibration', 'y  go on')
         seen.press('q')
