@@ -13,8 +13,9 @@ import time
 from adxl_ros.errors import UserError
 from adxl_ros.files import sweep_journal
 from adxl_ros.nodes import demo, jobs
-from processes import children, REPO
+from processes import children, executable, REPO
 import pytest
+from terminal import Terminal
 
 
 def test_steps_without_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -43,15 +44,20 @@ def suspend_calibration(demo_pid: int) -> None:
     os.kill(pid, signal.SIGCONT)
 
 
-def test_live(in_terminal, tmp_path) -> None:
+def test_live(ros_env, tmp_path) -> None:
     """No line wraps; no sample is lost although the calibration stops for 20 s of sensor time."""
-    terminal = in_terminal('demo', '--speed', '40', lines=60, columns=80)
-    terminal.wait_for('1/3 sweep', 'of 146 poses', '━', timeout_s=60.0)
-    suspend_calibration(terminal.popen.pid)
-    screen = terminal.wait_for('Next  your own sensor:', timeout_s=600.0)
-    assert terminal.wait(30.0) == 0 and terminal.restored()
+    terminal = Terminal([executable('demo'), '--speed', '40'], ros_env, tmp_path, lines=60,
+                        columns=80)
+    try:
+        terminal.wait_for('1/3 sweep', 'of 146 poses', '━', timeout_s=60.0)
+        suspend_calibration(terminal.popen.pid)
+        screen = terminal.wait_for('Next  your own sensor:', timeout_s=600.0)
+        assert terminal.wait(30.0) == 0
+        restored = terminal.restored()
+    finally:
+        terminal.close()
     lines = screen.splitlines()
-    assert max(map(len, lines)) <= 79
+    assert max(map(len, lines)) <= 79 and restored
     assert re.search(r'coefficients are known   \(\d', lines[0])
     assert (REPO / demo.NEXT_PAGE).is_file()
     assert re.search(r'1/3 sweep +146 of 146 poses +━+ +100 %', screen)

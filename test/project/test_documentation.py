@@ -10,7 +10,6 @@ import shlex
 import subprocess
 
 from adxl_ros.files import parameter_file
-from adxl_ros.nodes.settings import NODES
 from processes import REPO, TOOLS
 import pytest
 import rclpy
@@ -22,7 +21,8 @@ BY_HAND = [page for page in PAGES if 'measurements' not in page.parts
            and 'Made by `make reference`' not in page.read_text('utf-8')]
 MOST_WORDS = 24_000
 """Words of the pages by hand: what they have more, somebody has to read and to keep true."""
-EXECUTABLES = (*TOOLS, *NODES, 'demo', 'bench')
+EXECUTABLES = (*TOOLS, 'driver', 'compensation', 'calibration', 'stage', 'monitor', 'investigate',
+               'screen', 'demo', 'bench')
 OPTIONS_OF_ALL = {'--help', '--version', '--ros-args'}
 
 

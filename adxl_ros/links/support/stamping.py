@@ -150,11 +150,7 @@ class ClockMap:
         return self.settled and not self._late
 
     def host_ns(self, device_ns: np.ndarray) -> np.ndarray:
-        """
-        Map device times to host times.
-
-        device_ns: (n,) int64, ascending; returns: (n,) int64, ascending, from call to call, too.
-        """
+        """Map ascending device times, ns, (n,), to host times that ascend from call to call."""
         stamps = np.rint(self._line(device_ns)).astype(np.int64)
         newest_ns = self._newest_stamp_ns
         if newest_ns is not None and stamps[0] <= newest_ns:
