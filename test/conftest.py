@@ -18,6 +18,7 @@ from pathlib import Path
 import shutil
 import signal
 import subprocess
+import sys
 
 from domain import BY_UDP, own_domain
 from hypothesis import settings
@@ -142,11 +143,12 @@ def refusal(ros_env: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     def run(name: str, *args: object, status: int = 1) -> str:
         monkeypatch.setattr('adxl_ros.nodes.run_node._spin', started)
-        monkeypatch.setattr('adxl_ros.nodes.run_node._wake_in_time', lambda: None)
+        interval_s = sys.getswitchinterval()
         try:
             done = run_in_process(name, *args, cwd=tmp_path)
         finally:
             rclpy.try_shutdown()
+            sys.setswitchinterval(interval_s)
         # What C++ logs goes by the file descriptor.
         output = done.stderr + ''.join(capfd.readouterr())
         assert (done.returncode, done.stdout) == (status, '') and 'Traceback' not in output, output

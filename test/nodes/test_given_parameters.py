@@ -6,7 +6,6 @@ from pathlib import Path
 
 from adxl_ros.files import parameter_file
 from adxl_ros.nodes.parameters import has_section, sensor_keys, specs_of
-from adxl_ros.nodes.rclpy_internals import given_parameters
 from adxl_ros.nodes.settings import NODES
 from diagnostic_msgs.msg import DiagnosticStatus
 from graph import Graph
@@ -130,8 +129,8 @@ def test_the_sections_of_a_file_are_those_of_ros(ros_env, tmp_path, section, nam
     context = Context()
     rclpy.init(args=[ROS, '--params-file', path, '-r', f'__ns:={namespace}'], context=context)
     node = rclpy.create_node('driver', context=context, start_parameter_services=False)
-    assert has_section(path, node.get_fully_qualified_name()) \
-        == ('frame_id' in dict(given_parameters(node)))
+    frame = node.declare_parameter('frame_id', 'other').value
+    assert has_section(path, node.get_fully_qualified_name()) == (frame == 'case')
     node.destroy_node()
     context.shutdown()
 
