@@ -22,9 +22,8 @@ from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.report import page as html_page
 from adxl_ros.report.quantities import column_unit, duration, short_time
 from adxl_ros.report.screen import COLUMNS, row, wrapped
-from adxl_ros.signals.findings import Ability, check_recording, Findings
+from adxl_ros.signals.findings import Ability, check_recording, Findings, RecordingContents
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
-from adxl_ros.signals.recording_contents import RecordingContents
 from adxl_ros.tools import command_line as cli
 
 _NAME_COLUMNS = 20
