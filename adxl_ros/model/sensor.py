@@ -16,14 +16,11 @@ import numpy as np
 
 MODELS = ('nominal', 'linear', 'physical', 'full', 'gravity')
 """Names of the models that can be fitted."""
-
 MARGIN_K = 2.0
 """Distance from the temperatures of the poses that counts as inside, K; chosen: by the datasheet
 it is 0.2 mg, below the noise of a sample. No thermometer is at the element."""
-
 STRETCH = 1.1
 """Factor of the poses' forces at which h_max is taken, too; chosen: see `Envelope`."""
-
 MARGIN_MPS2 = 2.0
 """Distance from the forces of the poses that counts as inside, m/s²; chosen: planes from 30° on
 leave 1.3 m/s² to level, and nearby forces share one result."""
@@ -281,24 +278,8 @@ def with_axes(sensor: Sensor, axes: str) -> Sensor:
 
     Axes are removed from the end, or added with the values that all axes share.
 
-    Parameters
-    ----------
-    sensor
-        A sensor without effects, unless it has these axes.
-    axes
-        Axes of the stream: x, xy or xyz.
-
-    Returns
-    -------
-    Sensor
-        The sensor with the axes.
-
-    Raises
-    ------
-    UserError
-        The sensor is calibrated for other axes, or its axes differ, so that the values of
-        further axes are unknown.
-
+    sensor: A sensor without effects, unless it has these axes; axes: axes of the stream: x, xy or
+    xyz; returns: the sensor with the axes.
     """
     if axes == sensor.axes:
         return sensor
@@ -323,18 +304,8 @@ def to_volts(accel_mps2: np.ndarray, sensor: Sensor) -> np.ndarray:
     """
     Undo the nominal conversion, which is affine and exact.
 
-    Parameters
-    ----------
-    accel_mps2
-        Nominally converted specific force, m/s², (n, m).
-    sensor
-        The sensor with its nominal zero-g and scale factor.
-
-    Returns
-    -------
-    ndarray
-        Volts of the ADC, V, (n, m).
-
+    accel_mps2: nominally converted specific force, m/s², (n, m); sensor: the sensor with its
+    nominal zero-g and scale factor; returns: volts of the ADC, V, (n, m).
     """
     return sensor.nominal_zero_g_v + accel_mps2 / G0_MPS2 * sensor.nominal_scale_v_per_g
 
@@ -343,18 +314,8 @@ def to_nominal_mps2(volts: np.ndarray, sensor: Sensor) -> np.ndarray:
     """
     Convert volts by the nominal zero-g and scale factor (equation 3).
 
-    Parameters
-    ----------
-    volts
-        Volts of the ADC, V, (n, m).
-    sensor
-        The sensor with its nominal zero-g and scale factor.
-
-    Returns
-    -------
-    ndarray
-        Nominally converted specific force, m/s², (n, m).
-
+    volts: volts of the ADC, V, (n, m); sensor: the sensor with its nominal zero-g and scale
+    factor; returns: nominally converted specific force, m/s², (n, m).
     """
     return (volts - sensor.nominal_zero_g_v) / sensor.nominal_scale_v_per_g * G0_MPS2
 

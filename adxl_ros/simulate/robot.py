@@ -61,20 +61,8 @@ class Robot:
         """
         Read a URDF.
 
-        Parameters
-        ----------
-        urdf
-            The file.
-        frame
-            Name of the link, or frame, that carries the sensor.
-        moves
-            Whether the base moves in the world.
-
-        Raises
-        ------
-        UserError
-            The file is no URDF, has no such frame, or pinocchio is not installed.
-
+        urdf: the file; frame: name of the link, or frame, that carries the sensor; moves: whether
+        the base moves in the world.
         """
         try:
             import pinocchio
@@ -112,21 +100,10 @@ class Robot:
         """
         Return the motion of the frame.
 
-        Parameters
-        ----------
-        joints
-            Position, rate and acceleration of the joints, rad or m and s, (3, n, j).
-        base
-            The same of the pose of the base, x, y, z and quaternion x, y, z, w, (3, n, 7).
-        gravity_mps2
-            Local gravity, m/s².
-
-        Returns
-        -------
-        ndarray
-            In the frame: specific force, m/s², angular rate, rad/s, angular acceleration, rad/s²,
-            and the unit vector upward, (4, n, 3).
-
+        joints: position, rate and acceleration of the joints, rad or m and s, (3, n, j); base: the
+        same of the pose of the base, x, y, z and quaternion x, y, z, w, (3, n, 7); gravity_mps2:
+        local gravity, m/s²; returns: in the frame: specific force, m/s², angular rate, rad/s,
+        angular acceleration, rad/s², and the unit vector upward, (4, n, 3).
         """
         pin, model, data = self._pin, self._model, self._data
         q, v, a = (np.zeros((joints.shape[1], size)) for size in (model.nq, model.nv, model.nv))
@@ -176,22 +153,8 @@ class RobotPath(ForcePath):
         """
         Smooth the readings, and run the kinematics.
 
-        Parameters
-        ----------
-        robot
-            The kinematics.
-        readings
-            Readings of its joints, and of its base.
-        gravity_mps2
-            Local gravity, m/s².
-        since_s
-            Time from which the force is needed, s.
-
-        Raises
-        ------
-        UserError
-            A joint of the chain has no readings, or too few.
-
+        robot: the kinematics; readings: readings of its joints, and of its base; gravity_mps2:
+        local gravity, m/s²; since_s: time from which the force is needed, s.
         """
         self._robot, self._gravity_mps2 = robot, gravity_mps2
         self._tracks = _tracks(robot, readings)
@@ -384,29 +347,9 @@ def robot_path(urdf: str | os.PathLike, frame: str, path: str, epoch_ns: int,
     """
     Return the specific force in a frame of a robot, by a recording of its joints.
 
-    Parameters
-    ----------
-    urdf, frame
-        The robot, and the frame that carries the sensor.
-    path
-        The recording; see `robot_readings.read`.
-    epoch_ns
-        Stamp of time 0, ns.
-    gravity_mps2
-        Local gravity, m/s².
-    topic
-        Topic of the joints; empty for the only one.
-
-    Returns
-    -------
-    RobotPath
-        The force, with its errors.
-
-    Raises
-    ------
-    UserError
-        The URDF, the frame, a joint or the recording is wrong.
-
+    urdf, frame: the robot, and the frame that carries the sensor; path: the recording; see
+    `robot_readings.read`; epoch_ns: stamp of time 0, ns; gravity_mps2: local gravity, m/s²; topic:
+    topic of the joints; empty for the only one; returns: the force, with its errors.
     """
     robot = Robot(urdf, frame)
     readings = robot_readings.read(path, epoch_ns, topic, robot.root, bool(robot.joints))

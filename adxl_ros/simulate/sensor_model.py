@@ -64,24 +64,9 @@ def unit_draws(sensor: Sensor, units: str | PathLike | Population) -> UnitDraws:
     """
     Return how units differ.
 
-    Parameters
-    ----------
-    sensor
-        The unit, or the nominal sensor.
-    units
-        'datasheet' for the tolerances of the parameter file, 'calibration' for the covariance of
-        the unit's own coefficients, else the population.yaml of a fleet.
-
-    Returns
-    -------
-    UnitDraws
-        The distribution. Only effects that are functions of one sample are in it.
-
-    Raises
-    ------
-    UserError
-        The parameter file states no tolerance or covariance, or the population cannot be read.
-
+    sensor: the unit, or the nominal sensor; units: 'datasheet' for the tolerances of the parameter
+    file, 'calibration' for the covariance of the unit's own coefficients, else the population.yaml
+    of a fleet; returns: the distribution. Only effects that are functions of one sample are in it.
     """
     limit: float | np.ndarray
     if units == 'datasheet':

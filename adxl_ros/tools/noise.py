@@ -30,19 +30,15 @@ import yaml
 
 MICRO_G = 1e6 / G0_MPS2
 """1 m/s² in µg."""
-
 _LARGEST_STD_MPS2 = 0.3
 """Noise of a sample from which a sensor vibrates, m/s². Chosen: three times that of a low-cost
 IMU at 1 kHz."""
-
 _LARGEST_FILLED = 0.01
 """Share of missing samples from which white noise changes visibly. Chosen."""
-
 _NAMES = ('white noise N', 'bias instability B', 'random walk K')
 """Names of the terms."""
 _UNITS = {'white': 'm/s^2/sqrt(Hz)', 'instability': 'm/s^2', 'walk': 'm/s^2/sqrt(s)'}
 """Keys and units of the terms in JSON."""
-
 _YAML_COLUMNS = 60
 """Columns after which a list is wrapped; its last number may be beyond."""
 

@@ -31,7 +31,6 @@ import numpy as np
 
 _SHORTEST_S = 1e-9
 """Shorter durations count as this in the progress, s, so that one sample divides nothing by 0."""
-
 _EXAMPLES = {
     'a calibration sweep of the nominal sensor': 'sweep -o sweep.csv',
     'two effects, one of typical size and one with a value':
