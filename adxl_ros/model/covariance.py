@@ -129,7 +129,7 @@ def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = 
         largest = np.zeros(count)
         if envelope.leverage:
             # The range is that of the nominal surroundings.
-            largest = force_leverage(force) if follows else _trace(
+            largest = force_leverage(force) if follows else np.trace(
                 _propagated(tangent.back, by_coefficients))
         if envelope.temperature_c or envelope.leverage:
             extrapolation = envelope.extrapolation(force, largest if envelope.leverage else 0.0)
@@ -177,11 +177,6 @@ def _propagated(back: list[Components], volts: np.ndarray) -> np.ndarray:
     return covariance
 
 
-def _trace(covariance: np.ndarray) -> np.ndarray:
-    """Return the trace of covariances, (m, m, n), as (n,)."""
-    return sum(covariance[d, d] for d in range(len(covariance)))
-
-
 def leverage(sensor: Sensor) -> Callable[[Components], np.ndarray]:
     """
     Prepare the leverage of forces: the trace of their covariance by the coefficients alone.
@@ -197,7 +192,7 @@ def leverage(sensor: Sensor) -> Callable[[Components], np.ndarray]:
             return np.zeros(np.shape(force[0]) or 1)
         variance = _coefficient_variance(by_coefficient(force), sensor.covariance)
         tangent = signal_chain.tangent(respond, sensor.axes, force)
-        return _trace(_propagated(tangent.back, variance))
+        return np.trace(_propagated(tangent.back, variance))
 
     return force_leverage
 

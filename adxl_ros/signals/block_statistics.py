@@ -181,36 +181,19 @@ _TINY_VARIANCE = 1e-300
 """Lower bound of a variance, in squares of any unit, so that its logarithm is finite."""
 
 
-@dataclass(frozen=True)
 class Spans:
     """Lengths of windows in blocks, for a sample rate."""
 
-    rate_hz: float
-
-    @property
-    def size(self) -> int:
-        """Return the number of samples in a block."""
-        return max(1, round(BLOCK_S * self.rate_hz))
-
-    @property
-    def block_s(self) -> float:
-        """Return the length of a block, s."""
-        return self.size / self.rate_hz
-
-    @property
-    def window(self) -> int:
-        """Return the blocks of the window of a variance; odd, so that one is in the middle."""
-        return max(round(_WINDOW_S / self.block_s), -(-_WINDOW_SAMPLES // self.size)) // 2 * 2 + 1
-
-    @property
-    def half(self) -> int:
-        """Return the blocks of the shortest halves whose means are compared."""
-        return max(round(_HALF_S / self.block_s), 4)
-
-    @property
-    def longest(self) -> int:
-        """Return the number of blocks in both longest halves together."""
-        return self.half << DRIFT_OCTAVES
+    def __init__(self, rate_hz: float) -> None:
+        self.rate_hz = rate_hz
+        self.size = max(1, round(BLOCK_S * rate_hz))  # Samples of a block
+        self.block_s = self.size / rate_hz  # Length of a block, s
+        # Blocks of the window of a variance; odd, so that one is in the middle
+        self.window = max(round(_WINDOW_S / self.block_s),
+                          -(-_WINDOW_SAMPLES // self.size)) // 2 * 2 + 1
+        # Blocks of the shortest halves whose means are compared, and of both longest halves
+        self.half = max(round(_HALF_S / self.block_s), 4)
+        self.longest = self.half << DRIFT_OCTAVES
 
 
 def quiet_variance(blocks: Blocks, windows: np.ndarray,
@@ -273,7 +256,7 @@ def undithered(step: np.ndarray, sigma: np.ndarray) -> np.ndarray:
 
 
 def window_variance(blocks: Blocks, spans: Spans) -> np.ndarray:
-    """Return the variance of the samples in every window, (k − window + 1, m); inf across a gap."""
+    """Return the variance of the samples in each window, (k − window + 1, m); inf across a gap."""
     window = spans.window
     if len(blocks) < window:
         return np.empty((0, blocks.mean.shape[1]))

@@ -245,17 +245,17 @@ def _interval(groups: _Groups, theta: np.ndarray, likelihood: float, term: int) 
 
     scale = float(np.min(groups.shapes @ theta / groups.shapes[:, term]))
     best = float(theta[term])
-    low = 0.0
     begin = np.log(best if best > 0 else scale * _SMALLEST)
-    if best > 0 and 2 * (likelihood - _fit(groups, term, 0.0)[1]) > _DROP:
-        bottom = begin - 1.0
-        while excess(bottom) < 0:
-            bottom -= 1.0
-        low = float(np.exp(scipy.optimize.brentq(excess, bottom, begin, xtol=1e-6)))
-    top = begin + 1.0
-    while excess(top) < 0:
-        top += 1.0
-    high = float(np.exp(scipy.optimize.brentq(excess, top - 1.0, top, xtol=1e-6)))
+
+    def end(step: float) -> float:
+        """Return the end of the interval that lies in the direction of a step."""
+        beyond = begin + step
+        while excess(beyond) < 0:
+            beyond += step
+        return float(np.exp(scipy.optimize.brentq(excess, beyond - step, beyond, xtol=1e-6)))
+
+    is_seen = best > 0 and 2 * (likelihood - _fit(groups, term, 0.0)[1]) > _DROP
+    low, high = end(-1.0) if is_seen else 0.0, end(1.0)
     return Estimate(*(float(np.sqrt(square)) for square in (best, low, high)))
 
 
@@ -320,7 +320,8 @@ class AxisNoise:
     @property
     def sample_white(self) -> float:
         """N of the samples with their rounding, or its upper limit, m/s²/√Hz."""
-        return float(np.hypot(_likely(self.fit.white), self.rounding))
+        white = self.fit.white
+        return float(np.hypot(white.value if white.is_seen else white.high, self.rounding))
 
 
 @dataclass(frozen=True)
@@ -386,10 +387,6 @@ def density_g_per_rthz(noise: AxisNoise) -> float | None:
     """Return the density of white noise as datasheets state it, g/√Hz; None if it is not seen."""
     white = noise.fit.white
     return ONE_SIDED * white.value / G0_MPS2 if white.is_seen else None
-
-
-def _likely(estimate: Estimate) -> float:
-    return estimate.value if estimate.is_seen else estimate.high
 
 
 def with_noise(sensor: Sensor, noises: list[AxisNoise]) -> Sensor:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass
 from itertools import pairwise
 from types import MappingProxyType
@@ -357,24 +358,28 @@ class ForcePath:
     modes: Mapping[str, np.ndarray] = MappingProxyType({})
     """Force at `time_s` per unit of each error of a robot, (n, 3)."""
 
-    def rotation(self, time_s: np.ndarray) -> tuple[Components, Components] | None:
-        """Return angular rate, rad/s, and acceleration, rad/s², in the frame; None if unknown."""
-        return None
-
-    def __init__(self, time_s: np.ndarray, force_mps2: np.ndarray) -> None:
+    def __init__(self, time_s: np.ndarray, columns: np.ndarray) -> None:
         """
         Interpolate samples.
 
-        time_s: ascending times, s, (n,); force_mps2: specific force in the case frame, m/s², (n,
-        3).
+        time_s: ascending times, s, (n,); columns: specific force in the case frame, m/s², in the
+        first three of them, (n, k).
         """
         self.time_s = time_s  # Times of the samples, s, (n,)
-        self._force_mps2 = force_mps2
-        self._spline = scipy.interpolate.CubicSpline(time_s, force_mps2)
+        self._columns = columns
+        self._spline = scipy.interpolate.CubicSpline(time_s, columns)
+
+    def at(self, time_s: np.ndarray) -> Components:
+        """Return all columns at times, s, (n,); constant outside."""
+        return list(self._spline(np.clip(time_s, self.time_s[0], self.time_s[-1])).T)
 
     def __call__(self, time_s: np.ndarray) -> Components:
-        """Return the three components at times, s, (n,), m/s²; constant outside."""
-        return list(self._spline(np.clip(time_s, self.time_s[0], self.time_s[-1])).T)
+        """Return the three components of the force at times, s, (n,), m/s²; constant outside."""
+        return self.at(time_s)[:3]
+
+    def rotation(self, time_s: np.ndarray) -> tuple[Components, Components] | None:
+        """Return angular rate, rad/s, and acceleration, rad/s², in the frame; None if unknown."""
+        return None
 
     def errors(self, time_s: np.ndarray, component: int) -> PathErrors:
         """Return the errors of a component at times, s, (n,), m/s²: none are known."""
@@ -382,4 +387,6 @@ class ForcePath:
 
     def shifted(self, later_s: float) -> ForcePath:
         """Return the same force at later times, s."""
-        return ForcePath(self.time_s + later_s, self._force_mps2)
+        later = copy(self)
+        ForcePath.__init__(later, self.time_s + later_s, self._columns)
+        return later

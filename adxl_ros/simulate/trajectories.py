@@ -131,16 +131,12 @@ class Script:
         run_up = rate * RUN_UP_S / 2
         constant = distance - 2 * run_up
         self._knot(0.0, 0.0)
-        self._turn(joint, run_up, RUN_UP_S, rate)
-        self._turn(joint, constant, abs(constant) / speed, rate)
-        self._turn(joint, run_up, RUN_UP_S, 0.0)
-
-    def _turn(self, joint: str, angle: float, seconds: float, rate: float) -> None:
-        """Turn a joint by an angle, rad, within a time, s, up to a velocity, rad/s."""
-        setattr(self, joint, getattr(self, joint) + angle)
-        self.now += seconds
-        rates = {'alpha': 0.0, 'beta': 0.0, joint: rate}
-        self._knot(rates['alpha'], rates['beta'])
+        for angle, seconds, end_rate in ((run_up, RUN_UP_S, rate),
+                                         (constant, abs(constant) / speed, rate),
+                                         (run_up, RUN_UP_S, 0.0)):
+            setattr(self, joint, getattr(self, joint) + angle)
+            self.now += seconds
+            self._knot(**{'alpha_rate': 0.0, 'beta_rate': 0.0, f'{joint}_rate': end_rate})
 
     def joints(self) -> tuple[Knots, Knots]:
         """Return the paths of alpha and beta."""
