@@ -182,8 +182,8 @@ def fit_noise(means: np.ndarray, step_s: float, variances: np.ndarray | None = N
     highest = _highest(groups, len(means))
     used = groups.below(highest)
     theta, likelihood = _fit(used)
-    return NoiseFit(*(_interval(used, theta, likelihood, term) for term in range(3)), highest,
-                    highest / (2 * len(means) * step_s))
+    white, instability, walk = (_interval(used, theta, likelihood, term) for term in range(3))
+    return NoiseFit(white, instability, walk, highest, highest / (2 * len(means) * step_s))
 
 
 def _grouped(power: np.ndarray, variances: np.ndarray) -> _Groups:

@@ -91,7 +91,7 @@ class Robot:
         self._model = pinocchio.buildReducedModel(model, fixed, pinocchio.neutral(model))
         self._data = self._model.createData()
         self._frame = self._model.getFrameId(frame)
-        self.frame, self.urdf, self._moves = frame, str(urdf), moves
+        self.frame, self.urdf = frame, str(urdf)
         # Name of the link that the base is
         self.root = model.frames[1 + moves].name if model.nframes > 1 else ''
 
