@@ -243,7 +243,7 @@ def noise(options: argparse.Namespace) -> int:
                 show(block.done, 'read')
 
         result = noise_parameters.recording_noise(blocks, options.params,
-                                            lambda done: show(done, 'fit'))
+                                                  lambda done: show(done, 'fit'))
     rest = result.rest
     cli.report_reading('noise', *newest)
     files: list[Path] = []
