@@ -44,8 +44,8 @@ from adxl_ros.fleet.row import (
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import get, parameter_of, Sensor
 from adxl_ros.process import package_version
-from adxl_ros.signals.axis_noise import recording_noise
 from adxl_ros.signals.findings import BLOCK_ROWS, check_recording, Findings
+from adxl_ros.signals.noise_parameters import recording_noise
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
 import numpy as np
 

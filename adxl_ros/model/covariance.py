@@ -31,13 +31,10 @@ import numpy as np
 
 UNMEASURED_VARIANCE = 1e6
 """Variance of an axis that the sensor does not have, (m/s²)²; chosen: far above any force."""
-
 _FORCE2_FLOOR = 1e-30
 """Square of a negligible force, (m/s²)²; chosen: below any noise, it keeps divisors from 0."""
-
 _OVERHANG_MPS2 = -0.5
 """Lowest z of a sensor that is stated to be upright, m/s²; chosen: it may lean over by 3°."""
-
 _ROOT_MEAN = 1.25
 """Factor of the term that keeps the divisor of derived z from 0 where the in-plane force is g.
 Derived: there z² = 2·σ·g·n for normal noise n > 0, and the variance of z is 0.8·σ·g = σ·g/1.25."""
@@ -132,7 +129,7 @@ def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = 
         largest = np.zeros(count)
         if envelope.leverage:
             # The range is that of the nominal surroundings.
-            largest = force_leverage(force) if follows else _trace(
+            largest = force_leverage(force) if follows else np.trace(
                 _propagated(tangent.back, by_coefficients))
         if envelope.temperature_c or envelope.leverage:
             extrapolation = envelope.extrapolation(force, largest if envelope.leverage else 0.0)
@@ -180,11 +177,6 @@ def _propagated(back: list[Components], volts: np.ndarray) -> np.ndarray:
     return covariance
 
 
-def _trace(covariance: np.ndarray) -> np.ndarray:
-    """Return the trace of covariances, (m, m, n), as (n,)."""
-    return sum(covariance[d, d] for d in range(len(covariance)))
-
-
 def leverage(sensor: Sensor) -> Callable[[Components], np.ndarray]:
     """
     Prepare the leverage of forces: the trace of their covariance by the coefficients alone.
@@ -200,7 +192,7 @@ def leverage(sensor: Sensor) -> Callable[[Components], np.ndarray]:
             return np.zeros(np.shape(force[0]) or 1)
         variance = _coefficient_variance(by_coefficient(force), sensor.covariance)
         tangent = signal_chain.tangent(respond, sensor.axes, force)
-        return _trace(_propagated(tangent.back, variance))
+        return np.trace(_propagated(tangent.back, variance))
 
     return force_leverage
 
@@ -216,22 +208,10 @@ def derived_z_covariance(force: Components, measured: tuple[Value, Value, Value]
     z − 2·divisor/(1 + s²). Where that is upright, too, either may be true, so that half the
     square of their distance is added.
 
-    Parameters
-    ----------
-    force
-        Specific force, m/s², three components.
-    measured
-        Variances xx, xy and yy of the force given z, (m/s²)².
-    slope
-        Derivative s of the estimates of x and y by z; see `signal_chain.Tangent`.
-    maths
-        Functions for arrays or for floats.
-
-    Returns
-    -------
-    tuple
-        xx, xy, xz, yy, yz and zz, (m/s²)².
-
+    force: specific force, m/s², three components; measured: variances xx, xy and yy of the force
+    given z, (m/s²)²; slope: derivative s of the estimates of x and y by z; see
+    `signal_chain.Tangent`; maths: functions for arrays or for floats; returns: xx, xy, xz, yy, yz
+    and zz, (m/s²)².
     """
     x, y, z = force
     xx, xy, yy = measured
@@ -263,13 +243,9 @@ def coefficient_tangent(sensor: Sensor) -> Callable[..., np.ndarray]:
     They are central differences. Each begins at the place of its effect: up to there, the chain
     is the same for all. Coefficients of one parameter that act on their own axes share one.
 
-    Returns
-    -------
-    callable
-        Maps specific force, m/s², three components (n,) or floats, and an `Environment` (the
-        nominal one unless given) to derivatives by axis and coefficient, V by the unit of the
-        coefficient, (m, k, n).
-
+    returns: maps specific force, m/s², three components (n,) or floats, and an `Environment` (the
+    nominal one unless given) to derivatives by axis and coefficient, V by the unit of the
+    coefficient, (m, k, n).
     """
     chain = static_chain(sensor)
     names = sensor.covariance_names

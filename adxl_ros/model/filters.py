@@ -12,13 +12,10 @@ import numpy as np
 
 ORDER = 6
 """Number of newest samples that the polynomial interpolates; chosen: the error is of order 6."""
-
 _QUADRATURE_NODES = 24
 """Nodes of the Gauss-Legendre quadrature; chosen: exact to rounding for |z| < `_STIFF`."""
-
 _FEW_INPUTS = 512
 """Most inputs that are filtered one by one; chosen: it takes 50 µs, a block of 50 ms at 10 kHz."""
-
 _STIFF = 8.0
 """|z| from which the weights are integrated by parts; chosen: that is stable for large z only."""
 
@@ -29,22 +26,9 @@ def low_pass(x: np.ndarray, tau_s: float, dt_s: float, memory: dict[str, Any]) -
 
     Before the first block the filter is at rest at its first input.
 
-    Parameters
-    ----------
-    x
-        Input, (n,).
-    tau_s
-        Time constant τ, s; 0 passes the input on.
-    dt_s
-        Time between samples, s.
-    memory
-        State that the filter keeps from one block to the next; empty before the first.
-
-    Returns
-    -------
-    ndarray
-        Output, (n,), in the unit of the input.
-
+    x: input, (n,); tau_s: time constant τ, s; 0 passes the input on; dt_s: time between samples,
+    s; memory: state that the filter keeps from one block to the next; empty before the first;
+    returns: output, (n,), in the unit of the input.
     """
     if not tau_s:
         return x
@@ -58,24 +42,10 @@ def resonator(x: np.ndarray, frequency_hz: float, damping_ratio: float, dt_s: fl
 
     Before the first block the filter is at rest at its first input.
 
-    Parameters
-    ----------
-    x
-        Input, (n,).
-    frequency_hz
-        Undamped natural frequency ω/2π, Hz.
-    damping_ratio
-        ζ, damping divided by the critical one.
-    dt_s
-        Time between samples, s.
-    memory
-        State that the filter keeps from one block to the next; empty before the first.
-
-    Returns
-    -------
-    ndarray
-        Output, (n,), in the unit of the input.
-
+    x: input, (n,); frequency_hz: undamped natural frequency ω/2π, Hz; damping_ratio: ζ, damping
+    divided by the critical one; dt_s: time between samples, s; memory: state that the filter keeps
+    from one block to the next; empty before the first; returns: output, (n,), in the unit of the
+    input.
     """
     omega = 2 * np.pi * frequency_hz
     damped = omega * np.sqrt(1 - damping_ratio ** 2)
@@ -91,24 +61,10 @@ def pole(x: np.ndarray, rate: complex, dt_s: float, memory: dict[str, Any]) -> n
     Adams-Moulton method (Hochbruck and Ostermann 2010, section 2.6). The polynomial uses past
     samples only, so that the filter does not look ahead.
 
-    Parameters
-    ----------
-    x
-        Input, (n,), or (n, k) for k independent filters.
-    rate
-        The pole, 1/s; its real part is negative.
-    dt_s
-        Time between samples, s.
-    memory
-        Keeps the newest inputs and the last w. It is empty before the first block, when w is at
-        rest at the first input.
-
-    Returns
-    -------
-    ndarray
-        w at the samples, in the shape of the input and its unit times s; complex for a complex
-        rate.
-
+    x: input, (n,), or (n, k) for k independent filters; rate: the pole, 1/s; its real part is
+    negative; dt_s: time between samples, s; memory: keeps the newest inputs and the last w. It is
+    empty before the first block, when w is at rest at the first input; returns: w at the samples,
+    in the shape of the input and its unit times s; complex for a complex rate.
     """
     if not len(x):
         return x

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -74,24 +73,20 @@ def gauss_newton(linearise: Callable[[np.ndarray], State], start: np.ndarray,
         halvings = min(max_halvings, max_evaluations - evaluations - 1)
         if halvings < 0:
             return Solution(present, False, evaluations)
-        trial, accepted, trials = halve_until(
-            partial(_linearise_share, linearise, present),
-            partial(_lowers_cost, present.cost + cost_tolerance), halvings)
+
+        def attempt(share: float, origin: State = present) -> State:
+            return linearise(origin.values + share * origin.step)
+
+        def lowers_cost(trial: State, highest: float = present.cost + cost_tolerance) -> bool:
+            # A cost of NaN passes, so that a caller sees it.
+            return not trial.cost > highest
+
+        trial, accepted, trials = halve_until(attempt, lowers_cost, halvings)
         evaluations += trials
         if not accepted:
             return Solution(present, False, evaluations)
         previous, present = present, trial
     return Solution(present, True, evaluations)
-
-
-def _linearise_share(linearise: Callable[[np.ndarray], State], origin: State, share: float
-                     ) -> State:
-    return linearise(origin.values + share * origin.step)
-
-
-def _lowers_cost(highest_cost: float, trial: Iterate) -> bool:
-    # A cost of NaN passes, so that a caller sees it instead of a step that is never taken.
-    return not trial.cost > highest_cost
 
 
 def halve_until(attempt: Callable[[float], Trial], accept: Callable[[Trial], bool],

@@ -96,16 +96,8 @@ def angular_motion(alpha: Joint, beta: Joint) -> tuple[Components, Components]:
     ω = β̇·[0 0 1] − α̇·[sin β, cos β, 0]. A fixed vertical then moves as in `specific_force`:
     ḟ = −ω × f.
 
-    Parameters
-    ----------
-    alpha, beta
-        Joints with their derivatives, rad, arrays or floats of one shape.
-
-    Returns
-    -------
-    tuple
-        Angular velocity, rad/s, and angular acceleration, rad/s², three components each.
-
+    alpha, beta: joints with their derivatives, rad, arrays or floats of one shape; returns:
+    angular velocity, rad/s, and angular acceleration, rad/s², three components each.
     """
     sin_beta, cos_beta = np.sin(beta.position), np.cos(beta.position)
     along, across = sin_beta * alpha.velocity, cos_beta * alpha.velocity
@@ -133,16 +125,13 @@ def cross_product(a: Components, b: Components) -> Components:
 
 UNOBSERVABLE_RAD2 = 1.0
 """Variance from which an angle counts as not shown, rad²; chosen: a guess has 1.8 rad rms."""
-
 UNKNOWN_ANGLE_RAD2 = 1e6
 """Variance of an angle that is not known, rad²; yaw is never known.
 
 π²/3, that of a uniform angle, would let a filter that fuses 1000 samples a second believe in
 yaw = 0 before long. 1e6, as for an axis that is not there, never counts."""
-
 INFINITE = float('inf')
 """Variance of an angle that the force does not determine, rad²."""
-
 _FORCE2_FLOOR = 1e-30
 """Square of a negligible force, (m/s²)²; chosen: far below any noise, it keeps divisors from 0."""
 
@@ -215,20 +204,9 @@ def angles(force: Components, covariance: tuple[Value, ...],
     its variance is infinite. Pitch and inclination are then the length of a small vector of any
     direction.
 
-    Parameters
-    ----------
-    force
-        Specific force at rest in the case frame, m/s², three components.
-    covariance
-        Covariance of the force, (m/s²)²: xx, xy, xz, yy, yz, zz.
-    maths
-        Functions for arrays or for floats.
-
-    Returns
-    -------
-    tuple
-        Angle, rad, and variance, rad², of roll, pitch, inclination and beta.
-
+    force: specific force at rest in the case frame, m/s², three components; covariance: covariance
+    of the force, (m/s²)²: xx, xy, xz, yy, yz, zz; maths: functions for arrays or for floats;
+    returns: angle, rad, and variance, rad², of roll, pitch, inclination and beta.
     """
     x, y, z = force
     xx, xy, xz, yy, yz, zz = covariance

@@ -15,7 +15,6 @@ ONE_SIDED = float(np.sqrt(2))
 """Noise density of a datasheet, over positive frequencies alone, divided by the same over both
 signs: N of IEEE Std 952 and `accelerometer_noise_density` of Kalibr, whose sample has the variance
 N²·rate (ethz-asl/kalibr, wiki/IMU-Noise-Model)."""
-
 _HARMONICS = 50
 """Harmonics of the sawtooth of rounding that are summed. Chosen: the others hold 1 %."""
 
@@ -73,18 +72,7 @@ def rounding(sensor: Sensor, axis: int) -> Rounding:
     output alone is a sawtooth, whose k-th harmonic has the variance LSB²/(2π²k²)·exp(−(2πkσ/LSB)²)
     (Widrow and Kollár 2008, section 4.4). Above half a step of noise nothing of it is left.
 
-    Parameters
-    ----------
-    sensor
-        The unit.
-    axis
-        Index of the measured axis.
-
-    Returns
-    -------
-    Rounding
-        Both parts.
-
+    sensor: the unit; axis: index of the measured axis; returns: both parts.
     """
     total_v2 = sensor.lsb_v ** 2 / 12
     if not total_v2:

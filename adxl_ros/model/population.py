@@ -92,7 +92,9 @@ def posterior(sensor: Sensor, population: Population) -> Posterior:
         return Posterior(sensor, f'{population.name} has no zero-g or scale factor of the axes '
                          f'{sensor.axes}; it is not used')
     if not set(_EFFECTS) & set(sensor.effects):
-        return Posterior(_of_population(sensor, prior), f'zero-g and scale factor are those of '
+        unit = replace(put(with_neutral(sensor, _EFFECTS), prior.names, prior.mean),
+                       covariance=np.diag(prior.std ** 2), covariance_names=prior.names)
+        return Posterior(unit, f'zero-g and scale factor are those of '
                          f'{population.name}: the unit has none of its own')
     used = [i for i, name in enumerate(prior.names) if name in sensor.covariance_names]
     if not used:
@@ -100,12 +102,6 @@ def posterior(sensor: Sensor, population: Population) -> Posterior:
                          'the unit have no uncertainty')
     return _combined(sensor, population, Prior(tuple(prior.names[i] for i in used),
                                                prior.mean[used], prior.std[used]))
-
-
-def _of_population(sensor: Sensor, prior: Prior) -> Sensor:
-    """Return a unit without coefficients of its own at the mean of its population."""
-    unit = put(with_neutral(sensor, _EFFECTS), prior.names, prior.mean)
-    return replace(unit, covariance=np.diag(prior.std ** 2), covariance_names=prior.names)
 
 
 def _combined(sensor: Sensor, population: Population, prior: Prior) -> Posterior:

@@ -16,14 +16,11 @@ import numpy as np
 
 MODELS = ('nominal', 'linear', 'physical', 'full', 'gravity')
 """Names of the models that can be fitted."""
-
 MARGIN_K = 2.0
 """Distance from the temperatures of the poses that counts as inside, K; chosen: by the datasheet
 it is 0.2 mg, below the noise of a sample. No thermometer is at the element."""
-
 STRETCH = 1.1
 """Factor of the poses' forces at which h_max is taken, too; chosen: see `Envelope`."""
-
 MARGIN_MPS2 = 2.0
 """Distance from the forces of the poses that counts as inside, m/s²; chosen: planes from 30° on
 leave 1.3 m/s² to level, and nearby forces share one result."""
@@ -79,12 +76,7 @@ class Envelope:
                                           temperature_c - high - MARGIN_K))
 
     def extrapolation(self, force: Sequence[Any], leverage: Any) -> Any:
-        """
-        Return the extrapolation ρ of forces, at least 1.
-
-        force: specific force, m/s², three components, (n,) or floats; leverage: leverage of the
-        forces, (m/s²)², (n,); returns: ρ, (n,); 1 inside.
-        """
+        """Return the extrapolation ρ of forces, m/s², with their leverage, (m/s²)²; 1 inside."""
         rho = np.maximum(1.0, leverage / self.leverage if self.leverage else 1.0)
         for value, low, high in zip(force, self.force_low_mps2, self.force_high_mps2):
             distance = np.abs(value - (low + high) / 2) / ((high - low) / 2 + MARGIN_MPS2)
@@ -93,35 +85,19 @@ class Envelope:
 
     def added_variance(self, axis_mps2: Any, temperature_c: Any, extrapolation: Any,
                        gravity_mps2: float) -> Any:
-        """
-        Return the variance that an axis gets outside of the validity range.
-
-        axis_mps2: specific force along the axis, m/s², (n,); temperature_c: temperature, °C, (n,)
-        or one value; extrapolation: extrapolation ρ of the forces, (n,); returns: variance,
-        (m/s²)², (n,).
-        """
+        """Return the variance, (m/s²)², that an axis gets outside; see above."""
         beyond_k = self.beyond_k(temperature_c)
         return ((gravity_mps2 * self.zero_g_per_k * beyond_k) ** 2
                 + (axis_mps2 * self.scale_per_k * beyond_k) ** 2
                 + self.misfit_mps2 ** 2 * (extrapolation ** 2 - 1))
 
     def is_outside(self, temperature_c: Any, force: Sequence[Any], leverage: Any) -> np.ndarray:
-        """
-        Return which samples lie outside of the validity range.
-
-        temperature_c: temperature, °C, (n,) or one value; force: specific force, m/s², three
-        components, (n,) or floats; leverage: leverage of the forces, (m/s²)², (n,); returns:
-        whether each sample is outside, (n,).
-        """
+        """Return which samples lie outside of the validity range, (n,)."""
         return (self.beyond_k(temperature_c) > 0) | (self.extrapolation(force, leverage) > 1)
 
     def describe_outside(self, temperature_c: float, force: Sequence[float], leverage: float
                          ) -> tuple[str, ...]:
-        """
-        Describe in words how one sample lies outside of the validity range.
-
-        force: specific force, m/s², three components; leverage: leverage of the force, (m/s²)².
-        """
+        """Describe in words how one sample lies outside of the validity range."""
         texts = []
         if self.temperature_c is not None and self.beyond_k(temperature_c) > 0:
             low, high = self.temperature_c
@@ -152,55 +128,40 @@ class Sensor:
     One unit: the nominal chain by its nominal values, and the effects that depart from it.
 
     The metadata of the fields are the only description of the nominal values. Parameter files,
-    the nodes' parameters and error messages use them. Arrays marked (m,) have one entry for each
-    measured axis.
+    the nodes' parameters and error messages use them. Arrays have one entry for each measured
+    axis, (m,).
     """
 
-    # Serial number; "nominal" is no unit in particular
     serial: str = _nominal('sensor.serial', 'serial number; nominal is no unit in particular')
-    # Measured axes: x, xy or xyz
     axes: str = _nominal('sensor.axes', 'measured axes', choices=MEASURED_AXES)
-    # Zero-g by the datasheet, V, (m,)
     nominal_zero_g_v: np.ndarray = _nominal(
         'sensor.nominal_zero_g_v', 'zero-g output by the datasheet, by axis', 'V', -10.0, 10.0)
-    # Scale factor by the datasheet, V/g, (m,)
     nominal_scale_v_per_g: np.ndarray = _nominal(
         'sensor.nominal_scale_v_per_g', 'scale factor by the datasheet, by axis', 'V/g',
         1e-3, 10.0)
-    # Density of the white noise by the datasheet, g/√Hz, (m,)
     noise_density_g_per_rthz: np.ndarray = _nominal(
         'sensor.noise_density_g_per_rthz', 'white noise density, by axis', 'g/sqrt(Hz)',
         0.0, 0.1, placeholder=0.0)
-    # Output resistance that the filter capacitor sees, Ω
     rc_resistance_ohm: float = _nominal(
         'sensor.rc_resistance_ohm', 'output resistance that the filter capacitor sees', 'Ohm',
         0.0, 1e9, placeholder=0.0)
-    # Filter capacitor, F; 0 for no filter
     rc_capacitance_f: float = _nominal(
         'sensor.rc_capacitance_f', 'filter capacitor; 0 is no filter', 'F', 0.0, 1.0,
         placeholder=0.0)
-    # Resolution of the ADC, bit; 0 does not quantise
     adc_bits: int = _nominal('sensor.adc_bits', 'resolution of the ADC; 0 does not quantise',
                              'bit', 0, 32, placeholder=0)
-    # Full scale of the ADC, V
     adc_vref_v: float = _nominal('sensor.adc_vref_v', 'full scale of the ADC', 'V', 0.1, 100.0,
                                  placeholder=100.0)
-    # Sample rate, Hz
     rate_hz: float = _nominal('sensor.rate_hz', 'sample rate', 'Hz', 0.01, 100000.0)
-    # Measuring range by the datasheet, g
     range_g: float = _nominal('sensor.range_g', 'measuring range by the datasheet', 'g',
                               0.1, 1000.0, placeholder=1000.0)
-    # Local gravity, m/s²
     local_gravity_mps2: float = _nominal(
         'sensor.local_gravity_mps2', 'gravity where the sensor is', 'm/s^2', 9.7, 9.9)
-    # Sign of the z of equation 5: 1 is upright, −1 is upside down
     z_sign: int = _nominal(
         'sensor.z_sign', 'which way up, for the z of equation 5: 1 or -1', '', -1, 1)
-    # Step of the stage's encoders, rad
     stage_resolution_rad: float = _nominal(
         'stage.resolution_rad', "step of the stage's encoder, or of the scale read by hand",
         'rad', 0.0, 1.0)
-    # Model that was fitted, one of `MODELS`
     model: str = _nominal('model', 'what was fitted', choices=MODELS)
     effects: tuple[str, ...] = ()  # Names of the effects
     # Values by effect and parameter, (m,) or (), each in the unit of its parameter
@@ -281,24 +242,8 @@ def with_axes(sensor: Sensor, axes: str) -> Sensor:
 
     Axes are removed from the end, or added with the values that all axes share.
 
-    Parameters
-    ----------
-    sensor
-        A sensor without effects, unless it has these axes.
-    axes
-        Axes of the stream: x, xy or xyz.
-
-    Returns
-    -------
-    Sensor
-        The sensor with the axes.
-
-    Raises
-    ------
-    UserError
-        The sensor is calibrated for other axes, or its axes differ, so that the values of
-        further axes are unknown.
-
+    sensor: A sensor without effects, unless it has these axes; axes: axes of the stream: x, xy or
+    xyz; returns: the sensor with the axes.
     """
     if axes == sensor.axes:
         return sensor
@@ -323,18 +268,8 @@ def to_volts(accel_mps2: np.ndarray, sensor: Sensor) -> np.ndarray:
     """
     Undo the nominal conversion, which is affine and exact.
 
-    Parameters
-    ----------
-    accel_mps2
-        Nominally converted specific force, m/s², (n, m).
-    sensor
-        The sensor with its nominal zero-g and scale factor.
-
-    Returns
-    -------
-    ndarray
-        Volts of the ADC, V, (n, m).
-
+    accel_mps2: nominally converted specific force, m/s², (n, m); sensor: the sensor with its
+    nominal zero-g and scale factor; returns: volts of the ADC, V, (n, m).
     """
     return sensor.nominal_zero_g_v + accel_mps2 / G0_MPS2 * sensor.nominal_scale_v_per_g
 
@@ -343,18 +278,8 @@ def to_nominal_mps2(volts: np.ndarray, sensor: Sensor) -> np.ndarray:
     """
     Convert volts by the nominal zero-g and scale factor (equation 3).
 
-    Parameters
-    ----------
-    volts
-        Volts of the ADC, V, (n, m).
-    sensor
-        The sensor with its nominal zero-g and scale factor.
-
-    Returns
-    -------
-    ndarray
-        Nominally converted specific force, m/s², (n, m).
-
+    volts: volts of the ADC, V, (n, m); sensor: the sensor with its nominal zero-g and scale
+    factor; returns: nominally converted specific force, m/s², (n, m).
     """
     return (volts - sensor.nominal_zero_g_v) / sensor.nominal_scale_v_per_g * G0_MPS2
 

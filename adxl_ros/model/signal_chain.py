@@ -34,29 +34,22 @@ import numpy as np
 
 ANALOG = (Place.MOUNTING, Place.ELEMENT, Place.ELECTRONICS)
 """Places between the specific force and the filter."""
-
 _TOLERANCE_MPS2 = 1e-10
 """Newton step below which the inverse has converged, m/s²; chosen: near rounding."""
-
 _UNSOLVED_MPS2 = 1e-6
 """Last Newton step from which a sample has no solution, m/s²; chosen: near alpha = ±90°, the z of
 equation 5 is a root of 0, and rounding moves it by up to this."""
-
 _MAX_ITERATIONS = 60
 """Largest number of iterations of either inverse; chosen: samples with a solution need far
 fewer."""
-
 _CHORD_STEPS = 8
 """Steps with the tangent at rest without gravity before Newton's method; chosen: each leaves a few
 percent of the error of a real sensor, and takes a seventh of the time of a Newton step."""
-
 _CLEAR_Z_MPS2 = 1.0
 """Magnitude of a derived z, m/s², from which |f| = g determines it well; chosen: 6° from alpha =
 ±90°, far beyond any noise."""
-
 _SETTLED_V = 1e-13
 """Change below which the inverse of the ADC's effects has converged, V; chosen: near rounding."""
-
 _DIFFERENCE_MPS2 = 1e-3
 """Half step of the central differences by force, m/s²; chosen: the chain is smooth and nearly
 linear, so that a wide step loses nothing."""
@@ -199,13 +192,9 @@ def static_response(sensor: Sensor) -> Callable[..., Components]:
 
     `simulate.response` adds filter, noise, quantisation, stage, and effects with a memory.
 
-    Returns
-    -------
-    callable
-        Maps the three components of specific force in the case frame, m/s² (arrays of one shape,
-        or floats), and an `Environment` of that shape (the nominal one unless given) to the
-        volts of each measured axis.
-
+    returns: maps the three components of specific force in the case frame, m/s² (arrays of one
+    shape, or floats), and an `Environment` of that shape (the nominal one unless given) to the
+    volts of each measured axis.
     """
     chain = static_chain(sensor)
     return lambda force, environment=NOMINAL_ENVIRONMENT: chain.through_adc(chain.volts(
@@ -252,20 +241,9 @@ def jacobian(respond: Callable[..., Components], force: Components,
     """
     Differentiate volts by specific force, by central differences.
 
-    Parameters
-    ----------
-    respond
-        From `analog_response`.
-    force
-        Specific force in the case frame, m/s², three components (n,) or floats.
-    environment
-        Surroundings in the shape of the force.
-
-    Returns
-    -------
-    ndarray
-        Derivatives, V/(m/s²), (m, 3), or (m, 3, n) for arrays.
-
+    respond: from `analog_response`; force: specific force in the case frame, m/s², three
+    components (n,) or floats; environment: surroundings in the shape of the force; returns:
+    derivatives, V/(m/s²), (m, 3), or (m, 3, n) for arrays.
     """
     columns = []
     for c in range(3):
@@ -318,12 +296,8 @@ def newton_step(axes: str, gravity_mps2: float, maths: Maths) -> Callable[..., C
     """
     Prepare one Newton step of the inverse for measured axes, with |f| at rest for equation 5.
 
-    Returns
-    -------
-    callable
-        Maps volts minus the response to a force, V, that force, m/s², a `Tangent` near it, and
-        the sign of a derived z to the next force, m/s².
-
+    returns: maps volts minus the response to a force, V, that force, m/s², a `Tangent` near it,
+    and the sign of a derived z to the next force, m/s².
     """
     measured = [AXES.index(a) for a in axes]
 

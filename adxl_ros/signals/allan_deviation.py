@@ -116,17 +116,16 @@ class AllanStream:
         """Return the Allan deviation of the samples so far."""
         sizes = [1 << octave for octave in range((self.count // _FEWEST_AVERAGES).bit_length())]
         squares = [sums / count for _, sums, count in zip(sizes, self._sums, self._counts)]
-        squares += [_from_cells(cells, size // cells.size, len(self._phase)) * cells.size ** 2
+        squares += [_from_cells(cells, size // cells.size) * cells.size ** 2
                     for size in sizes[len(squares):]]
         size = np.array(sizes)
         return AllanDeviation(size / rate_hz, np.sqrt(np.array(squares) / 2) / size[:, None],
                               self.count / size)
 
 
-def _from_cells(cells: CellMeans, size: int, axes: int) -> np.ndarray:
+def _from_cells(cells: CellMeans, size: int) -> np.ndarray:
     """Return the mean square of second differences over `size` cells by axis, u², (m,)."""
-    means = cells.means[:, :axes]
-    phase = np.cumsum(np.vstack([np.zeros(axes), means - means[0]]), axis=0)
+    phase = np.cumsum(np.vstack([np.zeros_like(cells.means[0]), cells.means - cells.means[0]]), 0)
     differences = phase[2 * size:] - 2 * phase[size:-size] + phase[:-2 * size]
     return (differences ** 2).mean(axis=0)
 
@@ -155,8 +154,6 @@ class StillStretch:
     allan: AllanDeviation  # Their Allan deviation, m/s²
     step_s: float  # Length of a cell, s
     means: np.ndarray  # Means of the cells by axis, m/s², (k, m)
-    # Mean temperature of the cells, °C, (k,); None where it is not measured throughout
-    temperature_c: np.ndarray | None
     # Standard deviation of a sample within some seconds by axis, m/s², (m,)
     sample_std: np.ndarray
     resolution: np.ndarray  # Smallest change of a sample by axis, m/s², (m,)
@@ -212,37 +209,29 @@ class _Samples:
     def __init__(self, first: Recording) -> None:
         self._first, columns = first, len(first.sensor_columns)
         self._allan = AllanStream(columns)
-        self._cells = CellMeans(columns + 1)
+        self._cells = CellMeans(columns)
         self._resolution = np.full(columns, np.inf)
         self._filled = 0
-        # Stamps of the first and the newest sample, and the newest row; the last column is the
-        # temperature, which holds between its readings.
+        # Stamps of the first and the newest sample, and the newest row
         self._start_s = self._stop_s = np.nan
         self._last: np.ndarray | None = None
-        readings = first.columns.get('temperature_c', np.empty(0))
-        self._held_c = next(iter(readings[np.isfinite(readings)]), np.nan)
 
     def feed(self, block: Recording, unit: Sensor, rest: Rest) -> None:
         """Add the samples of a block that are part of the rest."""
         time_s = block.time_s
-        held_c = np.append(self._held_c, block.columns.get('temperature_c',
-                                                           np.full(len(block), np.nan)))
-        held_c = held_c[np.maximum.accumulate(
-            np.where(np.isfinite(held_c), np.arange(len(held_c)), 0))]
-        self._held_c = held_c[-1]
         inside = (time_s >= rest.time_start_s) & (time_s <= rest.time_stop_s)
         for start_s, stop_s in rest.disturbed_s:
             inside &= (time_s <= start_s) | (time_s >= stop_s)
         if not inside.any():
             return
-        rows = np.column_stack([block.accel_mps2(unit), held_c[1:]])[inside]
-        time_s, is_first = time_s[inside], self._last is None
+        rows, time_s = block.accel_mps2(unit)[inside], time_s[inside]
+        new = int(self._last is not None)
         if self._last is None:
             self._start_s = float(time_s[0])
         else:
             time_s, rows = np.append(self._stop_s, time_s), np.vstack([self._last, rows])
         self._last, self._stop_s = rows[-1], float(time_s[-1])
-        changes = np.abs(np.diff(rows[:, :-1], axis=0))
+        changes = np.abs(np.diff(rows, axis=0))
         self._resolution = np.minimum(self._resolution, np.where(
             changes > 0, changes, np.inf).min(axis=0, initial=np.inf))
         steps_s, rate_hz = np.diff(time_s), self._first.rate_hz
@@ -252,8 +241,8 @@ class _Samples:
         if len(full) > len(rows):
             self._filled += len(full) - len(rows)
             rows = np.column_stack([np.interp(full, number, column) for column in rows.T])
-        self._allan.feed(rows[0 if is_first else 1:, :-1])
-        self._cells.feed(rows[0 if is_first else 1:])
+        self._allan.feed(rows[new:])
+        self._cells.feed(rows[new:])
 
     def stretch(self, recorded_s: float, motion_s: list[tuple[float, float]]) -> StillStretch:
         """Return the samples as a rest; refuse an axis that never changes."""
@@ -268,9 +257,7 @@ class _Samples:
         # The variance within 2^k samples is that of the octaves of Haar's wavelets in it.
         octaves = max(int(np.ceil(np.log2(_WINDOW_S * rate_hz))), 1)
         variance = (allan.deviation[:octaves] ** 2).sum(axis=0) / 2 / (1 - 0.5 ** octaves)
-        temperature = cells.means[:, -1]
         return StillStretch(
             self._start_s, self._stop_s, rate_hz, count, self._filled, allan,
-            cells.size / rate_hz, cells.means[:, :-1],
-            temperature if np.isfinite(temperature).all() else None, np.sqrt(variance),
-            self._resolution, recorded_s, motion_s)
+            cells.size / rate_hz, cells.means, np.sqrt(variance), self._resolution, recorded_s,
+            motion_s)

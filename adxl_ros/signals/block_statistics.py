@@ -38,9 +38,7 @@ class Blocks:
     start: np.ndarray  # Row of the stream at which each block begins, (k,)
     time_s: np.ndarray  # Time of the first and last row, s, (k, 2)
     run: np.ndarray  # Number of the gapless run that the block belongs to, (k,)
-    count: np.ndarray  # Number of rows without NaN, (k,); 0 if these are at most half of the rows
-    # Mean of these rows by axis, (k, m); without such rows the mean of the block before
-    mean: np.ndarray
+    mean: np.ndarray  # Mean of the rows by axis, (k, m)
     squares: np.ndarray  # Sum of the squared deviations from the mean, (k, m)
     # Smallest change between consecutive rows that is not 0, (k, m); inf if nothing changes. It is
     # the step of the ADC if the noise exceeds that step.
@@ -74,7 +72,6 @@ class BlockCutter:
         self._axes = axes
         self._gap_s = gap_s(rate_hz)
         self._leftover = np.empty((1 + axes + angles, 0))
-        self._mean = np.zeros((axes, 1))
         self._row = 0
         self._run = -1
         self._last_time_s = -np.inf
@@ -84,8 +81,8 @@ class BlockCutter:
         """
         Add the next rows of the stream.
 
-        time_s: time of each row, s, (n,); samples: rows of the stream, (n, m); a row with a NaN is
-        left out; angles_rad: encoder angles, rad, (n, a), NaN where not sampled.
+        time_s: time of each row, s, (n,); samples: rows of the stream, (n, m), all finite;
+        angles_rad: encoder angles, rad, (n, a), NaN where not sampled.
         """
         columns = [time_s[:, None], samples] + ([] if angles_rad is None else [angles_rad])
         return Blocks.join([self.none()] + [
@@ -120,25 +117,13 @@ class BlockCutter:
     def _summed(self, columns: np.ndarray, start: np.ndarray, run: np.ndarray) -> Blocks:
         block = columns[:, start[:, None] + np.arange(self.size)]
         samples, angles = block[1:1 + self._axes], block[1 + self._axes:]
-        finite = np.isfinite(samples).all(axis=0)
-        if not finite.all():
-            finite &= 2 * finite.sum(axis=1, keepdims=True) > self.size
-            samples = np.where(finite, samples, np.nan)
-        count = finite.sum(axis=1)
         change = np.abs(np.diff(samples, axis=2))
         step = np.where(change > 0, change, np.inf).min(axis=2, initial=np.inf)
-        # Spikes of 1e38 and more overflow here; such a block is never at rest.
-        with np.errstate(over='ignore', invalid='ignore'):
-            mean = np.where(finite, samples, 0).sum(axis=2) / np.maximum(count, 1)
-            squares = (np.where(finite, samples - mean[..., None], 0) ** 2).sum(axis=2)
-        # A block without samples takes the mean of the newest block before it.
-        mean = np.concatenate([self._mean, mean], axis=1)
-        mean = mean[:, np.maximum.accumulate(np.where(count, np.arange(1, len(count) + 1), 0))]
-        if len(count):
-            self._mean = mean[:, -1:]
+        mean = samples.mean(axis=2)
+        squares = ((samples - mean[..., None]) ** 2).sum(axis=2)
         bounds = np.stack([np.fmin.reduce(angles, axis=2), np.fmax.reduce(angles, axis=2)])
-        return Blocks(self._row + start, block[0][:, [0, -1]], run, count, mean.T, squares.T,
-                      step.T, bounds.transpose(2, 0, 1))
+        return Blocks(self._row + start, block[0][:, [0, -1]], run, mean.T, squares.T, step.T,
+                      bounds.transpose(2, 0, 1))
 
 
 def angle_bounds(blocks: Blocks) -> np.ndarray:
@@ -196,36 +181,19 @@ _TINY_VARIANCE = 1e-300
 """Lower bound of a variance, in squares of any unit, so that its logarithm is finite."""
 
 
-@dataclass(frozen=True)
 class Spans:
     """Lengths of windows in blocks, for a sample rate."""
 
-    rate_hz: float
-
-    @property
-    def size(self) -> int:
-        """Return the number of samples in a block."""
-        return max(1, round(BLOCK_S * self.rate_hz))
-
-    @property
-    def block_s(self) -> float:
-        """Return the length of a block, s."""
-        return self.size / self.rate_hz
-
-    @property
-    def window(self) -> int:
-        """Return the blocks of the window of a variance; odd, so that one is in the middle."""
-        return max(round(_WINDOW_S / self.block_s), -(-_WINDOW_SAMPLES // self.size)) // 2 * 2 + 1
-
-    @property
-    def half(self) -> int:
-        """Return the blocks of the shortest halves whose means are compared."""
-        return max(round(_HALF_S / self.block_s), 4)
-
-    @property
-    def longest(self) -> int:
-        """Return the number of blocks in both longest halves together."""
-        return self.half << DRIFT_OCTAVES
+    def __init__(self, rate_hz: float) -> None:
+        self.rate_hz = rate_hz
+        self.size = max(1, round(BLOCK_S * rate_hz))  # Samples of a block
+        self.block_s = self.size / rate_hz  # Length of a block, s
+        # Blocks of the window of a variance; odd, so that one is in the middle
+        self.window = max(round(_WINDOW_S / self.block_s),
+                          -(-_WINDOW_SAMPLES // self.size)) // 2 * 2 + 1
+        # Blocks of the shortest halves whose means are compared, and of both longest halves
+        self.half = max(round(_HALF_S / self.block_s), 4)
+        self.longest = self.half << DRIFT_OCTAVES
 
 
 def quiet_variance(blocks: Blocks, windows: np.ndarray,
@@ -269,7 +237,7 @@ def _quietest(variances: np.ndarray, smallest: float) -> tuple[float, float]:
 def adc_step(blocks: Blocks) -> np.ndarray:
     """Return the smallest change of the samples, (m,); 0 where they never change."""
     changes = blocks.step
-    if len(blocks) > 1 and (blocks.count <= 1).all():
+    if not np.isfinite(changes).any():  # also where a block is one sample
         changes = np.abs(np.diff(blocks.mean, axis=0))
     smallest = np.where(changes > 0, changes, np.inf).min(axis=0, initial=np.inf)
     return np.where(np.isfinite(smallest), smallest, 0.0)
@@ -288,25 +256,14 @@ def undithered(step: np.ndarray, sigma: np.ndarray) -> np.ndarray:
 
 
 def window_variance(blocks: Blocks, spans: Spans) -> np.ndarray:
-    """
-    Return the variance of the samples in every window, (k − window + 1, m).
-
-    It is inf across a gap, and where half of the samples are missing.
-    """
+    """Return the variance of the samples in each window, (k − window + 1, m); inf across a gap."""
     window = spans.window
     if len(blocks) < window:
         return np.empty((0, blocks.mean.shape[1]))
-    means = sliding_window_view(blocks.mean, window, axis=0)
-    counts = sliding_window_view(blocks.count, window)[:, None, :]
-    rows = counts.sum(axis=2)
-    with np.errstate(over='ignore', invalid='ignore'):
-        centre = (means * counts).sum(axis=2) / np.maximum(rows, 1)
-        between = (counts * (means - centre[..., None]) ** 2).sum(axis=2)
-        within = sliding_window_view(blocks.squares, window, axis=0).sum(axis=2)
-        variance = (within + between) / np.maximum(rows - 1, 1)
+    between = window * spans.size * sliding_window_view(blocks.mean, window, axis=0).var(axis=2)
+    within = sliding_window_view(blocks.squares, window, axis=0).sum(axis=2)
     gapless = blocks.run[window - 1:] == blocks.run[:len(blocks) - window + 1]
-    usable = gapless[:, None] & (2 * rows > window * spans.size)
-    return np.where(usable & np.isfinite(variance), variance, np.inf)
+    return np.where(gapless[:, None], (within + between) / (window * spans.size - 1), np.inf)
 
 
 def quiet_blocks(blocks: Blocks, windows: np.ndarray, limit: np.ndarray,
@@ -330,14 +287,10 @@ def half_differences(blocks: Blocks, usable: np.ndarray,
     Returns differences, (k − 2·half + 1, m), the first one at block `half`; and whether all blocks
     of both halves are marked as usable, (k,) bool, and without a gap.
     """
-    places = len(blocks) - 2 * half + 1
-    if places < 1:
-        return np.empty((0, blocks.mean.shape[1])), np.zeros(0, bool)
-    # Only usable blocks are summed: a spike of 1e38 would absorb all later terms.
-    centre = np.median(blocks.mean[usable], axis=0) if usable.any() else 0.0
+    middle = np.median(blocks.mean[usable], axis=0) if usable.any() else 0.0
     total = np.zeros((len(blocks) + 1, blocks.mean.shape[1]))
-    np.cumsum(np.where(usable[:, None], blocks.mean - centre, 0), axis=0, out=total[1:])
+    np.cumsum(np.where(usable[:, None], blocks.mean - middle, 0), axis=0, out=total[1:])
     differences = (total[2 * half:] - 2 * total[half:-half] + total[:-2 * half]) / half
     unusable = np.concatenate([[0], np.cumsum(~usable)])
-    gapless = blocks.run[2 * half - 1:] == blocks.run[:places]
+    gapless = blocks.run[2 * half - 1:] == blocks.run[:len(differences)]
     return differences, gapless & (unusable[2 * half:] == unusable[:-2 * half])

@@ -7,15 +7,23 @@ The points of an Allan deviation are correlated, so a line through them has no s
 The fit therefore takes the cosine transform of the means of short cells. There a random walk and
 white noise have independent coefficients of known variance, and 1/f noise nearly so. The fit
 maximises the likelihood of the coefficients. The intervals are those of the profile likelihood.
-Lines of a fan or of mains are left out first, and a walk that ends in bounds is a Gauss-Markov
-process (IEEE Std 952, annex B).
+Frequencies from which on a filter, a fan or mains show are left out.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from adxl_ros.errors import UserError
+from adxl_ros.files.exports import kalibr_settings
+from adxl_ros.files.recording_columns import Recording, unit_of
+from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.noise import ONE_SIDED
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.signals.allan_deviation import longest_rest, StillStretch
+from adxl_ros.signals.recorded_sensor import load_sensor, RESISTANCE_OHM
 import numpy as np
 import scipy
 
@@ -37,18 +45,8 @@ _SMALLEST = 1e-4
 """Square of a term, by the square at which it would dominate, from which an upper limit is
 searched. Chosen: it changes the likelihood of no recording."""
 _OCTAVE_PROBABILITY = 1e-3
-"""Probability by chance, below which an octave shows a filter, or a group exceeds its
-neighbours. Chosen: with ten octaves one healthy recording in a hundred."""
-_BOUND_PROBABILITY = 1e-2
-"""Probability by chance, below which a walk has bounds. Chosen: one healthy recording in a
-hundred; where bounds are missed, the interval of K is too low."""
-_FEWEST_NEIGHBOURS = 8
-"""Fewest groups within an octave on both sides that show the level beside a line. Chosen."""
-_BOUND_STEP = 2 ** 0.5
-"""Ratio of correlation times that are tried. Chosen: the likelihood changes little between."""
-_SHORTEST_BOUND = 10.0
-"""Shortest correlation time, by that of the highest frequency. Chosen: a shorter one is taken for
-a filter of white noise."""
+"""Probability by chance, below which an octave shows a filter or a line. Chosen: with ten octaves
+one healthy recording in a hundred."""
 _MARGIN_OCTAVES = 2
 """Octaves below a filter's effect that are left out. Chosen: the effect falls by 16 in power."""
 _FEWEST = 32
@@ -85,21 +83,9 @@ class NoiseFit:
     # White noise N, u/√Hz: the density over positive and negative frequencies is N²
     white: Estimate
     instability: Estimate  # Bias instability B, u: the density is B²/(2π·f)
-    # Random walk K, u/√s: the density is K²/(2π·f)², or K²/((2π·f)² + 1/T²) with bounds
-    walk: Estimate
-    # Correlation time T of a bounded walk (first-order Gauss-Markov), s, whose standard deviation
-    # is K·√(T/2); None where no bounds show
-    correlation: Estimate | None
+    walk: Estimate  # Random walk K, u/√s: the density is K²/(2π·f)²
     highest: int  # Number of cosine coefficients of the fit, from the lowest
     highest_hz: float  # Frequency of the last one, Hz
-    kept: np.ndarray  # Groups of coefficients without lines, bool
-    lines_hz: np.ndarray  # Frequencies of sure lines among the others, Hz, (j,)
-    log_likelihood: float  # Largest log likelihood, up to a constant
-
-    @property
-    def squares(self) -> np.ndarray:
-        """N², B² and K², (3,)."""
-        return np.square([self.white.value, self.instability.value, self.walk.value])
 
     def allan_deviation(self, tau_s: np.ndarray) -> np.ndarray:
         """Return the Allan deviation of the fitted terms at times, s, (k,), in u."""
@@ -112,8 +98,9 @@ class NoiseFit:
         The Fisher information of the cosine coefficients tells when its interval excludes 0. It
         is inf beyond a thousand times the recording: the other terms hide it.
         """
-        squares = self.squares
-        squares[term] = ((self.white, self.instability, self.walk)[term].high / 2) ** 2
+        terms = self.white, self.instability, self.walk
+        squares = np.square([estimate.value for estimate in terms])
+        squares[term] = (terms[term].high / 2) ** 2
         present = np.flatnonzero(squares)
         for time_s in self.highest / (2 * self.highest_hz) * 2.0 ** np.arange(0, 10.25, 0.25):
             k = np.unique(np.geomspace(1, 2 * time_s * self.highest_hz, 400).astype(int))
@@ -128,16 +115,9 @@ class NoiseFit:
 
     def lines(self, tau_s: np.ndarray) -> np.ndarray:
         """Return the Allan deviations of N, B and K at times, s, (k,), in u, (3, k)."""
-        walk = np.sqrt(tau_s / 3)
-        if self.correlation is not None:
-            # IEEE Std 952, equation C.19; for short times its terms cancel.
-            time_s = self.correlation.value
-            x = tau_s / time_s
-            terms = 1 - (3 - 4 * np.exp(-x) + np.exp(-2 * x)) / (2 * x)
-            walk = np.where(x > 1e-3, time_s * np.sqrt(np.abs(terms) / tau_s), walk)
         return np.stack([self.white.value / np.sqrt(tau_s),
                          np.full(len(tau_s), FLOOR * self.instability.value),
-                         self.walk.value * walk])
+                         self.walk.value * np.sqrt(tau_s / 3)])
 
 
 @dataclass(frozen=True)
@@ -156,36 +136,6 @@ class _Groups:
     def below(self, stop: int) -> _Groups:
         """Return the groups that end before coefficient number `stop`."""
         return self.where(self.first + self.count <= stop)
-
-    def without_lines(self) -> np.ndarray:
-        """
-        Return which groups, and neighbours, do not exceed those of an octave on both sides, bool.
-
-        The fitted terms make the spectrum flat first; the median of the octaves is its level. A
-        strong line has a broad foot, which shows after its peak is left out.
-        """
-        kept = np.ones(len(self.first), bool)
-        spans = np.searchsorted(self.first, np.outer(self.first, (0.5, 2.0)), 'right')
-        for _ in range(_ROUNDS):
-            ratio = self.power / (self.shapes @ _fit(self.where(kept))[0])
-            of_median = np.where(kept, ratio / (1 - 2 / (9 * self.count)) ** 3, np.nan)
-            level = np.full(len(ratio), np.inf)
-            for i in np.flatnonzero(kept):
-                begin, end = spans[i]
-                if np.count_nonzero(kept[begin:end]) >= _FEWEST_NEIGHBOURS:
-                    level[i] = np.nanmedian(of_median[begin:end])
-            line = kept & (scipy.stats.chi2.sf(self.count * ratio / level, self.count)
-                           < _OCTAVE_PROBABILITY)
-            if not line.any():
-                break
-            kept &= ~(line | np.append(line[1:], False) | np.append(False, line[:-1]))
-        return kept
-
-    def bounded(self, correlation_s: float, span_s: float) -> _Groups:
-        """Return the groups with a bounded walk, in recordings of `span_s`."""
-        cycle = np.pi * correlation_s / span_s * (self.first + (self.count - 1) / 2)
-        return replace(self, shapes=self.shapes * np.column_stack(
-            [np.ones((len(cycle), 2)), 1 / (1 + cycle ** -2.0)]))
 
 
 def coefficients(means: np.ndarray) -> np.ndarray:
@@ -220,57 +170,20 @@ def coefficient_variances(count: int, step_s: float) -> np.ndarray:
     return np.column_stack([np.full(count - 1, 1 / step_s), flicker, walk])
 
 
-def fit_noise(means: np.ndarray, step_s: float, variances: np.ndarray | None = None,
-              like: NoiseFit | None = None) -> NoiseFit:
+def fit_noise(means: np.ndarray, step_s: float, variances: np.ndarray | None = None) -> NoiseFit:
     """
     Fit white noise, bias instability and random walk to the means of neighbouring cells, u, (n,).
 
-    variances: those of `coefficient_variances`, which axes of one recording share; like: fit whose
-    coefficients to use; None leaves out those at which a filter or vibration shows.
+    variances: those of `coefficient_variances`, which axes of one recording share.
     """
     if variances is None:
         variances = coefficient_variances(len(means), step_s)
-    everything = _grouped(np.square(coefficients(means)), variances)
-    kept = everything.without_lines() if like is None else like.kept
-    groups = everything.where(kept)
-    span_s = len(means) * step_s
-    highest = _highest(groups, len(means), span_s) if like is None else like.highest
+    groups = _grouped(np.square(coefficients(means)), variances)
+    highest = _highest(groups, len(means))
     used = groups.below(highest)
-    models, correlation = _walks(used, span_s, highest)
-    theta, likelihood = _best(models)
-    white, instability, walk = (_interval(models, theta, likelihood, term) for term in range(3))
-    excess = everything.count * everything.power / (everything.shapes @ theta)
-    is_line = ~kept & (scipy.stats.chi2.sf(excess, everything.count)
-                       < _OCTAVE_PROBABILITY / len(kept))
-    lines_hz = (everything.first + everything.count / 2)[is_line] / (2 * span_s)
-    return NoiseFit(white, instability, walk, correlation, highest, highest / (2 * span_s), kept,
-                    lines_hz, likelihood)
-
-
-def _walks(groups: _Groups, span_s: float, highest: int
-           ) -> tuple[list[_Groups], Estimate | None]:
-    """
-    Return the groups with the walks that the interval of its correlation time holds.
-
-    A walk without bounds is one of its own, which bounds must contradict.
-    """
-    count = int(np.log(highest / _SHORTEST_BOUND) / np.log(_BOUND_STEP))
-    times_s = span_s * _BOUND_STEP ** np.arange(-count, 5.0)
-    models = [groups.bounded(time_s, span_s) for time_s in times_s]
-    likelihoods = np.array([_fit(model)[1] for model in models])
-    free = _fit(groups)[1]
-    if 2 * (likelihoods.max() - free) < scipy.stats.chi2.isf(_BOUND_PROBABILITY, 1):
-        return [groups], None
-    inside = np.flatnonzero(2 * (likelihoods.max() - likelihoods) < _DROP)
-    low, high = max(inside[0] - 1, 0), min(inside[-1] + 1, len(times_s) - 1)
-    return models[low:high + 1], Estimate(float(times_s[likelihoods.argmax()]),
-                                          float(times_s[low]), float(times_s[high]))
-
-
-def _best(models: list[_Groups], fixed: int | None = None, value: float = 0.0
-          ) -> tuple[np.ndarray, float]:
-    """Return the most likely fit of several models; see `_fit`."""
-    return max((_fit(model, fixed, value) for model in models), key=lambda fit: fit[1])
+    theta, likelihood = _fit(used)
+    white, instability, walk = (_interval(used, theta, likelihood, term) for term in range(3))
+    return NoiseFit(white, instability, walk, highest, highest / (2 * len(means) * step_s))
 
 
 def _grouped(power: np.ndarray, variances: np.ndarray) -> _Groups:
@@ -324,37 +237,34 @@ def _fit(groups: _Groups, fixed: int | None = None, value: float = 0.0
     return theta, likelihood
 
 
-def _interval(models: list[_Groups], theta: np.ndarray, likelihood: float, term: int) -> Estimate:
-    """Return a term with the ends of its interval by the profile likelihood over models."""
+def _interval(groups: _Groups, theta: np.ndarray, likelihood: float, term: int) -> Estimate:
+    """Return a term with the ends of its interval by the profile likelihood."""
     def excess(logarithm: float) -> float:
         """Return twice the drop of the profile likelihood, minus its limit."""
-        return 2 * (likelihood - _best(models, term, np.exp(logarithm))[1]) - _DROP
+        return 2 * (likelihood - _fit(groups, term, np.exp(logarithm))[1]) - _DROP
 
-    scale = float(np.min(models[0].shapes @ theta / models[0].shapes[:, term]))
+    scale = float(np.min(groups.shapes @ theta / groups.shapes[:, term]))
     best = float(theta[term])
-    low = 0.0
     begin = np.log(best if best > 0 else scale * _SMALLEST)
-    if best > 0 and 2 * (likelihood - _best(models, term, 0.0)[1]) > _DROP:
-        bottom = begin - 1.0
-        while excess(bottom) < 0:
-            bottom -= 1.0
-        low = float(np.exp(scipy.optimize.brentq(excess, bottom, begin, xtol=1e-6)))
-    top = begin + 1.0
-    while excess(top) < 0:
-        top += 1.0
-    high = float(np.exp(scipy.optimize.brentq(excess, top - 1.0, top, xtol=1e-6)))
+
+    def end(step: float) -> float:
+        """Return the end of the interval that lies in the direction of a step."""
+        beyond = begin + step
+        while excess(beyond) < 0:
+            beyond += step
+        return float(np.exp(scipy.optimize.brentq(excess, beyond - step, beyond, xtol=1e-6)))
+
+    is_seen = best > 0 and 2 * (likelihood - _fit(groups, term, 0.0)[1]) > _DROP
+    low, high = end(-1.0) if is_seen else 0.0, end(1.0)
     return Estimate(*(float(np.sqrt(square)) for square in (best, low, high)))
 
 
-def _highest(groups: _Groups, count: int, span_s: float) -> int:
+def _highest(groups: _Groups, count: int) -> int:
     """Return the number of the coefficient at which the fit stops: where a filter shows."""
     stop = count
     while stop > 2 * _FEWEST:
         lower = groups.below(max(stop // 2, _FEWEST))
         octave = groups.where((groups.first >= stop // 2) & (groups.first + groups.count <= stop))
-        _, correlation = _walks(lower, span_s, stop // 2)
-        if correlation is not None:
-            lower, octave = (part.bounded(correlation.value, span_s) for part in (lower, octave))
         if _is_expected(octave, lower, _fit(lower)[0]):
             break
         stop //= 2
@@ -374,41 +284,204 @@ def _is_expected(octave: _Groups, lower: _Groups, theta: np.ndarray) -> bool:
     return bool(scipy.stats.chi2.sf(excess ** 2 / variance, 1) > _OCTAVE_PROBABILITY)
 
 
-_DRIFT_GAIN = 12.0
-"""Gain in twice the log likelihood from which a drift is named. Chosen: one chance in 2000."""
-_FIT_ROUNDS = 3
-"""Rounds that fit the size of a drift and the noise in turn. Chosen: sizes then stay."""
+_UNFILTERED = 0.8
+"""Variance of a sample, divided by that of unfiltered white noise, from which there is no filter.
+Chosen: a filter at a third of the sample rate."""
+_DITHERED_STEPS = 0.6
+"""Noise from which rounding adds step²/12, steps. Chosen: exact within 0.4 % by the first harmonic
+of the rounding error (Widrow and Kollár 2008, section 4.4)."""
+_DENSITY = 'noise_density_g_per_rthz'
+"""Field of a sensor that holds its white noise."""
 
 
 @dataclass(frozen=True)
-class Drift:
-    """A drift of one axis; u is its unit."""
+class AxisNoise:
+    """The noise of one axis."""
 
-    follows: str  # What it follows: temperature or time
-    size: float  # Its size: u/K or u/s
-    without: NoiseFit  # The noise without the drift
+    axis: str  # Its letter
+    fit: NoiseFit  # White noise, bias instability and random walk, in m/s²
+    sample_std: float  # Standard deviation of a sample, m/s²
+    resolution: float  # Smallest change of a sample, m/s²
+    rounding: float  # N of the rounding to this resolution, m/s²/√Hz, which `fit` does not contain
+    # lowest_s, lowest: Time, s, and value, m/s², of the lowest point of the Allan deviation
+    lowest_s: float
+    lowest: float
+
+    @property
+    def estimates(self) -> tuple[Estimate, Estimate, Estimate]:
+        """N in m/s²/√Hz, B in m/s², and K in m/s²/√s."""
+        return self.fit.white, self.fit.instability, self.fit.walk
+
+    @property
+    def is_coarse(self) -> bool:
+        """Whether rounding hides the noise."""
+        return _is_coarse(self.sample_std, self.resolution)
+
+    @property
+    def sample_white(self) -> float:
+        """N of the samples with their rounding, or its upper limit, m/s²/√Hz."""
+        white = self.fit.white
+        return float(np.hypot(white.value if white.is_seen else white.high, self.rounding))
 
 
-def find_drift(means: np.ndarray, step_s: float, variances: np.ndarray, fit: NoiseFit,
-               temperature_c: np.ndarray | None) -> Drift | None:
+@dataclass(frozen=True)
+class RecordingNoise:
+    """The noise of a recording."""
+
+    path: str  # The recording
+    sensor: Sensor  # Its parameter file
+    unit: Sensor  # The nominal sensor that it comes from
+    rest: StillStretch  # Its samples at rest
+    axes: list[AxisNoise]  # The noise by axis
+
+
+def recording_noise(read: Callable[[], Iterable[Recording]], params: str | None,
+                    show: Callable[[float], None] = lambda done: None) -> RecordingNoise:
+    """Fit the noise of all axes in the longest rest; `read` yields the blocks of a recording."""
+    first = next(iter(read()), None)
+    if first is None:
+        raise UserError('the recording holds no samples')
+    sensor = load_sensor(params, first)
+    unit = unit_of(sensor, first.stream_info, first.axes)
+    rest = longest_rest(read, unit, first)
+    variances = coefficient_variances(len(rest.means), rest.step_s)
+    noises = []
+    for i, axis in enumerate(unit.axes):
+        fit = fit_noise(rest.means[:, i], rest.step_s, variances)
+        deviation = rest.allan.deviation[:, i]
+        lowest = int(np.argmin(deviation))
+        std, resolution = float(rest.sample_std[i]), float(rest.resolution[i])
+        rounding = resolution / float(np.sqrt(12 * rest.rate_hz))
+        noises.append(AxisNoise(axis, without_rounding(fit, std, resolution, rounding), std,
+                                resolution, rounding, float(rest.allan.tau_s[lowest]),
+                                float(deviation[lowest])))
+        show((i + 1) / len(unit.axes))
+    return RecordingNoise(first.path, sensor, unit, rest, noises)
+
+
+def without_rounding(fit: NoiseFit, std: float, resolution: float, rounding: float) -> NoiseFit:
     """
-    Find the drift that explains most of the slow motion of a signal; None where noise does.
+    Return the noise before the rounding of the samples to a resolution.
 
-    means: means of cells, u, (n,); variances: those of `coefficient_variances`; fit: the noise of
-    the same cells; temperature_c: temperature of the cells, (n,), None where it is not measured.
+    Above 0.6 steps of noise, rounding adds independent noise of the variance step²/12. Less noise
+    is hidden: it may be anything up to that, and codes that do not change show less.
+
+    std: standard deviation of a sample within some seconds, m/s²; resolution: smallest change of a
+    sample, m/s².
     """
-    shapes = {'time': np.arange(len(means)) * step_s}
-    if temperature_c is not None and np.ptp(temperature_c) > 0:
-        shapes['temperature'] = temperature_c
-    drifts = []
-    for name, shape in shapes.items():
-        measured, expected = (coefficients(values)[:fit.highest] for values in (means, shape))
-        size, without = 0.0, fit
-        for _ in range(_FIT_ROUNDS):
-            weight = expected / (variances[:fit.highest] @ without.squares)
-            size = float(weight @ measured / (weight @ expected))
-            without = fit_noise(means - size * shape, step_s, variances, without)
-        drifts.append(Drift(name, size, without))
-    best = max(drifts, key=lambda drift: drift.without.log_likelihood)
-    gain = 2 * (best.without.log_likelihood - fit.log_likelihood)
-    return best if gain > _DRIFT_GAIN else None
+    if not _is_coarse(std, resolution):
+        return replace(fit, white=Estimate(*(float(np.sqrt(max(value ** 2 - rounding ** 2, 0.0)))
+                                             for value in fit.white)))
+    widest = max(_DITHERED_STEPS * resolution / std, 1.0)
+    white, instability, walk = (Estimate(term.value, 0.0, term.high * widest)
+                                for term in (fit.white, fit.instability, fit.walk))
+    return replace(fit, white=white, instability=instability, walk=walk)
+
+
+def _is_coarse(std: float, resolution: float) -> bool:
+    """Whether samples with rounding have less noise than makes rounding independent of them."""
+    return std ** 2 < resolution ** 2 * (_DITHERED_STEPS ** 2 + 1 / 12)
+
+
+def density_g_per_rthz(noise: AxisNoise) -> float | None:
+    """Return the density of white noise as datasheets state it, g/√Hz; None if it is not seen."""
+    white = noise.fit.white
+    return ONE_SIDED * white.value / G0_MPS2 if white.is_seen else None
+
+
+def with_noise(sensor: Sensor, noises: list[AxisNoise]) -> Sensor:
+    """
+    Give a sensor the measured noise.
+
+    White noise is its density. Bias instability is the effect `flicker`, whose density over
+    positive frequencies is B²/(π·f), and random walk is `bias_walk`. A term that is not seen on
+    an axis keeps the value of `sensor` up to its upper limit. White noise that neither shows stays
+    unstated, so that nobody takes it for 0. It has the rounding where `sensor` has no ADC.
+
+    Where the filter is not stated, it is the first-order one that gives a sample the measured
+    noise: white noise of the density 2·N² over positive frequencies has the variance N²/(2·RC)
+    behind it. A rest shows neither range nor resolution: where they are not stated, the
+    placeholders of `Sensor` stay, which limit and round nothing.
+    """
+    values = {name: value for name, value in sensor.values.items() if name != 'noise_excess'}
+    to_g = np.array([ONE_SIDED, 1 / np.sqrt(np.pi), 1.0])[:, None] / G0_MPS2
+    # By field of an estimate, term and axis.
+    value, low, high = (np.array([noise.estimates for noise in noises]) * to_g).T
+
+    def merged(term: int, before: np.ndarray | float) -> np.ndarray:
+        return np.where(low[term] > 0, value[term], np.minimum(before, high[term]))
+
+    for term, (effect, name) in enumerate((('flicker', 'density_g_per_rthz'),
+                                           ('bias_walk', 'density_g_per_rts')), 1):
+        sizes = merged(term, sensor.values.get(effect, {}).get(name, 0.0))
+        values.pop(effect, None)
+        if sizes.any():
+            values[effect] = {name: sizes}
+    kept = [name for name in sensor.effects if name in values]
+    changed: dict[str, Any] = {
+        'effects': (*kept, *(name for name in values if name not in kept)), 'values': values,
+        'unstated': (_DENSITY,)}
+    if _DENSITY not in sensor.unstated or (low[0] > 0).all():
+        before = sensor.noise_density_g_per_rthz
+        density = merged(0, np.where(before > 0, before, np.inf))
+        if not sensor.adc_bits:
+            rounding = [ONE_SIDED * noise.rounding / G0_MPS2 for noise in noises]
+            density = np.where(low[0] > 0, np.hypot(density, rounding), density)
+        changed |= {_DENSITY: density, 'unstated': ()}
+    if 'rc_capacitance_f' in sensor.unstated:
+        changed |= {'rc_resistance_ohm': RESISTANCE_OHM,
+                    'rc_capacitance_f': _filter_s(noises, sensor.rate_hz) / RESISTANCE_OHM}
+    return replace(sensor, **changed)
+
+
+def _filter_s(noises: list[AxisNoise], rate_hz: float) -> float:
+    """Return the time constant that the noise of a sample shows, s; 0 for no filter."""
+    seen = [noise for noise in noises if noise.fit.white.is_seen]
+    if not seen:
+        return 0.0
+    white = float(np.mean([noise.sample_white ** 2 for noise in seen]))
+    variance = float(np.mean([noise.sample_std ** 2 for noise in seen]))
+    return white / (2 * variance) if variance < _UNFILTERED * white * rate_hz else 0.0
+
+
+_PX4_HZ = 100.0
+"""Rate of the filter of PX4, Hz: EKF2_PREDICT_US is 10 000."""
+
+
+Setting = tuple[str, list[float], str]
+"""A line of another program's settings: name, one value or nine of a matrix, and their unit."""
+
+
+def settings(noises: list[AxisNoise], rate_hz: float) -> dict[str, list[Setting]]:
+    """
+    Return the settings of other programs.
+
+    kalibr takes N and K as they are. VINS-Fusion and PX4 add the variance of a value times the
+    square of the time step, so they take N·√rate and K·√rate, at the rate of their filter.
+    robot_localization takes the variance of a sample from the message. Programs that have one
+    value for all axes get the largest one. A term that is not seen is its upper limit.
+    """
+    loudest = max(noises, key=lambda noise: noise.sample_white)
+    walk = max((noise.fit.walk for noise in noises), key=lambda walk: walk.value)
+    white, k = loudest.sample_white, walk.value
+    if not walk.is_seen:
+        k = max(noise.fit.walk.high for noise in noises)
+    white_note, note = ('' if term.is_seen else ', an upper limit'
+                        for term in (loudest.fit.white, walk))
+    variances = [noise.sample_std ** 2 for noise in noises]
+    matrix = np.diag((variances + [1e6] * 3)[:3]).ravel()
+
+    def both(names: tuple[str, str], filter_hz: float, remark: str = '') -> list[Setting]:
+        root = float(np.sqrt(filter_hz))
+        return [(names[0], [white * root], f'm/s^2{remark}{white_note}'),
+                (names[1], [k * root], f'm/s^3{note}')]
+
+    return {
+        'kalibr, imu.yaml': [
+            (name, [value], unit + remark) for (name, value, unit), remark
+            in zip(kalibr_settings(white, k, rate_hz), (white_note, note, ''))],
+        f'VINS-Fusion, at {rate_hz:.4g} Hz': both(('acc_n', 'acc_w'), rate_hz),
+        'robot_localization, in sensor_msgs/Imu of the driver': [
+            ('linear_acceleration_covariance', matrix.tolist(), '(m/s^2)^2')],
+        'PX4, its filter at 100 Hz; vibration in flight needs more': both(
+            ('EKF2_ACC_NOISE', 'EKF2_ACC_B_NOISE'), _PX4_HZ, ', at least 0.01')}

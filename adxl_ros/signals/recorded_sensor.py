@@ -48,9 +48,8 @@ def measure_unstated(sensor: Sensor, read: Recording) -> tuple[Sensor, list[str]
 
 def listed(measured: list[str]) -> list[str]:
     """Return the lines of `measure_unstated` below a heading; none where nothing is measured."""
-    if not measured:
-        return []
-    return ['', 'Measured, as no parameter file states it:', *(f'  {line}' for line in measured)]
+    return ['', 'Measured, as no parameter file states it:',
+            *(f'  {line}' for line in measured)] if measured else []
 
 
 class BeyondRange:
@@ -116,7 +115,7 @@ def _measured(unit: Sensor, time_s: np.ndarray, volts: np.ndarray, where: str = 
                  for begin, end in stats.true_runs(quiet, blocks.run)]
         rc_s = _filter_s(rests, unit.rate_hz, float(np.max(step_v)))
     noise_g = np.sqrt(variance_v2) / scale_v_per_g
-    largest_g = float(np.nanmax(np.abs(volts - unit.nominal_zero_g_v) / scale_v_per_g))
+    largest_g = float(np.max(np.abs(volts - unit.nominal_zero_g_v) / scale_v_per_g))
     # A common range: a power of two
     range_g = 2.0 ** ceil(log2(max(largest_g, _SMALLEST_RANGE_G)))
     bandwidth_hz = 0.25 / rc_s if rc_s else unit.rate_hz / 2
@@ -193,10 +192,6 @@ _CORRELATED_ORDINATES = 35 / 18
 _ADC_NOISE_PRIOR_STD = 0.7
 """Prior standard deviation of the logarithm of the ADC's noise variance about LSB²/12. Chosen:
 a factor of two."""
-_LINE_STD = 6.0
-"""Excess from which an ordinate is a line (hum), standard deviations of the ordinates."""
-_FIT_ROUNDS = 2
-"""Number of fits: the second one leaves out the lines that the first one shows."""
 _MIN_VARIANCE_V2 = 1e-18
 """Lower bound of the start value of the noise variance, V²."""
 _MIN_LSB_V = 1e-9
@@ -235,7 +230,7 @@ class FilterNoise:
 def estimate_filter(rests: Iterable[np.ndarray], rate_hz: float, rc_s: float, lsb_v: float
                     ) -> FilterNoise | None:
     """
-    Estimate the time constant of one axis.
+    Estimate the time constant of one axis by the likelihood of its periodogram (Whittle).
 
     rests: volts of each rest without gaps, (n,) each.
     """
@@ -249,42 +244,37 @@ def estimate_filter(rests: Iterable[np.ndarray], rate_hz: float, rc_s: float, ls
         return None
     weight = _INDEPENDENT_SEGMENTS * count
     lags = np.correlate(window, window, 'full')[size - 1:]
-    used = np.arange(len(power)) > _LOWEST_BINS
-    start = np.log([max(float(np.mean(power[used])) / size, lsb_v ** 2, _MIN_VARIANCE_V2),
+    start = np.log([max(float(np.mean(power)) / size, lsb_v ** 2, _MIN_VARIANCE_V2),
                     rc_s * rate_hz, max(lsb_v, _MIN_LSB_V) ** 2 / 12])
-    log_adc_variance = float(start[2])
 
     def cost(x: np.ndarray) -> float:
         """Return the negative log posterior for the parameters of `_expected`."""
-        expected = np.maximum(_expected(x, lags)[used], _MIN_EXPECTED_V2)
-        prior = ((x[2] - log_adc_variance) / _ADC_NOISE_PRIOR_STD) ** 2
-        return float(np.sum(power[used] / expected + np.log(expected)) + prior / (2 * weight))
+        expected = _expected(x, lags)
+        prior = ((x[2] - start[2]) / _ADC_NOISE_PRIOR_STD) ** 2
+        return float(np.sum(power / expected + np.log(expected)) + prior / (2 * weight))
 
-    for _ in range(_FIT_ROUNDS):
-        fit = scipy.optimize.minimize(cost, start, method='Nelder-Mead',
-                                      options={'xatol': 1e-5, 'fatol': 1e-6, 'maxiter': 2000})
-        deviation = power / _expected(fit.x, lags) - 1
-        used &= deviation < _LINE_STD / np.sqrt(weight)
-        if used.sum() < _MIN_SEGMENT_SAMPLES // 2:
-            return None
-        start = fit.x
-    scatter = float(np.mean(deviation[used] ** 2) * weight)
-    information = _information(fit.x, used, lags) * weight / _CORRELATED_ORDINATES
+    best = scipy.optimize.minimize(cost, start, method='Nelder-Mead', options={
+        'xatol': 1e-5, 'fatol': 1e-6, 'maxiter': 2000}).x
+    scatter = float(np.mean((power / _expected(best, lags) - 1) ** 2) * weight)
+    slopes = np.array([np.log(_expected(best + step, lags) / _expected(best - step, lags))
+                       for step in _LOG_STEP * np.eye(3)]) / (2 * _LOG_STEP)
+    information = slopes @ slopes.T * weight / _CORRELATED_ORDINATES
     information += np.diag([0.0, 0.0, _ADC_NOISE_PRIOR_STD ** -2])
     # White noise does not show a filter.
     if np.linalg.cond(information) > _MAX_CONDITION:
         return None
     ratio_std = float(np.sqrt(np.linalg.inv(information)[1, 1] * max(scatter, 1.0)))
-    return FilterNoise(float(np.exp(fit.x[1]) / rate_hz), ratio_std, scatter)
+    return FilterNoise(float(np.exp(best[1]) / rate_hz), ratio_std, scatter)
 
 
 def _mean_periodogram(rests: Iterable[np.ndarray], window: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return the mean periodogram of all segments, V², and their number."""
+    """Return the mean periodogram of all segments above the lowest bins, V², and their number."""
     size = len(window)
     parts = np.concatenate([np.empty((0, size)), *(
         sliding_window_view(volts, size)[::size // 2] for volts in rests if len(volts) >= size)])
     spectra = np.fft.rfft(window * (parts - parts.mean(axis=1, keepdims=True)))
-    return (np.abs(spectra) ** 2).sum(axis=0) / max(len(parts), 1), len(parts)
+    power = (np.abs(spectra) ** 2).sum(axis=0) / max(len(parts), 1)
+    return power[_LOWEST_BINS + 1:], len(parts)
 
 
 def _expected(x: np.ndarray, lags: np.ndarray) -> np.ndarray:
@@ -293,15 +283,8 @@ def _expected(x: np.ndarray, lags: np.ndarray) -> np.ndarray:
     covariance = variance_v2 * np.exp(-np.arange(len(lags)) / rc_samples)
     covariance[0] += adc_variance_v2
     terms = covariance * lags
-    return 2 * np.fft.rfft(terms).real - terms[0]
-
-
-def _information(x: np.ndarray, used: np.ndarray, lags: np.ndarray) -> np.ndarray:
-    """Return the expected information of one periodogram, (3, 3): Σ ∂log S·∂log Sᵀ."""
-    slopes = np.array([(np.log(_expected(x + _LOG_STEP * unit, lags)[used])
-                        - np.log(_expected(x - _LOG_STEP * unit, lags)[used])) / (2 * _LOG_STEP)
-                       for unit in np.eye(3)])
-    return slopes @ slopes.T
+    expected = 2 * np.fft.rfft(terms).real - terms[0]
+    return np.maximum(expected[_LOWEST_BINS + 1:], _MIN_EXPECTED_V2)
 
 
 def with_filter(fitted: Sensor, estimates: Sequence[Sequence[FilterNoise | None]]

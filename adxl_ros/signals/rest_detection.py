@@ -52,8 +52,6 @@ _SETTLE_TAUS = 8.0
 0.03 %, is below the noise of a rest's mean."""
 _ANGLES = (JOINTS['alpha'], JOINTS['beta'])
 """Columns of the encoder angles."""
-_ROUNDING = 1e-9
-"""Relative excess over the angle tolerance that rounding explains."""
 _FALSE_ALARM = 1e-6
 """Probability that the variance of noise exceeds its limit."""
 _QUARTILE_TO_STD = 0.3186
@@ -132,7 +130,7 @@ def learned_limits(blocks: Blocks, windows: np.ndarray, step: np.ndarray,
 
     windows: `window_variance` of the blocks; step: step of the ADC, (m,).
     """
-    if len(blocks) < max(spans.window, 2 * spans.half) or not blocks.count.any():
+    if len(blocks) < max(spans.window, 2 * spans.half):
         return None
     variance, limit = stats.quiet_variance(blocks, windows, step)
     quiet = stats.quiet_blocks(blocks, windows, limit, spans.window)
@@ -239,14 +237,13 @@ class RestFinder:
     """
 
     def __init__(self, rate_hz: float, axes: int, noise: Noise | None = None,
-                 learn: bool | None = None, angle_tolerance_rad: float | None = None,
-                 min_rest_s: float | None = None):
+                 learn: bool | None = None, angle_tolerance_rad: float | None = None):
         self.noise = noise
         self.learn = noise is None if learn is None else learn
-        on_stage = not self.learn or angle_tolerance_rad is not None
         self.angle_tolerance_rad = angle_tolerance_rad
         self._spans = Spans(rate_hz)
-        shortest_s = (_STAGE_S if on_stage else _HAND_HELD_S) if min_rest_s is None else min_rest_s
+        on_stage = not self.learn or angle_tolerance_rad is not None
+        shortest_s = _STAGE_S if on_stage else _HAND_HELD_S
         self._min_blocks = max(round(shortest_s / self._spans.block_s), self._spans.window)
         # A motion that has decayed below the limits may still be in the first block.
         settle_s = _SETTLE_TAUS * noise.tau_s if noise is not None else 0.0
@@ -295,7 +292,7 @@ class RestFinder:
             return None
         rms = np.sqrt(stats.window_variance(newest, self._spans)[-1])
         halves = newest.mean[-2 * half:].reshape(2, half, -1).mean(axis=1)
-        values = np.nan_to_num(np.concatenate([rms, np.abs(halves[1] - halves[0])]), nan=np.inf)
+        values = np.concatenate([rms, np.abs(halves[1] - halves[0])])
         allowed = np.concatenate([np.sqrt(limits.variance),
                                   _DRIFT_SIGMAS * limits.drift[0] + limits.step])
         worst = int(np.argmax(values / allowed))
@@ -417,7 +414,7 @@ class RestFinder:
     def _is_one_pose(self, bounds: np.ndarray) -> bool:
         """Return whether the angles within (−lowest, highest), (2, a), are those of one pose."""
         assert self.angle_tolerance_rad is not None, 'angles have a tolerance'
-        allowed = 2 * self.angle_tolerance_rad * (1 + _ROUNDING)
+        allowed = 2 * self.angle_tolerance_rad * (1 + 1e-9)  # of rounding
         return not (bounds.sum(axis=0) > allowed).any()
 
 
@@ -465,15 +462,14 @@ class RecordedRests:
 
 def find_rests(time_s: np.ndarray, samples: np.ndarray, rate_hz: float,
                angles_rad: np.ndarray | None = None, noise: Noise | None = None,
-               learn: bool | None = None, angle_tolerance_rad: float | None = None,
-               min_rest_s: float | None = None) -> list[Rest]:
+               learn: bool | None = None, angle_tolerance_rad: float | None = None) -> list[Rest]:
     """
     Find the rests of a recording.
 
     time_s, samples, angles_rad: time s (n,), samples (n, m) in any unit, encoder angles rad (n,
     2).
     """
-    finder = RestFinder(rate_hz, samples.shape[1], noise, learn, angle_tolerance_rad, min_rest_s)
+    finder = RestFinder(rate_hz, samples.shape[1], noise, learn, angle_tolerance_rad)
     finder.feed(time_s, samples, angles_rad)
     return finder.rests()
 
@@ -510,8 +506,8 @@ def _mean(part: Blocks, step: np.ndarray, spans: Spans,
     The noise may have any spectrum. The means of up to twenty batches of the rest are nearly
     independent, and their scatter is the long-run variance (batch means; Law and Kelton 2000).
     """
-    mean = part.count @ part.mean / part.count.sum()
-    white = part.squares.sum(axis=0) / max((part.count - 1).sum(), 1)
+    mean = part.mean.mean(axis=0)
+    white = part.squares.sum(axis=0) / max((spans.size - 1) * len(part), 1)
     length = max(-(-len(part) // _BATCHES), _MIN_BATCH_BLOCKS)
     count = len(part) // length
     long_run = np.zeros(len(mean))
@@ -529,7 +525,6 @@ def _mean(part: Blocks, step: np.ndarray, spans: Spans,
 
 def _without_knocks(part: Blocks, step: np.ndarray, spans: Spans) -> Blocks:
     """Leave out the blocks of a rest whose variance differs from that of most blocks."""
-    part = part[part.count > 0]
     windows = stats.window_variance(part, spans)
     _, limit = stats.quiet_variance(part, windows, step)
     calm = part[stats.quiet_blocks(part, windows, limit, spans.window)]

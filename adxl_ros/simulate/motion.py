@@ -141,7 +141,6 @@ def check_needs(sensor: Sensor, motion: Motion) -> None:
 
 JOINTS = ('alpha', 'beta', 'shift')
 """Names of the joints, in the order of all arrays."""
-
 _REACH = {'alpha': 100.0, 'beta': 100.0, 'shift': 10.0}
 """Largest position of each joint, rad or m. Chosen: 16 turns, and more than a laboratory."""
 _SETTLED = 6.638

@@ -39,23 +39,17 @@ import numpy as np
 
 Columns = dict[str, np.ndarray]
 """Columns of a recording by canonical name, (n,) each."""
-
 _BLOCK_ROWS = 32768
 """Samples of a block; chosen: its arrays stay smaller than the internal grid."""
-
 _BLOCK_STEPS = 65536
 """Steps of the internal grid in memory at once; chosen: some 10 MB of signals."""
-
 _WHOLE_STEPS = 300_000
 """Largest number of steps that are simulated at once and kept; chosen: 20 minutes at 250 Hz, some
 200 MB."""
-
 _ALIGNED_STEPS = 1e-4
 """Largest distance of a sample on a step from it, in steps; chosen: far above rounding."""
-
 _ROUNDING = 1e-9
 """Rounding error of a ratio of two rates."""
-
 _NOISE_MEMORY = 50
 """Time constants of the filter over which the noise of missing samples is drawn; chosen: the state
 of the filter has then decayed to e⁻⁵⁰."""
@@ -78,7 +72,7 @@ class Response:
         self._seed = seed
         self._force_path: Callable[[np.ndarray], Components] | None = None
         self._chain = Chain(sensor, seed=seed)
-        self._memo: ChainMemo | None = None
+        self._kept: Callable[[str, Hashable, Callable[[], Any]], Any] = _computed
         self._block_steps = _BLOCK_STEPS
         steps_per_sample = ceil(motion.internal_rate_hz / sensor.rate_hz - _ROUNDING)
         self._step_s = 1 / (sensor.rate_hz * steps_per_sample)
@@ -124,7 +118,7 @@ class Response:
         steps = ceil((float(stamps_s[-1]) - self._begin_s) / self._step_s) + POINTS
         if steps > _WHOLE_STEPS:
             return self(stamps_s)
-        self._memo, self._block_steps = memo, steps
+        self._kept, self._block_steps = memo, steps
         sensor = self.sensor
         key = (*self._key(*Place), self._seed, sensor.rate_hz, sensor.rc_s, sensor.lsb_v,
                *sensor.nominal_zero_g_v.tolist(), *sensor.noise_density_g_per_rthz.tolist(),
@@ -137,10 +131,6 @@ class Response:
         return (self._motion, self._begin_s, self._step_s, sensor.local_gravity_mps2,
                 sensor.adc_vref_v, *sensor.nominal_scale_v_per_g.tolist(),
                 *(effect.key for place in places for effect in self._chain.effects[place]))
-
-    def _kept(self, part: str, key: Hashable, compute: Callable[[], Any]) -> Any:
-        """Return a result from the memo, or compute it."""
-        return compute() if self._memo is None else self._memo(part, key, compute)
 
     def _instants(self, stamps_s: np.ndarray) -> np.ndarray:
         """Return the instants of samples by their stamps, s, (n,)."""
@@ -271,6 +261,11 @@ class Response:
         return drawn[np.cumsum(passed) - 1] * std_v
 
 
+def _computed(_part: str, _key: Hashable, compute: Callable[[], Any]) -> Any:
+    """Compute a result, in place of a memo."""
+    return compute()
+
+
 _KEPT = 3
 """Number of results of each part that are kept. Chosen: the baseline, the present hypothesis and
 one more; a recording of ten minutes then needs below 100 MB."""
@@ -347,17 +342,13 @@ def _references(sensor: Sensor, motion: Motion, time_s: np.ndarray) -> Columns:
 
 _SEED = 0
 """Seed of noise-like effects in a comparison."""
-
 _QUIET = 1e-9
 """Factor of the white noise in a comparison; chosen: invisible, but not 0, which effects on the
 noise refuse."""
-
 _FINE_BITS = 32
 """Resolution of the ADC in a comparison, bit; chosen: its steps are invisible."""
-
 _RATE_HZ = 250.0
 """Largest sample rate of the comparison, Hz; chosen: above twice the bandwidth of the motion."""
-
 _SHORT_RC_S = 1e-9
 """Time constant of a filter that does nothing, s; chosen: not 0, which `bandwidth` refuses."""
 

@@ -10,7 +10,6 @@ are known; what the steps of the encoders leave open is simulated, and is the er
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import replace
 from functools import cached_property
 import os
@@ -21,6 +20,7 @@ from adxl_ros.files import robot_readings
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.robot_readings import Readings
 from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.effects.base import Components
 from adxl_ros.simulate.motion import Held, INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.smoothed_paths import (
     ForcePath,
@@ -61,20 +61,8 @@ class Robot:
         """
         Read a URDF.
 
-        Parameters
-        ----------
-        urdf
-            The file.
-        frame
-            Name of the link, or frame, that carries the sensor.
-        moves
-            Whether the base moves in the world.
-
-        Raises
-        ------
-        UserError
-            The file is no URDF, has no such frame, or pinocchio is not installed.
-
+        urdf: the file; frame: name of the link, or frame, that carries the sensor; moves: whether
+        the base moves in the world.
         """
         try:
             import pinocchio
@@ -103,7 +91,7 @@ class Robot:
         self._model = pinocchio.buildReducedModel(model, fixed, pinocchio.neutral(model))
         self._data = self._model.createData()
         self._frame = self._model.getFrameId(frame)
-        self.frame, self.urdf, self._moves = frame, str(urdf), moves
+        self.frame, self.urdf = frame, str(urdf)
         # Name of the link that the base is
         self.root = model.frames[1 + moves].name if model.nframes > 1 else ''
 
@@ -112,21 +100,10 @@ class Robot:
         """
         Return the motion of the frame.
 
-        Parameters
-        ----------
-        joints
-            Position, rate and acceleration of the joints, rad or m and s, (3, n, j).
-        base
-            The same of the pose of the base, x, y, z and quaternion x, y, z, w, (3, n, 7).
-        gravity_mps2
-            Local gravity, m/s².
-
-        Returns
-        -------
-        ndarray
-            In the frame: specific force, m/s², angular rate, rad/s, angular acceleration, rad/s²,
-            and the unit vector upward, (4, n, 3).
-
+        joints: position, rate and acceleration of the joints, rad or m and s, (3, n, j); base: the
+        same of the pose of the base, x, y, z and quaternion x, y, z, w, (3, n, 7); gravity_mps2:
+        local gravity, m/s²; returns: in the frame: specific force, m/s², angular rate, rad/s,
+        angular acceleration, rad/s², and the unit vector upward, (4, n, 3).
         """
         pin, model, data = self._pin, self._model, self._data
         q, v, a = (np.zeros((joints.shape[1], size)) for size in (model.nq, model.nv, model.nv))
@@ -176,22 +153,8 @@ class RobotPath(ForcePath):
         """
         Smooth the readings, and run the kinematics.
 
-        Parameters
-        ----------
-        robot
-            The kinematics.
-        readings
-            Readings of its joints, and of its base.
-        gravity_mps2
-            Local gravity, m/s².
-        since_s
-            Time from which the force is needed, s.
-
-        Raises
-        ------
-        UserError
-            A joint of the chain has no readings, or too few.
-
+        robot: the kinematics; readings: readings of its joints, and of its base; gravity_mps2:
+        local gravity, m/s²; since_s: time from which the force is needed, s.
         """
         self._robot, self._gravity_mps2 = robot, gravity_mps2
         self._tracks = _tracks(robot, readings)
@@ -207,12 +170,11 @@ class RobotPath(ForcePath):
             gaps_s = np.append(np.diff(times), 0.0)
             longest_s = max(_LONGEST_GAP_S, _USUAL_GAPS * float(np.median(gaps_s)))
             grid_s = grid_s[gaps_s[np.searchsorted(times, grid_s, 'right') - 1] <= longest_s]
-        self._grid_s = grid_s[grid_s >= since_s]
+        grid_s = grid_s[grid_s >= since_s]
         self._splines = self._paths(self._tracks)
-        self._smoothed = _derivatives(self._splines, self._grid_s)
+        self._smoothed = _derivatives(self._splines, grid_s)
         self.motion = self._moved(self._smoothed)
-        super().__init__(self._grid_s, self.motion[0])
-        self._rotation = CubicSpline(self._grid_s, np.hstack(list(self.motion[1:3])))
+        super().__init__(grid_s, np.hstack(list(self.motion)))
         self.joints, self.wanders = robot.joints, readings.base is not None
 
     def _paths(self, tracks: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Path]:
@@ -226,11 +188,10 @@ class RobotPath(ForcePath):
         base = tracks[:, :, count:] if tracks.shape[2] > count else None
         return self._robot.motion(tracks[:, :, :count], base, self._gravity_mps2)
 
-    def rotation(self, time_s: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    def rotation(self, time_s: np.ndarray) -> tuple[Components, Components]:
         """Return angular rate, rad/s, and acceleration, rad/s², in the frame, by component."""
-        inside_s = np.clip(time_s, self._grid_s[0], self._grid_s[-1])
-        both = self._rotation(inside_s).T
-        return list(both[:3]), list(both[3:])
+        columns = self.at(time_s)
+        return columns[3:6], columns[6:9]
 
     def as_motion(self) -> Motion:
         """Return the motion that a sensor in the frame follows."""
@@ -265,17 +226,8 @@ class RobotPath(ForcePath):
 
         Gravity at rest is g·[sin α·cos β, −sin α·sin β, cos α].
         """
-        inside_s = np.clip(time_s, self._grid_s[0], self._grid_s[-1])
-        x, y, z = CubicSpline(self._grid_s, self.motion[3])(inside_s).T
+        x, y, z = self.at(time_s)[9:]
         return np.arctan2(np.hypot(x, y), z), np.unwrap(np.arctan2(-y, x))
-
-    def shifted(self, later_s: float) -> RobotPath:
-        """Return the same motion at later times, s."""
-        later = copy(self)
-        later._grid_s = self._grid_s + later_s
-        ForcePath.__init__(later, later._grid_s, self.motion[0])
-        later._rotation = CubicSpline(later._grid_s, np.hstack(list(self.motion[1:3])))
-        return later
 
     @cached_property
     def modes(self) -> dict[str, np.ndarray]:  # type: ignore[override]
@@ -290,11 +242,11 @@ class RobotPath(ForcePath):
             moved = smoothed.copy()
             moved[0, :, number] += _OFFSET_RAD
             modes[f'joint{number + 1}'] = (self._moved(moved)[0] - self.motion[0]) / _OFFSET_RAD
-        lag = CubicSpline(self._grid_s, smoothed[2])
+        lag = CubicSpline(self.time_s, smoothed[2])
         yielded = smoothed.copy()
         count = len(self._robot.joints)
         yielded[:, :, :count] -= _COMPLIANCE_S2 * np.array(
-            [lag(self._grid_s, order)[:, :count] for order in range(3)])
+            [lag(self.time_s, order)[:, :count] for order in range(3)])
         modes['flexible'] = (self._moved(yielded)[0] - self.motion[0]) / _COMPLIANCE_S2
         return modes
 
@@ -307,11 +259,11 @@ class RobotPath(ForcePath):
         correlation of neighbours on a grid that is finer than the changes would say far less.
         """
         error = self.rounding_mps2[:, component] + self.smoothing_mps2[:, component]
-        around = max(round(_AROUND_S / (self._grid_s[1] - self._grid_s[0])), 3)
+        around = max(round(_AROUND_S / (self.time_s[1] - self.time_s[0])), 3)
         size, rate = (np.sqrt(np.maximum(uniform_filter1d(v ** 2, around), 0.0)) for v in (
-            error, np.gradient(error, self._grid_s)))
-        return PathErrors(np.interp(time_s, self._grid_s, size), np.interp(
-            time_s, self._grid_s, rate / np.maximum(size, _SMALLEST_STEP)))
+            error, np.gradient(error, self.time_s)))
+        return PathErrors(np.interp(time_s, self.time_s, size), np.interp(
+            time_s, self.time_s, rate / np.maximum(size, _SMALLEST_STEP)))
 
     @cached_property
     def smoothing_mps2(self) -> np.ndarray:
@@ -341,7 +293,7 @@ class RobotPath(ForcePath):
             if every == 1 and step and np.ptp(values):
                 read = np.rint((read + offset) / step) * step - offset
             tracks.append((times[::every], read[::every]))
-        return self._moved(_derivatives(self._paths(tracks), self._grid_s))[0] - self.motion[0]
+        return self._moved(_derivatives(self._paths(tracks), self.time_s))[0] - self.motion[0]
 
 
 def _derivatives(paths: Sequence[Path], time_s: np.ndarray) -> np.ndarray:
@@ -384,29 +336,9 @@ def robot_path(urdf: str | os.PathLike, frame: str, path: str, epoch_ns: int,
     """
     Return the specific force in a frame of a robot, by a recording of its joints.
 
-    Parameters
-    ----------
-    urdf, frame
-        The robot, and the frame that carries the sensor.
-    path
-        The recording; see `robot_readings.read`.
-    epoch_ns
-        Stamp of time 0, ns.
-    gravity_mps2
-        Local gravity, m/s².
-    topic
-        Topic of the joints; empty for the only one.
-
-    Returns
-    -------
-    RobotPath
-        The force, with its errors.
-
-    Raises
-    ------
-    UserError
-        The URDF, the frame, a joint or the recording is wrong.
-
+    urdf, frame: the robot, and the frame that carries the sensor; path: the recording; see
+    `robot_readings.read`; epoch_ns: stamp of time 0, ns; gravity_mps2: local gravity, m/s²; topic:
+    topic of the joints; empty for the only one; returns: the force, with its errors.
     """
     robot = Robot(urdf, frame)
     readings = robot_readings.read(path, epoch_ns, topic, robot.root, bool(robot.joints))

@@ -49,7 +49,6 @@ class UnitDraws:
     mean: np.ndarray  # (k,), each in the unit of its parameter
     root: np.ndarray  # Square root of the covariance by independent numbers, (k, l)
     limit_stds: np.ndarray  # Largest absolute value of each of these numbers, (l,); inf for none
-    held: tuple[str, ...] = ()  # Effects of the source that do not differ here
 
     def draw(self, count: int, rng: np.random.Generator) -> np.ndarray:
         """Return the coefficients of further units, (count, k)."""
@@ -64,24 +63,9 @@ def unit_draws(sensor: Sensor, units: str | PathLike | Population) -> UnitDraws:
     """
     Return how units differ.
 
-    Parameters
-    ----------
-    sensor
-        The unit, or the nominal sensor.
-    units
-        'datasheet' for the tolerances of the parameter file, 'calibration' for the covariance of
-        the unit's own coefficients, else the population.yaml of a fleet.
-
-    Returns
-    -------
-    UnitDraws
-        The distribution. Only effects that are functions of one sample are in it.
-
-    Raises
-    ------
-    UserError
-        The parameter file states no tolerance or covariance, or the population cannot be read.
-
+    sensor: the unit, or the nominal sensor; units: 'datasheet' for the tolerances of the parameter
+    file, 'calibration' for the covariance of the unit's own coefficients, else the population.yaml
+    of a fleet; returns: the distribution. Only effects that are functions of one sample are in it.
     """
     limit: float | np.ndarray
     if units == 'datasheet':
@@ -104,9 +88,7 @@ def unit_draws(sensor: Sensor, units: str | PathLike | Population) -> UnitDraws:
                         'population.yaml of a fleet')
     drawn = [effect_named(name.effect).invertible for name in names]
     return UnitDraws(tuple(name for name, is_drawn in zip(names, drawn) if is_drawn),
-                     mean[drawn], root[drawn], np.broadcast_to(limit, len(names)),
-                     tuple(dict.fromkeys(name.effect for name, is_drawn in zip(names, drawn)
-                                         if not is_drawn)))
+                     mean[drawn], root[drawn], np.broadcast_to(limit, len(names)))
 
 
 def _datasheet(sensor: Sensor) -> tuple[list[Coefficient], np.ndarray, np.ndarray]:

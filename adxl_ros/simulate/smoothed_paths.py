@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass
 from itertools import pairwise
 from types import MappingProxyType
@@ -17,83 +18,55 @@ import scipy
 
 _DEGREE = 5
 """Degree of the splines of joints; chosen: quintic, so that the acceleration is smooth."""
-
 BAND_LIMITED_DEGREE = 11
 """Degree of the spline through exact readings of a motion that is nearly as fast as its sampling;
 chosen: the acceleration of 40 Hz, sampled at 100 Hz, is exact to 0.1 %, by quintic splines to
 3 %."""
-
 _MAX_UNEVENNESS = 3.0
 """Longest interval of readings, divided by the median, that splines of a higher degree bridge;
 chosen: they overshoot in longer ones."""
-
 KNOT_S = 0.03
 """Distance of the knots, s; chosen: motion slower than 10 Hz is free, the penalty smooths it."""
-
 _WINDOW_S = 60.0
 """Length of a window, s; chosen: its normal equations are small."""
-
-_MAX_WINDOWS = 64
-"""Largest number of windows in memory; chosen: an hour of motion."""
-
-_MAX_PIECES = 20_000
-"""Largest number of knots of a window that is kept as polynomials; chosen: at most 2 MB."""
-
 _MARGIN_S = 3.0
 """Overlap of the windows on each side, s; chosen: far beyond the range of the spline's penalty."""
-
 _PROBES = 12
 """Windows that the strength of the penalty is matched to; chosen: enough for a median."""
-
 _MIN_MOVING = 100
 """Fewest readings in motion that determine a strength; chosen: their rms is then within 7 %."""
-
 _USUAL_STRENGTH = 1.0
 """Strength where too few readings move to determine one; chosen: that of quick moves."""
-
 _BOUNDED_SHARE = 0.03
 """Strength of the penalty within bounds, divided by the matched one. Tuned, with `_REST_WEIGHT`,
 on manoeuvres of the package from 25 to 250 Hz behind encoders of 0.083 and 0.01°: 0.01 to 1
 differ by 10 %."""
-
 _REST_WEIGHT = 0.1
 """Weight of a reading at rest beside its bounds; tuned as `_BOUNDED_SHARE`."""
-
 _BOUND_ROUNDS = 40
 """Iterations over the bounds; chosen: 100 change the error in motion by 5 %."""
-
 _ERROR_FACTOR = 2.0
 """Error in motion, times readings per second, divided by step and corner frequency; measured on
 the same manoeuvres: 0.3 to 2."""
-
 _RIDGE = 1e-12
 """Addition to the diagonal of the normal matrix, divided by its largest element; chosen: it
 matters only for coefficients without samples and penalty."""
-
 _STRENGTHS = (10.0 ** np.arange(-12, 13, 0.5)).tolist()
 """Strengths of the penalty that are tried; chosen: half a decade hardly changes a spline."""
-
 _REST_GAP = 8
 """Gap between changes of a reading, in median gaps and in samples, above which it rests; chosen:
 above the gaps of a slow move."""
-
 _SMALLEST_CHANGE = 1e-6
 """Change of a reading, in stated steps, that is a rounding error; chosen: above that of floats."""
-
 _WHOLE = 0.05
 """Deviation of a change from whole steps, in steps, by an inexact step; chosen: five steps of
 0.083° in place of 1/12°."""
-
 _FINER = 0.03
 """Largest step of a finer reference, in stated steps; chosen: readings between which an encoder
 was interpolated have 0.08."""
-
 _READING_QUANTILE = 0.9
 """Quantile of the distances between bends that is the distance of two readings. Chosen: a reading
 between two samples bends the line at both of them, so that half of the distances are 1."""
-
-_THIRD_DIFFERENCE = np.array([-1.0, 3.0, -3.0, 1.0])
-"""Weights of four coefficients in a third difference."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +105,7 @@ class SmoothedPath:
         """
         sampled = np.isfinite(reading)
         self._time_s, self._reading = time_s[sampled], reading[sampled]
-        self._windows: dict[int, scipy.interpolate.BSpline | scipy.interpolate.PPoly] = {}
+        self._windows: dict[int, scipy.interpolate.BSpline] = {}
         self._step = step if is_seen else visible_step(self._reading, step)
         if not is_seen and self._step == step and _is_interpolated(self._reading, step):
             kept = _places_of_readings(self._reading, _SMALLEST_CHANGE * step)
@@ -181,15 +154,11 @@ class SmoothedPath:
         return PathErrors(self._step * np.minimum(ratio, 1 / np.sqrt(12)),
                           np.minimum(4 * corner_hz, changes_hz))
 
-    def _spline(self, window: int) -> scipy.interpolate.BSpline | scipy.interpolate.PPoly:
+    def _spline(self, window: int) -> scipy.interpolate.BSpline:
         if window not in self._windows:
-            while len(self._windows) >= _MAX_WINDOWS:
-                del self._windows[min(self._windows)]
-            spline = smoothing_spline(*self._part(window), self._strength, self._step,
-                                      self._degree, self._knot_s, not self._is_seen)
-            # Polynomials are evaluated faster, but need more memory.
-            self._windows[window] = scipy.interpolate.PPoly.from_spline(spline) \
-                if spline.k == _DEGREE and len(spline.t) <= _MAX_PIECES else spline
+            self._windows[window] = smoothing_spline(
+                *self._part(window), self._strength, self._step, self._degree, self._knot_s,
+                not self._is_seen)
         return self._windows[window]
 
     def _part(self, window: int) -> tuple[np.ndarray, np.ndarray]:
@@ -327,11 +296,14 @@ class _Window:
         self.right = self.design.T @ self._values  # Right-hand side of the normal equations, (k,)
         self._normal = _banded(self.design.T @ self.design)
         self._normal[-1] += _RIDGE * self._normal[-1].max()
-        self._samples_per_coefficient = len(time_s) / len(self.right)
+        count = len(self.right)
+        third = scipy.sparse.diags([-1.0, 3.0, -3.0, 1.0], [0, 1, 2, 3], (count - 3, count))
+        # Matrix of the penalty for a strength of 1, banded
+        self._penalty = len(time_s) / count * _banded(third.T @ third)
 
     def coefficients(self, strength: float) -> np.ndarray:
         """Return the coefficients of least squares with a penalty, (k,)."""
-        return scipy.linalg.solveh_banded(self._normal + self._penalty(strength), self.right)
+        return scipy.linalg.solveh_banded(self._normal + strength * self._penalty, self.right)
 
     def bounded_coefficients(self, strength: float, weights: np.ndarray, bound: float
                              ) -> np.ndarray:
@@ -348,7 +320,7 @@ class _Window:
         weighted = self.design.multiply(1 + weights[:, None]).tocsr()
         normal = _banded(transposed @ weighted)
         normal[-1] += _RIDGE * normal[-1].max()
-        factor = scipy.linalg.cholesky_banded(normal + self._penalty(_BOUNDED_SHARE * strength))
+        factor = scipy.linalg.cholesky_banded(normal + _BOUNDED_SHARE * strength * self._penalty)
         low, high, pulled = self._values - bound, self._values + bound, weights * self._values
         within, excess = self._values, np.zeros(len(self._values))
         for _ in range(_BOUND_ROUNDS):
@@ -359,29 +331,10 @@ class _Window:
             excess = excess - within
         return coefficients
 
-    def _penalty(self, strength: float) -> np.ndarray:
-        """Return the banded matrix of the penalty."""
-        return _third_differences(np.full(len(self.right) - 3,
-                                          strength * self._samples_per_coefficient))
 
-
-def _banded(matrix: object) -> np.ndarray:
+def _banded(matrix: scipy.sparse.spmatrix) -> np.ndarray:
     """Return the upper diagonals of a sparse symmetric matrix as `solveh_banded` takes them."""
-    count = matrix.shape[0]  # type: ignore[attr-defined]
-    bands = np.zeros((_DEGREE + 1, count))
-    for k in range(_DEGREE + 1):
-        bands[_DEGREE - k, k:] = matrix.diagonal(k)  # type: ignore[attr-defined]
-    return bands
-
-
-def _third_differences(weights: np.ndarray) -> np.ndarray:
-    """Return DᵀWD of third differences with their weights, (k − 3,), banded."""
-    bands = np.zeros((_DEGREE + 1, len(weights) + 3))
-    for i in range(4):
-        for j in range(i, 4):
-            product = _THIRD_DIFFERENCE[i] * _THIRD_DIFFERENCE[j]
-            bands[_DEGREE - (j - i), j:j + len(weights)] += product * weights
-    return bands
+    return np.array([np.pad(matrix.diagonal(k), (k, 0)) for k in range(_DEGREE, -1, -1)])
 
 
 def _moving(reading: np.ndarray) -> np.ndarray:
@@ -405,24 +358,28 @@ class ForcePath:
     modes: Mapping[str, np.ndarray] = MappingProxyType({})
     """Force at `time_s` per unit of each error of a robot, (n, 3)."""
 
-    def rotation(self, time_s: np.ndarray) -> tuple[Components, Components] | None:
-        """Return angular rate, rad/s, and acceleration, rad/s², in the frame; None if unknown."""
-        return None
-
-    def __init__(self, time_s: np.ndarray, force_mps2: np.ndarray) -> None:
+    def __init__(self, time_s: np.ndarray, columns: np.ndarray) -> None:
         """
         Interpolate samples.
 
-        time_s: ascending times, s, (n,); force_mps2: specific force in the case frame, m/s², (n,
-        3).
+        time_s: ascending times, s, (n,); columns: specific force in the case frame, m/s², in the
+        first three of them, (n, k).
         """
         self.time_s = time_s  # Times of the samples, s, (n,)
-        self._force_mps2 = force_mps2
-        self._spline = scipy.interpolate.CubicSpline(time_s, force_mps2)
+        self._columns = columns
+        self._spline = scipy.interpolate.CubicSpline(time_s, columns)
+
+    def at(self, time_s: np.ndarray) -> Components:
+        """Return all columns at times, s, (n,); constant outside."""
+        return list(self._spline(np.clip(time_s, self.time_s[0], self.time_s[-1])).T)
 
     def __call__(self, time_s: np.ndarray) -> Components:
-        """Return the three components at times, s, (n,), m/s²; constant outside."""
-        return list(self._spline(np.clip(time_s, self.time_s[0], self.time_s[-1])).T)
+        """Return the three components of the force at times, s, (n,), m/s²; constant outside."""
+        return self.at(time_s)[:3]
+
+    def rotation(self, time_s: np.ndarray) -> tuple[Components, Components] | None:
+        """Return angular rate, rad/s, and acceleration, rad/s², in the frame; None if unknown."""
+        return None
 
     def errors(self, time_s: np.ndarray, component: int) -> PathErrors:
         """Return the errors of a component at times, s, (n,), m/s²: none are known."""
@@ -430,4 +387,6 @@ class ForcePath:
 
     def shifted(self, later_s: float) -> ForcePath:
         """Return the same force at later times, s."""
-        return ForcePath(self.time_s + later_s, self._force_mps2)
+        later = copy(self)
+        ForcePath.__init__(later, self.time_s + later_s, self._columns)
+        return later

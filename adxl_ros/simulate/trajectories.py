@@ -18,31 +18,22 @@ import numpy as np
 
 SLEW_RAD_S = np.pi / 4
 """Largest angular velocity of the stage between poses, rad/s; chosen: 30° take 1.25 s."""
-
 DWELL_S = 5.0
 """Dwell of a pose, s: the time over which the paper averages."""
-
 SETTLE_S = 0.2
 """Time to settle before a dwell, s; chosen: 20 time constants of the RC filter."""
-
 _JERK_PEAK = 1.875
 """Peak velocity of the motion of minimum jerk, divided by its mean: 15/8."""
-
 RUN_UP_S = 1.0
 """Time in which a joint reaches a constant velocity, s; chosen: 60° per second squared at most."""
-
 _SHAKE_LOW_HZ = 2.0
 """Lowest frequency of the shaker, Hz; chosen: its stroke is 13 mm."""
-
 _SHAKE_HIGH_HZ = 40.0
 """Highest frequency of the shaker, Hz; chosen: near the bandwidth of the sensor."""
-
 _SHAKE_MPS2 = 1.0
 """Amplitude of the shaker, m/s²; chosen: a tenth of gravity."""
-
 _SHAKE_S = 40.0
 """Duration of the shaker, s; chosen: some 9 s for each octave."""
-
 _FADE_S = 2.0
 """Time over which the shaker fades in and out, s; chosen: four periods of its lowest
 frequency."""
@@ -140,16 +131,12 @@ class Script:
         run_up = rate * RUN_UP_S / 2
         constant = distance - 2 * run_up
         self._knot(0.0, 0.0)
-        self._turn(joint, run_up, RUN_UP_S, rate)
-        self._turn(joint, constant, abs(constant) / speed, rate)
-        self._turn(joint, run_up, RUN_UP_S, 0.0)
-
-    def _turn(self, joint: str, angle: float, seconds: float, rate: float) -> None:
-        """Turn a joint by an angle, rad, within a time, s, up to a velocity, rad/s."""
-        setattr(self, joint, getattr(self, joint) + angle)
-        self.now += seconds
-        rates = {'alpha': 0.0, 'beta': 0.0, joint: rate}
-        self._knot(rates['alpha'], rates['beta'])
+        for angle, seconds, end_rate in ((run_up, RUN_UP_S, rate),
+                                         (constant, abs(constant) / speed, rate),
+                                         (run_up, RUN_UP_S, 0.0)):
+            setattr(self, joint, getattr(self, joint) + angle)
+            self.now += seconds
+            self._knot(**{'alpha_rate': 0.0, 'beta_rate': 0.0, f'{joint}_rate': end_rate})
 
     def joints(self) -> tuple[Knots, Knots]:
         """Return the paths of alpha and beta."""
@@ -281,7 +268,6 @@ TRAJECTORIES: dict[str, Callable[[np.random.Generator], Motion]] = {
 
 _MAX_SPEED_RAD_S = 100.0
 """Largest angular velocity of a stage, rad/s; chosen: a faster change is a jump of the reading."""
-
 _MIN_FORCE_SAMPLES = 4
 """Fewest samples of specific force; a cubic spline needs them."""
 

@@ -22,9 +22,8 @@ from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.report import page as html_page
 from adxl_ros.report.quantities import column_unit, duration, short_time
 from adxl_ros.report.screen import COLUMNS, row, wrapped
-from adxl_ros.signals.findings import Ability, check_recording, Findings
+from adxl_ros.signals.findings import Ability, check_recording, Findings, RecordingContents
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
-from adxl_ros.signals.recording_contents import RecordingContents
 from adxl_ros.tools import command_line as cli
 
 _NAME_COLUMNS = 20
@@ -209,23 +208,18 @@ def _with_what_shows(result: Findings, options: argparse.Namespace, reading: Rea
 
 
 def _next_command(results: list[Findings], options: argparse.Namespace) -> str:
-    for result in results:
-        able = {ability.tool for ability in result.abilities if ability.is_able}
-        for tool, output in (('fit', 'unit.yaml --report report'),
-                             ('noise', 'noise.yaml --report noise')):
-            if result.is_sound and tool in able:
-                return cli.command(tool, f'{cli.quoted(result.path)}{cli.reading_text(options)} '
-                                   f'-o {output}')
-    return ''
+    able = [(result.path, ability.tool) for result in results if result.is_sound
+            for ability in result.abilities if ability.is_able and ability.tool != 'diagnose']
+    return cli.command(able[0][1], f'{cli.quoted(able[0][0])}{cli.reading_text(options)} '
+                       '-o unit.yaml') if able else ''
 
 
 def _as_json(result: Findings) -> dict[str, Any]:
     values: dict[str, Any] = {}
     if result.contents is not None:
-        values = asdict(result.contents)
+        values = {name: value for name, value in asdict(result.contents).items()
+                  if name not in ('path', 'remarks', 'cut')}
         values['bad_stamps'] = result.contents.bad_stamps._asdict()
-        for name in ('path', 'remarks', 'cut'):
-            values.pop(name)
     return {'schema': 1, 'recording': result.path, 'sound': result.is_sound,
             'faults': list(result.faults), 'remarks': list(result.remarks), 'contents': values,
             'can': {ability.tool: {'able': ability.is_able, 'reason': ability.reason}

@@ -14,7 +14,6 @@ from typing import Any
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.atomic_write import write_bytes, write_text
-from adxl_ros.files.csv_file import csv_writer
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import ONE_SIDED
@@ -23,31 +22,25 @@ from adxl_ros.report import page as html_page
 from adxl_ros.report.figures import png, pyplot
 from adxl_ros.report.quantities import duration
 from adxl_ros.report.screen import row
-from adxl_ros.signals import axis_noise
-from adxl_ros.signals.allan_deviation import StillStretch
-from adxl_ros.signals.axis_noise import AxisNoise, RecordingNoise, settings, TERMS
-from adxl_ros.signals.noise_parameters import Estimate
+from adxl_ros.signals import noise_parameters
+from adxl_ros.signals.noise_parameters import AxisNoise, Estimate, RecordingNoise, settings
 from adxl_ros.tools import command_line as cli
 import numpy as np
 import yaml
 
 MICRO_G = 1e6 / G0_MPS2
 """1 m/s² in µg."""
-
 _LARGEST_STD_MPS2 = 0.3
 """Noise of a sample from which a sensor vibrates, m/s². Chosen: three times that of a low-cost
 IMU at 1 kHz."""
-
 _LARGEST_FILLED = 0.01
 """Share of missing samples from which white noise changes visibly. Chosen."""
-
-NAMES = {'white': 'white noise N', 'instability': 'bias instability B', 'walk': 'random walk K'}
+_NAMES = ('white noise N', 'bias instability B', 'random walk K')
 """Names of the terms."""
-
+_UNITS = {'white': 'm/s^2/sqrt(Hz)', 'instability': 'm/s^2', 'walk': 'm/s^2/sqrt(s)'}
+"""Keys and units of the terms in JSON."""
 _YAML_COLUMNS = 60
 """Columns after which a list is wrapped; its last number may be beyond."""
-_UNITS = {'white': 'm/s^2/sqrt(Hz)', 'instability': 'm/s^2', 'walk': 'm/s^2/sqrt(s)'}
-"""Units of the terms in JSON."""
 
 
 def _head(result: RecordingNoise) -> list[str]:
@@ -58,12 +51,11 @@ def _head(result: RecordingNoise) -> list[str]:
 def _tables(result: RecordingNoise) -> list[str]:
     """Return the terms with intervals, then in SI units and by sample, 79 columns at most."""
     wide, narrow = (6, 25, 25, 25), (6, 12, 12, 12, 13, 13, 9)
-    rows = [row((' axis', *(NAMES[term] for term in TERMS)), wide),
-            row(('', 'µg/√Hz (90 %)', 'µg (90 %)', 'µg/√s (90 %)'), wide)]
-    rows += [row((f' {noise.axis}', *_micro_g_intervals(noise)), wide) for noise in result.axes]
-    rows += _walk_lines(result)
-    rows += ['', row(('', 'N', 'B', 'K', 'N by sample', 'K by sample', 'datasheet'), narrow),
-             row((' axis', 'm/s²/√Hz', 'm/s²', 'm/s²/√s', 'm/s²', 'm/s²', 'µg/√Hz'), narrow)]
+    rows = [row((' axis', *_NAMES), wide),
+            row(('', 'µg/√Hz (90 %)', 'µg (90 %)', 'µg/√s (90 %)'), wide),
+            *(row((f' {noise.axis}', *_micro_g_intervals(noise)), wide) for noise in result.axes),
+            '', row(('', 'N', 'B', 'K', 'N by sample', 'K by sample', 'datasheet'), narrow),
+            row((' axis', 'm/s²/√Hz', 'm/s²', 'm/s²/√s', 'm/s²', 'm/s²', 'µg/√Hz'), narrow)]
     rate = np.sqrt(result.rest.rate_hz)
     for noise in result.axes:
         white, _, walk = noise.estimates
@@ -76,21 +68,6 @@ def _tables(result: RecordingNoise) -> list[str]:
 
 def _micro_g_intervals(noise: AxisNoise) -> list[str]:
     return [_interval(estimate.scaled(MICRO_G)) for estimate in noise.estimates]
-
-
-def _walk_lines(result: RecordingNoise) -> list[str]:
-    """Return the bounds of the walks, and for which times K holds."""
-    rows = []
-    for noise in result.axes:
-        time_s, walk = noise.fit.correlation, noise.fit.walk
-        if time_s is not None:
-            std = MICRO_G * walk.value * np.sqrt(time_s.value / 2)
-            rows.append(f' {noise.axis}: the walk has bounds, {std:.3g} µg rms; correlation time '
-                        f'{_interval(time_s)} s')
-    if any(noise.fit.walk.is_seen for noise in result.axes):
-        rows.append(f' K holds for times up to {duration(result.rest.span_s)}, those of the '
-                    'recording.')
-    return rows
 
 
 def _interval(estimate: Estimate) -> str:
@@ -126,33 +103,21 @@ def _warnings(result: RecordingNoise) -> list[str]:
         texts.append(f'{rest.filled} samples ({100 * rest.filled / rest.count:.2g} %) are '
                      'missing. They are filled by straight lines, which lowers N.')
     for noise in result.axes:
-        texts += [f'{noise.axis}: {text}' for text in _axis_warnings(rest, noise)]
+        texts += [f'{noise.axis}: {text}' for text in _axis_warnings(rest.span_s, noise)]
     return texts
 
 
-def _axis_warnings(rest: StillStretch, noise: AxisNoise) -> list[str]:
+def _axis_warnings(span_s: float, noise: AxisNoise) -> list[str]:
     texts = []
-    for term, name in enumerate(TERMS):
+    for term, name in enumerate(_NAMES):
         if not (noise.estimates[term].is_seen or noise.is_coarse):
             needed_s = noise.fit.needed_s(term)
-            texts.append(f'{duration(rest.span_s)} is too short to see the {NAMES[name]}. ' + (
+            texts.append(f'{duration(span_s)} is too short to see the {name}. ' + (
                 'The other terms hide it, in longer recordings, too.' if np.isinf(needed_s) else
                 f'To see half of the limit above, record about {duration(needed_s)}.'))
-    if noise.drift is not None:
-        is_thermal = noise.drift.follows == 'temperature'
-        size = noise.drift.size * MICRO_G * (1 if is_thermal else 3600)
-        instability, walk = (_interval(estimate.scaled(MICRO_G)) for estimate in (
-            noise.drift.without.instability, noise.drift.without.walk))
-        texts.append(f'drifts by {size:+.3g} µg/{"K, with the temperature" if is_thermal else "h"}'
-                     f'. B and K contain this drift. Without it B is {instability} µg, and K is '
-                     f'{walk} µg/√s.')
     if noise.is_coarse:
         texts.append(f'samples change in steps of {noise.resolution * MICRO_G:.3g} µg, which hide '
                      'the noise. N, B and K are upper limits. Choose a smaller range.')
-    if len(noise.fit.lines_hz):
-        first_hz, last_hz = noise.fit.lines_hz[[0, -1]]
-        texts.append(f'the power at {first_hz:.3g} to {last_hz:.3g} Hz is that of a line, and '
-                     'left out. Look for a fan, mains or a person nearby.')
     if not noise.fit.white.is_seen:
         texts.append('N is not determined. A parameter file keeps the figure of --params, or '
                      'states no white noise.')
@@ -163,34 +128,26 @@ def _axis_warnings(rest: StillStretch, noise: AxisNoise) -> list[str]:
 
 
 def _as_json(result: RecordingNoise) -> dict[str, Any]:
+    rest, letters = result.rest, [noise.axis for noise in result.axes]
     return {
-        'schema': 1,
-        'recording': result.path,
-        'rate_hz': result.rest.rate_hz,
-        'samples': result.rest.count,
-        'filled_samples': result.rest.filled,
-        'rest_s': [result.rest.start_s, result.rest.stop_s],
-        'recorded_s': result.rest.recorded_s,
+        'schema': 1, 'recording': result.path, 'rate_hz': rest.rate_hz, 'samples': rest.count,
+        'filled_samples': rest.filled, 'rest_s': [rest.start_s, rest.stop_s],
+        'recorded_s': rest.recorded_s,
         'axes': {noise.axis: _axis_json(noise) for noise in result.axes},
-        'allan_deviation': {
-            'tau_s': result.rest.allan.tau_s.tolist(),
-            **{noise.axis: result.rest.allan.deviation[:, i].tolist()
-               for i, noise in enumerate(result.axes)}},
+        'allan_deviation': {'tau_s': rest.allan.tau_s.tolist(),
+                            **dict(zip(letters, rest.allan.deviation.T.tolist()))},
         'settings': {program: {name: values[0] if len(values) == 1 else values
                                for name, values, _ in entries}
-                     for program, entries in settings(result.axes, result.rest.rate_hz).items()},
-        'warnings': _warnings(result),
-    }
+                     for program, entries in settings(result.axes, rest.rate_hz).items()},
+        'warnings': _warnings(result)}
 
 
 def _axis_json(noise: AxisNoise) -> dict[str, Any]:
     terms = {name: {'value': estimate.value if estimate.is_seen else None,
-                    'ci': [estimate.low, estimate.high], 'unit': _UNITS[name]}
-             for name, estimate in zip(TERMS, noise.estimates)}
-    time_s = noise.fit.correlation
-    return {**terms, 'correlation_s': time_s and {'value': time_s.value,
-                                                  'ci': [time_s.low, time_s.high]},
-            'rounding': noise.rounding, 'density_g_per_rthz': axis_noise.density_g_per_rthz(noise),
+                    'ci': [estimate.low, estimate.high], 'unit': unit}
+             for (name, unit), estimate in zip(_UNITS.items(), noise.estimates)}
+    return {**terms, 'rounding': noise.rounding,
+            'density_g_per_rthz': noise_parameters.density_g_per_rthz(noise),
             'sample_std_mps2': noise.sample_std, 'resolution_mps2': noise.resolution,
             'lowest': {'tau_s': noise.lowest_s, 'deviation_mps2': noise.lowest},
             'fitted_below_hz': noise.fit.highest_hz}
@@ -204,15 +161,11 @@ _COLUMNS = ('axis', 'white noise N, µg/√Hz', 'bias instability B, µg', 'rand
 
 
 def _write_page(folder: Path, result: RecordingNoise) -> list[Path]:
-    page, plot, curve = (folder / name for name in ('report.html', 'allan.png', 'allan.csv'))
+    page, plot = folder / 'report.html', folder / 'allan.png'
     figure = _plot(result)
     write_text(page, _page(result, figure))
     write_bytes(plot, png(figure))
-    with csv_writer(curve) as append:
-        append({'tau_s': result.rest.allan.tau_s, 'averages': result.rest.allan.averages,
-                **{f'{noise.axis}_mps2': result.rest.allan.deviation[:, i]
-                   for i, noise in enumerate(result.axes)}})
-    return [page, plot, curve]
+    return [page, plot]
 
 
 def _page(result: RecordingNoise, figure: Any) -> str:
@@ -235,9 +188,9 @@ def _plot(result: RecordingNoise) -> Any:
         measured = result.rest.allan.deviation[:, i] * MICRO_G
         plot.errorbar(tau_s, measured, yerr=measured * error.clip(max=0.9), fmt='o', ms=4,
                       color='#36c', label='measured')
-        for name, line, estimate in zip(TERMS, noise.fit.lines(tau_s), noise.estimates):
+        for name, line, estimate in zip(_NAMES, noise.fit.lines(tau_s), noise.estimates):
             if estimate.is_seen:
-                plot.plot(tau_s, line * MICRO_G, '--', lw=1, label=NAMES[name])
+                plot.plot(tau_s, line * MICRO_G, '--', lw=1, label=name)
         plot.plot(tau_s, noise.fit.allan_deviation(tau_s) * MICRO_G, color='#222',
                   lw=1, label='all three')
         plot.set(xscale='log', yscale='log', title=f'axis {noise.axis}',
@@ -270,7 +223,7 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('-o', dest='output', metavar='FILE.yaml',
                        help='a parameter file with the measured noise')
     parse.add_argument('--report', metavar='DIR',
-                       help='write the page report.html, the curve allan.png and allan.csv there')
+                       help='write the page report.html and the curve allan.png there')
     parse.add_argument('--json', action='store_true', help='print the result as JSON')
     cli.add_recording_options(parse)
     return parse
@@ -289,8 +242,8 @@ def noise(options: argparse.Namespace) -> int:
                 yield block
                 show(block.done, 'read')
 
-        result = axis_noise.recording_noise(blocks, options.params,
-                                            lambda done: show(done, 'fit'))
+        result = noise_parameters.recording_noise(blocks, options.params,
+                                                  lambda done: show(done, 'fit'))
     rest = result.rest
     cli.report_reading('noise', *newest)
     files: list[Path] = []
@@ -299,7 +252,7 @@ def noise(options: argparse.Namespace) -> int:
         files += _write_page(Path(options.report), result)
     if options.output:
         name = Path(options.recording).name
-        fresh = axis_noise.with_noise(_sensor(result), result.axes)
+        fresh = noise_parameters.with_noise(_sensor(result), result.axes)
         parameter_file.save(options.output, replace(fresh, provenance={
             **fresh.provenance, 'noise_from': name, 'rate_from': name}), [
                 f'Noise measured in {duration(rest.span_s)} at rest of {result.path}.',

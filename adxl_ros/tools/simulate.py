@@ -29,9 +29,6 @@ from adxl_ros.simulate.trajectories import (
 from adxl_ros.tools import command_line as cli
 import numpy as np
 
-_SHORTEST_S = 1e-9
-"""Shorter durations count as this in the progress, s, so that one sample divides nothing by 0."""
-
 _EXAMPLES = {
     'a calibration sweep of the nominal sensor': 'sweep -o sweep.csv',
     'two effects, one of typical size and one with a value':
@@ -96,8 +93,8 @@ def simulate(options: argparse.Namespace) -> int:
         for columns in blocks:
             for output in outputs:
                 output(columns)
-            elapsed_s = columns['time_s'][-1] - begin_s
-            show(min(elapsed_s / max(duration_s, _SHORTEST_S), 1.0))
+            if duration_s:
+                show(min((columns['time_s'][-1] - begin_s) / duration_s, 1.0))
     _print_end(options, sensor, duration_s)
     return 0
 

@@ -200,7 +200,7 @@ def test_thermal_hysteresis_depends_on_the_direction_and_not_on_the_speed():
 
 def flicker_theory(f, rate_hz):
     """Return f times the sum of the densities of the sampled processes, for k = 1."""
-    from adxl_ros.model.effects.noise import corners_hz
+    from adxl_ros.model.effects.adc import corners_hz
     a = np.exp(-2 * np.pi * corners_hz(rate_hz) / rate_hz)[:, None]
     step = np.log(10) / 2
     each = 2 / rate_hz * (1 - a * a) / (1 - 2 * a * np.cos(2 * np.pi * f / rate_hz) + a * a)

@@ -2,10 +2,9 @@
 
 """White noise, bias instability and random walk of simulated signals, and their intervals."""
 
-from adxl_ros.signals.noise_parameters import coefficient_variances, find_drift, fit_noise
+from adxl_ros.signals.noise_parameters import coefficient_variances, fit_noise
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 from still_noise import still_samples
 
 N, B, K = 1e-3, 2e-4, 1e-5
@@ -40,38 +39,3 @@ def test_the_fitted_curve_is_the_allan_deviation_of_the_terms() -> None:
     assert walk[1] == pytest.approx(fit.walk.value)
     assert fit.allan_deviation(np.array([1.0]))[0] ** 2 == pytest.approx(
         white[0] ** 2 + floor[0] ** 2 + walk[0] ** 2)
-
-
-def test_a_walk_with_bounds() -> None:
-    """Its density is known, where a walk without bounds would fall short of it."""
-    rng, k, bound_s = np.random.default_rng(10), 1e-4, 100.0
-    decay = np.exp(-STEP_S / bound_s)
-    fits = []
-    for _ in range(10):
-        walk = lfilter([1.0], [1.0, -decay], rng.standard_normal(8000))[800:]
-        walk *= k * np.sqrt(bound_s / 2 * (1 - decay ** 2))
-        fits.append(fit_noise(walk + rng.standard_normal(7200) * N, STEP_S))
-    assert all(fit.correlation is not None for fit in fits)
-    assert sum(fit.walk.low <= k <= fit.walk.high for fit in fits) >= 7
-    assert sum(fit.correlation.low <= bound_s <= fit.correlation.high for fit in fits) >= 7
-    flat = fits[0].lines(np.array([1000.0, 10000.0]))[2]
-    assert flat[0] / flat[1] > 2
-
-
-@pytest.mark.parametrize('follows', [None, 'temperature', 'time'])
-def test_drift_is_named_with_its_size(follows: str | None) -> None:
-    means, time_s = cells(7), np.arange(7200) * STEP_S
-    temperature = 25 + 2 * np.sin(time_s / 1500)
-    size, shape = {None: (0.0, time_s), 'temperature': (3e-3, temperature),
-                   'time': (3e-6, time_s)}[follows]
-    means = means + size * shape
-    variances = coefficient_variances(7200, STEP_S)
-    fit = fit_noise(means, STEP_S, variances)
-    drift = find_drift(means, STEP_S, variances, fit, temperature)
-    if follows is None:
-        assert drift is None
-        return
-    assert drift is not None
-    assert drift.follows == follows
-    assert drift.size == pytest.approx(size, rel=0.25)
-    assert drift.without.walk.value < fit.walk.value

@@ -1,11 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The ADC, the link and the clock that stamps the samples."""
+"""The ADC, the link, the clock that stamps the samples, and noise of every spectrum."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
 
 from adxl_ros.model.effects.base import (
     ActsOn,
     Detector,
     DiagnosisHints,
+    DriftSpectrum,
     effect,
     FormDimension,
     Manoeuvre,
@@ -17,6 +23,7 @@ from adxl_ros.model.effects.base import (
     Role,
     Signals,
 )
+from adxl_ros.model.filters import first_order_recursion
 import numpy as np
 
 _BITS = ('first_bit_v', 'second_bit_v', 'third_bit_v', 'fourth_bit_v', 'fifth_bit_v',
@@ -171,3 +178,191 @@ def time_offset(signals: Signals, p: Parameters) -> None:
 def clock_skew(signals: Signals, p: Parameters) -> None:
     """Clock skew: the clock that stamps the samples runs fast or slow."""
     signals.time_s = signals.time_s - p['ratio'] * signals.time_s
+
+
+@effect(Place.ELECTRONICS,
+        Parameter('ratio', '1', -0.99, 100.0, 0.3,
+                  'ADXL203 datasheet: 190 instead of 110 ug/sqrt(Hz) at 3 V',
+                  'noise density divided by the stated one, minus 1'),
+        acts_on=ActsOn.NOISE, needs=(Need.NOISE,),
+        cause='The noise is not the stated one; check the supply, its decoupling and the cable.',
+        diagnosis=DiagnosisHints(detector=Detector.NOISE_LEVEL, proof=(ProofVariable.FREQUENCY,)))
+def noise_excess(signals: Signals, p: Parameters) -> None:
+    """White noise beyond the stated density."""
+    for d, ratio in enumerate(p['ratio']):
+        signals.noise_ratio[d] = signals.noise_ratio[d] * (1 + ratio)
+
+
+_LOWEST_HZ = 1e-5
+"""Lowest corner, Hz; chosen: the density is 1/f from ten times this."""
+_HIGHEST_RATIO = 10 ** -0.5
+"""Highest corner divided by the sample rate; chosen: aliasing replaces the missing corners."""
+_PER_DECADE = 2
+"""Corners per decade; chosen: the sum is 1/f within 2 % up to a fifth of the sample rate."""
+_BISECTIONS = 60
+"""Bisections between two poles on a logarithmic axis; chosen: as fine as float64."""
+
+
+class _Shaping(NamedTuple):
+    """Filter of k first-order sections that turns white noise into flicker noise."""
+
+    # Coefficients of the sections as `scipy.signal.sosfilt` takes them, (k, 6)
+    sections: np.ndarray
+    # States of the sections in stationary noise, of k independent standard normals, (k, k)
+    stationary: np.ndarray
+
+
+@lru_cache(maxsize=8)
+def corners_hz(rate_hz: float) -> np.ndarray:
+    """Return the corners of the processes for a sample rate, Hz, the highest first."""
+    highest = _HIGHEST_RATIO * rate_hz
+    count = int(np.log10(highest / _LOWEST_HZ) * _PER_DECADE) + 1
+    return highest * 10 ** (-np.arange(count) / _PER_DECADE)
+
+
+@lru_cache(maxsize=8)
+def _shaping(rate_hz: float) -> _Shaping:
+    """
+    Factor the spectrum of the sampled processes for a sample rate, Hz.
+
+    A process of variance 1 has the spectrum sinh θ/(cosh θ − cos ω), with the pole exp(−θ) at
+    θ = 2π·corner/rate. In cos ω, the zeros of the sum are real and separate the poles. White noise
+    through these poles and zeros has the spectrum of the sum (Wold's decomposition).
+    """
+    poles = 2 * np.pi * corners_hz(rate_hz) / rate_hz
+    zeros = _zeros(poles)
+    # The densities of the processes, σ²·2/(π·f_c)/(1 + (f/f_c)²), sum up to σ²/(f·Δln f).
+    variance = np.log(10) / _PER_DECADE
+    gain = (np.sqrt(variance * np.tanh(poles / 2).sum())
+            * np.prod(1 + np.exp(-poles)) / np.prod(1 + np.exp(-zeros)))  # at half the rate
+    sections = np.zeros((len(poles), 6))
+    sections[:, [0, 3]] = 1.0
+    sections[:, 1], sections[:, 4] = -np.exp(-zeros), -np.exp(-poles)
+    sections[0, :2] *= gain
+    return _Shaping(sections, gain * _stationary(poles, zeros))
+
+
+def _zeros(poles: np.ndarray) -> np.ndarray:
+    """Return the zeros of Σ sinh θ/(cosh θ − cosh φ) for k poles θ, (k,); the last is infinite."""
+    upper, lower = np.log(poles[:-1]), np.log(poles[1:])
+    pole = poles[:, None]
+    for _ in range(_BISECTIONS):
+        middle = (lower + upper) / 2
+        zero = np.exp(middle)
+        sums = np.sum(np.sinh(pole) / (np.sinh((pole + zero) / 2) * np.sinh((pole - zero) / 2)),
+                      axis=0)
+        # From pole to pole the sum rises from −∞ to ∞.
+        upper, lower = np.where(sums > 0, middle, upper), np.where(sums > 0, lower, middle)
+    return np.append(np.exp(lower), np.inf)
+
+
+def _stationary(poles: np.ndarray, zeros: np.ndarray) -> np.ndarray:
+    """Return the states of sections of gain 1 in stationary noise by standard normals, (k, k)."""
+    # One pole alone, y' = exp(−θ)·y + white noise, has the covariance 1/(1 − exp(−θ − θ')).
+    single = np.linalg.cholesky(-1 / np.expm1(-(poles[:, None] + poles)))
+    # Partial fractions: the output of section j is a weighted sum of the single poles up to j.
+    states = np.zeros_like(single)
+    weights = np.zeros(len(poles))
+    for j, (pole, zero) in enumerate(zip(poles, zeros)):
+        apart = np.expm1(poles[:j] - pole)
+        states[j, :j] = weights[:j] * np.exp(-pole) * np.expm1(pole - zero) / apart
+        weights[:j] *= np.expm1(poles[:j] - zero) / apart
+        weights[j] = -np.expm1(pole - zero) * np.prod(np.expm1(pole - zeros[:j])
+                                                      / np.expm1(pole - poles[:j]))
+        states[j, j] = weights[j] * np.exp(-pole)
+    return states @ single
+
+
+@effect(Place.ADC,
+        Parameter('density_g_per_rthz', 'g/sqrt(Hz)', 0.0, 0.1, 1e-4,
+                  'physics: corner near 1 Hz at 110 ug/sqrt(Hz)',
+                  'density at 1 Hz; it falls with the root of the frequency'),
+        acts_on=ActsOn.NOISE,
+        cause='The electronics have 1/f noise; average shorter and take the zero more often.',
+        # A healthy unit has 0.2 mg rms over five decades of frequency at most (tuned by hand on
+        # simulated recordings).
+        diagnosis=DiagnosisHints(drift=DriftSpectrum.FLICKER, healthy_density=6e-5,
+                                 revealed_by=Manoeuvre.HEAT, proof=(ProofVariable.FREQUENCY,)))
+def flicker(signals: Signals, p: Parameters) -> None:
+    """
+    Flicker noise: 1/f noise as a sum of Ornstein-Uhlenbeck processes, drawn by one filter.
+
+    Add noise of the one-sided density k²/f, g²/Hz, from 10⁻⁴ Hz up to a fifth of the rate.
+
+    Ornstein-Uhlenbeck processes of equal variance, whose corners are evenly spaced on a
+    logarithmic axis, sum up to 1/f (van der Ziel 1950). Their sum is sampled exactly.
+    """
+    assert signals.rng is not None
+    shape = (*np.shape(signals.environment.time_s), len(p['density_g_per_rthz']))
+    if not shape[0]:
+        return
+    # scipy.signal takes 0.5 s to import.
+    from scipy.signal import sosfilt
+    shaping = _shaping(1 / signals.dt_s)
+    if 'state' not in signals.memory:
+        drawn = signals.rng.standard_normal((len(shaping.stationary), *shape[1:]))
+        state = np.tensordot(shaping.stationary, drawn, 1)
+        signals.memory['state'] = np.stack([state, np.zeros_like(state)], axis=1)
+    noise, signals.memory['state'] = sosfilt(
+        shaping.sections, signals.rng.standard_normal(shape), axis=0, zi=signals.memory['state'])
+    for d, density in enumerate(p['density_g_per_rthz']):
+        signals.volts[d] = (signals.volts[d]
+                            + density * noise[..., d] * signals.nominal_scale_v_per_g[d])
+
+
+@effect(Place.ADC,
+        Parameter('density_g_per_rts', 'g/sqrt(s)', 0.0, 0.1, 2e-5,
+                  'physics: slow stress in package and solder',
+                  'rms of the wandering zero-g divided by the root of time'),
+        Parameter('return_per_s', '1/s', 0.0, 1.0, 1e-2, 'physics: bounds of the stress',
+                  'inverse correlation time of a walk that has bounds', typical=0.0,
+                  role=Role.OPTIONAL),
+        acts_on=ActsOn.NOISE,
+        cause='The zero-g wanders; take the zero again more often, or choose a quieter sensor.',
+        # A healthy unit drifts by 0.3 mg within 100 s at most (tuned by hand on simulated
+        # recordings).
+        diagnosis=DiagnosisHints(drift=DriftSpectrum.RANDOM_WALK, healthy_density=3e-5,
+                                 revealed_by=Manoeuvre.HEAT, proof=(ProofVariable.FREQUENCY,)))
+def bias_walk(signals: Signals, p: Parameters) -> None:
+    """
+    Random walk of the zero-g: acceleration random walk, rate noise of an Allan deviation.
+
+    Add the sum of independent steps, g; after a time t its rms is k·√t.
+
+    A walk that returns at the rate r is a Gauss-Markov process: its rms ends at k/√(2·r).
+    """
+    assert signals.rng is not None
+    density = np.array(p['density_g_per_rts'])
+    drawn = signals.rng.standard_normal((*np.shape(signals.environment.time_s), len(density)))
+    if not density.any() or not len(drawn):
+        return
+    last = signals.memory.get('walked', np.zeros(drawn.shape[1:]))
+    returns = np.broadcast_to(p.get('return_per_s', 0.0), density.shape) * signals.dt_s
+    shrink = -np.expm1(-2 * returns) / np.where(returns, 2 * returns, 1.0)
+    drawn *= density * np.sqrt(np.where(returns, shrink, 1.0) * signals.dt_s)
+    walk = np.stack([first_order_recursion(1.0, a, drawn[..., d], last[..., d])
+                     for d, a in enumerate(np.exp(-returns))], axis=-1)
+    signals.memory['walked'] = walk[-1]
+    for d, scale in enumerate(signals.nominal_scale_v_per_g):
+        signals.volts[d] = signals.volts[d] + walk[..., d] * scale
+
+
+@effect(Place.ADC,
+        Parameter('amplitude_v', 'V', -1.0, 1.0, 1e-3, 'physics: unshielded cable',
+                  'amplitude of the sine'),
+        Parameter('frequency_hz', 'Hz', 1.0, 1000.0, 50.0, 'mains: 50 or 60 Hz',
+                  'frequency of the sine', '', neutral=50.0, role=Role.SHAPE),
+        Parameter('phase_rad', 'rad', -7.0, 7.0, 1.0, 'chosen: any', 'phase at time 0', '',
+                  typical=0.0, role=Role.OPTIONAL),
+        acts_on=ActsOn.NOISE,
+        cause='The mains couple into the signal; shield and twist the cable, and ground one end.',
+        diagnosis=DiagnosisHints(detector=Detector.MAINS_LINE, proof=(ProofVariable.FREQUENCY,)))
+def mains_hum(signals: Signals, p: Parameters) -> None:
+    """
+    Mains hum: a sine at the input of the ADC.
+
+    Add A·sin(2π·f·t + φ) to the volts of each axis.
+    """
+    wave = np.sin(2 * np.pi * p['frequency_hz'] * signals.environment.time_s + p['phase_rad'])
+    for d, amplitude in enumerate(p['amplitude_v']):
+        signals.volts[d] = signals.volts[d] + amplitude * wave

@@ -195,7 +195,6 @@ class Maths(NamedTuple):
 
 ARRAYS = Maths(np.sqrt, np.sin, np.cos, np.arctan2, np.maximum, np.where)
 """Functions for arrays, (n,)."""
-
 FLOATS = Maths(math.sqrt, math.sin, math.cos, math.atan2, max,
                lambda condition, value, otherwise: value if condition else otherwise)
 """Functions for single samples: ten times faster than those of numpy."""
