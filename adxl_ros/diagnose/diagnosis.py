@@ -16,16 +16,14 @@ from adxl_ros.diagnose import (
     data_checks,
     next_experiment,
     noise_effects,
-    noise_model,
     verdict as rule,
 )
 from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
 from adxl_ros.diagnose.data_checks import CheckedRecording, compare_checked
-from adxl_ros.diagnose.evidence import used_by_block
+from adxl_ros.diagnose.evidence import drifts_among, estimate_floor, NoiseFloor, used_by_block
 from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
 from adxl_ros.diagnose.next_experiment import CouldShow, NextExperiment
 from adxl_ros.diagnose.noise_effects import Detection, NoiseComparison, NoiseRemainder
-from adxl_ros.diagnose.noise_model import drift_effects, NoiseFloor
 from adxl_ros.diagnose.reference import DataFault
 from adxl_ros.diagnose.residual_map import (
     flexible_bases,
@@ -44,7 +42,7 @@ from adxl_ros.diagnose.verdict import (
 from adxl_ros.files.recording_columns import check_unit, Recording
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2, Z_90
-from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_axes, with_neutral
 from adxl_ros.report.quantities import Interval
 from adxl_ros.simulate.motion import Motion
@@ -150,12 +148,11 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
         return Diagnosis(fault.comparisons, fault=fault)
     compared = [c.search_comparison for c in checked]
     model = build_linear_model(
-        compared, noise_model.whiteners(compared),
-        lambda share: show_progress('2/5 library of effects', 0.1 + 0.2 * share))
+        compared, lambda share: show_progress('2/5 library of effects', 0.1 + 0.2 * share))
     search = Search(model)
     search.run(lambda share: show_progress('3/5 effects', 0.3 + 0.5 * share))
     show_progress('4/5 held-out figures', 0.8)
-    floor = noise_model.estimate([c.comparison for c in checked])
+    floor = estimate_floor([c.comparison for c in checked])
     counts = np.sum([used_by_block(c.used) for c in model.comparisons], axis=0)
     fits = _held_out(model, search, floor, max(counts.sum(), 1.0))
     smallest_mps2 = material_mps2(model, floor, material_mg)
@@ -169,7 +166,7 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
         np.inf if floor.source == 'assumed' else floor.rms_mps2,
         {effects: h.sizeless for effects, h in search.found.items()})
     detections = _detections(checked, search.best, model.baseline, smallest_mps2)
-    bases = [flexible_bases(c, v) for c, v in zip(compared, model.baseline_v)]
+    bases = [b for c, v in zip(compared, model.baseline_v) for b in flexible_bases(c, v)]
     verdict = rule.decide(
         evidence, lambda effects, drift: reproducible_rest(fits[effects][drift], bases),
         [d.effect for d in detections])
@@ -208,7 +205,7 @@ def _held_out(model: LinearModel, search: Search, floor: NoiseFloor, count: floa
     """Return held-out fits of all sets by the drift of their noise."""
     best = search.best
     beside = linearise(model, best.effects, best.sensor, model.filters)
-    drifts = drift_effects() if beside.fit(drifts=drift_effects()).log_evidence \
+    drifts = drifts_among(library()) if beside.fit(drifts=drifts_among(library())).log_evidence \
         > beside.fit().log_evidence else ()
     out = {}
     for effects, hypothesis in search.found.items():
@@ -281,7 +278,7 @@ def _named_sensor(verdict: Verdict, best: Hypothesis, detections: Sequence[Detec
         sensor = put(replace(sensor, values={**sensor.values, **{
             e: fitted.values[e] for e in (*best.effects, *straight)}}), hidden, before)
     in_noise = {d.effect: d.values for d in detections}
-    for drift in [e for e in drift_effects() if e in verdict.named][:1]:
+    for drift in [e for e in drifts_among(library()) if e in verdict.named][:1]:
         densities = fits[drift].drift_densities()[:len(sensor.axes)]
         in_noise[drift] = {effect_named(drift).parameters[0].name: densities}
     for effect, values in in_noise.items():
@@ -354,8 +351,8 @@ def what_shows(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | No
     except DataFault as fault:
         return fault
     compared = [c.search_comparison for c in checked]
-    model = build_linear_model(compared, noise_model.whiteners(compared))
-    floor = noise_model.estimate([c.comparison for c in checked])
+    model = build_linear_model(compared)
+    floor = estimate_floor([c.comparison for c in checked])
     return next_experiment.could_show(model, checked[0].comparison, floor.noise_v,
                                       material_mps2(model, floor))
 

@@ -31,8 +31,8 @@ from adxl_ros.diagnose.comparison import (
     Reference,
     with_values,
 )
+from adxl_ros.diagnose.evidence import expected_drift_g
 from adxl_ros.diagnose.linear_model import LinearModel
-from adxl_ros.diagnose.noise_model import expected_drift_g, whiteners
 from adxl_ros.diagnose.verdict import UNKNOWN, Verdict, WeightedHypothesis
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
@@ -96,8 +96,8 @@ def could_show(model: LinearModel, comparison: BaselineComparison, noise_v: np.n
         gram[np.ix_(c.column_ids, c.column_ids)] += c.total_grams[f][1:, 1:] / variance
         recording, axis = model.place_of_channel(number)
         of_channel = model.comparisons[recording]
-        for column in model.columns[number]:
-            plain[column.number] += float(np.sum(column.values[of_channel.used] ** 2)) \
+        for k, values in model.columns[number].items():
+            plain[k] += float(np.sum(values[of_channel.used] ** 2)) \
                 / float(of_channel.scale_v_per_mps2[axis]) ** 2
         samples += of_channel.used.sum()
     precision = gram[np.ix_(free, free)] + np.diag(prior_std[free] ** -2.0)
@@ -146,7 +146,7 @@ def _noise_could_show(comparison: BaselineComparison, noise_v: np.ndarray, mater
     for effect in library().values():
         hints = effect.diagnosis
         if hints.drift is not None:
-            unit_g = expected_drift_g(hints.drift, 1.0, comparison.span_s, rate_hz)
+            unit_g = expected_drift_g(effect.name, 1.0, comparison)
             parameter, size = effect.parameters[0].name, max(
                 material_mps2 / G0_MPS2 / unit_g, hints.healthy_density)
         elif hints.detector in sizes:
@@ -260,7 +260,7 @@ def predict(manoeuvre: Experiment, sensor: Sensor, effects: Sequence[str]) -> Pr
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     recording = Recording(manoeuvre.name, columns.pop('time_s'), columns)
     comparison = at_search_rate(compare(recording, at_rate))
-    model = linear.build_linear_model([comparison], whiteners([comparison]), only=effects)
+    model = linear.build_linear_model([comparison], only=effects)
     keys = _keys(model)
     places = {key: place for place, key in enumerate(keys.values())}
     gram = np.zeros((len(places), len(places)))

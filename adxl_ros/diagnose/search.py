@@ -112,7 +112,7 @@ def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
         e: start.values[e] for e in effects if linear.calibration_takes_up(e)}})
     channels: list[evidence.WhitenedChannel] = []
     columns: list[evidence.ChannelColumns] = []
-    changes: list[list[linear.Column]] = []
+    changes: list[dict[int, np.ndarray]] = []
     for comparison in linear_model.comparisons:
         at_rate = replace(sensor, rate_hz=comparison.sensor.rate_hz)
         output_v = comparison.simulated_v(at_rate)
@@ -134,7 +134,7 @@ def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
                     stacked / scale, comparison.used)))
             channels.append(evidence.whiten_channel(stacked[:, 0], stacked[:, 1:], ids,
                                                     comparison.used, filters[len(channels)]))
-            changes.append([linear.Column(0, change_v[:, d])])
+            changes.append({0: change_v[:, d]})
     # The square of each deviation is that of a healthy unit's tolerance plus that of what a
     # calibration can take up of the effects.
     parts = linear.parts_at_rest(linear_model.comparisons, linear_model.nuisance_columns,
@@ -386,7 +386,7 @@ def _model_about(model: LinearModel, best: Hypothesis) -> LinearModel:
     comparisons = [replace(c, sensor=replace(best.sensor, values=values,
                                              rate_hz=c.sensor.rate_hz))
                    for c in model.comparisons]
-    return linear.build_linear_model(comparisons, [[w] for w in best.whiteners])
+    return linear.build_linear_model(comparisons, filters=[[w] for w in best.whiteners])
 
 
 def _stepped(variant: Variant) -> dict[Coefficient, float]:
