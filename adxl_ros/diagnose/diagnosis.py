@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from adxl_ros.diagnose import (
     data_checks,
@@ -19,12 +19,11 @@ from adxl_ros.diagnose import (
     verdict as rule,
 )
 from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
-from adxl_ros.diagnose.data_checks import CheckedRecording, compare_checked
+from adxl_ros.diagnose.data_checks import CheckedRecording, compare_checked, DataFault
 from adxl_ros.diagnose.evidence import drifts_among, estimate_floor, NoiseFloor, used_by_block
 from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
 from adxl_ros.diagnose.next_experiment import CouldShow, NextExperiment
-from adxl_ros.diagnose.noise_effects import Detection, NoiseComparison, NoiseRemainder
-from adxl_ros.diagnose.reference import DataFault
+from adxl_ros.diagnose.noise_effects import compare_noise, Detection, NoiseRemainder
 from adxl_ros.diagnose.residual_map import (
     flexible_bases,
     not_covered,
@@ -81,10 +80,8 @@ class Report:
     # added
     detections: tuple[Detection, ...]
     noise_remainders: tuple[NoiseRemainder, ...]
-    # noise_before, noise_after: Recorded noise relative to simulated noise by recording, before
-    # and with what was found
-    noise_before: tuple[NoiseComparison, ...]
-    noise_after: tuple[NoiseComparison, ...]
+    # Recorded noise relative to simulated noise by recording, before and with what was found
+    noise: tuple[dict[str, Any], ...]
     residual_cells: tuple[ResidualCell, ...]  # Map of the residual of the first recording
     not_covered: tuple[str, ...]  # What the recordings do not cover, for people
     # Smallest size of each effect that these recordings would have shown
@@ -329,13 +326,11 @@ def _report(checked: Sequence[CheckedRecording], model: LinearModel, search: Sea
     remainders = tuple(noise_effects.noise_remainders(comparisons, best.sensor, sensor,
                                                       detections, seed))
     ranked = sorted(search.found.values(), key=lambda h: -h.log_evidence)
-    noise_before, noise_after = (
-        tuple(noise_effects.compare_noise(c, mean, noisy, seed) for c in comparisons)
-        for mean, noisy in ((baseline, baseline), (best.sensor, sensor)))
+    sensors = {'before': (baseline, baseline), 'after': (best.sensor, sensor)}
     return Report(
         verdict, _closure(verdict, evidence, floor, remainders, baseline, seed), floor,
         (best, *(h for h in ranked if h is not best)), tuple(detections), remainders,
-        noise_before, noise_after,
+        tuple(compare_noise(c, sensors, seed) for c in comparisons),
         tuple(residual_map(model.comparisons[0], seed)), lacking,
         tuple(next_experiment.could_show(model, comparisons[0], floor.noise_v,
                                          verdict.material_mps2)),

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from textwrap import wrap
 from typing import Any, NamedTuple
@@ -68,49 +67,46 @@ class Row(NamedTuple):
 def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the report as the objects of JSON; docs/reference/report_json.md lists its keys."""
     fault, report = diagnosis.fault, diagnosis.report
-    if fault is not None:
+    if report is None:
+        assert fault is not None
         return {'schema': 1, 'verdict': {
             'status': fault.status, 'effects': [], 'groups': [], 'of': None,
             'data_fault': fault.name if fault.status == 'bad_data' else None,
             'probability': 1.0}, 'hypotheses': [], 'gap': None, 'where': [], 'candidates': [],
             'notes': notes(diagnosis), 'next_experiment': None, 'summary': fault.message}
-    assert report is not None
     verdict, proposal = report.verdict, report.next_experiment
     # Rounded probabilities still sum to 1.
     probabilities = [round(h.probability, _DIGITS) for h in verdict.hypotheses]
     probabilities[0] = round(1 - sum(probabilities[1:]), _DIGITS)
-    return {
+    return _rounded({
         'schema': 1,
-        'verdict': {'status': verdict.status, 'effects': list(verdict.effects),
-                    'groups': [list(group) for group in verdict.groups], 'of': concern(verdict),
-                    'data_fault': None, 'probability': _rounded(verdict.probability)},
-        'hypotheses': [{'effects': list(h.effects), 'probability': p}
+        'verdict': {'status': verdict.status, 'effects': verdict.effects,
+                    'groups': verdict.groups, 'of': concern(verdict), 'data_fault': None,
+                    'probability': verdict.probability},
+        'hypotheses': [{'effects': h.effects, 'probability': p}
                        for h, p in zip(verdict.hypotheses, probabilities)],
-        'gap': _gap(diagnosis, report),
+        'gap': _gap(report),
         'explained': _power(verdict.explained), 'rest': _power(verdict.rest),
-        'rest_follows': list(verdict.rest_follows),
-        'material': _rounded(verdict.material_mps2),
+        'rest_follows': verdict.rest_follows, 'material': verdict.material_mps2,
         'lost_without': {e: _power(p) for e, p in verdict.lost_without.items()},
-        'where': [{'axis': c.axis, 'dimension': c.dimension, 'range': _rounded((c.low, c.high)),
-                   'mean': _rounded(c.mean_mps2), 'share': _rounded(c.share), 'p': _rounded(c.p)}
+        'where': [{'axis': c.axis, 'dimension': c.dimension, 'range': (c.low, c.high),
+                   'mean': c.mean_mps2, 'share': c.share, 'p': c.p}
                   for c in report.residual_cells if c.p < SIGNIFICANT_P][:_MOST_CELLS],
-        'not_covered': list(report.not_covered), 'notes': notes(diagnosis),
+        'not_covered': report.not_covered, 'notes': notes(diagnosis),
         'could_show': [
             {'effect': r.effect, 'parameter': r.name.parameter, 'axis': r.name.axis or None,
-             'unit': parameter_of(r.name).unit, 'smallest': _rounded(r.smallest),
-             'could_show': r.shows} for r in report.could_show],
+             'unit': parameter_of(r.name).unit, 'smallest': r.smallest, 'could_show': r.shows}
+            for r in report.could_show],
         'candidates': _candidates(report),
         'noise_remainders': [
-            {'effect': r.effect, 'quantity': r.quantity, 'unit': r.unit,
-             'axis': r.axes[r.largest] if r.axes else None,
-             'recorded': _rounded(r.recorded[r.largest]),
-             'simulated': _rounded(r.simulated[r.largest]),
-             'left': _rounded(r.remains[r.largest])} for r in report.noise_remainders],
+            {'effect': r.effect, 'quantity': r.quantity, 'unit': r.unit, 'axis': r.axis or None,
+             'recorded': r.recorded, 'simulated': r.simulated,
+             'left': abs(r.recorded - r.simulated)} for r in report.noise_remainders],
         'next_experiment': proposal and {
             'manoeuvre': proposal.manoeuvre, 'why': proposal.why, 'command': proposal.command,
-            'menu': [{'manoeuvre': w.manoeuvre.name, 'minutes': _rounded(w.manoeuvre.minutes),
-                      'nats_per_minute': _rounded(w.per_minute)} for w in proposal.menu]},
-        'summary': summary(diagnosis)}
+            'menu': [{'manoeuvre': w.manoeuvre.name, 'minutes': w.manoeuvre.minutes,
+                      'nats_per_minute': w.per_minute} for w in proposal.menu]},
+        'summary': summary(diagnosis)})
 
 
 def notes(diagnosis: Diagnosis) -> list[str]:
@@ -121,41 +117,34 @@ def notes(diagnosis: Diagnosis) -> list[str]:
 
 
 def _rounded(value: Any) -> Any:
-    """Round one or several numbers to the digits of the report; None for NaN and infinity."""
-    if isinstance(value, Sequence):
+    """Round all numbers to the digits of the report; None for NaN and infinity."""
+    if isinstance(value, dict):
+        return {key: _rounded(v) for key, v in value.items()}
+    if isinstance(value, (list, tuple)):
         return [_rounded(v) for v in value]
+    if not isinstance(value, float):
+        return value
     return float(f'{value:.{_DIGITS}g}') if np.isfinite(value) else None
 
 
 def _power(power: Interval) -> dict[str, Any]:
     """Return a power, (m/s²)², with its interval."""
-    return {'value': _rounded(power.value), 'ci': _rounded((power.low, power.high)),
-            'unit': '(m/s^2)^2'}
+    return {'value': power.value, 'ci': (power.low, power.high), 'unit': '(m/s^2)^2'}
 
 
-def _gap(diagnosis: Diagnosis, report: Report) -> dict[str, Any]:
+def _gap(report: Report) -> dict[str, Any]:
     """Return the gap before and after, and the noise recording by recording."""
-    closure, has_gap = report.closure, report.verdict.status not in _WITHOUT_GAP
-    noise = [{'recording': comparison.name,
-              'bands_hz': _rounded(after.band_edges_hz),
-              'power_ratio_before': _rounded(before.power_ratio),
-              'power_ratio_after': _rounded(after.power_ratio),
-              'log_likelihood_gain': _rounded(after.log_likelihood - before.log_likelihood),
-              'allan_s': list(after.averaging_times_s),
-              'allan_ratio_before': _rounded(before.allan_ratio),
-              'allan_ratio_after': _rounded(after.allan_ratio)}
-             for comparison, before, after in zip(diagnosis.comparisons, report.noise_before,
-                                                  report.noise_after)]
+    closure, verdict = report.closure, report.verdict
     figures: dict[str, Any] = {'unit': 'm/s^2'}
     for name, figure in closure._asdict().items():
-        figures[name] = _rounded(figure.value)
-        figures[f'{name}_ci'] = _rounded((figure.low, figure.high))
-    return {**figures, 'floor_ci': figures['floor_ci'] if np.isfinite(closure.floor.low) else None,
-            'closed': figures['closed'] if has_gap else None,
-            'floor_source': report.noise_floor.source,
-            'upper_limit': _rounded(report.verdict.upper_limit_mps2),
-            'reference': _rounded(report.verdict.reference_mps2),
-            'not_in_reference': _rounded(report.linear_model.lost_motion_mps2), 'noise': noise}
+        figures |= {name: figure.value, f'{name}_ci': (figure.low, figure.high)}
+    if verdict.status in _WITHOUT_GAP:
+        figures['closed'] = None
+    if not np.isfinite(closure.floor.low):
+        figures['floor_ci'] = None
+    return {**figures, 'floor_source': report.noise_floor.source,
+            'upper_limit': verdict.upper_limit_mps2, 'reference': verdict.reference_mps2,
+            'not_in_reference': report.linear_model.lost_motion_mps2, 'noise': report.noise}
 
 
 def shares_of_gap(report: Report) -> dict[str, float]:
@@ -188,13 +177,12 @@ def _candidates(report: Report) -> list[dict[str, Any]]:
         group = next((g for g in reversed(verdict.groups) if name in g), ())
         out.append({
             'effect': name, 'of': effect.concern.value,
-            'probability': _rounded(min(sum(h.probability for h in sets), 1.0)),
-            'closed': _rounded(report.closure.closed.value) if name in verdict.best else None,
+            'probability': min(sum(h.probability for h in sets), 1.0),
+            'closed': report.closure.closed.value if name in verdict.best else None,
             # The rule weighs held-out figures, and no effect has a p of its own.
             'p': None,
             'parameters': parameters,
-            'share': _rounded(shares[name]) if name in shares else None,
-            'visibility': _rounded(shown[name].share) if name in shown else 1.0,
+            'share': shares.get(name), 'visibility': shown[name].share if name in shown else 1.0,
             'inseparable_from': [other for other in group if other != name],
             'cause': effect.cause})
     return sorted(out, key=lambda c: (-c['probability'], c['effect']))
@@ -209,7 +197,7 @@ def _parameters(report: Report, hypothesis: Hypothesis | None, effect: str) -> d
     names, sensor = fitted_of(effect_named(effect), report.sensor.axes), report.sensor
     if effect_named(effect).diagnosis.drift and effect in sensor.effects:
         # The density of a drift is chosen with the noise, on a grid.
-        return {_key(name): {'value': _rounded(float(get(sensor, [name])[0])),
+        return {_key(name): {'value': float(get(sensor, [name])[0]),
                              'unit': parameter_of(name).unit} for name in names}
     parameters: dict[str, dict[str, Any]] = {}
     for name in names:
@@ -219,8 +207,8 @@ def _parameters(report: Report, hypothesis: Hypothesis | None, effect: str) -> d
         value, half = float(get(hypothesis.sensor, [name])[0]), Z_90 * hypothesis.std[place]
         known = not hypothesis.undetermined[place]
         parameters[_key(name)] = {
-            'value': _rounded(value) if known else None,
-            'ci': _rounded((value - half, value + half)) if known else None,
+            'value': value if known else None,
+            'ci': (value - half, value + half) if known else None,
             'unit': parameter_of(name).unit, 'determined': known}
     return parameters
 
@@ -336,10 +324,9 @@ def remainder_rows(report: Report) -> list[Row]:
             return mg_text(value)
         return f'{100 * value:.2g} %' if unit == '1' else f'{value:.2g} a second'
 
-    return [Row(f'{r.effect}, {r.quantity}{f" on {r.axes[r.largest]}" if r.axes else ""}',
-                '{} recorded, {} simulated, {} left'.format(*(
-                    text(float(v[r.largest]), r.unit)
-                    for v in (r.recorded, r.simulated, r.remains))))
+    return [Row(f'{r.effect}, {r.quantity}{f" on {r.axis}" if r.axis else ""}',
+                '{} recorded, {} simulated, {} left'.format(*(text(v, r.unit) for v in (
+                    r.recorded, r.simulated, abs(r.recorded - r.simulated)))))
             for r in report.noise_remainders]
 
 

@@ -87,7 +87,8 @@ def normalised(weights: Mapping[tuple[str, ...], float]) -> tuple[WeightedHypoth
     """Return sets by falling probability, which sums to 1."""
     total = sum(weights.values())
     return tuple(sorted((WeightedHypothesis(effects, weight / total)
-                         for effects, weight in weights.items()), key=lambda h: -h.probability))
+                         for effects, weight in weights.items()),
+                        key=lambda h: (-h.probability, h.effects)))
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from pathlib import Path
 import textwrap
 from typing import Any
 
+from adxl_ros.diagnose.data_checks import DataFault
 from adxl_ros.diagnose.diagnosis import what_shows
 from adxl_ros.diagnose.next_experiment import by_effect
-from adxl_ros.diagnose.reference import DataFault
 from adxl_ros.diagnose.report import shows_row
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import recording
