@@ -19,7 +19,7 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.rest_detection import find_rests
 from adxl_ros.simulate.motion import INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.response import ChainMemo, Response
-from adxl_ros.simulate.smoothed_paths import ForcePath, PathErrors, SmoothedPath
+from adxl_ros.simulate.smoothed_paths import ForcePath
 from adxl_ros.simulate.trajectories import environment_paths, motion_from_references
 import numpy as np
 import scipy
@@ -33,8 +33,6 @@ up to 60 Hz, and run time. Samples are left out, never averaged, so that aliases
 _LOWEST_INTERNAL_RATE_HZ, _MOST_STEPS = 250.0, 1_000_000
 """Lowest internal rate of the simulator where something moves, Hz, and its largest number of steps
 beyond the samples. Chosen: twice the rate of the search, and an hour of it."""
-_CACHED_VALUES = 3_000_000
-"""Number of values of one path that are kept in memory. Chosen: 24 MB."""
 _SMALLEST_MOVES = {'alpha': 2e-3, 'beta': 2e-3, 'shift': 1e-6}
 """Ranges of the joints, rad and m, from which they move. Chosen: above the step of an encoder."""
 _REST_RATE = 1e-3
@@ -66,7 +64,6 @@ class BaselineComparison:
     # The baseline: datasheet values and effects of the parameter file, at this sample rate
     sensor: Sensor
     reference: Reference  # What determines the motion
-    stage_angles: tuple[str, ...]  # Stage angles that the recording holds, even constant ones
     at_rest: np.ndarray  # Samples at which nothing moves, (n,) bool
     # Samples that are used, (n,) bool; the others are missing, repeated or outliers, or their
     # reference is not known
@@ -159,38 +156,6 @@ class BaselineComparison:
         return float(np.sqrt(max(lost.mean(axis=1).sum() * frequency_hz[1], 0.0)))
 
 
-class CachedPath:
-    """A path that keeps its newest values, because it is evaluated at the same times often."""
-
-    def __init__(self, path: Path) -> None:
-        self._path: Path = path._path if isinstance(path, CachedPath) else path
-        self._values: dict[tuple, np.ndarray] = {}
-
-    def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
-        """Return the derivative of an order at times."""
-        if not len(time_s):
-            return self._path(time_s, order)
-        key = (order, len(time_s), *time_s[[0, len(time_s) // 2, -1]].tolist())
-        # The entry moves to the end, so that the one that was not used for longest is deleted.
-        self._values[key] = self._values.pop(key) if key in self._values \
-            else self._path(time_s, order)
-        while sum(map(len, self._values.values())) > _CACHED_VALUES and len(self._values) > 1:
-            del self._values[next(iter(self._values))]
-        return self._values[key]
-
-    def errors(self, time_s: np.ndarray) -> PathErrors | None:
-        """Return the errors of the path at times, s, (n,); None where it is exact."""
-        return self._path.errors(time_s) if isinstance(self._path, SmoothedPath) else None
-
-
-def _cached(motion: Motion, reference: Reference) -> Motion:
-    """Return the motion with paths that are evaluated once."""
-    names = ('temperature_c', 'supply_v') + tuple(JOINTS) * (reference is Reference.STAGE)
-    paths: dict[str, Any] = {name: (path := getattr(motion, name)) and CachedPath(path)
-                             for name in names}
-    return replace(motion, **paths)
-
-
 def noiseless(sensor: Sensor) -> Sensor:
     """Return the sensor without noise and without the steps of its ADC."""
     mean = tuple(e for e in sensor.effects if effect_named(e).acts_on is ActsOn.MEAN)
@@ -216,15 +181,13 @@ def compare(recording: Recording, sensor: Sensor, sim: Motion | None = None
     if reference is not Reference.NONE:
         motion = replace(motion, internal_rate_hz=min(
             max(_LOWEST_INTERNAL_RATE_HZ, sensor.rate_hz), INTERNAL_RATE_HZ, _most_hz(time_s)))
-    motion = _cached(motion, reference)
     at_rest = _at_rest(motion, time_s, reference, volts)
     used = np.ones(len(recording), bool)
     if reference is Reference.SIMULATOR:
         # Where another simulator moves from its first sample on, the filter has not settled.
         used = at_rest | (time_s > time_s[0] + SETTLING_S)
-    return BaselineComparison(recording.path, time_s, volts, motion, sensor, reference,
-                              tuple(name for name in ('alpha_rad', 'beta_rad') if np.isfinite(
-                                  recording.columns.get(name, np.nan)).any()), at_rest, used)
+    return BaselineComparison(recording.path, time_s, volts, motion, sensor, reference, at_rest,
+                              used)
 
 
 def _most_hz(time_s: np.ndarray) -> float:
@@ -242,8 +205,8 @@ def at_search_rate(comparison: BaselineComparison) -> BaselineComparison:
                                                       _most_hz(comparison.time_s)))
     return replace(
         comparison, time_s=comparison.time_s[part], volts=comparison.volts[part],
-        motion=_cached(motion, comparison.reference),
-        sensor=replace(comparison.sensor, rate_hz=comparison.sensor.rate_hz / every),
+        motion=motion, sensor=replace(comparison.sensor,
+                                      rate_hz=comparison.sensor.rate_hz / every),
         at_rest=comparison.at_rest[part], used=comparison.used[part], memo=ChainMemo())
 
 

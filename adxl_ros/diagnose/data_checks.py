@@ -760,13 +760,10 @@ def _check_rest(comparison: BaselineComparison, finite: np.ndarray) -> None:
     range_g = np.subtract(*np.quantile(force_g, _RANGE_QUANTILES[::-1], axis=0))
     worst = int(np.argmax(range_g))
     if range_g[worst] >= _LARGEST_UNEXPLAINED_MOTION_G and step_g[worst] <= range_g[worst]:
-        missing = [name for name in JOINTS.values()
-                   if name != 'shift_m' and name not in comparison.stage_angles]
-        angles = 'it has no stage angles' if len(missing) > 1 else \
-            f'it has no {missing[0]}' if missing else 'its stage angles do not change'
         raise DataFault('reference', f'{comparison.sensor.axes[worst]} moves by '
-                        f'{range_g[worst]:.2f} g, but {angles}; give the angles, or --sim with '
-                        'the specific force of the same manoeuvre')
+                        f'{range_g[worst]:.2f} g, but no stage angles that change; give '
+                        'alpha_rad and beta_rad, or --sim with the specific force of the same '
+                        'manoeuvre')
 
 
 def _check_axes(comparison: BaselineComparison) -> None:

@@ -33,14 +33,14 @@ from itertools import pairwise
 from math import sqrt
 from typing import NamedTuple
 
-from adxl_ros.diagnose.comparison import BaselineComparison, CachedPath, gravity_slopes
+from adxl_ros.diagnose.comparison import BaselineComparison, gravity_slopes
 from adxl_ros.model import noise
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Coefficient, DriftSpectrum, Role
 from adxl_ros.model.sensor import parameter_of, Sensor
 from adxl_ros.signals.block_statistics import true_runs
-from adxl_ros.simulate.smoothed_paths import ForcePath
+from adxl_ros.simulate.smoothed_paths import ForcePath, SmoothedPath
 import numpy as np
 import scipy
 
@@ -288,8 +288,7 @@ def _angle_errors(comparison: BaselineComparison, axis: int
     sensor, time_s, joints = comparison.sensor, comparison.time_s, comparison.joints or ()
     slopes = gravity_slopes(*(joint(time_s) for joint in joints))[:, axis] if joints else ()
     for joint, slope in zip(joints, slopes):
-        errors = joint.errors(time_s) if isinstance(joint, CachedPath) else None
-        if errors is not None:
+        if isinstance(joint, SmoothedPath) and (errors := joint.errors(time_s)) is not None:
             # An error that grows, after a move, is a new one.
             memory = np.exp(-errors.forgetting_per_s * comparison.dt_s)
             memory[1:] *= np.minimum(errors.std[:-1] / errors.std[1:], 1.0)

@@ -20,7 +20,6 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache
 from typing import NamedTuple
 
 from adxl_ros.diagnose import linear_model as linear, noise_effects
@@ -40,6 +39,7 @@ from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Coefficient, Concern, Detector, Effect, Manoeuvre
 from adxl_ros.model.sensor import parameter_of, Sensor, with_neutral
+from adxl_ros.report.quantities import listed
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import simulate_blocks
@@ -204,29 +204,17 @@ def expected_information(gram: np.ndarray, probabilities: Sequence[float],
     return max(float(-weights[positive] @ np.log((overlap @ weights)[positive])), 0.0)
 
 
-class Experiment(NamedTuple):
-    """A manoeuvre that can be recorded next."""
-
-    name: str
-    begin_s: float  # Time of its motion at which it begins, s
-    motion: Motion
-
-    @property
-    def minutes(self) -> float:
-        """Return the duration, min."""
-        return self.motion.duration_s / 60
-
-
 class ManoeuvreWorth(NamedTuple):
     """What a manoeuvre is expected to tell."""
 
-    manoeuvre: Experiment
+    name: str
+    minutes: float  # Duration, min
     information: float  # Expected decrease of the entropy of the hypotheses, nat
 
     @property
     def per_minute(self) -> float:
         """Return the expected information per minute, nat/min."""
-        return self.information / self.manoeuvre.minutes
+        return self.information / self.minutes
 
 
 Key = tuple
@@ -236,15 +224,11 @@ Key = tuple
 class PredictedResponse(NamedTuple):
     """Products of the sensitivities of one manoeuvre."""
 
-    manoeuvre: Experiment
-    linear_model: LinearModel
+    name: str
+    minutes: float  # Duration, min
+    linear_model: LinearModel  # Its variants are those that the manoeuvre excites
     places: dict[Key, int]  # Place of each column
     gram: np.ndarray  # Products, in units of the noise, (k, k)
-
-    @property
-    def effects(self) -> set[str]:
-        """Return the effects that the manoeuvre excites."""
-        return {v.effect for v in self.linear_model.variants}
 
 
 def leading(hypotheses: Sequence[WeightedHypothesis]) -> tuple[WeightedHypothesis, ...]:
@@ -253,12 +237,17 @@ def leading(hypotheses: Sequence[WeightedHypothesis]) -> tuple[WeightedHypothesi
                  and UNKNOWN not in h.effects)[:_MOST_HYPOTHESES]
 
 
-def predict(manoeuvre: Experiment, sensor: Sensor, effects: Sequence[str]) -> PredictedResponse:
-    """Simulate a manoeuvre with the baseline, and multiply its whitened sensitivities."""
+def predict(name: str, motion: Motion, begin_s: float, sensor: Sensor, effects: Sequence[str]
+            ) -> PredictedResponse:
+    """
+    Simulate a manoeuvre with the baseline, and multiply its whitened sensitivities.
+
+    begin_s: time of its motion at which it begins, s.
+    """
     at_rate = replace(sensor, rate_hz=min(sensor.rate_hz, _RATE_HZ))
-    parts = list(simulate_blocks(at_rate, manoeuvre.motion, 0, manoeuvre.begin_s))
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    recording = Recording(manoeuvre.name, columns.pop('time_s'), columns)
+    parts = list(simulate_blocks(at_rate, motion, 0, begin_s))
+    columns = {column: np.concatenate([part[column] for part in parts]) for column in parts[0]}
+    recording = Recording(name, columns.pop('time_s'), columns)
     comparison = at_search_rate(compare(recording, at_rate))
     model = linear.build_linear_model([comparison], only=effects)
     keys = _keys(model)
@@ -269,7 +258,7 @@ def predict(manoeuvre: Experiment, sensor: Sensor, effects: Sequence[str]) -> Pr
         shown = [i for i, number in enumerate(channel.column_ids) if number in keys]
         ids = [places[keys[channel.column_ids[i]]] for i in shown]
         gram[np.ix_(ids, ids)] += channel.total_grams[f][1:, 1:][np.ix_(shown, shown)] / variance
-    return PredictedResponse(manoeuvre, model, places, gram)
+    return PredictedResponse(name, motion.duration_s / 60, model, places, gram)
 
 
 def _keys(model: LinearModel) -> dict[int, Key]:
@@ -285,20 +274,16 @@ def rank_responses(responses: Sequence[PredictedResponse],
     """Rank manoeuvres by their expected information per minute."""
     leaders = leading(hypotheses)
 
-    @cache
-    def best_variant(effect: str) -> int | None:
-        """Return the number of the variant of an effect that fits the samples best."""
-        return None if model is None else max(
-            _variants_of(model, effect), default=None,
-            key=lambda i: model.fit_variants([i], model.null_fit).log_evidence)
-
-    posteriors = []
-    for hypothesis in leaders:
-        seen = {e: i for e in hypothesis.effects if (i := best_variant(e)) is not None}
-        posteriors.append((_fitted(model, list(seen.values())), {*hypothesis.effects} - {*seen}))
+    # The variant of each effect that fits the samples best.
+    seen = {} if model is None else {effect: max(
+        numbers, key=lambda i: model.fit_variants([i], model.null_fit).log_evidence)
+        for effect in {e for h in leaders for e in h.effects}
+        if (numbers := _variants_of(model, effect))}
+    posteriors = [(_fitted(model, [seen[e] for e in h.effects if e in seen]),
+                   {*h.effects} - {*seen}) for h in leaders]
     total = sum(h.probability for h in leaders)
     probabilities = [h.probability / total for h in leaders]
-    worth = [ManoeuvreWorth(r.manoeuvre, expected_information(
+    worth = [ManoeuvreWorth(r.name, r.minutes, expected_information(
         r.gram, probabilities, [_belief(r, *p) for p in posteriors], _EVIDENCE_FACTOR))
         for r in responses]
     return tuple(sorted(worth, key=lambda w: -w.per_minute))
@@ -400,8 +385,8 @@ def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], sensor
             concerns_reference=True)
     if verdict.groups:
         ranked = _ranked_menu(verdict, sensor, model, seed)
-        group, best = verdict.groups[0], ranked[0].manoeuvre.name
-        why = f'to separate {", ".join(group[:-1])} and {group[-1]}'
+        group, best = verdict.groups[0], ranked[0].name
+        why = f'to separate {listed(group, "and")}'
         return _experiment(next(m for m, d in MENU.items() if d.text == best), why,
                            no_stage)._replace(menu=ranked)
     if verdict.status == 'no_gap' and not not_covered:
@@ -429,7 +414,7 @@ def _ranked_menu(verdict: Verdict, sensor: Sensor, model: LinearModel | None, se
         # At rest the pose is unknown, so that a baseline with effects of the stage has no place.
         with suppress(UserError):
             responses.append(predict(
-                Experiment(described.text, 0.0, motion),
+                described.text, motion, 0.0,
                 _remounted(sensor) if described.remounted else sensor, effects))
     return rank_responses(responses, verdict.hypotheses, model)
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from textwrap import wrap
 from typing import Any, NamedTuple
@@ -104,8 +105,8 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
              'left': abs(r.recorded - r.simulated)} for r in report.noise_remainders],
         'next_experiment': proposal and {
             'manoeuvre': proposal.manoeuvre, 'why': proposal.why, 'command': proposal.command,
-            'menu': [{'manoeuvre': w.manoeuvre.name, 'minutes': w.manoeuvre.minutes,
-                      'nats_per_minute': w.per_minute} for w in proposal.menu]},
+            'menu': [{'manoeuvre': w.name, 'minutes': w.minutes, 'nats_per_minute': w.per_minute}
+                     for w in proposal.menu]},
         'summary': summary(diagnosis)})
 
 
@@ -364,16 +365,17 @@ _BADGE_COLUMNS, _GAP_COLUMNS, _LABEL_COLUMNS = 29, 24, 9
 """Columns of the verdict, of the gap before and after, and of the words before rows of text."""
 _SURE_COLUMNS, _SHARE_COLUMNS = 8, 7
 """Columns of the table of effects."""
-_MOST_SHOWN, _MOST_HIDDEN, _MOST_OTHERS = 4, 4, 3
-"""Effects that the screen lists; the page has all of them."""
+_MOST_OTHERS = 3
+"""Other effects that the screen lists; the page has all of them."""
 
 
 def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
     """Return the diagnosis as lines of at most `COLUMNS` columns; the first one is the subject."""
     lines, word, report = [*wrapped(subject), ''], badge(diagnosis), diagnosis.report
-    note_lines = [line for note in notes(diagnosis) for line in _row_lines('note', note)]
+    labelled = [('note', note) for note in notes(diagnosis)]
     if report is None:
-        return lines + wrapped(f'{word}  {headline(diagnosis)}', len(word) + 2) + note_lines
+        return lines + wrapped(f'{word}  {headline(diagnosis)}', len(word) + 2) \
+            + _labelled(labelled)
     objects, rows = as_json(diagnosis), figure_rows(diagnosis)
     closure, first = report.closure, {row.label: row.note for row in rows}
     # The gap, with the effects, and the floor stand in the first line.
@@ -381,42 +383,23 @@ def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
     gap = f'{mg_text(closure.before.value)}{after} rms'
     lines.append(f'{word:{_BADGE_COLUMNS - 1}} {gap:{_GAP_COLUMNS - 1}} noise floor '
                  f'{mg_text(closure.floor.value)}')
-    remarks = [first['with the effects']] if closes(report) else \
-        [] if 'sim' in first['gap'] else [f'gap {first["gap"]}']
+    remark = first.get('with the effects', '' if 'sim' in first['gap'] else f'gap {first["gap"]}')
     lines += [f'{"":{_BADGE_COLUMNS}}{line}'
-              for remark in (*remarks, f'noise floor {first["noise floor"]}')
-              for line in wrap(remark, COLUMNS - _BADGE_COLUMNS)]
+              for text in (remark, f'noise floor {first["noise floor"]}')
+              for line in wrap(text, COLUMNS - _BADGE_COLUMNS)]
     if report.verdict.status != 'explained' or 'REFERENCE' in word:
         lines += wrapped(headline(diagnosis))
     elif is_only_noise(report):
         lines += wrapped(NOISE_STAYS)
-    lines += [*_effect_table(report, objects), '', *_row_lines('figures', '; '.join(
-        f'{row.label} {row.text}' for row in rows[3 if closes(report) else 2:]))]
-    lines += [line for i, row in enumerate(remainder_rows(report))
-              for line in _row_lines('' if i else 'noise', f'{row.label}: {row.text}')]
-    lines += _row_lines('shows', shown_text(report))
-    named, causes = named_effects(report, objects), {
-        c['effect']: c['cause'] for c in objects['candidates']}
-    width = max(map(len, named), default=0) + 2
-    return lines + [line for i, name in enumerate(named)
-                    for line in _row_lines('' if i else 'cause', f'{name:{width}}{causes[name]}',
-                                           _LABEL_COLUMNS + width)] + note_lines
-
-
-def shown_text(report: Report) -> str:
-    """Return how many effects would have shown, some of them, and some that could not."""
-    rows = by_effect(report.could_show)
-    scale = float(report.baseline.scale_v_per_g.mean())
-    shown = [f'{name} from {shown_row(row, scale)[2]}' for name, row in rows.items()
-             if row.shows and name not in report.verdict.named]
-    hidden = [name for name, row in rows.items() if not row.shows]
-    text = f'{sum(r.shows for r in rows.values())} of {len(rows)} effects could show'
-    if shown:
-        text += f': {", ".join(shown[:_MOST_SHOWN])}, ...'
-    if hidden:
-        more = ', ...' if len(hidden) > _MOST_HIDDEN else ''
-        text += f'; could not: {", ".join(hidden[:_MOST_HIDDEN])}{more}'
-    return text
+    shown = by_effect(report.could_show).values()
+    hidden = ', '.join(row.effect for row in shown if not row.shows)
+    return [*lines, *_effect_table(report, objects), '', *_labelled([
+        ('figures', '; '.join(f'{row.label} {row.text}' for row in rows[2 + closes(report):])),
+        *(('noise', f'{row.label}: {row.text}') for row in remainder_rows(report)),
+        ('shows', f'{sum(row.shows for row in shown)} of {len(shown)} effects could show'
+         + f'; could not: {hidden}' * bool(hidden)),
+        *(('cause', f'{name}: {effect_named(name).cause}')
+          for name in named_effects(report, objects)), *labelled])]
 
 
 def named_effects(report: Report, objects: dict[str, Any]) -> list[str]:
@@ -427,14 +410,9 @@ def named_effects(report: Report, objects: dict[str, Any]) -> list[str]:
 
 
 def _effect_table(report: Report, objects: dict[str, Any]) -> list[str]:
-    """Lay out the named effects, and the probable ones that are not named."""
+    """Lay out the named effects, and other probable hypotheses."""
     named = named_effects(report, objects)
     candidates = {c['effect']: c for c in objects['candidates']}
-    others = [(c['probability'], name) for name, c in candidates.items()
-              if name not in named and c['probability'] >= PROBABLE]
-    unknown = sum(h['probability'] for h in objects['hypotheses'] if UNKNOWN in h['effects'])
-    if unknown >= PROBABLE and report.verdict.status != 'unknown':
-        others.append((unknown, 'something unknown'))
     width = max(map(len, ('effect', *named))) + 2
     size_columns = COLUMNS - 1 - width - _SURE_COLUMNS - _SHARE_COLUMNS
     lines = ['', f' {"effect":{width}}{"sure":{_SURE_COLUMNS}}'
@@ -446,11 +424,14 @@ def _effect_table(report: Report, objects: dict[str, Any]) -> list[str]:
         lines.append(f' {name:{width}}{sure:{_SURE_COLUMNS}}{first:{size_columns}}'
                      f'{"" if share is None else percent(share):>{_SHARE_COLUMNS}}'.rstrip())
         lines += [f'{"":{1 + width + _SURE_COLUMNS}}{size}' for size in more]
-    if others:
-        texts = [f'{name} ({percent(p)})' for p, name in sorted(others, reverse=True)]
-        lines += [] if named else ['']
-        lines += _row_lines('', 'also possible: ' + listed(texts[:_MOST_OTHERS], 'and'), 1)
-    return lines
+    others = {name: c['probability'] for name, c in candidates.items() if name not in named}
+    if report.verdict.status != 'unknown':
+        others['something unknown'] = sum(h['probability'] for h in objects['hypotheses']
+                                          if UNKNOWN in h['effects'])
+    texts = [f'{name} ({percent(p)})' for p, name in sorted(zip(others.values(), others),
+                                                            reverse=True) if p >= PROBABLE]
+    return lines + [''] * bool(texts and not named) + wrapped(
+        ' also possible: ' * bool(texts) + listed(texts[:_MOST_OTHERS], 'and'), 1)
 
 
 def size_lines(report: Report, candidate: dict[str, Any]) -> list[str]:
@@ -470,6 +451,11 @@ def size_lines(report: Report, candidate: dict[str, Any]) -> list[str]:
                     if zeros else [])
 
 
-def _row_lines(label: str, text: str, indent: int = _LABEL_COLUMNS) -> list[str]:
-    """Return a text behind its label, wrapped between words."""
-    return wrapped(f' {label:{min(indent, _LABEL_COLUMNS) - 1}}{text}', indent)
+def _labelled(rows: Sequence[tuple[str, str]]) -> list[str]:
+    """Return texts behind their labels, wrapped between words; equal labels stand once."""
+    lines, last = [], ''
+    for label, text in rows:
+        shown = '' if label == last else label
+        lines += wrapped(f' {shown:{_LABEL_COLUMNS - 1}}{text}', _LABEL_COLUMNS)
+        last = label
+    return lines
