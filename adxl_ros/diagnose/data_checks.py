@@ -12,7 +12,7 @@ small one may be the latency of the sensor, which is an effect of the library: i
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from os.path import basename
@@ -24,19 +24,23 @@ from adxl_ros.diagnose.comparison import (
     BaselineComparison,
     code_step_v,
     compare,
+    fading_frequency_hz,
+    leave_out,
     Reference,
+    seen_step_rad,
     SMALLEST_MOTION_G,
+    stated_poses,
+    without_fast_motion,
+    without_gaps,
 )
 from adxl_ros.files.recording_columns import JOINTS, Recording
-from adxl_ros.files.reference_alignment import LONGEST_MOVE_NS, USUAL_GAPS
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2, MAD_TO_STD, Z_90
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.block_statistics import true_runs
 from adxl_ros.signals.recorded_sensor import find_polarity_fault
 from adxl_ros.simulate.motion import Motion
-from adxl_ros.simulate.smoothed_paths import BAND_LIMITED_DEGREE, ForcePath
+from adxl_ros.simulate.smoothed_paths import ForcePath
 import numpy as np
 import scipy
 
@@ -59,46 +63,6 @@ _LARGEST_ERROR_RATIO = 0.5
 keeps it."""
 _BLOCKS, _FINE_SAMPLES = 10, 20_000
 """Blocks and samples of the fine search. Chosen: their scatter shows the error to 24 %."""
-_LONGEST_BRIDGE_S, _SLOWEST_S = LONGEST_MOVE_NS / 1e9, 1.0
-"""Longest time without a reading that is bridged, s: of a joint as between messages of a bag, and
-of a slow encoder, whose readings are a move apart at most."""
-_BEFORE_S, _AFTER_S = 0.1, 0.3
-"""Times that are left out beside a gap, s. Chosen: the spline is uncertain before it, and an RC
-filter of 15 Hz has settled after it."""
-_FEWEST_CHANGES, _LARGEST_STEP_RAD, _COARSER = 100, 0.02, 1.05
-"""Fewest changes of a reading that show the step of its encoder, its largest step, rad, and the
-ratio to the stated one from which it counts. Chosen: two turns by hand; 1°; 1/12° may be 0.083°.
-"""
-_WHOLE, _WHOLE_SHARE = 0.2, 0.9
-"""Deviation from whole steps, and share of the changes within it, by encoders. Chosen: 40 % of the
-changes of exact readings are within it."""
-_SAME_POSE, _SAME_STEPS = 1e-4, 2.0
-"""Change of a joint over a gap without a move, rad or m, and in steps of its encoder. Chosen:
-0.1 mg, and two readings that scatter by one step."""
-_LAG_S, _SLOW = 0.02, 3.0
-"""Lag of differences, s, and standard deviation of the output, divided by theirs, up to which it
-rests. Chosen: an RC filter has forgotten its noise, and motion below 2 Hz exceeds it."""
-_WINDOW_S, _SHORTEST_WINDOW = 1.0, 64
-"""Length of a window whose spectrum is taken, s and readings. Chosen: shorter than a move, and
-some periods of a shaker."""
-_LARGEST_ERROR = 0.3
-"""Error of the force by the spline, divided by the noise, up to which a window is used. Chosen: it
-adds 4 % to the noise."""
-_SAME_MOTION = 2.0
-"""Ratio of recorded and simulated motion from which one is an alias. Chosen: an alias below 0.2 of
-the rate has a ratio of 4."""
-_NAMED_PARTS = 4
-"""Parts that a note names. Chosen: it stays one or two lines."""
-_FEWEST_WINDOWS, _BAND_HZ = 20, 2.0
-"""Fewest windows, and width of the bands, Hz, by which fading is judged. Chosen: noise then has a
-coherence of 0.05, and a line of the mains is one value."""
-_MOTION, _FADED = 10.0, 0.5
-"""Power over noise from which motion shows, and power of the reference, even without the filter of
-the sensor, divided by the recorded one, below which it has faded. Chosen."""
-_JERK_S, _LARGEST_JERK = 0.1, 4.0
-"""Time around a jerk of a robot that is left out, s, and error of the force, divided by the noise,
-from which it is one. Chosen: that of the splines' knots; the error of what stays is below the
-noise, rms, and the filter for errors weighs it."""
 _SAME_ROUGHNESS = 1.05
 """Ratio of the steps of two residuals up to which they are equal. Chosen: above its scatter by
 noise in a thousand samples."""
@@ -304,212 +268,6 @@ def _fine_shift(recording: Recording, sensor: Sensor, force: ForcePath, late_s: 
     return _Shift(late_s + more_s, std_s, correlation)
 
 
-def _in_gaps(time_s: np.ndarray, read_s: np.ndarray, longest_s: float
-             ) -> Iterable[tuple[int, int]]:
-    """
-    Yield the samples, begin and end, in gaps between readings that are not bridged.
-
-    Before the first reading and after the last, the ends of the recording count.
-    """
-    ends_s = np.concatenate([[min(time_s[0], read_s[0])], read_s, [max(time_s[-1], read_s[-1])]])
-    for i in np.flatnonzero(np.diff(ends_s) > longest_s):
-        yield (int(np.searchsorted(time_s, ends_s[i], 'right' if i else 'left')),
-               int(np.searchsorted(time_s, ends_s[i + 1], 'right' if i > len(read_s) - 1
-                                   else 'left')))
-
-
-def _leave_out(comparison: BaselineComparison, rows: np.ndarray, reason: str
-               ) -> BaselineComparison:
-    """Return a comparison that does not use some samples, and notes why and when."""
-    if not rows.any():
-        return comparison
-    time_s, runs = comparison.time_s, true_runs(rows)
-    parts = ', '.join(f'{time_s[a]:.5g} to {time_s[b - 1]:.5g} s' for a, b in runs[:_NAMED_PARTS])
-    note = (f'left out: {comparison.dt_s * rows.sum():.3g} s '
-            f'({parts}{", ..." * (len(runs) > _NAMED_PARTS)}): {reason}')
-    return replace(comparison, used=comparison.used & ~rows, notes=(*comparison.notes, note))
-
-
-def _without_gaps(comparison: BaselineComparison) -> BaselineComparison:
-    """Leave out samples in gaps of another simulator."""
-    time_s, force = comparison.time_s, comparison.motion.force
-    if not isinstance(force, ForcePath):
-        return comparison
-    limit_s = max(_LONGEST_BRIDGE_S, USUAL_GAPS * float(np.median(np.diff(force.time_s))))
-    unknown = np.zeros(len(time_s), bool)
-    for begin, end in _in_gaps(time_s, force.time_s, limit_s):
-        if end > begin:
-            unknown |= (time_s >= time_s[begin] - _BEFORE_S) \
-                & (time_s <= time_s[end - 1] + _AFTER_S)
-    return _leave_out(comparison, unknown,
-                      f'no reading of {force.name} for more than {limit_s:.3g} s')
-
-
-def _stated_poses(recording: Recording, sensor: Sensor
-                  ) -> tuple[Recording, list[tuple[np.ndarray, str]]]:
-    """
-    Fill the gaps of the stage's joints; return samples that are not known there, and reasons.
-
-    A pose that is stated before and after a gap, while the output rests, holds in between. Other
-    gaps are left out.
-    """
-    time_s, output_g = recording.time_s, recording.volts(sensor) / sensor.scale_v_per_g
-    columns, left_out = dict(recording.columns), []
-    lag = max(1, round(_LAG_S * recording.rate_hz))
-    for joint, name in JOINTS.items():
-        values = columns.get(name, np.zeros(0))
-        read = np.flatnonzero(np.isfinite(values))
-        if len(read) < 2:
-            continue
-        step = 0.0 if joint == 'shift' else sensor.stage_resolution_rad
-        filled = np.interp(time_s, time_s[read], values[read])
-        limit_s = max(_LONGEST_BRIDGE_S, min(USUAL_GAPS * float(np.median(np.diff(
-            time_s[read]))), _SLOWEST_S))
-        unknown, columns[name] = np.zeros(len(time_s), bool), values.copy()
-        for begin, end in _in_gaps(time_s, time_s[read], _LONGEST_BRIDGE_S):
-            inner = 0 < begin < end < len(time_s)
-            gap_s = time_s[min(end, len(time_s) - 1)] - time_s[max(begin - 1, 0)]
-            holds = inner and _rests(output_g[begin:end], lag) and abs(
-                filled[end] - filled[begin - 1]) <= _SAME_STEPS * step + _SAME_POSE
-            if inner and (holds or gap_s > limit_s):
-                columns[name][begin:end] = filled[begin:end]
-            if not holds and gap_s > limit_s:
-                unknown |= (time_s > time_s[begin] - _BEFORE_S) \
-                    & (time_s < time_s[end - 1] + _AFTER_S)
-        left_out.append((unknown, f'no reading of {name} for more than {limit_s:.3g} s'))
-    return replace(recording, columns=columns), left_out
-
-
-def _rests(output_g: np.ndarray, lag: int) -> bool:
-    """Determine whether an output, g, (n, m), neither moves far nor slowly; with NaN as gaps."""
-    output_g = output_g[np.isfinite(output_g).all(axis=1)]
-    if len(output_g) <= 2 * lag:
-        return True
-    noise_g = np.sqrt(np.mean((output_g[lag:] - output_g[:-lag]) ** 2, axis=0) / 2)
-    return bool(np.all(output_g.std(axis=0) < np.minimum(SMALLEST_MOTION_G, _SLOW * noise_g)
-                       + _SAME_POSE))
-
-
-def _seen_step_rad(recording: Recording, sensor: Sensor) -> float:
-    """Return the step that the encoders show, where it exceeds the stated one, rad."""
-    largest_rad = sensor.stage_resolution_rad
-    for name in ('alpha_rad', 'beta_rad'):
-        changes = np.abs(np.diff(recording.columns.get(name, np.zeros(0))))
-        changes = changes[changes > 1e-9]
-        if len(changes) < _FEWEST_CHANGES:
-            continue
-        step_rad = float(np.median(changes[changes < 1.5 * changes.min()]))
-        few = changes[changes < 4.5 * step_rad]
-        # Readings with decimals differ by one step more or less exactly.
-        step_rad = float(few.sum() / np.rint(few / step_rad).sum())
-        whole = np.abs(few / step_rad - np.rint(few / step_rad)) < _WHOLE
-        if whole.sum() >= _FEWEST_CHANGES and whole.mean() > _WHOLE_SHARE \
-                and _COARSER * largest_rad < step_rad < _LARGEST_STEP_RAD:
-            largest_rad = step_rad
-    return largest_rad
-
-
-def _without_jerks(comparison: BaselineComparison, force: ForcePath, noise_g: float
-                   ) -> BaselineComparison:
-    """Leave out samples at which a robot jerks: its encoders do not show its acceleration."""
-    error_g = np.abs(force.smoothing_mps2[:, :len(comparison.sensor.axes)]).max(axis=1) / G0_MPS2
-    time_s = comparison.time_s
-    rows = np.interp(time_s, force.time_s, error_g) > _LARGEST_JERK * noise_g
-    rows |= (time_s < force.time_s[0] + _JERK_S) | (time_s > force.time_s[-1] - _JERK_S)
-    margin = round(_JERK_S * comparison.sensor.rate_hz)
-    return _leave_out(
-        comparison, np.convolve(rows, np.ones(2 * margin + 1), 'same') > 0.5,
-        f'the robot jerks, which its encoders do not show (error up to {1e3 * error_g.max():.2g} '
-        'mg); move more smoothly, or record the joints at a higher rate')
-
-
-def _without_fast_motion(comparison: BaselineComparison, columns: dict[str, np.ndarray]
-                         ) -> BaselineComparison:
-    """Leave out samples at which the reference moves faster than its readings show."""
-    sensor, time_s, force = comparison.sensor, comparison.time_s, comparison.motion.force
-    noise_g = float(np.min(noise.analog_std_v(sensor) / sensor.scale_v_per_g))
-    limit_g = _LARGEST_ERROR * max(noise_g, float(np.min(sensor.lsb_v / sensor.scale_v_per_g)))
-    # Name, times and readings of each reference, degrees of its splines, derivative and step.
-    references: list[tuple] = []
-    if isinstance(force, ForcePath):
-        if force.is_robot:
-            return _without_jerks(comparison, force, noise_g)
-        references = [(force.name, force.time_s, np.array(force(force.time_s)) / G0_MPS2,
-                       (3, 5), 0, 0.0)]
-    for joint, name in JOINTS.items() if comparison.joints else ():
-        values = columns.get(name, np.zeros(0))
-        read = np.isfinite(values)
-        if read.sum() > BAND_LIMITED_DEGREE and np.ptp(values[read]):
-            how = ((BAND_LIMITED_DEGREE - 2, BAND_LIMITED_DEGREE), 2, 0.0) if joint == 'shift' \
-                else ((3, 5), 0, sensor.stage_resolution_rad)
-            unit = G0_MPS2 if joint == 'shift' else 1.0
-            references.append((name, time_s[read], values[None, read] / unit, *how))
-    margin = np.ones(2 * round(_WINDOW_S / 2 * sensor.rate_hz) + 1)
-    for name, read_s, readings, degrees, order, step_g in references:
-        # Between the readings, where both splines agree, they show the motion.
-        middle_s = (read_s[1:] + read_s[:-1]) / 2
-        first, second = (scipy.interpolate.make_interp_spline(
-            read_s, readings[:len(sensor.axes)].T, k)(middle_s, order) for k in degrees)
-        error_g = np.interp(time_s, middle_s, np.abs(first - second).max(axis=1))
-        coarse = comparison.used & (error_g > np.hypot(limit_g, step_g))
-        if coarse.any():
-            coarse = np.convolve(_with_aliases(comparison, coarse, noise_g), margin, 'same') > 0.5
-            rate_hz = 1 / float(np.median(np.diff(read_s)))
-            comparison = _leave_out(
-                comparison, coarse, f'{name} moves too fast for its {rate_hz:.4g} readings a '
-                f'second (error up to {1e3 * error_g[coarse].max():.2g} mg); read it at a higher '
-                'rate')
-    return comparison
-
-
-def _with_aliases(comparison: BaselineComparison, coarse: np.ndarray, noise_g: float
-                  ) -> np.ndarray:
-    """Extend samples to the seconds beside them that move otherwise than simulated, (n,) bool."""
-    sensor, signals_v = comparison.sensor, (comparison.volts,
-                                            comparison.simulated_v(comparison.sensor))
-    length = max(round(_WINDOW_S * sensor.rate_hz), _SHORTEST_WINDOW)
-    part = np.minimum(np.arange(len(coarse)) // length, max(len(coarse) // length - 1, 0))
-    recorded, simulated = (np.sqrt([
-        noise_g ** 2 + np.bincount(part, c ** 2) / np.bincount(part) for c in np.nan_to_num(
-            np.diff(v / sensor.scale_v_per_g, axis=0, prepend=0.0)).T]) for v in signals_v)
-    differs = np.any(np.abs(np.log(recorded / simulated)) > np.log(_SAME_MOTION), axis=0)
-    touched = np.bincount(part, coarse) > 0
-    extended = coarse.copy()
-    for begin, end in true_runs(differs | touched):
-        if touched[begin:end].any():
-            extended |= (part >= begin) & (part < end) & differs[part]
-    return extended
-
-
-def _fading_frequency_hz(comparison: BaselineComparison) -> float | None:
-    """Find the frequency above which the reference has less motion than the sensor."""
-    if comparison.reference is not Reference.SIMULATOR:
-        return None
-    sensor = comparison.sensor
-    size = max(round(_WINDOW_S * sensor.rate_hz), _SHORTEST_WINDOW)
-    recorded_g, simulated_g = (np.nan_to_num(v / sensor.scale_v_per_g) for v in (
-        comparison.volts, comparison.simulated_v(sensor)))
-    if len(recorded_g) < _FEWEST_WINDOWS * size // 2:
-        return None
-
-    frequency_hz = np.arange(size // 2 + 1) * sensor.rate_hz / size
-    band = max(round(_BAND_HZ * size / sensor.rate_hz), 1)
-    count = (size // 2) // band * band
-    stated = (noise.density_v2_per_hz(sensor, frequency_hz[1:]) / sensor.scale_v_per_g ** 2).sum(1)
-    # Without its RC filter the sensor has this gain over its simulation.
-    rc_s = float(np.max(noise.electronics(sensor).rc_s))
-    unfiltered = 1 + (2 * np.pi * frequency_hz[1:] * rc_s) ** 2
-    recorded, simulated = (scipy.signal.welch(
-        v, sensor.rate_hz, nperseg=size, detrend='linear', axis=0)[1][1:].sum(axis=1)
-        for v in (recorded_g, simulated_g))
-    recorded, simulated, stated = (v[:count].reshape(-1, band).mean(axis=1) for v in (
-        recorded, simulated * unfiltered, stated))
-    moves = recorded > _MOTION * stated
-    followed = np.flatnonzero(moves & (simulated >= _FADED * recorded))
-    first = followed[-1] + 1 if len(followed) else 0
-    return float(frequency_hz[1 + first * band]) if moves[first:].any() else None
-
-
 def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, may_shift: bool
                     ) -> BaselineComparison:
     """
@@ -525,12 +283,12 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
         recording, sim, notes = _align_force(recording, sensor, sim, may_shift)
     else:
         _check_encoder(recording, sensor)
-        step_rad, stated_rad = _seen_step_rad(recording, sensor), sensor.stage_resolution_rad
+        step_rad, stated_rad = seen_step_rad(recording, sensor), sensor.stage_resolution_rad
         if step_rad > stated_rad:
             notes.append(f'the stage reads in steps of {np.degrees(step_rad):.3g}°, not of '
                          f'{np.degrees(stated_rad):.3g}° as stated: this is used')
             sensor = replace(sensor, stage_resolution_rad=step_rad)
-        recording, left_out = _stated_poses(recording, sensor)
+        recording, left_out = stated_poses(recording, sensor)
     comparison = compare(recording, sensor, sim)
     if even_s is not None and len(even_s) == len(recording):
         # Samples may also have been taken unevenly, so that the simulation decides.
@@ -540,10 +298,10 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
             notes.append(f'stamps are uneven, and an even rate of {evenly.sensor.rate_hz:.6g} '
                          'Hz explains them: it is used')
     for rows, reason in left_out if comparison.joints else ():
-        comparison = _leave_out(comparison, rows, reason)
+        comparison = leave_out(comparison, rows, reason)
     # What moves too fast is looked for where the reference is stated.
-    comparison = _without_fast_motion(_without_gaps(comparison), recording.columns)
-    fading_hz = _fading_frequency_hz(comparison)
+    comparison = without_fast_motion(without_gaps(comparison), recording.columns)
+    fading_hz = fading_frequency_hz(comparison)
     if fading_hz is not None:
         notes.append(f'the reference is smoother than the sensor: above {fading_hz:.3g} Hz it '
                      'lacks motion that the recording has; effects that show in fast motion are '

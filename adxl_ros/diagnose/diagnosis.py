@@ -156,8 +156,7 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     robot_mps2 = max(c.robot_error_mps2 for c in model.comparisons)
     wanders = any(getattr(c.motion.force, 'wanders', False) for c in model.comparisons)
     evidence = rule.Evidence(
-        {e: {d: f.figures for d, f in drifts.items()} for e, drifts in fits.items()},
-        counts, rule.block_weights(seed), smallest_mps2,
+        fits, counts, rule.block_weights(seed), smallest_mps2,
         max(model.smallest_angle_rad() * G0_MPS2, robot_mps2), robot_mps2 > 0,
         any(c.fading_hz is not None for c in model.comparisons), wanders,
         np.inf if floor.source == 'assumed' else floor.rms_mps2,
@@ -289,7 +288,7 @@ def _closure(verdict: Verdict, evidence: rule.Evidence, floor: NoiseFloor,
              remainders: Sequence[NoiseRemainder], sensor: Sensor, seed: int) -> GapClosure:
     """Return the gap before and after the best set, above the floor without noise-like effects."""
     best = verdict.best if verdict.closes else frozenset[str]()
-    before, after = (evidence.mean(evidence.candidates[e][HEALTHY].squares)
+    before, after = (evidence.mean(evidence.candidates[e][HEALTHY].figures.squares)
                      for e in (frozenset[str](), best))
     stated = noise.sample_std_v(sensor) / (sensor.scale_v_per_g / G0_MPS2)
     stated_mps2 = float(np.sqrt(np.mean(stated ** 2)))

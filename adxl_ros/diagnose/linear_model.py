@@ -256,13 +256,19 @@ class LinearModel:
         return all(c.reference is not Reference.NONE for c in self.comparisons)
 
     @cached_property
+    def usual_filters(self) -> list[list[Whitener]]:
+        """Filters of each channel for healthy units and for the drifts of the baseline."""
+        return filters_for(self.filters, self.baseline.effects)
+
+    @cached_property
     def lost_motion_mps2(self) -> float:
         """Rms of the motion that smooth references lack, m/s²."""
         return float(np.sqrt(np.mean([c.lost_motion_mps2() ** 2 for c in self.comparisons])))
 
-    def place_of_channel(self, number: int) -> tuple[int, int]:
-        """Return the number of the recording and of the axis of a channel."""
-        return divmod(number, len(self.baseline.axes))
+    @property
+    def places(self) -> list[tuple[BaselineComparison, int]]:
+        """Recording and number of the axis of each channel."""
+        return [(c, axis) for c in self.comparisons for axis in range(len(c.sensor.axes))]
 
     @cached_property
     def null_fit(self) -> LinearFit:

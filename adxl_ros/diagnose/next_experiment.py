@@ -81,7 +81,7 @@ class CouldShow(NamedTuple):
 def could_show(model: LinearModel, comparison: BaselineComparison, noise_v: np.ndarray,
                material_mps2: float) -> list[CouldShow]:
     """
-    Return the smallest sizes by coefficient: material ones, that exceed their uncertainty.
+    Return the smallest sizes by effect: material ones, that exceed their uncertainty.
 
     Nuisance parameters are free, within their tolerance. An effect with several shapes has the
     size of the shape that shows best. The sizes of effects on the noise are those of one
@@ -91,41 +91,38 @@ def could_show(model: LinearModel, comparison: BaselineComparison, noise_v: np.n
     fit, count = model.null_fit, len(model.names)
     # Products of the whitened columns in units of the noise, and their squares, (m/s²)²/unit².
     gram, plain, samples = np.zeros((count, count)), np.zeros(count), 0.0
-    for number, (c, f, variance) in enumerate(zip(
-            model.channels, fit.filter_indices, fit.innovation_variance_v2)):
+    for c, f, variance, columns, (recorded, axis) in zip(
+            model.channels, fit.filter_indices, fit.innovation_variance_v2, model.columns,
+            model.places):
         gram[np.ix_(c.column_ids, c.column_ids)] += c.total_grams[f][1:, 1:] / variance
-        recording, axis = model.place_of_channel(number)
-        of_channel = model.comparisons[recording]
-        for k, values in model.columns[number].items():
-            plain[k] += float(np.sum(values[of_channel.used] ** 2)) \
-                / float(of_channel.scale_v_per_mps2[axis]) ** 2
-        samples += of_channel.used.sum()
+        for k, values in columns.items():
+            plain[k] += float(np.sum(values[recorded.used] ** 2)) \
+                / float(recorded.scale_v_per_mps2[axis]) ** 2
+        samples += recorded.used.sum()
     precision = gram[np.ix_(free, free)] + np.diag(prior_std[free] ** -2.0)
     marginal = np.diag(gram) - np.einsum('ij,ij->j', gram[free], np.linalg.solve(
         precision, gram[free]))
-    best: dict[Coefficient, CouldShow] = {}
+    rows = _noise_could_show(comparison, noise_v, material_mps2)
     for variant, ids in zip(model.variants, model.column_ids):
         hints = effect_named(variant.effect).diagnosis
         if variant.limit_start or (hints.straight_line and not model.pose_known):
             continue
         for k in ids:
-            name = model.names[k]
             information = gram[k, k] if hints.nuisance else marginal[k]
             share = float(np.clip(information / max(gram[k, k], 1e-300), 0.0, 1.0))
             power = plain[k] * share / max(samples, 1.0)
             size = max(_SHOWN_STDS * information ** -0.5, material_mps2 * power ** -0.5) \
                 if information > 0 and power > 0 else np.inf
             if hints.nuisance:
-                size = np.hypot(size, 3 * model.tolerance(name))
-            if name not in best or size < best[name].smallest:
-                best[name] = CouldShow(name, float(size), share)
-    seen = {row.effect for row in best.values()} | {
-        v.effect for v in model.variants if v.limit_start}
-    hidden = [CouldShow(Coefficient(e.name, e.parameters[0].name), np.inf, 0.0)
-              for e in linear.candidates() if e.name not in seen]
-    return sorted([*best.values(), *hidden, *_noise_could_show(comparison, noise_v,
-                                                               material_mps2)],
-                  key=lambda r: (r.effect, r.name.parameter, r.name.axis))
+                size = np.hypot(size, 3 * model.tolerance(model.names[k]))
+            rows.append(CouldShow(model.names[k], float(size), share))
+    seen = {r.effect for r in rows} | {v.effect for v in model.variants if v.limit_start}
+    rows += [CouldShow(Coefficient(e.name, e.parameters[0].name), np.inf, 0.0)
+             for e in linear.candidates() if e.name not in seen]
+    # The coefficient of each effect that shows best, by smallest over typical size.
+    best = {r.effect: r for r in sorted(rows, reverse=True, key=lambda r: (
+        r.smallest / parameter_of(r.name).scale, r.name))}
+    return [best[effect] for effect in sorted(best)]
 
 
 def _noise_could_show(comparison: BaselineComparison, noise_v: np.ndarray, material_mps2: float
@@ -155,14 +152,6 @@ def _noise_could_show(comparison: BaselineComparison, noise_v: np.ndarray, mater
             continue
         rows.append(CouldShow(Coefficient(effect.name, parameter), float(size)))
     return rows
-
-
-def by_effect(rows: Sequence[CouldShow]) -> dict[str, CouldShow]:
-    """Return for each effect its coefficient that shows best, by smallest over typical size."""
-    best: dict[str, CouldShow] = {}
-    for row in sorted(rows, key=lambda r: r.smallest / parameter_of(r.name).scale):
-        best.setdefault(row.effect, row)
-    return best
 
 
 class Belief(NamedTuple):
@@ -397,11 +386,9 @@ def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], sensor
     elif not_covered:
         why = f'because the recordings have no {", no ".join(not_covered)}'
     revealed_by = [effect_named(e).diagnosis.revealed_by for e in verdict.effects]
-    most = max(MENU, key=revealed_by.count)
-    if most not in revealed_by:
-        most = Manoeuvre.SPEEDS if verdict.status == 'unknown' or not not_covered \
-            else Manoeuvre.PLANES
-    return _experiment(most, why, no_stage)
+    usual = Manoeuvre.SPEEDS if verdict.status == 'unknown' or not not_covered \
+        else Manoeuvre.PLANES
+    return _experiment(next(filter(None, revealed_by), usual), why, no_stage)
 
 
 def _ranked_menu(verdict: Verdict, sensor: Sensor, model: LinearModel | None, seed: int

@@ -175,10 +175,8 @@ def coarse_codes(volts: np.ndarray, sensor: Sensor) -> Detection | None:
     bits, threshold = np.array([_lost_bits(v, sensor) for v in volts.T]), np.log2(COARSE_STEPS)
     if not (bits >= threshold).any():
         return None
-    common = 0.0
-    if not (bits < threshold).any():
-        common = float(np.nanmedian(bits) if np.nanmax(bits) - np.nanmin(bits) < threshold
-                       else np.nanmin(bits))
+    fewest = float(np.nanmin(bits))
+    common = fewest if fewest >= threshold else 0.0
     return _detection(
         Detector.COARSE_CODES, (sensor.lsb_v * 2 ** np.nan_to_num(bits)) ** 2 / 12, sensor,
         lost_bits=common, axis_lost_bits=np.where(bits - common >= threshold, bits - common, 0.0))

@@ -16,7 +16,6 @@ from adxl_ros.diagnose import report as words
 from adxl_ros.diagnose.comparison import BaselineComparison
 from adxl_ros.diagnose.diagnosis import Diagnosis, Report
 from adxl_ros.diagnose.evidence import bridged
-from adxl_ros.diagnose.next_experiment import by_effect
 from adxl_ros.diagnose.residual_map import BLOCK_S, ResidualCell, SIGNIFICANT_P
 from adxl_ros.model import noise
 from adxl_ros.model.constants import AXES, Z_90
@@ -129,8 +128,7 @@ def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> 
         'where': [_cell(c) for c in report.residual_cells if c.p < SIGNIFICANT_P][:_MOST_CELLS],
         'menu': [[m['manoeuvre'], f'{m["minutes"]:.1f}', f'{m["nats_per_minute"]:.2g}']
                  for m in proposal['menu']] if proposal else [],
-        'could_show': [(row.shows, *words.shown_row(row, scale))
-                       for row in by_effect(report.could_show).values()]}
+        'could_show': [(row.shows, *words.shown_row(row, scale)) for row in report.could_show]}
 
 
 def _cell(cell: ResidualCell) -> list[str]:

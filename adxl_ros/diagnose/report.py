@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from adxl_ros.diagnose.comparison import Reference
 from adxl_ros.diagnose.diagnosis import Diagnosis, Report
-from adxl_ros.diagnose.next_experiment import by_effect, CouldShow, MENU
+from adxl_ros.diagnose.next_experiment import CouldShow, MENU
 from adxl_ros.diagnose.residual_map import SIGNIFICANT_P
 from adxl_ros.diagnose.search import Hypothesis
 from adxl_ros.diagnose.verdict import UNKNOWN, Verdict
@@ -161,7 +161,7 @@ def shares_of_gap(report: Report) -> dict[str, float]:
 
 def _candidates(report: Report) -> list[dict[str, Any]]:
     """Return the effects of all hypotheses and detections, the most probable first."""
-    verdict, shown = report.verdict, by_effect(report.could_show)
+    verdict, shown = report.verdict, {row.effect: row for row in report.could_show}
     detected, shares = {d.effect: d for d in report.detections}, shares_of_gap(report)
     out = []
     for name, effect in library().items():
@@ -391,7 +391,7 @@ def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
         lines += wrapped(headline(diagnosis))
     elif is_only_noise(report):
         lines += wrapped(NOISE_STAYS)
-    shown = by_effect(report.could_show).values()
+    shown = report.could_show
     hidden = ', '.join(row.effect for row in shown if not row.shows)
     return [*lines, *_effect_table(report, objects), '', *_labelled([
         ('figures', '; '.join(f'{row.label} {row.text}' for row in rows[2 + closes(report):])),

@@ -91,15 +91,13 @@ def normalised(weights: Mapping[tuple[str, ...], float]) -> tuple[WeightedHypoth
                         key=lambda h: (-h.probability, h.effects)))
 
 
-@dataclass(frozen=True)
-class HeldOut:
+class HeldOut(NamedTuple):
     """What a set of effects leaves of blocks that it was not fitted to."""
 
     # Squares of recording minus simulation, mean over axes, sum over samples, by block, (m/s²)²,
     # (blocks,)
     squares: np.ndarray
     log_likelihood: np.ndarray  # Log likelihood by block, (blocks,)
-    drift_mps2: float = 0.0  # Expected rms of the fitted drift, m/s²
 
 
 @dataclass(frozen=True)
@@ -167,7 +165,7 @@ class HeldOutFits:
                 white = np.einsum('i,bij,j->b', v, channel.block_grams[f][held_out], v)
                 log_likelihood[held_out] += channel.log_scales[f][held_out] - 0.5 * (
                     white / variance + channel.counts[held_out] * np.log(variance))
-        return HeldOut(squares, log_likelihood, self.drift_mps2)
+        return HeldOut(squares, log_likelihood)
 
     @property
     def _whiteners(self) -> list[Whitener]:
@@ -179,12 +177,11 @@ class HeldOutFits:
         """Return the densities of the drift by channel; 0 for that of a healthy unit."""
         return np.array([0.0 if w.healthy else w.density for w in self._whiteners])
 
-    @property
+    @cached_property
     def drift_mps2(self) -> float:
         """Return the expected rms of the drift that the fitted noise has, m/s²."""
-        sizes_g = [expected_drift_g(
-            w.effect, density, self.model.comparisons[self.model.place_of_channel(number)[0]])
-            for number, (w, density) in enumerate(zip(self._whiteners, self.drift_densities()))]
+        sizes_g = [expected_drift_g(w.effect, density, comparison) for w, density, (comparison, _)
+                   in zip(self._whiteners, self.drift_densities(), self.model.places)]
         return float(G0_MPS2 * np.sqrt(np.mean(np.square(sizes_g))))
 
 
@@ -196,15 +193,13 @@ def reproducible_rest(fits: HeldOutFits, bases: Sequence[Basis]) -> Rest:
     1992), so that functions that follow noise vanish. The effects keep their values, so that the
     functions take up only what the effects leave. `bases` are the functions of each channel.
     """
-    linearised, model, every = fits.linearised, fits.model, [d.value for d in FormDimension]
+    linearised, model = fits.linearised, fits.model
     by_choice = {name: np.zeros(BLOCKS) for name in ('all', 'steady', 'nats')}
     whole = linearised.departures(fits.full, fits.full)
-    for number, (columns, filters, basis) in enumerate(zip(linearised.columns,
-                                                           linearised.filters, bases)):
+    for number, (columns, filters, basis, (comparison, axis)) in enumerate(zip(
+            linearised.columns, linearised.filters, bases, model.places)):
         if not basis:
             continue
-        recording, axis = model.place_of_channel(number)
-        comparison = model.comparisons[recording]
         unit_v = _FIRST_LEVEL_G * float(comparison.sensor.scale_v_per_g[axis])
         design = np.concatenate([columns.values, *(unit_v * b for b in basis.values())], axis=1)
         white = linear.whiten_channel(
@@ -214,7 +209,7 @@ def reproducible_rest(fits: HeldOutFits, bases: Sequence[Basis]) -> Rest:
         plain = linear.plain_grams(design / scale, comparison.used)
         variance = float(fits.full.innovation_variance_v2[number])
         names = np.repeat([d.value for d in basis], [b.shape[1] for b in basis.values()])
-        choices = {name: names == name for name in every if name in names}
+        choices = {d.value: names == d.value for d in basis}
         choices |= {'all': names != '', 'steady': names != FormDimension.TIME.value}
         for name, chosen in choices.items():
             level = _levels(_products(white, whole[columns.places]), names, chosen, variance)
@@ -232,8 +227,7 @@ def reproducible_rest(fits: HeldOutFits, bases: Sequence[Basis]) -> Rest:
     together, steady, nats = (by_choice.pop(name) for name in ('all', 'steady', 'nats'))
     p = [increments_p(c.values @ np.concatenate([[1.0], -whole[c.places]]), comparison.used,
                       comparison.sensor.rate_hz)
-         for number, c in enumerate(linearised.columns if fits.drifts else ())
-         for comparison in (model.comparisons[model.place_of_channel(number)[0]],)]
+         for c, (comparison, _) in zip(linearised.columns if fits.drifts else (), model.places)]
     return Rest(together, steady, nats, by_choice, min([1.0, *(len(p) * v for v in p)]))
 
 
@@ -352,7 +346,7 @@ class Evidence:
     """What the rule weighs; its methods return one value for each draw of the blocks."""
 
     # Sets of effects, the empty one among them, by the drift that the noise may have
-    candidates: Mapping[frozenset[str], Mapping[str, HeldOut]]
+    candidates: Mapping[frozenset[str], Mapping[str, HeldOutFits]]
     counts: np.ndarray  # Samples by block, (blocks,)
     # How often each block is drawn, (draws, blocks); once each in the first row
     weights: np.ndarray
@@ -368,7 +362,7 @@ class Evidence:
 
     def left(self, effects: frozenset[str]) -> np.ndarray:
         """Return the power above the noise floor that a set leaves."""
-        return self.mean(self.candidates[effects][HEALTHY].squares) - self.floor_mps2 ** 2
+        return self.mean(self.candidates[effects][HEALTHY].figures.squares) - self.floor_mps2 ** 2
 
     def material_power(self, pose_share: float) -> float:
         """Return the power that a user would act on and that is not of the reference, (m/s²)²."""
@@ -381,13 +375,13 @@ class Evidence:
 
     def gain(self, more: frozenset[str], less: frozenset[str]) -> np.ndarray:
         """Return by how much one set explains more power than another."""
-        a, b = (self.candidates[e][HEALTHY] for e in (more, less))
+        a, b = (self.candidates[e][HEALTHY].figures for e in (more, less))
         return self.mean(b.squares - a.squares)
 
-    def nats(self, more: frozenset[str], less: frozenset[str], drift: str = HEALTHY,
-             other_drift: str = HEALTHY) -> np.ndarray:
+    def nats(self, more: frozenset[str], less: frozenset[str], drift: str = HEALTHY
+             ) -> np.ndarray:
         """Return by how much a set, with its noise, makes the held-out samples more probable."""
-        a, b = self.candidates[more][drift], self.candidates[less][other_drift]
+        a, b = self.candidates[more][drift].figures, self.candidates[less][HEALTHY].figures
         return self.weights @ (a.log_likelihood - b.log_likelihood)
 
     def interval(self, draws: np.ndarray) -> Interval:
