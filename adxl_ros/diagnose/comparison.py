@@ -429,7 +429,7 @@ def seen_step_rad(recording: Recording, sensor: Sensor) -> float:
     return largest_rad
 
 
-def _without_jerks(comparison: BaselineComparison, force: ForcePath, noise_g: float
+def _without_jerks(comparison: BaselineComparison, force: Any, noise_g: float
                    ) -> BaselineComparison:
     """Leave out samples at which a robot jerks: its encoders do not show its acceleration."""
     error_g = np.abs(force.smoothing_mps2[:, :len(comparison.sensor.axes)]).max(axis=1) / G0_MPS2

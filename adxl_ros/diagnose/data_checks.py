@@ -368,7 +368,8 @@ def _check_encoder(recording: Recording, sensor: Sensor) -> None:
         return
 
     def force_g(factors: Sequence[float]) -> np.ndarray:
-        return np.column_stack(specific_force(*(angles_rad * factors).T, 1.0)[:axes])
+        alpha_rad, beta_rad = (angles_rad * factors).T
+        return np.column_stack(specific_force(alpha_rad, beta_rad, 1.0)[:axes])
 
     def unexplained(factors: Sequence[float]) -> float:
         """Return the share of the variance that angles times factors do not explain."""

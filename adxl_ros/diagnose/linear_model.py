@@ -257,7 +257,7 @@ class LinearModel:
 
     @cached_property
     def usual_filters(self) -> list[list[Whitener]]:
-        """Filters of each channel for healthy units and for the drifts of the baseline."""
+        """Return the filters of each channel for healthy units and for drifts of the baseline."""
         return filters_for(self.filters, self.baseline.effects)
 
     @cached_property
@@ -267,7 +267,7 @@ class LinearModel:
 
     @property
     def places(self) -> list[tuple[BaselineComparison, int]]:
-        """Recording and number of the axis of each channel."""
+        """Return the recording and the number of the axis of each channel."""
         return [(c, axis) for c in self.comparisons for axis in range(len(c.sensor.axes))]
 
     @cached_property

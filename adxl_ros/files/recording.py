@@ -79,7 +79,8 @@ def blocks(path: str | os.PathLike, rows: int, reading: ReadingOptions = AS_IT_I
     return _mounted(read_blocks, reading.mounting) if reading.mounting else read_blocks
 
 
-def _bag_blocks(path: str | os.PathLike, rows: int, **options: Any) -> Iterator[Recording]:
+def _bag_blocks(path: str | os.PathLike, rows: int, **options: Any
+                ) -> Generator[Recording, None, None]:
     from adxl_ros.files import bag_reader  # tables need none of it
     return bag_reader.blocks(path, rows, **options)
 
