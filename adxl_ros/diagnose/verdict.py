@@ -537,14 +537,14 @@ def _sets(answer: _Answer) -> list[frozenset[str]]:
 def _probabilities(answer: _Answer, drawn: Sequence[_Answer]
                    ) -> tuple[float, tuple[WeightedHypothesis, ...]]:
     """Return the probability of the answer, and of all sets, none above the answer's."""
-    named, shares = set(_sets(answer)), dict[frozenset[str], float]()
+    named, votes = set(_sets(answer)), dict[frozenset[str], float]()
     for sets in map(_sets, drawn):
         for effects in sets:
-            shares[effects] = shares.get(effects, 0.0) + 1 / len(sets) / len(drawn)
-    agreed = sum(share for effects, share in shares.items() if effects in named)
-    probability = float(np.interp(agreed, _REPEATED, _RIGHT))
-    weights = {e: min(share / (1 - agreed) * (1 - probability), probability)
-               for e, share in shares.items() if e not in named}
+            votes[effects] = votes.get(effects, 0.0) + 1 / len(sets)
+    agreed = sum(count for effects, count in votes.items() if effects in named)
+    probability = float(np.interp(agreed / len(drawn), _REPEATED, _RIGHT))
+    weights = {e: min(count / (len(drawn) - agreed) * (1 - probability), probability)
+               for e, count in votes.items() if e not in named}
     weights |= {effects: probability / len(named) for effects in named}
     missing = 1.0 - sum(weights.values())
     remaining = frozenset(() if answer.status == 'unknown' else {UNKNOWN})
