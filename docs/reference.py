@@ -91,7 +91,7 @@ REPORT = {
     'lost_without': 'by effect: what of `explained` is lost without it',
     'where': 'cells of the residual that noise does not explain, with share of the gap and p',
     'not_covered': 'what the recordings do not vary', 'notes': 'what was left out or corrected',
-    'could_show': 'by parameter: the smallest size that would have shown; null where none',
+    'could_show': 'by effect: the smallest size that would have shown; null where none',
     'candidates': 'by effect: probability, closed share, visibility, rivals, parameters',
     'candidates.parameters': 'value, 90 % interval, unit; null and not `determined` if not seen',
     'noise_remainders': 'by noise-like effect: a statistic recorded, simulated and left',

@@ -1,25 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording beside the simulation of its baseline, on the recording's own reference motion."""
+"""
+A recording beside the simulation of its baseline, on the recording's own reference motion.
+
+Samples are left out where the reference is not known: its cells are empty, or it moves faster
+than its readings show.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
 from typing import Any
 
 from adxl_ros.files.recording_columns import JOINTS, Recording
+from adxl_ros.files.reference_alignment import LONGEST_MOVE_NS, USUAL_GAPS
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import ActsOn
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.signals.block_statistics import true_runs
 from adxl_ros.signals.rest_detection import find_rests
 from adxl_ros.simulate.motion import INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.response import ChainMemo, Response
-from adxl_ros.simulate.smoothed_paths import ForcePath, PathErrors, SmoothedPath
+from adxl_ros.simulate.smoothed_paths import BAND_LIMITED_DEGREE, ForcePath
 from adxl_ros.simulate.trajectories import environment_paths, motion_from_references
 import numpy as np
 import scipy
@@ -33,8 +40,6 @@ up to 60 Hz, and run time. Samples are left out, never averaged, so that aliases
 _LOWEST_INTERNAL_RATE_HZ, _MOST_STEPS = 250.0, 1_000_000
 """Lowest internal rate of the simulator where something moves, Hz, and its largest number of steps
 beyond the samples. Chosen: twice the rate of the search, and an hour of it."""
-_CACHED_VALUES = 3_000_000
-"""Number of values of one path that are kept in memory. Chosen: 24 MB."""
 _SMALLEST_MOVES = {'alpha': 2e-3, 'beta': 2e-3, 'shift': 1e-6}
 """Ranges of the joints, rad and m, from which they move. Chosen: above the step of an encoder."""
 _REST_RATE = 1e-3
@@ -45,6 +50,46 @@ SETTLING_S = 0.3
 has settled."""
 _LONGEST_S = 1e3
 """Time since the last move where there was none, s. Chosen: beyond any creep."""
+_LONGEST_BRIDGE_S, _SLOWEST_S = LONGEST_MOVE_NS / 1e9, 1.0
+"""Longest time without a reading that is bridged, s: of a joint as between messages of a bag, and
+of a slow encoder, whose readings are a move apart at most."""
+_BEFORE_S, _AFTER_S = 0.1, 0.3
+"""Times that are left out beside a gap, s. Chosen: the spline is uncertain before it, and an RC
+filter of 15 Hz has settled after it."""
+_FEWEST_CHANGES, _LARGEST_STEP_RAD, _COARSER = 100, 0.02, 1.05
+"""Fewest changes of a reading that show the step of its encoder, its largest step, rad, and the
+ratio to the stated one from which it counts. Chosen: two turns by hand; 1°; 1/12° may be 0.083°.
+"""
+_WHOLE, _WHOLE_SHARE = 0.2, 0.9
+"""Deviation from whole steps, and share of the changes within it, by encoders. Chosen: 40 % of the
+changes of exact readings are within it."""
+_SAME_POSE, _SAME_STEPS = 1e-4, 2.0
+"""Change of a joint over a gap without a move, rad or m, and in steps of its encoder. Chosen:
+0.1 mg, and two readings that scatter by one step."""
+_LAG_S, _SLOW = 0.02, 3.0
+"""Lag of differences, s, and standard deviation of the output, divided by theirs, up to which it
+rests. Chosen: an RC filter has forgotten its noise, and motion below 2 Hz exceeds it."""
+_WINDOW_S, _SHORTEST_WINDOW = 1.0, 64
+"""Length of a window whose spectrum is taken, s and readings. Chosen: shorter than a move, and
+some periods of a shaker."""
+_LARGEST_ERROR = 0.3
+"""Error of the force by the spline, divided by the noise, up to which a window is used. Chosen: it
+adds 4 % to the noise."""
+_SAME_MOTION = 2.0
+"""Ratio of recorded and simulated motion from which one is an alias. Chosen: an alias below 0.2 of
+the rate has a ratio of 4."""
+_NAMED_PARTS = 4
+"""Parts that a note names. Chosen: it stays one or two lines."""
+_FEWEST_WINDOWS, _BAND_HZ = 20, 2.0
+"""Fewest windows, and width of the bands, Hz, by which fading is judged. Chosen: noise then has a
+coherence of 0.05, and a line of the mains is one value."""
+_MOTION, _FADED = 10.0, 0.5
+"""Power over noise from which motion shows, and power of the reference, even without the filter of
+the sensor, divided by the recorded one, below which it has faded. Chosen."""
+_JERK_S, _LARGEST_JERK = 0.1, 4.0
+"""Time around a jerk of a robot that is left out, s, and error of the force, divided by the noise,
+from which it is one. Chosen: that of the splines' knots; the error of what stays is below the
+noise, rms, and the filter for errors weighs it."""
 
 
 class Reference(Enum):
@@ -66,7 +111,6 @@ class BaselineComparison:
     # The baseline: datasheet values and effects of the parameter file, at this sample rate
     sensor: Sensor
     reference: Reference  # What determines the motion
-    stage_angles: tuple[str, ...]  # Stage angles that the recording holds, even constant ones
     at_rest: np.ndarray  # Samples at which nothing moves, (n,) bool
     # Samples that are used, (n,) bool; the others are missing, repeated or outliers, or their
     # reference is not known
@@ -159,38 +203,6 @@ class BaselineComparison:
         return float(np.sqrt(max(lost.mean(axis=1).sum() * frequency_hz[1], 0.0)))
 
 
-class CachedPath:
-    """A path that keeps its newest values, because it is evaluated at the same times often."""
-
-    def __init__(self, path: Path) -> None:
-        self._path: Path = path._path if isinstance(path, CachedPath) else path
-        self._values: dict[tuple, np.ndarray] = {}
-
-    def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
-        """Return the derivative of an order at times."""
-        if not len(time_s):
-            return self._path(time_s, order)
-        key = (order, len(time_s), *time_s[[0, len(time_s) // 2, -1]].tolist())
-        # The entry moves to the end, so that the one that was not used for longest is deleted.
-        self._values[key] = self._values.pop(key) if key in self._values \
-            else self._path(time_s, order)
-        while sum(map(len, self._values.values())) > _CACHED_VALUES and len(self._values) > 1:
-            del self._values[next(iter(self._values))]
-        return self._values[key]
-
-    def errors(self, time_s: np.ndarray) -> PathErrors | None:
-        """Return the errors of the path at times, s, (n,); None where it is exact."""
-        return self._path.errors(time_s) if isinstance(self._path, SmoothedPath) else None
-
-
-def _cached(motion: Motion, reference: Reference) -> Motion:
-    """Return the motion with paths that are evaluated once."""
-    names = ('temperature_c', 'supply_v') + tuple(JOINTS) * (reference is Reference.STAGE)
-    paths: dict[str, Any] = {name: (path := getattr(motion, name)) and CachedPath(path)
-                             for name in names}
-    return replace(motion, **paths)
-
-
 def noiseless(sensor: Sensor) -> Sensor:
     """Return the sensor without noise and without the steps of its ADC."""
     mean = tuple(e for e in sensor.effects if effect_named(e).acts_on is ActsOn.MEAN)
@@ -216,15 +228,13 @@ def compare(recording: Recording, sensor: Sensor, sim: Motion | None = None
     if reference is not Reference.NONE:
         motion = replace(motion, internal_rate_hz=min(
             max(_LOWEST_INTERNAL_RATE_HZ, sensor.rate_hz), INTERNAL_RATE_HZ, _most_hz(time_s)))
-    motion = _cached(motion, reference)
     at_rest = _at_rest(motion, time_s, reference, volts)
     used = np.ones(len(recording), bool)
     if reference is Reference.SIMULATOR:
         # Where another simulator moves from its first sample on, the filter has not settled.
         used = at_rest | (time_s > time_s[0] + SETTLING_S)
-    return BaselineComparison(recording.path, time_s, volts, motion, sensor, reference,
-                              tuple(name for name in ('alpha_rad', 'beta_rad') if np.isfinite(
-                                  recording.columns.get(name, np.nan)).any()), at_rest, used)
+    return BaselineComparison(recording.path, time_s, volts, motion, sensor, reference, at_rest,
+                              used)
 
 
 def _most_hz(time_s: np.ndarray) -> float:
@@ -242,8 +252,8 @@ def at_search_rate(comparison: BaselineComparison) -> BaselineComparison:
                                                       _most_hz(comparison.time_s)))
     return replace(
         comparison, time_s=comparison.time_s[part], volts=comparison.volts[part],
-        motion=_cached(motion, comparison.reference),
-        sensor=replace(comparison.sensor, rate_hz=comparison.sensor.rate_hz / every),
+        motion=motion, sensor=replace(comparison.sensor,
+                                      rate_hz=comparison.sensor.rate_hz / every),
         at_rest=comparison.at_rest[part], used=comparison.used[part], memo=ChainMemo())
 
 
@@ -312,3 +322,209 @@ def gravity_slopes(alpha_rad: np.ndarray, beta_rad: np.ndarray) -> np.ndarray:
     sin_beta, cos_beta = np.sin(beta_rad), np.cos(beta_rad)
     return np.array([[cos_alpha * cos_beta, -cos_alpha * sin_beta, -sin_alpha],
                      [-sin_alpha * sin_beta, -sin_alpha * cos_beta, 0 * sin_alpha]])
+
+
+def _in_gaps(time_s: np.ndarray, read_s: np.ndarray, longest_s: float
+             ) -> Iterable[tuple[int, int]]:
+    """
+    Yield the samples, begin and end, in gaps between readings that are not bridged.
+
+    Before the first reading and after the last, the ends of the recording count.
+    """
+    ends_s = np.concatenate([[min(time_s[0], read_s[0])], read_s, [max(time_s[-1], read_s[-1])]])
+    for i in np.flatnonzero(np.diff(ends_s) > longest_s):
+        yield (int(np.searchsorted(time_s, ends_s[i], 'right' if i else 'left')),
+               int(np.searchsorted(time_s, ends_s[i + 1], 'right' if i > len(read_s) - 1
+                                   else 'left')))
+
+
+def leave_out(comparison: BaselineComparison, rows: np.ndarray, reason: str
+               ) -> BaselineComparison:
+    """Return a comparison that does not use some samples, and notes why and when."""
+    if not rows.any():
+        return comparison
+    time_s, runs = comparison.time_s, true_runs(rows)
+    parts = ', '.join(f'{time_s[a]:.5g} to {time_s[b - 1]:.5g} s' for a, b in runs[:_NAMED_PARTS])
+    note = (f'left out: {comparison.dt_s * rows.sum():.3g} s '
+            f'({parts}{", ..." * (len(runs) > _NAMED_PARTS)}): {reason}')
+    return replace(comparison, used=comparison.used & ~rows, notes=(*comparison.notes, note))
+
+
+def without_gaps(comparison: BaselineComparison) -> BaselineComparison:
+    """Leave out samples in gaps of another simulator."""
+    time_s, force = comparison.time_s, comparison.motion.force
+    if not isinstance(force, ForcePath):
+        return comparison
+    limit_s = max(_LONGEST_BRIDGE_S, USUAL_GAPS * float(np.median(np.diff(force.time_s))))
+    unknown = np.zeros(len(time_s), bool)
+    for begin, end in _in_gaps(time_s, force.time_s, limit_s):
+        if end > begin:
+            unknown |= (time_s >= time_s[begin] - _BEFORE_S) \
+                & (time_s <= time_s[end - 1] + _AFTER_S)
+    return leave_out(comparison, unknown,
+                      f'no reading of {force.name} for more than {limit_s:.3g} s')
+
+
+def stated_poses(recording: Recording, sensor: Sensor
+                  ) -> tuple[Recording, list[tuple[np.ndarray, str]]]:
+    """
+    Fill the gaps of the stage's joints; return samples that are not known there, and reasons.
+
+    A pose that is stated before and after a gap, while the output rests, holds in between. Other
+    gaps are left out.
+    """
+    time_s, output_g = recording.time_s, recording.volts(sensor) / sensor.scale_v_per_g
+    columns, left_out = dict(recording.columns), []
+    lag = max(1, round(_LAG_S * recording.rate_hz))
+    for joint, name in JOINTS.items():
+        values = columns.get(name, np.zeros(0))
+        read = np.flatnonzero(np.isfinite(values))
+        if len(read) < 2:
+            continue
+        step = 0.0 if joint == 'shift' else sensor.stage_resolution_rad
+        filled = np.interp(time_s, time_s[read], values[read])
+        limit_s = max(_LONGEST_BRIDGE_S, min(USUAL_GAPS * float(np.median(np.diff(
+            time_s[read]))), _SLOWEST_S))
+        unknown, columns[name] = np.zeros(len(time_s), bool), values.copy()
+        for begin, end in _in_gaps(time_s, time_s[read], _LONGEST_BRIDGE_S):
+            inner = 0 < begin < end < len(time_s)
+            gap_s = time_s[min(end, len(time_s) - 1)] - time_s[max(begin - 1, 0)]
+            holds = inner and _rests(output_g[begin:end], lag) and abs(
+                filled[end] - filled[begin - 1]) <= _SAME_STEPS * step + _SAME_POSE
+            if inner and (holds or gap_s > limit_s):
+                columns[name][begin:end] = filled[begin:end]
+            if not holds and gap_s > limit_s:
+                unknown |= (time_s > time_s[begin] - _BEFORE_S) \
+                    & (time_s < time_s[end - 1] + _AFTER_S)
+        left_out.append((unknown, f'no reading of {name} for more than {limit_s:.3g} s'))
+    return replace(recording, columns=columns), left_out
+
+
+def _rests(output_g: np.ndarray, lag: int) -> bool:
+    """Determine whether an output, g, (n, m), neither moves far nor slowly; with NaN as gaps."""
+    output_g = output_g[np.isfinite(output_g).all(axis=1)]
+    if len(output_g) <= 2 * lag:
+        return True
+    noise_g = np.sqrt(np.mean((output_g[lag:] - output_g[:-lag]) ** 2, axis=0) / 2)
+    return bool(np.all(output_g.std(axis=0) < np.minimum(SMALLEST_MOTION_G, _SLOW * noise_g)
+                       + _SAME_POSE))
+
+
+def seen_step_rad(recording: Recording, sensor: Sensor) -> float:
+    """Return the step that the encoders show, where it exceeds the stated one, rad."""
+    largest_rad = sensor.stage_resolution_rad
+    for name in ('alpha_rad', 'beta_rad'):
+        changes = np.abs(np.diff(recording.columns.get(name, np.zeros(0))))
+        changes = changes[changes > 1e-9]
+        if len(changes) < _FEWEST_CHANGES:
+            continue
+        step_rad = float(np.median(changes[changes < 1.5 * changes.min()]))
+        few = changes[changes < 4.5 * step_rad]
+        # Readings with decimals differ by one step more or less exactly.
+        step_rad = float(few.sum() / np.rint(few / step_rad).sum())
+        whole = np.abs(few / step_rad - np.rint(few / step_rad)) < _WHOLE
+        if whole.sum() >= _FEWEST_CHANGES and whole.mean() > _WHOLE_SHARE \
+                and _COARSER * largest_rad < step_rad < _LARGEST_STEP_RAD:
+            largest_rad = step_rad
+    return largest_rad
+
+
+def _without_jerks(comparison: BaselineComparison, force: Any, noise_g: float
+                   ) -> BaselineComparison:
+    """Leave out samples at which a robot jerks: its encoders do not show its acceleration."""
+    error_g = np.abs(force.smoothing_mps2[:, :len(comparison.sensor.axes)]).max(axis=1) / G0_MPS2
+    time_s = comparison.time_s
+    rows = np.interp(time_s, force.time_s, error_g) > _LARGEST_JERK * noise_g
+    rows |= (time_s < force.time_s[0] + _JERK_S) | (time_s > force.time_s[-1] - _JERK_S)
+    margin = round(_JERK_S * comparison.sensor.rate_hz)
+    return leave_out(
+        comparison, np.convolve(rows, np.ones(2 * margin + 1), 'same') > 0.5,
+        f'the robot jerks, which its encoders do not show (error up to {1e3 * error_g.max():.2g} '
+        'mg); move more smoothly, or record the joints at a higher rate')
+
+
+def without_fast_motion(comparison: BaselineComparison, columns: dict[str, np.ndarray]
+                         ) -> BaselineComparison:
+    """Leave out samples at which the reference moves faster than its readings show."""
+    sensor, time_s, force = comparison.sensor, comparison.time_s, comparison.motion.force
+    noise_g = float(np.min(noise.analog_std_v(sensor) / sensor.scale_v_per_g))
+    limit_g = _LARGEST_ERROR * max(noise_g, float(np.min(sensor.lsb_v / sensor.scale_v_per_g)))
+    # Name, times and readings of each reference, degrees of its splines, derivative and step.
+    references: list[tuple] = []
+    if isinstance(force, ForcePath):
+        if force.is_robot:
+            return _without_jerks(comparison, force, noise_g)
+        references = [(force.name, force.time_s, np.array(force(force.time_s)) / G0_MPS2,
+                       (3, 5), 0, 0.0)]
+    for joint, name in JOINTS.items() if comparison.joints else ():
+        values = columns.get(name, np.zeros(0))
+        read = np.isfinite(values)
+        if read.sum() > BAND_LIMITED_DEGREE and np.ptp(values[read]):
+            how = ((BAND_LIMITED_DEGREE - 2, BAND_LIMITED_DEGREE), 2, 0.0) if joint == 'shift' \
+                else ((3, 5), 0, sensor.stage_resolution_rad)
+            unit = G0_MPS2 if joint == 'shift' else 1.0
+            references.append((name, time_s[read], values[None, read] / unit, *how))
+    margin = np.ones(2 * round(_WINDOW_S / 2 * sensor.rate_hz) + 1)
+    for name, read_s, readings, degrees, order, step_g in references:
+        # Between the readings, where both splines agree, they show the motion.
+        middle_s = (read_s[1:] + read_s[:-1]) / 2
+        first, second = (scipy.interpolate.make_interp_spline(
+            read_s, readings[:len(sensor.axes)].T, k)(middle_s, order) for k in degrees)
+        error_g = np.interp(time_s, middle_s, np.abs(first - second).max(axis=1))
+        coarse = comparison.used & (error_g > np.hypot(limit_g, step_g))
+        if coarse.any():
+            coarse = np.convolve(_with_aliases(comparison, coarse, noise_g), margin, 'same') > 0.5
+            rate_hz = 1 / float(np.median(np.diff(read_s)))
+            comparison = leave_out(
+                comparison, coarse, f'{name} moves too fast for its {rate_hz:.4g} readings a '
+                f'second (error up to {1e3 * error_g[coarse].max():.2g} mg); read it at a higher '
+                'rate')
+    return comparison
+
+
+def _with_aliases(comparison: BaselineComparison, coarse: np.ndarray, noise_g: float
+                  ) -> np.ndarray:
+    """Extend samples to the seconds beside them that move otherwise than simulated, (n,) bool."""
+    sensor, signals_v = comparison.sensor, (comparison.volts,
+                                            comparison.simulated_v(comparison.sensor))
+    length = max(round(_WINDOW_S * sensor.rate_hz), _SHORTEST_WINDOW)
+    part = np.minimum(np.arange(len(coarse)) // length, max(len(coarse) // length - 1, 0))
+    recorded, simulated = (np.sqrt([
+        noise_g ** 2 + np.bincount(part, c ** 2) / np.bincount(part) for c in np.nan_to_num(
+            np.diff(v / sensor.scale_v_per_g, axis=0, prepend=0.0)).T]) for v in signals_v)
+    differs = np.any(np.abs(np.log(recorded / simulated)) > np.log(_SAME_MOTION), axis=0)
+    touched = np.bincount(part, coarse) > 0
+    extended = coarse.copy()
+    for begin, end in true_runs(differs | touched):
+        if touched[begin:end].any():
+            extended |= (part >= begin) & (part < end) & differs[part]
+    return extended
+
+
+def fading_frequency_hz(comparison: BaselineComparison) -> float | None:
+    """Find the frequency above which the reference has less motion than the sensor."""
+    if comparison.reference is not Reference.SIMULATOR:
+        return None
+    sensor = comparison.sensor
+    size = max(round(_WINDOW_S * sensor.rate_hz), _SHORTEST_WINDOW)
+    recorded_g, simulated_g = (np.nan_to_num(v / sensor.scale_v_per_g) for v in (
+        comparison.volts, comparison.simulated_v(sensor)))
+    if len(recorded_g) < _FEWEST_WINDOWS * size // 2:
+        return None
+
+    frequency_hz = np.arange(size // 2 + 1) * sensor.rate_hz / size
+    band = max(round(_BAND_HZ * size / sensor.rate_hz), 1)
+    count = (size // 2) // band * band
+    stated = (noise.density_v2_per_hz(sensor, frequency_hz[1:]) / sensor.scale_v_per_g ** 2).sum(1)
+    # Without its RC filter the sensor has this gain over its simulation.
+    rc_s = float(np.max(noise.electronics(sensor).rc_s))
+    unfiltered = 1 + (2 * np.pi * frequency_hz[1:] * rc_s) ** 2
+    recorded, simulated = (scipy.signal.welch(
+        v, sensor.rate_hz, nperseg=size, detrend='linear', axis=0)[1][1:].sum(axis=1)
+        for v in (recorded_g, simulated_g))
+    recorded, simulated, stated = (v[:count].reshape(-1, band).mean(axis=1) for v in (
+        recorded, simulated * unfiltered, stated))
+    moves = recorded > _MOTION * stated
+    followed = np.flatnonzero(moves & (simulated >= _FADED * recorded))
+    first = followed[-1] + 1 if len(followed) else 0
+    return float(frequency_hz[1 + first * band]) if moves[first:].any() else None

@@ -5,33 +5,64 @@ What is corrected or left out before a comparison, and faults that make a diagno
 They are stamps, axes, units, clocks, the range, the reference, and missing samples. At rest
 f = g·[sin α·cos β, −sin α·sin β, cos α]: a wrong sign of β looks like an inverted y, and one of α
 like inverted x and y. The explanation with fewer changes is named.
+
+The force of another simulator may have another clock. A large shift is a fault of the files. A
+small one may be the latency of the sensor, which is an effect of the library: it is left alone.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
+from os.path import basename
 from typing import NamedTuple
 
-from adxl_ros.diagnose import noise_effects, reference
+from adxl_ros.diagnose import noise_effects
 from adxl_ros.diagnose.comparison import (
     at_search_rate,
     BaselineComparison,
     code_step_v,
     compare,
+    fading_frequency_hz,
+    leave_out,
     Reference,
+    seen_step_rad,
     SMALLEST_MOTION_G,
+    stated_poses,
+    without_fast_motion,
+    without_gaps,
 )
-from adxl_ros.diagnose.reference import DataFault, SHORTEST_S
 from adxl_ros.files.recording_columns import JOINTS, Recording
 from adxl_ros.model import noise
+from adxl_ros.model.constants import G0_MPS2, MAD_TO_STD, Z_90
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.recorded_sensor import find_polarity_fault
 from adxl_ros.simulate.motion import Motion
+from adxl_ros.simulate.smoothed_paths import ForcePath
 import numpy as np
+import scipy
 
+SHORTEST_S = 30.0
+"""Shortest time, s, that the recordings of a moving sensor last together. Chosen: a few turns of
+the stage."""
+LARGEST_LATENCY_S = 0.1
+"""Largest shift, s, that may be a latency of the sensor. Chosen: twenty times the typical delay of
+`time_offset`; a buffer of ten samples at 100 Hz has it."""
+_SEARCH_STEP_S, _LONGEST_SEARCH = 0.02, 1 << 20
+"""Step of the first search of a shift, s, and its largest number of steps. Chosen: well below the
+largest latency, and six hours."""
+_CORRELATED = 0.9
+"""Correlation from which two motions are the same one. Chosen: noise of half the motion."""
+_SAME_CORRELATION = 0.01
+"""Correlations that differ by less are equal, and the one of the longest overlap counts. Chosen: a
+motion that repeats fits at several shifts."""
+_LARGEST_ERROR_RATIO = 0.5
+"""A shift shows if it reduces 1 − correlation below this share. Chosen: noise that is not shifted
+keeps it."""
+_BLOCKS, _FINE_SAMPLES = 10, 20_000
+"""Blocks and samples of the fine search. Chosen: their scatter shows the error to 24 %."""
 _SAME_ROUGHNESS = 1.05
 """Ratio of the steps of two residuals up to which they are equal. Chosen: above its scatter by
 noise in a thousand samples."""
@@ -84,6 +115,159 @@ _UNIT_RATIOS = {9.80665: 'm/s² instead of g', 1e3: 'mV instead of V', 1e-3: 'kV
 """Gain of an output in the wrong unit, and which unit it has instead of which."""
 
 
+@dataclass(eq=False)
+class DataFault(Exception):
+    """A fault of the recording, with the recordings that were compared before."""
+
+    name: str  # Name in the report: `verdict.data_fault`
+    message: str  # What is wrong and what to do, one line
+    status: str = 'bad_data'  # Status of the verdict: 'bad_data' or 'insufficient'
+    comparisons: tuple[BaselineComparison, ...] = ()
+
+
+class _Shift(NamedTuple):
+    """How much later the motion of a simulator is stamped than that of a recording."""
+
+    late_s: float  # The shift, s; negative where the simulator is early
+    std_s: float  # Its standard deviation, s
+    correlation: float  # Correlation of the two motions without the shift
+
+    @property
+    def text(self) -> str:
+        """Return the shift with its 90 % error and correlation, for people."""
+        return (f'{abs(self.late_s):.4f} s {"late" if self.late_s > 0 else "early"} '
+                f'(± {Z_90 * self.std_s:.4f} s, correlation {self.correlation:.3f})')
+
+
+def _align_force(recording: Recording, sensor: Sensor, sim: Motion, may_shift: bool
+                ) -> tuple[Recording, Motion, list[str]]:
+    """
+    Find the part of a recording that another simulator covers, and check their time.
+
+    Return that part, the simulator, shifted where it was asked for, and notes; raise DataFault.
+    """
+    force, notes = sim.force, []
+    assert isinstance(force, ForcePath)
+    shift = _find_shift(recording, replace(sensor, rate_hz=recording.rate_hz), force)
+    if shift is not None and may_shift:
+        force = force.shifted(-shift.late_s)
+        notes = [f'--align: {force.name} was {shift.text}, and is shifted by '
+                 f'{-shift.late_s:+.6g} s; a latency of the sensor is a part of that and cannot '
+                 'show']
+    elif may_shift:
+        notes = [f'--align: no shift beyond {LARGEST_LATENCY_S:g} s was found; less may be an '
+                 'effect of the sensor (time_offset), and nothing is shifted']
+    begin_s, end_s = force.time_s[0], force.time_s[-1]
+    covered = (recording.time_s >= begin_s) & (recording.time_s <= end_s)
+    if not covered.any():
+        advice = f'its motion fits, but is {shift.text}; use --align' if shift is not None else \
+            'no shift makes its motion fit; give that of this recording'
+        raise DataFault('no_overlap', f'{force.name} does not overlap the recording in '
+                        f'time: {basename(recording.path)} is from {recording.time_s[0]:.6g} '
+                        f'to {recording.time_s[-1]:.6g} s, {force.name} from {begin_s:.6g} to '
+                        f'{end_s:.6g} s; {advice}')
+    if shift is not None and not may_shift:
+        raise DataFault('time_misaligned', f'{force.name} is {shift.text}; use --align, or '
+                        f'shift its stamps by {-shift.late_s:+.6g} s')
+    if not covered.all():
+        outside_s = (1 - covered.mean()) * float(np.ptp(recording.time_s))
+        notes.append(f'left out: {outside_s:.3g} s of the recording that {force.name} does not '
+                     f'cover (it is from {begin_s:.6g} to {end_s:.6g} s)')
+    return _between(recording, begin_s, end_s), replace(sim, force=force), notes
+
+
+def _between(recording: Recording, begin_s: float, end_s: float) -> Recording:
+    """Return the samples of a recording between two times."""
+    return recording.rows(int(np.searchsorted(recording.time_s, begin_s)),
+                          int(np.searchsorted(recording.time_s, end_s, 'right')))
+
+
+def _find_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> _Shift | None:
+    """
+    Return the shift of a simulator from the cross-correlation of both motions over all overlaps.
+
+    None where it may be a latency, or does not show.
+    """
+    measured_g = recording.volts(sensor) / sensor.nominal_scale_v_per_g
+    finite = np.isfinite(measured_g).all(axis=1)
+    if finite.sum() < 2:
+        return None
+    time_s, sim_s = recording.time_s[finite], force.time_s
+    step_s = max(_SEARCH_STEP_S, (np.ptp(time_s) + np.ptp(sim_s)) / _LONGEST_SEARCH)
+    first_s, second_s = (np.arange(t[0], t[-1], step_s) for t in (time_s, sim_s))
+    first = np.column_stack([np.interp(first_s, time_s, g) for g in measured_g[finite].T])
+    second = np.column_stack(force(second_s))[:, :first.shape[1]] / G0_MPS2
+    shortest_s = min(SHORTEST_S, np.ptp(time_s) / 2, np.ptp(sim_s) / 2)
+    lags, overlap, correlation = _correlations(first, second, max(round(shortest_s / step_s), 2))
+    lags_s = second_s[0] - first_s[0] + lags * step_s
+    equal = np.flatnonzero(correlation > correlation.max() - _SAME_CORRELATION)
+    longest_s = lags_s[equal[np.argmax(overlap[equal])]]
+    best = int(np.argmax(np.where(np.abs(lags_s - longest_s) < 1.0, correlation, -1.0)))
+    unshifted = int(np.argmin(np.abs(lags_s)))
+    if correlation[best] < _CORRELATED or (
+            abs(lags_s[unshifted]) < step_s and 1 - correlation[best]
+            > _LARGEST_ERROR_RATIO * (1 - correlation[unshifted])):
+        return None
+    fine = _fine_shift(recording, sensor, force, float(lags_s[best]), float(correlation[best]))
+    return fine if abs(fine.late_s) > LARGEST_LATENCY_S else None
+
+
+def _correlations(first: np.ndarray, second: np.ndarray, smallest: int
+                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """
+    Correlate two motions, g, (n, m) and (n', m), at all lags, each over the samples that overlap.
+
+    Sample i of the first meets sample i + lag of the second. Return lags, counts of samples that
+    overlap, and correlations, −1 where fewer than `smallest` overlap or one does not move.
+    """
+    def products(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return scipy.signal.correlate(b, a, method='fft')
+
+    one, two = np.ones(len(first)), np.ones(len(second))
+    overlap = np.maximum(np.rint(products(one, two)), 1)
+    covariance, squares = np.zeros(len(overlap)), np.zeros((2, len(overlap)))
+    for a, b in zip((first - first.mean(axis=0)).T, (second - second.mean(axis=0)).T):
+        sum_a, sum_b = products(a, two), products(one, b)
+        covariance += np.abs(products(a, b) - sum_a * sum_b / overlap)
+        squares[0] += products(a * a, two) - sum_a ** 2 / overlap
+        squares[1] += products(one, b * b) - sum_b ** 2 / overlap
+    smallest_square = SMALLEST_MOTION_G ** 2 * overlap
+    compared = (overlap >= smallest) & (squares > smallest_square).all(axis=0)
+    correlation = covariance / np.sqrt(np.maximum(squares, smallest_square).prod(axis=0))
+    return (scipy.signal.correlation_lags(len(second), len(first)), overlap,
+            np.where(compared, correlation, -1.0))
+
+
+def _fine_shift(recording: Recording, sensor: Sensor, force: ForcePath, late_s: float,
+                correlation: float) -> _Shift:
+    """Fit shift, zero-g and scale factor to blocks of the recording, from a rough shift."""
+    begin_s, end_s = force.time_s[0] - late_s, force.time_s[-1] - late_s
+    comparison = compare(_between(recording, begin_s, end_s), sensor,
+                         Motion(float(end_s - begin_s), force=force.shifted(-late_s)))
+    time_s, volts = comparison.time_s, comparison.volts
+    simulated_v = comparison.simulated_v(comparison.sensor)
+    # The ends may need values from outside.
+    inside = np.isfinite(volts).all(axis=1) & (time_s > time_s[0] + LARGEST_LATENCY_S) \
+        & (time_s < time_s[-1] - LARGEST_LATENCY_S)
+    rows = np.flatnonzero(inside)[::max(1, len(recording) // _FINE_SAMPLES)]
+
+    def left_v2(more_s: float, part: np.ndarray) -> float:
+        """Return what zero-g and scale factor leave of a part after a further shift."""
+        left = 0.0
+        for measured, simulated in zip(volts[part].T, simulated_v.T):
+            line = np.column_stack([np.ones(len(part)), np.interp(
+                time_s[part] + more_s, time_s, simulated)])
+            left += float(np.sum((measured - line @ np.linalg.lstsq(line, measured)[0]) ** 2))
+        return left
+
+    more_s, *of_blocks = (float(scipy.optimize.minimize_scalar(
+        left_v2, bounds=(-LARGEST_LATENCY_S, LARGEST_LATENCY_S), args=(part,), method='bounded',
+        options={'xatol': 1e-6}).x) for part in (rows, *np.array_split(rows, _BLOCKS)))
+    # A block at rest shows no shift, so that the median scatter counts.
+    std_s = MAD_TO_STD * float(np.median(np.abs(np.subtract(of_blocks, more_s)))) / _BLOCKS ** 0.5
+    return _Shift(late_s + more_s, std_s, correlation)
+
+
 def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, may_shift: bool
                     ) -> BaselineComparison:
     """
@@ -94,45 +278,35 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
     sensor, notes = replace(sensor, rate_hz=recording.rate_hz), list[str]()
     _check_clock(recording)
     even_s = even_stamps(recording.time_s)
-    left_out: list[reference.LeftOut] = []
+    left_out: list[tuple[np.ndarray, str]] = []
     if sim is not None:
-        recording, sim, more = reference.align_force(recording, sensor, sim, may_shift)
-        notes = notes + more
+        recording, sim, notes = _align_force(recording, sensor, sim, may_shift)
     else:
         _check_encoder(recording, sensor)
-        step_rad = reference.seen_step_rad(recording, sensor.stage_resolution_rad)
-        if step_rad > sensor.stage_resolution_rad:
-            notes = [*notes, f'the stage reads in steps of {np.degrees(step_rad):.3g}°, not of '
-                     f'{np.degrees(sensor.stage_resolution_rad):.3g}° as stated: this is used']
+        step_rad, stated_rad = seen_step_rad(recording, sensor), sensor.stage_resolution_rad
+        if step_rad > stated_rad:
+            notes.append(f'the stage reads in steps of {np.degrees(step_rad):.3g}°, not of '
+                         f'{np.degrees(stated_rad):.3g}° as stated: this is used')
             sensor = replace(sensor, stage_resolution_rad=step_rad)
-        recording, left_out = reference.stated_poses(recording, sensor)
+        recording, left_out = stated_poses(recording, sensor)
     comparison = compare(recording, sensor, sim)
     if even_s is not None and len(even_s) == len(recording):
         # Samples may also have been taken unevenly, so that the simulation decides.
         evenly = compare(replace(recording, time_s=even_s), sensor, sim)
         if _roughness(evenly) < _SAME_ROUGHNESS * _roughness(comparison):
             comparison = evenly
-            notes = [*notes, f'stamps are uneven, and an even rate of {evenly.sensor.rate_hz:.6g} '
-                     'Hz explains them: it is used']
-    stated = left_out if comparison.joints else []
-    comparison = _without(comparison, [
-        *stated, *reference.without_reading(comparison)])
+            notes.append(f'stamps are uneven, and an even rate of {evenly.sensor.rate_hz:.6g} '
+                         'Hz explains them: it is used')
+    for rows, reason in left_out if comparison.joints else ():
+        comparison = leave_out(comparison, rows, reason)
     # What moves too fast is looked for where the reference is stated.
-    comparison = _without(comparison, reference.too_coarse(comparison, recording.columns))
-    fading_hz = reference.fading_frequency_hz(comparison)
+    comparison = without_fast_motion(without_gaps(comparison), recording.columns)
+    fading_hz = fading_frequency_hz(comparison)
     if fading_hz is not None:
-        notes = [*notes, f'the reference is smoother than the sensor: above {fading_hz:.3g} '
-                 'Hz it lacks motion that the recording has; effects that show in fast motion '
-                 'are not named']
+        notes.append(f'the reference is smoother than the sensor: above {fading_hz:.3g} Hz it '
+                     'lacks motion that the recording has; effects that show in fast motion are '
+                     'not named')
     return replace(comparison, notes=(*notes, *comparison.notes), fading_hz=fading_hz)
-
-
-def _without(comparison: BaselineComparison, left_out: Sequence[reference.LeftOut]
-             ) -> BaselineComparison:
-    """Return a comparison that does not use some samples, and notes why."""
-    rows = np.logical_or.reduce([~comparison.used, *(part.rows for part in left_out)])
-    notes = [part.text(comparison.time_s) for part in left_out]
-    return replace(comparison, used=~rows, notes=(*comparison.notes, *notes))
 
 
 def _roughness(comparison: BaselineComparison) -> float:
@@ -193,33 +367,32 @@ def _check_encoder(recording: Recording, sensor: Sensor) -> None:
     if len(rows) < 2 or np.sum(np.var(measured_g, axis=0)) < SMALLEST_MOTION_G ** 2:
         return
 
-    def force_g(factors: tuple[float, ...]) -> np.ndarray:
+    def force_g(factors: Sequence[float]) -> np.ndarray:
         alpha_rad, beta_rad = (angles_rad * factors).T
         return np.column_stack(specific_force(alpha_rad, beta_rad, 1.0)[:axes])
 
-    def unexplained(factors: tuple[float, ...]) -> float:
+    def unexplained(factors: Sequence[float]) -> float:
         """Return the share of the variance that angles times factors do not explain."""
         return float(np.sum(np.var(measured_g - force_g(factors), axis=0))
                      / np.sum(np.var(measured_g, axis=0)))
 
     recorded, largest = unexplained((1.0, 1.0)), np.abs(angles_rad).max(axis=0)
     # The fewest changes come first, and of equal ones the first is the best.
-    tried = [tuple(s * u for s, u in zip(signs, units))
-             for units in product(*([1.0, np.pi / 180][:1 + (rad > 2 * np.pi)] for rad in largest))
-             for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
-    factors = min(tried, key=unexplained)
+    factors = min(([s * u for s, u in zip(signs, units)]
+                   for units in product(*([1.0, np.pi / 180][:1 + (rad > 2 * np.pi)]
+                                          for rad in largest))
+                   for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1))), key=unexplained)
     if recorded < _WRONG or unexplained(factors) > min(_RIGHT, recorded / 2):
         return
-    correlation = np.sqrt(1 - unexplained(factors))
+    correlation, joints = np.sqrt(1 - unexplained(factors)), list(JOINTS.values())
     in_degrees = [i for i in (0, 1) if abs(factors[i]) != 1]
-    names = [list(JOINTS.values())[i] for i in in_degrees or (0, 1)
-             if in_degrees or factors[i] < 0]
     if in_degrees:
-        reached = ' and '.join(f'{name} reaches {largest[i]:.4g}'
-                               for name, i in zip(names, in_degrees))
-        raise DataFault('unit', f'{reached}: degrees in a column of radians (as degrees it fits '
-                        f'the output, correlation {correlation:.2f}); multiply '
-                        f'{" and ".join(names)} by π/180')
+        joined = ' and '.join(joints[i] for i in in_degrees)
+        reached = ' and '.join(f'{largest[i]:.4g}' for i in in_degrees)
+        raise DataFault('unit', f'{joined}: up to {reached}: degrees in a column of radians (as '
+                        f'degrees it fits the output, correlation {correlation:.2f}); multiply '
+                        f'{joined} by π/180')
+    names = [joints[i] for i in (0, 1) if factors[i] < 0]
     mirrored = np.flatnonzero(np.std(force_g(factors) - force_g((1.0, 1.0)), axis=0)
                               > SMALLEST_MOTION_G)
     if len(mirrored) < len(names):
@@ -297,7 +470,7 @@ def _check_samples(comparison: BaselineComparison, search_comparison: BaselineCo
     if len(comparison) < _FEWEST_SAMPLES:
         raise DataFault('too_short', f'{len(comparison)} samples are too few; a recording needs '
                         f'{_FEWEST_SAMPLES}', 'insufficient')
-    finite = np.isfinite(comparison.volts).all(axis=1)
+    finite, sensor = np.isfinite(comparison.volts).all(axis=1), comparison.sensor
     if finite.mean() < 1 - _LARGEST_MISSING_SHARE:
         raise DataFault('missing', f'{100 * (1 - finite.mean()):.0f} % of the samples are not '
                         'numbers; record again')
@@ -307,7 +480,6 @@ def _check_samples(comparison: BaselineComparison, search_comparison: BaselineCo
     else:
         _check_axes(search_comparison)
     # No sensor can output more.
-    sensor = comparison.sensor
     level_g = np.abs(np.median(comparison.volts[finite], axis=0) - sensor.zero_g_v) \
         / sensor.scale_v_per_g
     worst = int(np.argmax(level_g))
@@ -347,13 +519,10 @@ def _check_rest(comparison: BaselineComparison, finite: np.ndarray) -> None:
     range_g = np.subtract(*np.quantile(force_g, _RANGE_QUANTILES[::-1], axis=0))
     worst = int(np.argmax(range_g))
     if range_g[worst] >= _LARGEST_UNEXPLAINED_MOTION_G and step_g[worst] <= range_g[worst]:
-        missing = [name for name in JOINTS.values()
-                   if name != 'shift_m' and name not in comparison.stage_angles]
-        angles = 'it has no stage angles' if len(missing) > 1 else \
-            f'it has no {missing[0]}' if missing else 'its stage angles do not change'
         raise DataFault('reference', f'{comparison.sensor.axes[worst]} moves by '
-                        f'{range_g[worst]:.2f} g, but {angles}; give the angles, or --sim with '
-                        'the specific force of the same manoeuvre')
+                        f'{range_g[worst]:.2f} g, but no stage angles that change; give '
+                        'alpha_rad and beta_rad, or --sim with the specific force of the same '
+                        'manoeuvre')
 
 
 def _check_axes(comparison: BaselineComparison) -> None:
@@ -365,12 +534,12 @@ def _check_axes(comparison: BaselineComparison) -> None:
     moving = np.flatnonzero(simulated_g.std(axis=0) > SMALLEST_MOTION_G)
     if not len(moving):
         return
-    lags, _, by_lag = reference.correlations(simulated_g, np.nan_to_num(measured_g),
+    lags, _, by_lag = _correlations(simulated_g, np.nan_to_num(measured_g),
                                              2 * len(simulated_g) // 3)
     by_lag = np.where(np.abs(lags) <= _LARGEST_DELAY_S * sensor.rate_hz, by_lag, -1.0)
     best = int(np.argmax(by_lag))
     delay_s = lags[best] / sensor.rate_hz
-    if by_lag[best] > max(reference.CORRELATED, by_lag[lags == 0][0] + _CORRELATION_GAIN) \
+    if by_lag[best] > max(_CORRELATED, by_lag[lags == 0][0] + _CORRELATION_GAIN) \
             and abs(delay_s) > _SEARCHED_DELAY_S:
         raise DataFault('time_misaligned', f'the sensor is {abs(delay_s):.2f} s '
                         f'{"later" if delay_s > 0 else "earlier"} than the reference, but the '
@@ -385,7 +554,7 @@ def _check_axes(comparison: BaselineComparison) -> None:
             'axis_inverted' if polarity.axis == polarity.follows else 'axis_swapped',
             polarity.describe(axes[polarity.axis], axes[polarity.follows]))
     gains = [np.polyfit(simulated_g[:, d], measured_g[:, d], 1)[0]
-             for d in np.flatnonzero(np.diag(correlation) > reference.CORRELATED)]
+             for d in np.flatnonzero(np.diag(correlation) > _CORRELATED)]
     for ratio, units in _UNIT_RATIOS.items() if gains else ():
         if abs(np.log(np.median(gains) / ratio)) < _UNIT_TOLERANCE:
             raise DataFault('unit', f'the output is {np.median(gains):.4g} times the simulated '

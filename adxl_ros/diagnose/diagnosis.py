@@ -10,23 +10,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from adxl_ros.diagnose import (
     data_checks,
     next_experiment,
     noise_effects,
-    noise_model,
     verdict as rule,
 )
 from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
-from adxl_ros.diagnose.data_checks import CheckedRecording, compare_checked
-from adxl_ros.diagnose.evidence import used_by_block
+from adxl_ros.diagnose.data_checks import CheckedRecording, compare_checked, DataFault
+from adxl_ros.diagnose.evidence import drifts_among, estimate_floor, NoiseFloor, used_by_block
 from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
 from adxl_ros.diagnose.next_experiment import CouldShow, NextExperiment
-from adxl_ros.diagnose.noise_effects import Detection, NoiseComparison, NoiseRemainder
-from adxl_ros.diagnose.noise_model import drift_effects, NoiseFloor
-from adxl_ros.diagnose.reference import DataFault
+from adxl_ros.diagnose.noise_effects import compare_noise, Detection, NoiseRemainder
 from adxl_ros.diagnose.residual_map import (
     flexible_bases,
     not_covered,
@@ -44,7 +41,7 @@ from adxl_ros.diagnose.verdict import (
 from adxl_ros.files.recording_columns import check_unit, Recording
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2, Z_90
-from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_axes, with_neutral
 from adxl_ros.report.quantities import Interval
 from adxl_ros.simulate.motion import Motion
@@ -83,10 +80,8 @@ class Report:
     # added
     detections: tuple[Detection, ...]
     noise_remainders: tuple[NoiseRemainder, ...]
-    # noise_before, noise_after: Recorded noise relative to simulated noise by recording, before
-    # and with what was found
-    noise_before: tuple[NoiseComparison, ...]
-    noise_after: tuple[NoiseComparison, ...]
+    # Recorded noise relative to simulated noise by recording, before and with what was found
+    noise: tuple[dict[str, Any], ...]
     residual_cells: tuple[ResidualCell, ...]  # Map of the residual of the first recording
     not_covered: tuple[str, ...]  # What the recordings do not cover, for people
     # Smallest size of each effect that these recordings would have shown
@@ -150,26 +145,24 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
         return Diagnosis(fault.comparisons, fault=fault)
     compared = [c.search_comparison for c in checked]
     model = build_linear_model(
-        compared, noise_model.whiteners(compared),
-        lambda share: show_progress('2/5 library of effects', 0.1 + 0.2 * share))
+        compared, lambda share: show_progress('2/5 library of effects', 0.1 + 0.2 * share))
     search = Search(model)
     search.run(lambda share: show_progress('3/5 effects', 0.3 + 0.5 * share))
     show_progress('4/5 held-out figures', 0.8)
-    floor = noise_model.estimate([c.comparison for c in checked])
+    floor = estimate_floor([c.comparison for c in checked])
     counts = np.sum([used_by_block(c.used) for c in model.comparisons], axis=0)
     fits = _held_out(model, search, floor, max(counts.sum(), 1.0))
     smallest_mps2 = material_mps2(model, floor, material_mg)
     robot_mps2 = max(c.robot_error_mps2 for c in model.comparisons)
     wanders = any(getattr(c.motion.force, 'wanders', False) for c in model.comparisons)
     evidence = rule.Evidence(
-        {e: {d: f.figures for d, f in drifts.items()} for e, drifts in fits.items()},
-        counts, rule.block_weights(seed), smallest_mps2,
+        fits, counts, rule.block_weights(seed), smallest_mps2,
         max(model.smallest_angle_rad() * G0_MPS2, robot_mps2), robot_mps2 > 0,
         any(c.fading_hz is not None for c in model.comparisons), wanders,
         np.inf if floor.source == 'assumed' else floor.rms_mps2,
         {effects: h.sizeless for effects, h in search.found.items()})
     detections = _detections(checked, search.best, model.baseline, smallest_mps2)
-    bases = [flexible_bases(c, v) for c, v in zip(compared, model.baseline_v)]
+    bases = [b for c, v in zip(compared, model.baseline_v) for b in flexible_bases(c, v)]
     verdict = rule.decide(
         evidence, lambda effects, drift: reproducible_rest(fits[effects][drift], bases),
         [d.effect for d in detections])
@@ -208,7 +201,7 @@ def _held_out(model: LinearModel, search: Search, floor: NoiseFloor, count: floa
     """Return held-out fits of all sets by the drift of their noise."""
     best = search.best
     beside = linearise(model, best.effects, best.sensor, model.filters)
-    drifts = drift_effects() if beside.fit(drifts=drift_effects()).log_evidence \
+    drifts = drifts_among(library()) if beside.fit(drifts=drifts_among(library())).log_evidence \
         > beside.fit().log_evidence else ()
     out = {}
     for effects, hypothesis in search.found.items():
@@ -281,7 +274,7 @@ def _named_sensor(verdict: Verdict, best: Hypothesis, detections: Sequence[Detec
         sensor = put(replace(sensor, values={**sensor.values, **{
             e: fitted.values[e] for e in (*best.effects, *straight)}}), hidden, before)
     in_noise = {d.effect: d.values for d in detections}
-    for drift in [e for e in drift_effects() if e in verdict.named][:1]:
+    for drift in [e for e in drifts_among(library()) if e in verdict.named][:1]:
         densities = fits[drift].drift_densities()[:len(sensor.axes)]
         in_noise[drift] = {effect_named(drift).parameters[0].name: densities}
     for effect, values in in_noise.items():
@@ -295,7 +288,7 @@ def _closure(verdict: Verdict, evidence: rule.Evidence, floor: NoiseFloor,
              remainders: Sequence[NoiseRemainder], sensor: Sensor, seed: int) -> GapClosure:
     """Return the gap before and after the best set, above the floor without noise-like effects."""
     best = verdict.best if verdict.closes else frozenset[str]()
-    before, after = (evidence.mean(evidence.candidates[e][HEALTHY].squares)
+    before, after = (evidence.mean(evidence.candidates[e][HEALTHY].figures.squares)
                      for e in (frozenset[str](), best))
     stated = noise.sample_std_v(sensor) / (sensor.scale_v_per_g / G0_MPS2)
     stated_mps2 = float(np.sqrt(np.mean(stated ** 2)))
@@ -332,13 +325,11 @@ def _report(checked: Sequence[CheckedRecording], model: LinearModel, search: Sea
     remainders = tuple(noise_effects.noise_remainders(comparisons, best.sensor, sensor,
                                                       detections, seed))
     ranked = sorted(search.found.values(), key=lambda h: -h.log_evidence)
-    noise_before, noise_after = (
-        tuple(noise_effects.compare_noise(c, mean, noisy, seed) for c in comparisons)
-        for mean, noisy in ((baseline, baseline), (best.sensor, sensor)))
+    sensors = {'before': (baseline, baseline), 'after': (best.sensor, sensor)}
     return Report(
         verdict, _closure(verdict, evidence, floor, remainders, baseline, seed), floor,
         (best, *(h for h in ranked if h is not best)), tuple(detections), remainders,
-        noise_before, noise_after,
+        tuple(compare_noise(c, sensors, seed) for c in comparisons),
         tuple(residual_map(model.comparisons[0], seed)), lacking,
         tuple(next_experiment.could_show(model, comparisons[0], floor.noise_v,
                                          verdict.material_mps2)),
@@ -354,8 +345,8 @@ def what_shows(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | No
     except DataFault as fault:
         return fault
     compared = [c.search_comparison for c in checked]
-    model = build_linear_model(compared, noise_model.whiteners(compared))
-    floor = noise_model.estimate([c.comparison for c in checked])
+    model = build_linear_model(compared)
+    floor = estimate_floor([c.comparison for c in checked])
     return next_experiment.could_show(model, checked[0].comparison, floor.noise_v,
                                       material_mps2(model, floor))
 

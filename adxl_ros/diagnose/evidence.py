@@ -1,26 +1,74 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Log evidence of linear models on whitened columns.
+The noise of a healthy unit and of its reference, and the evidence of linear models beside it.
 
-Columns are sensitivities of the simulated output, and a hypothesis is a set of columns. The
+The floor is from noise at rest, differences of repeats, and the steps of the encoder.
+
+The noise is white noise behind the RC filter, the ADC's steps, and a zero-g that drifts. With a
+random walk it is y = n + w + d. Here n is an AR(1) sequence with a = exp(−dt/RC), w is white, and
+d is the walk. Then (1 − aL)(1 − L)·y is an MA(2). Its factor follows from its spectrum (Brockwell
+and Davis 1991, section 3.2).
+
+Alternating poles and zeros, one pair a decade, whiten 1/f noise below its corner, where its
+density equals that of the white noise (Corsini and Saletti 1988, IEEE Trans. Instrum. Meas. 37).
+The variance of the innovations is fitted. The filter then depends only on the ratio of drift and
+noise, which is searched on a grid.
+
+Errors of followed angles are constant at rest and new after each move (errors in variables; Fuller
+1987). The model is y = n + g·u. Here n is noise behind the RC filter, AR(1) with pole a, u has
+variance 1, u_t = φ_t·u_(t−1) + √(1 − φ_t²)·ξ_t, and g is its standard deviation in V. A Kalman
+filter predicts g·u; its innovations, scaled and filtered by 1/(1 − aL), have the spectrum of n.
+Where g is 0, samples stay as they are.
+
+A hypothesis is a set of columns, which are whitened sensitivities of the simulated output. The
 coefficients have normal priors. The evidence integrates the coefficients out (Bishop 2006,
 section 3.5), so that an effect that the recording hardly shows gains nothing and costs nothing.
-The noise is one of several whitening filters; filter and level are fitted to each hypothesis.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from math import sqrt
 from typing import NamedTuple
 
-from adxl_ros.model.effects import effect_named
+from adxl_ros.diagnose.comparison import BaselineComparison, gravity_slopes
+from adxl_ros.model import noise
+from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Coefficient, DriftSpectrum, Role
 from adxl_ros.model.sensor import parameter_of, Sensor
+from adxl_ros.signals.block_statistics import true_runs
+from adxl_ros.simulate.smoothed_paths import ForcePath, SmoothedPath
 import numpy as np
 import scipy
 
+_REST_S, _PARTS_OF_REST = 1.0, 4
+"""Length of a rest whose mean is subtracted, s, and its parts for the interval of the noise.
+Chosen: slower changes are part of the gap, and a part is longer than its samples correlate."""
+_FEWEST_PARTS, _MOST_PARTS = 20, 100
+"""Parts from which an interval is drawn. Chosen: 20 parts show their spread to 16 %."""
+FEWEST_SAMPLES = 200
+"""Fewest samples of an estimate. Chosen: 5 % of the standard deviation."""
+_REPEAT_SHORTEST_S, _REPEAT_DELAY_S = 20.0, 10.0
+"""Shortest repeat of a trajectory, s, and smallest delay of one in the same recording. Chosen: a
+few moves, beyond the correlation of a move with itself."""
+_REPEAT_STEPS, _SMALLEST_RESOLUTION_RAD, _REPEAT_MOTION = 5.0, 1e-5, 0.05
+"""Largest rms angle between two repeats, in steps of the encoder; the smallest such step, rad; and
+smallest standard deviation of the direction of gravity in a repeat, rad. Chosen."""
+RANDOM_WALKS_G_PER_RTS = (1e-7, 1e-5, 3e-5, 7e-5, 1.5e-4, 4e-4, 1e-3, 3e-3)
+"""Grid of densities of a random walk, g/√s, a factor of two to three apart."""
+FLICKERS_G_PER_RTHZ = (6e-5, 1.5e-4, 5e-4, 1.5e-3, 4e-3)
+"""Grid of densities of 1/f noise at 1 Hz, g/√Hz, a factor of three apart."""
+_USUAL_DENSITY, _DENSITY_DECADES = 1e-5, 1.0
+"""Usual density of both drifts, and prior standard deviation of its logarithm, decades. Chosen:
+0.1 mg within 100 s, and a factor of ten."""
+_LOWEST_NOISE_V = 1e-7
+"""Smallest standard deviation of the noise, V, because whitening needs noise. Chosen: below that
+of any ADC."""
+_TOP_OF_RATE = 0.25
+"""Highest corner frequency of 1/f noise, divided by the sample rate. Chosen: half of Nyquist."""
 BLOCKS = 48
 """Number of blocks of a recording, of which some are held out. Chosen: a multiple of the folds,
 and blocks of a few seconds in a short recording."""
@@ -28,15 +76,133 @@ _ITERATIONS = 3
 """Iterations over coefficients and noise. Chosen: the filters no longer change then."""
 _SMALLEST_SQUARES_V2 = 1e-300
 """Smallest sum of squares, V², whose logarithm is taken: above zero."""
-_CACHED_VALUES = 100_000
-"""Number of values that are filtered at once. Chosen: 0.8 MB stay in the cache of a processor."""
 _RIDGE = 1e-12
 """Ridge on the scaled precision. Chosen: columns that differ by a millionth are separable."""
 UNDETERMINED_SHARE, _UNDETERMINED_RATIO = 0.5, 3.0
 """A coefficient is not determined if its posterior standard deviation exceeds this share of the
 prior's, nor by some blocks if it exceeds that of all blocks by this factor. Chosen."""
-_SERIES = 16
-"""Series that are filtered together. Chosen: little memory beside all series."""
+
+
+@dataclass(frozen=True)
+class NoiseFloor:
+    """Rms of what no model can predict, over samples and measured axes."""
+
+    noise_v: np.ndarray  # Standard deviation of the samples about their mean, V, (m,)
+    rms_mps2: float  # Noise and the steps of the stage's encoder, m/s²
+    # 'still' for rests, 'repeats' of a trajectory, or 'assumed' from the parameter file
+    source: str
+    # Sum of the squares of noise and steps, mean over axes, (m/s²)², and number of samples, by
+    # part of the recordings, (2, k). Without columns where the floor is assumed.
+    parts: np.ndarray
+
+    def draws_mps2(self, seed: int, draws: int) -> np.ndarray | None:
+        """Return the floor from parts drawn with replacement, m/s²; None for too few parts."""
+        count = self.parts.shape[1]
+        if count < _FEWEST_PARTS:
+            return None
+        edges = np.linspace(0, count, min(count, _MOST_PARTS) + 1).astype(int)[:-1]
+        squares, samples = np.add.reduceat(self.parts, edges, axis=1)
+        drawn = np.random.default_rng(seed).integers(0, len(edges), (draws, len(edges)))
+        return np.sqrt(squares[drawn].sum(axis=1) / samples[drawn].sum(axis=1))
+
+
+Squares = list[tuple[np.ndarray, int]]
+"""Sums of squares by axis, V², (m,), and their numbers of samples, by part of a recording."""
+
+
+def estimate_floor(comparisons: Sequence[BaselineComparison]) -> NoiseFloor:
+    """
+    Estimate the noise floor from rests, else from repeats, else from the parameter file.
+
+    The noise at rest is that about the mean of each second. The mean square of the encoder's steps
+    is added: step²/12 times the squared slope of gravity, or what they leave open of a robot.
+    """
+    sums: Squares = [part for c in comparisons for part in squares_at_rest(
+        c.volts, c.at_rest & c.used, c.sensor)]
+    source, scale_v_per_mps2 = 'still', comparisons[0].scale_v_per_mps2
+    if sum(count for _, count in sums) < FEWEST_SAMPLES:
+        sums, source = _repeat_squares(comparisons), 'repeats'
+    count = sum(count for _, count in sums)
+    if count < FEWEST_SAMPLES:
+        sums, noise_v, source = [], noise.sample_std_v(comparisons[0].sensor), 'assumed'
+    else:
+        noise_v = np.sqrt(np.sum([squares_v2 for squares_v2, _ in sums], axis=0) / count)
+    encoder = float(np.mean([c.robot_error_mps2 ** 2 for c in comparisons]))
+    for c in comparisons:
+        if c.joints:
+            slopes = gravity_slopes(*(joint(c.time_s)[c.used] for joint in c.joints))
+            squares = np.mean((slopes[:, :len(c.sensor.axes)] ** 2).sum(axis=0))
+            encoder += float((c.sensor.local_gravity_mps2 * c.sensor.stage_std_rad) ** 2
+                             * squares / len(comparisons))
+    parts = np.array([(np.mean(squares_v2 / scale_v_per_mps2 ** 2) + count * encoder, count)
+                      for squares_v2, count in sums]).reshape(-1, 2).T
+    return NoiseFloor(noise_v, float(np.sqrt(np.mean((noise_v / scale_v_per_mps2) ** 2)
+                                             + encoder)), source, parts)
+
+
+def squares_at_rest(volts: np.ndarray, at_rest: np.ndarray, sensor: Sensor) -> Squares:
+    """Sum the squares of an output, V, (n, m), about the mean of each second at rest."""
+    length = max(round(_REST_S * sensor.rate_hz), 4)
+    # The mean of correlated samples takes more out of their variance than one sample.
+    independent = length / float(noise.effective_samples(length, 1 / sensor.rate_hz,
+                                                         sensor.rc_s))
+    squares: Squares = []
+    for begin, end in true_runs(at_rest):
+        for first in range(begin, end - length + 1, length):
+            part = volts[first:first + length]
+            squares_v2 = (part - part.mean(axis=0)) ** 2 * length / (length - independent)
+            squares += [(piece.sum(axis=0), len(piece))
+                        for piece in np.array_split(squares_v2, _PARTS_OF_REST)]
+    return squares
+
+
+def _repeat_squares(comparisons: Sequence[BaselineComparison]) -> Squares:
+    """Return half the squares of the differences between repeats of a trajectory on the stage."""
+    staged = [(c, force) for c in comparisons
+              if c.joints and (force := c.reference_force_g()) is not None]
+    squares: Squares = []
+    for i, (first, force) in enumerate(staged):
+        for second, other in staged[i:]:
+            rate_hz = first.sensor.rate_hz
+            if abs(rate_hz / second.sensor.rate_hz - 1) > 1e-3:
+                continue
+            found = find_repeat(force, other, rate_hz, first.sensor.stage_resolution_rad,
+                                first is second)
+            if found is None:
+                continue
+            lag, count = found
+            used = first.used[:count] & second.used[lag:lag + count]
+            difference_v = (second.residual_v(second.sensor)[lag:lag + count]
+                            - first.residual_v(first.sensor)[:count])[used]
+            squares_v2 = (difference_v - difference_v.mean(axis=0)) ** 2 / 2
+            length = max(round(_REST_S * rate_hz), 1)
+            squares += [(part.sum(axis=0), len(part)) for part in np.split(
+                squares_v2, range(length, len(squares_v2), length))]
+    return squares
+
+
+def find_repeat(first: np.ndarray, second: np.ndarray, rate_hz: float, resolution_rad: float,
+                same_recording: bool) -> tuple[int, int] | None:
+    """
+    Find the lag, and its overlap, by which the directions of gravity in two recordings agree best.
+
+    first, second: direction of gravity in the sensor's frame, unit vectors, (3, n) and (3, n').
+    """
+    products = sum(scipy.signal.correlate(b, a, method='fft') for a, b in zip(first, second))
+    lags = scipy.signal.correlation_lags(second.shape[1], first.shape[1])
+    overlap = np.minimum(first.shape[1], second.shape[1] - lags)
+    tried = (lags >= _REPEAT_DELAY_S * rate_hz * same_recording) \
+        & (overlap >= _REPEAT_SHORTEST_S * rate_hz)
+    if not tried.any():
+        return None
+    # |a − b|² of unit vectors is 2 − 2·a·b.
+    mean_square = np.where(tried, 2 - 2 * products / np.maximum(overlap, 1), np.inf)
+    best = int(np.argmin(mean_square))
+    lag, count = int(lags[best]), int(overlap[best])
+    largest_rad = _REPEAT_STEPS * max(resolution_rad, _SMALLEST_RESOLUTION_RAD)
+    moved = first[:, :count].std(axis=1).max()
+    return (lag, count) if mean_square[best] <= largest_rad ** 2 and moved >= _REPEAT_MOTION \
+        else None
 
 
 @dataclass(frozen=True)
@@ -54,20 +220,14 @@ class AngleErrorFilter:
         """Filter k series, (k, n)."""
         lower = np.ones((2, len(self.gain)))
         lower[1, :-1] = -self.transition[1:]
-        filtered = np.empty_like(values)
-        for first in range(0, len(values), _SERIES):
-            part = values[first:first + _SERIES]
-            changes = part.copy()
-            changes[:, 1:] -= self.pole * part[:, :-1]
-            changes[:, 0] = 0.0
-            estimates = scipy.linalg.lapack.dtbtrs(lower, (changes * self.gain).T, uplo='L',
-                                                   diag='U')[0].T
-            changes[:, 1:] -= self.weight[1:] * estimates[:, :-1]
-            changes *= self.scale
-            changes[:, 0] = part[:, 0]
-            filtered[first:first + _SERIES] = scipy.signal.lfilter(
-                [1.0], [1.0, -self.pole], changes)
-        return filtered
+        changes = np.zeros_like(values)
+        changes[:, 1:] = values[:, 1:] - self.pole * values[:, :-1]
+        estimates = scipy.linalg.lapack.dtbtrs(lower, (changes * self.gain).T, uplo='L',
+                                               diag='U')[0].T
+        changes[:, 1:] -= self.weight[1:] * estimates[:, :-1]
+        changes *= self.scale
+        changes[:, 0] = values[:, 0]
+        return scipy.signal.lfilter([1.0], [1.0, -self.pole], changes)
 
 
 @dataclass(frozen=True)
@@ -75,7 +235,6 @@ class Whitener:
     """A filter that makes noise white."""
 
     sections: np.ndarray  # Second-order sections, (s, 6)
-    log_prior: float  # Log prior probability of such noise, up to a constant
     effect: str  # Name of the drift effect that the filter is for
     density: float  # Density of the drift, in the unit of the effect's parameter
     # Filter for the errors of angles and rounding; None where there are none, or where the drift
@@ -83,25 +242,127 @@ class Whitener:
     errors: AngleErrorFilter | None = None
 
     @property
-    def spectrum(self) -> DriftSpectrum:
-        """Spectrum of the drift."""
-        spectrum = effect_named(self.effect).diagnosis.drift
-        assert spectrum is not None
-        return spectrum
+    def log_prior(self) -> float:
+        """Log prior probability of such noise, up to a constant."""
+        return -0.5 * float(np.log10(self.density / _USUAL_DENSITY) / _DENSITY_DECADES) ** 2
 
     @property
     def healthy(self) -> bool:
         """Whether a unit without the effect may drift as much."""
         return self.density <= effect_named(self.effect).diagnosis.healthy_density
 
-    def continued(self, values: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Filter the next part of k series, (k, n); return it and the state, (s, k, 2)."""
-        if len(self.sections) > 1:
-            return scipy.signal.sosfilt(self.sections, values, zi=state)
-        # The same recursion without a copy.
-        filtered, after = scipy.signal.lfilter(self.sections[0, :3], self.sections[0, 3:], values,
-                                               zi=state[0])
-        return filtered, after[None]
+
+def _angle_error_filter(comparison: BaselineComparison, axis: int, pole: float, analog_v: float
+                        ) -> AngleErrorFilter | None:
+    """
+    Return the filter for one axis by the Riccati recursion of the Kalman filter.
+
+    None where the errors of angles are 0.
+    """
+    variance_v2, remembered_v2 = np.zeros(len(comparison)), np.zeros(len(comparison))
+    for part_v2, memory in _angle_errors(comparison, axis):
+        variance_v2 += part_v2
+        remembered_v2 += part_v2 * memory
+    if not variance_v2.any():
+        return None
+    noise_v2 = analog_v ** 2 * (1 - pole ** 2) \
+        + comparison.sensor.lsb_v ** 2 / 12 * (1 + pole ** 2)
+    memories = np.divide(remembered_v2, variance_v2, where=variance_v2 > 0,
+                         out=np.ones(len(comparison)))
+    std_v = np.sqrt(variance_v2)
+    rows, variance, previous_v = [], 1.0, float(std_v[0])
+    for g, phi in zip(std_v.tolist(), memories.tolist()):
+        renewal2 = 1 - phi * phi
+        weight = g * phi - pole * previous_v
+        total_v2 = weight * weight * variance + g * g * renewal2 + noise_v2
+        gain = (phi * weight * variance + g * renewal2) / total_v2
+        rows.append((phi - gain * weight, gain, weight, sqrt(noise_v2 / total_v2)))
+        variance = phi * phi * variance + renewal2 - gain * gain * total_v2
+        previous_v = g
+    return AngleErrorFilter(float(np.sqrt(np.mean(variance_v2))), pole, *np.array(rows).T)
+
+
+def _angle_errors(comparison: BaselineComparison, axis: int
+                  ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield variance, V², and memory from sample to sample, (n,) each, of errors of angles."""
+    sensor, time_s, joints = comparison.sensor, comparison.time_s, comparison.joints or ()
+    slopes = gravity_slopes(*(joint(time_s) for joint in joints))[:, axis] if joints else ()
+    for joint, slope in zip(joints, slopes):
+        if isinstance(joint, SmoothedPath) and (errors := joint.errors(time_s)) is not None:
+            # An error that grows, after a move, is a new one.
+            memory = np.exp(-errors.forgetting_per_s * comparison.dt_s)
+            memory[1:] *= np.minimum(errors.std[:-1] / errors.std[1:], 1.0)
+            v_per_rad = slope * sensor.scale_v_per_g[axis] * sensor.local_gravity_mps2 / G0_MPS2
+            yield (v_per_rad * errors.std) ** 2, memory
+    force = comparison.motion.force
+    if isinstance(force, ForcePath) and force.is_robot:
+        errors = force.errors(time_s, AXES.index(sensor.axes[axis]))
+        v_per_mps2 = sensor.scale_v_per_g[axis] / G0_MPS2
+        yield (v_per_mps2 * errors.std) ** 2, np.exp(-errors.forgetting_per_s * comparison.dt_s)
+
+
+def whiteners(comparison: BaselineComparison) -> list[list[Whitener]]:
+    """Return the filters that are tried for the noise of each axis of a recording."""
+    return [_whiteners(comparison, axis) for axis in range(len(comparison.sensor.axes))]
+
+
+def _whiteners(comparison: BaselineComparison, axis: int) -> list[Whitener]:
+    sensor, dt_s = comparison.sensor, comparison.dt_s
+    scale, rc_s = float(sensor.scale_v_per_g[axis]), float(noise.electronics(sensor).rc_s[axis])
+    # Pole of the RC filter, and standard deviation of the analog noise.
+    a = float(np.exp(-dt_s / rc_s)) if rc_s else 0.0
+    std_v = max(float(noise.analog_std_v(sensor)[axis]), _LOWEST_NOISE_V)
+    errors, step_v2 = _angle_error_filter(comparison, axis, a, std_v), sensor.lsb_v ** 2 / 12
+    by_spectrum = {effect_named(e).diagnosis.drift: e for e in drifts_among(library())}
+    pole, difference = np.array([1, -a]), np.array([1, -1.0])
+    filters = []
+    for density in RANDOM_WALKS_G_PER_RTS:
+        spectrum = (std_v ** 2 * (1 - a * a) * _power(difference, 2)
+                    + step_v2 * _power(np.convolve(pole, difference), 2)
+                    + (density * scale) ** 2 * dt_s * _power(pole, 2))
+        filters.append(Whitener(scipy.signal.tf2sos(np.convolve(pole, difference),
+                                                    _spectral_factor(spectrum, 2)),
+                                by_spectrum[DriftSpectrum.RANDOM_WALK], density))
+    # Noise and ADC steps without drift are an ARMA(1, 1) sequence; this is the zero of its MA.
+    zero = -_spectral_factor(std_v ** 2 * (1 - a * a) * _power(np.ones(1), 1)
+                             + step_v2 * _power(pole, 1), 1)[1]
+    white_v2_per_hz = 2 * dt_s * (std_v ** 2 * (1 + a) / (1 - a) + step_v2)
+    for density in FLICKERS_G_PER_RTHZ:
+        corner_hz = (density * scale) ** 2 / white_v2_per_hz
+        top_hz = min(corner_hz, _TOP_OF_RATE / dt_s)
+        # Zeros and poles, one pair a decade from the corner down: the gain of the filter rises
+        # with the root of the frequency.
+        decades = np.arange(int(np.ceil(max(np.log10(top_hz * comparison.span_s), 0.0))))
+        corners = 2 * np.pi * dt_s * top_hz * 10.0 ** -decades
+        filters.append(Whitener(scipy.signal.zpk2sos(
+            [a, *np.exp(-corners * 10 ** -0.5)], [zero, *np.exp(-corners)], 1.0),
+            by_spectrum[DriftSpectrum.FLICKER], density))
+        if corner_hz > top_hz:
+            break
+    largest = np.inf if errors is None else errors.rms_v / scale
+    return [replace(f, errors=errors) if f.healthy or f.density < largest else f for f in filters]
+
+
+def expected_drift_g(effect: str, density: float, comparison: BaselineComparison) -> float:
+    """Return the expected rms of a drift about its mean over a recording."""
+    if effect_named(effect).diagnosis.drift is DriftSpectrum.RANDOM_WALK:
+        return float(density * np.sqrt(comparison.span_s / 6))
+    return float(density * np.sqrt(np.log(comparison.sensor.rate_hz / 2 * comparison.span_s)))
+
+
+def _power(polynomial: np.ndarray, order: int) -> np.ndarray:
+    """Return the coefficients of |p(L)|², of the powers of L from −order to order."""
+    square = np.convolve(polynomial, polynomial[::-1])
+    return np.pad(square, order - (len(polynomial) - 1))
+
+
+def _spectral_factor(spectrum: np.ndarray, order: int) -> np.ndarray:
+    """Return the monic polynomial with all roots inside the unit circle and this spectrum."""
+    trimmed = np.trim_zeros(np.where(np.abs(spectrum) > 1e-14 * spectrum.max(), spectrum, 0.0))
+    roots = np.roots(trimmed)
+    inside = roots[np.argsort(np.abs(roots))[:len(roots) // 2]]
+    factor = np.atleast_1d(np.real(np.poly(inside)))
+    return np.pad(factor, (0, order + 1 - len(factor)))
 
 
 def drifts_among(effects: Iterable[str]) -> tuple[str, ...]:
@@ -142,27 +403,17 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
         data = bridged(data.T, used).T
     before = {id(f.errors): data if f.errors is None else f.errors(data)
               for f in {id(f.errors): f for f in filters}.values()}
-    edges, unused = block_edges(len(used)), np.flatnonzero(~used)
-    grams = np.zeros((len(filters), BLOCKS if by_block else 1, len(data), len(data)))
-    states = [np.zeros((len(f.sections), len(data), 2)) for f in filters]
-    together = max(1, _CACHED_VALUES * BLOCKS // data.size)
-    for first in range(0, BLOCKS, together):
-        blocks = range(first, min(first + together, BLOCKS))
-        part = slice(edges[first], edges[blocks[-1] + 1])
-        values = {kind: np.ascontiguousarray(series[:, part]) for kind, series in before.items()}
-        dropped = unused[slice(*np.searchsorted(unused, [part.start, part.stop]))] - part.start
-        for i, whitener in enumerate(filters):
-            white, states[i] = whitener.continued(values[id(whitener.errors)], states[i])
-            # The first sample is a step from zero.
-            white[:, dropped if first else np.append(dropped, 0)] = 0.0
-            if not by_block:
-                grams[i, 0] += white @ white.T
-                continue
-            for b in blocks:
-                inside = white[:, edges[b] - part.start:edges[b + 1] - part.start]
-                np.matmul(inside, inside.T, out=grams[i, b])
-    total = grams.sum(axis=1)
-    grams = grams if by_block else np.zeros((len(filters), 0, len(data), len(data)))
+    edges, dropped = block_edges(len(used)), np.append(np.flatnonzero(~used), 0)
+    grams = np.zeros((len(filters), BLOCKS if by_block else 0, len(data), len(data)))
+    total = np.zeros((len(filters), len(data), len(data)))
+    for i, whitener in enumerate(filters):
+        white = scipy.signal.sosfilt(whitener.sections, before[id(whitener.errors)])
+        # The first sample is a step from zero.
+        white[:, dropped] = 0.0
+        if by_block:
+            for b, (begin, end) in enumerate(pairwise(edges)):
+                grams[i, b] = white[:, begin:end] @ white[:, begin:end].T
+        total[i] = grams[i].sum(axis=0) if by_block else white @ white.T
     # The log determinant of the filter for errors, sample by sample.
     log_scales = np.array([np.zeros(BLOCKS) if f.errors is None else np.add.reduceat(
         np.where(used, np.log(f.errors.scale), 0.0), edges[:-1]) for f in filters])
@@ -189,15 +440,10 @@ def block_edges(count: int) -> np.ndarray:
 
 def bridged(data: np.ndarray, used: np.ndarray) -> np.ndarray:
     """Replace rows, (n, k), that are not used by straight lines between those that are."""
-    if used.all() or not used.any() or not data.shape[1]:
+    if used.all() or not used.any():
         return data
-    kept, missing = np.flatnonzero(used), np.flatnonzero(~used)
-    after = np.searchsorted(kept, missing)
-    before, right = kept[np.maximum(after - 1, 0)], kept[np.minimum(after, len(kept) - 1)]
-    share = np.clip((missing - before) / np.maximum(right - before, 1), 0.0, 1.0)[:, None]
-    out = data.copy(order='K')
-    out[missing] = data[before] + share * (data[right] - data[before])
-    return out
+    number, kept = np.arange(len(used)), np.flatnonzero(used)
+    return np.column_stack([np.interp(number, kept, column[kept]) for column in data.T])
 
 
 @dataclass(frozen=True)

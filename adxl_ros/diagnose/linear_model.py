@@ -18,7 +18,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain, product
-from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence
 from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
@@ -70,13 +69,6 @@ Simulate = Callable[[Sensor], np.ndarray]
 """Mean output of a sensor in one recording, V, (n, m)."""
 
 
-class Column(NamedTuple):
-    """Sensitivity of one axis to a coefficient."""
-
-    number: int  # Number of the coefficient in its variant, or of the column in the linear model
-    values: np.ndarray  # V per unit of the coefficient, (n,)
-
-
 @dataclass(frozen=True)
 class Variant:
     """An effect with fixed shape parameters, and the sensitivities to its p coefficients."""
@@ -85,7 +77,8 @@ class Variant:
     shape: dict[str, float]  # Values of the shape parameters
     step: float  # Step of the derivative, in typical sizes; for a limit the number of its level
     names: tuple[Coefficient, ...]  # Names of the coefficients, (p,)
-    columns: list[list[Column]]  # Sensitivities of each axis
+    # By axis: sensitivities by coefficient, V per unit, (n,)
+    columns: list[dict[Coefficient, np.ndarray]]
     # Only for an effect with a limit: first values of its fit, by coefficient. The columns are
     # then the change of the output by these values, V.
     limit_start: dict[Coefficient, float] = field(default_factory=dict)
@@ -166,9 +159,8 @@ def _limit_variants(comparison: BaselineComparison, effect: Effect, limit: Param
         clipped = [d for d in range(len(axes)) if np.any(np.abs(change_v[:, d]) > _SMALLEST_V)]
         if clipped:
             yield Variant(effect.name, {}, float(number), tuple(names[d] for d in clipped),
-                          [[Column(clipped.index(d), change_v[:, d])] if d in clipped else []
-                           for d in range(len(axes))],
-                          dict(zip(names, values)) | start)
+                          [{name: change_v[:, d]} if d in clipped else {}
+                           for d, name in enumerate(names)], dict(zip(names, values)) | start)
 
 
 def _variant(comparison: BaselineComparison, effect: Effect, parameters: Sequence[Parameter],
@@ -177,7 +169,7 @@ def _variant(comparison: BaselineComparison, effect: Effect, parameters: Sequenc
     axes = comparison.sensor.axes
     start = with_values(with_neutral(comparison.sensor, [effect.name]), effect.name, shape)
     names: list[Coefficient] = []
-    columns: list[list[Column]] = [[] for _ in axes]
+    columns: list[dict[Coefficient, np.ndarray]] = [{} for _ in axes]
     for p in parameters:
         values = np.asarray(start.values[effect.name][p.name], float)
         size, highest = p.scale * step, float(np.max(values))
@@ -193,9 +185,9 @@ def _variant(comparison: BaselineComparison, effect: Effect, parameters: Sequenc
         for name in names_of(replace(effect, parameters=(p,)), axes):
             reached = [axes.index(name.axis)] if p.axes else list(range(len(axes)))
             if np.any(np.abs(change[:, reached]) * p.scale > _SMALLEST_V):
-                for d in reached:
-                    columns[d].append(Column(len(names), change[:, d]))
                 names.append(name)
+                for d in reached:
+                    columns[d][name] = change[:, d]
     return Variant(effect.name, shape, step, tuple(names), columns) if names else None
 
 
@@ -245,7 +237,8 @@ class LinearModel:
     # drifts of the baseline
     channels: list[evidence.WhitenedChannel]
     filters: list[list[Whitener]]  # Whitening filters of each channel
-    columns: list[list[Column]]  # By channel: sensitivities to the library
+    # By channel: sensitivities by number of the column, V per unit, (n,)
+    columns: list[dict[int, np.ndarray]]
     # By channel: nuisance parameters and their sensitivities, V per unit, (n,)
     nuisance_columns: list[dict[Coefficient, np.ndarray]]
     # For each coefficient of zero-g and scale factor: how much of it a calibration can take up of
@@ -263,13 +256,19 @@ class LinearModel:
         return all(c.reference is not Reference.NONE for c in self.comparisons)
 
     @cached_property
+    def usual_filters(self) -> list[list[Whitener]]:
+        """Return the filters of each channel for healthy units and for drifts of the baseline."""
+        return filters_for(self.filters, self.baseline.effects)
+
+    @cached_property
     def lost_motion_mps2(self) -> float:
         """Rms of the motion that smooth references lack, m/s²."""
         return float(np.sqrt(np.mean([c.lost_motion_mps2() ** 2 for c in self.comparisons])))
 
-    def place_of_channel(self, number: int) -> tuple[int, int]:
-        """Return the number of the recording and of the axis of a channel."""
-        return divmod(number, len(self.baseline.axes))
+    @property
+    def places(self) -> list[tuple[BaselineComparison, int]]:
+        """Return the recording and the number of the axis of each channel."""
+        return [(c, axis) for c in self.comparisons for axis in range(len(c.sensor.axes))]
 
     @cached_property
     def null_fit(self) -> LinearFit:
@@ -346,14 +345,15 @@ def calibration_takes_up(effect: str) -> bool:
 
 
 def build_linear_model(comparisons: Sequence[BaselineComparison],
-                       filters: Sequence[list[Whitener]],
                        show_progress: Callable[[float], None] = lambda fraction: None,
-                       only: Sequence[str] | None = None) -> LinearModel:
+                       only: Sequence[str] | None = None,
+                       filters: Sequence[list[Whitener]] = ()) -> LinearModel:
     """
     Differentiate the baseline by the whole library in all recordings.
 
-    filters: whitening filters of each channel.
+    filters: whitening filters of each channel, where not all are tried.
     """
+    filters = filters or [f for c in comparisons for f in evidence.whiteners(c)]
     baseline_v = [c.simulated_v(c.sensor) for c in comparisons]
     # The same variant of several recordings, by the number of the recording.
     every: dict[tuple, dict[int, Variant]] = {}
@@ -366,35 +366,32 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
                 every.setdefault(variant.key, {})[i] = variant
             show_progress(_SIMULATED_SHARE * (i + (k + 1) / len(effects)) / len(comparisons))
     names: list[Coefficient] = []
-    prior_std: list[float] = []
     kept: list[Variant] = []
     column_ids: list[list[int]] = []
-    columns: list[list[list[Column]]] = [[[] for _ in c.sensor.axes] for c in comparisons]
+    columns: list[list[dict[int, np.ndarray]]] = [[{} for _ in c.sensor.axes] for c in comparisons]
     for by_recording in every.values():
         own = dict.fromkeys(chain(*(v.names for v in by_recording.values())))
         numbers = {name: len(names) + i for i, name in enumerate(own)}
         names += own
         for i, variant in by_recording.items():
-            for d, axis in enumerate(variant.columns):
-                columns[i][d] += [Column(numbers[variant.names[c.number]], c.values) for c in axis]
+            for of_channel, of_axis in zip(columns[i], variant.columns):
+                of_channel |= {numbers[name]: values for name, values in of_axis.items()}
         kept.append(replace(next(iter(by_recording.values())), names=tuple(own)))
-        # The columns of a limit are the change by its first value.
-        prior_std += [1.0 if kept[-1].limit_start else PRIOR_WIDTH * parameter_of(name).scale
-                      for name in own]
         column_ids.append(list(numbers.values()))
+    # The columns of a limit are the change by its first value.
+    prior_std = [1.0 if v.limit_start else PRIOR_WIDTH * parameter_of(name).scale
+                 for v in kept for name in v.names]
     by_channel = list(chain(*columns))
-    channels: list[evidence.WhitenedChannel] = []
-    chosen = filters_for(filters, comparisons[0].sensor.effects)
-    for comparison in comparisons:
-        for residual_v in comparison.residual_v(comparison.sensor).T:
-            k = len(channels)
-            channels.append(evidence.whiten_channel(
-                residual_v, np.array([c.values for c in by_channel[k]]).T,
-                np.array([c.number for c in by_channel[k]]), comparison.used, chosen[k], False))
+    residuals_v = [v for c in comparisons for v in c.residual_v(c.sensor).T]
+    used = [c.used for c in comparisons for _ in c.sensor.axes]
+    channels = [evidence.whiten_channel(
+        residual_v, np.array([*own.values()]).T, np.array([*own]), of_channel, chosen, False)
+        for residual_v, own, of_channel, chosen in zip(
+            residuals_v, by_channel, used, filters_for(filters, comparisons[0].sensor.effects))]
     show_progress(1.0)
     # The first column of an effect is that of its smallest start.
-    nuisance_columns = [{names[c.number]: c.values for c in reversed(channel)
-                         if hints_of(names[c.number]).nuisance} for channel in by_channel]
+    nuisance_columns = [{names[k]: values for k, values in reversed(channel.items())
+                         if hints_of(names[k]).nuisance} for channel in by_channel]
     parts = parts_at_rest(comparisons, nuisance_columns, by_channel, len(names))
     return LinearModel(list(comparisons), baseline_v, kept, column_ids, names,
                        np.array(prior_std), channels, list(filters), by_channel, nuisance_columns,
@@ -416,7 +413,7 @@ def filters_for(filters: Sequence[list[Whitener]], effects: Sequence[str]
 
 def parts_at_rest(comparisons: Sequence[BaselineComparison],
                   nuisance_columns: Sequence[Mapping[Coefficient, np.ndarray]],
-                  columns: Sequence[Sequence[Column]], count: int
+                  columns: Sequence[Mapping[int, np.ndarray]], count: int
                   ) -> dict[Coefficient, np.ndarray]:
     """
     Compute how much of other columns a calibration can take for zero-g or scale factor.
@@ -426,7 +423,7 @@ def parts_at_rest(comparisons: Sequence[BaselineComparison],
     of the calibration differ from those of the recording, so that a share of the whole effect is
     added.
 
-    columns: other columns of each channel, with numbers below `count`; returns: by coefficient of
+    columns: other columns of each channel by numbers below `count`; returns: by coefficient of
     zero-g or scale factor: the standard deviation of its part in one unit of each other column,
     in its own unit, (count,).
     """
@@ -438,14 +435,14 @@ def parts_at_rest(comparisons: Sequence[BaselineComparison],
         if not lines or not channel_columns:
             continue
         matrix = np.column_stack(list(lines.values()))
-        others = np.column_stack([c.values for c in channel_columns])
+        others = np.column_stack(list(channel_columns.values()))
         rms = np.sqrt(np.mean(others[rows] ** 2, axis=0))
         at_rests = np.abs(np.linalg.lstsq(matrix[rows], others[rows])[0])
         in_all = np.linalg.lstsq(matrix, others)[0]
         # A calibration with an effect that is a straight line would have left nothing of it.
         bent = (others - matrix @ in_all).std(axis=0) \
             > _SMALLEST_BENT_SHARE * np.sqrt(np.mean(others ** 2, axis=0))
-        ids = [c.number for c in channel_columns]
+        ids = list(channel_columns)
         for j, (name, line) in enumerate(lines.items()):
             size = max(float(np.sqrt(np.mean(line ** 2))), np.finfo(float).tiny)
             # The poses of a calibration may reach further than the rests of the recording.

@@ -20,7 +20,6 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache
 from typing import NamedTuple
 
 from adxl_ros.diagnose import linear_model as linear, noise_effects
@@ -31,8 +30,8 @@ from adxl_ros.diagnose.comparison import (
     Reference,
     with_values,
 )
+from adxl_ros.diagnose.evidence import expected_drift_g
 from adxl_ros.diagnose.linear_model import LinearModel
-from adxl_ros.diagnose.noise_model import expected_drift_g, whiteners
 from adxl_ros.diagnose.verdict import UNKNOWN, Verdict, WeightedHypothesis
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
@@ -40,6 +39,7 @@ from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Coefficient, Concern, Detector, Effect, Manoeuvre
 from adxl_ros.model.sensor import parameter_of, Sensor, with_neutral
+from adxl_ros.report.quantities import listed
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import simulate_blocks
@@ -81,7 +81,7 @@ class CouldShow(NamedTuple):
 def could_show(model: LinearModel, comparison: BaselineComparison, noise_v: np.ndarray,
                material_mps2: float) -> list[CouldShow]:
     """
-    Return the smallest sizes by coefficient: material ones, that exceed their uncertainty.
+    Return the smallest sizes by effect: material ones, that exceed their uncertainty.
 
     Nuisance parameters are free, within their tolerance. An effect with several shapes has the
     size of the shape that shows best. The sizes of effects on the noise are those of one
@@ -91,41 +91,38 @@ def could_show(model: LinearModel, comparison: BaselineComparison, noise_v: np.n
     fit, count = model.null_fit, len(model.names)
     # Products of the whitened columns in units of the noise, and their squares, (m/s²)²/unit².
     gram, plain, samples = np.zeros((count, count)), np.zeros(count), 0.0
-    for number, (c, f, variance) in enumerate(zip(
-            model.channels, fit.filter_indices, fit.innovation_variance_v2)):
+    for c, f, variance, columns, (recorded, axis) in zip(
+            model.channels, fit.filter_indices, fit.innovation_variance_v2, model.columns,
+            model.places):
         gram[np.ix_(c.column_ids, c.column_ids)] += c.total_grams[f][1:, 1:] / variance
-        recording, axis = model.place_of_channel(number)
-        of_channel = model.comparisons[recording]
-        for column in model.columns[number]:
-            plain[column.number] += float(np.sum(column.values[of_channel.used] ** 2)) \
-                / float(of_channel.scale_v_per_mps2[axis]) ** 2
-        samples += of_channel.used.sum()
+        for k, values in columns.items():
+            plain[k] += float(np.sum(values[recorded.used] ** 2)) \
+                / float(recorded.scale_v_per_mps2[axis]) ** 2
+        samples += recorded.used.sum()
     precision = gram[np.ix_(free, free)] + np.diag(prior_std[free] ** -2.0)
     marginal = np.diag(gram) - np.einsum('ij,ij->j', gram[free], np.linalg.solve(
         precision, gram[free]))
-    best: dict[Coefficient, CouldShow] = {}
+    rows = _noise_could_show(comparison, noise_v, material_mps2)
     for variant, ids in zip(model.variants, model.column_ids):
         hints = effect_named(variant.effect).diagnosis
         if variant.limit_start or (hints.straight_line and not model.pose_known):
             continue
         for k in ids:
-            name = model.names[k]
             information = gram[k, k] if hints.nuisance else marginal[k]
             share = float(np.clip(information / max(gram[k, k], 1e-300), 0.0, 1.0))
             power = plain[k] * share / max(samples, 1.0)
             size = max(_SHOWN_STDS * information ** -0.5, material_mps2 * power ** -0.5) \
                 if information > 0 and power > 0 else np.inf
             if hints.nuisance:
-                size = np.hypot(size, 3 * model.tolerance(name))
-            if name not in best or size < best[name].smallest:
-                best[name] = CouldShow(name, float(size), share)
-    seen = {row.effect for row in best.values()} | {
-        v.effect for v in model.variants if v.limit_start}
-    hidden = [CouldShow(Coefficient(e.name, e.parameters[0].name), np.inf, 0.0)
-              for e in linear.candidates() if e.name not in seen]
-    return sorted([*best.values(), *hidden, *_noise_could_show(comparison, noise_v,
-                                                               material_mps2)],
-                  key=lambda r: (r.effect, r.name.parameter, r.name.axis))
+                size = np.hypot(size, 3 * model.tolerance(model.names[k]))
+            rows.append(CouldShow(model.names[k], float(size), share))
+    seen = {r.effect for r in rows} | {v.effect for v in model.variants if v.limit_start}
+    rows += [CouldShow(Coefficient(e.name, e.parameters[0].name), np.inf, 0.0)
+             for e in linear.candidates() if e.name not in seen]
+    # The coefficient of each effect that shows best, by smallest over typical size.
+    best = {r.effect: r for r in sorted(rows, reverse=True, key=lambda r: (
+        r.smallest / parameter_of(r.name).scale, r.name))}
+    return [best[effect] for effect in sorted(best)]
 
 
 def _noise_could_show(comparison: BaselineComparison, noise_v: np.ndarray, material_mps2: float
@@ -146,7 +143,7 @@ def _noise_could_show(comparison: BaselineComparison, noise_v: np.ndarray, mater
     for effect in library().values():
         hints = effect.diagnosis
         if hints.drift is not None:
-            unit_g = expected_drift_g(hints.drift, 1.0, comparison.span_s, rate_hz)
+            unit_g = expected_drift_g(effect.name, 1.0, comparison)
             parameter, size = effect.parameters[0].name, max(
                 material_mps2 / G0_MPS2 / unit_g, hints.healthy_density)
         elif hints.detector in sizes:
@@ -155,14 +152,6 @@ def _noise_could_show(comparison: BaselineComparison, noise_v: np.ndarray, mater
             continue
         rows.append(CouldShow(Coefficient(effect.name, parameter), float(size)))
     return rows
-
-
-def by_effect(rows: Sequence[CouldShow]) -> dict[str, CouldShow]:
-    """Return for each effect its coefficient that shows best, by smallest over typical size."""
-    best: dict[str, CouldShow] = {}
-    for row in sorted(rows, key=lambda r: r.smallest / parameter_of(r.name).scale):
-        best.setdefault(row.effect, row)
-    return best
 
 
 class Belief(NamedTuple):
@@ -204,29 +193,17 @@ def expected_information(gram: np.ndarray, probabilities: Sequence[float],
     return max(float(-weights[positive] @ np.log((overlap @ weights)[positive])), 0.0)
 
 
-class Experiment(NamedTuple):
-    """A manoeuvre that can be recorded next."""
-
-    name: str
-    begin_s: float  # Time of its motion at which it begins, s
-    motion: Motion
-
-    @property
-    def minutes(self) -> float:
-        """Return the duration, min."""
-        return self.motion.duration_s / 60
-
-
 class ManoeuvreWorth(NamedTuple):
     """What a manoeuvre is expected to tell."""
 
-    manoeuvre: Experiment
+    name: str
+    minutes: float  # Duration, min
     information: float  # Expected decrease of the entropy of the hypotheses, nat
 
     @property
     def per_minute(self) -> float:
         """Return the expected information per minute, nat/min."""
-        return self.information / self.manoeuvre.minutes
+        return self.information / self.minutes
 
 
 Key = tuple
@@ -236,15 +213,11 @@ Key = tuple
 class PredictedResponse(NamedTuple):
     """Products of the sensitivities of one manoeuvre."""
 
-    manoeuvre: Experiment
-    linear_model: LinearModel
+    name: str
+    minutes: float  # Duration, min
+    linear_model: LinearModel  # Its variants are those that the manoeuvre excites
     places: dict[Key, int]  # Place of each column
     gram: np.ndarray  # Products, in units of the noise, (k, k)
-
-    @property
-    def effects(self) -> set[str]:
-        """Return the effects that the manoeuvre excites."""
-        return {v.effect for v in self.linear_model.variants}
 
 
 def leading(hypotheses: Sequence[WeightedHypothesis]) -> tuple[WeightedHypothesis, ...]:
@@ -253,14 +226,19 @@ def leading(hypotheses: Sequence[WeightedHypothesis]) -> tuple[WeightedHypothesi
                  and UNKNOWN not in h.effects)[:_MOST_HYPOTHESES]
 
 
-def predict(manoeuvre: Experiment, sensor: Sensor, effects: Sequence[str]) -> PredictedResponse:
-    """Simulate a manoeuvre with the baseline, and multiply its whitened sensitivities."""
+def predict(name: str, motion: Motion, begin_s: float, sensor: Sensor, effects: Sequence[str]
+            ) -> PredictedResponse:
+    """
+    Simulate a manoeuvre with the baseline, and multiply its whitened sensitivities.
+
+    begin_s: time of its motion at which it begins, s.
+    """
     at_rate = replace(sensor, rate_hz=min(sensor.rate_hz, _RATE_HZ))
-    parts = list(simulate_blocks(at_rate, manoeuvre.motion, 0, manoeuvre.begin_s))
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    recording = Recording(manoeuvre.name, columns.pop('time_s'), columns)
+    parts = list(simulate_blocks(at_rate, motion, 0, begin_s))
+    columns = {column: np.concatenate([part[column] for part in parts]) for column in parts[0]}
+    recording = Recording(name, columns.pop('time_s'), columns)
     comparison = at_search_rate(compare(recording, at_rate))
-    model = linear.build_linear_model([comparison], whiteners([comparison]), only=effects)
+    model = linear.build_linear_model([comparison], only=effects)
     keys = _keys(model)
     places = {key: place for place, key in enumerate(keys.values())}
     gram = np.zeros((len(places), len(places)))
@@ -269,7 +247,7 @@ def predict(manoeuvre: Experiment, sensor: Sensor, effects: Sequence[str]) -> Pr
         shown = [i for i, number in enumerate(channel.column_ids) if number in keys]
         ids = [places[keys[channel.column_ids[i]]] for i in shown]
         gram[np.ix_(ids, ids)] += channel.total_grams[f][1:, 1:][np.ix_(shown, shown)] / variance
-    return PredictedResponse(manoeuvre, model, places, gram)
+    return PredictedResponse(name, motion.duration_s / 60, model, places, gram)
 
 
 def _keys(model: LinearModel) -> dict[int, Key]:
@@ -285,20 +263,16 @@ def rank_responses(responses: Sequence[PredictedResponse],
     """Rank manoeuvres by their expected information per minute."""
     leaders = leading(hypotheses)
 
-    @cache
-    def best_variant(effect: str) -> int | None:
-        """Return the number of the variant of an effect that fits the samples best."""
-        return None if model is None else max(
-            _variants_of(model, effect), default=None,
-            key=lambda i: model.fit_variants([i], model.null_fit).log_evidence)
-
-    posteriors = []
-    for hypothesis in leaders:
-        seen = {e: i for e in hypothesis.effects if (i := best_variant(e)) is not None}
-        posteriors.append((_fitted(model, list(seen.values())), {*hypothesis.effects} - {*seen}))
+    # The variant of each effect that fits the samples best.
+    seen = {} if model is None else {effect: max(
+        numbers, key=lambda i: model.fit_variants([i], model.null_fit).log_evidence)
+        for effect in {e for h in leaders for e in h.effects}
+        if (numbers := _variants_of(model, effect))}
+    posteriors = [(_fitted(model, [seen[e] for e in h.effects if e in seen]),
+                   {*h.effects} - {*seen}) for h in leaders]
     total = sum(h.probability for h in leaders)
     probabilities = [h.probability / total for h in leaders]
-    worth = [ManoeuvreWorth(r.manoeuvre, expected_information(
+    worth = [ManoeuvreWorth(r.name, r.minutes, expected_information(
         r.gram, probabilities, [_belief(r, *p) for p in posteriors], _EVIDENCE_FACTOR))
         for r in responses]
     return tuple(sorted(worth, key=lambda w: -w.per_minute))
@@ -400,8 +374,8 @@ def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], sensor
             concerns_reference=True)
     if verdict.groups:
         ranked = _ranked_menu(verdict, sensor, model, seed)
-        group, best = verdict.groups[0], ranked[0].manoeuvre.name
-        why = f'to separate {", ".join(group[:-1])} and {group[-1]}'
+        group, best = verdict.groups[0], ranked[0].name
+        why = f'to separate {listed(group, "and")}'
         return _experiment(next(m for m, d in MENU.items() if d.text == best), why,
                            no_stage)._replace(menu=ranked)
     if verdict.status == 'no_gap' and not not_covered:
@@ -412,11 +386,9 @@ def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], sensor
     elif not_covered:
         why = f'because the recordings have no {", no ".join(not_covered)}'
     revealed_by = [effect_named(e).diagnosis.revealed_by for e in verdict.effects]
-    most = max(MENU, key=revealed_by.count)
-    if most not in revealed_by:
-        most = Manoeuvre.SPEEDS if verdict.status == 'unknown' or not not_covered \
-            else Manoeuvre.PLANES
-    return _experiment(most, why, no_stage)
+    usual = Manoeuvre.SPEEDS if verdict.status == 'unknown' or not not_covered \
+        else Manoeuvre.PLANES
+    return _experiment(next(filter(None, revealed_by), usual), why, no_stage)
 
 
 def _ranked_menu(verdict: Verdict, sensor: Sensor, model: LinearModel | None, seed: int
@@ -429,7 +401,7 @@ def _ranked_menu(verdict: Verdict, sensor: Sensor, model: LinearModel | None, se
         # At rest the pose is unknown, so that a baseline with effects of the stage has no place.
         with suppress(UserError):
             responses.append(predict(
-                Experiment(described.text, 0.0, motion),
+                described.text, motion, 0.0,
                 _remounted(sensor) if described.remounted else sensor, effects))
     return rank_responses(responses, verdict.hypotheses, model)
 

@@ -11,9 +11,10 @@ repeated samples, the distance of codes, the level of the noise, the Allan devia
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any, NamedTuple
 
 from adxl_ros.diagnose.comparison import at_search_rate, BaselineComparison, code_step_v
 from adxl_ros.diagnose.evidence import bridged, drifts_among
@@ -174,10 +175,8 @@ def coarse_codes(volts: np.ndarray, sensor: Sensor) -> Detection | None:
     bits, threshold = np.array([_lost_bits(v, sensor) for v in volts.T]), np.log2(COARSE_STEPS)
     if not (bits >= threshold).any():
         return None
-    common = 0.0
-    if not (bits < threshold).any():
-        common = float(np.nanmedian(bits) if np.nanmax(bits) - np.nanmin(bits) < threshold
-                       else np.nanmin(bits))
+    fewest = float(np.nanmin(bits))
+    common = fewest if fewest >= threshold else 0.0
     return _detection(
         Detector.COARSE_CODES, (sensor.lsb_v * 2 ** np.nan_to_num(bits)) ** 2 / 12, sensor,
         lost_bits=common, axis_lost_bits=np.where(bits - common >= threshold, bits - common, 0.0))
@@ -305,38 +304,36 @@ def _mains_frequency_hz(line_hz: float, rate_hz: float) -> float | None:
     return None
 
 
-@dataclass(frozen=True)
-class NoiseComparison:
-    """Recorded noise relative to simulated noise, all axes together."""
+def compare_noise(comparison: BaselineComparison, sensors: Mapping[str, tuple[Sensor, Sensor]],
+                  seed: int) -> dict[str, Any]:
+    """
+    Return recorded noise relative to simulated noise, all axes together, by label of `sensors`.
 
-    band_edges_hz: tuple[float, ...]  # Edges of the k bands of frequency, Hz, (k + 1,)
-    power_ratio: tuple[float, ...]  # Recorded power divided by simulated power, for each band
-    # Log likelihood of the recorded spectrum under the simulated power of each band (Whittle 1953)
-    log_likelihood: float
-    averaging_times_s: tuple[float, ...]  # Averaging times of the Allan deviation, s, (j,)
-    allan_ratio: tuple[float, ...]  # Recorded Allan deviation divided by the simulated one, (j,)
-
-
-def compare_noise(comparison: BaselineComparison, mean_sensor: Sensor, noise_sensor: Sensor,
-                  seed: int) -> NoiseComparison:
-    """Compare the residual after one sensor's mean output with the drawn noise of another."""
-    rate_hz = comparison.sensor.rate_hz
-    series = [bridged(v, comparison.used) / comparison.scale_v_per_mps2
-              for v in (comparison.residual_v(mean_sensor),
-                        comparison.simulated_noise_v(noise_sensor, seed))]
-    (frequency_hz, recorded), (_, simulated) = (
-        scipy.signal.periodogram(v, rate_hz, axis=0) for v in series)
+    A label has the sensor whose mean output is subtracted, and the one whose noise is drawn. The
+    log likelihood is that of the recorded spectrum under the simulated power of each band
+    (Whittle 1953).
+    """
+    rate_hz, scale = comparison.sensor.rate_hz, comparison.scale_v_per_mps2
+    times_s = [t for t in _TIMES_S if t * rate_hz >= 2 and 10 * t < len(comparison) / rate_hz]
+    frequency_hz = np.fft.rfftfreq(len(comparison), 1 / rate_hz)
     edges_hz = np.geomspace(max(frequency_hz[1], _LOWEST_EDGE_HZ), rate_hz / 2, _BANDS + 1)
     edges_hz[0] = 0.0
     bands = [(frequency_hz > low) & (frequency_hz <= high) for low, high in pairwise(edges_hz)]
-    levels = [(recorded[band], simulated[band].mean(axis=0)) for band in bands if band.any()]
-    times_s = [t for t in _TIMES_S if t * rate_hz >= 2 and 10 * t < len(comparison) / rate_hz]
-    allan = [[allan_deviation(v, round(t * rate_hz)) for v in series] for t in times_s]
-    return NoiseComparison(
-        tuple(edges_hz.tolist()),
-        tuple(float(recorded[band].sum() / simulated[band].sum()) for band in bands),
-        -sum(float(np.sum(power / level + np.log(level))) for power, level in levels),
-        tuple(times_s), tuple(float(np.sqrt(np.mean((a / b) ** 2))) for a, b in allan))
+    log_likelihoods = []
+    ratios: dict[str, Any] = {}
+    for label, (mean, noisy) in sensors.items():
+        series = [bridged(v, comparison.used) / scale for v in (
+            comparison.residual_v(mean), comparison.simulated_noise_v(noisy, seed))]
+        recorded, simulated = (scipy.signal.periodogram(v, rate_hz, axis=0)[1] for v in series)
+        ratios[f'power_ratio_{label}'] = [
+            float(recorded[band].sum() / simulated[band].sum()) for band in bands]
+        allan = [[allan_deviation(v, round(t * rate_hz)) for v in series] for t in times_s]
+        ratios[f'allan_ratio_{label}'] = [float(np.sqrt(np.mean((a / b) ** 2))) for a, b in allan]
+        levels = [(recorded[band], simulated[band].mean(axis=0)) for band in bands if band.any()]
+        log_likelihoods.append(-sum(float(np.sum(power / level + np.log(level)))
+                                    for power, level in levels))
+    return {'recording': comparison.name, 'bands_hz': edges_hz.tolist(), 'allan_s': times_s,
+            'log_likelihood_gain': log_likelihoods[-1] - log_likelihoods[0], **ratios}
 
 
 def allan_deviation(values: np.ndarray, count: int) -> np.ndarray:
@@ -346,26 +343,16 @@ def allan_deviation(values: np.ndarray, count: int) -> np.ndarray:
     return np.sqrt(np.mean(second_difference ** 2, axis=0) / 2) / count
 
 
-@dataclass(frozen=True)
-class NoiseRemainder:
-    """One statistic of a noise-like effect, in the recordings and in their simulation."""
+class NoiseRemainder(NamedTuple):
+    """One statistic of a noise-like effect on the axis where it is largest."""
 
     effect: str  # Name of the effect
     quantity: str  # What is compared, for people
     unit: str  # Unit of the values: 'm/s^2', '1/s' or '1'
-    axes: str  # Measured axes, or empty where all have the same value
-    recorded: np.ndarray  # Value in the recordings by axis, (m,) or (1,)
-    simulated: np.ndarray  # The same in the simulation with the effect
-
-    @property
-    def largest(self) -> int:
-        """Return the number of the axis on which the recorded value is largest."""
-        return int(np.argmax(self.recorded))
-
-    @property
-    def remains(self) -> np.ndarray:
-        """Return the magnitude of recorded minus simulated, in the shape of `recorded`."""
-        return np.abs(self.recorded - self.simulated)
+    axis: str  # Measured axis, or empty where all have the same value
+    recorded: float  # Value in the recordings
+    simulated: float  # The same in the simulation with the effect
+    mean_square: float  # Mean square over axes of the values in the recordings
 
 
 def noise_remainders(comparisons: Sequence[BaselineComparison], mean_sensor: Sensor,
@@ -389,8 +376,10 @@ def noise_remainders(comparisons: Sequence[BaselineComparison], mean_sensor: Sen
     remainders: list[NoiseRemainder] = []
     for key, pairs in values.items():
         recorded, simulated = np.sqrt(np.mean(np.square(np.array(pairs, float)), axis=0))
-        axes = named_sensor.axes if len(recorded) == len(named_sensor.axes) else ''
-        remainders.append(NoiseRemainder(*key, axes, recorded, simulated))
+        largest, axes = int(np.argmax(recorded)), named_sensor.axes
+        remainders.append(NoiseRemainder(
+            *key, axes[largest] if len(recorded) == len(axes) else '', float(recorded[largest]),
+            float(simulated[largest]), float(np.mean(recorded ** 2))))
     return remainders
 
 
@@ -450,9 +439,9 @@ def floor_without(floor_mps2: float, remainders: Sequence[NoiseRemainder], state
     """
     square = floor_mps2 ** 2
     for r in remainders:
-        detector, recorded = effect_named(r.effect).diagnosis.detector, np.mean(r.recorded ** 2)
+        detector = effect_named(r.effect).diagnosis.detector
         if detector is Detector.MAINS_LINE:
-            square -= recorded / 2
+            square -= r.mean_square / 2
         elif detector is Detector.NOISE_LEVEL:
-            square -= recorded - stated_mps2 ** 2
+            square -= r.mean_square - stated_mps2 ** 2
     return float(np.sqrt(max(square, min(stated_mps2, floor_mps2) ** 2)))

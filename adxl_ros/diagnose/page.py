@@ -8,15 +8,14 @@ effect's own variable, or spectra with and without it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 from adxl_ros.diagnose import report as words
 from adxl_ros.diagnose.comparison import BaselineComparison
 from adxl_ros.diagnose.diagnosis import Diagnosis, Report
 from adxl_ros.diagnose.evidence import bridged
-from adxl_ros.diagnose.next_experiment import by_effect
 from adxl_ros.diagnose.residual_map import BLOCK_S, ResidualCell, SIGNIFICANT_P
 from adxl_ros.model import noise
 from adxl_ros.model.constants import AXES, Z_90
@@ -28,6 +27,7 @@ from adxl_ros.report import figures as plots, page as html_page
 from adxl_ros.report.figures import Figure, figure, line, rounded
 from adxl_ros.report.quantities import decimals, mg, mg_text, percent
 import numpy as np
+import pandas as pd
 import scipy
 
 _BINS, _FEWEST_SAMPLES = 10, 20
@@ -55,15 +55,6 @@ _CURVE_COLOURS = {'recorded': _INK, 'stated noise': plots.QUIET_COLOUR} | dict.f
         ('after', 'with the effect'), plots.AFTER_COLOUR)
 _WIDE = {'l': 8, 'r': 12, 't': 36, 'b': 8}
 """Margins of a plot with a legend, pixels."""
-
-
-class Curve(NamedTuple):
-    """A spectrum of one axis."""
-
-    axis: str
-    label: str
-    x: np.ndarray
-    y: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -118,7 +109,9 @@ def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> 
     return {
         'has_verdict': True,
         'figures': {'waterfall': waterfall(report), 'signals': signals(compared, best.sensor),
-                    'spectrum': gap_spectrum(full_rate, best.sensor),
+                    'spectrum': _spectra(full_rate, {
+                        'before': full_rate.residual_v(full_rate.sensor),
+                        'after': full_rate.residual_v(best.sensor)}, True),
                     **{f'proof-{name}': drawn for name, (drawn, _) in proofs.items()}},
         'tiles': rows[:3] + [r for r in rows[3:] if r.label in (
             'upper limit', 'explained', 'repeats, not explained')][:4 - len(rows[:3])],
@@ -135,8 +128,7 @@ def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> 
         'where': [_cell(c) for c in report.residual_cells if c.p < SIGNIFICANT_P][:_MOST_CELLS],
         'menu': [[m['manoeuvre'], f'{m["minutes"]:.1f}', f'{m["nats_per_minute"]:.2g}']
                  for m in proposal['menu']] if proposal else [],
-        'could_show': [(row.shows, *words.shown_row(row, scale))
-                       for row in by_effect(report.could_show).values()]}
+        'could_show': [(row.shows, *words.shown_row(row, scale)) for row in report.could_show]}
 
 
 def _cell(cell: ResidualCell) -> list[str]:
@@ -162,20 +154,17 @@ def _proof(effect: str, comparison: BaselineComparison, full_rate: BaselineCompa
     neutral = with_neutral(comparison.sensor, [effect]).values[effect]
     without = replace(sensor, values={**sensor.values, effect: neutral})
     labelled = {'without the effect': without, 'with the effect': sensor}
-    if not acts_on_noise and Over.FREQUENCY not in variables:
-        return _binned(variables, comparison, sensor, without), \
-            'Points: recording minus a simulation with all other effects, with 90 % bars. ' \
-            'Line: the model of this effect.'
     if acts_on_noise:
-        text = 'The effect is there if the recorded spectrum follows the green line, not the ' \
-            'red one.'
-        signals_v = {'recorded': full_rate.residual_v(sensor)} | {
-            label: full_rate.simulated_noise_v(s, 0) for label, s in labelled.items()}
-    else:
-        text = 'The effect is there if the spectrum of the difference falls from red to green.'
-        signals_v = {label: full_rate.residual_v(s) for label, s in labelled.items()}
-    curves = [curve for label, v in signals_v.items() for curve in _spectra(full_rate, v, label)]
-    return _panels(curves, Over.FREQUENCY.value, 'mg/√Hz'), text
+        return _spectra(full_rate, {'recorded': full_rate.residual_v(sensor)} | {
+            label: full_rate.simulated_noise_v(s, 0) for label, s in labelled.items()}), \
+            'The effect is there if the recorded spectrum follows the green line, not the red one.'
+    if Over.FREQUENCY in variables:
+        return _spectra(full_rate, {label: full_rate.residual_v(s)
+                                    for label, s in labelled.items()}), \
+            'The effect is there if the spectrum of the difference falls from red to green.'
+    return _binned(variables, comparison, sensor, without), \
+        'Points: recording minus a simulation with all other effects, with 90 % bars. ' \
+        'Line: the model of this effect.'
 
 
 def _binned(variables: Sequence[Over], comparison: BaselineComparison, sensor: Sensor,
@@ -184,36 +173,33 @@ def _binned(variables: Sequence[Over], comparison: BaselineComparison, sensor: S
     to_mg, used = mg(1 / comparison.scale_v_per_mps2), comparison.used
     residual_mg = (comparison.residual_v(without) * to_mg)[used]
     model_mg = residual_mg - (comparison.residual_v(sensor) * to_mg)[used]
+
+    def share(values: np.ndarray) -> float:
+        """Return the share of the model's squares between the ranges of a variable."""
+        between = [(pd.Series(m).groupby(_places(v)).transform('mean') ** 2).sum()
+                   for v, m in zip(values.T, model_mg.T)]
+        return float(sum(between) / max(np.sum(model_mg ** 2), 1e-300))
+
+    known = {v.value: values[used] for v, values in _variables(comparison).items()
+             if v in variables}
+    best = max(known, key=lambda name: share(known[name]), default='')
+    if not best or share(known[best]) <= _SMALLEST_SHARE:
+        best, known = _CONTRIBUTION, {_CONTRIBUTION: model_mg}
     block = np.flatnonzero(used) // max(round(BLOCK_S * comparison.sensor.rate_hz), 1)
-    best, values, largest = _CONTRIBUTION, model_mg, _SMALLEST_SHARE
-    for variable, candidate in _variables(comparison).items():
-        if variable in variables:
-            # Share of the variance of the model that lies between the ranges of the variable.
-            between = 0.0
-            for v, m in zip(candidate[used].T, model_mg.T):
-                place = _places(v)
-                count = np.maximum(np.bincount(place), 1)
-                between += float(np.sum(np.bincount(place, m) ** 2 / count))
-            share = between / max(float(np.sum(model_mg ** 2)), 1e-300)
-            if share > largest:
-                best, values, largest = variable.value, candidate[used], share
     traces = []
     for d, axis in enumerate(comparison.sensor.axes):
-        place, colour = _places(values[:, d]), plots.AXIS_COLOURS[axis]
-        count = np.bincount(place)
-        filled = count >= min(_FEWEST_SAMPLES, int(count.max()))
-        count = np.maximum(count, 1)
-        x, recorded, model = (np.bincount(place, v[:, d]) / count
-                              for v in (values, residual_mg, model_mg))
+        place, colour = _places(known[best][:, d]), plots.AXIS_COLOURS[axis]
+        groups = pd.DataFrame({'x': known[best][:, d], 'recorded': residual_mg[:, d],
+                               'model': model_mg[:, d]}).groupby(place)
+        means, count = groups.mean(), groups.size()
         # The noise is correlated, so that the sums of whole blocks give the error of a mean.
-        noise_mg = (residual_mg - model_mg)[:, d] - (recorded - model)[place]
-        blocks = int(block.max()) + 1
-        sums = np.bincount(place * blocks + block, noise_mg, len(count) * blocks)
-        std = np.sqrt(np.sum(sums.reshape(-1, blocks) ** 2, axis=1)) / count
-        x, recorded, model, half = (v[filled] for v in (x, recorded, model, Z_90 * std))
-        order = np.argsort(x)
-        traces += [plots.points(x, recorded, half, f'{axis} recorded', colour),
-                   line(x[order], model[order], f'{axis} model', colour)]
+        noise_mg = pd.Series((residual_mg - model_mg)[:, d]
+                             - (means.recorded - means.model)[place].to_numpy())
+        squares = noise_mg.groupby([place, block]).sum() ** 2
+        means['half'] = Z_90 * np.sqrt(squares.groupby(level=0).sum()) / count
+        means = means[count >= min(_FEWEST_SAMPLES, count.max())].sort_values('x')
+        traces += [plots.points(means.x, means.recorded, means.half, f'{axis} recorded', colour),
+                   line(means.x, means.model, f'{axis} model', colour)]
     return figure(traces, 300, xaxis={'title': {'text': best}}, margin=_WIDE,
                   yaxis={'title': {'text': 'recording minus simulation, mg'}})
 
@@ -252,19 +238,31 @@ def _variables(comparison: BaselineComparison) -> dict[Over, np.ndarray]:
     return of_axes | {name: np.repeat(v[:, None], len(axes), axis=1) for name, v in of_all.items()}
 
 
-def _spectra(comparison: BaselineComparison, signal_v: np.ndarray, label: str) -> list[Curve]:
-    """Estimate spectra, mg/√Hz, by axis, with equally dense points per octave."""
-    signal_mg = mg(bridged(signal_v, comparison.used) / comparison.scale_v_per_mps2)
-    frequency_hz, power = scipy.signal.welch(
-        np.nan_to_num(signal_mg), comparison.sensor.rate_hz, axis=0,
-        nperseg=min(_SEGMENT, len(signal_mg)))
-    frequency_hz, power = frequency_hz[1:], power[1:]
-    place = np.floor(np.log2(frequency_hz / frequency_hz[0]) * _POINTS_PER_OCTAVE).astype(int)
-    _, place = np.unique(place, return_inverse=True)
-    count = np.bincount(place)
-    mean_hz = np.bincount(place, frequency_hz) / count
-    return [Curve(axis, label, mean_hz, np.sqrt(np.bincount(place, power[:, d]) / count))
-            for d, axis in enumerate(comparison.sensor.axes)]
+def _spectra(comparison: BaselineComparison, signals_v: Mapping[str, np.ndarray],
+             with_stated: bool = False) -> Figure:
+    """
+    Draw spectra of signals, V, (n, m), and the stated noise, in one panel for each axis.
+
+    Points are equally dense per octave.
+    """
+    sensor, scale, densities = comparison.sensor, comparison.scale_v_per_mps2, {}
+    for label, signal_v in signals_v.items():
+        signal_mg = np.nan_to_num(mg(bridged(signal_v, comparison.used) / scale))
+        all_hz, power = (v[1:] for v in scipy.signal.welch(
+            signal_mg, sensor.rate_hz, axis=0, nperseg=min(_SEGMENT, len(signal_mg))))
+        octave = np.floor(np.log2(all_hz / all_hz[0]) * _POINTS_PER_OCTAVE)
+        hz = pd.Series(all_hz).groupby(octave).mean().to_numpy()
+        densities[label] = np.sqrt(pd.DataFrame(power).groupby(octave).mean().to_numpy())
+    if with_stated:
+        densities['stated noise'] = mg(np.sqrt(noise.density_v2_per_hz(sensor, hz)) / scale)
+    panels = []
+    for d, axis in enumerate(sensor.axes):
+        curves = {label: np.where(v[:, d] > 0, v[:, d], np.nan) for label, v in densities.items()}
+        panels.append(({'title': {'text': f'{axis}, mg/√Hz'},
+                        **plots.log_axis(np.concatenate(list(curves.values())))},
+                       [line(hz, v, label, _CURVE_COLOURS[label]) for label, v in curves.items()]))
+    return _stacked(panels, 60 + 190 * len(panels), _WIDE,
+                    {'title': {'text': Over.FREQUENCY.value}, **plots.log_axis(hz)})
 
 
 def waterfall(report: Report) -> Figure:
@@ -308,19 +306,6 @@ def _stacked(panels: Sequence[tuple[dict[str, Any], Sequence[Figure]]], height: 
                   xaxis={'anchor': plots.axis_number('y', count), **xaxis}, **layout)
 
 
-def _panels(curves: Sequence[Curve], title: str, unit: str) -> Figure:
-    """Draw curves in one panel for each axis."""
-    panels = []
-    for axis in dict.fromkeys(curve.axis for curve in curves):
-        own = [c for c in curves if c.axis == axis]
-        panels.append(({'title': {'text': f'{axis}, {unit}'},
-                        **plots.log_axis(np.concatenate([c.y for c in own]))},
-                       [line(c.x[c.y > 0], c.y[c.y > 0], c.label, _CURVE_COLOURS[c.label])
-                        for c in own]))
-    return _stacked(panels, 60 + 190 * len(panels), _WIDE, {
-        'title': {'text': title}, **plots.log_axis(curves[0].x)})
-
-
 def signals(comparison: BaselineComparison, after: Sensor) -> Figure:
     """Draw recording, simulation and difference, before and after, with linked zoom."""
     time_s, scale = comparison.time_s - comparison.time_s[0], comparison.scale_v_per_mps2
@@ -343,15 +328,3 @@ def signals(comparison: BaselineComparison, after: Sensor) -> Figure:
             panels.append(({'title': {'text': label.format(axis)}, 'nticks': 5}, lines))
     return _stacked(panels, 80 + 150 * len(panels), {**_WIDE, 't': 60},
                     {'title': {'text': 'time, s'}})
-
-
-def gap_spectrum(comparison: BaselineComparison, after: Sensor) -> Figure:
-    """Draw the spectrum of the gap before and after, and the stated noise."""
-    curves = [*_spectra(comparison, comparison.residual_v(comparison.sensor), 'before'),
-              *_spectra(comparison, comparison.residual_v(after), 'after')]
-    frequency_hz = curves[0].x
-    stated = mg(np.sqrt(noise.density_v2_per_hz(comparison.sensor, frequency_hz))
-                / comparison.scale_v_per_mps2)
-    curves += [Curve(axis, 'stated noise', frequency_hz, stated[:, d])
-               for d, axis in enumerate(comparison.sensor.axes)]
-    return _panels(curves, Over.FREQUENCY.value, 'mg/√Hz')

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from adxl_ros.diagnose.comparison import Reference
 from adxl_ros.diagnose.diagnosis import Diagnosis, Report
-from adxl_ros.diagnose.next_experiment import by_effect, CouldShow, MENU
+from adxl_ros.diagnose.next_experiment import CouldShow, MENU
 from adxl_ros.diagnose.residual_map import SIGNIFICANT_P
 from adxl_ros.diagnose.search import Hypothesis
 from adxl_ros.diagnose.verdict import UNKNOWN, Verdict
@@ -68,49 +68,46 @@ class Row(NamedTuple):
 def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the report as the objects of JSON; docs/reference/report_json.md lists its keys."""
     fault, report = diagnosis.fault, diagnosis.report
-    if fault is not None:
+    if report is None:
+        assert fault is not None
         return {'schema': 1, 'verdict': {
             'status': fault.status, 'effects': [], 'groups': [], 'of': None,
             'data_fault': fault.name if fault.status == 'bad_data' else None,
             'probability': 1.0}, 'hypotheses': [], 'gap': None, 'where': [], 'candidates': [],
             'notes': notes(diagnosis), 'next_experiment': None, 'summary': fault.message}
-    assert report is not None
     verdict, proposal = report.verdict, report.next_experiment
     # Rounded probabilities still sum to 1.
     probabilities = [round(h.probability, _DIGITS) for h in verdict.hypotheses]
     probabilities[0] = round(1 - sum(probabilities[1:]), _DIGITS)
-    return {
+    return _rounded({
         'schema': 1,
-        'verdict': {'status': verdict.status, 'effects': list(verdict.effects),
-                    'groups': [list(group) for group in verdict.groups], 'of': concern(verdict),
-                    'data_fault': None, 'probability': _rounded(verdict.probability)},
-        'hypotheses': [{'effects': list(h.effects), 'probability': p}
+        'verdict': {'status': verdict.status, 'effects': verdict.effects,
+                    'groups': verdict.groups, 'of': concern(verdict), 'data_fault': None,
+                    'probability': verdict.probability},
+        'hypotheses': [{'effects': h.effects, 'probability': p}
                        for h, p in zip(verdict.hypotheses, probabilities)],
-        'gap': _gap(diagnosis, report),
+        'gap': _gap(report),
         'explained': _power(verdict.explained), 'rest': _power(verdict.rest),
-        'rest_follows': list(verdict.rest_follows),
-        'material': _rounded(verdict.material_mps2),
+        'rest_follows': verdict.rest_follows, 'material': verdict.material_mps2,
         'lost_without': {e: _power(p) for e, p in verdict.lost_without.items()},
-        'where': [{'axis': c.axis, 'dimension': c.dimension, 'range': _rounded((c.low, c.high)),
-                   'mean': _rounded(c.mean_mps2), 'share': _rounded(c.share), 'p': _rounded(c.p)}
+        'where': [{'axis': c.axis, 'dimension': c.dimension, 'range': (c.low, c.high),
+                   'mean': c.mean_mps2, 'share': c.share, 'p': c.p}
                   for c in report.residual_cells if c.p < SIGNIFICANT_P][:_MOST_CELLS],
-        'not_covered': list(report.not_covered), 'notes': notes(diagnosis),
+        'not_covered': report.not_covered, 'notes': notes(diagnosis),
         'could_show': [
             {'effect': r.effect, 'parameter': r.name.parameter, 'axis': r.name.axis or None,
-             'unit': parameter_of(r.name).unit, 'smallest': _rounded(r.smallest),
-             'could_show': r.shows} for r in report.could_show],
+             'unit': parameter_of(r.name).unit, 'smallest': r.smallest, 'could_show': r.shows}
+            for r in report.could_show],
         'candidates': _candidates(report),
         'noise_remainders': [
-            {'effect': r.effect, 'quantity': r.quantity, 'unit': r.unit,
-             'axis': r.axes[r.largest] if r.axes else None,
-             'recorded': _rounded(r.recorded[r.largest]),
-             'simulated': _rounded(r.simulated[r.largest]),
-             'left': _rounded(r.remains[r.largest])} for r in report.noise_remainders],
+            {'effect': r.effect, 'quantity': r.quantity, 'unit': r.unit, 'axis': r.axis or None,
+             'recorded': r.recorded, 'simulated': r.simulated,
+             'left': abs(r.recorded - r.simulated)} for r in report.noise_remainders],
         'next_experiment': proposal and {
             'manoeuvre': proposal.manoeuvre, 'why': proposal.why, 'command': proposal.command,
-            'menu': [{'manoeuvre': w.manoeuvre.name, 'minutes': _rounded(w.manoeuvre.minutes),
-                      'nats_per_minute': _rounded(w.per_minute)} for w in proposal.menu]},
-        'summary': summary(diagnosis)}
+            'menu': [{'manoeuvre': w.name, 'minutes': w.minutes, 'nats_per_minute': w.per_minute}
+                     for w in proposal.menu]},
+        'summary': summary(diagnosis)})
 
 
 def notes(diagnosis: Diagnosis) -> list[str]:
@@ -121,41 +118,34 @@ def notes(diagnosis: Diagnosis) -> list[str]:
 
 
 def _rounded(value: Any) -> Any:
-    """Round one or several numbers to the digits of the report; None for NaN and infinity."""
-    if isinstance(value, Sequence):
+    """Round all numbers to the digits of the report; None for NaN and infinity."""
+    if isinstance(value, dict):
+        return {key: _rounded(v) for key, v in value.items()}
+    if isinstance(value, (list, tuple)):
         return [_rounded(v) for v in value]
+    if not isinstance(value, float):
+        return value
     return float(f'{value:.{_DIGITS}g}') if np.isfinite(value) else None
 
 
 def _power(power: Interval) -> dict[str, Any]:
     """Return a power, (m/s²)², with its interval."""
-    return {'value': _rounded(power.value), 'ci': _rounded((power.low, power.high)),
-            'unit': '(m/s^2)^2'}
+    return {'value': power.value, 'ci': (power.low, power.high), 'unit': '(m/s^2)^2'}
 
 
-def _gap(diagnosis: Diagnosis, report: Report) -> dict[str, Any]:
+def _gap(report: Report) -> dict[str, Any]:
     """Return the gap before and after, and the noise recording by recording."""
-    closure, has_gap = report.closure, report.verdict.status not in _WITHOUT_GAP
-    noise = [{'recording': comparison.name,
-              'bands_hz': _rounded(after.band_edges_hz),
-              'power_ratio_before': _rounded(before.power_ratio),
-              'power_ratio_after': _rounded(after.power_ratio),
-              'log_likelihood_gain': _rounded(after.log_likelihood - before.log_likelihood),
-              'allan_s': list(after.averaging_times_s),
-              'allan_ratio_before': _rounded(before.allan_ratio),
-              'allan_ratio_after': _rounded(after.allan_ratio)}
-             for comparison, before, after in zip(diagnosis.comparisons, report.noise_before,
-                                                  report.noise_after)]
+    closure, verdict = report.closure, report.verdict
     figures: dict[str, Any] = {'unit': 'm/s^2'}
     for name, figure in closure._asdict().items():
-        figures[name] = _rounded(figure.value)
-        figures[f'{name}_ci'] = _rounded((figure.low, figure.high))
-    return {**figures, 'floor_ci': figures['floor_ci'] if np.isfinite(closure.floor.low) else None,
-            'closed': figures['closed'] if has_gap else None,
-            'floor_source': report.noise_floor.source,
-            'upper_limit': _rounded(report.verdict.upper_limit_mps2),
-            'reference': _rounded(report.verdict.reference_mps2),
-            'not_in_reference': _rounded(report.linear_model.lost_motion_mps2), 'noise': noise}
+        figures |= {name: figure.value, f'{name}_ci': (figure.low, figure.high)}
+    if verdict.status in _WITHOUT_GAP:
+        figures['closed'] = None
+    if not np.isfinite(closure.floor.low):
+        figures['floor_ci'] = None
+    return {**figures, 'floor_source': report.noise_floor.source,
+            'upper_limit': verdict.upper_limit_mps2, 'reference': verdict.reference_mps2,
+            'not_in_reference': report.linear_model.lost_motion_mps2, 'noise': report.noise}
 
 
 def shares_of_gap(report: Report) -> dict[str, float]:
@@ -171,7 +161,7 @@ def shares_of_gap(report: Report) -> dict[str, float]:
 
 def _candidates(report: Report) -> list[dict[str, Any]]:
     """Return the effects of all hypotheses and detections, the most probable first."""
-    verdict, shown = report.verdict, by_effect(report.could_show)
+    verdict, shown = report.verdict, {row.effect: row for row in report.could_show}
     detected, shares = {d.effect: d for d in report.detections}, shares_of_gap(report)
     out = []
     for name, effect in library().items():
@@ -188,13 +178,12 @@ def _candidates(report: Report) -> list[dict[str, Any]]:
         group = next((g for g in reversed(verdict.groups) if name in g), ())
         out.append({
             'effect': name, 'of': effect.concern.value,
-            'probability': _rounded(min(sum(h.probability for h in sets), 1.0)),
-            'closed': _rounded(report.closure.closed.value) if name in verdict.best else None,
+            'probability': min(sum(h.probability for h in sets), 1.0),
+            'closed': report.closure.closed.value if name in verdict.best else None,
             # The rule weighs held-out figures, and no effect has a p of its own.
             'p': None,
             'parameters': parameters,
-            'share': _rounded(shares[name]) if name in shares else None,
-            'visibility': _rounded(shown[name].share) if name in shown else 1.0,
+            'share': shares.get(name), 'visibility': shown[name].share if name in shown else 1.0,
             'inseparable_from': [other for other in group if other != name],
             'cause': effect.cause})
     return sorted(out, key=lambda c: (-c['probability'], c['effect']))
@@ -209,7 +198,7 @@ def _parameters(report: Report, hypothesis: Hypothesis | None, effect: str) -> d
     names, sensor = fitted_of(effect_named(effect), report.sensor.axes), report.sensor
     if effect_named(effect).diagnosis.drift and effect in sensor.effects:
         # The density of a drift is chosen with the noise, on a grid.
-        return {_key(name): {'value': _rounded(float(get(sensor, [name])[0])),
+        return {_key(name): {'value': float(get(sensor, [name])[0]),
                              'unit': parameter_of(name).unit} for name in names}
     parameters: dict[str, dict[str, Any]] = {}
     for name in names:
@@ -219,8 +208,8 @@ def _parameters(report: Report, hypothesis: Hypothesis | None, effect: str) -> d
         value, half = float(get(hypothesis.sensor, [name])[0]), Z_90 * hypothesis.std[place]
         known = not hypothesis.undetermined[place]
         parameters[_key(name)] = {
-            'value': _rounded(value) if known else None,
-            'ci': _rounded((value - half, value + half)) if known else None,
+            'value': value if known else None,
+            'ci': (value - half, value + half) if known else None,
             'unit': parameter_of(name).unit, 'determined': known}
     return parameters
 
@@ -336,10 +325,9 @@ def remainder_rows(report: Report) -> list[Row]:
             return mg_text(value)
         return f'{100 * value:.2g} %' if unit == '1' else f'{value:.2g} a second'
 
-    return [Row(f'{r.effect}, {r.quantity}{f" on {r.axes[r.largest]}" if r.axes else ""}',
-                '{} recorded, {} simulated, {} left'.format(*(
-                    text(float(v[r.largest]), r.unit)
-                    for v in (r.recorded, r.simulated, r.remains))))
+    return [Row(f'{r.effect}, {r.quantity}{f" on {r.axis}" if r.axis else ""}',
+                '{} recorded, {} simulated, {} left'.format(*(text(v, r.unit) for v in (
+                    r.recorded, r.simulated, abs(r.recorded - r.simulated)))))
             for r in report.noise_remainders]
 
 
@@ -377,16 +365,17 @@ _BADGE_COLUMNS, _GAP_COLUMNS, _LABEL_COLUMNS = 29, 24, 9
 """Columns of the verdict, of the gap before and after, and of the words before rows of text."""
 _SURE_COLUMNS, _SHARE_COLUMNS = 8, 7
 """Columns of the table of effects."""
-_MOST_SHOWN, _MOST_HIDDEN, _MOST_OTHERS = 4, 4, 3
-"""Effects that the screen lists; the page has all of them."""
+_MOST_OTHERS = 3
+"""Other effects that the screen lists; the page has all of them."""
 
 
 def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
     """Return the diagnosis as lines of at most `COLUMNS` columns; the first one is the subject."""
     lines, word, report = [*wrapped(subject), ''], badge(diagnosis), diagnosis.report
-    note_lines = [line for note in notes(diagnosis) for line in _row_lines('note', note)]
+    labelled = [('note', note) for note in notes(diagnosis)]
     if report is None:
-        return lines + wrapped(f'{word}  {headline(diagnosis)}', len(word) + 2) + note_lines
+        return lines + wrapped(f'{word}  {headline(diagnosis)}', len(word) + 2) \
+            + _labelled(labelled)
     objects, rows = as_json(diagnosis), figure_rows(diagnosis)
     closure, first = report.closure, {row.label: row.note for row in rows}
     # The gap, with the effects, and the floor stand in the first line.
@@ -394,42 +383,23 @@ def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
     gap = f'{mg_text(closure.before.value)}{after} rms'
     lines.append(f'{word:{_BADGE_COLUMNS - 1}} {gap:{_GAP_COLUMNS - 1}} noise floor '
                  f'{mg_text(closure.floor.value)}')
-    remarks = [first['with the effects']] if closes(report) else \
-        [] if 'sim' in first['gap'] else [f'gap {first["gap"]}']
+    remark = first.get('with the effects', '' if 'sim' in first['gap'] else f'gap {first["gap"]}')
     lines += [f'{"":{_BADGE_COLUMNS}}{line}'
-              for remark in (*remarks, f'noise floor {first["noise floor"]}')
-              for line in wrap(remark, COLUMNS - _BADGE_COLUMNS)]
+              for text in (remark, f'noise floor {first["noise floor"]}')
+              for line in wrap(text, COLUMNS - _BADGE_COLUMNS)]
     if report.verdict.status != 'explained' or 'REFERENCE' in word:
         lines += wrapped(headline(diagnosis))
     elif is_only_noise(report):
         lines += wrapped(NOISE_STAYS)
-    lines += [*_effect_table(report, objects), '', *_row_lines('figures', '; '.join(
-        f'{row.label} {row.text}' for row in rows[3 if closes(report) else 2:]))]
-    lines += [line for i, row in enumerate(remainder_rows(report))
-              for line in _row_lines('' if i else 'noise', f'{row.label}: {row.text}')]
-    lines += _row_lines('shows', shown_text(report))
-    named, causes = named_effects(report, objects), {
-        c['effect']: c['cause'] for c in objects['candidates']}
-    width = max(map(len, named), default=0) + 2
-    return lines + [line for i, name in enumerate(named)
-                    for line in _row_lines('' if i else 'cause', f'{name:{width}}{causes[name]}',
-                                           _LABEL_COLUMNS + width)] + note_lines
-
-
-def shown_text(report: Report) -> str:
-    """Return how many effects would have shown, some of them, and some that could not."""
-    rows = by_effect(report.could_show)
-    scale = float(report.baseline.scale_v_per_g.mean())
-    shown = [f'{name} from {shown_row(row, scale)[2]}' for name, row in rows.items()
-             if row.shows and name not in report.verdict.named]
-    hidden = [name for name, row in rows.items() if not row.shows]
-    text = f'{sum(r.shows for r in rows.values())} of {len(rows)} effects could show'
-    if shown:
-        text += f': {", ".join(shown[:_MOST_SHOWN])}, ...'
-    if hidden:
-        more = ', ...' if len(hidden) > _MOST_HIDDEN else ''
-        text += f'; could not: {", ".join(hidden[:_MOST_HIDDEN])}{more}'
-    return text
+    shown = report.could_show
+    hidden = ', '.join(row.effect for row in shown if not row.shows)
+    return [*lines, *_effect_table(report, objects), '', *_labelled([
+        ('figures', '; '.join(f'{row.label} {row.text}' for row in rows[2 + closes(report):])),
+        *(('noise', f'{row.label}: {row.text}') for row in remainder_rows(report)),
+        ('shows', f'{sum(row.shows for row in shown)} of {len(shown)} effects could show'
+         + f'; could not: {hidden}' * bool(hidden)),
+        *(('cause', f'{name}: {effect_named(name).cause}')
+          for name in named_effects(report, objects)), *labelled])]
 
 
 def named_effects(report: Report, objects: dict[str, Any]) -> list[str]:
@@ -440,14 +410,9 @@ def named_effects(report: Report, objects: dict[str, Any]) -> list[str]:
 
 
 def _effect_table(report: Report, objects: dict[str, Any]) -> list[str]:
-    """Lay out the named effects, and the probable ones that are not named."""
+    """Lay out the named effects, and other probable hypotheses."""
     named = named_effects(report, objects)
     candidates = {c['effect']: c for c in objects['candidates']}
-    others = [(c['probability'], name) for name, c in candidates.items()
-              if name not in named and c['probability'] >= PROBABLE]
-    unknown = sum(h['probability'] for h in objects['hypotheses'] if UNKNOWN in h['effects'])
-    if unknown >= PROBABLE and report.verdict.status != 'unknown':
-        others.append((unknown, 'something unknown'))
     width = max(map(len, ('effect', *named))) + 2
     size_columns = COLUMNS - 1 - width - _SURE_COLUMNS - _SHARE_COLUMNS
     lines = ['', f' {"effect":{width}}{"sure":{_SURE_COLUMNS}}'
@@ -459,11 +424,14 @@ def _effect_table(report: Report, objects: dict[str, Any]) -> list[str]:
         lines.append(f' {name:{width}}{sure:{_SURE_COLUMNS}}{first:{size_columns}}'
                      f'{"" if share is None else percent(share):>{_SHARE_COLUMNS}}'.rstrip())
         lines += [f'{"":{1 + width + _SURE_COLUMNS}}{size}' for size in more]
-    if others:
-        texts = [f'{name} ({percent(p)})' for p, name in sorted(others, reverse=True)]
-        lines += [] if named else ['']
-        lines += _row_lines('', 'also possible: ' + listed(texts[:_MOST_OTHERS], 'and'), 1)
-    return lines
+    others = {name: c['probability'] for name, c in candidates.items() if name not in named}
+    if report.verdict.status != 'unknown':
+        others['something unknown'] = sum(h['probability'] for h in objects['hypotheses']
+                                          if UNKNOWN in h['effects'])
+    texts = [f'{name} ({percent(p)})' for p, name in sorted(zip(others.values(), others),
+                                                            reverse=True) if p >= PROBABLE]
+    return lines + [''] * bool(texts and not named) + wrapped(
+        ' also possible: ' * bool(texts) + listed(texts[:_MOST_OTHERS], 'and'), 1)
 
 
 def size_lines(report: Report, candidate: dict[str, Any]) -> list[str]:
@@ -483,6 +451,11 @@ def size_lines(report: Report, candidate: dict[str, Any]) -> list[str]:
                     if zeros else [])
 
 
-def _row_lines(label: str, text: str, indent: int = _LABEL_COLUMNS) -> list[str]:
-    """Return a text behind its label, wrapped between words."""
-    return wrapped(f' {label:{min(indent, _LABEL_COLUMNS) - 1}}{text}', indent)
+def _labelled(rows: Sequence[tuple[str, str]]) -> list[str]:
+    """Return texts behind their labels, wrapped between words; equal labels stand once."""
+    lines, last = [], ''
+    for label, text in rows:
+        shown = '' if label == last else label
+        lines += wrapped(f' {shown:{_LABEL_COLUMNS - 1}}{text}', _LABEL_COLUMNS)
+        last = label
+    return lines

@@ -34,6 +34,7 @@ from adxl_ros.model.effects.base import FormDimension as Form
 from adxl_ros.model.filters import loop, low_pass
 from adxl_ros.model.sensor import Sensor
 import numpy as np
+import scipy
 
 RANGES = 8
 """Number of ranges of a dimension, with equally many samples. Chosen: a row of the page."""
@@ -334,11 +335,9 @@ def tilt_deg(time_s: np.ndarray, recorded: np.ndarray, simulated: np.ndarray) ->
 
 def velocity_mps(time_s: np.ndarray, recorded: np.ndarray, simulated: np.ndarray) -> float:
     """Return the rms velocity, m/s, that the difference has become after `INTEGRATED_S`."""
-    steps = np.diff(time_s)[:, None]
-    difference = recorded - simulated
     # Over a gap the difference counts as the mean of both sides.
-    velocity = np.vstack([np.zeros(3), np.cumsum(
-        steps * (difference[1:] + difference[:-1]) / 2, axis=0)])
+    velocity = scipy.integrate.cumulative_trapezoid(recorded - simulated, time_s, axis=0,
+                                                    initial=0)
     later = np.searchsorted(time_s, time_s + INTEGRATED_S)
     within = later < len(time_s)
     if not within.any():

@@ -85,18 +85,11 @@ class Hypothesis:
             self.names, differs, self.undetermined) if parameter_of(name).is_size and not is_open]
         return frozenset(e for e, _ in sizes) - {e for e, shows in sizes if shows}
 
-    @property
-    def whiteners(self) -> list[Whitener]:
-        """Whitening filter of each channel."""
-        return [filters[i] for filters, i in zip(self.linearised.filters,
-                                                 self.fit.filter_indices)]
-
 
 def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
               filters: Sequence[Sequence[Whitener]] | None = None) -> LinearisedHypothesis:
     """Linearise a hypothesis at the coefficients of a sensor."""
-    filters = linear.filters_for(linear_model.filters, linear_model.baseline.effects) \
-        if filters is None else filters
+    filters = linear_model.usual_filters if filters is None else filters
     names = _fitted_names(linear_model, effects)
     nuisances = [n for n in dict.fromkeys(chain(*linear_model.nuisance_columns))
                  if n.effect not in effects]
@@ -112,7 +105,7 @@ def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
         e: start.values[e] for e in effects if linear.calibration_takes_up(e)}})
     channels: list[evidence.WhitenedChannel] = []
     columns: list[evidence.ChannelColumns] = []
-    changes: list[list[linear.Column]] = []
+    changes: list[dict[int, np.ndarray]] = []
     for comparison in linear_model.comparisons:
         at_rate = replace(sensor, rate_hz=comparison.sensor.rate_hz)
         output_v = comparison.simulated_v(at_rate)
@@ -134,7 +127,7 @@ def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
                     stacked / scale, comparison.used)))
             channels.append(evidence.whiten_channel(stacked[:, 0], stacked[:, 1:], ids,
                                                     comparison.used, filters[len(channels)]))
-            changes.append([linear.Column(0, change_v[:, d])])
+            changes.append({0: change_v[:, d]})
     # The square of each deviation is that of a healthy unit's tolerance plus that of what a
     # calibration can take up of the effects.
     parts = linear.parts_at_rest(linear_model.comparisons, linear_model.nuisance_columns,
@@ -181,9 +174,9 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
     """
     neutral_sensor = with_neutral(linear_model.baseline, effects)
     names = _fitted_names(linear_model, effects)
-    filters = linear.filters_for(linear_model.filters, linear_model.baseline.effects)
     # The iteration has the noise of no gap; only its end is compared for every noise.
-    fixed = [[f[i]] for f, i in zip(filters, linear_model.null_fit.filter_indices)]
+    fixed = [[f[i]] for f, i in zip(linear_model.usual_filters,
+                                    linear_model.null_fit.filter_indices)]
 
     def linearised_at(values: np.ndarray) -> _HypothesisIterate:
         within = np.clip(values, [parameter_of(n).lower for n in names],
@@ -208,7 +201,7 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
     first = np.array([shapes.get(name.without_axis, value) for name, value in zip(names, first)])
     solution = gauss_newton(linearised_at, first, has_ended, _EVALUATIONS, _HALVINGS,
                             _EVIDENCE_TOLERANCE)
-    linearised = linearise(linear_model, effects, solution.last.linearised.sensor, filters)
+    linearised = linearise(linear_model, effects, solution.last.linearised.sensor)
     fit, j = linearised.fit(), len(names)
     at_values = linearised.values - linearised.prior_mean[:j]
     std = np.sqrt(np.diag(fit.covariance)[:j])
@@ -386,7 +379,8 @@ def _model_about(model: LinearModel, best: Hypothesis) -> LinearModel:
     comparisons = [replace(c, sensor=replace(best.sensor, values=values,
                                              rate_hz=c.sensor.rate_hz))
                    for c in model.comparisons]
-    return linear.build_linear_model(comparisons, [[w] for w in best.whiteners])
+    return linear.build_linear_model(comparisons, filters=[
+        [f[i]] for f, i in zip(best.linearised.filters, best.fit.filter_indices)])
 
 
 def _stepped(variant: Variant) -> dict[Coefficient, float]:

@@ -13,18 +13,22 @@ user would act on. The same rule, applied to blocks drawn with replacement, says
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
 from typing import NamedTuple
 import warnings
 
 from adxl_ros.diagnose import evidence as linear
-from adxl_ros.diagnose.evidence import BLOCKS, LinearFit, LinearisedHypothesis
+from adxl_ros.diagnose.evidence import (
+    BLOCKS,
+    expected_drift_g,
+    LinearFit,
+    LinearisedHypothesis,
+    Whitener,
+)
 from adxl_ros.diagnose.linear_model import LinearModel
-from adxl_ros.diagnose.noise_model import expected_drift_g
 from adxl_ros.diagnose.residual_map import Basis
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
@@ -83,18 +87,17 @@ def normalised(weights: Mapping[tuple[str, ...], float]) -> tuple[WeightedHypoth
     """Return sets by falling probability, which sums to 1."""
     total = sum(weights.values())
     return tuple(sorted((WeightedHypothesis(effects, weight / total)
-                         for effects, weight in weights.items()), key=lambda h: -h.probability))
+                         for effects, weight in weights.items()),
+                        key=lambda h: (-h.probability, h.effects)))
 
 
-@dataclass(frozen=True)
-class HeldOut:
+class HeldOut(NamedTuple):
     """What a set of effects leaves of blocks that it was not fitted to."""
 
     # Squares of recording minus simulation, mean over axes, sum over samples, by block, (m/s²)²,
     # (blocks,)
     squares: np.ndarray
     log_likelihood: np.ndarray  # Log likelihood by block, (blocks,)
-    drift_mps2: float = 0.0  # Expected rms of the fitted drift, m/s²
 
 
 @dataclass(frozen=True)
@@ -162,42 +165,39 @@ class HeldOutFits:
                 white = np.einsum('i,bij,j->b', v, channel.block_grams[f][held_out], v)
                 log_likelihood[held_out] += channel.log_scales[f][held_out] - 0.5 * (
                     white / variance + channel.counts[held_out] * np.log(variance))
-        return HeldOut(squares, log_likelihood, self.drift_mps2)
+        return HeldOut(squares, log_likelihood)
+
+    @property
+    def _whiteners(self) -> list[Whitener]:
+        """Whitening filter of each channel."""
+        return [filters[f] for filters, f in zip(self.linearised.filters,
+                                                 self.full.filter_indices)]
 
     def drift_densities(self) -> np.ndarray:
         """Return the densities of the drift by channel; 0 for that of a healthy unit."""
-        chosen = [filters[f] for filters, f in zip(self.linearised.filters,
-                                                   self.full.filter_indices)]
-        return np.array([0.0 if w.healthy else w.density for w in chosen])
+        return np.array([0.0 if w.healthy else w.density for w in self._whiteners])
 
-    @property
+    @cached_property
     def drift_mps2(self) -> float:
         """Return the expected rms of the drift that the fitted noise has, m/s²."""
-        sizes = []
-        for number, density in enumerate(self.drift_densities()):
-            comparison = self.model.comparisons[self.model.place_of_channel(number)[0]]
-            spectrum = self.linearised.filters[number][self.full.filter_indices[number]].spectrum
-            sizes.append(expected_drift_g(spectrum, density, comparison.span_s,
-                                          comparison.sensor.rate_hz))
-        return float(G0_MPS2 * np.sqrt(np.mean(np.square(sizes))))
+        sizes_g = [expected_drift_g(w.effect, density, comparison) for w, density, (comparison, _)
+                   in zip(self._whiteners, self.drift_densities(), self.model.places)]
+        return float(G0_MPS2 * np.sqrt(np.mean(np.square(sizes_g))))
 
 
-def reproducible_rest(fits: HeldOutFits, bases: Sequence[Sequence[Basis]]) -> Rest:
+def reproducible_rest(fits: HeldOutFits, bases: Sequence[Basis]) -> Rest:
     """
     Predict held-out blocks by flexible functions of everything that a residual may follow.
 
     Each axis has functions by dimension; their levels are those of the largest evidence (MacKay
     1992), so that functions that follow noise vanish. The effects keep their values, so that the
-    functions take up only what the effects leave. `bases` are the functions of each axis of each
-    recording.
+    functions take up only what the effects leave. `bases` are the functions of each channel.
     """
-    linearised, model, every = fits.linearised, fits.model, [d.value for d in FormDimension]
+    linearised, model = fits.linearised, fits.model
     by_choice = {name: np.zeros(BLOCKS) for name in ('all', 'steady', 'nats')}
     whole = linearised.departures(fits.full, fits.full)
-    for number, (columns, filters) in enumerate(zip(linearised.columns, linearised.filters)):
-        recording, axis = model.place_of_channel(number)
-        comparison = model.comparisons[recording]
-        basis = bases[recording][axis]
+    for number, (columns, filters, basis, (comparison, axis)) in enumerate(zip(
+            linearised.columns, linearised.filters, bases, model.places)):
         if not basis:
             continue
         unit_v = _FIRST_LEVEL_G * float(comparison.sensor.scale_v_per_g[axis])
@@ -209,7 +209,7 @@ def reproducible_rest(fits: HeldOutFits, bases: Sequence[Sequence[Basis]]) -> Re
         plain = linear.plain_grams(design / scale, comparison.used)
         variance = float(fits.full.innovation_variance_v2[number])
         names = np.repeat([d.value for d in basis], [b.shape[1] for b in basis.values()])
-        choices = {name: names == name for name in every if name in names}
+        choices = {d.value: names == d.value for d in basis}
         choices |= {'all': names != '', 'steady': names != FormDimension.TIME.value}
         for name, chosen in choices.items():
             level = _levels(_products(white, whole[columns.places]), names, chosen, variance)
@@ -227,8 +227,7 @@ def reproducible_rest(fits: HeldOutFits, bases: Sequence[Sequence[Basis]]) -> Re
     together, steady, nats = (by_choice.pop(name) for name in ('all', 'steady', 'nats'))
     p = [increments_p(c.values @ np.concatenate([[1.0], -whole[c.places]]), comparison.used,
                       comparison.sensor.rate_hz)
-         for number, c in enumerate(linearised.columns if fits.drifts else ())
-         for comparison in (model.comparisons[model.place_of_channel(number)[0]],)]
+         for c, (comparison, _) in zip(linearised.columns if fits.drifts else (), model.places)]
     return Rest(together, steady, nats, by_choice, min([1.0, *(len(p) * v for v in p)]))
 
 
@@ -339,18 +338,15 @@ class Verdict:
         return 1.0 - self.remaining / total if total > 0 else 1.0
 
 
-_Modelled = tuple[frozenset[str], str]
-"""A set of effects, and the drift of the noise beside it."""
 _NOTHING: frozenset[str] = frozenset()
-_ALL = slice(None)
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the rule weighs; its methods return one value for each draw of the blocks in `rows`."""
+    """What the rule weighs; its methods return one value for each draw of the blocks."""
 
     # Sets of effects, the empty one among them, by the drift that the noise may have
-    candidates: Mapping[frozenset[str], Mapping[str, HeldOut]]
+    candidates: Mapping[frozenset[str], Mapping[str, HeldOutFits]]
     counts: np.ndarray  # Samples by block, (blocks,)
     # How often each block is drawn, (draws, blocks); once each in the first row
     weights: np.ndarray
@@ -364,30 +360,29 @@ class Evidence:
     # Effects of each set none of whose sizes differs from 0
     sizeless: Mapping[frozenset[str], frozenset[str]] = field(default_factory=dict)
 
-    def left(self, effects: frozenset[str], rows: slice) -> np.ndarray:
+    def left(self, effects: frozenset[str]) -> np.ndarray:
         """Return the power above the noise floor that a set leaves."""
-        squares = self.candidates[effects][HEALTHY].squares
-        return self.mean(squares, rows) - self.floor_mps2 ** 2
+        return self.mean(self.candidates[effects][HEALTHY].figures.squares) - self.floor_mps2 ** 2
 
     def material_power(self, pose_share: float) -> float:
         """Return the power that a user would act on and that is not of the reference, (m/s²)²."""
         share = 1.0 if self.errs_in_motion else pose_share
         return self.material_mps2 ** 2 + share * self.reference_mps2 ** 2
 
-    def mean(self, by_block: np.ndarray, rows: slice = _ALL) -> np.ndarray:
+    def mean(self, by_block: np.ndarray) -> np.ndarray:
         """Return the mean over samples of sums by block."""
-        weights = self.weights[rows]
-        return weights @ by_block / np.maximum(weights @ self.counts, 1.0)
+        return self.weights @ by_block / np.maximum(self.weights @ self.counts, 1.0)
 
-    def gain(self, more: frozenset[str], less: frozenset[str], rows: slice) -> np.ndarray:
+    def gain(self, more: frozenset[str], less: frozenset[str]) -> np.ndarray:
         """Return by how much one set explains more power than another."""
-        a, b = (self.candidates[e][HEALTHY] for e in (more, less))
-        return self.mean(b.squares - a.squares, rows)
+        a, b = (self.candidates[e][HEALTHY].figures for e in (more, less))
+        return self.mean(b.squares - a.squares)
 
-    def nats(self, more: _Modelled, less: _Modelled, rows: slice) -> np.ndarray:
+    def nats(self, more: frozenset[str], less: frozenset[str], drift: str = HEALTHY
+             ) -> np.ndarray:
         """Return by how much a set, with its noise, makes the held-out samples more probable."""
-        a, b = (self.candidates[e][noise] for e, noise in (more, less))
-        return self.weights[rows] @ (a.log_likelihood - b.log_likelihood)
+        a, b = self.candidates[more][drift].figures, self.candidates[less][HEALTHY].figures
+        return self.weights @ (a.log_likelihood - b.log_likelihood)
 
     def interval(self, draws: np.ndarray) -> Interval:
         """Return the value of all blocks with the interval of the draws."""
@@ -405,31 +400,29 @@ def _predicts(nats: np.ndarray) -> bool:
     return bool(nats[0] > _NATS and _low(nats) > 0)
 
 
-def is_needed(evidence: Evidence, effects: frozenset[str], effect: str, rows: slice) -> bool:
+def is_needed(evidence: Evidence, effects: frozenset[str], effect: str) -> bool:
     """Determine whether a set loses a material part of what it explains without an effect."""
     if effect in evidence.sizeless.get(effects, ()):
         return False
     rest = effects - {effect}
-    lost, nats = evidence.gain(effects, rest, rows), evidence.nats(
-        (effects, HEALTHY), (rest, HEALTHY), rows)
+    lost, nats = evidence.gain(effects, rest), evidence.nats(effects, rest)
     if nats[0] <= _NATS or max(_low(nats), _low(lost)) <= 0:
         return False
     hints = effect_named(effect).diagnosis
     # An error of form of another effect may look like an effect over the same variables.
     shares_form = any({*hints.form} & {*effect_named(e).diagnosis.form} for e in rest)
     share = _SHARE_OF_FORM if shares_form else _SHARE_OF_SET
-    explained = float(evidence.gain(effects, _NOTHING, rows)[0])
+    explained = float(evidence.gain(effects, _NOTHING)[0])
     by_pose = bool(hints.proof) and {*hints.proof} <= _SHOWN_BY_POSE
     return float(lost[0]) > max(evidence.material_power(float(by_pose)), share * explained)
 
 
-def minimal_sets(evidence: Evidence, rows: slice) -> list[frozenset[str]]:
+def minimal_sets(evidence: Evidence) -> list[frozenset[str]]:
     """Return the sets all of whose effects are needed, the most probable first."""
     kept = [effects for effects in evidence.candidates
-            if all(effects - {e} in evidence.candidates
-                   and is_needed(evidence, effects, e, rows) for e in effects)]
-    return sorted(kept, key=lambda effects: -evidence.nats(
-        (effects, HEALTHY), (_NOTHING, HEALTHY), rows)[0])
+            if all(effects - {e} in evidence.candidates and is_needed(evidence, effects, e)
+                   for e in effects)]
+    return sorted(kept, key=lambda effects: -evidence.nats(effects, _NOTHING)[0])
 
 
 def drifts_beside(evidence: Evidence, effects: frozenset[str], rest: Rest) -> list[str]:
@@ -439,21 +432,20 @@ def drifts_beside(evidence: Evidence, effects: frozenset[str], rest: Rest) -> li
     What flexible functions predict as well is an error of form, and no drift; nor is the motion
     that a smooth reference lacks.
     """
-    candidate, healthy = evidence.candidates[effects], (effects, HEALTHY)
-    drifts = sorted((d for d in candidate if d != HEALTHY), key=lambda d: -evidence.nats(
-        (effects, d), healthy, _ALL)[0])
+    candidate = evidence.candidates[effects]
+    nats = {d: evidence.nats(effects, effects, d) for d in candidate if d != HEALTHY}
+    drifts = sorted(nats, key=lambda d: -nats[d][0])
     if not drifts or evidence.fades:
         return []
-    nats = evidence.nats((effects, drifts[0]), healthy, _ALL)
-    explained = float(evidence.gain(effects, _NOTHING, _ALL)[0])
+    best = nats[drifts[0]]
+    explained = float(evidence.gain(effects, _NOTHING)[0])
     exact = all(effect_named(e).exact for e in effects)
     smallest = max(evidence.material_mps2 ** 2,
                    (_SHARE_OF_SET if exact else _SHARE_OF_FORM) * explained)
-    if candidate[drifts[0]].drift_mps2 ** 2 <= smallest or not _predicts(nats) \
-            or not _predicts(nats - evidence.weights @ rest.steady_log_likelihood):
+    if candidate[drifts[0]].drift_mps2 ** 2 <= smallest or not _predicts(best) \
+            or not _predicts(best - evidence.weights @ rest.steady_log_likelihood):
         return []
-    return [d for d in drifts if d == drifts[0] or not _predicts(evidence.nats(
-        (effects, drifts[0]), (effects, d), _ALL))]
+    return [d for d in drifts if d == drifts[0] or not _predicts(best - nats[d])]
 
 
 class _Answer(NamedTuple):
@@ -464,21 +456,13 @@ class _Answer(NamedTuple):
     groups: frozenset[frozenset[str]]
 
 
-def _answer(evidence: Evidence, rest: Rest, drifts: Sequence[str], detected: frozenset[str],
-            rows: slice) -> _Answer:
+def _answer(evidence: Evidence, rest: Rest, rest_material: float, drifts: Sequence[str],
+            detected: frozenset[str]) -> _Answer:
     """Apply the rule to the figures of all blocks, or of one draw of them."""
-    minimal = minimal_sets(evidence, rows)
+    minimal = minimal_sets(evidence)
     best = minimal[0]
-    explained, above = (float(v[0]) for v in (evidence.gain(best, _NOTHING, rows),
-                                              evidence.left(best, rows)))
-    repeats, steady = (evidence.mean(squares, rows)
-                       for squares in (rest.squares, rest.steady_squares))
-    # What follows the pose may be of the reference.
-    total = float(evidence.mean(rest.squares)[0])
-    pose = max((float(evidence.mean(rest.by_dimension[d])[0])
-                for d in _POSE & {*rest.by_dimension}), default=0.0)
-    rest_material = evidence.material_power(
-        float(np.clip(pose / total, 0.0, 1.0)) if total > 0 else 0.0)
+    explained, above = (float(v[0]) for v in (evidence.gain(best, _NOTHING), evidence.left(best)))
+    repeats, steady = map(evidence.mean, (rest.squares, rest.steady_squares))
     left = float(repeats[0]) if _low(repeats) > rest_material else 0.0
     drift = evidence.candidates[best][drifts[0]].drift_mps2 ** 2 if drifts else 0.0
     follows = _low(steady) > rest_material and float(steady[0]) > _SHARE_OF_FORM * drift
@@ -496,8 +480,7 @@ def _answer(evidence: Evidence, rest: Rest, drifts: Sequence[str], detected: fro
     # the rest that the best set leaves; or that of errors of the reference in motion.
     smallest = max(left, evidence.errs_in_motion * evidence.reference_mps2 ** 2)
     rivals = [other for other in minimal[1:] if len(other) == len(best) and not (
-        _predicts(evidence.nats((best, HEALTHY), (other, HEALTHY), rows))
-        and float(evidence.gain(best, other, rows)[0]) > smallest)]
+        _predicts(evidence.nats(best, other)) and float(evidence.gain(best, other)[0]) > smallest)]
     groups = {group for e in best if len(group := frozenset({e}).union(
         *(other - best for other in rivals if e not in other))) > 1}
     certain = best.difference(*groups) | detected | {*named[:1]}
@@ -516,28 +499,31 @@ def _answer(evidence: Evidence, rest: Rest, drifts: Sequence[str], detected: fro
 def decide(evidence: Evidence, rest_of: Callable[[frozenset[str], str], Rest],
            detected: Sequence[str]) -> Verdict:
     """Apply the rule to the figures, and to draws of their blocks."""
-    best = minimal_sets(evidence, _ALL)[0]
+    best = minimal_sets(evidence)[0]
     rest = rest_of(best, HEALTHY)
     drifts = drifts_beside(evidence, best, rest)
     if drifts:
         rest = rest_of(best, drifts[0])
-    answers = [_answer(evidence, rest, drifts, frozenset(detected), rows) for rows in (
-        _ALL, *(slice(i, i + 1) for i in range(1, len(evidence.weights))))]
-    answer = answers[0]
-    repeats = evidence.interval(evidence.mean(rest.squares))
-    highest = max(evidence.interval(evidence.gain(e, _NOTHING, _ALL)).high
-                  for e in evidence.candidates)
-    probability, hypotheses = _probabilities(answer, Counter(answers[1:]))
     power = {d: float(evidence.mean(b)[0]) for d, b in rest.by_dimension.items()}
+    repeats = evidence.interval(evidence.mean(rest.squares))
+    # What follows the pose may be of the reference.
+    pose = max((power[d] for d in _POSE & {*power}), default=0.0)
+    rest_material = evidence.material_power(
+        float(np.clip(pose / repeats.value, 0.0, 1.0)) if repeats.value > 0 else 0.0)
+    answer, *drawn = (_answer(replace(evidence, weights=weights), rest, rest_material, drifts,
+                              frozenset(detected))
+                      for weights in (evidence.weights, *evidence.weights[1:, None]))
+    highest = max(evidence.interval(evidence.gain(e, _NOTHING)).high for e in evidence.candidates)
+    probability, hypotheses = _probabilities(answer, drawn)
     strongest = sorted(power, key=lambda d: -power[d])
     return Verdict(
         answer.status, tuple(sorted(answer.effects)),
         tuple(sorted(tuple(sorted(g)) for g in answer.groups)), probability, hypotheses, best,
         evidence.material_mps2, evidence.reference_mps2,
-        evidence.interval(evidence.gain(best, _NOTHING, _ALL)), repeats,
-        evidence.interval(evidence.left(best, _ALL)),
+        evidence.interval(evidence.gain(best, _NOTHING)), repeats,
+        evidence.interval(evidence.left(best)),
         float(np.sqrt(max(highest, repeats.high, evidence.material_power(1.0)))),
-        {e: evidence.interval(evidence.gain(best, best - {e}, _ALL)) for e in sorted(best)},
+        {e: evidence.interval(evidence.gain(best, best - {e})) for e in sorted(best)},
         tuple(d for d in strongest if power[d] > 0 and power[d] >= power[strongest[0]] / 2))
 
 
@@ -548,19 +534,17 @@ def _sets(answer: _Answer) -> list[frozenset[str]]:
     return [answer.effects | set(choice) for choice in product(*answer.groups)]
 
 
-def _probabilities(answer: _Answer, votes: Mapping[_Answer, int]
+def _probabilities(answer: _Answer, drawn: Sequence[_Answer]
                    ) -> tuple[float, tuple[WeightedHypothesis, ...]]:
     """Return the probability of the answer, and of all sets, none above the answer's."""
-    named = set(_sets(answer))
-    shares: Counter[frozenset[str]] = Counter()
-    for other, count in votes.items():
-        for effects in _sets(other):
-            shares[effects] += count / len(_sets(other))  # type: ignore[assignment]
-    total = sum(shares.values())
-    agreed = sum(v for e, v in shares.items() if e in named)
-    probability = float(np.interp(agreed / total, _REPEATED, _RIGHT))
-    weights = {e: min(v / (total - agreed) * (1 - probability), probability)
-               for e, v in shares.items() if e not in named}
+    named, votes = set(_sets(answer)), dict[frozenset[str], float]()
+    for sets in map(_sets, drawn):
+        for effects in sets:
+            votes[effects] = votes.get(effects, 0.0) + 1 / len(sets)
+    agreed = sum(count for effects, count in votes.items() if effects in named)
+    probability = float(np.interp(agreed / len(drawn), _REPEATED, _RIGHT))
+    weights = {e: min(count / (len(drawn) - agreed) * (1 - probability), probability)
+               for e, count in votes.items() if e not in named}
     weights |= {effects: probability / len(named) for effects in named}
     missing = 1.0 - sum(weights.values())
     remaining = frozenset(() if answer.status == 'unknown' else {UNKNOWN})

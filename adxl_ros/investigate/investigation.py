@@ -178,10 +178,9 @@ def rank(assessment: Assessment, sensor: Sensor, manoeuvres: Sequence[PlannedMan
     seen = {v.effect for v in model.variants} if model else set()
     considered = {e for h in next_experiment.leading(assessment.hypotheses) for e in h.effects}
     needed = sorted(considered | (set(library()) - seen))
-    responses = [next_experiment.predict(
-        next_experiment.Experiment(m.name, m.begin_s, m.motion), sensor, needed)
-        for m in manoeuvres]
-    excited = {effect for response in responses for effect in response.effects}
+    responses = [next_experiment.predict(m.name, m.motion, m.begin_s, sensor, needed)
+                 for m in manoeuvres]
+    excited = {v.effect for response in responses for v in response.linear_model.variants}
     # Effects that the samples could not show keep their prior odds over no gap.
     weights = {h.effects: h.probability for h in assessment.hypotheses}
     unseen = weights.get((), 0.0) * (1 / max(len(excited | seen), 1))
@@ -205,7 +204,7 @@ def decide(ranking: Ranking, question: Question, has_time: bool) -> Answer:
     following = [w for w in ranking.worth if w.per_minute > _SMALLEST_PER_MINUTE]
     if verdict and verdict == question.verdict:
         kinds = {KIND_OF[name] for name in question.recorded}
-        following = [w for w in following if KIND_OF[w.manoeuvre.name] not in kinds]
+        following = [w for w in following if KIND_OF[w.name] not in kinds]
     totals = accumulate(hypothesis.probability for hypothesis in hypotheses)
     # The fewest that together have 90 %
     named = hypotheses[:next((i for i, total in enumerate(totals, 1) if total >= CERTAIN), None)]
@@ -220,7 +219,7 @@ def decide(ranking: Ranking, question: Question, has_time: bool) -> Answer:
     elif not has_time:
         outcome = Outcome.TIME_OVER
     else:
-        return Answer(hypotheses, Outcome.GO_ON, '', following[0].manoeuvre.name,
+        return Answer(hypotheses, Outcome.GO_ON, '', following[0].name,
                       following[0].per_minute, hidden=ranking.hidden, verdict=verdict)
     return Answer(hypotheses, outcome, _sentence(outcome, named), hidden=ranking.hidden,
                   verdict=verdict)

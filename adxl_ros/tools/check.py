@@ -11,9 +11,8 @@ from pathlib import Path
 import textwrap
 from typing import Any
 
+from adxl_ros.diagnose.data_checks import DataFault
 from adxl_ros.diagnose.diagnosis import what_shows
-from adxl_ros.diagnose.next_experiment import by_effect
-from adxl_ros.diagnose.reference import DataFault
 from adxl_ros.diagnose.report import shows_row
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import recording
@@ -192,8 +191,7 @@ def _with_what_shows(result: Findings, options: argparse.Namespace, reading: Rea
             reason = shown.message
         else:
             scale_v_per_g = float(sensor.scale_v_per_g.mean())
-            effects = sorted(by_effect(shown).values(),
-                             key=lambda effect: (not effect.shows, effect.effect))
+            effects = sorted(shown, key=lambda effect: not effect.shows)
             result = replace(result, shows=tuple(
                 shows_row(effect, scale_v_per_g) for effect in effects))
     except UserError as error:

@@ -226,7 +226,7 @@ def test_next_experiment_separates_most():
         verdict, status='inseparable', groups=(rivals,),
         hypotheses=tuple(WeightedHypothesis((effect,), 0.5) for effect in rivals))
     proposal = propose_next_experiment(verdict, [], sensor, None, 0)
-    worth = {m.manoeuvre.name: m.per_minute for m in proposal.menu}
+    worth = {m.name: m.per_minute for m in proposal.menu}
     assert max(worth.values()) == worth[proposal.manoeuvre] > 0
     assert worth['shake along x from 2 to 40 Hz'] < 0.1 * worth['dwell, heat and cool']
 

@@ -4,7 +4,7 @@
 
 from dataclasses import replace
 
-from adxl_ros.diagnose.noise_model import NoiseFloor, squares_at_rest
+from adxl_ros.diagnose.evidence import NoiseFloor, squares_at_rest
 from adxl_ros.model import noise
 import numpy as np
 import pytest

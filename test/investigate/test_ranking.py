@@ -42,7 +42,7 @@ def planned(*names):
 
 
 def told_nothing(information=0.0):
-    return ManoeuvreWorth(*planned('rests_upright'), information)
+    return ManoeuvreWorth('rests_upright', 1.0, information)
 
 
 @cache
@@ -52,7 +52,7 @@ def first_round():
 
 
 def worth(ranking):
-    return {w.manoeuvre.name: w.information for w in ranking.worth}
+    return {w.name: w.information for w in ranking.worth}
 
 
 def test_fast_turns_show_an_arm_better_than_rests_and_slow_turns():
@@ -89,7 +89,7 @@ def test_a_verdict_that_stays_after_every_kind_of_manoeuvre_ends_it():
     verdict = SimpleNamespace(status='no_gap', effects=())
     assessment = Assessment((WeightedHypothesis((), 0.8), WeightedHypothesis(('gravity',), 0.2)),
                             SimpleNamespace(report=SimpleNamespace(verdict=verdict), fault=None))
-    worth = tuple(ManoeuvreWorth(m, 1.0) for m in plan_all(LIMITS, Pose(1.5, 0.0)))
+    worth = tuple(ManoeuvreWorth(m.name, m.minutes, 1.0) for m in plan_all(LIMITS, Pose(1.5, 0.0)))
     question, recorded = FIRST, []
     while (answer := decide(Ranking(assessment, worth, ()), question, True)).manoeuvre:
         recorded.append(answer.manoeuvre)

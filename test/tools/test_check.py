@@ -10,7 +10,7 @@ import shlex
 import subprocess
 
 from adxl_ros.calibrate.fits import gravity_fit
-from adxl_ros.diagnose import reference
+from adxl_ros.diagnose import data_checks
 from adxl_ros.signals import findings
 from bags import bag_of, imu, stamps
 import numpy as np
@@ -36,7 +36,7 @@ def samples(seconds: float = 60.0) -> tuple[np.ndarray, np.ndarray]:
 
 def test_the_needs_of_other_tools_are_theirs() -> None:
     assert findings.FEWEST_GRAVITY_POSES == gravity_fit.MIN_RESTS
-    assert findings.SHORTEST_MOTION_S == reference.SHORTEST_S
+    assert findings.SHORTEST_MOTION_S == data_checks.SHORTEST_S
 
 
 def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
