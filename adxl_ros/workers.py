@@ -141,6 +141,15 @@ class Processes(Pool):
         self._threads.shutdown(wait, cancel_futures=cancel_futures)
 
 
+def in_background(work: Callable[..., Any], *arguments: Any
+                  ) -> tuple[Future, Callable[[], None]]:
+    """Start a task in a process of its own; return its end, and what ends it at once."""
+    pool = Processes(1)
+    end = pool.submit(work, *arguments)
+    pool.shutdown(wait=False)
+    return end, pool.kill
+
+
 def _work(pipe: Connection, shared: tuple) -> None:
     """
     Run tasks in a process until the pipe is closed.

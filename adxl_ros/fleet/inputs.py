@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from glob import has_magic
 import hashlib
+from io import TextIOWrapper
 import os
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -25,7 +26,7 @@ from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files import recording
 from adxl_ros.files.recording_columns import NO_UNIT, Recording
 from adxl_ros.files.tables import TABLE_ENDINGS
-from adxl_ros.fleet.row import as_date, PAGE, POPULATION, TABLE, UNITS
+from adxl_ros.fleet.row import as_date, TABLE
 from adxl_ros.report.page import as_utf_8, without_secrets
 
 _ENDINGS = ('.csv', '.mcap', '.db3')
@@ -99,11 +100,7 @@ def _is_web(url: str) -> bool:
 
 
 def find_sources(inputs: Iterable[str]) -> list[Source]:
-    """
-    Find the recordings of a command line.
-
-    The files of a fleet's results, which lie beside its table, are no recordings.
-    """
+    """Find the recordings of a command line; the table of a fleet is none."""
     sources: dict[str, Source] = {}
     for text in inputs:
         try:
@@ -146,7 +143,7 @@ def _of_listing(text: str, fs: Any, path: str, named: Mapping[str, Mapping[str, 
     for name, info in files.items():
         bag = next((str(folder) for folder in PurePosixPath(name).parents if str(folder) in bags),
                    '')
-        if bag or (not _is_of_fleet(fs, name) and (name in named or _is_recording_name(name))):
+        if bag or (file_name(name) != TABLE and (name in named or _is_recording_name(name))):
             found.setdefault(bag or name, {})[name] = info
     sources = [_of_files(fs, name, content) for name, content in found.items()
                if name.count('/.') <= path.count('/.')]
@@ -164,12 +161,6 @@ def file_name(path: str) -> str:
 def _is_recording_name(path: str) -> bool:
     """Return whether the name of a file is that of a recording, for folders and manifests."""
     return PurePosixPath(file_name(path)).suffix.lower() in (*_ENDINGS, *TABLE_ENDINGS)
-
-
-def _is_of_fleet(fs: Any, name: str) -> bool:
-    """Return whether a file is part of the results of a fleet."""
-    folder, _, file = name.rpartition('/')
-    return file in (PAGE, POPULATION, TABLE, UNITS) and fs.exists(f'{folder}/{TABLE}')
 
 
 def look_up(fs: Any, path: str) -> Source:
@@ -251,19 +242,16 @@ def _manifest_rows(text: str, fs: Any, path: str) -> dict[int, dict[str, str]] |
             os.path.exists(path) and not os.path.isfile(path)):  # a pipe may never end
         return None
     try:
-        if suffix == '.csv':
-            with fs.open(path, 'r', encoding='utf-8-sig', newline='') as file:
-                return _csv_rows(text, file)
-        from pyarrow import parquet, string
         with fs.open(path, 'rb') as file:
+            if suffix == '.csv':
+                return _csv_rows(text, TextIOWrapper(file, 'utf-8-sig', newline=''))
+            from pyarrow import parquet, string
             content = parquet.ParquetFile(file)
             names = [name for name in _MANIFEST_COLUMNS if name in content.schema_arrow.names]
-            if 'url' not in names:
-                return None
-            columns = {name: column.cast(string()).fill_null('').to_pylist()
-                       for name, column in zip(names, content.read(names).columns)}
-        return {number: dict(zip(names, row))
-                for number, row in enumerate(zip(*columns.values()), 1)}
+            columns = [column.cast(string()).fill_null('').to_pylist()
+                       for column in content.read(names).columns]
+        return dict(enumerate((dict(zip(names, row)) for row in zip(*columns)), 1)) \
+            if 'url' in names else None
     except UserError:
         raise
     except Exception:

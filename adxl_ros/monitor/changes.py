@@ -20,22 +20,21 @@ before.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, UTC
-from importlib import import_module
 import json
 import os
 from pathlib import Path
-import sys
+import shlex
 import time
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.atomic_write import append_line
+from adxl_ros.files.atomic_write import append_line, write_text
 from adxl_ros.files.recording_columns import ACCEL, Recording
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.workers import Processes
+from adxl_ros.simulate.trajectories import motion_from_force
+from adxl_ros.workers import in_background
 import numpy as np
 import scipy
 
@@ -270,13 +269,11 @@ class DiagnosisResult:
 
 
 class DiagnosisRun:
-    """Runs the tool `diagnose`, a module with `main`, on some samples."""
+    """Diagnoses some samples in a process of its own."""
 
-    def __init__(self, folder: Path, given: DiagnosisInput, tool: str, budget_s: float) -> None:
+    def __init__(self, folder: Path, given: DiagnosisInput, budget_s: float) -> None:
         self._budget_s, self._end_s = budget_s, time.monotonic() + budget_s
-        self._pool = Processes(1)
-        self._end = self._pool.submit(_diagnose, folder, given, tool)
-        self._pool.shutdown(wait=False)
+        self._end, self.close = in_background(_diagnose, folder, given)
 
     @property
     def result(self) -> DiagnosisResult | None:
@@ -289,45 +286,37 @@ class DiagnosisRun:
         self.close()
         return _without(f'it takes longer than diagnose.budget_s, {self._budget_s:.0f} s')
 
-    def close(self) -> None:
-        """End the process; its finished files stay."""
-        self._pool.kill()
-
 
 def _without(reason: str) -> DiagnosisResult:
     return DiagnosisResult(False, f'no diagnosis: {reason[:_REASON_LENGTH]}')
 
 
-def _diagnose(folder: Path, given: DiagnosisInput, tool: str) -> DiagnosisResult:
-    """Write recording, baseline and force, run the tool on them, and read its report."""
+def _diagnose(folder: Path, given: DiagnosisInput) -> DiagnosisResult:
+    """Diagnose; write the samples, the baseline, and the files of the diagnosis."""
+    from adxl_ros.diagnose.diagnosis import diagnose  # the node itself needs none
+    from adxl_ros.diagnose.documents import documents
+    from adxl_ros.diagnose.page import Run
+    from adxl_ros.diagnose.report import as_json
     os.nice(_NICENESS)
-    os.environ['NO_COLOR'] = '1'
     folder.mkdir(parents=True, exist_ok=True)
-    samples, baseline = folder / 'recording.csv', folder / 'baseline.yaml'
-    recording.write(samples, given.recording, given.sensor)
-    parameter_file.save(baseline, given.sensor)
-    sys.argv = ['diagnose', str(samples), '--params', str(baseline), '-o', str(folder / 'gap')]
+    samples, sim = replace(given.recording, path=str(folder / 'recording.csv')), None
+    recording.write(samples.path, samples, given.sensor)
+    parameter_file.save(folder / 'baseline.yaml', given.sensor)
+    command = ['ros2', 'run', 'adxl_ros', 'diagnose', samples.path, '--params',
+               str(folder / 'baseline.yaml')]
     if given.force is not None:
         time_s, force_mps2 = given.force
-        ideal = folder / 'reference.csv'
-        recording.write(ideal, Recording(str(ideal), time_s, dict(zip(ACCEL, force_mps2.T))),
-                        given.sensor)
-        sys.argv += ['--sim', str(ideal)]
-    log = folder / 'diagnose.log'
-    with open(log, 'w', encoding='utf-8') as file, redirect_stdout(file), redirect_stderr(file):
-        import_module(tool).main()
-    report = folder / 'gap' / 'report.json'
-    if report.exists():
-        return result_of(json.loads(report.read_text(encoding='utf-8')),
-                         str(report.with_name('report.html')))
-    lines = log.read_text(encoding='utf-8').splitlines()
-    return _without(' '.join(lines[-1].split()) if lines else '')
-
-
-def result_of(report: dict, page: str) -> DiagnosisResult:
-    """Return what a report of `diagnose` says."""
+        ideal = Recording(str(folder / 'reference.csv'), time_s, dict(zip(ACCEL, force_mps2.T)))
+        recording.write(ideal.path, ideal, given.sensor)
+        command += ['--sim', ideal.path]
+        sim, _ = motion_from_force(ideal, False)
+    diagnosis = diagnose([samples], given.sensor, sim)
+    report = as_json(diagnosis)
+    run = Run(f'{samples.path}  minus  simulation of {given.sensor.serial}', 'baseline.yaml', [],
+              command=shlex.join([*command, '-o', str(folder / 'again')]))
+    for name, text in documents(diagnosis, report, [report['summary']], run).items():
+        write_text(folder / name, text)
     verdict = report['verdict']
-    effects = tuple(verdict['effects'])
-    probability = float(verdict.get('probability') or 0.0)
-    likely = tuple(effect for group in verdict.get('groups') or [] for effect in group)
-    return DiagnosisResult(True, report['summary'], page, effects or likely, probability)
+    likely = [effect for group in verdict['groups'] for effect in group]
+    return DiagnosisResult(True, report['summary'], str(folder / 'report.html'),
+                           tuple(verdict['effects'] or likely), verdict['probability'] or 0.0)

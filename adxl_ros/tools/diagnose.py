@@ -5,13 +5,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from time import monotonic
 from typing import Any
 
 from adxl_ros.diagnose import page
 from adxl_ros.diagnose.diagnosis import diagnose as diagnose_recordings, Diagnosis, self_check
+from adxl_ros.diagnose.documents import as_text, documents
 from adxl_ros.diagnose.report import as_json, screen_lines
 from adxl_ros.diagnose.residual_map import gap_in, GapInUnit, quantity
 from adxl_ros.diagnose.verdict import MATERIAL_MG
@@ -119,7 +119,7 @@ def diagnose(options: argparse.Namespace) -> int:
         lines += ['', f' in      {gap.text}'] if gap else []
         report = _write(options, diagnosis, subject, lines, gap)
     if options.json:
-        print(json.dumps(report, indent=1, allow_nan=False))
+        print(as_text(report), end='')
     else:
         cli.print_end([*lines, ''], [Path(options.output, name) for name in _FILES],
                       _next_steps(options, diagnosis), monotonic() - begin_s)
@@ -137,14 +137,10 @@ def _write(options: argparse.Namespace, diagnosis: Diagnosis, subject: str, line
     folder = Path(options.output)
     cli.make_folder(folder)
     report = as_json(diagnosis) | ({'gap_in': gap._asdict()} if gap else {})
-    write_text(folder / 'report.json', json.dumps(report, indent=1, allow_nan=False) + '\n')
-    parameters = '' if diagnosis.report is None else \
-        parameter_file.as_text(diagnosis.report.sensor, lines)
-    if parameters:
-        write_text(folder / 'params.yaml', parameters)
-    write_text(folder / 'report.html', page.page(diagnosis, page.Run(
-        subject, Path(options.params or parameter_file.nominal_path()).name,
-        _next_steps(options, diagnosis), parameters)))
+    for name, text in documents(diagnosis, report, lines, page.Run(
+            subject, Path(options.params or parameter_file.nominal_path()).name,
+            _next_steps(options, diagnosis))).items():
+        write_text(folder / name, text)
     return report
 
 

@@ -75,12 +75,7 @@ class DeviceSettings(LatencySettings):
 
 @dataclass(frozen=True)
 class SimulatorSettings:
-    """Settings of a link whose samples have the time of a simulator, the clock of the graph."""
-
-    @property
-    def turns_case(self) -> bool:
-        """Return whether the frame of the case is not that of the simulator's samples."""
-        return False
+    """Settings of a link whose samples have time and frame of a simulator."""
 
 
 def samples_within(latency_s: float, rate_hz: float) -> int:
