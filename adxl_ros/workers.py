@@ -42,15 +42,13 @@ _CONNECT_S = 20.0
 """Time in which a scheduler must answer, s; chosen."""
 _FETCH_S = 60.0
 """Time in which a cluster must deliver a result, s; chosen: some MB over a slow line."""
+_DIED = 'the worker ended while it ran the task'
 _WAIT_S = 1.0
 """Time after which the number of slots is asked for again, s; chosen."""
 
 
 class WorkerDied(Exception):
     """The worker ended while it ran a task."""
-
-    def __str__(self) -> str:
-        return 'the worker ended while it ran the task'
 
 
 class Pool(Executor):
@@ -113,7 +111,7 @@ class Processes(Pool):
             value, error = own.pipe.recv()
         except (EOFError, OSError):
             own.pipe = None
-            raise WorkerDied from None
+            raise WorkerDied(_DIED) from None
         if error is not None:
             raise error
         return value
@@ -223,7 +221,7 @@ class Cluster(Pool):
         except (Exception, asyncio.CancelledError) as error:
             if getattr(future, 'status', 'error') != 'error':
                 raise self._lost() from None
-            return None, WorkerDied() if isinstance(error, KilledWorker) else error
+            return None, WorkerDied(_DIED) if isinstance(error, KilledWorker) else error
 
     def _lost(self) -> UserError:
         return UserError(f'--scheduler {self._address}: was lost; start it again, and the same '

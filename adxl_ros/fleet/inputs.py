@@ -65,25 +65,22 @@ class Source:
     params: str = ''
     date: str = ''
     fault: str = ''  # Why it cannot be read; empty if it was found
-    # What its address leaves out: the password of its server, or the whole address of a web
-    # server; empty for nothing
-    secret: str = field(default='', repr=False)
+    address: str = field(default='', repr=False)  # With its secrets; empty if it has none
 
 
-def file_system(url: str, secret: str = '') -> tuple[Any, str]:
-    """Return the file system of a URL, and the path in it."""
+def file_system(address: str) -> tuple[Any, str]:
+    """Return the file system of an address, and the path in it."""
     from fsspec.core import url_to_fs
     from fsspec.implementations.local import LocalFileSystem
-    address = secret if _is_web(secret) else url
     # A path of this machine may have two colons, which join addresses.
     if '://' not in address or address.startswith('file://'):
         return LocalFileSystem(), os.path.normpath(LocalFileSystem._strip_protocol(address))
+    options: dict[str, Any] = {}
     try:
-        options: dict[str, Any] = {'password': secret} if secret else {}
-        if _is_web(address):
+        if address.lower().startswith(('http://', 'https://')):
             from aiohttp import ClientTimeout
-            options = {'client_kwargs': {'timeout': ClientTimeout(
-                total=None, sock_connect=_SILENCE_S, sock_read=_SILENCE_S)}}
+            options['client_kwargs'] = {'timeout': ClientTimeout(
+                total=None, sock_connect=_SILENCE_S, sock_read=_SILENCE_S)}
         return url_to_fs(address, **options)
     except (ImportError, ValueError) as error:
         # fsspec itself says what to install.
@@ -91,12 +88,7 @@ def file_system(url: str, secret: str = '') -> tuple[Any, str]:
         reason = one_line(error) + (f'; {install_hint(name)}' if name else '')
     except Exception as error:
         reason = f'cannot be opened: {one_line(error)}'
-    raise UserError(without_secrets(f'{url}: {reason}'))
-
-
-def _is_web(url: str) -> bool:
-    """Return whether an address is that of a web server."""
-    return url.lower().startswith(('http://', 'https://'))
+    raise UserError(without_secrets(f'{address}: {reason}'))
 
 
 def find_sources(inputs: Iterable[str]) -> list[Source]:
@@ -192,20 +184,16 @@ def fault_of(error: BaseException) -> str:
 
 def _source(fs: Any, path: str, **known: Any) -> Source:
     """Return a recording by its address, which is the path itself on this machine."""
-    name, options = str(fs.unstrip_protocol(path)), fs.storage_options
-    scheme, _, rest = name.partition(':///')
+    # A name that is not UTF-8 has no place in a table.
+    address, options = as_utf_8(str(fs.unstrip_protocol(path))), fs.storage_options
+    scheme, _, rest = address.partition(':///')
     if rest and options.get('host'):
         # The path in a server does not name the server.
-        user = f'{options["username"]}@' if options.get('username') else ''
+        login = ':'.join(filter(None, map(options.get, ('username', 'password'))))
         port = f':{options["port"]}' if options.get('port') else ''
-        name = f'{scheme}://{user}{options["host"]}{port}/{rest}'
-    # A name that is not UTF-8 has no place in a table.
-    url = without_secrets(as_utf_8(name))
-    url = url.removeprefix('file://') if url.startswith('file:///') else url
-    secret = str(options.get('password') or '')
-    if _is_web(path):
-        secret = path if path != url else ''
-    return Source(url, **known, secret=secret)
+        address = f'{scheme}://{login}{"@" * bool(login)}{options["host"]}{port}/{rest}'
+    url = without_secrets(address)
+    return Source(url.removeprefix('file://'), **known, address=address if address != url else '')
 
 
 def _of_files(fs: Any, path: str, files: Mapping[str, Mapping[str, Any]]) -> Source:

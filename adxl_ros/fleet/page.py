@@ -199,15 +199,11 @@ def _badge(table: FleetTable, units: Sequence[UnitState], counts: Counter[State]
 
 
 def _tiles(table: FleetTable, counts: Counter[State]) -> list[dict[str, str]]:
-    outcome = table['outcome']
-    refused, crashed = (int((outcome == name).sum()) for name in ('refused', 'crashed'))
-    rows = [{'label': 'recordings', 'text': str(len(table)),
-             'note': f'{refused} refused, {crashed} crashed'}]
-    rows += [{'label': f'units: {state.words}', 'text': str(counts[state]), 'note': ''}
-             for state in State]
-    hours = float(np.nansum(table['seconds'])) / 3600
-    return [*rows, {'label': 'core hours', 'text': number(hours),
-                    'note': f'{number(3600 * hours / max(len(table), 1))} s a recording'}]
+    outcomes = Counter(table['outcome'].tolist())
+    return [{'label': 'recordings', 'text': str(len(table)),
+             'note': f'{outcomes["refused"]} refused, {outcomes["crashed"]} crashed'},
+            *({'label': f'units: {state.words}', 'text': str(counts[state]), 'note': ''}
+              for state in State)]
 
 
 def _link(folder: Path, report: str) -> str:

@@ -43,7 +43,7 @@ import scipy
 _TEXTS = ['url', 'hash', 'serial', 'outcome', 'refusal', 'refused_by', 'calibration_id', 'status',
           'report', 'version']
 """Columns of texts that the page uses."""
-_OTHERS = ['date', 'effects', 'calibration_age_days', 'gap_floor_mps2', 'seconds']
+_OTHERS = ['date', 'effects', 'calibration_age_days', 'gap_floor_mps2']
 """Columns that the page uses, beside those of the quantities."""
 _YEAR = np.timedelta64(31_557_600_000_000, 'us')
 """A year of 365.25 days."""

@@ -89,7 +89,7 @@ def stage(source: Source, folder: Path) -> Staged:
     """Copy a recording into a folder."""
     url = source.url
     try:
-        fs, path = inputs.file_system(url, source.secret)
+        fs, path = inputs.file_system(source.address or url)
     except UserError as reason:
         raise StagingError(one_line(reason)) from None
     before = inputs.look_up(fs, path)

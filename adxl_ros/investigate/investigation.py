@@ -100,7 +100,6 @@ class Answer:
     outcome: Outcome  # Why the investigation goes on or ends
     sentence: str = ''  # The result in one sentence; '' where it goes on
     manoeuvre: str = ''  # Name of the next manoeuvre; '' at the end
-    information_per_minute: float = 0.0  # What it is expected to tell, nat/min
     fault: str = ''  # Fault of the recording that makes a verdict impossible; '' without one
     hidden: tuple[str, ...] = ()  # Effects that this stage cannot show
     verdict: str = ''  # Status and effects of the diagnosis; '' without a verdict
@@ -215,8 +214,8 @@ def decide(ranking: Ranking, question: Question, has_time: bool) -> Answer:
     elif not has_time:
         outcome = Outcome.TIME_OVER
     else:
-        return Answer(hypotheses, Outcome.GO_ON, '', following[0].manoeuvre.name,
-                      following[0].per_minute, hidden=ranking.hidden, verdict=verdict)
+        return Answer(hypotheses, Outcome.GO_ON, manoeuvre=following[0].manoeuvre.name,
+                      hidden=ranking.hidden, verdict=verdict)
     return Answer(hypotheses, outcome, _sentence(outcome, named), hidden=ranking.hidden,
                   verdict=verdict)
 

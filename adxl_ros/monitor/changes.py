@@ -27,6 +27,7 @@ import os
 from pathlib import Path
 import shlex
 import time
+from typing import NamedTuple
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file, recording
@@ -69,8 +70,7 @@ _KINDS = 2
 """Kinds of windows: at rest throughout, and with motion. Like is compared with like."""
 
 
-@dataclass(frozen=True)
-class Change:
+class Change(NamedTuple):
     """A change of the mean."""
 
     channel: int  # Number of the series
@@ -97,29 +97,20 @@ class ChangeTest:
         self._channels, self._block_s, self._walks = channels, block_s, np.array(walks)
         comparisons = sum(_DAY_S / block_s / _stride(2 ** j) for j in range(_LENGTHS))
         # Permitted probability of a false alarm in one comparison
-        p = min(_RESERVE * false_alarms_per_day / (comparisons * channels), 0.5)
-        # Limit of Student's t by degrees of freedom, (401,); huge for too few
-        self._limits = np.full(_MOST + 1, _NEVER)
-        self._limits[_FEWEST:] = -scipy.special.stdtrit(np.arange(_FEWEST, _MOST + 1), p / 2)
+        self._p = min(_RESERVE * false_alarms_per_day / (comparisons * channels), 0.5)
         self._size = (1 + _BEFORE) * 2 ** (_LENGTHS - 1) + 1
-        n = channels
         # Sums up to each block; the place of a block is its number modulo the size.
-        self._sums = np.zeros((self._size, n))
+        self._sums = np.zeros((self._size, channels))
         self._moves = np.zeros(self._size, int)
         self._count = 0
-        self._since = np.zeros(n, int)
-        self._squares = np.zeros((_KINDS, _LENGTHS, n))
-        self._weights = np.zeros((_KINDS, _LENGTHS, n))
+        self._since = np.zeros(channels, int)
+        self._squares, self._weights = np.zeros((2, _KINDS, _LENGTHS, channels))
         # Differences that are not learnt yet, in the order of their blocks.
         self._waiting: list[list[tuple[int, int, np.ndarray, np.ndarray]]] = [
             [] for _ in range(_LENGTHS)]
 
     def add(self, values: np.ndarray, moves: bool) -> list[Change]:
-        """
-        Test the next block.
-
-        values: means of the block, (channels,).
-        """
+        """Test the next block by its means, (channels,)."""
         last = self._count % self._size
         self._count += 1
         place = self._count % self._size
@@ -162,7 +153,8 @@ class ChangeTest:
         weights = self._weights[kind, j]
         freedom = (weights * _stride(2 ** j) / (_INDEPENDENT * 2 ** j)).astype(int)
         std = np.sqrt(self._squares[kind, j] / np.maximum(weights, 1.0))
-        return np.maximum(std, _SMALLEST), self._limits[np.minimum(freedom, _MOST)]
+        limit = -scipy.special.stdtrit(freedom.clip(_FEWEST, _MOST), self._p / 2)
+        return np.maximum(std, _SMALLEST), np.where(freedom < _FEWEST, _NEVER, limit)
 
     def _learn(self, j: int, length: int) -> None:
         """Add the differences that are so old that no change can be in them unseen."""

@@ -9,7 +9,6 @@ from contextlib import contextmanager, suppress
 import os
 from pathlib import Path
 import pty
-import termios
 import time
 import tty
 
@@ -139,21 +138,20 @@ def check_sensor(sensor: Sensor) -> None:
 
 @contextmanager
 def open_terminal(port: str) -> Iterator[int]:
-    """Open the end of a terminal that a board writes to; a new one gets a name that is free."""
-    path, is_new = Path(port), not os.path.exists(port)
-    fds = [*pty.openpty()] if is_new else []
+    """Open the end of a new terminal that a board writes to; the other end gets a name."""
+    path, (board_fd, driver_fd) = Path(port), pty.openpty()
+    name = os.ttyname(driver_fd)
     try:
-        fds = fds or [os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)]
-        tty.setraw(fds[-1])
-        os.set_blocking(fds[0], False)
-        if is_new:
+        tty.setraw(driver_fd)
+        os.set_blocking(board_fd, False)
+        if not path.exists():
             path.unlink(missing_ok=True)  # the name of an earlier board
-            path.symlink_to(os.ttyname(fds[-1]))
-        yield fds[0]
-    except (OSError, termios.error) as error:
-        raise UserError(f'--port {port}: cannot be opened: {error}') from None
+        path.symlink_to(name)
+        yield board_fd
+    except OSError as error:
+        raise UserError(f'--port {port}: cannot be made: {error.strerror}') from None
     finally:
-        if is_new and path.is_symlink() and os.readlink(path) == os.ttyname(fds[-1]):
+        if path.is_symlink() and os.readlink(path) == name:
             path.unlink()
-        for fd in fds:
-            os.close(fd)
+        os.close(board_fd)
+        os.close(driver_fd)
