@@ -163,9 +163,9 @@ class ReferenceStream:
     def motion(self, origin_ns: int) -> Motion:
         """Return the motion whose time begins at a stamp, ns; it follows the prepared blocks."""
         self._origin_ns = origin_ns
-        motion = Motion(np.inf, *(partial(self._joint, number) for number in range(len(JOINTS))),
-                        temperature_c=partial(self._surrounding, 'temperature_c'),
-                        supply_v=partial(self._surrounding, 'supply_v'))
+        alpha, beta, shift = (partial(self._joint, number) for number in range(len(JOINTS)))
+        motion = Motion(np.inf, alpha, beta, shift, partial(self._surrounding, 'temperature_c'),
+                        partial(self._surrounding, 'supply_v'))
         if self.kind is ReferenceKind.STAGE:
             return motion
         return replace(motion, force=lambda time_s: self._force(time_s),
@@ -194,10 +194,11 @@ class ReferenceStream:
         """Return what the steps of the encoder make of the force at some times, m/s², (3,)."""
         alpha, beta = (path(time_s) for path in self._paths[:2])
         alpha_std, beta_std = (_path_std(path, time_s) for path in self._paths[:2])
-        exact, *others = (
-            np.array(specific_force(*angles, self._sensor.local_gravity_mps2))
-            for angles in ((alpha, beta), (alpha + alpha_std, beta), (alpha, beta + beta_std)))
-        return np.asarray(np.sqrt(sum((other - exact) ** 2 for other in others).mean(axis=1)))
+        angles = (alpha, beta), (alpha + alpha_std, beta), (alpha, beta + beta_std)
+        force, by_alpha, by_beta = (np.array(specific_force(a, b, self._sensor.local_gravity_mps2))
+                                    for a, b in angles)
+        squares = (by_alpha - force) ** 2 + (by_beta - force) ** 2
+        return np.asarray(np.sqrt(squares.mean(axis=1)))
 
     def _joint(self, number: int, time_s: np.ndarray, order: int = 0) -> np.ndarray:
         return self._paths[number](time_s, order)
