@@ -160,7 +160,7 @@ def _next_steps(options: argparse.Namespace, diagnosis: Diagnosis) -> list[NextS
     """Return what to record, how to diagnose that, and how to simulate what was found."""
     if diagnosis.report is None:
         return []
-    params = cli.quoted(Path(options.output) / 'params.yaml')
+    params = str(Path(options.output) / 'params.yaml')
     proposal, steps = diagnosis.report.next_experiment, []
     if proposal is not None:
         both = ', and next_simulated.csv in the simulator' if options.sim else ''
@@ -169,17 +169,15 @@ def _next_steps(options: argparse.Namespace, diagnosis: Diagnosis) -> list[NextS
     if proposal is not None and not proposal.concerns_reference:
         is_closed = diagnosis.report.verdict.status in ('explained', 'partly')
         is_alone = is_closed or options.sim or options.urdf
-        words = [cli.quoted(*([] if is_alone else options.recording), 'next.csv')]
-        if is_closed or options.params:
-            words.append(f'--params {params if is_closed else cli.quoted(options.params)}')
-        words += ['--sim next_simulated.csv'] if options.sim else []
-        words += [f'--urdf {cli.quoted(options.urdf)} --frame {cli.quoted(options.frame)}'] \
-            if options.urdf else []
-        words.append(f'-o {cli.quoted(options.output + "_2")}')
+        given = {'--params': params if is_closed else options.params,
+                 '--sim': options.sim and 'next_simulated.csv', '--urdf': options.urdf,
+                 '--frame': options.urdf and options.frame, '-o': f'{options.output}_2'}
+        words = [*([] if is_alone else options.recording), 'next.csv']
+        words += [word for option in given.items() if option[1] for word in option]
         steps.append(NextStep('diagnose it' if is_alone else 'diagnose it together with this one',
-                              cli.command('diagnose', ' '.join(words))))
+                              cli.command('diagnose', cli.quoted(*words))))
     return [*steps, NextStep('simulate the sensor as it was found', cli.command(
-        'simulate', f'rich --params {params} -o sim.csv'))]
+        'simulate', f'rich --params {cli.quoted(params)} -o sim.csv'))]
 
 
 def main() -> int:
