@@ -17,7 +17,6 @@ FLEETS = {
     'bad': MadeUpFleet(units=60, per_unit=12, batch=12, drifting_mg=2.5, refused=0.05,
                        stage_fault=True),
     'sound': MadeUpFleet(units=8, per_unit=6),
-    'drift': MadeUpFleet(units=8, per_unit=12, drifting_mg=2.5),
     'single': MadeUpFleet(units=1, per_unit=1),
     'refused': MadeUpFleet(units=3, per_unit=2, refused=1.0),
 }
