@@ -154,10 +154,8 @@ def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> 
         figures['matrix'] = _matrix_figure(table, share)
     counts = Counter(unit.state for unit in units)
     years = table.years[np.isfinite(table.years)]
-    versions = ', '.join(sorted({text for text in table['version'] if text}))
     about = [f'{len(table)} recordings', f'{len(table.serials)} units',
-             *([f'{date_text(years.min())} to {date_text(years.max())}'] if len(years) else []),
-             *([f'rows made by version {versions}'] if versions else [])]
+             *([f'{date_text(years.min())} to {date_text(years.max())}'] if len(years) else [])]
     batches = [f'{batch.members.sum()} units with a serial number {batch.prefix}… have a '
                f'{result.quantity.label} that differs by '
                + result.quantity.text(batch.difference, batch.low, batch.high) +

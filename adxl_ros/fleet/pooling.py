@@ -296,11 +296,9 @@ CHANCE = 0.01
 
 def moderated(variance: np.ndarray, freedom: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
-    Moderate the variances of units.
+    Moderate the variances of units, (m,), by their degrees of freedom, (m,), 0 for none.
 
-    variance: variances of the units, (m,). Those without a degree of freedom may be NaN.; freedom:
-    their degrees of freedom, (m,); 0 for none; returns: moderated variances and their degrees of
-    freedom, (m,) each. Without any variance all are 1.
+    returns: moderated variances and their degrees of freedom. Without any variance all are 1.
     """
     determined = freedom > 0
     common, common_freedom = _common_variance(variance[determined], freedom[determined])
@@ -416,23 +414,14 @@ def _variances(y: np.ndarray, variance: np.ndarray, mean: float) -> tuple[float,
 
 
 def weighted_mean(y: np.ndarray, variance: np.ndarray, spread2: float) -> tuple[float, float]:
-    """
-    Return the mean of a population for a given spread.
-
-    y: estimates, (n,); variance: their own variances, (n,).
-    """
+    """Return the mean of estimates, (n,), for a given spread, and its variance."""
     weight = 1 / (variance + spread2)
     total = float(weight.sum())
     return float(weight @ y) / total, 1 / total
 
 
 def _spreads2(y: np.ndarray, variance: np.ndarray) -> list[float]:
-    """
-    Return the variance between units, and the ends of its 90 % interval.
-
-    Each is the one at which the weighted squares about the mean have a value: that which they are
-    expected to have, or a quantile of their χ² distribution; 0 where they are below it everywhere.
-    """
+    """Return the variance between units, and the ends of its 90 % interval; see the module."""
     def squares(spread2: float) -> float:
         mean, _ = weighted_mean(y, variance, spread2)
         return float(np.sum((y - mean) ** 2 / (variance + spread2)))
@@ -471,11 +460,7 @@ def by_prefix(names: Sequence[str]) -> dict[str, np.ndarray]:
 
 def bad_batch(serials: Sequence[str], level: np.ndarray, tolerance: float, tests: int
               ) -> BadBatch | None:
-    """
-    Return the most certain batch whose level differs by more than a tolerance.
-
-    serials, level: serial number and level of each unit, (m,).
-    """
+    """Return the most certain batch whose level differs by more than a tolerance."""
     # The larger part of a fleet is what the others are compared with.
     groups = {prefix: members for prefix, members in by_prefix(serials).items()
               if members.sum() <= len(serials) / 2}

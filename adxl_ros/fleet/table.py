@@ -41,7 +41,7 @@ import pandas as pd
 import scipy
 
 _TEXTS = ['url', 'hash', 'serial', 'outcome', 'refusal', 'refused_by', 'calibration_id', 'status',
-          'report', 'version']
+          'report']
 """Columns of texts that the page uses."""
 _OTHERS = ['date', 'effects', 'calibration_age_days', 'gap_floor_mps2']
 """Columns that the page uses, beside those of the quantities."""
