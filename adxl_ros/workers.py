@@ -290,11 +290,7 @@ def for_each(pool: Pool, work: Callable[..., Any], jobs: Iterable[Callable[[], t
 
 
 def write(path: Path, data: bytes) -> None:
-    """
-    Write a file as a whole or not at all, in a folder that is made.
-
-    Several processes may write the same one at once.
-    """
+    """Write a file as a whole or not at all; several processes may write the same one at once."""
     temporary = path.with_name(f'.{path.name}.{os.uname().nodename}.{os.getpid()}')
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -299,11 +299,7 @@ def _beside(folder: str, url: str) -> str:
 
 
 def stated_by(sources: Iterable[Source]) -> list[tuple[str, str]]:
-    """
-    Return what recordings of this machine state at their begin; nothing for those of a server.
-
-    It is the serial number of the unit, and the date, ISO 8601 in UTC; empty for nothing.
-    """
+    """Return the serial number and date that recordings of this machine state, or '' each."""
     with ThreadPoolExecutor(_THREADS) as pool:
         return list(pool.map(_stated, sources))
 

@@ -411,11 +411,7 @@ def _select_monotonic_clock(device: Any) -> bool:
 
 
 def _set_rate(context: Any, device: Any, columns: Sequence[_Column], rate_hz: float) -> float:
-    """
-    Set the sample rate of the device, of a channel or of the only trigger.
-
-    returns: sample rate that the device states then, Hz; `rate_hz` where it states none.
-    """
+    """Set the sample rate of device, channel or only trigger; return the rate that it states."""
     triggers = [d for d in context.devices if isinstance(d, import_libiio().Trigger)]
     places = [device, *(column.channel for column in columns)]
     places += triggers if len(triggers) == 1 else []

@@ -294,11 +294,7 @@ def read(tool: str, path: str, reading: ReadingOptions = AS_IT_IS) -> Recording:
 
 @contextmanager
 def progress(title: str) -> Iterator[Callable[..., None]]:
-    """
-    Show a progress bar on a terminal where rich is installed, else nothing.
-
-    Yield what takes the share that is done, and the name of the stage.
-    """
+    """Show a bar on a terminal with rich; yield what takes the share done, and a stage's name."""
     drawn = bar(sys.stderr, _BAR_COLUMNS, '{task.percentage:3.0f} %', 'TimeElapsedColumn',
                 'TimeRemainingColumn')
     if drawn is None:

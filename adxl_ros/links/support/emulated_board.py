@@ -53,11 +53,7 @@ class Board:
         self._frame_samples = _FRAME_SAMPLES
 
     def send(self, columns: Mapping[str, np.ndarray]) -> None:
-        """
-        Send samples, each frame at the time of its last sample.
-
-        columns: volts by axis, such as `x_v`, and `supply_v` and `temperature_c`, (n,) each.
-        """
+        """Send the samples of columns, (n,) each, every frame at the time of its last sample."""
         volts = np.column_stack([_volts(role, columns) for role in self._roles])
         codes = np.rint(volts / self._sensor.lsb_v).clip(
             0, 2 ** self._sensor.adc_bits - 1).astype(np.uint16)

@@ -150,12 +150,7 @@ class ClockMap:
         return self.settled and not self._late
 
     def host_ns(self, device_ns: np.ndarray) -> np.ndarray:
-        """
-        Map device times to host times.
-
-        device_ns: device times, ns, (n,) int64, ascending; returns: host times, ns, (n,) int64,
-        ascending within the call and from call to call.
-        """
+        """Map ascending device times, ns, (n,), to host times that ascend from call to call."""
         stamps = np.rint(self._line(device_ns)).astype(np.int64)
         newest_ns = self._newest_stamp_ns
         if newest_ns is not None and stamps[0] <= newest_ns:
@@ -208,8 +203,7 @@ class ClockMap:
         """
         Fit the best line to the windows; return the lag of a device time on it, ns.
 
-        The fit is a least-squares line, reweighted so that a window above it counts less, with a
-        prior for a drift of 0.
+        A window above the line counts less, and a drift of 0 is the prior.
         """
         windows = [self._open] if self._open and not self._windows else [*self._windows]
         origin = windows[-1]
