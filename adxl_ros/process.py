@@ -35,18 +35,13 @@ def use_one_thread() -> None:
     """
     Keep OpenBLAS to one thread, unless the user chooses a number; call it before numpy is loaded.
 
-    The matrices of this package are small. On busy cores the threads of OpenBLAS wait for each
-    other: a fit of 614 poses took 35 s of CPU instead of 2 s.
+    On busy cores its threads wait for each other: a fit of 614 poses took 35 s instead of 2 s.
     """
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 
 def end_silently_while_loading() -> None:
-    """
-    Let SIGINT end the executable of a node without a traceback of its imports.
-
-    Programs that import the package, such as `ros2 launch`, keep their handler.
-    """
+    """Let SIGINT end a node that loads without a traceback; others keep their handler."""
     path = Path(sys.argv[0])
     is_node = path.name in _NODES and path.parent.parts[-2:] == ('lib', 'adxl_ros')
     if is_node and signal.getsignal(signal.SIGINT) is signal.default_int_handler:

@@ -42,15 +42,13 @@ _CONNECT_S = 20.0
 """Time in which a scheduler must answer, s; chosen."""
 _FETCH_S = 60.0
 """Time in which a cluster must deliver a result, s; chosen: some MB over a slow line."""
+_DIED = 'the worker ended while it ran the task'
 _WAIT_S = 1.0
 """Time after which the number of slots is asked for again, s; chosen."""
 
 
 class WorkerDied(Exception):
     """The worker ended while it ran a task."""
-
-    def __str__(self) -> str:
-        return 'the worker ended while it ran the task'
 
 
 class Pool(Executor):
@@ -113,7 +111,7 @@ class Processes(Pool):
             value, error = own.pipe.recv()
         except (EOFError, OSError):
             own.pipe = None
-            raise WorkerDied from None
+            raise WorkerDied(_DIED) from None
         if error is not None:
             raise error
         return value
@@ -139,6 +137,15 @@ class Processes(Pool):
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the workers after their tasks."""
         self._threads.shutdown(wait, cancel_futures=cancel_futures)
+
+
+def in_background(work: Callable[..., Any], *arguments: Any
+                  ) -> tuple[Future, Callable[[], None]]:
+    """Start a task in a process of its own; return its end, and what ends it at once."""
+    pool = Processes(1)
+    end = pool.submit(work, *arguments)
+    pool.shutdown(wait=False)
+    return end, pool.kill
 
 
 def _work(pipe: Connection, shared: tuple) -> None:
@@ -214,7 +221,7 @@ class Cluster(Pool):
         except (Exception, asyncio.CancelledError) as error:
             if getattr(future, 'status', 'error') != 'error':
                 raise self._lost() from None
-            return None, WorkerDied() if isinstance(error, KilledWorker) else error
+            return None, WorkerDied(_DIED) if isinstance(error, KilledWorker) else error
 
     def _lost(self) -> UserError:
         return UserError(f'--scheduler {self._address}: was lost; start it again, and the same '
@@ -283,11 +290,7 @@ def for_each(pool: Pool, work: Callable[..., Any], jobs: Iterable[Callable[[], t
 
 
 def write(path: Path, data: bytes) -> None:
-    """
-    Write a file as a whole or not at all, in a folder that is made.
-
-    Several processes may write the same one at once.
-    """
+    """Write a file as a whole or not at all; several processes may write the same one at once."""
     temporary = path.with_name(f'.{path.name}.{os.uname().nodename}.{os.getpid()}')
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

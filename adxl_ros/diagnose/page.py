@@ -69,7 +69,7 @@ class Run:
     subject: str
     parameter_file: str
     steps: Sequence[tuple[str, str]]
-    parameters_text: str
+    parameters_text: str = ''
     command: str = ''
 
 

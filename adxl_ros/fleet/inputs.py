@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from glob import has_magic
 import hashlib
+from io import TextIOWrapper
 import os
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -25,7 +26,7 @@ from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files import recording
 from adxl_ros.files.recording_columns import NO_UNIT, Recording
 from adxl_ros.files.tables import TABLE_ENDINGS
-from adxl_ros.fleet.row import as_date, PAGE, POPULATION, TABLE, UNITS
+from adxl_ros.fleet.row import as_date, TABLE
 from adxl_ros.report.page import as_utf_8, without_secrets
 
 _ENDINGS = ('.csv', '.mcap', '.db3')
@@ -64,25 +65,22 @@ class Source:
     params: str = ''
     date: str = ''
     fault: str = ''  # Why it cannot be read; empty if it was found
-    # What its address leaves out: the password of its server, or the whole address of a web
-    # server; empty for nothing
-    secret: str = field(default='', repr=False)
+    address: str = field(default='', repr=False)  # With its secrets; empty if it has none
 
 
-def file_system(url: str, secret: str = '') -> tuple[Any, str]:
-    """Return the file system of a URL, and the path in it."""
+def file_system(address: str) -> tuple[Any, str]:
+    """Return the file system of an address, and the path in it."""
     from fsspec.core import url_to_fs
     from fsspec.implementations.local import LocalFileSystem
-    address = secret if _is_web(secret) else url
     # A path of this machine may have two colons, which join addresses.
     if '://' not in address or address.startswith('file://'):
         return LocalFileSystem(), os.path.normpath(LocalFileSystem._strip_protocol(address))
+    options: dict[str, Any] = {}
     try:
-        options: dict[str, Any] = {'password': secret} if secret else {}
-        if _is_web(address):
+        if address.lower().startswith(('http://', 'https://')):
             from aiohttp import ClientTimeout
-            options = {'client_kwargs': {'timeout': ClientTimeout(
-                total=None, sock_connect=_SILENCE_S, sock_read=_SILENCE_S)}}
+            options['client_kwargs'] = {'timeout': ClientTimeout(
+                total=None, sock_connect=_SILENCE_S, sock_read=_SILENCE_S)}
         return url_to_fs(address, **options)
     except (ImportError, ValueError) as error:
         # fsspec itself says what to install.
@@ -90,20 +88,11 @@ def file_system(url: str, secret: str = '') -> tuple[Any, str]:
         reason = one_line(error) + (f'; {install_hint(name)}' if name else '')
     except Exception as error:
         reason = f'cannot be opened: {one_line(error)}'
-    raise UserError(without_secrets(f'{url}: {reason}'))
-
-
-def _is_web(url: str) -> bool:
-    """Return whether an address is that of a web server."""
-    return url.lower().startswith(('http://', 'https://'))
+    raise UserError(without_secrets(f'{address}: {reason}'))
 
 
 def find_sources(inputs: Iterable[str]) -> list[Source]:
-    """
-    Find the recordings of a command line.
-
-    The files of a fleet's results, which lie beside its table, are no recordings.
-    """
+    """Find the recordings of a command line; the table of a fleet is none."""
     sources: dict[str, Source] = {}
     for text in inputs:
         try:
@@ -146,7 +135,7 @@ def _of_listing(text: str, fs: Any, path: str, named: Mapping[str, Mapping[str, 
     for name, info in files.items():
         bag = next((str(folder) for folder in PurePosixPath(name).parents if str(folder) in bags),
                    '')
-        if bag or (not _is_of_fleet(fs, name) and (name in named or _is_recording_name(name))):
+        if bag or (file_name(name) != TABLE and (name in named or _is_recording_name(name))):
             found.setdefault(bag or name, {})[name] = info
     sources = [_of_files(fs, name, content) for name, content in found.items()
                if name.count('/.') <= path.count('/.')]
@@ -164,12 +153,6 @@ def file_name(path: str) -> str:
 def _is_recording_name(path: str) -> bool:
     """Return whether the name of a file is that of a recording, for folders and manifests."""
     return PurePosixPath(file_name(path)).suffix.lower() in (*_ENDINGS, *TABLE_ENDINGS)
-
-
-def _is_of_fleet(fs: Any, name: str) -> bool:
-    """Return whether a file is part of the results of a fleet."""
-    folder, _, file = name.rpartition('/')
-    return file in (PAGE, POPULATION, TABLE, UNITS) and fs.exists(f'{folder}/{TABLE}')
 
 
 def look_up(fs: Any, path: str) -> Source:
@@ -201,20 +184,16 @@ def fault_of(error: BaseException) -> str:
 
 def _source(fs: Any, path: str, **known: Any) -> Source:
     """Return a recording by its address, which is the path itself on this machine."""
-    name, options = str(fs.unstrip_protocol(path)), fs.storage_options
-    scheme, _, rest = name.partition(':///')
+    # A name that is not UTF-8 has no place in a table.
+    address, options = as_utf_8(str(fs.unstrip_protocol(path))), fs.storage_options
+    scheme, _, rest = address.partition(':///')
     if rest and options.get('host'):
         # The path in a server does not name the server.
-        user = f'{options["username"]}@' if options.get('username') else ''
+        login = ':'.join(filter(None, map(options.get, ('username', 'password'))))
         port = f':{options["port"]}' if options.get('port') else ''
-        name = f'{scheme}://{user}{options["host"]}{port}/{rest}'
-    # A name that is not UTF-8 has no place in a table.
-    url = without_secrets(as_utf_8(name))
-    url = url.removeprefix('file://') if url.startswith('file:///') else url
-    secret = str(options.get('password') or '')
-    if _is_web(path):
-        secret = path if path != url else ''
-    return Source(url, **known, secret=secret)
+        address = f'{scheme}://{login}{"@" * bool(login)}{options["host"]}{port}/{rest}'
+    url = without_secrets(address)
+    return Source(url.removeprefix('file://'), **known, address=address if address != url else '')
 
 
 def _of_files(fs: Any, path: str, files: Mapping[str, Mapping[str, Any]]) -> Source:
@@ -251,19 +230,16 @@ def _manifest_rows(text: str, fs: Any, path: str) -> dict[int, dict[str, str]] |
             os.path.exists(path) and not os.path.isfile(path)):  # a pipe may never end
         return None
     try:
-        if suffix == '.csv':
-            with fs.open(path, 'r', encoding='utf-8-sig', newline='') as file:
-                return _csv_rows(text, file)
-        from pyarrow import parquet, string
         with fs.open(path, 'rb') as file:
+            if suffix == '.csv':
+                return _csv_rows(text, TextIOWrapper(file, 'utf-8-sig', newline=''))
+            from pyarrow import parquet, string
             content = parquet.ParquetFile(file)
             names = [name for name in _MANIFEST_COLUMNS if name in content.schema_arrow.names]
-            if 'url' not in names:
-                return None
-            columns = {name: column.cast(string()).fill_null('').to_pylist()
-                       for name, column in zip(names, content.read(names).columns)}
-        return {number: dict(zip(names, row))
-                for number, row in enumerate(zip(*columns.values()), 1)}
+            columns = [column.cast(string()).fill_null('').to_pylist()
+                       for column in content.read(names).columns]
+        return dict(enumerate((dict(zip(names, row)) for row in zip(*columns)), 1)) \
+            if 'url' in names else None
     except UserError:
         raise
     except Exception:
@@ -323,11 +299,7 @@ def _beside(folder: str, url: str) -> str:
 
 
 def stated_by(sources: Iterable[Source]) -> list[tuple[str, str]]:
-    """
-    Return what recordings of this machine state at their begin; nothing for those of a server.
-
-    It is the serial number of the unit, and the date, ISO 8601 in UTC; empty for nothing.
-    """
+    """Return the serial number and date that recordings of this machine state, or '' each."""
     with ThreadPoolExecutor(_THREADS) as pool:
         return list(pool.map(_stated, sources))
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The page of a fleet and the files beside it: `fleet.html`, `population.yaml`, `units.csv`."""
+"""The page of a fleet, and the file of its population."""
 
 from __future__ import annotations
 
@@ -8,19 +8,18 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from datetime import datetime, timedelta, timezone
 from functools import partial
-from itertools import repeat
 from pathlib import Path
 
 from adxl_ros.files import calibration_store
 from adxl_ros.files.atomic_write import write_text
-from adxl_ros.fleet.row import PAGE, POPULATION, reason_kind, TABLE, UNITS
+from adxl_ros.fleet.pooling import FALSE_DISCOVERY_RATE
+from adxl_ros.fleet.row import PAGE, POPULATION, reason_kind, TABLE
 from adxl_ros.fleet.table import (
     analyse,
+    DAYS_PER_YEAR,
     effect_matrix,
-    EffectMatrix,
     far_out,
     FleetTable,
-    MG,
     QuantityResult,
     rank,
     read,
@@ -28,7 +27,6 @@ from adxl_ros.fleet.table import (
     TOLERANCE_MG,
     UnitState,
 )
-from adxl_ros.fleet.trends import FALSE_DISCOVERY_RATE
 from adxl_ros.model.constants import AXES, Z_90
 from adxl_ros.model.population import Population
 from adxl_ros.report import figures as plotly, page as html_page
@@ -45,7 +43,6 @@ _MOST_PIXELS = 640
 _MATRIX_HEAD_PIXELS = 150
 """Heights of the matrix: of a unit with a name, of all units, and of the names of effects."""
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
-_DAYS_PER_YEAR = 365.25
 _SHOWN = 12
 """Number of units in the first table and with a plot. Chosen: they fit on one screen."""
 _MOST_ROWS = 50
@@ -65,7 +62,7 @@ def date_text(year: float) -> str:
 
 
 def _stamps(years: Iterable[float]) -> list[str]:
-    return [f'{_EPOCH + timedelta(days=float(year) * _DAYS_PER_YEAR):%Y-%m-%d %H:%M}'
+    return [f'{_EPOCH + timedelta(days=float(year) * DAYS_PER_YEAR):%Y-%m-%d %H:%M}'
             for year in years]
 
 
@@ -76,21 +73,31 @@ def _trend_figure(table: FleetTable, result: QuantityResult, unit: int) -> plotl
     origin = float(result.trends.level[place]) if is_relative and place is not None else 0.0
     part = table.unit[result.rows] == unit
     years, is_outlier = result.recordings.time[part], result.is_outlier[part]
-    dates = np.array(_stamps(years), object)
     value = quantity.factor * (result.recordings.value[part] - origin)
     half = Z_90 * quantity.factor * result.recordings.std[part]
     traces = []
     if place is not None and (~is_outlier).sum() > 1:
-        periods = result.recordings[~result.is_outlier].period[part[~result.is_outlier]]
-        traces = _lines(result, place, years[~is_outlier], periods, origin)
+        is_claimed = bool(result.is_claimed[place])
+        slope = quantity.factor * result.trends.slope[place] if is_claimed else 0.0
+        colour = plotly.BEFORE_COLOUR if is_claimed else plotly.QUIET_COLOUR
+        periods = np.where(is_outlier, -1, result.recordings.period[part])
+        for period in set(periods.tolist()) - {-1}:
+            within, level = years[periods == period], value[periods == period].mean()
+            ends = np.array([within.min(), within.max()])
+            traces.append(plotly.line([], level + slope * (ends - within.mean()), 'line', colour)
+                          | {'x': _stamps(ends)})
     for name, shown, colour in (('recording', ~is_outlier, plotly.AXIS_COLOURS['x']),
                                 ('outlier', is_outlier, plotly.BEFORE_COLOUR)):
         if shown.any():
             traces.append(plotly.points([], value[shown], half[shown], name, colour)
-                          | {'x': list(dates[shown])})
+                          | {'x': _stamps(years[shown])})
+    # Calibrations between recordings, where a period ends
+    rows = table.rows_of(unit)
+    made = table.years[rows] - table['calibration_age_days'][rows] / DAYS_PER_YEAR
+    begins = made[1:][np.diff(table.period[rows]) > 0]
     marks = [{'type': 'line', 'x0': stamp, 'x1': stamp, 'yref': 'paper', 'y0': 0, 'y1': 1,
               'line': {'color': plotly.QUIET_COLOUR, 'width': 1.2, 'dash': 'dash'}}
-             for stamp in _stamps(calibration_years(table, unit))]
+             for stamp in _stamps(begins[np.isfinite(begins)])]
     title = quantity.shown_unit + ' from the mean' * is_relative
     return plotly.figure(
         traces, _TREND_HEIGHT, showlegend=False, shapes=marks,
@@ -98,36 +105,12 @@ def _trend_figure(table: FleetTable, result: QuantityResult, unit: int) -> plotl
         yaxis={'title': {'text': title}, 'nticks': 5})
 
 
-def calibration_years(table: FleetTable, unit: int) -> np.ndarray:
-    """Return when a unit was calibrated again between its recordings."""
-    rows = table.rows_of(unit)
-    made = table.years[rows] - table['calibration_age_days'][rows] / _DAYS_PER_YEAR
-    begins = made[1:][np.diff(table.period[rows]) > 0]
-    return begins[np.isfinite(begins)]
-
-
-def _lines(result: QuantityResult, place: int, times: np.ndarray, periods: np.ndarray,
-           origin: float) -> list[plotly.Figure]:
-    """Return the lines of a unit between calibrations."""
-    trends, is_claimed = result.trends, bool(result.is_claimed[place])
-    slope = trends.slope[place] if is_claimed else 0.0
-    traces = []
-    for period in np.unique(periods):
-        part = times[periods == period]
-        ends = np.array([part.min(), part.max()])
-        value = trends.period_value[period] + slope * (ends - trends.period_time[period])
-        traces.append(plotly.line(
-            [], result.quantity.factor * (value - origin), 'line', plotly.BEFORE_COLOUR
-            if is_claimed else plotly.QUIET_COLOUR) | {'x': _stamps(ends)})
-    return traces
-
-
-def _matrix_figure(table: FleetTable, effects: EffectMatrix) -> plotly.Figure:
+def _matrix_figure(table: FleetTable, share: pd.DataFrame) -> plotly.Figure:
     """Plot how often each effect is named in each unit."""
-    columns = list(effects.effects[:_MOST_EFFECTS])
-    share = 100 * effects.share[:, :len(columns)]
-    trace = {'type': 'heatmap', 'x': columns, 'y': [table.serials[i] for i in effects.units],
-             'z': share.round(1).tolist(), 'zmin': 0, 'zmax': 100,
+    share = share.iloc[:, :_MOST_EFFECTS]
+    columns = list(share)
+    trace = {'type': 'heatmap', 'x': columns, 'y': [table.serials[unit] for unit in share.index],
+             'z': (100 * share.to_numpy()).round(1).tolist(), 'zmin': 0, 'zmax': 100,
              'colorscale': [[0, '#f0f3f6'], [1, '#b03224']], 'xgap': 2,
              'hovertemplate': '%{y}: %{x} in %{z} % of the recordings<extra></extra>',
              'colorbar': {'title': {'text': '%'}, 'thickness': 10, 'len': 0.6}}
@@ -140,7 +123,7 @@ def _matrix_figure(table: FleetTable, effects: EffectMatrix) -> plotly.Figure:
 
 
 def write(folder: Path) -> list[Path]:
-    """Write page, population and estimates of a fleet beside its table."""
+    """Write page and population of a fleet beside its table."""
     html_page.check_libraries()
     table = read(folder / TABLE)
     results = analyse(table)
@@ -151,31 +134,15 @@ def write(folder: Path) -> list[Path]:
     calibration_store.write_population(folder / POPULATION, population, [
         {'serial': item.serial, 'coefficient': item.quantity.column, 'value': item.value,
          'distance': item.distance} for item in distant])
-    write_text(folder / UNITS, _units_csv(results, table.serials))
     write_text(folder / PAGE, page(table, results, folder))
-    return [folder / name for name in (PAGE, POPULATION, UNITS)]
-
-
-def _units_csv(results: Sequence[QuantityResult], serials: Sequence[str]) -> str:
-    """Return the estimates of all units, with and without the population."""
-    columns = ('serial', 'coefficient', 'unit', 'estimate', 'std', 'shrunken', 'shrunken_std',
-               'distance', 'is_far_out')
-    rows: list[tuple] = []
-    for result in results:
-        if (population := result.population) is not None:
-            rows += zip([serials[unit] for unit in result.units], repeat(result.quantity.column),
-                        repeat(result.quantity.unit), population.estimates, population.std,
-                        *population.shrunken(), population.distances(),
-                        np.where(population.is_far_out, 'true', 'false'))
-    return pd.DataFrame(rows, columns=columns).to_csv(
-        index=False, float_format='%.9g', lineterminator='\n')
+    return [folder / name for name in (PAGE, POPULATION)]
 
 
 def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> str:
     """Return the page of a fleet."""
     distant = far_out(results, table.serials)
     units = rank(table, results, distant)
-    effects = effect_matrix(table)
+    share, findings = effect_matrix(table)
     # Units that drift come first, although others may be more urgent.
     plotted = [(unit, shown[0]) for unit in sorted(units, key=lambda unit: not unit.drifts)
                if (shown := [*(drift.result for drift in unit.drifts), *(
@@ -183,14 +150,12 @@ def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> 
                ][:_SHOWN]
     figures = {f'trend-{i}': _trend_figure(table, result, unit.unit)
                for i, (unit, result) in enumerate(plotted)}
-    if effects.effects:
-        figures['matrix'] = _matrix_figure(table, effects)
+    if len(share.columns):
+        figures['matrix'] = _matrix_figure(table, share)
     counts = Counter(unit.state for unit in units)
     years = table.years[np.isfinite(table.years)]
-    versions = ', '.join(sorted({text for text in table['version'] if text}))
     about = [f'{len(table)} recordings', f'{len(table.serials)} units',
-             *([f'{date_text(years.min())} to {date_text(years.max())}'] if len(years) else []),
-             *([f'rows made by version {versions}'] if versions else [])]
+             *([f'{date_text(years.min())} to {date_text(years.max())}'] if len(years) else [])]
     batches = [f'{batch.members.sum()} units with a serial number {batch.prefix}… have a '
                f'{result.quantity.label} that differs by '
                + result.quantity.text(batch.difference, batch.low, batch.high) +
@@ -200,13 +165,12 @@ def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> 
         'title': 'Fleet', 'about': about, 'badge': _badge(table, units, counts),
         'tiles': _tiles(table, counts), 'shown': _SHOWN, 'figures': figures,
         'units': units, 'date': date_text, 'link': partial(_link, folder),
-        'without_unit': _rows_without_unit(table),
-        'without_unit_count': int((table.unit < 0).sum()),
+        'without_unit': int((table.unit < 0).sum()),
         'trends': [{'figure': f'trend-{i}', 'title': f'{unit.serial}: {result.quantity.label}',
                     'text': f'{unit.drifts[0].text}.' if unit.drifts else 'No slope is claimed.'}
                    for i, (unit, result) in enumerate(plotted)],
-        'findings': [*batches, *effects.findings], 'has_effects': bool(effects.effects),
-        'judged': len(effects.units), 'populations': _population_rows(results),
+        'findings': [*batches, *findings], 'has_effects': 'matrix' in figures,
+        'judged': len(share), 'populations': _population_rows(results),
         'far_out': [
             [item.serial, item.quantity.label, f'{item.value:.5g} {item.quantity.unit}',
              number(item.distance, True)] for item in distant[:_MOST_ROWS]],
@@ -233,27 +197,11 @@ def _badge(table: FleetTable, units: Sequence[UnitState], counts: Counter[State]
 
 
 def _tiles(table: FleetTable, counts: Counter[State]) -> list[dict[str, str]]:
-    outcome = table['outcome']
-    refused, crashed = (int((outcome == name).sum()) for name in ('refused', 'crashed'))
-    rows = [{'label': 'recordings', 'text': str(len(table)),
-             'note': f'{refused} refused, {crashed} crashed'}]
-    rows += [{'label': f'units: {state.words}', 'text': str(counts[state]), 'note': ''}
-             for state in State]
-    hours = float(np.nansum(table['seconds'])) / 3600
-    return [*rows, {'label': 'core hours', 'text': number(hours),
-                    'note': f'{number(3600 * hours / max(len(table), 1))} s a recording'}]
-
-
-def _rows_without_unit(table: FleetTable) -> list[dict[str, str]]:
-    """Return the recordings that state no serial number, the largest gap first."""
-    rows = np.flatnonzero(table.unit < 0)
-    gap_mg, floor_mg = (MG * table[f'gap_{name}_mps2'] for name in ('before', 'floor'))
-    rows = rows[np.argsort(-np.nan_to_num(gap_mg[rows]), kind='stable')]
-    return [{'url': table['url'][row], 'date': date_text(table.years[row]),
-             'verdict': ', '.join([table['status'][row] or table['outcome'][row],
-                                   *table['effects'][row]]),
-             'gap': f'{number(gap_mg[row])} / {number(floor_mg[row])}',
-             'report': table['report'][row]} for row in rows[:_MOST_ROWS]]
+    outcomes = Counter(table['outcome'].tolist())
+    return [{'label': 'recordings', 'text': str(len(table)),
+             'note': f'{outcomes["refused"]} refused, {outcomes["crashed"]} crashed'},
+            *({'label': f'units: {state.words}', 'text': str(counts[state]), 'note': ''}
+              for state in State)]
 
 
 def _link(folder: Path, report: str) -> str:

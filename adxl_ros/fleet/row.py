@@ -38,8 +38,6 @@ PAGE = 'fleet.html'
 """Name of the page beside the table."""
 POPULATION = 'population.yaml'
 """Name of the file of the population beside the table."""
-UNITS = 'units.csv'
-"""Name of the file with the estimates of each unit, beside the table."""
 
 OUTCOMES = ('done', 'refused', 'crashed')
 """Values of `outcome`: the tasks gave results; the recording was refused, and `refusal` has the
@@ -51,8 +49,7 @@ class Column:
     """One column of the table."""
 
     name: str  # Its name, which ends in the unit where there is one
-    # `text`, `float`, `integer`, `flag`, `time` (UTC), `texts`, `groups` (lists of texts) or
-    # `coefficients` (see `arrow_schema`)
+    # `text`, `float`, `integer`, `flag`, `time` (UTC), `texts` or `groups` (lists of texts)
     kind: str
     meaning: str  # What it holds, for people
     unit: str = ''  # Its unit; empty for none
@@ -122,8 +119,6 @@ COLUMNS: tuple[Column, ...] = (
     Column('groups', 'groups', 'sets of inseparable effects, one of each acts'),
     Column('probability', 'float', 'probability of the verdict'),
     Column('data_fault', 'text', 'name of the fault of the data, with the status bad_data'),
-    Column('coefficients', 'coefficients',
-           'estimates of fit and diagnose with standard deviations, baseline included'),
     Column('report', 'text', "folder of the recording's single reports, relative to the table"),
     Column('version', 'text', 'version of the package'),
     Column('code', 'text', 'SHA-256 of the code that made the row'),
@@ -141,7 +136,7 @@ TIMING = tuple(column.name for column in COLUMNS if column.is_timing)
 
 def empty_row() -> Row:
     """Return a row without any value."""
-    return {column.name: [] if column.kind in ('texts', 'groups', 'coefficients') else None
+    return {column.name: [] if column.kind in ('texts', 'groups') else None
             for column in COLUMNS}
 
 
@@ -162,14 +157,10 @@ def reason_kind(row: Row) -> str:
 def arrow_schema() -> Any:
     """Return the columns as a schema of pyarrow, with unit and meaning as metadata."""
     import pyarrow as pa
-    text, number = pa.string(), pa.float64()
-    # `effect.parameter.axis` or `effect.parameter`; its source is the task, `fit` or `diagnose`
-    coefficient = pa.struct([('name', text), ('unit', text), ('value', number), ('std', number),
-                             ('source', text)])
-    types = {'text': text, 'float': number, 'integer': pa.int64(), 'flag': pa.bool_(),
+    text = pa.string()
+    types = {'text': text, 'float': pa.float64(), 'integer': pa.int64(), 'flag': pa.bool_(),
              'time': pa.timestamp('us', 'UTC'), 'texts': pa.list_(text),
-             'groups': pa.list_(pa.list_(text)),
-             'coefficients': pa.list_(coefficient)}
+             'groups': pa.list_(pa.list_(text))}
     return pa.schema([
         pa.field(column.name, types[column.kind],
                  metadata={'unit': column.unit, 'meaning': column.meaning})

@@ -25,7 +25,7 @@ from adxl_ros.errors import one_line, UserError
 from adxl_ros.files.atomic_write import atomic_path
 from adxl_ros.fleet.inputs import Source, stated_by
 from adxl_ros.fleet.row import arrow_schema, as_table, Recipe, Row, TABLE
-from adxl_ros.fleet.task import make_row, refused, Result, StagingError, TaskCrashed
+from adxl_ros.fleet.task import make_row, refused, Result, StagingError
 from adxl_ros.workers import Finished, finished_tasks, Pool, write
 
 _ROWS = 'rows'
@@ -221,8 +221,8 @@ def _written(end: Finished, recipe: Recipe, results: Results) -> Row:
     error = end.error
     if isinstance(error, UserError):
         raise error
-    if error is None or isinstance(error, TaskCrashed):
-        result = error.args[0] if error else end.value
+    if error is None:
+        result = end.value
     elif isinstance(error, StagingError):
         result = refused(recipe, source, one_line(error).removeprefix(f'{source.url}: '))
     else:

@@ -31,18 +31,9 @@ import os
 from typing import NamedTuple
 
 from adxl_ros.errors import UserError
-from adxl_ros.fleet.populations import (
-    bad_batch,
-    BadBatch,
-    by_prefix,
-    CHANCE,
-    MIN_GROUP,
-    MIN_UNITS,
-    random_effects,
-    RandomEffects,
-)
+from adxl_ros.fleet import pooling
+from adxl_ros.fleet.pooling import by_prefix, Recordings
 from adxl_ros.fleet.row import NOISE
-from adxl_ros.fleet.trends import claims, fit_trends, interval_factor, outliers, Recordings, Trends
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.report.quantities import counted, number
 import numpy as np
@@ -50,9 +41,9 @@ import pandas as pd
 import scipy
 
 _TEXTS = ['url', 'hash', 'serial', 'outcome', 'refusal', 'refused_by', 'calibration_id', 'status',
-          'report', 'version']
+          'report']
 """Columns of texts that the page uses."""
-_OTHERS = ['date', 'effects', 'calibration_age_days', 'gap_floor_mps2', 'seconds']
+_OTHERS = ['date', 'effects', 'calibration_age_days', 'gap_floor_mps2']
 """Columns that the page uses, beside those of the quantities."""
 _YEAR = np.timedelta64(31_557_600_000_000, 'us')
 """A year of 365.25 days."""
@@ -182,14 +173,15 @@ class QuantityResult:
     # Recordings that are too far from the others of their unit, (n,) bool. They do not count.
     is_outlier: np.ndarray
     units: np.ndarray  # Numbers of the units, (k,)
-    trends: Trends  # Levels and slopes of the units
+    trends: pooling.Trends  # Levels and slopes of the units
     # Slopes that survive the control of the false discovery rate over all units and quantities,
     # (k,) bool
     is_claimed: np.ndarray
     half_width: np.ndarray  # Half of the interval of each slope, (k,)
-    population: RandomEffects | None  # Mean and spread over the units; None where they are too few
-    # Units of one batch that are not of this population; None for none
-    batch: BadBatch | None = None
+    # Mean and spread over the units, None where they are too few, and units of one batch that are
+    # not of this population
+    population: pooling.RandomEffects | None
+    batch: pooling.BadBatch | None
 
     def place_of(self, unit: int) -> int | None:
         """Return where a unit stands among those of the quantity; None if it is not there."""
@@ -206,38 +198,29 @@ def analyse(table: FleetTable) -> list[QuantityResult]:
     coefficients = sum(item[0].is_coefficient for item in measured) * len(table.serials)
     results = []
     for quantity, rows, recordings in measured:
-        distance, is_outlier = outliers(recordings, values)
-        trends = fit_trends(recordings[~is_outlier])
+        distance, is_outlier = pooling.outliers(recordings, values)
+        trends = pooling.fit_trends(recordings[~is_outlier])
         units = np.unique(table.unit[rows[~is_outlier]])
         population, batch = None, None
-        if quantity.is_coefficient and len(units) >= MIN_UNITS:
-            batch = bad_batch([table.serials[unit] for unit in units], trends.level,
-                              TOLERANCE_MG / quantity.factor, len(measured)) \
-                if quantity.is_force else None
-            population = _population(trends, batch, coefficients)
+        if quantity.is_coefficient and len(units) >= pooling.MIN_UNITS:
+            if quantity.is_force:
+                batch = pooling.bad_batch([table.serials[unit] for unit in units], trends.level,
+                                          TOLERANCE_MG / quantity.factor, len(measured))
+            population = pooling.random_effects(trends.level, trends.level_std, coefficients,
+                                                None if batch is None else batch.members)
         none = np.zeros(len(units), bool)
         results.append(QuantityResult(quantity, rows, recordings, distance, is_outlier, units,
                                       trends, none, np.zeros(len(units)), population, batch))
     if not results:
         return []
     # The false discovery rate is controlled over all slopes together.
-    is_claimed = claims(np.concatenate([result.trends.p_values for result in results]))
-    factor = interval_factor(np.concatenate([r.trends.freedom for r in results]), is_claimed)
+    is_claimed = pooling.claims(np.concatenate([r.trends.p_values for r in results]))
+    factor = pooling.interval_factor(np.concatenate([r.trends.freedom for r in results]),
+                                     is_claimed)
     splits = np.cumsum([len(result.units) for result in results])[:-1]
     return [replace(result, is_claimed=claimed, half_width=factors * result.trends.slope_std)
             for result, claimed, factors in zip(
                 results, np.split(is_claimed, splits), np.split(factor, splits))]
-
-
-def _population(trends: Trends, batch: BadBatch | None, tests: int) -> RandomEffects:
-    """Return the population of the units without those of a bad batch, which are far out."""
-    if batch is None:
-        return random_effects(trends.level, trends.level_std, tests)
-    others = ~batch.members
-    of_others = random_effects(trends.level[others], trends.level_std[others], tests)
-    is_far_out = batch.members.copy()
-    is_far_out[others] = of_others.is_far_out
-    return RandomEffects(of_others.pooled, trends.level, trends.level_std, is_far_out)
 
 
 class FarOut(NamedTuple):
@@ -266,58 +249,48 @@ RECENT = 5
 """Number of recordings whose median is the gap of a unit now. Chosen: one odd one is no gap."""
 MAX_AGE_DAYS = 365.0
 """Largest age of a calibration, days. Chosen: a year."""
-_DAYS_PER_YEAR = 365.25
-_FARTHEST_DAYS = 10 * _DAYS_PER_YEAR
+DAYS_PER_YEAR = 365.25
+_FARTHEST_DAYS = 10 * DAYS_PER_YEAR
 """A drift that needs longer is no matter of urgency. Chosen: the life of a robot."""
 
 
-@dataclass(frozen=True)
-class EffectMatrix:
-    """How often each effect is named in each unit."""
+def effect_matrix(table: FleetTable) -> tuple[pd.DataFrame, list[str]]:
+    """
+    Count the named effects by unit, and look for what units with an effect have in common.
 
-    effects: tuple[str, ...]  # Effects that are named anywhere, the most frequent first, (e,)
-    units: np.ndarray  # Numbers of the units with a verdict, (k,)
-    share: np.ndarray  # Share of the recordings of each unit in which each effect is named, (k, e)
-    findings: tuple[str, ...]  # What rows and columns have in common, one sentence each
-
-
-def effect_matrix(table: FleetTable) -> EffectMatrix:
-    """Count the named effects by unit, and look for what units with an effect have in common."""
+    returns: share of the recordings in which each effect is named, the most frequent first, by the
+    numbers of the units with a verdict; and one sentence for each finding.
+    """
     used = np.isin(table['status'].astype(str), _VERDICTS) & (table.unit >= 0) & table.first
     frame, unit = table.frame[used], table.unit[used]
     counts = Counter(name for names in frame['effects'] for name in names)
-    effects = tuple(sorted(counts, key=lambda name: (-counts[name], name)))
+    effects = sorted(counts, key=lambda name: (-counts[name], name))
     has = pd.DataFrame([[name in names for name in effects] for names in frame['effects']],
                        columns=effects, dtype=float)
     share = has.groupby(unit).mean()
     by_place = has.groupby([unit, [url.rpartition('/')[0] for url in frame['url']]]).mean()
-    serials = [table.serials[i] for i in share.index]
     common = (share > _MOST).sum()
     findings = [
         *(f'{common[name]} of {len(share)} units have {name}. Look for what they share: stage, '
           'mounting, parameter file, batch.' for name in effects
-          if common[name] > _MOST * len(share) and len(share) >= MIN_GROUP),
-        *_frequent(by_prefix(serials), share > _MOST, 'with a serial number', 'a bad batch'),
-        *_frequent(by_prefix([folder for _, folder in by_place.index]), by_place > _MOST,
-                   'recorded in', 'a bad stage or place')]
-    return EffectMatrix(effects, share.index.to_numpy(), share.to_numpy(), tuple(findings))
+          if common[name] > _MOST * len(share) and len(share) >= pooling.MIN_GROUP),
+        *_frequent([table.serials[unit] for unit in share.index], share > _MOST,
+                   'with a serial number', 'a bad batch'),
+        *_frequent([folder for _, folder in by_place.index], by_place > _MOST, 'recorded in',
+                   'a bad stage or place')]
+    return share, findings
 
 
-def _frequent(groups: dict[str, np.ndarray], has: pd.DataFrame, what: str, cause: str
-              ) -> list[str]:
-    """
-    Name the group in which each effect is more frequent than elsewhere, if there is one.
-
-    groups: members by the beginning of their names, (k,) bool each; has: whether each of k members
-    has each effect.
-    """
-    findings = []
+def _frequent(names: Sequence[str], has: pd.DataFrame, what: str, cause: str) -> list[str]:
+    """Name the group of names in which each effect is more frequent than elsewhere, if any."""
+    groups, findings = by_prefix(names), []
     for effect, named in has.items() if groups else ():
         chance, prefix, members = min((scipy.stats.hypergeom.logsf(
             (members & named).sum() - 1, len(named), named.sum(), members.sum()), prefix, members)
             for prefix, members in groups.items())
         inside, size = (members & named).sum(), members.sum()
-        if chance < np.log(CHANCE / (len(groups) * has.shape[1])) and inside > _MOST * size:
+        limit = np.log(pooling.CHANCE / (len(groups) * has.shape[1]))
+        if chance < limit and inside > _MOST * size:
             findings.append(f'{inside} of {size} units {what} {prefix}… have {effect}, and '
                             f'{named.sum() - inside} of the {len(named) - size} others: {cause}.')
     return findings
@@ -359,6 +332,7 @@ class Drift(NamedTuple):
 class UnitState:
     """One unit; its texts are for people."""
 
+    urgency: float  # Its rank among the units of its state; the least is the most urgent
     unit: int  # Its number
     serial: str  # Its serial number
     state: State  # Its state
@@ -375,15 +349,14 @@ def rank(table: FleetTable, results: Sequence[QuantityResult],
          distant: Sequence[FarOut]) -> list[UnitState]:
     """Return all units, the most urgent first."""
     farthest = {item.serial: item for item in reversed(distant)}
-    ranked = [_state_of(unit, table, results, farthest.get(serial))
+    states = [_state_of(unit, table, results, farthest.get(serial))
               for unit, serial in enumerate(table.serials)]
-    return [state for _, state in sorted(ranked, key=lambda item: (
-        item[1].state, item[0], item[1].serial))]
+    return sorted(states, key=lambda unit: (unit.state, unit.urgency, unit.serial))
 
 
 def _state_of(unit: int, table: FleetTable, results: Sequence[QuantityResult],
-              distant: FarOut | None) -> tuple[float, UnitState]:
-    """Return a unit and its rank among those of its state, the most urgent least."""
+              distant: FarOut | None) -> UnitState:
+    """Return a unit with the first state that fits."""
     rows = table.rows_of(unit)
     gap_mg, floor_mg, over_mg = _gap_now(table, rows)
     ages = table['calibration_age_days'][rows]
@@ -414,8 +387,8 @@ def _state_of(unit: int, table: FleetTable, results: Sequence[QuantityResult],
         state, urgency = State.OLD_CALIBRATION, -age_days if age_days > 0 else -np.inf
         reason = f'Its calibration is {age_days:.0f} days old.' if age_days > 0 else \
             'It has no calibration with a date.'
-    return urgency, UnitState(
-        unit, table.serials[unit], state, reason[:1].upper() + reason[1:], drifts,
+    return UnitState(
+        urgency, unit, table.serials[unit], state, reason[:1].upper() + reason[1:], drifts,
         f'{number(gap_mg)} / {number(floor_mg)}' if np.isfinite(gap_mg) else '-',
         f'{len(rows)} ({refused.sum()})', f'{age_days:.0f}' if np.isfinite(age_days) else '-',
         float(table.years[rows[-1]]),
@@ -447,7 +420,7 @@ def _drifts(unit: int, results: Sequence[QuantityResult], over_mg: float, age_da
         days, reached_mg = np.inf, np.nan
         if quantity.is_force and (quantity.is_coefficient or slope > 0):
             # A coefficient is right at its calibration, and the gap shows what it is now.
-            mg_per_day = abs(quantity.factor * slope) / _DAYS_PER_YEAR
+            mg_per_day = abs(quantity.factor * slope) / DAYS_PER_YEAR
             reached_mg = over_mg if np.isfinite(over_mg) else mg_per_day * np.nan_to_num(age_days)
             days = max(TOLERANCE_MG - reached_mg, 0.0) / mg_per_day
         drifts.append(Drift(result, text, days, reached_mg))

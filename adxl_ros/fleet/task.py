@@ -11,10 +11,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from datetime import datetime, timedelta
 from functools import cached_property
-import json
 import os
 from pathlib import Path
 from resource import getrusage, RUSAGE_SELF
@@ -42,7 +41,6 @@ from adxl_ros.fleet.row import (
     sha256_of,
 )
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.sensor import get, parameter_of, Sensor
 from adxl_ros.process import package_version
 from adxl_ros.signals.findings import BLOCK_ROWS, check_recording, Findings
 from adxl_ros.signals.noise_parameters import recording_noise
@@ -91,7 +89,7 @@ def stage(source: Source, folder: Path) -> Staged:
     """Copy a recording into a folder."""
     url = source.url
     try:
-        fs, path = inputs.file_system(url, source.secret)
+        fs, path = inputs.file_system(source.address or url)
     except UserError as reason:
         raise StagingError(one_line(reason)) from None
     before = inputs.look_up(fs, path)
@@ -143,12 +141,8 @@ class Result(NamedTuple):
     is_known: bool = False  # Whether there is a row with this key
 
 
-class TaskCrashed(Exception):
-    """A task raised what it should not; the argument is the `Result` with what is known."""
-
-
 def make_row(recipe: Recipe, earlier: frozenset[str], source: Source, is_again: bool) -> Result:
-    """Make the row of a recording; see the module."""
+    """Make the row of a recording; one with an `earlier` key is only made where `is_again`."""
     worker = f'{os.uname().nodename}:{os.getpid()}'
     if recipe.code != code_version():
         raise UserError(f'worker {worker}: has another version of adxl_ros '
@@ -159,15 +153,15 @@ def make_row(recipe: Recipe, earlier: frozenset[str], source: Source, is_again: 
         if source.fault:
             raise UserError(f'{source.url}: {source.fault}')
         with temporary_folder() as folder:
-            result = _in_folder(recipe, source, frozenset() if is_again else earlier, folder)
+            (folder / 'recording').mkdir()
+            staged = stage(source, folder / 'recording')
+            result = _of_staged(recipe, source, frozenset() if is_again else earlier, staged)
     except UserError as error:
         result = refused(recipe, source, one_line(error).removeprefix(f'{source.url}: '))
     row = result.row
     row |= {name: finite(value) for name, value in row.items() if isinstance(value, float)}
     row |= {'seconds': round(monotonic() - begin_s, 6), 'worker': worker,
             'memory_mb': getrusage(RUSAGE_SELF).ru_maxrss / 1024}
-    if row['outcome'] == 'crashed':
-        raise TaskCrashed(result)
     return result
 
 
@@ -181,10 +175,8 @@ def refused(recipe: Recipe, source: Source, reason: str, outcome: str = 'refused
     return Result(row, {}, source.stamp, digest)
 
 
-def _in_folder(recipe: Recipe, source: Source, earlier: frozenset[str], folder: Path) -> Result:
-    """Stage a recording, and run the tasks on it."""
-    (folder / 'recording').mkdir()
-    staged = stage(source, folder / 'recording')
+def _of_staged(recipe: Recipe, source: Source, earlier: frozenset[str], staged: Staged) -> Result:
+    """Run the tasks on a copy, unless there is a row of this content by this recipe."""
     first, fault = None, ''
     try:
         first = next(recording.blocks(
@@ -203,10 +195,7 @@ def _in_folder(recipe: Recipe, source: Source, earlier: frozenset[str], folder: 
     row['key'] = sha256_of(staged.content, digest)
     if row['key'] in earlier:
         return Result(row, {}, source.stamp, digest, is_known=True)
-    params = folder / parameters.name if parameters.text else None
-    if params is not None:
-        params.write_text(parameters.text, encoding='utf-8')
-    job = _Job(recipe, source, staged, parameters, str(params) if params else None, row)
+    job = _Job(recipe, source, staged, parameters, row)
     if fault:
         job.refuse('read', job.plain(fault))
     elif is_other:
@@ -231,37 +220,40 @@ def _identity(recipe: Recipe, source: Source, staged: Staged | None, serial: str
             'version': package_version(), 'code': recipe.code}
 
 
-@dataclass
 class _Job:
     """The tasks on one staged recording."""
 
-    recipe: Recipe
-    source: Source
-    staged: Staged
-    parameters: ParameterText
-    params: str | None  # Path of the parameter file; None for the nominal sensor
-    row: Row
-    files: dict[str, bytes] = field(default_factory=dict)
+    def __init__(self, recipe: Recipe, source: Source, staged: Staged, parameters: ParameterText,
+                 row: Row) -> None:
+        self._recipe, self._source, self._staged = recipe, source, staged
+        self._parameters = parameters
+        self._params: str | None = None  # Path of the parameter file; None: the nominal sensor
+        if parameters.text:
+            path = staged.path.parents[1] / parameters.name
+            path.write_text(parameters.text, encoding='utf-8')
+            self._params = str(path)
+        self.row = row
+        self.files: dict[str, bytes] = {}
 
     def run(self) -> None:
         """Run the tasks. One that does not fit the recording is skipped, unless all are."""
-        findings = check_recording(str(self.staged.path), self.params, replace(
-            self.recipe.reading, drop_bad_stamps=True))
-        self.row['faults'] = [self.plain(fault) for fault in findings.faults]
+        findings = check_recording(str(self._staged.path), self._params, replace(
+            self._recipe.reading, drop_bad_stamps=True))
         self._put_check(findings)
         if findings.contents is None:
             self.refuse('check', self.plain(findings.faults[0]))
             return
+        tasks = self._recipe.tasks
         skipped = {ability.tool: self.plain(ability.reason) for ability in findings.abilities
-                   if not ability.is_able and ability.tool in self.recipe.tasks}
-        results = int(self.recipe.tasks == ('check',))
+                   if not ability.is_able and ability.tool in tasks}
+        has_result = tasks == ('check',)
         for name, step in (('noise', self._noise), ('fit', self._fit),
                            ('diagnose', self._diagnose)):
-            if name not in self.recipe.tasks or name in skipped:
+            if name not in tasks or name in skipped:
                 continue
             try:
                 step()
-                results += 1
+                has_result = True
             except UserError as error:
                 reason = self.plain(one_line(error))
                 if name == 'noise':
@@ -274,11 +266,10 @@ class _Job:
                 self.refuse(name, self.plain(
                     f'{type(error).__name__}: {one_line(error)} ({Path(place.filename).name}:'
                     f'{place.lineno})'), 'crashed')
-                return
         # Many recordings have no noise; what the others need says more.
-        order = [name for name in self.recipe.tasks if name in skipped]
-        for name in () if results else reversed(order):
-            self.refuse(name, skipped[name])
+        order = [name for name in tasks if name in skipped]
+        if order and not has_result:
+            self.refuse(order[-1], skipped[order[-1]])
         self.row['skipped'] = [f'{name}: {skipped[name]}' for name in order]
         self.row['outcome'] = self.row['outcome'] or 'done'
 
@@ -289,15 +280,15 @@ class _Job:
 
     def plain(self, text: str) -> str:
         """Return a text with the names of the files in place of the paths of the copies."""
-        name = self.staged.path.name
-        text = text.replace(str(self.staged.path), name)
-        text = text.replace(self.params, self.parameters.name) if self.params else text
+        name = self._staged.path.name
+        text = text.replace(str(self._staged.path), name)
+        text = text.replace(self._params, self._parameters.name) if self._params else text
         return text.removeprefix(f'{name}: ')
 
     def _put_check(self, findings: Findings) -> None:
         """Put the check of a recording into its row, and whether its calibration is valid."""
         row, contents = self.row, findings.contents
-        row['is_sound'] = findings.is_sound
+        row |= {'is_sound': findings.is_sound, 'faults': [*map(self.plain, findings.faults)]}
         if contents is None:
             return
         low, high = contents.reference_ranges.get('temperature_c', (None, None))
@@ -307,9 +298,9 @@ class _Job:
                 'missing': contents.missing, 'longest_gap_s': contents.longest_gap_s,
                 'temperature_c': contents.reference_means.get('temperature_c'),
                 'temperature_low_c': low, 'temperature_high_c': high}
-        if self.params is None or not row['calibration_id']:
+        if self._params is None or not row['calibration_id']:
             return
-        envelope = parameter_file.load(self.params, may_measure=True).envelope
+        envelope = parameter_file.load(self._params, may_measure=True).envelope
         if row['calibration_age_days'] is not None and row['calibration_age_days'] < 0:
             row['validity'] = 'younger than the recording'
         elif envelope.temperature_c is None or low is None:
@@ -321,14 +312,14 @@ class _Job:
     @cached_property
     def _recording(self) -> Recording:
         """Return the whole recording; reports name it, and not its copy."""
-        return replace(recording.read(self.staged.path, self.recipe.reading),
-                       path=self.source.url)
+        return replace(recording.read(self._staged.path, self._recipe.reading),
+                       path=self._source.url)
 
     def _noise(self) -> None:
         """Find the noise of the longest rest."""
         result = recording_noise(
-            lambda: recording.blocks(self.staged.path, BLOCK_ROWS, self.recipe.reading),
-            self.params)
+            lambda: recording.blocks(self._staged.path, BLOCK_ROWS, self._recipe.reading),
+            self._params)
         for noise in result.axes:
             for (letter, _, unit, _), estimate in zip(NOISE, noise.estimates):
                 values = (estimate.value if estimate.is_seen else None, estimate.low,
@@ -341,12 +332,12 @@ class _Job:
         from adxl_ros.calibrate import calibration  # the client needs none
         from adxl_ros.calibrate.poses import estimate_filters, extract_poses
         read = self._recording
-        sensor, _ = measure_unstated(load_sensor(self.params, read), read)
+        sensor, _ = measure_unstated(load_sensor(self._params, read), read)
         unit = recorded_unit(sensor, read)
         poses = extract_poses(read, unit, None)
         recorded = calibration.RecordedPoses(
-            Path(self.source.url).name, poses, estimate_filters(read, unit, poses))
-        result = calibration.calibrate(unit, [recorded], None, (), self.staged.content)
+            Path(self._source.url).name, poses, estimate_filters(read, unit, poses))
+        result = calibration.calibrate(unit, [recorded], None, (), self._staged.content)
         fitted = result.fitted
         stds = dict(zip(fitted.covariance_names, np.sqrt(np.diag(fitted.covariance)).tolist()))
         for name, unit_name, coefficient, values in (
@@ -357,7 +348,6 @@ class _Job:
                              f'{name}_std_{axis}_{unit_name}':
                              stds.get(Coefficient(*coefficient, axis))}
         self.row |= {'fit_model': fitted.model, 'fit_poses': int(result.inliers.sum())}
-        self._put_coefficients('fit', fitted, stds)
         self.files['unit.yaml'] = parameter_file.as_text(
             fitted, result.report_lines).encode('utf-8')
 
@@ -365,23 +355,19 @@ class _Job:
         """Compare the recording with its simulation."""
         from adxl_ros.diagnose import page
         from adxl_ros.diagnose.diagnosis import diagnose
+        from adxl_ros.diagnose.documents import documents
         from adxl_ros.diagnose.report import as_json
         read = self._recording
-        sensor, _ = measure_unstated(load_sensor(self.params, read), read)
+        sensor, _ = measure_unstated(load_sensor(self._params, read), read)
         diagnosis = diagnose([read], sensor)
         report = as_json(diagnosis)
         self._put_verdict(diagnosis, report)
-        self.files['report.json'] = json.dumps(report, indent=1, allow_nan=False).encode()
-        parameters = ''
-        if diagnosis.report is not None:
-            parameters = parameter_file.as_text(diagnosis.report.sensor, [report['summary']])
-            self.files['params.yaml'] = parameters.encode('utf-8')
-        if report['verdict']['status'] in _PAGES:
-            params = ['--params', self.parameters.name] if self.parameters.text else []
-            again = ['ros2', 'run', 'adxl_ros', 'diagnose', self.source.url, *params, '-o', 'gap']
-            self.files['report.html'] = page.page(diagnosis, page.Run(
-                self.source.url, self.parameters.name, [], parameters, shlex.join(again)
-            )).encode('utf-8')
+        params = ['--params', self._parameters.name] if self._params else []
+        again = ['ros2', 'run', 'adxl_ros', 'diagnose', self._source.url, *params, '-o', 'gap']
+        run = page.Run(self._source.url, self._parameters.name, [], command=shlex.join(again))
+        self.files |= {name: text.encode() for name, text in documents(
+            diagnosis, report, [report['summary']],
+            run if report['verdict']['status'] in _PAGES else None).items()}
 
     def _put_verdict(self, diagnosis: Diagnosis, report: dict[str, Any]) -> None:
         """Put a diagnosis into the row."""
@@ -396,15 +382,3 @@ class _Job:
             interval = (gap[name] is not None and gap[f'{name}_ci']) or (None, None)
             self.row |= {f'gap_{name}{end}{unit}': value for end, value in zip(
                 ('', '_low', '_high'), (gap[name], *interval))}
-        best = diagnosis.report.hypotheses[0]
-        self._put_coefficients('diagnose', best.sensor, {
-            name: std for name, std, is_open in zip(best.names, best.std, best.undetermined)
-            if not is_open})
-
-    def _put_coefficients(self, source: str, sensor: Sensor, stds: dict[Coefficient, float]
-                          ) -> None:
-        """Put estimates of a task into the row."""
-        self.row['coefficients'] += [
-            {'name': str(name), 'unit': parameter_of(name).unit, 'value': finite(value),
-             'std': finite(std), 'source': source}
-            for (name, std), value in zip(stds.items(), get(sensor, tuple(stds)))]

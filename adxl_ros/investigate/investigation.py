@@ -21,16 +21,16 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from enum import Enum
 from itertools import accumulate, chain, count
-import json
 import os
 from pathlib import Path
 import shlex
 import shutil
-from typing import Any
 
-from adxl_ros.diagnose import next_experiment, page
+from adxl_ros.diagnose import next_experiment
 from adxl_ros.diagnose.diagnosis import diagnose, Diagnosis
+from adxl_ros.diagnose.documents import documents
 from adxl_ros.diagnose.linear_model import candidates
+from adxl_ros.diagnose.page import Run
 from adxl_ros.diagnose.report import as_json, screen_lines
 from adxl_ros.diagnose.verdict import normalised, UNKNOWN, WeightedHypothesis
 from adxl_ros.errors import one_line, UserError
@@ -50,7 +50,7 @@ from adxl_ros.investigate.manoeuvres import (
 from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report import quantities
-from adxl_ros.workers import Processes
+from adxl_ros.workers import in_background
 import numpy as np
 
 CERTAIN = 0.9
@@ -100,15 +100,9 @@ class Answer:
     outcome: Outcome  # Why the investigation goes on or ends
     sentence: str = ''  # The result in one sentence; '' where it goes on
     manoeuvre: str = ''  # Name of the next manoeuvre; '' at the end
-    information_per_minute: float = 0.0  # What it is expected to tell, nat/min
     fault: str = ''  # Fault of the recording that makes a verdict impossible; '' without one
     hidden: tuple[str, ...] = ()  # Effects that this stage cannot show
     verdict: str = ''  # Status and effects of the diagnosis; '' without a verdict
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the answer as values of JSON."""
-        return {**vars(self), 'outcome': self.outcome.value,
-                'hypotheses': [[list(h.effects), h.probability] for h in self.hypotheses]}
 
 
 @dataclass(frozen=True)
@@ -219,8 +213,8 @@ def decide(ranking: Ranking, question: Question, has_time: bool) -> Answer:
     elif not has_time:
         outcome = Outcome.TIME_OVER
     else:
-        return Answer(hypotheses, Outcome.GO_ON, '', following[0].name,
-                      following[0].per_minute, hidden=ranking.hidden, verdict=verdict)
+        return Answer(hypotheses, Outcome.GO_ON, manoeuvre=following[0].name,
+                      hidden=ranking.hidden, verdict=verdict)
     return Answer(hypotheses, outcome, _sentence(outcome, named), hidden=ranking.hidden,
                   verdict=verdict)
 
@@ -253,7 +247,7 @@ def listed(names: Sequence[str]) -> str:
 
 _NICENESS = 10
 """Niceness of the process. Chosen: the node that records comes first."""
-_WITHOUT_DIAGNOSIS = {'bag', 'baseline.yaml', 'answer.json'}
+_WITHOUT_DIAGNOSIS = {'bag', 'baseline.yaml'}
 """Files of an investigation that was stopped before its first diagnosis of samples."""
 
 
@@ -266,7 +260,6 @@ class OutputFolder:
         self.baseline = path / 'baseline.yaml'  # What the recording is compared with
         self.parameters = path / 'params.yaml'  # The parameters with the effects that were found
         self.report = path / 'report.html'  # The page of the diagnosis
-        self.answer = path / 'answer.json'  # The newest answer
 
     @staticmethod
     def free(path: Path) -> OutputFolder:
@@ -293,23 +286,14 @@ def _write_diagnosis(folder: OutputFolder, diagnosis: Diagnosis, recording: Reco
     subject = (f'{folder.bag.name} ({recording.time_s[-1] - recording.time_s[0]:.0f} s, '
                f'{recording.rate_hz:.4g} Hz, {" ".join(recording.axes)})  minus  simulation of '
                f'{folder.baseline.name}')
-    write_text(folder.path / 'report.json', _as_text(as_json(diagnosis)))
-    parameters = ''
-    if diagnosis.report is not None:
-        parameters = parameter_file.as_text(diagnosis.report.sensor,
-                                            screen_lines(diagnosis, subject))
-        write_text(folder.parameters, parameters)
-    if with_page:
-        steps = [('simulate with these parameters', 'ros2 run adxl_ros simulate rich --params '
-                  f'{folder.parameters} -o sim.csv')] if parameters else []
-        command = shlex.join(['ros2', 'run', 'adxl_ros', 'diagnose', str(folder.bag), '--params',
-                              str(folder.baseline), '-o', f'{folder.path}_again'])
-        write_text(folder.report, page.page(diagnosis, page.Run(
-            subject, folder.baseline.name, steps, parameters, command)))
-
-
-def _as_text(values: dict[str, Any]) -> str:
-    return json.dumps(values, indent=1, allow_nan=False) + '\n'
+    lines = screen_lines(diagnosis, subject) if diagnosis.report is not None else []
+    steps = [('simulate with these parameters', 'ros2 run adxl_ros simulate rich --params '
+              f'{folder.parameters} -o sim.csv')] if lines else []
+    command = shlex.join(['ros2', 'run', 'adxl_ros', 'diagnose', str(folder.bag), '--params',
+                          str(folder.baseline), '-o', f'{folder.path}_again'])
+    run = Run(subject, folder.baseline.name, steps, command=command) if with_page else None
+    for name, text in documents(diagnosis, as_json(diagnosis), lines, run).items():
+        write_text(folder.path / name, text)
 
 
 class BackgroundDiagnoser:
@@ -317,16 +301,13 @@ class BackgroundDiagnoser:
 
     def __init__(self, folder: OutputFolder, limits: StageLimits, seed: int) -> None:
         self._folder, self._limits, self._seed = folder, limits, seed
-        self._pool: Processes | None = None
         self._answer: Future | None = None
+        self.cancel: Callable[[], object] = lambda: None  # Ends the process
 
     def ask(self, question: Question) -> None:
         """Start the process."""
-        self._folder.answer.unlink(missing_ok=True)
-        self._pool = Processes(1)
-        self._answer = self._pool.submit(_diagnose, self._folder, question, self._limits,
-                                         self._seed)
-        self._pool.shutdown(wait=False)
+        self._answer, self.cancel = in_background(_diagnose, self._folder, question, self._limits,
+                                                  self._seed)
 
     def answer(self) -> Answer | None:
         """Return the answer, or None while the process runs."""
@@ -338,14 +319,9 @@ class BackgroundDiagnoser:
         except Exception as error:
             raise UserError(f'the diagnosis failed: {one_line(error)}') from error
 
-    def cancel(self) -> None:
-        """End the process."""
-        if self._pool is not None and self._answer is not None:
-            self._pool.kill()
-
 
 def _diagnose(folder: OutputFolder, question: Question, limits: StageLimits, seed: int) -> Answer:
-    """Answer one question, and write the answer and the files of its diagnosis."""
+    """Answer one question, and write the files of its diagnosis."""
     os.nice(_NICENESS)
     sensor = parameter_file.load(folder.baseline)
     recordings = [recording_files.read(folder.bag)] if question.has_samples else []
@@ -353,7 +329,6 @@ def _diagnose(folder: OutputFolder, question: Question, limits: StageLimits, see
     if diagnosis is not None:
         _write_diagnosis(folder, diagnosis, recordings[0],
                          with_page=answer.outcome is not Outcome.GO_ON)
-    write_text(folder.answer, _as_text(answer.as_json()))
     return answer
 
 

@@ -42,21 +42,19 @@ controller lags by some tenths of a second."""
 
 
 class Pose(NamedTuple):
-    """Angles of the stage."""
+    """Angles of the stage, rad."""
 
-    # alpha_rad, beta_rad: Angles, rad
     alpha_rad: float
     beta_rad: float
 
 
 @dataclass(frozen=True)
 class StageLimits:
-    """Limits of angle and rate."""
+    """Lowest and highest angle, and largest rate, of each joint."""
 
-    # alpha_rad, beta_rad: Lowest and highest angle of each joint, rad
     alpha_rad: tuple[float, float]
     beta_rad: tuple[float, float]
-    rate_rad_s: float  # Largest rate of each joint, rad/s
+    rate_rad_s: float
 
     def of(self, joint: str) -> tuple[float, float]:
         """Return the lowest and highest angle of a joint, rad."""
@@ -215,11 +213,7 @@ def plan_all(limits: StageLimits, pose: Pose, begin_s: float = 0.0) -> list[Plan
 
 
 class CommandStream:
-    """
-    The commands of one manoeuvre.
-
-    command: the newest command.
-    """
+    """The commands of one manoeuvre; `command` is the newest one."""
 
     def __init__(self, limits: StageLimits, manoeuvre: PlannedManoeuvre, pose: Pose) -> None:
         """Begin with the stage in a pose."""
@@ -240,11 +234,7 @@ class CommandStream:
         return max(self._manoeuvre.motion.duration_s - self._elapsed_s, 0.0)
 
     def advance(self, elapsed_s: float, pose: Pose) -> Pose:
-        """
-        Return the next command.
-
-        The manoeuvre takes longer where a call is later than `LONGEST_STEP_S`.
-        """
+        """Return the next command; a call later than `LONGEST_STEP_S` makes a manoeuvre longer."""
         # Where a stage is that has moved on with its last command.
         self._expected = _moved(self._expected, self.command, *(
             speed * max(elapsed_s, 0.0) for speed in self.speed))

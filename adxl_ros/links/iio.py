@@ -212,28 +212,37 @@ class _ReadError(Exception):
     """The device is absent or lost; another attempt may find it."""
 
 
-@dataclass(frozen=True)
 class _Column:
-    """A channel, with the conversion of its codes to V or degC: (code + offset) * scale + zero."""
+    """A channel, with the conversion of its codes to V or degC."""
 
-    role: str
-    channel: Any  # The channel of libiio
-    dtype: str  # numpy type of its codes
-    offset: float  # Offset, in codes
-    scale: float  # Scale, V or degC per code
-    zero: float = 0.0  # Zero-g of a digital sensor's pseudo-volts, V
-
-    def convert(self, codes: Any) -> Any:
-        """Return V or degC for a code or an array of codes."""
-        return (codes + self.offset) * self.scale + self.zero
-
-    def adc(self) -> dict[str, float]:
-        """Return the ADC as fields of a sensor; 0 bits where the codes do not begin at 0 V."""
-        if self.zero or self.offset:
-            return {'adc_bits': 0}
-        form = self.channel.data_format
+    def __init__(self, role: str, channel: Any, sensor: Sensor, supply_scale: float) -> None:
+        form, kind = channel.data_format, channel.type.name
+        if form.repeat > 1 or form.length not in (8, 16, 32, 64):
+            raise UserError(f'{channel.id}: a format of {form.length} bits, {form.repeat} times, '
+                            'cannot be read')
+        self.role, self.channel = role, channel
+        self._dtype = f'{"i" if form.is_signed else "u"}{form.length // 8}'
+        # The kernel omits an offset of 0, but never a scale. IIO scales to mV and m°C.
+        self._offset = _number(channel, 'offset') if 'offset' in channel.attrs else 0.0
+        self._scale, self._zero = 1e-3 * _number(channel, 'scale'), 0.0
+        if kind == 'IIO_ACCEL' and role in sensor.axes:
+            # A digital sensor in m/s²: pseudo-volts by the nominal scale factor and zero-g.
+            axis = sensor.axes.index(role)
+            self._scale *= 1e3 / G0_MPS2 * float(sensor.nominal_scale_v_per_g[axis])
+            self._zero = float(sensor.nominal_zero_g_v[axis])
+        elif kind != ('IIO_TEMP' if role == base.TEMPERATURE else 'IIO_VOLTAGE'):
+            raise UserError(f'link.channels: {channel.id} cannot be {role}: it is {kind}')
+        elif role == base.SUPPLY:
+            self._scale *= supply_scale
+        # The ADC as fields of a sensor; 0 bits where the codes do not begin at 0 V
         bits = int(form.bits - form.is_signed)
-        return {'adc_bits': bits, 'adc_vref_v': self.scale * 2.0 ** bits}
+        self.adc: dict[str, float] = {'adc_bits': 0} if self._zero or self._offset else {
+            'adc_bits': bits, 'adc_vref_v': self._scale * 2.0 ** bits}
+
+    def read(self, buffer: Any) -> np.ndarray:
+        """Return V or degC for the codes of a buffer, (n,)."""
+        codes = np.frombuffer(self.channel.read(buffer), self._dtype)
+        return (codes + self._offset) * self._scale + self._zero
 
 
 class _Stream:
@@ -255,7 +264,7 @@ class _Stream:
         self.by_host_clock = _select_monotonic_clock(device) and settings.uri.startswith('local:')
         axis = next(column for column in columns if column.role in sensor.axes)
         self.rate_hz = rate_hz = _set_rate(context, device, columns, sensor.rate_hz)
-        self.adc = {'rate_hz': rate_hz, **axis.adc()}
+        self.adc = {'rate_hz': rate_hz, **axis.adc}
         count = min(max(settings.samples_together(rate_hz),
                         ceil(_ROUND_TRIPS * _answer_s(axis.channel) * rate_hz)), _MAX_BUFFER)
         self.buffer_s = count / rate_hz
@@ -274,8 +283,7 @@ class _Stream:
         try:
             self._buffer.refill()
             device_ns = np.frombuffer(self._timestamp.read(self._buffer), np.int64)
-            values = {column.role: column.convert(np.frombuffer(
-                column.channel.read(self._buffer), column.dtype)) for column in self._columns}
+            values = {column.role: column.read(self._buffer) for column in self._columns}
         except OSError as error:
             raise _ReadError(f'{self.name}: lost: {base.reason(error)}') from None
         lengths = {len(device_ns), *map(len, values.values())}
@@ -302,7 +310,7 @@ def _open_stream(settings: Settings, entries: Sequence[str], sensor: Sensor) -> 
         raise _ReadError(base.reason(error)) from None
     try:
         device = _find_device(context, settings.device)
-        columns = [_column(role, channel, sensor, settings.supply_scale)
+        columns = [_Column(role, channel, sensor, settings.supply_scale)
                    for role, channel in _assign_roles(device, entries, sensor.axes).items()]
         return _Stream(context, device, columns, settings, sensor)
     except (OSError, ValueError) as error:
@@ -346,27 +354,24 @@ def _inputs(device: Any) -> list[Any]:
 def _assign_roles(device: Any, entries: Sequence[str], axes: str) -> dict[str, Any]:
     """Return the channels of a device by role."""
     inputs, order = _inputs(device), [*axes, base.SUPPLY, base.TEMPERATURE]
-    labels = {channel.id: _label(channel) for channel in inputs}
-    if not entries:
-        by_label = {labels[channel.id]: channel for channel in inputs}
-        if all(axis in by_label for axis in axes):
-            return {role: by_label[role] for role in order if role in by_label}
+    named = {name: channel for channel in reversed(inputs)
+             for name in (channel.name, _label(channel), channel.id) if name}
+    if not entries and set(axes) <= set(named):
+        entries = [role for role in order if role in named]
+    elif not entries:
         measured = [channel for channel in inputs
                     if channel.type.name in ('IIO_VOLTAGE', 'IIO_ACCEL')]
         entries = [channel.id for channel
                    in sorted(measured, key=lambda channel: channel.index)[:len(axes)]]
     assigned: list[tuple[str, Any]] = []
     for entry in entries:
-        role, equals, name = entry.rpartition('=')
-        named = [channel for channel in inputs
-                 if name in (channel.id, labels[channel.id], channel.name)]
-        if not named:
+        role, _, name = entry.rpartition('=')
+        if name not in named:
             raise UserError(f'link.channels: {_name(device)} has no channel {name!r}; it has '
-                            f'{", ".join(labels)} in its buffer')
-        if not equals:
-            free = [candidate for candidate in order if candidate not in dict(assigned)]
-            role = name if name in free or not free else free[0]
-        assigned.append((role, named[0]))
+                            f'{", ".join(channel.id for channel in inputs)} in its buffer')
+        free = [candidate for candidate in order if candidate not in dict(assigned)]
+        role = role or (name if name in free or not free else free[0])
+        assigned.append((role, named[name]))
     base.check_roles([role for role, _ in assigned], axes)
     return dict(assigned)
 
@@ -376,30 +381,6 @@ def _label(channel: Any) -> str:
     with suppress(OSError, KeyError):
         return channel.attrs['label'].value.strip()
     return ''
-
-
-def _column(role: str, channel: Any, sensor: Sensor, supply_scale: float) -> _Column:
-    """Read how the codes of a channel become V or degC."""
-    form = channel.data_format
-    if form.repeat > 1 or form.length not in (8, 16, 32, 64):
-        raise UserError(f'{channel.id}: a format of {form.length} bits, {form.repeat} times, '
-                        'cannot be read')
-    dtype = f'{"i" if form.is_signed else "u"}{form.length // 8}'
-    # The kernel omits an offset of 0, but never a scale.
-    offset = _number(channel, 'offset') if 'offset' in channel.attrs else 0.0
-    scale = _number(channel, 'scale')
-    kind = channel.type.name
-    if kind == 'IIO_ACCEL' and role in sensor.axes:
-        # A digital sensor in m/s²: pseudo-volts by the nominal scale factor and zero-g.
-        axis = sensor.axes.index(role)
-        return _Column(role, channel, dtype, offset,
-                       scale / G0_MPS2 * float(sensor.nominal_scale_v_per_g[axis]),
-                       float(sensor.nominal_zero_g_v[axis]))
-    if kind != ('IIO_TEMP' if role == base.TEMPERATURE else 'IIO_VOLTAGE'):
-        raise UserError(f'link.channels: {channel.id} cannot be {role}: it is {kind}')
-    # IIO scales to mV and m°C.
-    divider = supply_scale if role == base.SUPPLY else 1.0
-    return _Column(role, channel, dtype, offset, scale * 1e-3 * divider)
 
 
 def _number(channel: Any, name: str) -> float:
@@ -430,11 +411,7 @@ def _select_monotonic_clock(device: Any) -> bool:
 
 
 def _set_rate(context: Any, device: Any, columns: Sequence[_Column], rate_hz: float) -> float:
-    """
-    Set the sample rate of the device, of a channel or of the only trigger.
-
-    returns: sample rate that the device states then, Hz; `rate_hz` where it states none.
-    """
+    """Set the sample rate of device, channel or only trigger; return the rate that it states."""
     triggers = [d for d in context.devices if isinstance(d, import_libiio().Trigger)]
     places = [device, *(column.channel for column in columns)]
     places += triggers if len(triggers) == 1 else []

@@ -114,10 +114,6 @@ class Replay:
 
 
 def _recorded_sensor(sensor: Sensor, first: Recording) -> Sensor:
-    """
-    Return the sensor of a recording; what the recording does not state is as in the parameters.
-
-    Calibrated coefficients have no part in the nominal conversion.
-    """
+    """Return the nominal sensor of a recording; what it does not state is as in the parameters."""
     rate_hz = first.stream_info.rate_hz or (first.rate_hz if len(first) > 1 else sensor.rate_hz)
     return uncalibrated(sensor, first.stream_info, first.axes, rate_hz)

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 import errno
@@ -99,47 +99,39 @@ def open_link(sensor: Sensor, settings: Settings) -> SerialLink:
     return SerialLink(sensor, settings)
 
 
-@dataclass(frozen=True)
 class _Conversion:
-    """How the codes of a board become samples."""
+    """How the codes of a board become samples; raises `UserError` where they cannot."""
 
-    # Value of a channel is gain · code + offset, V or degC, (m,)
-    gain: np.ndarray
-    offset: np.ndarray
-    axes: list[int]  # Channels of the axes of the sensor
-    references: Mapping[str, int]  # Channel of each reference by column
-    steps_ns: np.ndarray  # Times of the samples of a frame after its first one, ns, int64, (256,)
-    max_code: int  # Largest code
+    def __init__(self, info: BoardInfo, roles: Sequence[str], axes: str, settings: Settings
+                 ) -> None:
+        if len(roles) > info.channels:
+            raise UserError(f'link.channels: {len(roles)} are named, the board has '
+                            f'{info.channels}')
+        base.check_roles(roles, axes)
+        self.max_code = 2 ** info.bits - 1
+        # Value of a channel is gain · code + offset, V or degC, (m,)
+        self._gain = np.full(info.channels, info.vref_v / 2 ** info.bits)
+        self._offset = np.zeros(info.channels)
+        for i, role in enumerate(roles):
+            if role == base.SUPPLY:
+                self._gain[i] *= settings.supply_scale
+            elif role == base.TEMPERATURE:
+                self._gain[i] /= settings.temperature_v_per_c
+                self._offset[i] = -settings.temperature_zero_v / settings.temperature_v_per_c
+        self._axes = [roles.index(axis) for axis in axes]
+        self._references = {column: roles.index(role) for role, column in base.COLUMNS.items()
+                            if role in roles}
+        # Times of the samples of a frame after its first one, ns
+        self._steps_ns = np.rint(np.arange(wire_format.MAX_COUNT + 1) * (1e9 / info.rate_hz)
+                                 ).astype(np.int64)
 
     def block(self, frame: SampleFrame, lost: int) -> stamping.Block:
         """Return the samples of a frame."""
-        values = frame.codes.astype(float)
-        values *= self.gain
-        values += self.offset
-        return stamping.Block(frame.time_us * 1000 + self.steps_ns[:len(values)],
-                              values[:, self.axes],
-                              {column: values[:, i] for column, i in self.references.items()},
+        values = frame.codes * self._gain + self._offset
+        return stamping.Block(frame.time_us * 1000 + self._steps_ns[:len(values)],
+                              values[:, self._axes],
+                              {column: values[:, i] for column, i in self._references.items()},
                               lost)
-
-
-def _conversion(info: BoardInfo, roles: Sequence[str], axes: str, settings: Settings
-                ) -> _Conversion:
-    """Return how the codes of a board become samples; raises `UserError` where they cannot."""
-    if len(roles) > info.channels:
-        raise UserError(f'link.channels: {len(roles)} are named, the board has {info.channels}')
-    base.check_roles(roles, axes)
-    gain, offset = np.full(info.channels, info.vref_v / 2 ** info.bits), np.zeros(info.channels)
-    for i, role in enumerate(roles):
-        if role == base.SUPPLY:
-            gain[i] *= settings.supply_scale
-        elif role == base.TEMPERATURE:
-            gain[i] /= settings.temperature_v_per_c
-            offset[i] = -settings.temperature_zero_v / settings.temperature_v_per_c
-    return _Conversion(
-        gain, offset, [roles.index(axis) for axis in axes],
-        {column: roles.index(role) for role, column in base.COLUMNS.items() if role in roles},
-        np.rint(np.arange(wire_format.MAX_COUNT + 1) * (1e9 / info.rate_hz)).astype(np.int64),
-        2 ** info.bits - 1)
 
 
 class _FrameSize:
@@ -162,8 +154,9 @@ class _FrameSize:
 
     def command(self, info: BoardInfo | None) -> None:
         """Send a command where the newest frame is not as it shall be."""
+        now_s = time.monotonic()
         count, self._newest = self._newest, 0
-        if not count:
+        if not count or now_s < self._due_s:
             return
         latency_us = round(self._settings.latency_ms * 1e3)
         if info is not None:
@@ -172,11 +165,9 @@ class _FrameSize:
             if count == wanted:
                 return
             latency_us = max(latency_us, round(wanted / info.rate_hz * 1e6))
-        now_s = time.monotonic()
-        if now_s >= self._due_s:
-            self._port.write(wire_format.encode_command(self._sent, latency_us))
-            self._sent += 1
-            self._due_s = now_s + _COMMAND_PAUSE_S
+        self._port.write(wire_format.encode_command(self._sent, latency_us))
+        self._sent += 1
+        self._due_s = now_s + _COMMAND_PAUSE_S
 
 
 class SerialLink(base.DeviceLink):
@@ -279,23 +270,18 @@ class SerialLink(base.DeviceLink):
         arrived_ns = time.monotonic_ns()
         samples = 0
         for raw in self._splitter.split(chunk):
-            frame = self._decoded(raw)
-            if frame is not None:
-                samples += len(frame.codes) if isinstance(frame, SampleFrame) else 1
-                self._arrivals.append((frame, arrived_ns))
+            try:
+                frame = wire_format.decode(raw)
+            except wire_format.WireError:
+                self._counts['bad_frames'] += 1
+                continue
+            self._counts['frames'] += 1
+            self._last_frame_s = time.monotonic()
+            self._port.confirm()
+            samples += len(frame.codes) if isinstance(frame, SampleFrame) else 1
+            self._arrivals.append((frame, arrived_ns))
         rate_hz = self._info.rate_hz if self._info else _UNSTATED_RATE_HZ
         self._unpaid_s = len(chunk) / _MAX_BYTES_PER_S + samples / (_MAX_RATE_RATIO * rate_hz)
-
-    def _decoded(self, raw: bytes) -> BoardInfo | SampleFrame | None:
-        try:
-            frame = wire_format.decode(raw)
-        except wire_format.WireError:
-            self._counts['bad_frames'] += 1
-            return None
-        self._counts['frames'] += 1
-        self._last_frame_s = time.monotonic()
-        self._port.confirm()
-        return frame
 
     def _throttle(self) -> None:
         """Pause so that bytes and samples stay below their largest rates (a leaky bucket)."""
@@ -317,7 +303,7 @@ class SerialLink(base.DeviceLink):
             base.UNUSED if role in AXES and role not in axes else role
             for role in _DEFAULT_ROLES[:info.channels]]
         try:
-            self._conversion = _conversion(info, roles, axes, self._settings)
+            self._conversion = _Conversion(info, roles, axes, self._settings)
         except UserError as error:
             self._misfit = str(error)
             return

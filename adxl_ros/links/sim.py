@@ -176,14 +176,7 @@ class SimulatedSensor:
         return Response(self.sensor, Motion(inf, alpha, beta, shift), self._seed - 1)
 
     def _joint(self, joint: int, time_s: np.ndarray, order: int = 0) -> np.ndarray:
-        """
-        Interpolate one joint by cubic Hermite splines, as a `simulate.motion.Path`.
-
-        The interpolation is exact in position and velocity at the stage's stamps.
-
-        time_s: times since the origin, s, (n,); returns: position, rad or m, or its derivative,
-        (n,).
-        """
+        """Interpolate one joint by cubic Hermite splines, exactly at the stage's stamps."""
         stamps = self._origin_ns + np.rint(time_s * 1e9).astype(np.int64)
         knots = np.array([knot.stamp_ns for knot in self._knots], np.int64)
         position = np.array([knot.position[joint] for knot in self._knots])

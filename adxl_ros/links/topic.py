@@ -18,7 +18,6 @@ from adxl_ros.simulate.motion import lagrange_weights, Motion, POINTS
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.sensor_model import SensorModel
 import numpy as np
-import scipy
 
 _SILENT_S = 3.0
 """Steady time without samples after which the stream counts as silent, s; chosen: as for the
@@ -58,19 +57,10 @@ class Settings(base.SimulatorSettings):
     temperature_topic: str = base.option('temperature', 'topic of the temperature of the sensor, '
                                          'sensor_msgs/Temperature; 25 °C until it comes')
     seed: int = base.option(0, 'seed of the noise', '', 0, 2 ** 31 - 1)
-    roll_rad: float = base.option(0.0, 'roll of the case in the frame of the ideal samples', 'rad',
-                                  -7.0, 7.0)
-    pitch_rad: float = base.option(0.0, 'pitch of the case in that frame', 'rad', -7.0, 7.0)
-    yaw_rad: float = base.option(0.0, 'yaw of the case in that frame', 'rad', -7.0, 7.0)
-
-    @property
-    def turns_case(self) -> bool:
-        """Return whether the frame of the case is not that of the simulator's samples."""
-        return any((self.roll_rad, self.pitch_rad, self.yaw_rad))
 
 
 class _Ideal(NamedTuple):
-    """One sample of the simulator: stamp, ns, and the fields of its message in the case frame."""
+    """One sample of the simulator: stamp, ns, and the fields of its message."""
 
     stamp_ns: int
     fields: dict[str, np.ndarray]
@@ -141,10 +131,6 @@ class EmulatedSensor(base.DeviceLink):
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
         self.imu_topic, self.temperature_topic = settings.topic, settings.temperature_topic
         self._seed = settings.seed
-        # Fixed axes (REP-103), as in a URDF joint.
-        self._case = scipy.spatial.transform.Rotation.from_euler(
-            'xyz', (settings.roll_rad, settings.pitch_rad, settings.yaw_rad)) \
-            if settings.turns_case else None
         self._temperature_c = NOMINAL_TEMPERATURE_C
         left_out = SensorModel(sensor).left_out
         self._left_out = '; '.join(f'{name} {reason}' for name, reason in left_out.items())
@@ -174,15 +160,14 @@ class EmulatedSensor(base.DeviceLink):
         self._publishers, self._mixture = count, mixture
 
     def sense_imu(self, stamp_ns: np.ndarray, fields: Mapping[str, np.ndarray]) -> None:
-        """
-        Take ideal samples in the simulator's frame.
-
-        stamp_ns: their stamps, ns, (n,); fields: number fields of sensor_msgs/Imu by name, (n, k).
-        """
+        """Take ideal samples in the frame of the case; values that are no numbers are absent."""
         self._heard_s = time.monotonic()
         for i, stamp in enumerate(stamp_ns.tolist()):
-            self._sense(_Ideal(stamp, _in_case(
-                {name: values[i] for name, values in fields.items()}, self._case)))
+            sample = {name: values[i] for name, values in fields.items()}
+            for name, value in _ABSENT.items():
+                if not np.isfinite([*sample[name], *sample[f'{name}_covariance']]).all():
+                    sample |= {name: value, f'{name}_covariance': _NOT_MEASURED}
+            self._sense(_Ideal(stamp, sample))
         self._run_chain()
 
     def read(self, now_ns: int) -> base.Samples:
@@ -287,24 +272,3 @@ class EmulatedSensor(base.DeviceLink):
         volts = self._chain(np.array(forces), self._temperature_c)
         self._made += zip(self._held, volts[places])
         self._held.clear()
-
-
-def _in_case(fields: dict[str, np.ndarray], case: scipy.spatial.transform.Rotation | None
-             ) -> dict[str, np.ndarray]:
-    """Turn a message of the simulator into the frame of the case."""
-    for name, value in _ABSENT.items():
-        if not np.isfinite([*fields[name], *fields[f'{name}_covariance']]).all():
-            fields |= {name: value, f'{name}_covariance': _NOT_MEASURED}
-    if case is None:
-        return fields
-    for name in ('linear_acceleration', 'angular_velocity'):
-        fields[name] = case.inv().apply(fields[name])
-    covariance = fields['angular_velocity_covariance']
-    if covariance[0] >= 0:
-        rotation = case.as_matrix()
-        fields['angular_velocity_covariance'] = (
-            rotation.T @ covariance.reshape(3, 3) @ rotation).ravel()
-    if fields['orientation'].any():
-        orientation = scipy.spatial.transform.Rotation.from_quat(fields['orientation'])
-        fields['orientation'] = (orientation * case).as_quat()
-    return fields

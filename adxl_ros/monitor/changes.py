@@ -20,22 +20,22 @@ before.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, UTC
-from importlib import import_module
 import json
 import os
 from pathlib import Path
-import sys
+import shlex
 import time
+from typing import NamedTuple
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.atomic_write import append_line
+from adxl_ros.files.atomic_write import append_line, write_text
 from adxl_ros.files.recording_columns import ACCEL, Recording
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.workers import Processes
+from adxl_ros.simulate.trajectories import motion_from_force
+from adxl_ros.workers import in_background
 import numpy as np
 import scipy
 
@@ -70,8 +70,7 @@ _KINDS = 2
 """Kinds of windows: at rest throughout, and with motion. Like is compared with like."""
 
 
-@dataclass(frozen=True)
-class Change:
+class Change(NamedTuple):
     """A change of the mean."""
 
     channel: int  # Number of the series
@@ -98,29 +97,20 @@ class ChangeTest:
         self._channels, self._block_s, self._walks = channels, block_s, np.array(walks)
         comparisons = sum(_DAY_S / block_s / _stride(2 ** j) for j in range(_LENGTHS))
         # Permitted probability of a false alarm in one comparison
-        p = min(_RESERVE * false_alarms_per_day / (comparisons * channels), 0.5)
-        # Limit of Student's t by degrees of freedom, (401,); huge for too few
-        self._limits = np.full(_MOST + 1, _NEVER)
-        self._limits[_FEWEST:] = -scipy.special.stdtrit(np.arange(_FEWEST, _MOST + 1), p / 2)
+        self._p = min(_RESERVE * false_alarms_per_day / (comparisons * channels), 0.5)
         self._size = (1 + _BEFORE) * 2 ** (_LENGTHS - 1) + 1
-        n = channels
         # Sums up to each block; the place of a block is its number modulo the size.
-        self._sums = np.zeros((self._size, n))
+        self._sums = np.zeros((self._size, channels))
         self._moves = np.zeros(self._size, int)
         self._count = 0
-        self._since = np.zeros(n, int)
-        self._squares = np.zeros((_KINDS, _LENGTHS, n))
-        self._weights = np.zeros((_KINDS, _LENGTHS, n))
+        self._since = np.zeros(channels, int)
+        self._squares, self._weights = np.zeros((2, _KINDS, _LENGTHS, channels))
         # Differences that are not learnt yet, in the order of their blocks.
         self._waiting: list[list[tuple[int, int, np.ndarray, np.ndarray]]] = [
             [] for _ in range(_LENGTHS)]
 
     def add(self, values: np.ndarray, moves: bool) -> list[Change]:
-        """
-        Test the next block.
-
-        values: means of the block, (channels,).
-        """
+        """Test the next block by its means, (channels,)."""
         last = self._count % self._size
         self._count += 1
         place = self._count % self._size
@@ -163,7 +153,8 @@ class ChangeTest:
         weights = self._weights[kind, j]
         freedom = (weights * _stride(2 ** j) / (_INDEPENDENT * 2 ** j)).astype(int)
         std = np.sqrt(self._squares[kind, j] / np.maximum(weights, 1.0))
-        return np.maximum(std, _SMALLEST), self._limits[np.minimum(freedom, _MOST)]
+        limit = -scipy.special.stdtrit(freedom.clip(_FEWEST, _MOST), self._p / 2)
+        return np.maximum(std, _SMALLEST), np.where(freedom < _FEWEST, _NEVER, limit)
 
     def _learn(self, j: int, length: int) -> None:
         """Add the differences that are so old that no change can be in them unseen."""
@@ -270,13 +261,11 @@ class DiagnosisResult:
 
 
 class DiagnosisRun:
-    """Runs the tool `diagnose`, a module with `main`, on some samples."""
+    """Diagnoses some samples in a process of its own."""
 
-    def __init__(self, folder: Path, given: DiagnosisInput, tool: str, budget_s: float) -> None:
+    def __init__(self, folder: Path, given: DiagnosisInput, budget_s: float) -> None:
         self._budget_s, self._end_s = budget_s, time.monotonic() + budget_s
-        self._pool = Processes(1)
-        self._end = self._pool.submit(_diagnose, folder, given, tool)
-        self._pool.shutdown(wait=False)
+        self._end, self.close = in_background(_diagnose, folder, given)
 
     @property
     def result(self) -> DiagnosisResult | None:
@@ -289,45 +278,37 @@ class DiagnosisRun:
         self.close()
         return _without(f'it takes longer than diagnose.budget_s, {self._budget_s:.0f} s')
 
-    def close(self) -> None:
-        """End the process; its finished files stay."""
-        self._pool.kill()
-
 
 def _without(reason: str) -> DiagnosisResult:
     return DiagnosisResult(False, f'no diagnosis: {reason[:_REASON_LENGTH]}')
 
 
-def _diagnose(folder: Path, given: DiagnosisInput, tool: str) -> DiagnosisResult:
-    """Write recording, baseline and force, run the tool on them, and read its report."""
+def _diagnose(folder: Path, given: DiagnosisInput) -> DiagnosisResult:
+    """Diagnose; write the samples, the baseline, and the files of the diagnosis."""
+    from adxl_ros.diagnose.diagnosis import diagnose  # the node itself needs none
+    from adxl_ros.diagnose.documents import documents
+    from adxl_ros.diagnose.page import Run
+    from adxl_ros.diagnose.report import as_json
     os.nice(_NICENESS)
-    os.environ['NO_COLOR'] = '1'
     folder.mkdir(parents=True, exist_ok=True)
-    samples, baseline = folder / 'recording.csv', folder / 'baseline.yaml'
-    recording.write(samples, given.recording, given.sensor)
-    parameter_file.save(baseline, given.sensor)
-    sys.argv = ['diagnose', str(samples), '--params', str(baseline), '-o', str(folder / 'gap')]
+    samples, sim = replace(given.recording, path=str(folder / 'recording.csv')), None
+    recording.write(samples.path, samples, given.sensor)
+    parameter_file.save(folder / 'baseline.yaml', given.sensor)
+    command = ['ros2', 'run', 'adxl_ros', 'diagnose', samples.path, '--params',
+               str(folder / 'baseline.yaml')]
     if given.force is not None:
         time_s, force_mps2 = given.force
-        ideal = folder / 'reference.csv'
-        recording.write(ideal, Recording(str(ideal), time_s, dict(zip(ACCEL, force_mps2.T))),
-                        given.sensor)
-        sys.argv += ['--sim', str(ideal)]
-    log = folder / 'diagnose.log'
-    with open(log, 'w', encoding='utf-8') as file, redirect_stdout(file), redirect_stderr(file):
-        import_module(tool).main()
-    report = folder / 'gap' / 'report.json'
-    if report.exists():
-        return result_of(json.loads(report.read_text(encoding='utf-8')),
-                         str(report.with_name('report.html')))
-    lines = log.read_text(encoding='utf-8').splitlines()
-    return _without(' '.join(lines[-1].split()) if lines else '')
-
-
-def result_of(report: dict, page: str) -> DiagnosisResult:
-    """Return what a report of `diagnose` says."""
+        ideal = Recording(str(folder / 'reference.csv'), time_s, dict(zip(ACCEL, force_mps2.T)))
+        recording.write(ideal.path, ideal, given.sensor)
+        command += ['--sim', ideal.path]
+        sim, _ = motion_from_force(ideal, False)
+    diagnosis = diagnose([samples], given.sensor, sim)
+    report = as_json(diagnosis)
+    run = Run(f'{samples.path}  minus  simulation of {given.sensor.serial}', 'baseline.yaml', [],
+              command=shlex.join([*command, '-o', str(folder / 'again')]))
+    for name, text in documents(diagnosis, report, [report['summary']], run).items():
+        write_text(folder / name, text)
     verdict = report['verdict']
-    effects = tuple(verdict['effects'])
-    probability = float(verdict.get('probability') or 0.0)
-    likely = tuple(effect for group in verdict.get('groups') or [] for effect in group)
-    return DiagnosisResult(True, report['summary'], page, effects or likely, probability)
+    likely = [effect for group in verdict['groups'] for effect in group]
+    return DiagnosisResult(True, report['summary'], str(folder / 'report.html'),
+                           tuple(verdict['effects'] or likely), verdict['probability'] or 0.0)

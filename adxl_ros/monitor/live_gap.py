@@ -123,12 +123,7 @@ class LiveGap:
         return self._samples.newest_ns or 0
 
     def add_samples(self, stamp_ns: np.ndarray, accel_mps2: np.ndarray) -> None:
-        """
-        Add samples.
-
-        stamp_ns: stamps, ns, (n,); accel_mps2: specific force by nominal conversion, m/s², (n, m)
-        or with further columns.
-        """
+        """Add stamps, ns, (n,), and specific force by nominal conversion, m/s², (n, m or more)."""
         accel_mps2 = accel_mps2[:, :len(self.sensor.axes)]
         finite = np.isfinite(accel_mps2).all(axis=1)
         self.counts['samples'] += len(stamp_ns)
@@ -194,10 +189,10 @@ class LiveGap:
     def _append(self, stamp_ns: np.ndarray, accel_mps2: np.ndarray) -> None:
         """Keep samples, and count what is missing before them."""
         newest_ns = self._samples.newest_ns
-        self.counts['dropped'] += self._samples.add(stamp_ns, accel_mps2)
-        ascending = np.unique(stamp_ns if newest_ns is None else
-                              np.maximum(np.append(newest_ns, stamp_ns), newest_ns))
-        periods = np.rint(np.diff(ascending) * 1e-9 * self.sensor.rate_hz)
+        kept_ns = self._samples.add(stamp_ns, accel_mps2)
+        self.counts['dropped'] += len(stamp_ns) - len(kept_ns)
+        steps_ns = np.diff(kept_ns, prepend=kept_ns[:1] if newest_ns is None else newest_ns)
+        periods = np.rint(steps_ns * 1e-9 * self.sensor.rate_hz)
         self.counts['missing'] += int((periods - 1).clip(0).sum())
 
     def _restart(self) -> None:
@@ -241,10 +236,7 @@ class LiveGap:
         if self._compared_ns is not None and begin_ns - self._compared_ns > _BREAK_NS:
             self._prediction.restart()
             self._test.restart()
-        is_first = not self._prediction.is_running
-        if is_first:
-            self._prediction.start(begin_ns)
-        motion = self.reference.prepare(begin_ns, end_ns)
+        motion = self._prediction.prepare(begin_ns, end_ns)
         if motion is None or len(stamps_ns) < _FEWEST_SAMPLES:
             self.counts['skipped'] += 1
             if motion is None and not self.obstacle.startswith(('no ref', 'the ref')):
@@ -252,11 +244,8 @@ class LiveGap:
             elif motion is not None:
                 self.obstacle = 'no samples'
             return None
-        block = self._prediction.block(stamps_ns, accel_mps2, motion, end_ns)
-        self._compared_ns = end_ns
-        self.obstacle = ''
-        # The filter of the sensor settles within the first second.
-        return None if is_first else block
+        self._compared_ns, self.obstacle = end_ns, ''
+        return self._prediction.block(stamps_ns, accel_mps2, motion, end_ns)
 
     def _take(self, block: Block) -> list[GapChange]:
         """Add a block to the window, and test it."""

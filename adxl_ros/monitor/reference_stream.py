@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from functools import partial
 from itertools import takewhile
 from typing import NamedTuple
 
@@ -42,6 +43,8 @@ _STILL_RAD = 1e-4
 """The same for an exact encoder, rad and m. Chosen: 0.1 mg, as the noise of a mean of 1 s."""
 _SURROUNDINGS_NS = 20_000_000_000
 """Time around a block whose temperatures and supplies count, ns. Chosen: slow thermometers."""
+_USUAL = {'temperature_c': NOMINAL_TEMPERATURE_C, 'supply_v': NOMINAL_SUPPLY_V}
+"""Surroundings by their columns, and their values where nobody publishes them."""
 _STILL_MPS2 = 0.05
 """Range of the force of a simulator at rest, m/s². Chosen: noise of a simulator that adds some."""
 _MOST_ROWS = 4_000_000
@@ -83,12 +86,8 @@ class StreamBuffer:
         """Return the newest stamp, ns; None without rows."""
         return int(self._pieces[-1][0][-1]) if self._pieces else None
 
-    def add(self, stamp_ns: np.ndarray, rows: np.ndarray) -> int:
-        """
-        Append rows; drop those whose stamp does not increase, and return their number.
-
-        stamp_ns: stamps, ns, (n,); rows: numbers, (n, k).
-        """
+    def add(self, stamp_ns: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Append rows, (n, k), whose stamps, ns, (n,), increase; return these stamps."""
         newest_ns = np.iinfo(np.int64).min if self.newest_ns is None else self.newest_ns
         later = stamp_ns > np.maximum.accumulate(np.append(newest_ns, stamp_ns))[:-1]
         stamp_ns, rows = stamp_ns[later], rows[later]
@@ -98,14 +97,10 @@ class StreamBuffer:
             while self._pieces[0][0][-1] < stamp_ns[-1] - self._span_ns \
                     or self._rows > max(_MOST_ROWS, len(stamp_ns)):
                 self._rows -= len(self._pieces.popleft()[0])
-        return int((~later).sum())
+        return stamp_ns
 
     def between(self, begin_ns: int, end_ns: int) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Return the rows of a time.
-
-        returns: stamps, ns, (n,), and rows, (n, k).
-        """
+        """Return the stamps, ns, (n,), and rows, (n, k), of a time."""
         pieces = [*takewhile(lambda piece: piece[0][-1] >= begin_ns, reversed(self._pieces))]
         stamps, rows = (np.concatenate(parts) for parts in zip(self._nothing, *pieces[::-1]))
         part = slice(*np.searchsorted(stamps, [begin_ns, end_ns]))
@@ -140,8 +135,7 @@ class ReferenceStream:
         self._sensor = sensor
         # Joints in the order of `JOINTS`, rad and m, or force, m/s²
         self.readings = StreamBuffer(3, span_ns)
-        self.surroundings = {'temperature_c': StreamBuffer(1, span_ns),
-                             'supply_v': StreamBuffer(1, span_ns)}
+        self.surroundings = {name: StreamBuffer(1, span_ns) for name in _USUAL}
         self.error_mps2 = np.zeros(3)  # Standard deviation of the newest forces by their source
         self._held = [0.0, 0.0, 0.0]
         self._origin_ns = 0
@@ -159,11 +153,7 @@ class ReferenceStream:
         self.add_readings(np.array(stamps_ns, np.int64), np.array(rows).reshape(-1, len(JOINTS)))
 
     def add_readings(self, stamp_ns: np.ndarray, readings: np.ndarray) -> None:
-        """
-        Add readings.
-
-        stamp_ns: stamps, ns, (n,); readings: joints, rad and m, or force, m/s², (n, 3).
-        """
+        """Add joints, rad and m, or force, m/s², (n, 3), with their stamps, ns, (n,)."""
         _add_finite(self.readings, stamp_ns, readings, _LONGEST_GAP_NS)
 
     def add_surroundings(self, name: str, stamp_ns: np.ndarray, values: np.ndarray) -> None:
@@ -173,21 +163,13 @@ class ReferenceStream:
     def motion(self, origin_ns: int) -> Motion:
         """Return the motion whose time begins at a stamp, ns; it follows the prepared blocks."""
         self._origin_ns = origin_ns
-
-        def joint(number: int) -> Path:
-            return lambda time_s, order=0: self._paths[number](time_s, order)
-
-        def surrounding(name: str, default: float) -> Path:
-            return lambda time_s, order=0: self._surrounding(name, time_s, default)
-
-        temperature_c = surrounding('temperature_c', NOMINAL_TEMPERATURE_C)
-        supply_v = surrounding('supply_v', NOMINAL_SUPPLY_V)
-        if self.kind is not ReferenceKind.STAGE:
-            return Motion(np.inf, force=lambda time_s: self._force(time_s), internal_rate_hz=max(
-                INTERNAL_RATE_HZ, self._sensor.rate_hz), temperature_c=temperature_c,
-                          supply_v=supply_v)
-        return Motion(np.inf, joint(0), joint(1), joint(2), temperature_c=temperature_c,
-                      supply_v=supply_v)
+        alpha, beta, shift = (partial(self._joint, number) for number in range(len(JOINTS)))
+        motion = Motion(np.inf, alpha, beta, shift, partial(self._surrounding, 'temperature_c'),
+                        partial(self._surrounding, 'supply_v'))
+        if self.kind is ReferenceKind.STAGE:
+            return motion
+        return replace(motion, force=lambda time_s: self._force(time_s),
+                       internal_rate_hz=max(INTERNAL_RATE_HZ, self._sensor.rate_hz))
 
     def prepare(self, begin_ns: int, end_ns: int) -> BlockMotion | None:
         """Make the paths of a block."""
@@ -205,25 +187,27 @@ class ReferenceStream:
         self._paths = [SmoothedPath(time_s, values, step)
                        for values, step in zip(readings.T, (step_rad, step_rad, 0.0))]
         largest = max(_STILL_STEPS * step_rad, _STILL_RAD)
-        return BlockMotion(bool((changes > largest).any()), self._encoder_error_mps2(
-            (begin_ns - self._origin_ns) * 1e-9, (end_ns - self._origin_ns) * 1e-9))
+        return BlockMotion(bool((changes > largest).any()), self._encoder_error_mps2(np.linspace(
+            (begin_ns - self._origin_ns) * 1e-9, (end_ns - self._origin_ns) * 1e-9, 3)))
 
-    def _encoder_error_mps2(self, begin_s: float, end_s: float) -> np.ndarray:
-        """Return what the steps of the encoder make of the force in a block, m/s², (3,)."""
-        time_s = np.linspace(begin_s, end_s, 3)
-        gravity_mps2 = self._sensor.local_gravity_mps2
+    def _encoder_error_mps2(self, time_s: np.ndarray) -> np.ndarray:
+        """Return what the steps of the encoder make of the force at some times, m/s², (3,)."""
         alpha, beta = (path(time_s) for path in self._paths[:2])
         alpha_std, beta_std = (_path_std(path, time_s) for path in self._paths[:2])
-        force = np.array(specific_force(alpha, beta, gravity_mps2))
-        by_alpha = np.array(specific_force(alpha + alpha_std, beta, gravity_mps2)) - force
-        by_beta = np.array(specific_force(alpha, beta + beta_std, gravity_mps2)) - force
-        return np.asarray(np.sqrt((by_alpha ** 2 + by_beta ** 2).mean(axis=1)))
+        angles = (alpha, beta), (alpha + alpha_std, beta), (alpha, beta + beta_std)
+        force, by_alpha, by_beta = (np.array(specific_force(a, b, self._sensor.local_gravity_mps2))
+                                    for a, b in angles)
+        squares = (by_alpha - force) ** 2 + (by_beta - force) ** 2
+        return np.asarray(np.sqrt(squares.mean(axis=1)))
 
-    def _surrounding(self, name: str, time_s: np.ndarray, default: float) -> np.ndarray:
+    def _joint(self, number: int, time_s: np.ndarray, order: int = 0) -> np.ndarray:
+        return self._paths[number](time_s, order)
+
+    def _surrounding(self, name: str, time_s: np.ndarray, order: int = 0) -> np.ndarray:
         """Return the temperature or the supply at times of the motion, s, (n,)."""
         buffer = self.surroundings[name]
         if buffer.newest_ns is None:
-            return np.full(len(time_s), default)
+            return np.full(len(time_s), _USUAL[name])
         at_ns = self._origin_ns + time_s * 1e9
         stamps_ns, values = buffer.between(
             min(int(at_ns[0]) - _SURROUNDINGS_NS, buffer.newest_ns),
@@ -324,28 +308,27 @@ class Prediction:
         """Let the next block be the first one."""
         self._responses = []
 
-    @property
-    def is_running(self) -> bool:
-        """Return whether a block has been predicted since the last start."""
-        return bool(self._responses)
-
-    def start(self, begin_ns: int) -> None:
-        """Put the sensors, settled, at the begin of a block, ns; it is to be prepared then."""
-        self._origin_ns = begin_ns
-        self._motion = self._reference.motion(begin_ns)
+    def prepare(self, begin_ns: int, end_ns: int) -> BlockMotion | None:
+        """Return what the reference shows of a block; before the first one the sensor rests."""
+        if not self._responses:
+            self._origin_ns, self._motion = begin_ns, self._reference.motion(begin_ns)
+        return self._reference.prepare(begin_ns, end_ns)
 
     def block(self, stamp_ns: np.ndarray, accel_mps2: np.ndarray, motion: BlockMotion,
-              end_ns: int) -> Block:
+              end_ns: int) -> Block | None:
         """
-        Compare the samples of one prepared block.
+        Compare the samples of one prepared block; None for the first, in which filters settle.
 
         stamp_ns: stamps, ns, (n,); accel_mps2: samples by nominal conversion, m/s², (n, m).
         """
-        self._responses = self._responses or [
-            Response(sensor, self._motion, 0) for sensor in self._sensors]
+        is_first = not self._responses
+        if is_first:
+            self._responses = [Response(sensor, self._motion, 0) for sensor in self._sensors]
         time_s = (stamp_ns - self._origin_ns) * 1e-9
         modelled, datasheet = (accel_mps2 - to_nominal_mps2(respond(time_s), self._sensor)
                                for respond in self._responses)
+        if is_first:
+            return None
         mean_mps2 = _clean_mean(modelled)
         independent = float(noise.effective_samples(
             len(stamp_ns), 1 / self._sensor.rate_hz, self._sensor.rc_s))

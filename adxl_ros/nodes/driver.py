@@ -57,7 +57,7 @@ class Driver(LifecycleNode):
         own, self._module, self._settings = declare_driver(self, self._sensor.serial)
         self._delay_ns = round(1e9 * own.stamp_offset_s)
         settings, self._link = self._settings, own.link
-        has_frame = isinstance(settings, base.SimulatorSettings) and not settings.turns_case
+        has_frame = isinstance(settings, base.SimulatorSettings)
         self._frame_id = own.frame_id or ('' if has_frame else DEFAULT_FRAME)
         paced = isinstance(settings, base.PacedSettings)
         # All nodes must share a sensor time that is not real time: this node then publishes it,

@@ -243,7 +243,7 @@ class Monitor(Node):
         """Begin a diagnosis of the samples since a stamp, ns."""
         name = datetime.now(UTC).strftime('diagnosis_%Y%m%dT%H%M%S_%fZ')
         self._run = DiagnosisRun(self._output / name, self._live.diagnosis_input(begin_ns),
-                                 'adxl_ros.tools.diagnose', self._own.budget_s)
+                                 self._own.budget_s)
 
     def _serve(self) -> None:
         """Take requests of ~/diagnose, and answer them when the diagnosis ends."""

@@ -13,7 +13,8 @@ from pathlib import Path
 
 from adxl_ros.compensate.estimators import Estimates, RecordingEstimator
 from adxl_ros.compensate.live_stream import ImuFields
-from adxl_ros.files import parameter_file, recording
+from adxl_ros.errors import UserError
+from adxl_ros.files import recording
 from adxl_ros.files.bag_writer import tilt_bag
 from adxl_ros.files.csv_file import csv_writer
 from adxl_ros.files.recording_columns import check_unit, Recording
@@ -70,13 +71,20 @@ def apply(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     cli.refuse_same_file(options.output, options.recording)
     counts: Counter[str] = Counter()
-    block, beyond = None, BeyondRange()
     blocks = recording.blocks(options.recording, _BLOCK_ROWS, cli.reading_options(options))
     first = next(blocks, None)
-    sensor, measured = _sensor(options.params, first)
+    if first is None:
+        raise UserError(f'{options.recording}: has no samples to correct')
+    sensor, measured = measure_unstated(load_sensor(options.params, first), first)
+    if not sensor.effects:
+        sensor = with_axes(sensor, first.axes)
+    check_unit(first.stream_info, first.axes, sensor)
+    _report_effects(first, sensor, options.undo_filter)
+    estimator = RecordingEstimator(sensor, first, options.inverse == 'paper', options.undo_filter)
+    block, beyond = first, BeyondRange()
     opened = (_table if Path(options.output).suffix == '.csv' else _bag)(options.output)
     with opened as write, cli.progress('apply') as show:
-        for block, estimates in _estimated(options, sensor, first, blocks):
+        for block, estimates in estimator.blocks(itertools.chain([first], blocks)):
             write(block, estimates)
             explained = ~(estimates.unsolved | estimates.at_rail)
             beyond.add(estimates.volts[explained], sensor)
@@ -89,8 +97,7 @@ def apply(options: argparse.Namespace) -> int:
             cli.note(f'apply: {counts[name]} of {counts["rows"]} samples {statement}')
     if beyond.describe(sensor):
         cli.note(f'apply: {beyond.describe(sensor)}')
-    if block is not None:
-        cli.report_reading('apply', block)
+    cli.report_reading('apply', block)
     by_what = f'the {sensor.model} calibration of {sensor.serial}' if sensor.effects else \
         'the datasheet values: the sensor is not calibrated'
     following = ('compensation', f'--ros-args -p calibration:={cli.quoted(options.params or "")}')
@@ -115,27 +122,6 @@ def _bag(path: str) -> Iterator[Callable[[Recording, Estimates], None]]:
     with tilt_bag(path) as append:
         yield lambda block, estimates: append(block.stamp_ns[~estimates.unsolved],
                                               *fields(estimates))
-
-
-def _sensor(params: str | None, first: Recording | None) -> tuple[Sensor, list[str]]:
-    """Return the sensor of a recording by its first block, and what is measured of it."""
-    if first is None:
-        return parameter_file.load(params or parameter_file.nominal_path()), []
-    sensor, measured = measure_unstated(load_sensor(params, first), first)
-    if not sensor.effects:
-        sensor = with_axes(sensor, first.axes)
-    check_unit(first.stream_info, first.axes, sensor)
-    return sensor, measured
-
-
-def _estimated(options: argparse.Namespace, sensor: Sensor, first: Recording | None,
-               blocks: Iterator[Recording]) -> Iterator[tuple[Recording, Estimates]]:
-    """Yield the blocks of the recording, of which `first` is the first, with their estimates."""
-    if first is None:
-        return
-    _report_effects(first, sensor, options.undo_filter)
-    estimator = RecordingEstimator(sensor, first, options.inverse == 'paper', options.undo_filter)
-    yield from estimator.blocks(itertools.chain([first], blocks))
 
 
 def _report_effects(block: Recording, sensor: Sensor, undo_filter: bool) -> None:

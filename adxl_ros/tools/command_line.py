@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 import math
@@ -173,41 +173,38 @@ def with_effects(sensor: Sensor, texts: Sequence[str]) -> Sensor:
         name, _, rest = text.partition(':')
         try:
             effect = effect_named(name)
+            values = dict(sensor.values.get(name) or neutral(effect, sensor.axes)) \
+                if rest else typical(effect, sensor.axes)
+            for part in filter(None, rest.split(',')):
+                key, _, number = (word.strip() for word in part.partition('='))
+                parameter, _, axis = key.partition('.')
+                values[parameter] = _value(effect, values, sensor.axes, parameter, axis, number)
         except UserError as error:
             raise UserError(f'--effect {text}: {error}') from None
-        values = dict(sensor.values.get(name) or neutral(effect, sensor.axes)) \
-            if rest else typical(effect, sensor.axes)
-        for part in filter(None, rest.split(',')):
-            key, _, number = (word.strip() for word in part.partition('='))
-            parameter, _, axis = key.partition('.')
-            values[parameter] = _value(effect, values, sensor.axes, parameter, axis, number, text)
         effects = sensor.effects if name in sensor.effects else (*sensor.effects, name)
         sensor = replace(sensor, effects=effects, values={**sensor.values, name: values})
     return sensor
 
 
 def _value(effect: Effect, values: Mapping[str, np.ndarray], axes: str, name: str, axis: str,
-           number: str, text: str) -> np.ndarray:
-    """Return one parameter with a new value for all its axes or one; `text` is the option."""
+           number: str) -> np.ndarray:
+    """Return one parameter with a new value for all its axes or one."""
     parameters = {parameter.name: parameter for parameter in effect.parameters}
     if name not in parameters:
-        raise UserError(f'--effect {text}: {effect.name} has no parameter {name!r}, but '
-                        f'{", ".join(parameters)}')
-    parameter = parameters[name]
-    try:
+        raise UserError(f'{effect.name} has no parameter {name!r}, but {", ".join(parameters)}')
+    parameter, value = parameters[name], math.nan
+    with suppress(ValueError):
         value = float(number)
-    except ValueError:
-        value = math.nan
     if not parameter.lower <= value <= parameter.upper:
-        raise UserError(f'--effect {text}: {number!r} is not a number from {parameter.lower:g} to '
+        raise UserError(f'{number!r} is not a number from {parameter.lower:g} to '
                         f'{parameter.upper:g} ({parameter.unit}); a typical {name} is '
                         f'{parameter.scale:g}')
     if not (parameter.axes or axis):
         return np.array(value)
     chosen = [i for i, a in enumerate(axes) if a in parameter.axes and axis in ('', a)]
     if not chosen:
-        raise UserError(f'--effect {text}: no axis {axis!r} to act on; the sensor has {axes}, '
-                        f'{name} acts on {parameter.axes or "none, it is one number"}')
+        raise UserError(f'no axis {axis!r} to act on; the sensor has {axes}, {name} acts on '
+                        f'{parameter.axes or "none, it is one number"}')
     changed = np.array(values[name], float)
     changed[chosen] = value
     return changed
@@ -297,11 +294,7 @@ def read(tool: str, path: str, reading: ReadingOptions = AS_IT_IS) -> Recording:
 
 @contextmanager
 def progress(title: str) -> Iterator[Callable[..., None]]:
-    """
-    Show a progress bar on a terminal where rich is installed, else nothing.
-
-    Yield what takes the share that is done, and the name of the stage.
-    """
+    """Show a bar on a terminal with rich; yield what takes the share done, and a stage's name."""
     drawn = bar(sys.stderr, _BAR_COLUMNS, '{task.percentage:3.0f} %', 'TimeElapsedColumn',
                 'TimeRemainingColumn')
     if drawn is None:

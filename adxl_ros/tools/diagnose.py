@@ -5,13 +5,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from time import monotonic
 from typing import Any
 
 from adxl_ros.diagnose import page
 from adxl_ros.diagnose.diagnosis import diagnose as diagnose_recordings, Diagnosis, self_check
+from adxl_ros.diagnose.documents import as_text, documents
 from adxl_ros.diagnose.report import as_json, screen_lines
 from adxl_ros.diagnose.residual_map import gap_in, GapInUnit, quantity
 from adxl_ros.diagnose.verdict import MATERIAL_MG
@@ -119,7 +119,7 @@ def diagnose(options: argparse.Namespace) -> int:
         lines += ['', f' in      {gap.text}'] if gap else []
         report = _write(options, diagnosis, subject, lines, gap)
     if options.json:
-        print(json.dumps(report, indent=1, allow_nan=False))
+        print(as_text(report), end='')
     else:
         cli.print_end([*lines, ''], [Path(options.output, name) for name in _FILES],
                       _next_steps(options, diagnosis), monotonic() - begin_s)
@@ -137,14 +137,10 @@ def _write(options: argparse.Namespace, diagnosis: Diagnosis, subject: str, line
     folder = Path(options.output)
     cli.make_folder(folder)
     report = as_json(diagnosis) | ({'gap_in': gap._asdict()} if gap else {})
-    write_text(folder / 'report.json', json.dumps(report, indent=1, allow_nan=False) + '\n')
-    parameters = '' if diagnosis.report is None else \
-        parameter_file.as_text(diagnosis.report.sensor, lines)
-    if parameters:
-        write_text(folder / 'params.yaml', parameters)
-    write_text(folder / 'report.html', page.page(diagnosis, page.Run(
-        subject, Path(options.params or parameter_file.nominal_path()).name,
-        _next_steps(options, diagnosis), parameters)))
+    for name, text in documents(diagnosis, report, lines, page.Run(
+            subject, Path(options.params or parameter_file.nominal_path()).name,
+            _next_steps(options, diagnosis))).items():
+        write_text(folder / name, text)
     return report
 
 
@@ -164,7 +160,7 @@ def _next_steps(options: argparse.Namespace, diagnosis: Diagnosis) -> list[NextS
     """Return what to record, how to diagnose that, and how to simulate what was found."""
     if diagnosis.report is None:
         return []
-    params = cli.quoted(Path(options.output) / 'params.yaml')
+    params = str(Path(options.output) / 'params.yaml')
     proposal, steps = diagnosis.report.next_experiment, []
     if proposal is not None:
         both = ', and next_simulated.csv in the simulator' if options.sim else ''
@@ -173,17 +169,15 @@ def _next_steps(options: argparse.Namespace, diagnosis: Diagnosis) -> list[NextS
     if proposal is not None and not proposal.concerns_reference:
         is_closed = diagnosis.report.verdict.status in ('explained', 'partly')
         is_alone = is_closed or options.sim or options.urdf
-        words = [cli.quoted(*([] if is_alone else options.recording), 'next.csv')]
-        if is_closed or options.params:
-            words.append(f'--params {params if is_closed else cli.quoted(options.params)}')
-        words += ['--sim next_simulated.csv'] if options.sim else []
-        words += [f'--urdf {cli.quoted(options.urdf)} --frame {cli.quoted(options.frame)}'] \
-            if options.urdf else []
-        words.append(f'-o {cli.quoted(options.output + "_2")}')
+        given = {'--params': params if is_closed else options.params,
+                 '--sim': options.sim and 'next_simulated.csv', '--urdf': options.urdf,
+                 '--frame': options.urdf and options.frame, '-o': f'{options.output}_2'}
+        words = [*([] if is_alone else options.recording), 'next.csv']
+        words += [word for option in given.items() if option[1] for word in option]
         steps.append(NextStep('diagnose it' if is_alone else 'diagnose it together with this one',
-                              cli.command('diagnose', ' '.join(words))))
+                              cli.command('diagnose', cli.quoted(*words))))
     return [*steps, NextStep('simulate the sensor as it was found', cli.command(
-        'simulate', f'rich --params {params} -o sim.csv'))]
+        'simulate', f'rich --params {cli.quoted(params)} -o sim.csv'))]
 
 
 def main() -> int:

@@ -46,8 +46,7 @@ _REASON_COLUMNS = 12
 """Columns before a reason."""
 _MOST_REASONS = 3
 """Reasons of refusals on the screen. Chosen: the page has all."""
-_SHOWN = ('url', 'outcome', 'refusal', 'refused_by', 'serial', 'status', 'seconds', 'is_sound',
-          'duration_s')
+_SHOWN = ('url', 'outcome', 'refusal', 'refused_by', 'serial', 'status')
 """What the screen needs of a row; the others are not kept."""
 
 
@@ -71,7 +70,7 @@ def parser() -> argparse.ArgumentParser:
     pool.add_argument('--jobs', metavar='N', type=int,
                       help='processes of this machine (default: one for each core)')
     parse.add_argument('--retries', metavar='N', type=int, default=RETRIES,
-                       help='further attempts where a task crashes or its worker ends '
+                       help='further attempts where a copy fails or a worker ends '
                             '(default: %(default)s)')
     parse.add_argument('--only-failed', action='store_true',
                        help='repeat the recordings that were refused or crashed, no others')
@@ -120,10 +119,10 @@ def fleet(options: argparse.Namespace) -> int:
         finally:
             # Ctrl-C leaves table and page of what is done.
             files = _written(folder, results)
-    took_s = monotonic() - begin_s
     is_repeated = any(row['outcome'] == 'crashed' or row['refused_by'] == 'stage' for row in rows)
-    cli.print_end([*_result_lines(rows, to_do, took_s), ''], files,
-                  f'{command_of_this_process()} --only-failed' if is_repeated else '', took_s)
+    cli.print_end([*_result_lines(rows, to_do), ''], files,
+                  f'{command_of_this_process()} --only-failed' if is_repeated else '',
+                  monotonic() - begin_s)
     return 1 if rows and not any(row['outcome'] == 'done' for row in rows) else 0
 
 
@@ -157,7 +156,7 @@ def _left_out(to_do: Plan) -> str:
     return f'{to_do.outside} by --since, --limit or --only-failed' if to_do.outside else ''
 
 
-def _result_lines(rows: Sequence[Row], to_do: Plan, took_s: float) -> list[str]:
+def _result_lines(rows: Sequence[Row], to_do: Plan) -> list[str]:
     if not rows:
         return [f'Nothing to do: {counted(to_do.done, "recording")} had a row before',
                 f' left out  {_left_out(to_do)}' * bool(to_do.outside)]
@@ -166,12 +165,8 @@ def _result_lines(rows: Sequence[Row], to_do: Plan, took_s: float) -> list[str]:
     statuses = Counter(row['status'] for row in rows if row['status'])
     figures = {
         'units': str(len({row['serial'] for row in rows if row['serial']})),
-        'recorded': duration(sum(row['duration_s'] or 0.0 for row in rows)),
-        'not sound': str(sum(row['is_sound'] is False for row in rows)),
         'left out': _left_out(to_do),
-        'verdicts': ', '.join(f'{count} {name}' for name, count in statuses.most_common()),
-        'computed': f'{duration(sum(row["seconds"] or 0.0 for row in rows))} of workers in '
-                    f'{duration(took_s)}'}
+        'verdicts': ', '.join(f'{count} {name}' for name, count in statuses.most_common())}
     kinds: dict[tuple[str, str], list[str]] = {}
     for row in rows:
         if row['refusal']:

@@ -70,6 +70,6 @@ def test_a_token_opens_a_recording_and_stays_out_of_its_row(tmp_path):
         old, = find_sources([f'{url}?token=SECRET1&x=1'])
         assert stage(first, tmp_path).path.read_bytes() == _PART
         with pytest.raises(StagingError, match='Forbidden') as error:
-            stage(replace(first, secret=f'{url}?token=SECRET1&x=1'), tmp_path)
+            stage(replace(first, address=f'{url}?token=SECRET1&x=1'), tmp_path)
     assert (first.url, second.url, old.url) == (f'{url}?x=1', f'{url}?x=2', f'{url}?x=1')
     assert 'SECRET' not in f'{first} {old} {error.value}'

@@ -108,19 +108,6 @@ def test_gyroscope_and_orientation_pass_through() -> None:
     assert (marked['angular_velocity_covariance'][:, 0] == -1).all()
 
 
-def test_a_rotation_turns_the_whole_message() -> None:
-    """The x axis of a case that is yawed by 90° lies along the y axis of the simulator."""
-    sensor = unit('bias:offset_v=0', rc_capacitance_f=0.0)
-    link = topic.open_link(sensor, topic.Settings(yaw_rad=np.pi / 2))
-    samples = feed(link, START_NS + STEP_NS * np.arange(60), np.tile([1.0, 2.0, 3.0], (60, 1)))
-    assert to_nominal_mps2(samples.volts[-1], sensor) == pytest.approx([2.0, -1.0, 3.0])
-    turned = samples.imu_fields
-    assert turned['angular_velocity'][0] == pytest.approx([0.2, -0.1, 0.3])
-    assert turned['angular_velocity_covariance'][0].reshape(3, 3).diagonal() == pytest.approx(
-        [2, 1, 3])
-    assert turned['orientation'][0] == pytest.approx([0, 0, 0.5 ** 0.5, 0.5 ** 0.5])
-
-
 def test_the_status_names_what_is_missing() -> None:
     link = topic.open_link(unit('lever_arm'), topic.Settings())
     assert 'waiting for a sample' in link.status().text

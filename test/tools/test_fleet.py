@@ -120,10 +120,6 @@ def test_fit_and_diagnose_name_the_effect(run_tool, tmp_path):
     assert row['gap_floor_low_mps2'] < row['gap_floor_mps2'] < row['gap_floor_high_mps2']
     assert row['gap_after_mps2'] < row['gap_before_mps2'] and row['gap_closed'] > 0.5
     assert abs(row['zero_g_x_v'] - 2.5) < 0.05 and 0 < row['zero_g_std_x_v'] < 0.01
-    named = {entry['name']: entry for entry in row['coefficients']
-             if entry['source'] == 'diagnose'}
-    estimate = named['temperature_bias.per_k.x']
-    assert estimate['unit'] == 'g/K' and 0 < estimate['std'] < abs(estimate['value'])
     report = tmp_path / 'out' / row['report']
     written = json.loads((report / 'report.json').read_text())
     assert written['verdict']['status'] == 'explained'

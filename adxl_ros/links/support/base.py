@@ -34,11 +34,10 @@ _MAX_SHARE = 1e-3
 def option(default: bool | int | float | str | tuple[()], doc: str, unit: str = '',
            lower: float | None = None, upper: float | None = None) -> Any:
     """
-    Declare one field of a link's `Settings`, which is the parameter `link.<name>` of the driver.
+    Declare a field of a link's `Settings`, which is the parameter `link.<name>` of the driver.
 
-    default: its type is that of the parameter; an empty tuple stands for a list of strings, or one
-    string with commas; doc: meaning, for the descriptor; unit: unit of the value, '' without one;
-    lower, upper: permitted range, in `unit`, None without limits.
+    Its type is that of the default; an empty tuple stands for a list of strings, or one string
+    with commas. The permitted range is in `unit`.
     """
     return field(default=default, metadata={'doc': doc, 'unit': unit, 'lower': lower,
                                             'upper': upper})
@@ -75,12 +74,7 @@ class DeviceSettings(LatencySettings):
 
 @dataclass(frozen=True)
 class SimulatorSettings:
-    """Settings of a link whose samples have the time of a simulator, the clock of the graph."""
-
-    @property
-    def turns_case(self) -> bool:
-        """Return whether the frame of the case is not that of the simulator's samples."""
-        return False
+    """Settings of a link whose samples have time and frame of a simulator."""
 
 
 def samples_within(latency_s: float, rate_hz: float) -> int:
@@ -109,11 +103,8 @@ class LinkStatus:
     """How a link works."""
 
     level: Level  # How well
-    # One or two words, or one line with the reason. It changes only when the condition of the link
-    # changes.
-    text: str
-    # Counts of the link and of its clock, by name
-    statistics: Mapping[str, Any] = field(default_factory=dict)
+    text: str  # Some words, or one line with the reason; it changes with the condition only
+    statistics: Mapping[str, Any] = field(default_factory=dict)  # Counts by name
     events: tuple[Event, ...] = ()  # Events that are logged when their count rises
 
 
@@ -163,11 +154,7 @@ class Link(Protocol):
     start_ns: int | None
 
     def begin(self, now_ns: int) -> int:
-        """
-        Make the next sample due now; return how many samples this loses.
-
-        It is called once before the first `read`, and again when the clock has jumped.
-        """
+        """Make the next sample due now, also after a jump of the clock; return the lost ones."""
 
     def read(self, now_ns: int) -> Samples:
         """Return the samples that are due; raises `UserError` when there will be no more."""
@@ -204,12 +191,7 @@ class StageLink(Protocol):
 
     def sense_stage(self, stamp_ns: int, position: Mapping[str, float],
                     velocity: Mapping[str, float]) -> None:
-        """
-        Take the true motion of the stage at a ROS time, ns, which may lie ahead.
-
-        Positions are in rad or m, by joint, and velocities in rad/s or m/s. A joint that is not
-        named stays.
-        """
+        """Take the true motion of named joints, in rad, m and s, at a stamp that may lie ahead."""
 
 
 @runtime_checkable
@@ -235,11 +217,7 @@ class LinkModule(Protocol):
     Settings: type  # Frozen dataclass whose fields are declared by `option`
 
     def open_link(self, sensor: Sensor, settings: Any) -> Link:
-        """
-        Open the link of the driver's sensor; a device that is not there yet is opened by reading.
-
-        Raises `UserError` where the link cannot work with these settings.
-        """
+        """Open the link; raise `UserError` for settings that cannot work. `read` opens devices."""
 
 
 def link_names() -> tuple[str, ...]:
@@ -298,9 +276,7 @@ class Watchdog:
     """
     Measures for how long nothing has come, in time during which the node could listen.
 
-    A node that was held up for seconds finds its messages waiting: they were not missing. And a
-    machine that was held up has stopped whoever publishes them, too. So a turn counts as
-    `longest_turn_s` at most.
+    A turn counts as `longest_turn_s` at most: a node that was held up finds its messages waiting.
     """
 
     def __init__(self, longest_turn_s: float) -> None:
@@ -331,11 +307,7 @@ COLUMNS = {SUPPLY: 'supply_v', TEMPERATURE: 'temperature_c'}
 
 
 def parse_channels(value: str | Sequence[str]) -> list[str]:
-    """
-    Parse `link.channels`: a list of strings, or one string with commas.
-
-    The string is for the command line, where YAML reads a bare y in a list as a boolean.
-    """
+    """Parse `link.channels`: a list, or a string with commas, as YAML reads a bare y as true."""
     parts = value.split(',') if isinstance(value, str) else value
     if not isinstance(parts, Sequence) or not all(isinstance(part, str) for part in parts):
         raise UserError(f'link.channels: {value!r} is not a list of strings')

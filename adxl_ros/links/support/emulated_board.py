@@ -9,7 +9,6 @@ from contextlib import contextmanager, suppress
 import os
 from pathlib import Path
 import pty
-import termios
 import time
 import tty
 
@@ -54,11 +53,7 @@ class Board:
         self._frame_samples = _FRAME_SAMPLES
 
     def send(self, columns: Mapping[str, np.ndarray]) -> None:
-        """
-        Send samples, each frame at the time of its last sample.
-
-        columns: volts by axis, such as `x_v`, and `supply_v` and `temperature_c`, (n,) each.
-        """
+        """Send the samples of columns, (n,) each, every frame at the time of its last sample."""
         volts = np.column_stack([_volts(role, columns) for role in self._roles])
         codes = np.rint(volts / self._sensor.lsb_v).clip(
             0, 2 ** self._sensor.adc_bits - 1).astype(np.uint16)
@@ -139,21 +134,20 @@ def check_sensor(sensor: Sensor) -> None:
 
 @contextmanager
 def open_terminal(port: str) -> Iterator[int]:
-    """Open the end of a terminal that a board writes to; a new one gets a name that is free."""
-    path, is_new = Path(port), not os.path.exists(port)
-    fds = [*pty.openpty()] if is_new else []
+    """Open the end of a new terminal that a board writes to; the other end gets a name."""
+    path, (board_fd, driver_fd) = Path(port), pty.openpty()
+    name = os.ttyname(driver_fd)
     try:
-        fds = fds or [os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)]
-        tty.setraw(fds[-1])
-        os.set_blocking(fds[0], False)
-        if is_new:
+        tty.setraw(driver_fd)
+        os.set_blocking(board_fd, False)
+        if not path.exists():
             path.unlink(missing_ok=True)  # the name of an earlier board
-            path.symlink_to(os.ttyname(fds[-1]))
-        yield fds[0]
-    except (OSError, termios.error) as error:
-        raise UserError(f'--port {port}: cannot be opened: {error}') from None
+        path.symlink_to(name)
+        yield board_fd
+    except OSError as error:
+        raise UserError(f'--port {port}: cannot be made: {error.strerror}') from None
     finally:
-        if is_new and path.is_symlink() and os.readlink(path) == os.ttyname(fds[-1]):
+        if path.is_symlink() and os.readlink(path) == name:
             path.unlink()
-        for fd in fds:
-            os.close(fd)
+        os.close(board_fd)
+        os.close(driver_fd)

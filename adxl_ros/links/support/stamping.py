@@ -204,8 +204,7 @@ class ClockMap:
         """
         Fit the best line to the windows; return the lag of a device time on it, ns.
 
-        The fit is a least-squares line, reweighted so that a window above it counts less, with a
-        prior for a drift of 0.
+        A window above the line counts less, and a drift of 0 is the prior.
         """
         windows = [self._open] if self._open and not self._windows else [*self._windows]
         origin = windows[-1]

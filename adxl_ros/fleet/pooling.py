@@ -1,0 +1,475 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Units from repeated recordings: levels and slopes of each, and what all of them share.
+
+**Trends.** The value of a recording is the level of its unit, a slope in time, a step that each
+calibration may cause, a scatter from recording to recording, and the stated error of the value.
+Scatter and steps have variances that all units share. They maximise the restricted likelihood of
+all recordings, with levels and slopes of the units free. The own scatter of a unit moderates the
+shared one, as variances that have a scaled inverse χ² distribution over units (Smyth 2004, section
+6.2), and its slope has a t distribution. So a weak drift shows that the recordings of the unit
+alone would not show. The correlation ρ of neighbouring recordings, which the units share,
+multiplies the variances of levels and slopes by 1 + 2cρ/(1 − ρ), where c is the share of the
+scatter in the variance (Bartlett 1946). A slope is claimed only if it survives the control of the
+false discovery rate (Benjamini and Hochberg 1995); intervals of claims hold for that share of them
+(Benjamini and Yekutieli 2005).
+
+**Populations.** The estimate of unit u is y = μ + b + e. Its own error e has the known standard
+deviation v, and the unit's departure b from the mean has the standard deviation τ, the spread. At
+the spread the weighted squares about the mean are as large as expected (Paule and Mandel 1982),
+and at the ends of its interval as large as quantiles of χ² (Viechtbauer 2007). The errors of the
+mean and of a further unit are those over all spreads by their restricted likelihood, with all
+spreads equally likely before (Gelman 2006), because few units hardly determine the spread.
+
+**Batches** are units whose serial numbers begin alike, and whose levels are not those of the
+others by Welch's t test, whose chance all batches share (Bonferroni), and by more than matters.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+from adxl_ros.model.constants import MAD_TO_STD
+from adxl_ros.model.population import PooledCoefficient
+import numpy as np
+import pandas as pd
+import scipy
+
+FALSE_DISCOVERY_RATE = 0.05
+"""Share of the claimed slopes that may be false. Chosen: the usual value."""
+_INTERVAL = 0.9
+"""Probability of the intervals. Chosen: that of all intervals of the package."""
+_MIN_RECORDINGS = 3
+"""Fewest recordings with a slope: one more than level and slope."""
+_LARGEST_CORRELATION = 0.95
+"""Largest correlation of neighbours. Chosen: above it a scatter is a drift of its own."""
+_ROUNDS = 20
+"""Rounds of the factor by correlation; it changes by less than 1e-3 after ten."""
+_SMALLEST_SHARE = 1e-8
+"""Smallest variance beside the stated errors, relative to that of the values."""
+_FIT_TOLERANCE = 1e-3
+"""Tolerance of the logarithms of both variances."""
+FALSE_OUTLIERS = 0.05
+"""Probability that a fleet without outliers has one on its page. Chosen."""
+_MIN_OF_OUTLIERS = 5
+"""Fewest recordings of a unit with outliers. Chosen: a median needs them."""
+_MAD_EFFICIENCY = 0.37
+"""Efficiency of that median for normal values (Rousseeuw and Croux 1993)."""
+_MAD_BIAS = 0.8
+"""That median of n values is too small by the factor 1 − 0.8/n (Croux and Rousseeuw 1992)."""
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """A quantity in n recordings, in the order of units and time."""
+
+    unit: np.ndarray  # Numbers of the units from 0, (n,)
+    # Numbers of the periods between calibrations from 0, which rise along the array, (n,)
+    period: np.ndarray
+    time: np.ndarray  # Times, in the unit of time of the slopes, (n,)
+    value: np.ndarray  # Values, (n,)
+    std: np.ndarray  # Stated standard deviations of the values, (n,)
+
+    def __getitem__(self, part: np.ndarray) -> Recordings:
+        return Recordings(_numbered(self.unit[part]), _numbered(self.period[part]),
+                          self.time[part], self.value[part], self.std[part])
+
+
+def _numbered(labels: np.ndarray) -> np.ndarray:
+    """Replace sorted labels by 0, 1, ..."""
+    return np.cumsum(np.diff(labels, prepend=labels[:1]) != 0)
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """What all units share."""
+
+    recording: float  # Standard deviation from recording to recording, beyond the stated errors
+    calibration: float  # Standard deviation of the steps at calibrations
+    widening: float = 1.0  # Factor of the variances of levels and slopes by correlation in time
+
+
+@dataclass(frozen=True)
+class Trends:
+    """Levels and slopes of m units; NaN stands for a slope that the recordings do not have."""
+
+    scatter: Scatter  # What the units share
+    # level, level_std: Mean of each unit over its recordings and its standard deviation, (m,)
+    level: np.ndarray
+    level_std: np.ndarray
+    # slope, slope_std: Slope of each unit and its standard deviation, (m,)
+    slope: np.ndarray
+    slope_std: np.ndarray
+    freedom: np.ndarray  # Degrees of freedom of the slopes, (m,)
+    squares: np.ndarray  # Weighted squares of the residuals of each unit, (m,)
+    residual: np.ndarray  # Residuals over the expected scatter, (n,)
+    log_likelihood: float  # Restricted log-likelihood of the scatter
+
+    @property
+    def p_values(self) -> np.ndarray:
+        """Two-sided probability of each slope without a drift, (m,); NaN without a slope."""
+        with np.errstate(invalid='ignore'):
+            return 2 * scipy.special.stdtr(self.freedom, -np.abs(self.slope / self.slope_std))
+
+
+def fit_trends(recordings: Recordings) -> Trends:
+    """Fit levels and slopes of all units."""
+    sums = _Sums(recordings)
+    scatter = _shared_scatter(sums)
+    fit = sums.fit(scatter)
+    widening = _widening(sums, fit)
+    # A line takes two independent recordings, which are so many of the correlated ones.
+    remaining = sums.counts - 2 * widening
+    own_freedom = np.maximum(remaining, 0.0) * sums.has_slope / widening
+    with np.errstate(invalid='ignore', divide='ignore'):
+        ratio = np.where(own_freedom > 0, fit.squares / remaining, np.nan)
+    variance, freedom = moderated(ratio, own_freedom)
+    factor = np.sqrt(variance * widening)
+    return replace(
+        fit, scatter=replace(scatter, widening=widening), level_std=factor * fit.level_std,
+        slope_std=factor * fit.slope_std, freedom=np.where(sums.has_slope, freedom, np.nan))
+
+
+class _Sums:
+    """Recordings about the centre of their unit, with where units and periods begin."""
+
+    def __init__(self, recordings: Recordings) -> None:
+        self.recordings = recordings
+        unit = recordings.unit
+        self.counts = np.bincount(unit)
+        self.period_starts = np.flatnonzero(np.diff(recordings.period, prepend=-1))
+        self.unit_starts = np.flatnonzero(np.diff(unit[self.period_starts], prepend=-1))
+        self.centre_value = np.bincount(unit, recordings.value) / self.counts
+        self.time = recordings.time - (np.bincount(unit, recordings.time) / self.counts)[unit]
+        self.value = recordings.value - self.centre_value[unit]
+        self.has_slope = (self.counts >= _MIN_RECORDINGS) & (
+            np.bincount(unit, self.time ** 2) > 0)
+
+    def fit(self, scatter: Scatter) -> Trends:
+        """Fit the lines of all units for given variances, by generalised least squares."""
+        step2, unit = scatter.calibration ** 2, self.recordings.unit
+        weight = 1 / (self.recordings.std ** 2 + scatter.recording ** 2)
+        t, y = self.time, self.value
+        w, wt, wy, wtt, wty, wyy = (np.add.reduceat(weight * part, self.period_starts)
+                                    for part in (np.ones_like(t), t, y, t * t, t * y, y * y))
+        # The step of a period has one common part in all of its recordings (Woodbury).
+        shared = step2 / (1 + step2 * w)
+        a, b, c, p, q, r = (np.add.reduceat(part, self.unit_starts) for part in (
+            w - shared * w * w, wt - shared * w * wt, wtt - shared * wt * wt,
+            wy - shared * w * wy, wty - shared * wt * wy, wyy - shared * wy * wy))
+        det = np.where(self.has_slope, a * c - b * b, 1.0)
+        det = np.maximum(det, np.finfo(float).tiny)
+        slope = np.where(self.has_slope, (a * q - b * p) / det, 0.0)
+        intercept = (p - b * slope) / a
+        squares = np.maximum(r - intercept * p - slope * q, 0.0)
+        log_det = np.add.reduceat(np.log1p(step2 * w), self.unit_starts).sum() \
+            - np.log(weight).sum()
+        log_likelihood = -0.5 * (log_det + np.log(np.where(self.has_slope, det, a)).sum()
+                                 + squares.sum())
+        residual = y - intercept[unit] - slope[unit] * t
+        step = shared * np.add.reduceat(weight * residual, self.period_starts)
+        residual = (residual - step[self.recordings.period]) * np.sqrt(weight)
+        nan = np.where(self.has_slope, 1.0, np.nan)
+        with np.errstate(invalid='ignore'):
+            slope_std = nan * np.sqrt(a / det)
+        return Trends(
+            scatter, self.centre_value + p / a, a ** -0.5, nan * slope, slope_std,
+            np.full(len(a), np.inf), squares, residual, float(log_likelihood))
+
+
+def _shared_scatter(sums: _Sums) -> Scatter:
+    """Estimate the variances that all units share."""
+    recordings = sums.recordings
+    spread2 = float(np.mean(sums.value ** 2)) + float(np.min(recordings.std)) ** 2
+    several = len(sums.period_starts) > len(sums.counts)
+    if spread2 == 0 or not (sums.counts >= _MIN_RECORDINGS).any():
+        return Scatter(0.0, 0.0) if recordings.std.min() > 0 else Scatter(1.0, 0.0)
+    floor = np.log(_SMALLEST_SHARE * spread2)
+
+    def scatter(logs: np.ndarray) -> Scatter:
+        variances = np.exp(np.maximum(logs, floor))
+        return Scatter(float(variances[0] ** 0.5),
+                       float(variances[1] ** 0.5) if several else 0.0)
+
+    start = np.log(spread2) - np.array([1.0, 2.0])[:1 + several]
+    best = scipy.optimize.minimize(
+        lambda logs: -sums.fit(scatter(logs)).log_likelihood, start, method='Nelder-Mead',
+        options={'xatol': _FIT_TOLERANCE, 'fatol': _FIT_TOLERANCE})
+    return scatter(best.x)
+
+
+def _widening(sums: _Sums, fit: Trends) -> float:
+    """Estimate the factor of the variances of levels and slopes by correlation in time."""
+    unit, residual = sums.recordings.unit, fit.residual
+    used = sums.has_slope & (sums.counts > 2 * _MIN_RECORDINGS)
+    same = (unit[1:] == unit[:-1]) & used[unit[1:]]
+    if not same.any() or fit.scatter.recording == 0:
+        return 1.0
+    variance = fit.scatter.recording ** 2
+    share = float(np.mean((variance / (variance + sums.recordings.std ** 2))[used[unit]]))
+    products = float((residual[1:] * residual[:-1])[same].sum())
+    squares, count = float((residual ** 2)[used[unit]].sum()), int(sums.counts[used].sum())
+    lines, widening = 2 * int(used.sum()), 1.0
+    for _ in range(_ROUNDS):
+        # A line removes as much from squares and products of its residuals.
+        removed = lines * widening
+        neighbours = (products * max(count - removed, 1.0) / squares + removed) / same.sum()
+        correlation = float(np.clip(neighbours / share, 0.0, _LARGEST_CORRELATION))
+        widening = 1 + 2 * share * correlation / (1 - correlation)
+    return widening
+
+
+def claims(p_values: np.ndarray) -> np.ndarray:
+    """Mark the slopes that survive the control of the false discovery rate."""
+    tested = np.isfinite(p_values)
+    result = np.zeros(p_values.shape, bool)
+    if tested.any():
+        adjusted = scipy.stats.false_discovery_control(p_values[tested])
+        result[tested] = adjusted <= FALSE_DISCOVERY_RATE
+    return result
+
+
+def interval_factor(freedom: np.ndarray, is_claimed: np.ndarray) -> np.ndarray:
+    """Return half the width of the intervals of slopes, in standard deviations."""
+    share = is_claimed.sum() / max(np.isfinite(freedom).sum(), 1)
+    outside = (1 - _INTERVAL) * np.where(is_claimed, share, 1.0)
+    return -scipy.special.stdtrit(freedom, outside / 2)
+
+
+def outliers(recordings: Recordings, tests: int) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Mark the recordings that are too far from the median of their unit and period to be chance.
+
+    tests: number of recordings that share the chance of a false outlier; returns: the distance of
+    each recording in robust standard deviations, (n,), which is 0 where a period has too few
+    recordings, and whether it is an outlier, (n,) bool.
+    """
+    period, value = recordings.period, recordings.value
+    counts = np.bincount(period)
+    deviation = np.abs(value - _medians(period, value)[period])
+    enough = counts >= _MIN_OF_OUTLIERS
+    # Both the median of few values and that of their deviations are uncertain.
+    mad = MAD_TO_STD * counts / (counts - _MAD_BIAS) * _medians(period, deviation)
+    variance, freedom = moderated(mad ** 2, np.where(
+        enough, _MAD_EFFICIENCY * (counts - 1), 0.0))
+    stated2 = recordings.std ** 2
+    worse2 = np.maximum(stated2 - _medians(period, stated2)[period], 0.0)
+    scale = np.sqrt((variance * (1 + np.pi / 2 / counts))[period] + worse2)
+    distance = np.divide(deviation, scale, out=np.zeros(len(value)),
+                         where=(scale > 0) & enough[period])
+    limits = -scipy.special.stdtrit(np.minimum(freedom[period], 1e6),
+                                    FALSE_OUTLIERS / (2 * max(tests, 1)))
+    return distance, distance > limits
+
+
+def _medians(label: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """Return the median of the values with each label 0, 1, ..."""
+    return pd.Series(value).groupby(label).median().to_numpy()
+
+
+_EQUAL_VARIANCES = 1e6
+"""Degrees of freedom of the common variance where units do not differ. Chosen: infinite."""
+_NO_FREEDOM = 1e-6
+"""Degrees of freedom of the common variance of one unit, which moderates none. Chosen: small."""
+MIN_UNITS = 5
+"""Smallest count of units with a spread: with fewer, a further unit has no finite variance."""
+_GRID = (np.arange(400) + 0.5) / 400
+"""Shares x of the spreads s·x/(1 − x) over which the likelihood is integrated. Chosen: more change
+the integrals by less than 1e-3."""
+_OUTLIER_CHANCE = 0.05
+"""Probability that a page names a unit although all units are of one population. Chosen."""
+_MAX_ROUNDS = 10
+"""Largest count of rounds of spread and outliers; a round seldom changes after the second."""
+_MAX_OUTLIERS = 0.25
+"""Largest share of units that are far out. Chosen: more of them are a population of their own."""
+_FAR_MADS = 5.0
+"""Units further from the median do not count in the first round. Chosen: far beyond normal."""
+MIN_GROUP = 5
+"""Fewest units of a group. Chosen: fewer have nothing in common that a test could show."""
+CHANCE = 0.01
+"""Probability of a false group among all groups. Chosen."""
+
+
+def moderated(variance: np.ndarray, freedom: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Moderate the variances of units, (m,), by their degrees of freedom, (m,), 0 for none.
+
+    returns: moderated variances and their degrees of freedom. Without any variance all are 1.
+    """
+    determined = freedom > 0
+    common, common_freedom = _common_variance(variance[determined], freedom[determined])
+    squares = np.where(determined, freedom * np.nan_to_num(variance), 0.0)
+    total = common_freedom + freedom
+    # What all units share is no better known than from all of their recordings (limma).
+    largest = float(freedom[determined].sum())
+    return (common_freedom * common + squares) / total, np.minimum(total, largest or np.inf)
+
+
+def _common_variance(variance: np.ndarray, freedom: np.ndarray) -> tuple[float, float]:
+    """Return the scale of the inverse χ² distribution and its degrees of freedom."""
+    freedom, variance = freedom[variance > 0], variance[variance > 0]
+    if len(variance) < 2:
+        return (float(variance[0]), _NO_FREEDOM) if len(variance) else (1.0, _EQUAL_VARIANCES)
+    log_variance = np.log(variance) - scipy.special.digamma(freedom / 2) + np.log(freedom / 2)
+    mean = float(log_variance.mean())
+    excess = float(log_variance.var(ddof=1) - scipy.special.polygamma(1, freedom / 2).mean())
+    if excess <= 2 / _EQUAL_VARIANCES:
+        return float(np.exp(mean)), _EQUAL_VARIANCES
+    # trigamma(x) is above 1/x², and near 1/x where x is large.
+    half = scipy.optimize.brentq(lambda x: float(scipy.special.polygamma(1, x)) - excess,
+                                 excess ** -0.5, _EQUAL_VARIANCES, xtol=1e-300, rtol=1e-14)
+    return float(np.exp(mean + scipy.special.digamma(half) - np.log(half))), 2 * half
+
+
+@dataclass(frozen=True)
+class RandomEffects:
+    """A coefficient over n units."""
+
+    pooled: PooledCoefficient  # Mean and spread of the population
+    # estimates, std: The units' own estimates and their standard deviations, (n,)
+    estimates: np.ndarray
+    std: np.ndarray
+    is_far_out: np.ndarray  # Units that are not of this population, (n,) bool. They do not count.
+
+    def distances(self) -> np.ndarray:
+        """Return the distances of the units from the mean, in standard deviations, (n,)."""
+        pooled = self.pooled
+        return (self.estimates - pooled.mean) / np.sqrt(
+            pooled.spread ** 2 + pooled.mean_std ** 2 + self.std ** 2)
+
+
+def random_effects(estimates: np.ndarray, std: np.ndarray, tests: int | None = None,
+                   strangers: np.ndarray | None = None) -> RandomEffects:
+    """
+    Estimate mean and spread of a population, without the units that are not of it.
+
+    estimates: estimates of at least `MIN_UNITS` units, (n,); std: their standard deviations, (n,);
+    strangers: units that are known not to be of the population, (n,) bool.
+    """
+    if strangers is not None:
+        others = random_effects(estimates[~strangers], std[~strangers], tests)
+        is_far_out = strangers.copy()
+        is_far_out[~strangers] = others.is_far_out
+        return RandomEffects(others.pooled, estimates, std, is_far_out)
+    chance = _OUTLIER_CHANCE / (2 * (tests or len(estimates)))
+    deviation = np.abs(estimates - np.median(estimates))
+    scale = MAD_TO_STD * np.median(deviation)
+    kept = _largest_dropped(deviation / np.hypot(max(scale, np.finfo(float).tiny), std), _FAR_MADS)
+    for _ in range(_MAX_ROUNDS):
+        population = _of_units(estimates, std, kept)
+        limit = -float(scipy.special.stdtrit(kept.sum() - 2, chance))
+        now = _largest_dropped(np.abs(population.distances()), limit)
+        if np.array_equal(now, kept):
+            break
+        kept = now
+    return population
+
+
+def _largest_dropped(distance: np.ndarray, limit: float) -> np.ndarray:
+    """Mark the units within a limit, (n,) bool; of too many others, the nearest count, too."""
+    count = len(distance)
+    limit_count = min(int(_MAX_OUTLIERS * count), count - MIN_UNITS)
+    farthest = np.argsort(-distance)[:limit_count]
+    kept = np.ones(count, bool)
+    kept[farthest[distance[farthest] > limit]] = False
+    return kept
+
+
+def _of_units(estimates: np.ndarray, std: np.ndarray, kept: np.ndarray) -> RandomEffects:
+    """Return the population of the units that count."""
+    y, variance = estimates[kept], std[kept] ** 2
+    unit = max(float(np.ptp(y)), float(std[kept].max()), np.finfo(float).tiny)
+    y, variance = (y - y.mean()) / unit, variance / unit ** 2
+    spread2, low, high = _spreads2(y, variance)
+    mean, _ = weighted_mean(y, variance, spread2)
+    mean_variance, prediction_variance = _variances(y, variance, mean)
+    pooled = PooledCoefficient(
+        mean=float(estimates[kept].mean() + unit * mean), mean_std=unit * mean_variance ** 0.5,
+        spread=unit * spread2 ** 0.5, spread_low=unit * low ** 0.5,
+        spread_high=unit * high ** 0.5, prediction_std=unit * prediction_variance ** 0.5,
+        units=int(kept.sum()))
+    return RandomEffects(pooled, estimates, std, is_far_out=~kept)
+
+
+def _variances(y: np.ndarray, variance: np.ndarray, mean: float) -> tuple[float, float]:
+    """Return the variances of mean and of a further unit, over all spreads."""
+    scale = float(np.sqrt(np.var(y) + variance.mean()))
+    if scale == 0:
+        return 0.0, 0.0
+    spread2 = (scale * _GRID / (1 - _GRID)) ** 2
+    weight = 1 / (variance + spread2[:, None])
+    total = weight.sum(axis=1)
+    means = weight @ y / total
+    squares = (weight * (y - means[:, None]) ** 2).sum(axis=1)
+    log_density = 0.5 * (np.log(weight).sum(axis=1) - np.log(total) - squares) \
+        - 2 * np.log1p(-_GRID)
+    density = np.exp(log_density - log_density.max())
+    density /= density.sum()
+    mean_variance = float(density @ (1 / total + (means - mean) ** 2))
+    return mean_variance, mean_variance + float(density @ spread2)
+
+
+def weighted_mean(y: np.ndarray, variance: np.ndarray, spread2: float) -> tuple[float, float]:
+    """Return the mean of estimates, (n,), for a given spread, and its variance."""
+    weight = 1 / (variance + spread2)
+    total = float(weight.sum())
+    return float(weight @ y) / total, 1 / total
+
+
+def _spreads2(y: np.ndarray, variance: np.ndarray) -> list[float]:
+    """Return the variance between units, and the ends of its 90 % interval; see the module."""
+    def squares(spread2: float) -> float:
+        mean, _ = weighted_mean(y, variance, spread2)
+        return float(np.sum((y - mean) ** 2 / (variance + spread2)))
+
+    floor, freedom, spreads2 = 1e-12 * float(np.var(y) + variance.mean()), len(y) - 1, []
+    for target in (freedom, *scipy.special.chdtri(freedom, [0.05, 0.95])):
+        # No weight is above 1/spread2, so that the squares are below the target at the high end.
+        high = floor + len(y) * float(np.var(y)) / target
+        is_below = floor == 0 or squares(floor) <= target
+        spreads2.append(0.0 if is_below else float(scipy.optimize.brentq(
+            lambda spread2, target=target: squares(spread2) - target, floor, high,
+            rtol=1e-12, xtol=1e-300)))
+    return spreads2
+
+
+class BadBatch(NamedTuple):
+    """Units with a serial number `prefix`…, and how far their mean is above that of the others."""
+
+    prefix: str
+    members: np.ndarray
+    difference: float
+    low: float
+    high: float
+
+
+def by_prefix(names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Return the groups whose names begin alike, (m,) bool each, by the shortest beginning."""
+    counts = Counter(name[:length] for name in names for length in range(1, len(name) + 1))
+    groups: dict[bytes, tuple[str, np.ndarray]] = {}
+    for prefix in sorted(counts, key=len):
+        if MIN_GROUP <= counts[prefix] < len(names):
+            members = np.array([name.startswith(prefix) for name in names])
+            groups.setdefault(members.tobytes(), (prefix, members))
+    return dict(groups.values())
+
+
+def bad_batch(serials: Sequence[str], level: np.ndarray, tolerance: float, tests: int
+              ) -> BadBatch | None:
+    """Return the most certain batch whose level differs by more than a tolerance."""
+    # The larger part of a fleet is what the others are compared with.
+    groups = {prefix: members for prefix, members in by_prefix(serials).items()
+              if members.sum() <= len(serials) / 2}
+    best, lowest = None, CHANCE / (max(len(groups), 1) * tests)
+    for prefix, members in groups.items():
+        test = scipy.stats.ttest_ind(level[members], level[~members], equal_var=False)
+        difference = float(level[members].mean() - level[~members].mean())
+        if test.pvalue < lowest and abs(difference) > tolerance:
+            lowest = float(test.pvalue)
+            best = BadBatch(prefix, members, difference,
+                            *map(float, test.confidence_interval(0.9)))
+    return best
