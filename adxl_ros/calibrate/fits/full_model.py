@@ -106,11 +106,6 @@ class FullFit:
     converged: bool  # Whether coefficients, stage error and outliers have converged
 
     @property
-    def stage_std_rad(self) -> float:
-        """Return the standard deviation of a joint's error in one pose, rad."""
-        return self.stage.total_rad
-
-    @property
     def kept(self) -> np.ndarray:
         """Mark the poses that are no outliers, (k,) bool."""
         return ~np.isin(np.arange(len(self.linear_poses)), self.outliers)
@@ -201,7 +196,9 @@ class _Search:
         self._sizes = np.array([parameter_of(name).scale for name in names])
         self._unit, self._stage = unit, stated  # Unit with coefficients, and stage error
         # Predicted errors of the angles, and the poses turned by them; see `_turned_linearly`
-        self._errors, self._poses = linearisation.AngleErrors.zeros(len(poses)), poses
+        none_rad = np.zeros((len(poses), 2))
+        self._errors = linearisation.AngleErrors(none_rad, none_rad, none_rad[:, 0], 0.0)
+        self._poses = poses
         self._kept = np.ones(len(poses), bool)  # Poses that are no outliers
         # Volts by which the model departs from its linearisation, (m,)
         self._curvature_v = np.zeros(len(unit.axes))

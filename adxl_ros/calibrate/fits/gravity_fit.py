@@ -150,12 +150,6 @@ def posterior_information(rests: NominalRests, parameters: np.ndarray, excess_g2
     return _PRIOR_INFORMATION + fisher_information(rests, parameters, excess_g2)
 
 
-def undetermined(information: np.ndarray) -> list[Coefficient]:
-    """Name the coefficients that the information, (9, 9), does not determine."""
-    std = np.sqrt(np.diag(np.linalg.inv(information)))
-    return [name for name, parameter_std in zip(NAMES, std) if parameter_std > DETERMINED_STD]
-
-
 CANDIDATES = np.array([signs for signs in product((0, 1, -1), repeat=3) if any(signs)])
 """Faces, edges and corners of a cube, one of which points up, (26, 3)."""
 UP = CANDIDATES / np.linalg.norm(CANDIDATES, axis=1, keepdims=True)
@@ -178,18 +172,11 @@ def next_up(available: np.ndarray, now: np.ndarray | None) -> int | None:
     return int(cost.argmin()) if available.any() else None
 
 
-def name_up(candidate: int) -> str:
-    """Name what points up: '+x', or '+x and −y equally' for an edge."""
-    axes = [('+' if sign > 0 else '−') + axis for axis, sign in zip(AXES, CANDIDATES[candidate])
-            if sign]
-    return axes[0] if len(axes) == 1 else f'{" and ".join(axes)} equally'
-
-
 def points_up(candidate: int) -> str:
     """Return a sentence: '+x points up', '+x and −y point up equally'."""
-    name = name_up(candidate)
-    return f'{name.removesuffix(" equally")} point up equally' if ' and ' in name else \
-        f'{name} points up'
+    axes = [('+' if sign > 0 else '−') + axis for axis, sign in zip(AXES, CANDIDATES[candidate])
+            if sign]
+    return f'{axes[0]} points up' if len(axes) == 1 else f'{" and ".join(axes)} point up equally'
 
 
 MIN_RESTS = len(NAMES) + 1
@@ -411,8 +398,9 @@ def _require_determined(rests: NominalRests, parameters: np.ndarray, excess_g2: 
         raise UserError(f'gravity: the rests read {measured * G0_MPS2:.3g} m/s², not '
                         f'{rests.gravity_g * G0_MPS2:.3g}: correct nominal_zero_g_v, '
                         'nominal_scale_v_per_g or local_gravity_mps2')
-    information = posterior_information(rests, parameters, excess_g2)
-    missing = undetermined(information)
+    covariance = np.linalg.inv(posterior_information(rests, parameters, excess_g2))
+    missing = [name for name, variance in zip(NAMES, np.diag(covariance))
+               if variance > DETERMINED_STD ** 2]
     if count >= MIN_RESTS and not missing:
         return
     names = 'all nine coefficients' if len(missing) == len(NAMES) else \

@@ -154,11 +154,6 @@ class AngleErrors:
     squared_distances: np.ndarray
     setting_penalty: float  # Sum of the squared errors of the settings over σ_s²
 
-    @classmethod
-    def zeros(cls, count: int) -> AngleErrors:
-        """Return errors of 0 in a number of poses."""
-        return cls(np.zeros((count, 2)), np.zeros((count, 2)), np.zeros(count), 0.0)
-
     @property
     def total_rad(self) -> np.ndarray:
         """Return the sum of both parts, rad, (k, 2)."""

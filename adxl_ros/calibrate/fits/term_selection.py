@@ -192,7 +192,7 @@ def _weakest_direction(fitted: Sensor) -> str:
 def warnings(full: full_model.FullFit, poses: Poses) -> list[str]:
     """Return what is wrong with the poses or the fit, one line each."""
     lines = [] if full.converged else [NOT_CONVERGED]
-    if full.stage_std_rad > _BAD_STAGE_RATIO * full.stated_std_rad + _MIN_STAGE_EXCESS_RAD:
+    if full.stage.total_rad > _BAD_STAGE_RATIO * full.stated_std_rad + _MIN_STAGE_EXCESS_RAD:
         lines.append('the reference is worse than stated, or the model lacks an effect that looks '
                      'like a stage error; poses are weighted accordingly')
     if full.outliers:

@@ -58,18 +58,16 @@ class ThermalFit:
 
     def error_g(self, temperatures_c: np.ndarray, calibrated_c: float) -> np.ndarray:
         """Return the standard deviation of the zero-g of the worst axis, (n,)."""
-        warmer_k = np.asarray(temperatures_c) - NOMINAL_TEMPERATURE_C
+        warmer_k = temperatures_c - NOMINAL_TEMPERATURE_C
         base_k = calibrated_c - NOMINAL_TEMPERATURE_C
         slopes = np.column_stack([warmer_k - base_k, warmer_k ** 2 - base_k ** 2])
-        worst = np.zeros(len(slopes))
-        axes = dict.fromkeys(name.axis for name in self.names if name.axis)
+        variances, axes = [], dict.fromkeys(name.axis for name in self.names if name.axis)
         for axis, residual_g in zip(axes, self.residual_g):
             places = [self.names.index(Coefficient('temperature_bias', parameter, axis))
                       for parameter in ('per_k', 'per_k2')]
             part = self.covariance[np.ix_(places, places)]
-            variance = np.einsum('ni,ij,nj->n', slopes, part, slopes) + residual_g ** 2
-            worst = np.maximum(worst, np.sqrt(variance))
-        return worst
+            variances.append(np.einsum('ni,ij,nj->n', slopes, part, slopes) + residual_g ** 2)
+        return np.sqrt(np.max(variances, axis=0))
 
 
 def fit(sensor: Sensor, blocks: Poses, with_history: bool = True) -> ThermalFit:

@@ -78,8 +78,9 @@ def guided(planes_rad: Sequence[float], step_rad: float, check_poses: int) -> li
 
 def with_checks(targets: list[Target], check_poses: int) -> list[Target]:
     """Add check poses in whole degrees, each the nearest to the pose before."""
-    checks = [Target(*np.radians(np.round(np.degrees([target.alpha_rad, target.beta_rad]))
-                                 ).tolist(), True) for target in spread(check_poses)]
+    angles_deg = np.degrees([(t.alpha_rad, t.beta_rad) for t in spread(check_poses)])
+    checks = [Target(alpha_rad, beta_rad, True)
+              for alpha_rad, beta_rad in np.radians(np.round(angles_deg)).tolist()]
     return targets + nearest(targets[-1], checks)
 
 
@@ -131,7 +132,8 @@ def spread(count: int) -> list[Target]:
     index = np.arange(count)
     alpha = np.arccos(_HIGHEST_COSINE - 2 * _HIGHEST_COSINE * (index + 0.5) / max(count, 1))
     beta = (index * _GOLDEN_RAD) % (2 * np.pi)
-    return [Target(*angles_rad, True) for angles_rad in np.column_stack([alpha, beta]).tolist()]
+    return [Target(alpha_rad, beta_rad, True)
+            for alpha_rad, beta_rad in zip(alpha.tolist(), beta.tolist())]
 
 
 def by_plane(targets: Sequence[Target], accepted: Collection[int]) -> tuple[Coverage, ...]:

@@ -111,9 +111,9 @@ class HandRests(Guide):
         if self.next_up is None:
             return 'there is no direction left to skip'
         self._skipped[self.next_up] = True
-        skipped = gravity_fit.name_up(self.next_up)
+        skipped = gravity_fit.points_up(self.next_up)
         self._choose_next_up()
-        return f'{skipped} up is left out'
+        return f'the direction in which {skipped} is left out'
 
     def forget(self, number: int) -> str:
         """Leave a rest out of the fit; return a line for people."""

@@ -264,7 +264,7 @@ def read_laboratory(path: str | os.PathLike | None) -> dict[str, Any]:
             if name in STATED else isinstance(value, str) and value.strip()
         if is_right and name in _PATTERNS:
             form = _PATTERNS[name]
-            is_right = re.fullmatch(form, value)
+            is_right = bool(re.fullmatch(form, value))
         if not is_right:
             raise UserError(f'{path}: {name}: {value!r} is no {form}')
     return {**_LABORATORY, **given}

@@ -272,7 +272,7 @@ class ErrorBudget:
         return parts[int(np.argmax([getattr(self, part) for part in parts]))]
 
 
-_NO_BUDGET = ErrorBudget(*[float('nan')] * 6)  # Budget of a quantity that no pose shows
+_NO_BUDGET = ErrorBudget(*(float('nan'),) * 6)  # Budget of a quantity that no pose shows
 
 
 class ErrorBudgets(NamedTuple):
