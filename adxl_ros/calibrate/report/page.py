@@ -254,7 +254,7 @@ def _sweep(sensor: Sensor, fitted: Sensor, poses: Poses) -> Any:
         deviation_mv, model_mv = (1e3 * (volts[:, d] - linear_v)
                                   for volts in (swept.volts, predicted))
         name, other = ('x', 'y') if d == 0 else ('y', 'x')
-        row[0].set(title=f'figs. 2, 3, 5, 7: forth ●, back ◁, {fitted.model} model ─',
+        row[0].set(title='figs. 2, 3, 5, 7: forth ●, back ◁, model ─',
                    xlabel=f'{name} reference, g', ylabel=f'{name} output minus linear, mV')
         backward = np.gradient(swept.beta_rad) < 0
         for plane in planes(swept.alpha_rad):
@@ -269,7 +269,7 @@ def _sweep(sensor: Sensor, fitted: Sensor, poses: Poses) -> Any:
         vertical = np.abs(np.sin(swept.alpha_rad)) > _VERTICAL
         az_g = regression.plane_az_g
         for axis, title, x_label, y_label, x, y, polynomial in (
-                (row[1], 'fig. 4: residual against the other axis (10, 11), alpha = 90°',
+                (row[1], f'fig. 4: residual against {other} (10, 11)',
                  f'{other} reference, g', f'{name} residual, mV', force_g[vertical, 1 - d],
                  deviation_mv[vertical], 1e3 * regression.p),
                 (row[2], 'fig. 6: zero-g against z (12, 13)', 'z reference, g',
