@@ -40,9 +40,8 @@ class RecordedPoses:
     """Poses of one recording."""
 
     source: str  # Name of the recording, for messages and the provenance
-    poses: Poses  # Its poses, with angles or without
-    # Estimate of the output filter of each axis; empty where there is none
-    filters: Sequence[FilterNoise | None] = ()
+    poses: Poses  # With angles or without
+    filters: Sequence[FilterNoise | None] = ()  # Estimated output filter of each axis
 
 
 def _joined(recordings: Sequence[RecordedPoses]) -> Poses:
@@ -118,9 +117,7 @@ def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | 
 
 @dataclass(frozen=True)
 class _StageFit:
-    """A fit against the stage."""
-
-    fitted: Sensor  # The fitted unit
+    fitted: Sensor
     refit: held_out.Fit  # The same fit to other poses, for cross-validation
     full: full_model.FullFit | None = None  # The full fit; None for other models
     terms: Sequence[term_selection.Term] = ()  # Evidence for the terms of a full fit
@@ -136,15 +133,13 @@ def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: s
     if population is not None:
         fit = _with_population(fit, population)
     full, fitted, fitting = fit.full, fit.fitted, np.flatnonzero(~poses.check)
-    fit_lines, warnings = ([], []) if full is None else (
+    fit_lines, warnings, outliers = ([], [], ()) if full is None else (
         term_selection.report_lines(full, poses.subset(fitting), fit.terms),
-        term_selection.warnings(full, poses.subset(fitting)))
-    outliers = tuple(fitting[list(full.outliers)].tolist()) if full else ()
+        term_selection.warnings(full, poses.subset(fitting)),
+        tuple(fitting[list(full.outliers)].tolist()))
     errors, assessments = _assessed(
         sensor, poses.subset(~np.isin(np.arange(len(poses)), outliers)), fit)
-    assessment = next((row for row in assessments if row.model == fitted.model), None)
-    if assessment is None:
-        errors, assessments = (), ()
+    assessment = assessments[-1] if assessments else None
     force = np.column_stack(reference_force(poses, fitted.local_gravity_mps2))
     residual_mg = ((poses.volts - predicted_volts(fitted, poses)) / fitted.scale_v_per_g
                    * 1e3)[fitting]
@@ -205,6 +200,8 @@ def _assessed(sensor: Sensor, inliers: Poses, fit: _StageFit
         sensor, inliers, stage)
     is_certain = (fit.full is None or fit.full.converged) and \
         not acceptance.open_coefficients(fit.fitted)
+    if not errors or errors[-1].model != fit.fitted.model:
+        return (), ()
     return tuple(errors), tuple(
         acceptance.assess(row.model, held_out.error_budgets(row, inliers, stage), sensor,
                           is_certain or row.model != fit.fitted.model)
@@ -239,7 +236,6 @@ def _richest_fit(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str
 
 def _fit_full(sensor: Sensor, poses: Poses, recordings: Sequence[RecordedPoses],
               effects: Sequence[str]) -> _StageFit:
-    """Fit the full model to recordings of one unit in one mounting."""
     full, terms = term_selection.fit_selected(sensor, poses, effects)
     if len(recordings) > 1:
         _require_one_mounting(full, recordings)
@@ -285,8 +281,7 @@ either recording, far below a new mounting."""
 _MAX_ZERO_G_SHIFT_G = 0.02
 """Largest shift of the zero-g between recordings, g. Chosen: a healthy unit may shift by so much
 between two days."""
-_MIN_DEVIATIONS = 6.0
-"""Smallest turn or shift that counts, in its standard deviations. Chosen: never by chance."""
+_MIN_DEVIATIONS = 6.0  # Smallest turn or shift that counts, in its stds; chosen: never by chance
 _MIN_EIGENVALUE_RATIO = 1e-10
 """Smallest relative eigenvalue of the information whose direction counts as determined."""
 _MIN_VARIANCE = 1e-30
@@ -298,12 +293,7 @@ class _ContradictionError(UserError):
 
 
 def _require_one_mounting(full: full_model.FullFit, recordings: Sequence[RecordedPoses]) -> None:
-    """
-    Refuse recordings if the mounting or the zero-g of one of them differs.
-
-    A turn of the case and a shift of the zero-g of each axis are fitted by least squares to the
-    residuals of each recording about the common fit.
-    """
+    """Refuse recordings if a turn of the case or a shift of the zero-g shows in one of them."""
     axes = full.unit.axes
     limits = np.repeat([_MAX_TURN_RAD, _MAX_ZERO_G_SHIFT_G], [3, len(axes)])
     for recording in recordings:
@@ -322,7 +312,7 @@ def _require_one_mounting(full: full_model.FullFit, recordings: Sequence[Recorde
 
 
 def _turn_and_shifts(full: full_model.FullFit, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
-    """Fit the turn of the case, rad, (3,), and the zero-g shifts, g, (m,); values and std."""
+    """Fit turn, rad, (3,), and zero-g shifts, g, (m,), to residuals; return values and std."""
     unit = full.unit
     force = reference_force(poses, unit.local_gravity_mps2)
     by_force = np.moveaxis(signal_chain.jacobian(
@@ -421,11 +411,8 @@ def calibrate_thermal(base: Sensor, poses: Poses, source: str, data_sha256: str 
 def _slope_lines(fitted: Sensor, fit: thermal_fit.ThermalFit) -> list[str]:
     """Return slope and curvature of each axis with half of their 90 % intervals."""
     std = dict(zip(fit.names, Z_90 * np.sqrt(np.diag(fit.covariance))))
-    lines = []
-    for axis in fitted.axes:
-        slope, curvature = (Coefficient('temperature_bias', parameter, axis)
-                            for parameter in ('per_k', 'per_k2'))
-        k, k2 = get(fitted, [slope, curvature])
-        lines.append(f'  {axis}  {with_half_width(k * 1e3, std[slope] * 1e3)} mg/K at 25 °C, '
-                     f'{with_half_width(k2 * 1e6, std[curvature] * 1e6)} µg/K²')
-    return lines
+    pairs = [[Coefficient('temperature_bias', name, axis) for name in ('per_k', 'per_k2')]
+             for axis in fitted.axes]
+    return [f'  {slope.axis}  {with_half_width(k * 1e3, std[slope] * 1e3)} mg/K at 25 °C, '
+            f'{with_half_width(k2 * 1e6, std[curvature] * 1e6)} µg/K²'
+            for slope, curvature in pairs for k, k2 in [get(fitted, [slope, curvature])]]

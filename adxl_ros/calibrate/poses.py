@@ -3,9 +3,7 @@
 """
 Poses: mean output at rest with the angles of the stage's encoder.
 
-- What a unit reads in them: predicted volts and their derivatives.
-- Angles that a table states, and poses from the rests of a recording.
-- Settings of a joint: the poses between which the stage has not moved it.
+Poses between which the stage has not moved a joint are of one setting of the joint.
 """
 
 from __future__ import annotations
@@ -35,20 +33,16 @@ from adxl_ros.signals.rest_detection import (
 )
 import numpy as np
 
-_SAME_PLANE_RAD = np.radians(1.0)
-"""Largest difference of neighbouring angles alpha in one plane, rad."""
+_SAME_PLANE_RAD = np.radians(1.0)  # Largest difference of neighbouring angles alpha in one plane
 
 
 @dataclass(frozen=True)
 class Poses:
     """k poses of one unit with m measured axes."""
 
-    # volts, std_v: Mean output of each measured axis and the standard deviation of that mean, V,
-    # (k, m)
-    volts: np.ndarray
-    std_v: np.ndarray
-    # alpha_rad, beta_rad: Angles of the stage's encoder, unwrapped, (k,); NaN without a stage
-    alpha_rad: np.ndarray
+    volts: np.ndarray  # Mean output of each measured axis, V, (k, m)
+    std_v: np.ndarray  # Standard deviation of that mean, V, (k, m)
+    alpha_rad: np.ndarray  # Of the stage's encoder, unwrapped, (k,); NaN without a stage
     beta_rad: np.ndarray
     time_s: np.ndarray  # Beginning and end of each rest, s, (k, 2)
     # True for a pose that the fit does not use, so that it can show the error, (k,)
@@ -56,9 +50,8 @@ class Poses:
     # temperature_c, supply_v: Means over each rest, (k,); NaN where they were not measured
     temperature_c: np.ndarray = None  # type: ignore[assignment]
     supply_v: np.ndarray = None  # type: ignore[assignment]
-    # alpha_setting, beta_setting: Number of the setting of each joint, (k,) int. Poses of one
-    # setting share the error of the joint; see `joint_settings`. By default each change of the
-    # angle from one pose to the next in time begins a setting.
+    # Number of the setting of each joint, (k,) int. Poses of one setting share the error of the
+    # joint. By default each change of the angle from one pose to the next begins a setting.
     alpha_setting: np.ndarray = None  # type: ignore[assignment]
     beta_setting: np.ndarray = None  # type: ignore[assignment]
 
@@ -79,13 +72,7 @@ class Poses:
     @classmethod
     def without_volts(cls, alpha_rad: np.ndarray, beta_rad: np.ndarray, std_v: np.ndarray,
                       setting: np.ndarray | None = None) -> Poses:
-        """
-        Make poses that have not been measured: their volts and times are 0.
-
-        alpha_rad, beta_rad: joint angles, (k,); std_v: noise of the mean of a pose, V, (m,), or of
-        each pose, (k, m); setting: number of the setting of both joints, (k,) int. By default each
-        change of an angle begins a setting.
-        """
+        """Make poses that have not been measured, with a noise, (m,) or (k, m), of their means."""
         count = len(alpha_rad)
         noise_v = np.broadcast_to(std_v, (count, np.shape(std_v)[-1])).copy()
         poses = cls(np.zeros_like(noise_v), noise_v, alpha_rad, beta_rad, np.zeros((count, 2)),
@@ -152,11 +139,7 @@ def planes(alpha_rad: np.ndarray) -> list[np.ndarray]:
 
 
 def reference_force(poses: Poses, gravity_mps2: float) -> Components:
-    """
-    Return the specific force at the angles of the encoder, on a stage without errors.
-
-    returns: three components in the case frame, m/s², (k,).
-    """
+    """Return the specific force at the angles of the encoder, on a stage without errors."""
     return specific_force(poses.alpha_rad, poses.beta_rad, gravity_mps2)
 
 
@@ -210,22 +193,13 @@ linear over a thousandth of a typical size."""
 
 def predicted_volts(unit: Sensor, poses: Poses, shift_rad: tuple[float, float] = (0.0, 0.0)
                     ) -> np.ndarray:
-    """
-    Predict the mean output of a unit in poses.
-
-    returns: volts, (k, m).
-    """
+    """Predict the mean output of a unit in poses, V, (k, m)."""
     force = stage_force(unit, poses.alpha_rad + shift_rad[0], poses.beta_rad + shift_rad[1])
     return np.column_stack(signal_chain.static_response(unit)(force, poses.environment))
 
 
 def stage_force(unit: Sensor, alpha_rad: np.ndarray, beta_rad: np.ndarray) -> Components:
-    """
-    Return the specific force at rest on a stage with the stage effects of a unit.
-
-    alpha_rad, beta_rad: angles of the encoder, rad, (k,); returns: three components in the case
-    frame, m/s², (k,).
-    """
+    """Return the specific force at rest on a stage with the stage effects of a unit."""
     signals = base.Signals(
         NOMINAL_ENVIRONMENT, alpha=base.Joint(alpha_rad), beta=base.Joint(beta_rad),
         up=list(UPRIGHT), gravity_mps2=unit.local_gravity_mps2)
@@ -235,11 +209,7 @@ def stage_force(unit: Sensor, alpha_rad: np.ndarray, beta_rad: np.ndarray) -> Co
 
 
 def angle_jacobian(unit: Sensor, poses: Poses) -> np.ndarray:
-    """
-    Differentiate the predicted volts by alpha and beta.
-
-    returns: jacobian, V/rad, (k, m, 2).
-    """
+    """Differentiate the predicted volts by alpha and beta, V/rad, (k, m, 2)."""
     def slope(alpha_rad: float, beta_rad: float) -> np.ndarray:
         above = predicted_volts(unit, poses, (alpha_rad, beta_rad))
         below = predicted_volts(unit, poses, (-alpha_rad, -beta_rad))
@@ -249,11 +219,7 @@ def angle_jacobian(unit: Sensor, poses: Poses) -> np.ndarray:
 
 
 def coefficient_jacobian(unit: Sensor, poses: Poses, names: Sequence[Coefficient]) -> np.ndarray:
-    """
-    Differentiate the predicted volts by coefficients.
-
-    names: coefficients, (p,); returns: jacobian, V per unit of the coefficient, (k, m, p).
-    """
+    """Differentiate the predicted volts by coefficients, V per their unit, (k, m, p)."""
     def slope(name: Coefficient) -> np.ndarray:
         value, step = get(unit, [name]), _COEFFICIENT_STEP * parameter_of(name).scale
         above = predicted_volts(put(unit, [name], value + step), poses)
@@ -281,9 +247,9 @@ def _moved(readings_rad: np.ndarray, before_rad: Any, commands_rad: np.ndarray, 
     """
     Return whether joints have moved from one pose to the next, by their encoder or their command.
 
-    readings_rad, before_rad: readings between the poses and the mean of the second one, rad, (n,)
-    or (n, joints), and the mean of the first one; commands_rad, held_rad: commands between the
-    poses, and the one before. NaN where there is none.
+    readings_rad, before_rad: readings between the poses with the mean of the second one, (n,) or
+    (n, joints), and the mean of the first one; commands_rad, held_rad: commands between the poses,
+    and the one before. NaN where there is none.
     """
     low, high = (extreme(readings_rad, axis=0) for extreme in (np.fmin.reduce, np.fmax.reduce))
     first, last = (extreme(commands_rad, axis=0, initial=np.nan)
@@ -299,9 +265,7 @@ def recorded_settings(rests: np.ndarray, readings_rad: np.ndarray | None,
     Return the number of the setting of one joint in each rest of a recording, (k,) int.
 
     rests: first row and row after the last of each rest, (k, 2), in any order; readings_rad,
-    commands_rad: encoder and command at each sample, rad, (n,); NaN where there is none. None for
-    a joint without them. A command stays in force until the next one.; returns: numbers from 0 in
-    the order of time, (k,) int.
+    commands_rad: encoder and command at each sample, (n,); NaN or None where there is none.
     """
     missing = np.full(int(rests.max(initial=0)), np.nan)
     readings = missing if readings_rad is None else readings_rad
@@ -358,11 +322,7 @@ class SettingTracker:
             self._commands.append((stamp_ns, new))
 
     def lose_track(self) -> None:
-        """
-        Count both joints as moved before the next pose: the stage may have moved unseen.
-
-        Later stamps may be smaller than the former ones, since a clock may have been set.
-        """
+        """Count both joints as moved before the next pose; stamps may begin again."""
         self._newest_ns = None
         self._readings.clear()
         held = [(-np.inf, angles) for _, angles in self._commands][-1:]
@@ -440,33 +400,25 @@ def extract_poses(recording: Recording, sensor: Sensor,
         return np.array([np.nan if values is None else
                          _mean_of_finite(values[rest.start:rest.stop]) for rest in rests])
 
-    def settings(joint: str) -> np.ndarray:
-        numbers = [getattr(record, f'{joint}_setting') for record in records or ()]
-        if records is not None and None not in numbers:
-            return np.array(numbers)
-        readings, commands = (recording.columns.get(name)
-                              for name in (JOINTS[joint], COMMANDS[joint]))
-        if readings is None and commands is None:
-            return None  # type: ignore[return-value]  # `Poses` numbers them by the angles
-        return recorded_settings(np.array([[rest.start, rest.stop] for rest in rests]), readings,
-                                 commands, angle_tolerance_rad(sensor))
-
     mean, std = rest_means(recording.time_s, volts, rests, sensor.rate_hz,
                            datasheet_noise(sensor))
-    if records is None:
-        alpha_rad, beta_rad = (means(None if angles is None else angles[:, joint])
-                               for joint in range(2))
-        check = np.zeros(len(rests), bool)
-    else:
-        alpha_rad, beta_rad = (np.array([getattr(record, name) for record in records])
-                               for name in ('alpha_rad', 'beta_rad'))
-        check = np.array([record.check for record in records], bool)
-    return Poses(
-        volts=mean, std_v=std, alpha_rad=alpha_rad, beta_rad=beta_rad,
-        time_s=np.array([[rest.time_start_s, rest.time_stop_s] for rest in rests]), check=check,
-        temperature_c=means(recording.columns.get('temperature_c')),
-        supply_v=means(recording.columns.get('supply_v')),
-        alpha_setting=settings('alpha'), beta_setting=settings('beta'))
+    measured = {'volts': mean, 'std_v': std,
+                'time_s': np.array([[rest.time_start_s, rest.time_stop_s] for rest in rests]),
+                'temperature_c': means(recording.columns.get('temperature_c')),
+                'supply_v': means(recording.columns.get('supply_v'))}
+    if records is not None:
+        return replace(Poses.from_records(records), **measured)
+    alpha_rad, beta_rad = (means(None if angles is None else angles[:, joint])
+                           for joint in range(2))
+    for joint in ('alpha', 'beta'):
+        readings, commands = (recording.columns.get(name)
+                              for name in (JOINTS[joint], COMMANDS[joint]))
+        if readings is not None or commands is not None:
+            measured[f'{joint}_setting'] = recorded_settings(
+                np.array([[rest.start, rest.stop] for rest in rests]), readings, commands,
+                angle_tolerance_rad(sensor))
+    return Poses(alpha_rad=alpha_rad, beta_rad=beta_rad, check=np.zeros(len(rests), bool),
+                 **measured)
 
 
 def estimate_filters(recording: Recording, sensor: Sensor, poses: Poses

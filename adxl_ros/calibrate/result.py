@@ -3,8 +3,7 @@
 """
 The result of a calibration: the fitted unit with its provenance, validity range and report.
 
-- Its coefficients as lines of text, and its files.
-- Comparison of fitted coefficients with the true ones of a simulated unit, and drift of a unit.
+It is compared with the truth of a simulated unit, and with earlier calibrations.
 """
 
 from __future__ import annotations
@@ -43,9 +42,8 @@ _SAME_FIT_TOLERANCE = 1e-6
 class CalibrationResult:
     """A calibrated unit with its assessment."""
 
-    # nominal, fitted: The unit before and after the fit
-    nominal: Sensor
-    fitted: Sensor
+    nominal: Sensor  # The unit before the fit
+    fitted: Sensor  # The unit after the fit
     summary: Sequence[str]  # Verdict, errors and limits as text
     poses: Poses  # k poses, check poses among them
     # Acceptance of each model; the last one is that of `fitted`
@@ -78,7 +76,7 @@ class CalibrationResult:
         """
         Copy the calibration to the store, unless it is '' or cannot be written.
 
-        returns: one line with the path, or with the reason why there is no copy.
+        returns: one line with the path or the reason.
         """
         if not str(folder):
             return 'not kept in a store'
@@ -271,8 +269,7 @@ def errors_in_words(fitted: Sensor) -> str:
             f'{slope}.')
 
 
-_LONGEST_LABEL = 26
-"""Columns that a coefficient's name may take, so that its line has at most 79."""
+_LONGEST_LABEL = 26  # Columns that a coefficient's name may take, so that its line has at most 79
 _COVERED = 0.9
 """Share of the 90 % intervals that contain the true value if the intervals are right."""
 
@@ -304,56 +301,41 @@ _QUANTITIES = {
 """Field of a sensor, fitted parameter, and unit of a change of what calibrations compare."""
 
 
-@dataclass(frozen=True)
-class DriftHistory:
-    """Calibrations of one unit, oldest first."""
+def history(newest: Sensor, stored: Sequence[Sensor]
+            ) -> tuple[list[str], list[list[str]], str] | None:
+    """
+    Return head and rows of the calibrations of a unit, and the changes since the one before.
 
-    # The stored calibrations, then the newest. Empty where the newest is the only one.
-    sensors: tuple[Sensor, ...]
-
-    @staticmethod
-    def from_store(newest: Sensor, stored: Sequence[Sensor]) -> DriftHistory:
-        """Append the newest calibration to the stored ones of other data and the same axes."""
-        by_data: dict[str, Sensor] = {}
-        for sensor in (*stored, newest):
-            # Two fits of the same data show no drift: only the last one counts.
-            if sensor.axes == newest.axes:
-                data = sensor.provenance.get('data_sha256') or \
-                    calibration_store.calibration_id(sensor)
-                by_data.pop(data, None)
-                by_data[data] = sensor
-        return DriftHistory(tuple(by_data.values()) if len(by_data) > 1 else ())
-
-    def table(self) -> tuple[list[str], list[list[str]]]:
-        """Return head and rows, a row for each calibration."""
-        head = ['date', 'id', 'model', 'temperature, °C', *(
-            f'{label} {axis}' for label in _QUANTITIES for axis in self.sensors[-1].axes)]
-        return head, [
-            [date, calibration_store.calibration_id(sensor), sensor.model,
+    Of the stored ones those of other data and the same axes count; None without any.
+    """
+    by_data: dict[str, Sensor] = {}
+    for sensor in (*stored, newest):
+        # Two fits of the same data show no drift: only the last one counts.
+        if sensor.axes == newest.axes:
+            data = sensor.provenance.get('data_sha256') or calibration_store.calibration_id(sensor)
+            by_data.pop(data, None)
+            by_data[data] = sensor
+    if len(by_data) < 2:
+        return None
+    rows = [[sensor.provenance.get('date', f'no. {i}')[:16].replace('T', ' '),
+             calibration_store.calibration_id(sensor), sensor.model,
              sensor.provenance.get('temperature_c', '-'),
              *(f'{value:.5f}' for value in (*sensor.zero_g_v, *sensor.scale_v_per_g))]
-            for date, sensor in zip(self.dates, self.sensors)]
-
-    def changes(self) -> str:
-        """State the changes since the calibration before that exceed their intervals."""
-        before, now = self.sensors[-2:]
-        changes = []
-        for label, (field, parameter, unit) in _QUANTITIES.items():
-            differences = getattr(now, field) - getattr(before, field)
-            for d, axis in enumerate(now.axes):
-                name, scale = replace(parameter, axis=axis), 1e3 / now.scale_v_per_g[d]
-                variance = sum(float(sensor.covariance[i, i]) for sensor in (before, now)
-                               for i, own in enumerate(sensor.covariance_names) if own == name)
-                change, half_width = scale * differences[d], scale * Z_90 * variance ** 0.5
-                if abs(change) > half_width:
-                    changes.append(f'{label} of {axis} changed by {change:+.2f} +- '
-                                   f'{half_width:.2f} {unit}')
-        since = f'Since {calibration_store.calibration_id(before)}, {self.dates[-2]}'
-        return f'{since}: {"; ".join(changes)}.' if changes else \
-            f'{since}, nothing has changed beyond the 90 % intervals.'
-
-    @property
-    def dates(self) -> list[str]:
-        """Return the dates of the calibrations, as text."""
-        return [sensor.provenance.get('date', f'no. {i}')[:16].replace('T', ' ')
-                for i, sensor in enumerate(self.sensors, 1)]
+            for i, sensor in enumerate(by_data.values(), 1)]
+    before, now = list(by_data.values())[-2:]
+    changes = []
+    for label, (field, parameter, unit) in _QUANTITIES.items():
+        for d, axis in enumerate(now.axes):
+            name, scale = replace(parameter, axis=axis), 1e3 / now.scale_v_per_g[d]
+            variance = sum(float(sensor.covariance[i, i]) for sensor in (before, now)
+                           for i, own in enumerate(sensor.covariance_names) if own == name)
+            change = scale * (getattr(now, field) - getattr(before, field))[d]
+            half_width = scale * Z_90 * variance ** 0.5
+            if abs(change) > half_width:
+                changes.append(f'{label} of {axis} changed by {change:+.2f} +- {half_width:.2f} '
+                               f'{unit}')
+    head = ['date', 'id', 'model', 'temperature, °C',
+            *(f'{label} {axis}' for label in _QUANTITIES for axis in newest.axes)]
+    return head, rows, f'Since {rows[-2][1]}, {rows[-2][0]}' + (
+        f': {"; ".join(changes)}.' if changes else
+        ', nothing has changed beyond the 90 % intervals.')

@@ -101,18 +101,15 @@ _CELL_MPS2 = 0.5
 """Width of a cell of the grid of forces, m/s²; chosen: tangent and covariance hardly vary within
 it, so that its samples share them."""
 
-_MAX_CELLS = 4096
-"""Largest number of cells in memory; chosen: the forces of all poses fill about as many."""
+_MAX_CELLS = 4096  # Most cells in memory; chosen: the forces of all poses fill about as many
 
 _CELL_ENVIRONMENT = Environment(time_s=0.0, temperature_c=0.5, supply_v=0.01)
 """Change of the surroundings, °C and V, from which the cells are computed again; chosen: the
 tangent hardly varies within it. Time has no limit."""
 
-_MAX_ACCEL_MPS2 = 1e6
-"""Acceleration that no sensor outputs, m/s²; chosen: far beyond any range."""
+_MAX_ACCEL_MPS2 = 1e6  # Acceleration that no sensor outputs, m/s²; chosen: far beyond any range
 
-_TOLERANCE_MPS2 = 1e-8
-"""Largest next step of a converged inverse, m/s²; chosen: far below any noise."""
+_TOLERANCE_MPS2 = 1e-8  # Largest next step of a converged inverse; chosen: far below any noise
 
 _MAX_STEPS = 8
 """Newton steps after which the inverse starts from zero; chosen: one or two suffice usually."""

@@ -57,10 +57,8 @@ def undo_filter(volts: np.ndarray, time_s: np.ndarray, rc_s: np.ndarray, rate_hz
     Undo the filter of consecutive samples.
 
     Near the ends of the series, and near gaps, the difference uses as many neighbours as both
-    sides have. A sample without a neighbour on one side stays as it is.
-
-    volts: volts behind the filter, V, (n, m); time_s: stamps, s, (n,); rc_s: time constants of the
-    filter by axis, s, (m,); returns: volts before the filter, V, (n, m).
+    sides have. A sample without a neighbour on one side stays as it is. Volts are (n, m), time
+    constants (m,).
     """
     distance = np.diff(time_s) * rate_hz
     breaks = np.concatenate([[0], np.flatnonzero(~((distance > 0) & (distance < MAX_GAP))) + 1,
@@ -79,13 +77,7 @@ def undo_filter(volts: np.ndarray, time_s: np.ndarray, rc_s: np.ndarray, rate_hz
 
 def undo_filter_blocks(blocks: Iterable[tuple[Token, np.ndarray, np.ndarray]],
                        rc_s: np.ndarray, rate_hz: float) -> Iterator[tuple[Token, np.ndarray]]:
-    """
-    Undo the filter block by block, with the result of `undo_filter` for the whole.
-
-    blocks: for each block: a token, stamps, s, (n,), and volts behind the filter, V, (n, m); rc_s:
-    time constants of the filter by axis, s, (m,); yields: for each block: its token, and volts
-    before the filter, V, (n, m).
-    """
+    """Undo the filter block by block (token, stamps, volts), as `undo_filter` of the whole."""
     none: tuple[Any, ...] = None, np.empty(0), np.empty((0, len(rc_s)))
     _, before_s, before_v = none
     for (token, time_s, volts), (_, after_s, after_v) in itertools.pairwise(
@@ -119,11 +111,7 @@ class DelayedInversion:
     """`undo_filter` for a stream: returns a sample when it has `HALF` neighbours after it."""
 
     def __init__(self, rc_s: np.ndarray, rate_hz: float) -> None:
-        """
-        Prepare for a stream.
-
-        rc_s: time constants of the filter by axis, s, (m,).
-        """
+        """Prepare for time constants by axis, (m,)."""
         self._rate_hz = rate_hz
         self._near: deque[tuple[float, list[float], object]] = deque()
         self._index = 0
@@ -133,12 +121,7 @@ class DelayedInversion:
 
     def __call__(self, time_s: float, volts: list[float], token: object
                  ) -> Iterator[tuple[float, list[float], object]]:
-        """
-        Take a sample. At a gap, all samples before it become ready.
-
-        volts: volts behind the filter by axis, V; yields: each sample that is ready: its stamp, s,
-        volts before the filter, V, and its token.
-        """
+        """Take a sample; yield those that are ready, before a gap all, before the filter."""
         near = self._near
         if near and not 0 < (time_s - near[-1][0]) * self._rate_hz < MAX_GAP:
             while self._index < len(near):
@@ -173,14 +156,8 @@ def paper_inverse(sensor: Sensor, maths: Maths = ARRAYS) -> Callable[..., Compon
 
     First each axis is linear (3), and z follows from equation 5 if it is not measured. Then the
     bias by the other axes is subtracted, and the result is divided by the scale factor at those
-    inputs (14, 16). Finally the misalignment is removed, one axis after the other (20, 21).
-
-    Returns
-    -------
-    callable
-        Maps the volts of each axis, and an `Environment` (the nominal one unless given), to three
-        components of specific force, m/s².
-
+    inputs (14, 16). Finally the misalignment is removed, one axis after the other (20, 21). The
+    result maps the volts of each axis, and an `Environment`, to specific force, m/s².
     """
     measured = [AXES.index(axis) for axis in sensor.axes]
     gravity_g = gravity_mps2(sensor) / G0_MPS2

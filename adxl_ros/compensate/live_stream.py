@@ -28,8 +28,7 @@ import numpy as np
 COUNTS = ('received', 'published', 'dropped', 'saturated', 'outside')
 """What a stream counts: samples, and those to which something happened."""
 
-_MAX_UNKNOWN = 5000
-"""Largest number of samples that wait for their sensor; chosen: 5 s at 1 kHz."""
+_MAX_UNKNOWN = 5000  # Largest number of samples that wait for their sensor; chosen: 5 s at 1 kHz
 
 
 class _Chain(NamedTuple):
@@ -47,10 +46,8 @@ class LiveStream:
     One thread calls it with samples; another one may replace the sensor and the surroundings
     meanwhile. A sample has the coefficients before or after a replacement, never some of both.
 
-    publish_tilt: takes roll, pitch and inclination, rad, a serialized
-    geometry_msgs/Vector3Stamped; publish_free: takes the acceleration without gravity of a sample
-    that states an orientation, m/s², a serialized geometry_msgs/Vector3Stamped; None for no such
-    output.
+    publish_tilt, publish_free: take roll, pitch and inclination, and the acceleration without
+    gravity of a sample with an orientation, each a serialized geometry_msgs/Vector3Stamped.
     """
 
     def __init__(self, paper: bool, undo_filter: bool, publish_imu: Callable[[bytes], None],
@@ -113,13 +110,9 @@ class LiveStream:
         self._forces = []
 
     def collected(self) -> np.ndarray:
-        """Return the forces since `collect` in the frame of the case, m/s², (n, 3)."""
-        forces = self._forces or []
-        return np.reshape(forces[:], (-1, 3)) @ self._mounting.rows
-
-    def stop_collecting(self) -> None:
-        """Forget the kept forces."""
-        self._forces = None
+        """Return the forces since `collect` in the frame of the case, (n, 3), and forget them."""
+        forces, self._forces = self._forces or [], None
+        return np.reshape(forces, (-1, 3)) @ self._mounting.rows
 
     def surround(self, name: str, value: float) -> None:
         """Take a temperature or supply into account, from the next sample on."""
@@ -227,12 +220,7 @@ class ImuFields:
         self._last_rad = np.zeros(3)
 
     def __call__(self, estimates: Estimates) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """
-        Return the fields of sensor_msgs/Imu and the tilt of the samples that have a solution.
-
-        returns: fields by name, (n, k) each. The yaw of the orientation is 0 and unknown. Roll,
-        pitch and inclination, rad, (n, 3).
-        """
+        """Return fields of sensor_msgs/Imu, (n, k), and the tilt, (n, 3), of solved samples."""
         unsolved = estimates.unsolved
         solved = ~unsolved if unsolved.any() else slice(None)  # a slice copies nothing
         force = estimates.force_mps2[:, solved]
@@ -261,12 +249,7 @@ class ImuFields:
 
 def _orientation_covariance(force: np.ndarray, covariance: np.ndarray, roll_rad2: np.ndarray,
                             pitch_rad2: np.ndarray) -> np.ndarray:
-    """
-    Return the elements of the covariance of roll, pitch and yaw, row after row.
-
-    force: specific force, m/s², (3, n); covariance: its covariance, (m/s²)², (3, 3, n); roll_rad2,
-    pitch_rad2: variances, rad², (n,); returns: the covariance, rad², (9, n).
-    """
+    """Return the covariance of roll, pitch and yaw, (9, n), by that of a force, (3, 3, n)."""
     components = tuple(covariance[i, j] for i in range(3) for j in range(i, 3))
     both = roll_pitch_covariance(list(force), components, ARRAYS)
     is_known = np.maximum(roll_rad2, pitch_rad2) < UNKNOWN_ANGLE_RAD2

@@ -76,7 +76,6 @@ class MountingParameters:
         await waiting
         self._node.destroy_timer(timer)
         forces_mps2, self._waiting = self._stream.collected(), None
-        self._stream.stop_collecting()
         try:
             levelled = level(self._mounting, forces_mps2, self._stream.sensor)
         except UserError as error:

@@ -43,8 +43,7 @@ import scipy
 TERMS = ('bias', 'scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z', 'scale_factor_z',
          'nonlinearity')
 """Terms of a two-axis unit: those of the paper, and a cube."""
-_THREE_AXES = ('scale_factor_cross',)
-"""Terms that only a three-axis unit has."""
+_THREE_AXES = ('scale_factor_cross',)  # Terms that only a three-axis unit has
 _PRIOR_SUFFICES = ('nonlinearity',)
 """Terms that the poses need not determine: most units hardly have them."""
 GAUGE = ('cross_axis.linear', 'cross_axis_z.linear')
@@ -60,10 +59,8 @@ any healthy unit, so that the prior matters only where the poses determine nothi
 _STAGE_PRIOR_SIZES = 3.0
 """Prior standard deviation of a coefficient of the stage, in typical sizes. Chosen: wider than any
 stage that is in order."""
-_GAUGE_PRIOR_SIZES = 1.0
-"""Prior standard deviation of a term of `GAUGE`, in typical sizes: the datasheet's 1.5 %."""
-_NAMED_POSES = 4
-"""Number of further poses that a message names."""
+_GAUGE_PRIOR_SIZES = 1.0  # Prior std of a term of `GAUGE`, in typical sizes: the datasheet's 1.5 %
+_NAMED_POSES = 4  # Number of further poses that a message names
 _REGULARISATION = 1e-6
 """Term added to the information in typical sizes, so that it can be inverted."""
 
@@ -72,36 +69,24 @@ _MAX_ROUNDS = 16
 reported as not converged."""
 _FIRST_ROUND_LEVELS = 3
 """Number of estimates of the stage error in the first round, which starts from the stated one."""
-_START_STEPS = 12
-"""Gauss-Newton steps before the first round."""
-_ROUND_STEPS = 2
-"""Gauss-Newton steps of a round."""
-_MAX_HALVINGS = 7
-"""How often the step of a round is halved."""
-_MAX_STEP_SIZES = 3.0
-"""Longest step of a coefficient, in typical sizes."""
-_LAST_STEP_STD = 1e-4
-"""A shorter step is the last one, in standard deviations of each coefficient."""
-_SETTLED_STD = 1e-2
-"""Coefficients have converged if a round moves them by less, in standard deviations of each."""
-_SETTLED_DEVIANCE = 1e-2
-"""The stage error has converged if a round changes the deviance by less."""
-_CURVATURE_SHRINK = 0.2
-"""Share of the curvature by angle errors that remains after a round."""
+_START_STEPS = 12  # Gauss-Newton steps before the first round
+_ROUND_STEPS = 2  # Gauss-Newton steps of a round
+_MAX_HALVINGS = 7  # How often the step of a round is halved
+_MAX_STEP_SIZES = 3.0  # Longest step of a coefficient, in typical sizes
+_LAST_STEP_STD = 1e-4  # A shorter step is the last one, in standard deviations of each coefficient
+_SETTLED_STD = 1e-2  # Coefficients have converged if a round moves them by less, in stds of each
+_SETTLED_DEVIANCE = 1e-2  # The stage error has converged if a round changes the deviance by less
+_CURVATURE_SHRINK = 0.2  # Share of the curvature by angle errors that remains after a round
 _MAX_CURVATURE = 0.1
 """Largest curvature at which convergence is checked, relative to the noise of a mean."""
 
-_OUTLIER_CHANCE = 1e-6
-"""A pose less likely than this is an outlier."""
-_MAX_OUTLIERS = 0.2
-"""Largest share of outliers. Chosen: more of them are a fault of the model."""
+_OUTLIER_CHANCE = 1e-6  # A pose less likely than this is an outlier
+_MAX_OUTLIERS = 0.2  # Largest share of outliers. Chosen: more of them are a fault of the model
 
-_SHAPE_STEP = 1.05
-"""Ratio of neighbouring trial values of a shape parameter."""
+_SHAPE_STEP = 1.05  # Ratio of neighbouring trial values of a shape parameter
 _SHAPE_STEPS = 60
 """Number of trial values on each side of the typical one: from 1/19 to 19 times that value."""
-_FINE_SHAPES = 15
-"""Number of trial values between the neighbours of the likeliest value."""
+_FINE_SHAPES = 15  # Number of trial values between the neighbours of the likeliest value
 
 
 @dataclass(frozen=True)
@@ -111,20 +96,14 @@ class FullFit:
     fitted: Sensor  # The unit with its covariance, without effects of the stage
     unit: Sensor  # The unit with the fitted effects of the stage
     names: tuple[Coefficient, ...]  # Fitted coefficients, (p,)
-    stage: StageError  # Estimated standard deviations of the stage's error
-    stated_std_rad: float  # Stated standard deviation of a joint's error: step/√12, rad
+    stage: StageError
+    stated_std_rad: float  # Stated standard deviation of a joint's error: step/√12
     outliers: tuple[int, ...]  # Indices of the outliers, which the fit leaves out
     information: np.ndarray  # Inverse covariance of `names`, priors included, (p, p)
-    # Squared Mahalanobis distance of each pose, given its settings, (k,)
-    squared_distances: np.ndarray
+    squared_distances: np.ndarray  # Mahalanobis, of each pose, given its settings, (k,)
     linear_poses: Poses  # The poses at the most likely angles, about which the model is linear
     deviance: float  # −2 times the logarithm of the restricted likelihood, up to a constant
     converged: bool  # Whether coefficients, stage error and outliers have converged
-
-    @property
-    def stage_std_rad(self) -> float:
-        """Return the standard deviation of a joint's error in one pose, rad."""
-        return self.stage.total_rad
 
     @property
     def kept(self) -> np.ndarray:
@@ -217,7 +196,9 @@ class _Search:
         self._sizes = np.array([parameter_of(name).scale for name in names])
         self._unit, self._stage = unit, stated  # Unit with coefficients, and stage error
         # Predicted errors of the angles, and the poses turned by them; see `_turned_linearly`
-        self._errors, self._poses = linearisation.AngleErrors.zeros(len(poses)), poses
+        none_rad = np.zeros((len(poses), 2))
+        self._errors = linearisation.AngleErrors(none_rad, none_rad, none_rad[:, 0], 0.0)
+        self._poses = poses
         self._kept = np.ones(len(poses), bool)  # Poses that are no outliers
         # Volts by which the model departs from its linearisation, (m,)
         self._curvature_v = np.zeros(len(unit.axes))
@@ -345,11 +326,7 @@ def _inliers(about: Linearised, stage: StageError) -> np.ndarray:
 
 
 def fitted_coefficients(axes: str, terms: Sequence[str]) -> tuple[Coefficient, ...]:
-    """
-    Name the coefficients that a fit of some terms, effects and names of `GAUGE`, estimates.
-
-    returns: coefficients of the sensor, then the tilt of the base, then other errors of the stage.
-    """
+    """Name the coefficients of terms: of the sensor, the base's tilt, then of the stage."""
     effects = dict.fromkeys(map(effect_of, terms))
     names = [name for effect in effects for name in names_of(effect_named(effect), axes)
              if parameter_of(name).role not in (Role.SHAPE, Role.OPTIONAL)
@@ -377,20 +354,14 @@ def prior_precision(names: Sequence[Coefficient]) -> np.ndarray:
 def _prior_std(name: Coefficient) -> float:
     if name in _BASE_TILT:
         return float(LEVEL_STD_RAD)
-    if term_of(name) in GAUGE:
-        sizes = _GAUGE_PRIOR_SIZES
-    else:
-        sizes = _STAGE_PRIOR_SIZES if belongs_to_stage(name) else _SENSOR_PRIOR_SIZES
-    return parameter_of(name).scale * sizes
+    return parameter_of(name).scale * (
+        _GAUGE_PRIOR_SIZES if term_of(name) in GAUGE else
+        _STAGE_PRIOR_SIZES if belongs_to_stage(name) else _SENSOR_PRIOR_SIZES)
 
 
 def fisher_information(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
                        stage: StageError) -> np.ndarray:
-    """
-    Return the Fisher information of poses about coefficients, priors included, (p, p).
-
-    Its inverse is the Cramér-Rao bound.
-    """
+    """Return the Fisher information, priors included, (p, p); the Cramér-Rao bound inverted."""
     about = linearised(unit, poses, names, prior_precision(names))
     return about.information(about.covariance(stage))
 
@@ -402,11 +373,7 @@ def _turned(poses: Poses, errors_rad: np.ndarray) -> Poses:
 
 
 def _turned_linearly(unit: Sensor, poses: Poses, errors_rad: np.ndarray) -> Poses:
-    """
-    Turn poses by angle errors, (k, 2), and add the linear effect of the errors to the volts.
-
-    The residuals are then linear in the whole error about the angles of the encoder.
-    """
+    """Turn poses by errors, (k, 2), and add their linear effect to the volts: a linear model."""
     turned = _turned(poses, errors_rad)
     effect_v = (angle_jacobian(unit, turned) @ errors_rad[:, :, None])[:, :, 0]
     return replace(turned, volts=poses.volts + effect_v)
@@ -419,11 +386,7 @@ def belongs_to_stage(name: Coefficient) -> bool:
 
 def open_coefficients(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
                       stage: StageError) -> list[Coefficient]:
-    """
-    Return the coefficients that poses leave as uncertain as their typical size.
-
-    Errors of the stage and terms for which the prior suffices are never open.
-    """
+    """Return the sensor's coefficients that poses leave as uncertain as their typical size."""
     scale = np.array([parameter_of(name).scale for name in names])
     required = [not belongs_to_stage(name) and term_of(name) not in (*GAUGE, *_PRIOR_SUFFICES)
                 for name in names]
@@ -455,9 +418,8 @@ def next_poses(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: 
     """
     Name the poses that would help most, one by one, as `(alpha, beta)` in degrees.
 
-    Each pose is the one of a 15° grid that shrinks the joint confidence region of all
-    coefficients the most, in units of their typical size (D-optimality; Fedorov 1972). Each is a
-    new setting of both joints.
+    Each pose of a 15° grid shrinks the joint confidence region of all coefficients the most, in
+    units of their typical size (D-optimality; Fedorov 1972).
     """
     grid = linearisation.candidate_poses(np.median(poses.std_v, axis=0))
     scale = np.array([parameter_of(name).scale for name in names])

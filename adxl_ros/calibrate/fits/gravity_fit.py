@@ -40,10 +40,8 @@ DETERMINED_STD = 0.01
 tolerances of datasheets."""
 TRIAL_STD_G = 1e-4
 """Standard deviation of a rest's magnitude before the excess is estimated, g."""
-_ROUNDING_STD_G = 1e-9
-"""Standard deviation of a mean by rounding alone, g, so that no weight is infinite."""
-_MAX_VALUE = 0.5
-"""Largest magnitude of a parameter in an iteration. Chosen: five prior standard deviations."""
+_ROUNDING_STD_G = 1e-9  # Std of a mean by rounding alone, so that no weight is infinite
+_MAX_VALUE = 0.5  # Largest magnitude of a parameter in an iteration; chosen: five prior stds
 _PRIOR_INFORMATION = np.eye(len(NAMES)) / PRIOR_STD ** 2
 """Inverse covariance of the prior about 0, (9, 9)."""
 
@@ -99,7 +97,7 @@ def magnitude(mean: np.ndarray, parameters: np.ndarray) -> np.ndarray:
 class Linearised(NamedTuple):
     """Magnitudes of k rests to first order."""
 
-    magnitude: np.ndarray  # Magnitudes, g, (k,)
+    magnitude: np.ndarray  # g, (k,)
     by_output: np.ndarray  # Derivatives by the means, (k, 3)
     jacobian: np.ndarray  # Derivatives by the parameters, (k, 9)
 
@@ -139,11 +137,7 @@ def regularised_fit(rests: NominalRests, steps: int) -> np.ndarray:
 
 def fisher_information(rests: NominalRests, parameters: np.ndarray, excess_g2: float
                        ) -> np.ndarray:
-    """
-    Return the Fisher information of rests about the parameters, without the prior, (9, 9).
-
-    excess_g2: variance of the magnitudes beyond the noise of the means, g².
-    """
+    """Return the Fisher information of rests about the parameters, without the prior, (9, 9)."""
     if not len(rests.mean):
         return np.zeros((len(NAMES), len(NAMES)))
     rows = linearised(rests.mean, parameters).jacobian
@@ -154,12 +148,6 @@ def posterior_information(rests: NominalRests, parameters: np.ndarray, excess_g2
                           ) -> np.ndarray:
     """Return the information of prior and rests about the parameters, (9, 9)."""
     return _PRIOR_INFORMATION + fisher_information(rests, parameters, excess_g2)
-
-
-def undetermined(information: np.ndarray) -> list[Coefficient]:
-    """Name the coefficients that the information, (9, 9), does not determine."""
-    std = np.sqrt(np.diag(np.linalg.inv(information)))
-    return [name for name, parameter_std in zip(NAMES, std) if parameter_std > DETERMINED_STD]
 
 
 CANDIDATES = np.array([signs for signs in product((0, 1, -1), repeat=3) if any(signs)])
@@ -178,54 +166,35 @@ def covered(up: np.ndarray) -> np.ndarray:
 
 
 def next_up(available: np.ndarray, now: np.ndarray | None) -> int | None:
-    """
-    Choose the candidate to turn to: the nearest face, without one the nearest edge, then corner.
-
-    available: whether a candidate may be chosen, (26,); now: direction that points up at present,
-    (3,), if known.
-    """
+    """Choose the nearest available face, edge or corner by what points up now, (3,)."""
     nearness = UP @ (np.zeros(3) if now is None else now)
     cost = np.where(available, AXES_UP - 0.4 * nearness, np.inf)
     return int(cost.argmin()) if available.any() else None
 
 
-def name_up(candidate: int) -> str:
-    """Name what points up: '+x', or '+x and −y equally' for an edge."""
-    axes = [('+' if sign > 0 else '−') + axis for axis, sign in zip(AXES, CANDIDATES[candidate])
-            if sign]
-    return axes[0] if len(axes) == 1 else f'{" and ".join(axes)} equally'
-
-
 def points_up(candidate: int) -> str:
     """Return a sentence: '+x points up', '+x and −y point up equally'."""
-    name = name_up(candidate)
-    return f'{name.removesuffix(" equally")} point up equally' if ' and ' in name else \
-        f'{name} points up'
+    axes = [('+' if sign > 0 else '−') + axis for axis, sign in zip(AXES, CANDIDATES[candidate])
+            if sign]
+    return f'{axes[0]} points up' if len(axes) == 1 else f'{" and ".join(axes)} point up equally'
 
 
 MIN_RESTS = len(NAMES) + 1
 """Smallest count of rests: one more than coefficients, so that residuals show the error."""
-_TOLERANCE = 1e-12
-"""Relative tolerance of `leastsq` in cost, parameters and gradient."""
-_UNSCALED = np.ones(len(NAMES))
-"""Weights of the parameters in the trust region of `leastsq`: none."""
-_CONVERGED = (1, 2, 3, 4)
-"""States of `leastsq` in which it has converged (MINPACK, lmder)."""
+_TOLERANCE = 1e-12  # Relative tolerance of `leastsq` in cost, parameters and gradient
+_UNSCALED = np.ones(len(NAMES))  # Weights of the parameters in the trust region of `leastsq`: none
+_CONVERGED = (1, 2, 3, 4)  # States of `leastsq` in which it has converged (MINPACK, lmder)
 STRETCHES = 5
 """Stretches of time that are held out in turn. Chosen: the usual number of folds."""
-_MAX_ROUNDS = 20
-"""Largest count of rounds of parameters and excess variance."""
+_MAX_ROUNDS = 20  # Largest count of rounds of parameters and excess variance
 _EXCESS_TOLERANCE = 1e-6
 """The excess variance has converged if it changes by less, relative to the variance."""
 
-_OUTLIER_CHANCE = 0.01
-"""Probability of a false outlier among all rests of a fit without outliers."""
+_OUTLIER_CHANCE = 0.01  # Probability of a false outlier among all rests of a fit without outliers
 _MAX_OUTLIERS = 0.25
 """Largest share of outliers. Chosen: more of them are a fault of the recording."""
-_MAX_DEVIATIONS = 5.0
-"""Largest residual of a rest with which the search for outliers begins, standard deviations."""
-_MIN_REMAINDER = 1e-9
-"""Lower bound of 1 − leverage, as a divisor."""
+_MAX_DEVIATIONS = 5.0  # Largest residual of a rest with which the search for outliers begins, stds
+_MIN_REMAINDER = 1e-9  # Lower bound of 1 − leverage, as a divisor
 _MIN_GRAVITY_RATIO = 0.5
 """Smallest ratio of the measured magnitude to local gravity; a smaller one is a wrong unit."""
 _MAX_GRAVITY_RATIO = 2.0
@@ -236,29 +205,21 @@ _MAX_GRAVITY_RATIO = 2.0
 class GravityFit:
     """Result of the fit of k rests."""
 
-    # Parameters of effects by axis, as `Sensor.values` has them
-    values: dict[str, dict[str, np.ndarray]]
-    covariance: np.ndarray  # Covariance of the coefficients NAMES, in their units, (9, 9)
-    # before_mps2, residual_mps2, held_out_mps2: Magnitude minus local gravity, m/s², (k,): by
-    # nominal values, by the fit, and by the fit to the rests outside of the rest's own stretch of
-    # time
-    before_mps2: np.ndarray
-    residual_mps2: np.ndarray
-    held_out_mps2: np.ndarray
-    # Standard deviation of a rest's magnitude, m/s², (k,): noise of the mean and excess
-    expected_mps2: np.ndarray
-    # Part of `expected_mps2` that the noise of the means does not explain, m/s²
-    excess_mps2: float
+    values: dict[str, dict[str, np.ndarray]]  # As in `Sensor.values`
+    covariance: np.ndarray  # Of the coefficients NAMES, in their units, (9, 9)
+    before_mps2: np.ndarray  # Magnitude minus local gravity by nominal values, (k,)
+    residual_mps2: np.ndarray  # The same by the fit
+    held_out_mps2: np.ndarray  # By the fit to the rests of the other stretches of time
+    expected_mps2: np.ndarray  # Standard deviation of a magnitude: noise of the mean and excess
+    excess_mps2: float  # Part of it that the noise of the means does not explain
     outliers: tuple[int, ...]  # Indices of the outliers, which the fit leaves out
     converged: bool = True  # Whether parameters and excess variance have converged
 
 
 class _Estimate(NamedTuple):
-    """An estimate of the parameters."""
-
-    parameters: np.ndarray  # The nine parameters, (9,)
-    excess_g2: float  # Variance of the magnitudes beyond the noise of the means, g²
-    converged: bool  # Whether parameters and excess have converged
+    parameters: np.ndarray  # (9,)
+    excess_g2: float  # Variance of the magnitudes beyond the noise of the means
+    converged: bool
 
 
 def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor,
@@ -296,12 +257,8 @@ def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor,
     _require_determined(rests, np.zeros(len(NAMES)), 0.0)
     fits = cache(lambda mask: _fit(rests[np.frombuffer(mask, bool)]))
 
-    def fit(kept: np.ndarray) -> _Estimate:
-        """Fit the rests of a mask, (k,) bool, once for each mask."""
-        return fits(kept.tobytes())
-
-    kept = _inliers(rests, fit)
-    parameters, excess_g2, converged = fit(kept)
+    kept = _inliers(rests, lambda mask: fits(mask.tobytes()))
+    parameters, excess_g2, converged = fits(kept.tobytes())
     _require_determined(rests[kept], parameters, excess_g2)
     variance = magnitude_variance(rests, parameters) + excess_g2
     covariance = np.linalg.inv(
@@ -441,8 +398,9 @@ def _require_determined(rests: NominalRests, parameters: np.ndarray, excess_g2: 
         raise UserError(f'gravity: the rests read {measured * G0_MPS2:.3g} m/s², not '
                         f'{rests.gravity_g * G0_MPS2:.3g}: correct nominal_zero_g_v, '
                         'nominal_scale_v_per_g or local_gravity_mps2')
-    information = posterior_information(rests, parameters, excess_g2)
-    missing = undetermined(information)
+    covariance = np.linalg.inv(posterior_information(rests, parameters, excess_g2))
+    missing = [name for name, variance in zip(NAMES, np.diag(covariance))
+               if variance > DETERMINED_STD ** 2]
     if count >= MIN_RESTS and not missing:
         return
     names = 'all nine coefficients' if len(missing) == len(NAMES) else \

@@ -1,10 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The manufacturer's linear model: equations 1 to 3.
-
-- The paper's sequential fit of its nonlinear regression model: equations 4 to 19.
-"""
+"""The linear model, equations 1 to 3, and the paper's sequential fit, equations 4 to 19."""
 
 from __future__ import annotations
 
@@ -29,10 +25,8 @@ _MIN_SPAN_G = 0.2
 cross-axis terms dominate the slope."""
 
 
-_OPEN_STD_V = 0.5
-"""Prior standard deviation of a zero-g that may be open, V. Chosen: far wider than any unit."""
-_OPEN_STD_V_PER_G = 0.2
-"""Prior standard deviation of a scale factor that may be open, V/g. Chosen: as above."""
+_OPEN_STD_V = 0.5  # Prior std of a zero-g that may be open; chosen: far wider than any unit
+_OPEN_STD_V_PER_G = 0.2  # Prior std of a scale factor that may be open; chosen: as above
 
 
 def fit(sensor: Sensor, poses: Poses, may_be_open: bool = False) -> Sensor:
@@ -42,28 +36,8 @@ def fit(sensor: Sensor, poses: Poses, may_be_open: bool = False) -> Sensor:
     Where an axis has been at +1 g and at −1 g, only those poses count, which is
     SF = (V₊ − V₋)/2 (1) and B = (V₊ + V₋)/2 (2), in g of 9.80665 m/s². Otherwise all poses count.
     The covariance is scaled to the residuals over all poses, so that it covers what the linear
-    model leaves out.
-
-    Parameters
-    ----------
-    sensor
-        Nominal values and local gravity of the unit.
-    poses
-        Poses on the stage.
-    may_be_open
-        Whether an axis may leave its scale factor open. It is nominal then, with an uncertainty
-        that any prior reduces.
-
-    Returns
-    -------
-    Sensor
-        The fitted unit with its covariance.
-
-    Raises
-    ------
-    UserError
-        An axis has not been turned far enough to determine its scale factor.
-
+    model leaves out. Poses that do not determine a scale factor are refused, unless it may be
+    open: it is nominal then, with an uncertainty that any prior reduces.
     """
     force = np.column_stack(reference_force(poses, sensor.local_gravity_mps2)) / G0_MPS2
     nominal = np.column_stack([sensor.nominal_zero_g_v, sensor.nominal_scale_v_per_g])
@@ -119,26 +93,19 @@ _GAUGE = {('cross_axis', 'linear'), ('cross_axis_z', 'linear')}
 """Effect and parameter of the coefficients that stay 0."""
 _OF_Z_AXIS = ('bias', 'scale_factor', 'misalignment')
 """Effects of a z axis: the paper has no model of it."""
-_VERTICAL_SIN = np.sin(np.radians(89.0))
-"""Planes with a greater |sin α| count as vertical."""
-_MIN_PLANE_SIN = 0.2
-"""Planes with |sin α| below this do not determine a scale factor (15)."""
-_MIN_PLANE_SPAN_G = 0.1
-"""Smallest span of the reference in a plane that determines a scale factor, g."""
-_MIN_INPUTS = 3
-"""Smallest number of distinct inputs that determine a quadratic."""
-_MIN_INPUT_SPAN_G = 0.3
-"""Smallest span of the inputs that determine a quadratic, g."""
-_REPLICAS = 200
-"""Sweeps of the parametric bootstrap: the standard deviations are known to 5 %."""
+_VERTICAL_SIN = np.sin(np.radians(89.0))  # Planes with a greater |sin α| count as vertical
+_MIN_PLANE_SIN = 0.2  # Planes with |sin α| below this do not determine a scale factor (15)
+_MIN_PLANE_SPAN_G = 0.1  # Smallest span of the reference in a plane that determines a scale factor
+_MIN_INPUTS = 3  # Smallest number of distinct inputs that determine a quadratic
+_MIN_INPUT_SPAN_G = 0.3  # Smallest span of the inputs that determine a quadratic, g
+_REPLICAS = 200  # Sweeps of the parametric bootstrap: the standard deviations are known to 5 %
 
 
 @dataclass(frozen=True)
 class AxisRegression:
     """Regressions of one axis before the gauge is fixed, for figures 4 to 8 of the paper."""
 
-    # zero_g_v, scale_v_per_g: Zero-g and scale factor of the linear model, V and V/g
-    zero_g_v: float
+    zero_g_v: float  # Of the linear model
     scale_v_per_g: float
     # p, q: Coefficients of 1, a, a² in g(V_c) (11) and h(V_z) (13): V, V/g, V/g², (3,)
     p: np.ndarray
@@ -151,27 +118,7 @@ class AxisRegression:
 
 
 def fit_physical(sensor: Sensor, poses: Poses) -> Sensor:
-    """
-    Fit the paper's model to the poses of a sweep through several planes alpha.
-
-    Parameters
-    ----------
-    sensor
-        Nominal values and local gravity of the unit.
-    poses
-        Poses on the stage.
-
-    Returns
-    -------
-    Sensor
-        The fitted unit with its covariance.
-
-    Raises
-    ------
-    UserError
-        The planes do not determine the model. The message names the missing ones.
-
-    """
+    """Fit the paper's model to a sweep through several planes alpha; name missing planes."""
     fitted = _assemble(sensor, poses, regress_axes(sensor, poses))
     return replace(fitted, covariance=_covariance(sensor, fitted, poses))
 
@@ -195,45 +142,35 @@ def _regress_axis(d: int, start: Sensor, poses: Poses) -> AxisRegression:
     residual = volts - zero - scale * along                                  # (10)
     p = _quadratic(across[vertical], residual[vertical],
                    'the plane alpha = 90 deg', 'poses at steps of 30 deg in beta there')  # (11)
-    corrected = volts - _polynomial(p, across)
-    rows = [_regress_plane(along[plane], az[plane], corrected[plane], poses.alpha_rad[plane],
-                           scale) for plane in planes(poses.alpha_rad)]
+    corrected = volts - np.polynomial.polynomial.polyval(across, p)
+    rows = []
+    for plane in planes(poses.alpha_rad):
+        inclined = np.abs(np.sin(poses.alpha_rad[plane]).mean()) >= _MIN_PLANE_SIN
+        line = np.polyfit(along[plane], corrected[plane], 1) \
+            if inclined and np.ptp(along[plane]) > _MIN_PLANE_SPAN_G else \
+            (np.nan, np.mean(corrected[plane] - scale * along[plane]))
+        rows.append([az[plane].mean(), line[1], line[0]])
     plane_az, plane_bias, plane_scale = np.array(rows).T                     # (12), (15)
     plane_bias -= zero
     missing = 'planes alpha = 30, 60, 120 and 150 deg beside 90'
     has_scale = np.isfinite(plane_scale)
     r = _quadratic(plane_az[has_scale], plane_scale[has_scale], 'the inclined planes', missing)
     # q1 is the misalignment's A_z, which the scale factor multiplies like any other force.
-    growth = _polynomial(r / r[0], plane_az)
+    growth = np.polynomial.polynomial.polyval(plane_az, r / r[0])
     q = _quadratic(plane_az, plane_bias, 'the planes', missing, growth)      # (13)
     return AxisRegression(zero, scale, p, q, r, plane_az, plane_bias, plane_scale)
-
-
-def _regress_plane(along_g: np.ndarray, az_g: np.ndarray, volts: np.ndarray,
-                   alpha_rad: np.ndarray, scale_v_per_g: float) -> tuple[float, float, float]:
-    """Return z in g, bias in V and scale factor in V/g (NaN if undetermined) of a plane."""
-    inclined = np.abs(np.sin(alpha_rad).mean()) >= _MIN_PLANE_SIN
-    if inclined and np.ptp(along_g) > _MIN_PLANE_SPAN_G:
-        scale, bias = np.polyfit(along_g, volts, 1)
-    else:
-        scale, bias = np.nan, np.mean(volts - scale_v_per_g * along_g)
-    return float(az_g.mean()), float(bias), float(scale)
 
 
 def _quadratic(a: np.ndarray, values: np.ndarray, where: str, missing: str,
                growth: np.ndarray | float = 1.0) -> np.ndarray:
     """Fit the coefficients of 1, a·growth, a², (3,), for inputs a, g; refuse too few inputs."""
-    # Inputs within 0.017 g are one, as angles within 1° are one plane.
+    # Inputs within 0.017 g are one, as angles within 1° are.
     if len(planes(a)) < _MIN_INPUTS or np.ptp(a) < _MIN_INPUT_SPAN_G:
         raise UserError(f'the physical model is not determined: {len(planes(a))} distinct '
                         f'inputs in {where}, at least {_MIN_INPUTS} are needed; add {missing}, '
                         'or fit the linear model')
     design = np.column_stack([np.ones_like(a), a * growth, a * a])
     return np.linalg.lstsq(design, values, rcond=None)[0]
-
-
-def _polynomial(coefficients: np.ndarray, a: np.ndarray) -> np.ndarray:
-    return np.polynomial.polynomial.polyval(a, coefficients)
 
 
 def _assemble(sensor: Sensor, poses: Poses, regressions: list[AxisRegression]) -> Sensor:

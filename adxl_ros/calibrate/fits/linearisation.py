@@ -1,10 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The covariance of poses about a unit, and a fit linearised at its coefficients.
-
-- The stage's error by restricted maximum likelihood.
-- Selection of poses by D-optimality: the smallest joint confidence region of all coefficients.
+The covariance of poses about a unit, a fit linearised at its coefficients, and D-optimal poses.
 
 About coefficients θ₀ the volts are V = h(θ₀) + X·(θ − θ₀) + error with a covariance S(σ_s, σ_p),
 and θ has a normal prior. The angles of the stage have an error with one part for each setting of a
@@ -35,11 +32,9 @@ _MIN_VARIANCE_RAD2 = 1e-24
 class StageError:
     """Standard deviations of the error of a joint."""
 
-    # Standard deviation of the part that the poses of one setting share, σ_s, rad
-    setting_rad: float
-    pose_rad: float = 0.0  # Standard deviation of the part that is new with each pose, σ_p, rad
-    # Standard deviation of alpha over the geometric mean of those of alpha and beta, r
-    ratio: float = 1.0
+    setting_rad: float  # Of the part that the poses of one setting share, σ_s
+    pose_rad: float = 0.0  # Of the part that is new with each pose, σ_p
+    ratio: float = 1.0  # That of alpha over the geometric mean of both joints, r
 
     @property
     def joints(self) -> np.ndarray:
@@ -112,12 +107,7 @@ class PoseCovariance:
 
     def normal_equations(self, design: np.ndarray, residual: np.ndarray
                          ) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Return XᵀS⁻¹X, (p, p), and XᵀS⁻¹r, (p,), of a design X and residuals r.
-
-        design: derivatives of the volts, (k, m, p); residual: measured volts minus predicted
-        volts, V, (k, m).
-        """
+        """Return XᵀS⁻¹X, (p, p), and XᵀS⁻¹r, (p,), of a design, (k, m, p), and residuals."""
         products = self.products(np.concatenate([design, residual[:, :, None]], axis=2))
         return products[:-1, :-1], products[:-1, -1]
 
@@ -140,11 +130,7 @@ class PoseCovariance:
         return float(total)
 
     def predicted_errors(self, residual: np.ndarray) -> AngleErrors:
-        """
-        Predict the angle errors from the residuals (best linear unbiased prediction).
-
-        residual: measured volts minus the predicted volts at the encoder's angles, V, (k, m).
-        """
+        """Predict the angle errors from residuals, (k, m): the best linear unbiased prediction."""
         by_setting = self._solve_settings(
             self._white_settings.T @ self.whiten_by_pose(residual[:, :, None]))
         factor = scipy.linalg.solve_triangular(self._settings_root, by_setting, lower=True,
@@ -162,17 +148,11 @@ class PoseCovariance:
 class AngleErrors:
     """Predicted errors of alpha and beta in k poses."""
 
-    # setting_rad, pose_rad: Parts of the error by setting and by pose, rad, (k, 2)
-    setting_rad: np.ndarray
-    pose_rad: np.ndarray
+    setting_rad: np.ndarray  # Part of the error by setting, (k, 2)
+    pose_rad: np.ndarray  # Part of the error by pose, (k, 2)
     # Squared Mahalanobis distance of each pose from the model, given its settings, (k,)
     squared_distances: np.ndarray
     setting_penalty: float  # Sum of the squared errors of the settings over σ_s²
-
-    @classmethod
-    def zeros(cls, count: int) -> AngleErrors:
-        """Return errors of 0 in a number of poses."""
-        return cls(np.zeros((count, 2)), np.zeros((count, 2)), np.zeros(count), 0.0)
 
     @property
     def total_rad(self) -> np.ndarray:
@@ -188,12 +168,7 @@ class AngleErrors:
 
 
 def shared_settings(poses: Poses) -> tuple[np.ndarray, int]:
-    """
-    Return the numbers of the settings that several poses share.
-
-    returns: the number of the setting of each joint, (k, 2), −1 where no other pose shares it, and
-    how many of them there are, q.
-    """
+    """Return the numbers of settings that poses share, (k, 2), −1 for others, and their count."""
     numbers, count = np.full((len(poses), 2), -1), 0
     for joint, setting in enumerate((poses.alpha_setting, poses.beta_setting)):
         _, index, size = np.unique(setting, return_inverse=True, return_counts=True)
@@ -205,18 +180,13 @@ def shared_settings(poses: Poses) -> tuple[np.ndarray, int]:
 
 def volts_covariance(unit: Sensor, poses: Poses, error: StageError,
                      kept: np.ndarray | None = None) -> PoseCovariance:
-    """
-    Return the covariance of the volts of all poses about the model.
-
-    kept: poses that count, (k,) bool; None for all.
-    """
+    """Return the covariance of the volts about the model; `kept`: poses that count, or all."""
     return PoseCovariance(angle_jacobian(unit, poses), poses, shared_settings(poses), error, kept)
 
 
 _MIN_TOTAL_RAD = 1e-7
 """Smallest standard deviation of an angle error, rad. Chosen: no encoder is as good."""
-_MAX_TOTAL_RAD = 0.3
-"""Largest standard deviation of an angle error, rad. Chosen: no stage is as bad."""
+_MAX_TOTAL_RAD = 0.3  # Largest standard deviation of an angle error; chosen: no stage is as bad
 _TOTAL_PRIOR_STD = 1.0
 """Prior standard deviation of ln(total/stated): a factor of 2.7. Chosen: the prior decides only
 where the poses do not."""
@@ -237,8 +207,7 @@ _LEVELS = np.linspace(-1.5, 1.5, 13)
 """Logarithms of the levels of a joint's error over which coefficients are integrated, relative to
 the estimate. Chosen: a factor of 4.5 is three standard deviations of a level that five settings
 show, and steps of 0.25 change the standard deviations by less than 1 %."""
-_LEAST_WEIGHT = 1e-3
-"""Least posterior probability of a level that counts."""
+_LEAST_WEIGHT = 1e-3  # Least posterior probability of a level that counts
 
 
 @dataclass(frozen=True)
@@ -313,7 +282,6 @@ class Linearised:
     def stage_error(self, stated_rad: float, start: StageError | None = None) -> StageError:
         """Estimate the stage error by restricted maximum likelihood."""
         start = start or StageError(stated_rad)
-
         total = float(np.log(np.clip(start.total_rad, 10 * _MIN_TOTAL_RAD, _MAX_TOTAL_RAD)))
         share = (start.pose_rad / max(start.total_rad, _MIN_TOTAL_RAD)) ** 2
         bounds = np.array([np.log((_MIN_TOTAL_RAD, _MAX_TOTAL_RAD)), (0.0, 1.0),
@@ -337,9 +305,6 @@ class Linearised:
         A joint that is set few times hardly shows how large its errors are. The level of each
         joint therefore is integrated over its posterior; by the law of total variance this adds
         the mean change of the covariance and the covariance of the best coefficients.
-
-        error, stated_rad: the estimate of `stage_error`, and the stated error that it began with,
-        rad; returns: covariance, (p, p).
         """
         best, information = self.solve(self.covariance(error))
         at_estimate = np.linalg.inv(information)
@@ -367,12 +332,7 @@ def _from_search(x: np.ndarray) -> StageError:
 
 def linearised(unit: Sensor, poses: Poses, names: Sequence[Coefficient], precision: np.ndarray,
                kept: np.ndarray | None = None) -> Linearised:
-    """
-    Linearise the volts of poses about the coefficients of a unit.
-
-    precision: inverse variances of their prior about 0, (p,); kept: poses that count, (k,) bool;
-    None for all.
-    """
+    """Linearise the volts of poses about the coefficients of a unit; see `Linearised`."""
     return Linearised(poses, angle_jacobian(unit, poses),
                       coefficient_jacobian(unit, poses, names),
                       poses.volts - predicted_volts(unit, poses), get(unit, names),
@@ -402,12 +362,7 @@ def choose_poses(rows: np.ndarray, information: np.ndarray, count: int) -> list[
 
 
 def candidate_poses(std_v: np.ndarray) -> Poses:
-    """
-    Return candidates on a grid of `GRID_RAD` over the sphere, each a new setting of both joints.
-
-    Alpha covers 0 to π and beta covers 0 to 2π. `std_v` is the noise of the mean of a pose, V,
-    (m,).
-    """
+    """Return a grid over the sphere with a noise, (m,); each pose sets both joints anew."""
     alpha, beta = np.meshgrid(np.arange(round(np.pi / GRID_RAD) + 1) * GRID_RAD,
                               np.arange(round(2 * np.pi / GRID_RAD)) * GRID_RAD)
     return Poses.without_volts(alpha.ravel(), beta.ravel(), std_v, np.arange(alpha.size))
@@ -415,11 +370,7 @@ def candidate_poses(std_v: np.ndarray) -> Poses:
 
 def whitened_jacobian(unit: Sensor, poses: Poses, names: tuple[Coefficient, ...],
                       stage: StageError) -> np.ndarray:
-    """
-    Return the Jacobian of each pose by coefficients, whitened by noise and stage error, (k, m, p).
-
-    The poses share no setting.
-    """
+    """Return the Jacobian, (k, m, p), whitened by noise and stage error, without settings."""
     design = coefficient_jacobian(unit, poses, names)
     covariance = volts_covariance(unit, poses, stage)
     return covariance.whiten_by_pose(design).reshape(design.shape)

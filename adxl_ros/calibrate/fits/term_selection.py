@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Selection of the full model's terms by Bayes factors.
-
-- Report of a full fit as lines of text: stage, weakest direction, terms; and its warnings.
+Selection of the full model's terms by Bayes factors, and the report of a full fit.
 
 A Bayes factor is the ratio of the marginal likelihoods of the poses with a term and without it.
 Coefficients are integrated over their priors, and both models have the stage error of the richer
@@ -16,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from adxl_ros.calibrate.fits import full_model
 from adxl_ros.calibrate.fits.linear import AFFINE
@@ -37,10 +34,8 @@ points up or down leaves its scale factor and two misalignments open."""
 _MIN_CHANGE = {'temperature_c': 0.5, 'supply_v': 0.02}
 """Smallest range of temperature, °C, and supply, V, for which effects that follow them are
 candidates. Chosen: 0.5 °C changes the zero-g by 0.05 mg, about the noise of a mean."""
-_MAX_ADDED = 6
-"""Largest count of added terms."""
-_GAUGE_CHANCE = 0.01
-"""Probability of freeing the linear cross-axis terms although they are 0."""
+_MAX_ADDED = 6  # Largest count of added terms
+_GAUGE_CHANCE = 0.01  # Probability of freeing the linear cross-axis terms although they are 0
 
 
 @dataclass(frozen=True)
@@ -58,13 +53,6 @@ class Term:
         return self.log_bayes_factor > 0.0
 
 
-class SelectedFit(NamedTuple):
-    """A full fit with selected terms."""
-
-    full: full_model.FullFit  # The fit
-    terms: list[Term]  # Evidence for its terms and for the candidates
-
-
 def candidates(poses: Poses) -> tuple[str, ...]:
     """Name the terms that these poses may need beyond the default ones."""
     changed = {name for name, change in _MIN_CHANGE.items()
@@ -76,7 +64,7 @@ def candidates(poses: Poses) -> tuple[str, ...]:
 
 def fit(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()) -> Sensor:
     """Fit the full model with selected terms, and with some effects in any case."""
-    return fit_selected(sensor, poses, effects).full.fitted
+    return fit_selected(sensor, poses, effects)[0].fitted
 
 
 def fit_affine(sensor: Sensor, poses: Poses, max_open: int = _MAX_OPEN) -> full_model.FullFit:
@@ -88,28 +76,9 @@ def fit_affine(sensor: Sensor, poses: Poses, max_open: int = _MAX_OPEN) -> full_
     return full_model.fit_full(sensor, poses, AFFINE, max_open)
 
 
-def fit_selected(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()) -> SelectedFit:
-    """
-    Fit the full model, and add the terms that the poses support one by one.
-
-    Parameters
-    ----------
-    sensor, poses
-        As for `full_model.fit_full`.
-    effects
-        Further terms that are fitted in any case.
-
-    Returns
-    -------
-    SelectedFit
-        The fit and the evidence for each term.
-
-    Raises
-    ------
-    UserError
-        The poses do not determine a coefficient.
-
-    """
+def fit_selected(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()
+                 ) -> tuple[full_model.FullFit, list[Term]]:
+    """Fit the full model and effects as `fit_full` does, and add terms that the poses support."""
     terms = tuple(dict.fromkeys((*full_model.default_terms(sensor.axes), *effects)))
     full = full_model.fit_full(sensor, poses, terms)
     if gauge_is_identifiable(full):
@@ -124,7 +93,7 @@ def fit_selected(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()) -> S
         terms = (*terms, max(supported, key=lambda term: term.log_bayes_factor).name)
         full = full_model.fit_full(sensor, poses, terms)
         compared = compare_terms(full)
-    return SelectedFit(full, compared)
+    return full, compared
 
 
 def compare_terms(full: full_model.FullFit) -> list[Term]:
@@ -187,10 +156,8 @@ _BAD_STAGE_RATIO = 1.5
 """Ratio of the estimated to the stated stage error from which the report warns."""
 _MIN_STAGE_EXCESS_RAD = 1e-5
 """Excess over that ratio from which the report warns, rad, for a stage without a stated error."""
-_MAX_PARTS = 4
-"""Largest count of components of the weakest direction in the report."""
-_MIN_PART = 0.2
-"""Smallest component of the weakest direction, a unit vector, in the report."""
+_MAX_PARTS = 4  # Largest count of components of the weakest direction in the report
+_MIN_PART = 0.2  # Smallest component of the weakest direction, a unit vector, in the report
 
 
 def report_lines(full: full_model.FullFit, poses: Poses, terms: Sequence[Term]) -> list[str]:
@@ -225,7 +192,7 @@ def _weakest_direction(fitted: Sensor) -> str:
 def warnings(full: full_model.FullFit, poses: Poses) -> list[str]:
     """Return what is wrong with the poses or the fit, one line each."""
     lines = [] if full.converged else [NOT_CONVERGED]
-    if full.stage_std_rad > _BAD_STAGE_RATIO * full.stated_std_rad + _MIN_STAGE_EXCESS_RAD:
+    if full.stage.total_rad > _BAD_STAGE_RATIO * full.stated_std_rad + _MIN_STAGE_EXCESS_RAD:
         lines.append('the reference is worse than stated, or the model lacks an effect that looks '
                      'like a stage error; poses are weighted accordingly')
     if full.outliers:

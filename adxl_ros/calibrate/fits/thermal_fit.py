@@ -1,11 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Zero-g over temperature, fitted to a sensor that rests while it warms and cools.
-
-- Blocks of a resting sensor, which are the input.
-- Which parts of a wanted range the temperature has passed, and the error to expect there.
-"""
+"""Zero-g over temperature, fitted to blocks of a sensor that rests while it warms and cools."""
 
 from __future__ import annotations
 
@@ -33,8 +28,7 @@ _SCALE_FORCES_G = 0.5
 the error of that slope is then at most twice that of the zero-g's."""
 _SMALLEST_SPAN_K = 5.0
 """Smallest range of temperature, K, that is fitted. Chosen: 0.5 mg of a typical sensor."""
-_FEWEST_BLOCKS = 12
-"""Fewest blocks of an orientation. Chosen: twice the coefficients of one axis."""
+_FEWEST_BLOCKS = 12  # Fewest blocks of an orientation. Chosen: twice the coefficients of one axis
 PRIOR_WIDTH = 5.0
 """Prior standard deviation of a coefficient divided by its typical size, as in the diagnosis."""
 _LAGS_S = np.geomspace(10.0, 1000.0, 7)
@@ -42,46 +36,38 @@ _LAGS_S = np.geomspace(10.0, 1000.0, 7)
 _REACHES = np.geomspace(0.02, 0.5, 6)
 """Reaches of `thermal_hysteresis` that are tried, divided by the range of temperature. Chosen: a
 loop whose reach is larger has no corner in the range."""
-_STEP = 0.02
-"""Step of the derivative by a shape, divided by its value. Chosen: smooth."""
+_STEP = 0.02  # Step of the derivative by a shape, divided by its value. Chosen: smooth
 _SMALLEST_GAIN = 5.0
 """Gain in half of the BIC from which a dependence on the history counts. Chosen: odds of 150."""
 _LARGEST_CORRELATION = 0.95
 """Largest correlation of neighbouring blocks. Chosen: beyond it the drift is a random walk."""
-_ITERATIONS = 4
-"""Iterations over coefficients and correlation. Chosen: they no longer change then."""
+_ITERATIONS = 4  # Iterations over coefficients and correlation. Chosen: they no longer change then
 
 
 @dataclass(frozen=True)
 class ThermalFit:
     """Zero-g over temperature with its covariance."""
 
-    names: tuple[Coefficient, ...]  # Coefficients, (p,)
-    values: np.ndarray  # Their values, (p,), each in the unit of its parameter
-    covariance: np.ndarray  # Their covariance, (p, p)
+    names: tuple[Coefficient, ...]  # (p,)
+    values: np.ndarray  # (p,), each in the unit of its parameter
+    covariance: np.ndarray  # (p, p)
     history: str  # `thermal_lag` or `thermal_hysteresis`, where the blocks support one, else ''
     shape: float  # Its time constant, s, or its reach, K
-    residual_g: np.ndarray  # Rms residual of each axis, g, (m,)
-    span_c: tuple[float, float]  # Lowest and highest temperature, °C
+    residual_g: np.ndarray  # Rms residual of each axis, (m,)
+    span_c: tuple[float, float]  # Lowest and highest temperature
 
     def error_g(self, temperatures_c: np.ndarray, calibrated_c: float) -> np.ndarray:
-        """
-        Return the expected error of the zero-g of the worst axis.
-
-        temperatures_c: temperatures, °C, (n,); returns: standard deviation, g, (n,).
-        """
-        warmer_k = np.asarray(temperatures_c) - NOMINAL_TEMPERATURE_C
+        """Return the standard deviation of the zero-g of the worst axis, (n,)."""
+        warmer_k = temperatures_c - NOMINAL_TEMPERATURE_C
         base_k = calibrated_c - NOMINAL_TEMPERATURE_C
         slopes = np.column_stack([warmer_k - base_k, warmer_k ** 2 - base_k ** 2])
-        worst = np.zeros(len(slopes))
-        axes = dict.fromkeys(name.axis for name in self.names if name.axis)
+        variances, axes = [], dict.fromkeys(name.axis for name in self.names if name.axis)
         for axis, residual_g in zip(axes, self.residual_g):
             places = [self.names.index(Coefficient('temperature_bias', parameter, axis))
                       for parameter in ('per_k', 'per_k2')]
             part = self.covariance[np.ix_(places, places)]
-            variance = np.einsum('ni,ij,nj->n', slopes, part, slopes) + residual_g ** 2
-            worst = np.maximum(worst, np.sqrt(variance))
-        return worst
+            variances.append(np.einsum('ni,ij,nj->n', slopes, part, slopes) + residual_g ** 2)
+        return np.sqrt(np.max(variances, axis=0))
 
 
 def fit(sensor: Sensor, blocks: Poses, with_history: bool = True) -> ThermalFit:
@@ -216,11 +202,7 @@ _SHAPES = {'thermal_lag': 'tau_s', 'thermal_hysteresis': 'reach_k'}
 
 
 def applied(base: Sensor, fitted: ThermalFit, calibrated_c: float) -> Sensor:
-    """
-    Put a fit over temperature into a calibrated unit, whose zero-g stays right.
-
-    calibrated_c: temperature at which the zero-g of the unit was calibrated, °C.
-    """
+    """Put a fit into a calibrated unit, whose zero-g stays right at `calibrated_c`."""
     names, effects = fitted.names, dict.fromkeys(name.effect for name in fitted.names)
     kept = [i for i, name in enumerate(base.covariance_names) if name.effect not in EFFECTS]
     kept_names = tuple(base.covariance_names[i] for i in kept)
@@ -270,10 +252,9 @@ thermometer."""
 class Passed:
     """Parts of the wanted range that the temperature has passed."""
 
-    middles_c: np.ndarray  # Middle of each part, °C, (parts,)
-    # warming, cooling: Whether the temperature has passed it in that direction, (parts,) bool
-    warming: np.ndarray
-    cooling: np.ndarray
+    middles_c: np.ndarray  # Middle of each part, (parts,)
+    warming: np.ndarray  # Whether the temperature has passed it upwards, (parts,) bool
+    cooling: np.ndarray  # The same downwards
     rises: bool  # Whether the temperature rose last
 
     @property
@@ -294,11 +275,7 @@ class Passed:
 
 
 def passed(temperatures_c: np.ndarray, range_c: tuple[float, float]) -> Passed:
-    """
-    Return which parts of a range the temperature has passed.
-
-    temperatures_c: temperatures in the order of time, °C, (k,).
-    """
+    """Return which parts of a range the temperatures, in the order of time, have passed."""
     low_c, high_c = range_c
     middles_c = low_c + (high_c - low_c) * (np.arange(PARTS) + 0.5) / PARTS
     steady_c = play(np.asarray(temperatures_c, float), _STEADY_K, {})
@@ -326,8 +303,7 @@ BLOCK_S = 10.0
 """Length of a block, s. Chosen: short beside the lag of a thermometer."""
 _FEWEST_SAMPLES = 10
 """Fewest samples of a block. Chosen: their scatter shows whether the sensor rests."""
-_MOST_BLOCKS = 2000
-"""Largest number of blocks. Chosen: a fit of less than a second."""
+_MOST_BLOCKS = 2000  # Largest number of blocks. Chosen: a fit of less than a second
 _MOVING = 3.0
 """Scatter of a block, divided by the median of all blocks, above which the sensor moves. Chosen:
 far above the scatter of a standard deviation of ten samples."""

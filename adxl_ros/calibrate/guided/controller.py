@@ -1,11 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The guided calibration as a state machine, free of ROS.
-
-Services, keys and messages call its methods, and `poll` advances it. Samples come from a
-`SampleSource`. Lines, answers and poses go to `Outputs`.
-"""
+"""The guided calibration as a state machine, free of ROS; `poll` advances it."""
 
 from __future__ import annotations
 
@@ -32,24 +27,17 @@ class ControllerState(Enum):
     """State of the guided calibration."""
 
     IDLE = auto()
-    """No calibration runs or waits."""
     WAITING_FOR_SENSOR = auto()
-    """A calibration begins once the sensor is known."""
-    ASKING = auto()
-    """The operator is asked what to do with an interrupted calibration."""
+    ASKING = auto()  # The operator, what to do with an interrupted calibration
     RUNNING = auto()
-    """A session takes poses."""
 
 
 class Resume(Enum):
     """What to do with an interrupted calibration."""
 
-    ASK = 'ask'
-    """Ask the operator if somebody is at a screen; else resume it."""
+    ASK = 'ask'  # The operator if somebody is at a screen; else resume it
     CONTINUE = 'continue'
-    """Resume it."""
-    ANEW = 'anew'
-    """Put its journal aside and begin a new calibration."""
+    ANEW = 'anew'  # Put its journal aside and begin a new calibration
 
 
 class Severity(Enum):
@@ -206,11 +194,9 @@ class Controller:
         self.settings = settings
         self.state = ControllerState.IDLE  # The present state
         self.stream = StreamSensor(settings, sensor, anonymous or sensor, samples)
-        # The running calibration; None in the states IDLE, WAITING_FOR_SENSOR and ASKING
-        self.session: Session | None = None
+        self.session: Session | None = None  # Only in the state RUNNING
         self.question = ''  # The question to the operator in the state ASKING, else ''
-        # Why the fit or its files failed after all poses were taken, or ''
-        self.fit_fault = ''
+        self.fit_fault = ''  # Why the fit or its files failed after all poses were taken, or ''
         self.outcome: tuple[str, ...] = ()  # Lines on the calibration that ended last
         self.may_ask = False  # Whether somebody is at a screen who can be asked
         self.shows_idle_stream = False  # Whether a screen shows samples without a calibration
@@ -424,8 +410,10 @@ class Controller:
         try:
             result = session.finish()
             self._outputs.log(Severity.INFO, result.keep(self.settings.store))
-            if fault := session.write_report(result):
-                self._log.line(Severity.ERROR, f'no report: {fault}')
+            try:
+                session.write_report(result)
+            except (UserError, OSError) as error:
+                self._log.line(Severity.ERROR, f'no report: {error}')
             session.end()
         except (UserError, OSError) as error:
             # The poses stay: further poses, or room on the disk, can still lead to a fit.

@@ -1,15 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-What all guides share: a guide leads through the poses of one calibration.
-
-- What it looks at: the newest samples of a stream, those of a dwell, readings of temperature and
-  supply over time, and those of the encoder of a stage.
-"""
+"""What all guides share; a guide leads through the poses of one calibration."""
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
+from bisect import bisect
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -33,15 +28,12 @@ import numpy as np
 
 _REST_WINDOW_S = 1.2
 """Newest samples that stay in memory, s; chosen: more than the rest detection looks at."""
-_SHOWN_S = 0.5
-"""Newest samples whose mean is shown, s; chosen: steady to read and still quick."""
-_FEWEST_SAMPLES = 20
-"""Samples that stay at the lowest rates; chosen: they give the rate."""
+_SHOWN_S = 0.5  # Newest samples whose mean is shown, s; chosen: steady to read and still quick
+_FEWEST_SAMPLES = 20  # Samples that stay at the lowest rates; chosen: they give the rate
 _BACK_NS = 1_000_000_000
 """A stamp that is earlier than the one before by more is of another clock, ns; chosen: messages
 in wrong order differ by less."""
-_KEPT_READINGS = 100_000
-"""Readings that stay in memory; chosen: 1000 s at 100 Hz."""
+_KEPT_READINGS = 100_000  # Readings that stay in memory; chosen: 1000 s at 100 Hz
 STALE_NS = 60_000_000_000
 """A reading counts for samples up to this far from its stamp, ns; chosen: temperature and supply
 hardly change in a minute."""
@@ -57,20 +49,19 @@ class NewestSamples:
 
     def __init__(self, sensor: Sensor) -> None:
         self._sensor = sensor
-        self.stamps_ns = np.zeros(0, np.int64)  # Stamps, ns, (n,)
-        self.volts = np.zeros((0, len(sensor.axes)))  # Samples, V, (n, m)
+        self.stamps_ns = np.zeros(0, np.int64)  # (n,)
+        self.volts = np.zeros((0, len(sensor.axes)))  # (n, m)
 
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
-        """Take samples: their stamps, ns, (n,), and volts, (n, m)."""
+        """Take samples."""
         keep = self._count(_REST_WINDOW_S)
         self.stamps_ns = np.concatenate([self.stamps_ns, stamps_ns])[-keep:]
         self.volts = np.concatenate([self.volts, volts])[-keep:]
 
     def stillness(self) -> Stillness | None:
         """Return whether the samples are at rest, by the datasheet's noise; None if too few."""
-        dwell = Dwell(self._sensor, int(self.stamps_ns[0]) if len(self.stamps_ns) else 0)
-        if len(self.stamps_ns):
-            dwell.feed(self.stamps_ns, self.volts)
+        dwell = Dwell(self._sensor, int(self.stamps_ns[:1].sum()))
+        dwell.feed(self.stamps_ns, self.volts)
         return dwell.stillness()
 
     def rate_hz(self) -> float:
@@ -103,28 +94,21 @@ class Readings:
     """Readings of one quantity over time."""
 
     def __init__(self) -> None:
-        self._stamps_ns: deque[int] = deque(maxlen=_KEPT_READINGS)
-        self._values: deque[float] = deque(maxlen=_KEPT_READINGS)
+        self._kept: deque[tuple[int, float]] = deque(maxlen=_KEPT_READINGS)
 
     def add(self, stamp_ns: int, value: float) -> None:
         """Take a reading; one that is not finite is left out."""
-        if not math.isfinite(value):
-            return
-        if self._stamps_ns and stamp_ns < self._stamps_ns[-1]:
-            self._stamps_ns.clear()
-            self._values.clear()
-        self._stamps_ns.append(stamp_ns)
-        self._values.append(value)
+        if math.isfinite(value):
+            if self._kept and stamp_ns < self._kept[-1][0]:
+                self._kept.clear()
+            self._kept.append((stamp_ns, value))
 
     def mean(self, first_ns: int, last_ns: int) -> float:
         """Average the readings between two stamps, or return the last reading before."""
-        begin = bisect_left(self._stamps_ns, first_ns)
-        end = bisect_right(self._stamps_ns, last_ns)
-        if begin == end and end and first_ns - self._stamps_ns[end - 1] < STALE_NS:
+        begin, end = bisect(self._kept, (first_ns,)), bisect(self._kept, (last_ns, math.inf))
+        if begin == end and end and first_ns - self._kept[end - 1][0] < STALE_NS:
             begin = end - 1
-        if begin == end:
-            return math.nan
-        return float(np.mean([self._values[i] for i in range(begin, end)]))
+        return float(np.mean([self._kept[i][1] for i in range(begin, end)] or math.nan))
 
 
 class Dwell:
@@ -140,11 +124,10 @@ class Dwell:
         self._count = 0
 
     def __len__(self) -> int:
-        """Return the number of samples since the arrival."""
         return self._count
 
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
-        """Take samples: their stamps, ns, (n,), and volts, (n, m)."""
+        """Take samples."""
         new = stamps_ns >= self.arrived_ns
         self._stamps.append(stamps_ns[new])
         self._volts.append(volts[new])
@@ -251,8 +234,7 @@ class NextPose(NamedTuple):
 
     text: str  # One line for people
     values: Mapping[str, str | float]  # Values for programs, by key
-    # Angles alpha and beta for a stage that turns itself, rad; None for others
-    command_rad: tuple[float, float] | None
+    command_rad: tuple[float, float] | None  # For a stage that turns itself
     newest_ns: int = 0  # Stamp of the newest sample, ns: a command is given after it
 
 

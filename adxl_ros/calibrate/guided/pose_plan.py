@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The pose plan: which poses a sweep visits, in which order.
+The pose plan, and checks of one pose.
 
-- How many poses of each group are taken: by plane, by direction of travel, by orientation.
-- Checks of one pose: one line with the value that is wrong and what to do, or '' if all is well.
+A check returns one line with the value that is wrong and what to do, or '' if all is well.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
-from adxl_ros.calibrate.fits import gravity_fit
 from adxl_ros.calibrate.guided.screen_contents import Coverage
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import PoseRecord
@@ -29,10 +27,8 @@ MOVE_S = 5.0
 """Time of a move with settling, s; chosen: it is used until poses show the real time."""
 _FLAT = 0.2
 """Lower bound of |sin α| of the planes that show beta well, as in equation (15) of the paper."""
-_ROUNDING = 1e-6
-"""Largest rounding error of the sine of a multiple of a quarter turn."""
-_GOLDEN_RAD = np.pi * (3 - np.sqrt(5))
-"""The golden angle, rad."""
+_ROUNDING = 1e-6  # Largest rounding error of the sine of a multiple of a quarter turn
+_GOLDEN_RAD = np.pi * (3 - np.sqrt(5))  # The golden angle, rad
 _HIGHEST_COSINE = 0.97
 """Cosine of alpha at the ends of the spiral of `spread`; chosen: inclined poses show beta."""
 
@@ -41,7 +37,6 @@ _HIGHEST_COSINE = 0.97
 class Target:
     """One pose to visit."""
 
-    # alpha_rad, beta_rad: Angles of the joints, rad
     alpha_rad: float
     beta_rad: float
     check: bool = False  # Whether the pose is kept out of the fit, to show how good the fit is
@@ -56,13 +51,9 @@ def sweep(planes_rad: Sequence[float], step_rad: float, check_poses: int) -> lis
 
 
 def default_planes_rad(axes: str) -> tuple[float, ...]:
-    """
-    Return the planes alpha of a sweep, rad: 30° to 150° by 30°, with z 0° to 180°.
-
-    Without level planes a z axis is calibrated to 0.87 g only.
-    """
+    """Return the planes alpha of a sweep, rad; without level ones z is calibrated to 0.87 g."""
     first_deg, last_deg = (0.0, 180.0) if 'z' in axes else (30.0, 150.0)
-    return tuple(float(angle) for angle in np.radians(np.arange(first_deg, last_deg + 1, 30.0)))
+    return tuple(np.radians(np.arange(first_deg, last_deg + 1, 30.0)).tolist())
 
 
 def guided(planes_rad: Sequence[float], step_rad: float, check_poses: int) -> list[Target]:
@@ -70,11 +61,9 @@ def guided(planes_rad: Sequence[float], step_rad: float, check_poses: int) -> li
     Order the poses of `sweep` for a real stage, whose joints keep their error until they move.
 
     Beta turns forth and then back. At each angle beta, alpha goes through all planes, up and down
-    in turn. A joint takes a new error with each move, so that the errors of a plane average out.
-    With one setting for a plane, the error of that setting would count in full. All planes are
-    complete after half of the sweep, and each pose is reached in both directions of both joints.
-    Where |sin alpha| < 0.2 beta hardly shows, and quarter turns of beta are enough. Check poses
-    follow in whole degrees, which can be set by hand on a scale.
+    in turn: with one setting for a plane, the error of that setting would not average out. Each
+    pose is reached in both directions of both joints. Where |sin alpha| < 0.2 beta hardly shows,
+    and quarter turns of beta are enough. Check poses follow in whole degrees, as on a scale.
     """
     forth = _turn(planes_rad, step_rad)
     planes = np.array(sorted({float(alpha) for alpha in planes_rad}))
@@ -89,8 +78,9 @@ def guided(planes_rad: Sequence[float], step_rad: float, check_poses: int) -> li
 
 def with_checks(targets: list[Target], check_poses: int) -> list[Target]:
     """Add check poses in whole degrees, each the nearest to the pose before."""
-    checks = [Target(_whole_degrees(target.alpha_rad), _whole_degrees(target.beta_rad), True)
-              for target in spread(check_poses)]
+    angles_deg = np.degrees([(t.alpha_rad, t.beta_rad) for t in spread(check_poses)])
+    checks = [Target(alpha_rad, beta_rad, True)
+              for alpha_rad, beta_rad in np.radians(np.round(angles_deg)).tolist()]
     return targets + nearest(targets[-1], checks)
 
 
@@ -127,19 +117,12 @@ def _turn(planes_rad: Sequence[float], step_rad: float) -> np.ndarray:
     return np.arange(round(2 * np.pi / step_rad) + 1) * step_rad
 
 
-def _whole_degrees(angle_rad: float) -> float:
-    return float(np.radians(np.round(np.degrees(angle_rad))))
-
-
-def _distance_rad(first: Target, second: Target) -> float:
-    return max(abs(first.alpha_rad - second.alpha_rad), abs(first.beta_rad - second.beta_rad))
-
-
 def nearest(start: Target, targets: list[Target]) -> list[Target]:
     """Order poses so that each one is the nearest to the pose before."""
     remaining, path = list(targets), [start]
     while remaining:
-        path.append(min(remaining, key=lambda target: _distance_rad(path[-1], target)))
+        path.append(min(remaining, key=lambda target: max(
+            abs(path[-1].alpha_rad - target.alpha_rad), abs(path[-1].beta_rad - target.beta_rad))))
         remaining.remove(path[-1])
     return path[1:]
 
@@ -149,84 +132,46 @@ def spread(count: int) -> list[Target]:
     index = np.arange(count)
     alpha = np.arccos(_HIGHEST_COSINE - 2 * _HIGHEST_COSINE * (index + 0.5) / max(count, 1))
     beta = (index * _GOLDEN_RAD) % (2 * np.pi)
-    return [Target(float(alpha_rad), float(beta_rad), True)
-            for alpha_rad, beta_rad in zip(alpha, beta)]
-
-
-_SIDES = {1: 'faces up', 2: 'edges up', 3: 'corners up'}
-"""Groups of orientations, by the number of axes that point up."""
-_CHECKS = 'check poses'
-"""Group of the check poses."""
-_FORTH = 'beta forth'
-"""Group of the poses that a rising beta reaches."""
-_BACK = 'beta back'
-"""Group of the poses that a falling beta reaches."""
+    return [Target(alpha_rad, beta_rad, True)
+            for alpha_rad, beta_rad in zip(alpha.tolist(), beta.tolist())]
 
 
 def by_plane(targets: Sequence[Target], accepted: Collection[int]) -> tuple[Coverage, ...]:
     """Count the poses of a plan by plane and by direction of travel, and the check poses."""
-    groups: dict[str, list[int]] = {}
-    previous = None
-    for number, target in enumerate(targets):
-        for name in _groups(target, previous):
-            groups.setdefault(name, []).append(number)
-        previous = target
-    order = sorted(groups, key=lambda name: (name == _CHECKS, name in (_FORTH, _BACK)))
-    return tuple(Coverage(name, sum(number in accepted for number in groups[name]),
-                          len(groups[name])) for name in order)
-
-
-def by_orientation(covered: np.ndarray) -> tuple[Coverage, ...]:
-    """Count the covered orientations, (26,) bool, by faces, edges and corners."""
-    groups = [(name, covered[count == gravity_fit.AXES_UP]) for count, name in _SIDES.items()]
-    return tuple(Coverage(name, int(part.sum()), len(part)) for name, part in groups)
-
-
-def _groups(target: Target, previous: Target | None) -> list[str]:
-    """Return the groups of a target: its plane and its direction of travel, or the checks."""
-    if target.check:
-        return [_CHECKS]
-    plane = f'{np.degrees(target.alpha_rad):.0f}°'
-    if previous is None or target.beta_rad == previous.beta_rad:
-        return [plane]
-    return [plane, _FORTH if target.beta_rad > previous.beta_rad else _BACK]
+    alpha_rad, beta_rad, check = np.array([(t.alpha_rad, t.beta_rad, t.check) for t in targets]).T
+    planes, grid, turn = np.round(np.degrees(alpha_rad)), check == 0, np.diff(beta_rad, prepend=0)
+    turn[:1] = 0
+    groups = {f'{plane:.0f}°': grid & (planes == plane) for plane in dict.fromkeys(planes[grid])}
+    groups |= {'beta forth': grid & (turn > 0), 'beta back': grid & (turn < 0),
+               'check poses': ~grid}
+    taken = np.isin(np.arange(len(targets)), list(accepted))
+    return tuple(Coverage(name, int((taken & group).sum()), int(group.sum()))
+                 for name, group in groups.items() if group.any())
 
 
 _RATE_ERROR = 0.05
 """Largest relative error of the sample rate; chosen: above the error of any oscillator."""
 _CHANGE_G = 0.003
 """Largest change of a repeated pose beyond noise and stage error, g; chosen: a turn of 0.17°."""
-_NOISE_STDS = 3.0
-"""Standard deviations of the noise in the limit of a change; chosen: exceeded once in 400."""
+_NOISE_STDS = 3.0  # Stds of the noise in the limit of a change; chosen: exceeded once in 400
 
 
 def angle_fault(target: Target, alpha_rad: float, beta_rad: float, tolerance_rad: float) -> str:
     """Refuse a stage that is not at the pose."""
     return ', '.join(
-        f'{name} is {_degrees(now - wanted)} from the target {np.degrees(wanted):.4g}°'
+        f'{name} is {np.degrees(abs(now - wanted)):.1f}° from the target {np.degrees(wanted):.4g}°'
         for name, now, wanted in (('alpha', alpha_rad, target.alpha_rad),
                                   ('beta', beta_rad, target.beta_rad))
         if abs(now - wanted) > tolerance_rad)
-
-
-def motion_fault(readings_rad: np.ndarray, tolerance_rad: float) -> str:
-    """Refuse a stage whose encoder, (n, 2), turned while the pose was averaged."""
-    for name, angles_rad in zip(('alpha', 'beta'), readings_rad.T):
-        range_rad = float(np.ptp(angles_rad)) if len(angles_rad) else 0.0
-        if range_rad > tolerance_rad:
-            return (f'{name} moved {_degrees(range_rad)} while the pose was averaged; hold the '
-                    'stage still')
-    return ''
 
 
 def turn_fault(sensor: Sensor, change_v: np.ndarray, near_rad: float) -> str:
     """Refuse a mean that differs from that of the capture by a change, V, (m,)."""
     change_g = np.abs(change_v) / sensor.nominal_scale_v_per_g
     axis = int(change_g.argmax())
-    if change_g[axis] < np.sin(near_rad):
-        return ''
-    return (f'the pose changed after the capture: {sensor.axes[axis]} moved by '
-            f'{change_g[axis]:.2f} g; hold the stage still until the pose is taken')
+    return '' if change_g[axis] < np.sin(near_rad) else (
+        f'the pose changed after the capture: {sensor.axes[axis]} moved by '
+        f'{change_g[axis]:.2f} g; hold the stage still until the pose is taken')
 
 
 def saturation_fault(sensor: Sensor, volts: np.ndarray) -> str:
@@ -246,16 +191,8 @@ def rate_fault(measured_hz: float, unit: Sensor) -> str:
     """Refuse samples whose rate is not that of the unit."""
     if not abs(measured_hz / unit.rate_hz - 1) > _RATE_ERROR:
         return ''
-    expected = f'were {unit.rate_hz:.4g} at the start; keep the rate of the sensor' \
-        if 'rate_hz' in unit.measured else \
-        f'sensor_info states rate_hz {unit.rate_hz:.4g}; correct the rate of the driver'
-    return f'samples are {measured_hz:.4g} a second by their stamps, but {expected}'
-
-
-def _degrees(angle_rad: float) -> str:
-    """Return the size of an angle as text."""
-    size = abs(float(np.degrees(angle_rad)))
-    return f'{size:.2f}°' if size < 1 else f'{size:.1f}°'
+    return (f'samples are {measured_hz:.4g} a second by their stamps, but rate_hz is '
+            f'{unit.rate_hz:.4g}; correct the rate of the driver')
 
 
 def signed_text(value: float) -> str:

@@ -1,15 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The guides of a sensor that no stage carries: samples go in, accepted rests come out.
-
-- `HandGuide`: it is turned by hand, and rests in many directions.
-- `ThermalGuide`: it lies still while it warms and cools, and each block of samples is a rest.
-"""
+"""The guides of a sensor that no stage carries: samples go in, accepted rests come out."""
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -28,7 +22,7 @@ from adxl_ros.calibrate.guided.screen_contents import (
     Progress,
     Status,
 )
-from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.poses import at_a_rail, Poses
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import JournalEntry, PoseRecord
 from adxl_ros.model.sensor import parameter_of, Sensor
@@ -37,14 +31,11 @@ import numpy as np
 
 ENOUGH_RESTS = 24
 """Rests that are recommended; chosen: nearly all of the 26 orientations."""
-_ENDED_NS = 1_000_000_000
-"""A rest is announced when the stream has gone on for longer after it, ns."""
+_ENDED_NS = 1_000_000_000  # A rest is announced when the stream has gone on for longer after it
 _SEARCH_PERIOD_NS = 500_000_000
 """Shortest time between two searches for rests, ns: each one looks at the whole stream."""
 _STEPS = 3
 """Gauss-Newton steps after each rest; chosen: the estimate changes little with each rest."""
-_MOST_SATURATED = 0.01
-"""Largest share of a rest's samples at a rail; chosen: a knock does not spoil the mean."""
 _UP_SAMPLES = 20
 """Samples whose mean shows what points up at present; chosen: quick and still steady."""
 _MIN_FORCE_G = 1e-9
@@ -53,11 +44,10 @@ _MIN_FORCE_G = 1e-9
 
 class HandRests(Guide):
     """
-    Collects the rests of a hand-held sensor.
+    Collects the rests of a hand-held sensor, which are announced as they end.
 
-    The noise of the unit is learned from the quietest parts of the stream. The rests can therefore
-    change while the stream runs. Rests are announced as they end. `poses_to_fit` finds
-    the rests of the complete stream once more, as `fit` does with a recording.
+    The noise is learned from the quietest parts of the stream, so that rests can change while it
+    runs: `poses_to_fit` finds those of the complete stream once more, as `fit` does.
     """
 
     def __init__(self, sensor: Sensor, temperature_span_c: float,
@@ -75,7 +65,6 @@ class HandRests(Guide):
         self._newest = NewestSamples(self.sensor)
         self._announced_ns = self._next_search_ns = 0
         self._dropped: list[PoseRecord] = []
-        self._saturated_ns: list[int] = []
         self._finder = RestFinder(
             self.sensor.rate_hz, len(self.sensor.axes), datasheet_noise(self.sensor), learn=True)
 
@@ -88,7 +77,6 @@ class HandRests(Guide):
         self.newest_ns = int(stamps_ns[-1])
         self._stamps.append(stamps_ns)
         self._newest.feed(stamps_ns, volts)
-        self._saturated_ns += stamps_ns[self.sensor.saturated(volts).any(axis=1)].tolist()
         # Since the first stamp: seconds since 1970 would resolve only 0.2 µs.
         self._finder.feed((stamps_ns - self._stamps[0][0]) * 1e-9, volts)
 
@@ -123,9 +111,9 @@ class HandRests(Guide):
         if self.next_up is None:
             return 'there is no direction left to skip'
         self._skipped[self.next_up] = True
-        skipped = gravity_fit.name_up(self.next_up)
+        skipped = gravity_fit.points_up(self.next_up)
         self._choose_next_up()
-        return f'{skipped} up is left out'
+        return f'the direction in which {skipped} is left out'
 
     def forget(self, number: int) -> str:
         """Leave a rest out of the fit; return a line for people."""
@@ -187,11 +175,8 @@ class HandRests(Guide):
 
     def _fault(self, record: PoseRecord) -> str:
         """Return why a rest is refused, or ''."""
-        saturated = (bisect_right(self._saturated_ns, record.stop_ns)
-                     - bisect_left(self._saturated_ns, record.start_ns))
-        if saturated > _MOST_SATURATED * record.samples:
-            return ('saturated: samples of the rest are beyond the range of '
-                    f'±{self.sensor.range_g:g} g or at a rail of the ADC; check supply and wiring')
+        if at_a_rail(self.sensor, Poses.from_records([record])).any():
+            return 'saturated: the ADC is at its rail in this rest; check supply and wiring'
         return self.temperature_fault(record.temperature_c, self._span_c)
 
     def _records(self, number: int) -> Iterator[PoseRecord]:
@@ -247,8 +232,11 @@ class HandGuide(HandRests):
 
     def estimate_contents(self) -> Estimate:
         """Return what the rests determine so far, for the screen."""
+        groups = [np.flatnonzero(count == gravity_fit.AXES_UP) for count in (1, 2, 3)]
         return Estimate(
-            coverage=pose_plan.by_orientation(self.covered), coefficients=self.rows,
+            coverage=tuple(Coverage(f'{name} up', int(self.covered[group].sum()), len(group))
+                           for name, group in zip(('faces', 'edges', 'corners'), groups)),
+            coefficients=self.rows,
             tilt_error_deg=running_estimate.degrees_or_none(self.tilt_error_rad()))
 
     def tilt_error_rad(self) -> float:

@@ -1,11 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The estimate of a unit after each pose: coefficients and expected tilt error.
-
-- The check of a reading against it.
-- The quick plan: the fewest poses that reach a stated tilt error.
-"""
+"""The estimate of a unit after each pose, and the quick plan: the fewest poses for an error."""
 
 from __future__ import annotations
 
@@ -30,38 +25,27 @@ from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_neutral
 from adxl_ros.report.quantities import with_half_width
 import numpy as np
 
-_ROUNDS = 2
-"""Linearised fits after each pose; chosen: the estimate changes little with each pose."""
+_ROUNDS = 2  # Linearised fits after each pose; chosen: the estimate changes little with each pose
 _EVALUATION_POSES = 48
 """Poses at which the tilt error is predicted; chosen: even over the sphere, and quick."""
 _VISIBLE_RAD = np.radians(1.0)
 """Largest standard deviation of alpha by noise alone, rad, at which a pose counts."""
 _LEAST_STD_V = 1e-7
 """Lower bound of the noise of a mean, V; chosen: below any ADC, so that no weight is infinite."""
-_OUTLIER_STDS = 3.5
-"""Residual from which a pose is refused, standard deviations; chosen: one of 2000 by chance."""
-_MODEL_STD_G = 5e-3
-"""Standard deviation of further model errors, g; chosen: it accepts twice the datasheet limits."""
+_OUTLIER_STDS = 3.5  # Residual from which a pose is refused, stds; chosen: one of 2000 by chance
+_MODEL_STD_G = 5e-3  # Std of further model errors; chosen: it accepts twice the datasheet limits
 
 
 @dataclass(frozen=True)
 class RunningEstimate:
     """The unit by the poses so far and the datasheet."""
 
-    # The unit with the most likely coefficients, those of the stage's base among them
-    unit: Sensor
+    unit: Sensor  # With the most likely coefficients, those of the stage's base among them
     names: tuple[Coefficient, ...]  # Names of those coefficients, (p,)
-    # Their covariance, the inverse of the Fisher information of poses and datasheet, (p, p)
-    covariance: np.ndarray
+    covariance: np.ndarray  # Inverse of the Fisher information of poses and datasheet, (p, p)
     prior: np.ndarray  # Standard deviation of each coefficient by the datasheet alone, (p,)
-    stage: StageError  # Levels of the stage's error, by the stated one and by the poses
-    pose_std_v: np.ndarray  # Standard deviation of the mean of one pose, V, (m,)
-    poses: int  # Number of poses
-
-    @property
-    def std(self) -> np.ndarray:
-        """Return the standard deviation of each coefficient, (p,)."""
-        return np.sqrt(np.diag(self.covariance))
+    stage: StageError
+    pose_std_v: np.ndarray  # Standard deviation of the mean of one pose, (m,)
 
     def reading_fault(self, target: Target, volts: np.ndarray, tolerance_rad: float) -> str:
         """Refuse a pose whose mean, V, (m,), is an outlier to the prediction by earlier poses."""
@@ -106,7 +90,8 @@ class RunningEstimate:
 
     def rows(self) -> tuple[CoefficientRow, ...]:
         """Return the coefficients for the screen."""
-        return coefficient_rows(self.names, get(self.unit, self.names), self.std, self.prior)
+        std = np.sqrt(np.diag(self.covariance))
+        return coefficient_rows(self.names, get(self.unit, self.names), std, self.prior)
 
 
 def from_records(sensor: Sensor, records: Sequence[PoseRecord], dwell_s: float,
@@ -137,16 +122,11 @@ def from_poses(sensor: Sensor, poses: Poses, dwell_s: float, stage_rad: float,
     samples = noise.effective_samples(round(dwell_s * sensor.rate_hz), 1 / sensor.rate_hz,
                                       sensor.rc_s)
     pose_std_v = np.maximum(noise.sample_std_v(sensor) / np.sqrt(samples), _LEAST_STD_V)
-    return RunningEstimate(unit, names, np.linalg.inv(information), prior, stage, pose_std_v,
-                           len(poses))
+    return RunningEstimate(unit, names, np.linalg.inv(information), prior, stage, pose_std_v)
 
 
 def tilt_error_rad(sensor: Sensor, pose_std_v: np.ndarray) -> float:
-    """
-    Predict the rms angle between true and measured vertical over the sphere; NaN if unknown.
-
-    pose_std_v: standard deviation of the readings, V, (m,).
-    """
+    """Predict the rms angle between true and measured vertical over the sphere, or NaN."""
     alpha_rad, beta_rad = np.array([(target.alpha_rad, target.beta_rad)
                                     for target in pose_plan.spread(_EVALUATION_POSES)]).T
     force = specific_force(alpha_rad, beta_rad, sensor.local_gravity_mps2)
@@ -166,11 +146,7 @@ def degrees_or_none(angle_rad: float) -> float | None:
 
 def coefficient_rows(names: Sequence[Coefficient], values: np.ndarray, std: np.ndarray,
                      prior: np.ndarray) -> tuple[CoefficientRow, ...]:
-    """
-    Lay out coefficients for the screen, one row for each parameter of the unit.
-
-    values, std, prior: their values, standard deviations, and those by the datasheet alone, (p,).
-    """
+    """Lay out coefficients for the screen, one row for each parameter of the unit."""
     places: dict[Coefficient, list[int]] = {}
     for i, name in enumerate(names):
         if not full_model.belongs_to_stage(name):
@@ -188,14 +164,13 @@ def coefficient_rows(names: Sequence[Coefficient], values: np.ndarray, std: np.n
 
 _SPARE_READINGS = 40
 """Readings beyond the number of coefficients; chosen: they show stage error and outliers."""
-_MOST_POSES = 90
-"""Largest number of poses; chosen: by hand a longer plan is no longer quick."""
+_MOST_POSES = 90  # Largest number of poses; chosen: by hand a longer plan is no longer quick
 
 
 def quick(sensor: Sensor, dwell_s: float, tilt_error_rad: float, check_poses: int
           ) -> list[Target]:
     """Choose the fewest poses that reach a tilt error, and never more than 90."""
-    start = datasheet_estimate(sensor, dwell_s)
+    start = from_records(sensor, [], dwell_s)
     fewest = math.ceil((len(start.names) + _SPARE_READINGS) / len(sensor.axes))
     grid = linearisation.candidate_poses(start.pose_std_v)
     rows = linearisation.whitened_jacobian(start.unit, grid, start.names, start.stage)
@@ -211,12 +186,7 @@ def quick(sensor: Sensor, dwell_s: float, tilt_error_rad: float, check_poses: in
     return pose_plan.with_checks(targets, check_poses)
 
 
-def datasheet_estimate(sensor: Sensor, dwell_s: float) -> RunningEstimate:
-    """Return the estimate of a unit before its first pose, by the datasheet alone."""
-    return from_records(sensor, [], dwell_s)
-
-
 def expected_tilt_error_rad(sensor: Sensor, dwell_s: float, targets: Sequence[Target]) -> float:
     """Predict the tilt error after a pose plan."""
     fitted = [target for target in targets if not target.check]
-    return datasheet_estimate(sensor, dwell_s).with_poses(fitted).tilt_error_rad()
+    return from_records(sensor, [], dwell_s).with_poses(fitted).tilt_error_rad()

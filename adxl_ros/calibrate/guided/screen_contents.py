@@ -1,10 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The contents of the calibration screen, and the text that a topic carries them in.
-
-- How poses are taken, and what a guided calibration waits for.
-"""
+"""The contents of the calibration screen, and the text that a topic carries them in."""
 
 from __future__ import annotations
 
@@ -29,16 +25,12 @@ class StageMode(Enum):
 class CaptureSettings:
     """How poses are taken; times are by the stamps of the samples."""
 
-    dwell_s: float  # Time at rest for each pose, s
-    # Largest distance of a joint from the pose at which a stage that turns itself has arrived, rad
-    tolerance_rad: float
-    timeout_s: float  # Time after which an open pose is reported as late, s
-    stage_mode: StageMode  # Who turns the stage
-    # Largest distance of a joint from the pose at which a capture by hand is accepted, rad. The
-    # default is 2°.
-    near_rad: float = 0.035
-    # Largest difference of the temperature from that of the first pose, °C
-    temperature_span_c: float = 3.0
+    dwell_s: float  # Time at rest for each pose
+    tolerance_rad: float  # Largest distance of a stage that turns itself and has arrived
+    timeout_s: float  # Time after which an open pose is reported as late
+    stage_mode: StageMode
+    near_rad: float = 0.035  # Largest distance at which a capture by hand is accepted: 2°
+    temperature_span_c: float = 3.0  # Largest difference from the first pose
 
 
 class Phase(Enum):
@@ -74,18 +66,16 @@ class Status:
 
     phase: Phase  # What it waits for
     text: str  # One line with the values that matter
-    # Whether somebody should look: it waits longer than the time-out, or refuses its input
-    late: bool
+    late: bool  # Whether somebody should look: it waits for long, or refuses its input
 
 
 @dataclass(frozen=True)
 class AxisReading:
     """What one axis reads at present."""
 
-    axis: str  # Name of the axis
-    # mean_mps2, rms_mps2: Mean of the newest samples and their rms about it, m/s²
-    mean_mps2: float
-    rms_mps2: float
+    axis: str
+    mean_mps2: float  # Of the newest samples
+    rms_mps2: float  # About the mean
 
 
 @dataclass(frozen=True)
@@ -93,10 +83,9 @@ class RestReading:
     """Whether the sensor is at rest."""
 
     at_rest: bool  # Whether both quantities of all axes are within their limits
-    axis: str  # Name of the axis that moves most
+    axis: str  # The one that moves most
     quantity: str  # 'rms' or 'drift'
-    # value_mps2, limit_mps2: The quantity on that axis, and its limit, m/s²
-    value_mps2: float
+    value_mps2: float  # The quantity on that axis
     limit_mps2: float
 
 
@@ -104,9 +93,9 @@ class RestReading:
 class LiveReading:
     """What the sensor reads at present."""
 
-    axes: tuple[AxisReading, ...]  # Reading of each measured axis
-    rate_hz: float | None  # Rate of the samples by their stamps, Hz; None while they are too few
-    rest: RestReading | None  # Whether the sensor is at rest; None while the samples are too few
+    axes: tuple[AxisReading, ...]
+    rate_hz: float | None  # By the stamps; None while the samples are too few
+    rest: RestReading | None  # None while the samples are too few
 
 
 @dataclass(frozen=True)
@@ -116,27 +105,20 @@ class Progress:
     number: int  # Number of the next pose, from 1
     destination: str  # The pose to reach, for people
     position: str  # Where the sensor is at present, for people; '' where it is unknown
-    # accepted, total, skipped: Number of accepted poses, of all poses, and of those that are left
-    # out
-    accepted: int
+    accepted: int  # Number of accepted poses
     total: int
     skipped: int = 0
-    # Number of poses that a fit would miss now; 0 where the number of poses is not fixed
-    open_poses: int = 0
-    # Time that the open poses take, s; None where the number of poses is not fixed
-    remaining_s: float | None = None
-    # dwelt_s, dwell_s: Time at rest in the pose so far, and the required time, s; None without a
-    # fixed dwell
-    dwelt_s: float | None = None
-    dwell_s: float | None = None
+    open_poses: int = 0  # That a fit would miss now; 0 where the number of poses is not fixed
+    remaining_s: float | None = None  # For the open poses; None where their number is not fixed
+    dwelt_s: float | None = None  # Time at rest in the pose so far; None without a fixed dwell
+    dwell_s: float | None = None  # The required time
 
 
 @dataclass(frozen=True)
 class Coverage:
     """How many poses of one group are taken."""
 
-    group: str  # Name of the group
-    # accepted, total: Number of accepted poses and of all poses
+    group: str
     accepted: int
     total: int
 
@@ -145,34 +127,29 @@ class Coverage:
 class CoefficientRow:
     """One parameter of an effect, as the poses determine it so far."""
 
-    name: str  # Name of the parameter, with its unit
-    # Most likely value and half of the 90 % interval of each axis, as text
-    intervals: tuple[str, ...]
-    # Relative reduction of the datasheet's standard deviation, of the worst axis, 0 to 1
-    determined: float
+    name: str  # With its unit
+    intervals: tuple[str, ...]  # Value and half of the 90 % interval of each axis
+    determined: float  # Share of the datasheet's standard deviation that is gone, worst axis
 
 
 @dataclass(frozen=True)
 class Estimate:
     """What the poses determine so far."""
 
-    coverage: tuple[Coverage, ...]  # Poses by group
-    coefficients: tuple[CoefficientRow, ...]  # The parameters of the unit
-    # Expected rms error of alpha and beta, degrees; None where no pose shows both
-    tilt_error_deg: float | None = None
-    # The same after all poses; None where the number of poses is not fixed
-    final_tilt_error_deg: float | None = None
-    # Expected error over a range of temperature, for people; '' for other calibrations
-    range_error: str = ''
+    coverage: tuple[Coverage, ...]
+    coefficients: tuple[CoefficientRow, ...]
+    tilt_error_deg: float | None = None  # Expected rms; None where no pose shows both angles
+    final_tilt_error_deg: float | None = None  # After all poses, if their number is fixed
+    range_error: str = ''  # Expected error over a range of temperature, if that is calibrated
 
 
 @dataclass(frozen=True)
 class KeyAction:
     """What a key does."""
 
-    key: str  # The key
-    action: str  # Its action, for people
-    service: str  # Name of the service of the calibration node that does it
+    key: str
+    action: str  # For people
+    service: str  # Of the calibration node
 
 
 @dataclass(frozen=True)
@@ -184,10 +161,8 @@ class ScreenContents:
     unit: str = ''  # Serial number and axes of the sensor; '' before they are known
     output: str = ''  # The parameter file that is to be written
     keys: tuple[KeyAction, ...] = ()  # Keys that have an action now
-    live: LiveReading | None = None  # What the sensor reads; None without samples
-    # progress, estimate: Progress and estimate of the running calibration; None while no
-    # calibration runs
-    progress: Progress | None = None
+    live: LiveReading | None = None  # None without samples
+    progress: Progress | None = None  # Of the running calibration, if one runs
     estimate: Estimate | None = None
     outcome: tuple[str, ...] = ()  # Lines on the calibration that has ended
 

@@ -41,8 +41,8 @@ class SessionSettings:
     plan_kind: str  # Kind of the pose plan: 'full' or 'quick'
     # Planes alpha of the plan `full`, rad; empty for those that the axes of the unit need
     planes_rad: tuple[float, ...]
-    step_rad: float  # Step of beta of the plan `full`, rad
-    tilt_error_rad: float  # Rms error of the tilt that the plan `quick` is to reach, rad
+    step_rad: float  # Step of beta of the plan `full`
+    tilt_error_rad: float  # That the plan `quick` is to reach, rms
     check_poses: int  # Number of poses that are kept out of the fit
     capture: CaptureSettings  # How poses are taken
     output: Path  # The parameter file to write
@@ -140,14 +140,19 @@ class Session:
         self.fault = ''  # What is wrong with the samples, or ''
         # The accepted poses on disk
         self.journal = sweep_journal.Journal(settings.journal, settings.head(unit), start_over)
-        self._remove_unfinished()
+        # A process that was killed while it wrote has left unfinished files.
+        places = [*(Path(settings.report, name) for name in page.FILES if settings.report),
+                  settings.output, settings.journal]
+        for place in places:
+            remove_unfinished(place.parent, place.name)
+        if settings.store:
+            remove_unfinished(calibration_store.unit_folder(settings.store, unit.serial), '')
         self._fitted: list[PoseRecord] = []
-        self._estimate: tuple[tuple[int, int], Estimate] | None = None
+        self._estimate: tuple[list[int], Estimate] | None = None
         entries = self.journal.entries
         self._is_mounting_unchecked = any(isinstance(e, MountingUnchecked) for e in entries)
         accepted = sweep_journal.accepted_poses(entries)
         self.resumed = len(accepted)  # Number of the poses of an interrupted calibration
-        # stage, guide: Lead through the poses; `stage` is None without a stage
         self.stage: StageGuide | None = None
         self.guide: StageGuide | HandGuide | ThermalGuide
         if settings.mode == 'gravity':
@@ -197,19 +202,13 @@ class Session:
 
     def estimate(self) -> Estimate:
         """Return what the poses determine so far; it is computed once for each pose."""
-        accepted = self.guide.accepted
-        # A pose that is taken again changes the stamp only.
-        key = len(accepted), max((record.stop_ns for record in accepted.values()), default=0)
+        key = [record.stop_ns for record in self.guide.accepted.values()]
         if self._estimate is None or key != self._estimate[0]:
             self._estimate = key, self.guide.estimate_contents()
         return self._estimate[1]
 
     def finish(self) -> calibration.CalibrationResult:
-        """
-        Fit the poses so far and write the parameter file.
-
-        Call `end` once the report and the copy in the store are written, too.
-        """
+        """Fit the poses so far and write the parameter file; `end` follows all other files."""
         records, source = self.guide.poses_to_fit(), self.journal.path.name
         if not records:
             raise UserError('no pose is taken yet')
@@ -229,35 +228,16 @@ class Session:
         self._fitted = records
         return result
 
-    def write_report(self, result: calibration.CalibrationResult) -> str:
-        """Write the report; return why there is none: without it the calibration is valid."""
+    def write_report(self, result: calibration.CalibrationResult) -> None:
+        """Write the report if one is asked for."""
         if self.settings.report:
-            try:
-                Path(self.settings.report).mkdir(parents=True, exist_ok=True)
-                page.write(self.settings.report, result, self.settings.store)
-            except (UserError, OSError) as error:
-                return f'{error}'
-        return ''
+            Path(self.settings.report).mkdir(parents=True, exist_ok=True)
+            page.write(self.settings.report, result, self.settings.store)
 
     def end(self) -> None:
-        """
-        Note in the journal that the fit is written; a sweep with open poses can be resumed.
-
-        Without this note the next start fits and writes the files again.
-        """
+        """Note in the journal that the fit is written, else the next start writes it again."""
         try:
             done = not self.guide.open_poses
             self.journal.append(sweep_journal.Fitted(tuple(self._fitted), done))
         except UserError as error:
             raise UserError(f'{self.settings.output} is written, but {error}') from None
-
-    def _remove_unfinished(self) -> None:
-        """Remove the unfinished files of a process that was killed while it wrote."""
-        settings = self.settings
-        places = [(path.parent, path.name) for path in (settings.output, settings.journal)]
-        if settings.report:
-            places += [(Path(settings.report), name) for name in page.FILES]
-        if settings.store:
-            places.append((calibration_store.unit_folder(settings.store, self.unit.serial), ''))
-        for folder, name in places:
-            remove_unfinished(folder, name)

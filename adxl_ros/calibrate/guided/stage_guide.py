@@ -1,11 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The guide of a sweep on a stage: samples and encoder angles go in, accepted poses come out.
-
-The stage arrives, or the operator captures. The sensor comes to rest, and a full dwell at rest is
-averaged. Motion begins the dwell again. A check can refuse the pose.
-"""
+"""The guide of a sweep on a stage: samples and encoder angles go in, accepted poses come out."""
 
 from __future__ import annotations
 
@@ -35,7 +30,11 @@ class MountingError(UserError):
 
 
 class StageSweep(Guide):
-    """Takes the poses of a plan on a stage that turns itself, or that an operator turns."""
+    """
+    Takes the poses of a plan on a stage that turns itself, or that an operator turns.
+
+    After arrival or capture a full dwell at rest is averaged; motion begins the dwell again.
+    """
 
     def __init__(self, sensor: Sensor, targets: Sequence[Target], settings: CaptureSettings,
                  accepted: Sequence[PoseRecord] = (), skipped: Iterable[int] = ()) -> None:
@@ -222,9 +221,7 @@ def _fault(sweep: StageSweep, record: PoseRecord, rest: Rest) -> str:
     if settings.stage_mode is StageMode.ENCODER:
         now_rad = sweep.encoder.angles_rad or (record.alpha_rad, record.beta_rad)
         fault = pose_plan.angle_fault(
-            sweep.course.targets[record.pose], *now_rad, settings.near_rad) or \
-            pose_plan.motion_fault(sweep.tracker.between(record.start_ns, record.stop_ns),
-                                   settings.tolerance_rad)
+            sweep.course.targets[record.pose], *now_rad, settings.near_rad)
     elif settings.stage_mode is StageMode.MANUAL:
         # Without an encoder the first rest shows where the operator captured.
         first_v = sweep.dwell.volts(sweep.dwell.rests()[0]).mean(axis=0)
@@ -314,26 +311,20 @@ class StageGuide(StageSweep):
         if self.refusal:
             return Status(Phase.REFUSED, self.refusal, True)
         late = waited_s > self.settings.timeout_s
+        since, place = f' for {waited_s:.0f} s' if late else '', self.destination()
         if self.has_arrived:
-            return self._status_at_pose(late, f' for {waited_s:.0f} s' if late else '')
+            stillness = self.dwell.stillness()
+            if stillness is not None and stillness.at_rest:
+                return Status(Phase.DWELL, f'at {place}: averaging', late)
+            motion = stillness.describe_mps2(self.sensor) if stillness else 'waiting for samples'
+            return Status(Phase.REST, f'at {place}: {motion}{since}', late)
         if not self.moves_itself:
-            waited = f' (waited {waited_s:.0f} s)' if late else ''
-            return Status(Phase.OPERATOR,
-                          f'turn the stage to {self.destination()}, then capture{waited}', False)
-        angles_rad = self.encoder.angles_rad
-        distance = silence if silence or angles_rad is None else pose_plan.angle_fault(
-            target, *angles_rad, self.settings.tolerance_rad) or 'arrived'
-        since = f' for {waited_s:.0f} s' if late else ''
-        return Status(Phase.STAGE, f'the stage has not arrived at {self.destination()}{since}: '
-                      f'{distance}', late)
-
-    def _status_at_pose(self, late: bool, since: str) -> Status:
-        place, stillness = f'at {self.destination()}', self.dwell.stillness()
-        if stillness is None:
-            return Status(Phase.REST, f'{place}: waiting for samples{since}', late)
-        if stillness.at_rest:
-            return Status(Phase.DWELL, f'{place}: averaging', late)
-        return Status(Phase.REST, f'{place}: {stillness.describe_mps2(self.sensor)}{since}', late)
+            return Status(Phase.OPERATOR, f'turn the stage to {place}, then capture', False)
+        distance = silence if silence or self.encoder.angles_rad is None else \
+            pose_plan.angle_fault(target, *self.encoder.angles_rad, self.settings.tolerance_rad) \
+            or 'arrived'
+        return Status(Phase.STAGE, f'the stage has not arrived at {place}{since}: {distance}',
+                      late)
 
     def progress(self) -> screen_contents.Progress:
         """Return the progress of the sweep, for the screen."""

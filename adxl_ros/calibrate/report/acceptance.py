@@ -1,10 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Acceptance of a calibration: PASS or FAIL against the datasheet and against the noise.
-
-- Errors and outcomes as lines of a terminal.
-"""
+"""Acceptance of a calibration, PASS or FAIL against datasheet and noise, and its lines."""
 
 from __future__ import annotations
 
@@ -29,8 +25,7 @@ FAIL = 'FAIL'
 """Outcome: the error exceeds the limit."""
 NOT_SHOWN = 'NOT SHOWN'
 """Outcome: the error is within the limit, but its 90 % interval is not."""
-_UPPER_QUANTILE = 0.95
-"""Probability of the upper end of a 90 % interval."""
+_UPPER_QUANTILE = 0.95  # Probability of the upper end of a 90 % interval
 _NONLINEARITY = Coefficient('nonlinearity', 'cubic_per_g2')
 """Parameter whose typical datasheet value limits the error of acceleration."""
 
@@ -39,14 +34,11 @@ _NONLINEARITY = Coefficient('nonlinearity', 'cubic_per_g2')
 class Assessment:
     """The outcomes of one model: PASS, FAIL or NOT SHOWN by limit, '' without a limit."""
 
-    model: str  # Name of the model
-    # accel, tilt: Error budgets of acceleration, (m/s²)² per axis, and of tilt, rad²
-    accel: ErrorBudget
-    tilt: ErrorBudget
-    # accel_datasheet, tilt_datasheet: Outcomes against the typical nonlinearity of the datasheet
-    accel_datasheet: str
-    # accel_noise, tilt_noise: Outcomes against the noise of one sample
-    accel_noise: str
+    model: str
+    accel: ErrorBudget  # (m/s²)² per axis
+    tilt: ErrorBudget  # rad²
+    accel_datasheet: str  # Against the typical nonlinearity of the datasheet
+    accel_noise: str  # Against the noise of one sample
     tilt_datasheet: str = ''
     tilt_noise: str = ''
 
@@ -66,10 +58,6 @@ class Assessment:
         return float(np.degrees(np.sqrt(self.tilt.calibration)))
 
 
-def _worse(*outcomes: str) -> str:
-    return next((outcome for outcome in (FAIL, NOT_SHOWN, PASS) if outcome in outcomes), '')
-
-
 def assess(model: str, budgets: ErrorBudgets, sensor: Sensor, is_certain: bool = True
            ) -> Assessment:
     """
@@ -83,25 +71,18 @@ def assess(model: str, budgets: ErrorBudgets, sensor: Sensor, is_certain: bool =
     the held-out poses show nothing of others, so that it cannot pass.
     """
     def outcome(budget: ErrorBudget, limit: float) -> str:
-        found = _outcome(budget, limit)
-        return found if is_certain or found != PASS else NOT_SHOWN
+        if not limit > 0:
+            return ''
+        # Where stage and model are inseparable, the model part may be an error of the stage.
+        certain = budget.calibration if budget.separable else budget.coefficients
+        passes = is_certain and budget.calibration_high <= limit
+        return FAIL if certain > limit else PASS if passes else NOT_SHOWN
 
     datasheet, noise = nonlinearity_mps2(sensor) ** 2, held_out.sample_noise_mps2(sensor) ** 2
     accel, tilt = budgets
     return Assessment(model, accel, tilt, outcome(accel, datasheet), outcome(accel, noise),
                       outcome(tilt, datasheet * tilt.tilt_per_axis),
                       outcome(tilt, noise * tilt.tilt_per_axis))
-
-
-def _outcome(budget: ErrorBudget, limit: float) -> str:
-    """Compare the error of a calibration with a limit, both mean squares."""
-    if not limit > 0:
-        return ''
-    # Where stage and model are inseparable, the model part may be an error of the stage.
-    certain_error = budget.calibration if budget.separable else budget.coefficients
-    if certain_error > limit:
-        return FAIL
-    return PASS if budget.calibration_high <= limit else NOT_SHOWN
 
 
 def gravity_error_budgets(fit: GravityFit, fitted: Sensor, force: np.ndarray, kept: np.ndarray
@@ -193,9 +174,11 @@ def held_out_lines(models: Sequence[HeldOutErrors], inliers: int) -> list[str]:
 
 def screen_table(models: Sequence[HeldOutErrors]) -> list[str]:
     """Lay out the errors of the models on held-out poses for people; the last one is saved."""
+    # Padded so that the decimal points stand in one line.
     lines = [f' {"":24}tilt error     acceleration error     (rms)']
-    lines += [f' {_MODELS[errors.model]:22} {_three_digits(errors.tilt_deg.rms):>9} ° '
-              f'{_three_digits(errors.accel_mg.rms):>18} mg' for errors in models]
+    lines += [f' {_MODELS[errors.model]:22} {tilt:>9} ° {accel:>18} mg' for errors in models
+              for tilt, accel in [['-   ' if np.isnan(value) else digits(value).ljust(
+                  len(f'{value:.3f}')) for value in (errors.tilt_deg.rms, errors.accel_mg.rms)]]]
     lines[-1] += '           <- saved'
     return lines
 
@@ -205,12 +188,10 @@ _MODELS = {'nominal': 'datasheet values', 'linear': 'linear calibration',
 """Models in words."""
 
 
-def _three_digits(value: float) -> str:
-    """Write a value so that the decimal points of a right-aligned column stand in one line."""
-    if np.isnan(value):
-        return '-   '
+def digits(value: float) -> str:
+    """Write a positive value with three digits at most, without an exponent."""
     decimals = 1 if value >= 10 else 2 if value >= 1 else 3
-    return f'{value:.{decimals}f}'.ljust(len(f'{value:.3f}'))
+    return f'{value:.{decimals}f}' if value >= 5e-4 else '< 0.001'
 
 
 def limit_table(assessment: Assessment, sensor: Sensor) -> list[str]:
@@ -231,19 +212,14 @@ def limit_table(assessment: Assessment, sensor: Sensor) -> list[str]:
 
 
 def gravity_lines(fit: GravityFit, time_s: np.ndarray) -> list[str]:
-    """
-    State the errors of a calibration against gravity, before and after, and its outliers.
-
-    time_s: beginning of each rest, s, (k,).
-    """
+    """State the errors against gravity of rests that begin at times, (k,), and the outliers."""
     kept = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
-    before, after, unseen = (rms_mg(np.mean(values[kept] ** 2)) for values in (
+    before, after, unseen = (held_out.statistic(1e3 * values[kept] / G0_MPS2) for values in (
         fit.before_mps2, fit.residual_mps2, fit.held_out_mps2))
-    held_out_mg = fit.held_out_mps2[kept] / G0_MPS2 * 1e3
-    low, high = held_out.rms_interval(held_out_mg)
-    lines = [f'magnitude of gravity over {len(kept)} rests, rms in mg: nominal {before:.2f}, '
-             f'nine parameters {after:.3f}, held-out stretches of time {unseen:.3f} ({low:.3f} '
-             f'to {high:.3f}), {np.abs(held_out_mg).max():.3f} max']
+    low, high = unseen.interval
+    lines = [f'magnitude of gravity over {len(kept)} rests, rms in mg: nominal {before.rms:.2f}, '
+             f'nine parameters {after.rms:.3f}, held-out stretches of time {unseen.rms:.3f} '
+             f'({low:.3f} to {high:.3f}), {unseen.largest:.3f} max']
     if fit.outliers:
         rests = ', '.join(f'{i + 1} (from {time_s[i]:.1f} s)' for i in fit.outliers)
         lines.append(f'outliers, left out: rest {rests}')
@@ -257,20 +233,18 @@ def provenance_entries(assessment: Assessment | None, models: Sequence[HeldOutEr
         return {}
     numbers: dict[str, float] = {'own_accel_mg': assessment.error_mg,
                                  'own_tilt_deg': assessment.error_deg}
-    for errors in models:
-        if errors.model == assessment.model:
-            numbers |= {'held_out_poses': errors.pose_count,
-                        'held_out_tilt_rms_deg': errors.tilt_deg.rms,
-                        'held_out_tilt_max_deg': errors.tilt_deg.largest,
-                        'held_out_accel_rms_mg': errors.accel_mg.rms,
-                        'held_out_accel_max_mg': errors.accel_mg.largest}
-    outcomes = {'verdict_datasheet': assessment.accel_datasheet,
-                'verdict_noise': assessment.accel_noise,
-                'verdict_tilt_datasheet': assessment.tilt_datasheet,
-                'verdict_tilt_noise': assessment.tilt_noise}
-    return {**{key: f'{value:.4g}' for key, value in numbers.items() if np.isfinite(value)},
-            **{key: outcome for key, outcome in outcomes.items() if outcome},
-            'limited_by': assessment.limited_by}
+    for errors in models[-1:]:
+        numbers |= {'held_out_poses': errors.pose_count,
+                    'held_out_tilt_rms_deg': errors.tilt_deg.rms,
+                    'held_out_tilt_max_deg': errors.tilt_deg.largest,
+                    'held_out_accel_rms_mg': errors.accel_mg.rms,
+                    'held_out_accel_max_mg': errors.accel_mg.largest}
+    entries = {**{key: f'{value:.4g}' for key, value in numbers.items() if np.isfinite(value)},
+               'verdict_datasheet': assessment.accel_datasheet,
+               'verdict_noise': assessment.accel_noise,
+               'verdict_tilt_datasheet': assessment.tilt_datasheet,
+               'verdict_tilt_noise': assessment.tilt_noise, 'limited_by': assessment.limited_by}
+    return {key: entry for key, entry in entries.items() if entry}
 
 
 def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
@@ -288,7 +262,8 @@ def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
         allows = 'the noise of one sample is'
     limit = f'{_two_digits(1e3 * limit_mps2 / G0_MPS2)} mg'
     accel = provenance.get(f'verdict_{kind}', '')
-    outcome = _worse(accel, provenance.get(f'verdict_tilt_{kind}', '')) or PASS
+    outcomes = accel, provenance.get(f'verdict_tilt_{kind}')
+    outcome = next((word for word in (FAIL, NOT_SHOWN) if word in outcomes), PASS)
     lines = [f'calibration error {_two_digits(float(provenance["own_accel_mg"]))} mg; {allows} '
              f'{limit}']
     if outcome == FAIL:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The uncertainty of the acceleration at a stated pose, as the GUM asks for it (JCGM 100).
+The uncertainty of the acceleration at a stated pose (GUM, JCGM 100), and a certificate of it.
 
 Squares of contributions add. Those of noise, coefficients, stage and model are the parts of
-`held_out.ErrorBudget`, here pose by pose. A Digital Calibration Certificate carries it.
+`held_out.ErrorBudget`, here pose by pose.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.sensor import MARGIN_K, Sensor
 from adxl_ros.report.quantities import number
 import numpy as np
-import scipy
 import yaml
 
 K = 2
@@ -40,18 +39,12 @@ _LOCAL_STD_MPS2 = 5e-4
 """Uncertainty of a stated local gravity, m/s². Chosen: 50 mGal, the size of gravity anomalies."""
 _NOT_LOCAL_MPS2 = (G0_MPS2, 9.8, 9.81)
 """Values of gravity that are those of no place in particular, m/s²."""
-_UNIFORM = np.sqrt(3)
-"""Half-width of a uniform distribution divided by its standard deviation."""
+_UNIFORM = np.sqrt(3)  # Half-width of a uniform distribution divided by its standard deviation
 _SURROUNDINGS = {'temperature': ('temperature_c', 'temperature_std_k', 'K', MARGIN_K, 0.1),
                  'supply': ('supply_v', 'supply_std_v', 'V', 0.0, 1e-3)}
 """Field of a pose, key of `STATED`, unit, margin of the range, and step of central differences."""
 STATED = ('gravity_std_mps2', 'temperature_std_k', 'supply_std_v')
 """Inputs whose standard uncertainty a laboratory may state."""
-_MANY = 1000
-"""Degrees of freedom from which they count as infinite; chosen."""
-_HEAVIEST_TAIL = 1.5365
-"""Square of a ratio from which no sum of squares of normal errors exceeds its mean more often than
-the square of one normal error does (Székely and Bakirov 2003)."""
 MODEL = (
     'a = F(V; θ, T, U)·(1 + δg/g) − g·(∂u/∂α·δα + ∂u/∂β·δβ) + δm. The measurand a is the '
     'acceleration along an axis of the case at the stated pose α, β. F inverts the calibrated '
@@ -66,9 +59,9 @@ MEANING = (
 RULE = (
     f'{PASS} if error + guard band is at most the limit; {FAIL} if the error exceeds it; '
     f'{NOT_SHOWN} in between, and where stage and model are inseparable. The guard band reaches '
-    'to the upper end of the 90 % interval. The risk is '
-    'the largest probability that a unit with such an error exceeds the limit. The error is that '
-    'of coefficients and model; the other inputs belong to each use.')
+    'to the upper end of the 90 % interval, so that the risk of a false '
+    f'{PASS} is at most 5 %. The error is that of coefficients and model; the other inputs belong '
+    'to each use.')
 """The decision rule (ISO/IEC 17025, 7.8.6)."""
 
 
@@ -76,31 +69,22 @@ RULE = (
 class Input:
     """An input quantity, and what it contributes to the acceleration at k poses of m axes."""
 
-    name: str  # The quantity
+    name: str
     kind: str  # Evaluation, A or B, and distribution or source
     std: Any  # Standard uncertainty, (k, m) or one for all
     unit: str  # Unit of `std`
-    freedom: float  # Degrees of freedom
-    contribution_mps2: np.ndarray  # Standard uncertainty of the acceleration, (k, m)
+    contribution_mps2: np.ndarray  # To the standard uncertainty of the acceleration, (k, m)
 
 
 class Decision(NamedTuple):
-    """A comparison of the calibration error with its limit, in one unit."""
+    """A comparison of the rms error of a calibration with its limit."""
 
     quantity: str  # acceleration or tilt
     unit: str  # mg or °
-    error: float  # Error of the calibration, rms over the poses
-    guard_band: float  # From there to the upper end of its 90 % interval
+    error: float
+    guard_band: float  # From the error to the upper end of its 90 % interval
     limit: float
-    outcome: str  # PASS, FAIL or NOT SHOWN
-
-    @property
-    def risk(self) -> float:
-        """Return the largest probability that the error of such a unit exceeds the limit."""
-        square = (self.limit / (self.error + self.guard_band)) ** 2
-        if square < 1:
-            return 1.0
-        return float(scipy.special.chdtrc(1, square)) if square >= _HEAVIEST_TAIL else 0.5
+    outcome: str
 
 
 @dataclass(frozen=True)
@@ -108,13 +92,10 @@ class Uncertainty:
     """The uncertainty at k held-out poses of a calibration of m axes."""
 
     axes: str
-    # alpha_rad, beta_rad: The stated poses, (k,)
-    alpha_rad: np.ndarray
-    beta_rad: np.ndarray
-    # reference_mps2, error_mps2: Acceleration by stage and gravity, and the measured one minus
-    # that, (k, m)
-    reference_mps2: np.ndarray
-    error_mps2: np.ndarray
+    alpha_rad: np.ndarray  # (k,)
+    beta_rad: np.ndarray  # (k,)
+    reference_mps2: np.ndarray  # Acceleration by stage and gravity, (k, m)
+    error_mps2: np.ndarray  # Measured acceleration minus that, (k, m)
     inputs: tuple[Input, ...]
     limit_name: str  # Where the limits of the decisions come from
     decisions: tuple[Decision, ...]
@@ -129,17 +110,6 @@ class Uncertainty:
         """Return pose and axis of the largest combined uncertainty."""
         return divmod(int(np.argmax(self.combined_mps2)), self.error_mps2.shape[1])
 
-    @property
-    def freedom(self) -> float:
-        """Return the effective degrees of freedom there, by Welch and Satterthwaite."""
-        total = sum(row.contribution_mps2[self.worst] ** 4 / row.freedom for row in self.inputs)
-        return float(self.combined_mps2[self.worst] ** 4 / total) if total else float('inf')
-
-    @property
-    def coverage(self) -> float:
-        """Return the probability of ±`K` standard uncertainties by Student's t."""
-        return float(2 * scipy.special.stdtr(min(self.freedom, 1e9), K) - 1)
-
 
 def uncertainty(result: CalibrationResult, stated: Mapping[str, Any] | None = None
                 ) -> Uncertainty | None:
@@ -149,10 +119,9 @@ def uncertainty(result: CalibrationResult, stated: Mapping[str, Any] | None = No
     stated: standard uncertainties that the laboratory states, by the names of `STATED`.
     """
     fitted, stated = result.fitted, stated or {}
-    errors = next((row for row in result.held_out if row.model == fitted.model), None)
-    assessment = next((row for row in result.assessments if row.model == fitted.model), None)
-    if errors is None or assessment is None or not np.isfinite(assessment.accel.measured):
+    if not result.held_out or not np.isfinite(result.assessments[-1].accel.measured):
         return None
+    errors, assessment = result.held_out[-1], result.assessments[-1]
     gravity, axes = fitted.local_gravity_mps2, [AXES.index(axis) for axis in fitted.axes]
     poses = result.poses.subset(result.inliers)
     held, used = poses.subset(errors.pose_index), held_out.determining_alpha(errors.errors)
@@ -162,7 +131,6 @@ def uncertainty(result: CalibrationResult, stated: Mapping[str, Any] | None = No
         for covariance in held_out.covariances(errors, held, force))
     held, reference = held.subset(used), force[used][:, axes]
     error, budget = errors.errors.accel_mps2[used], assessment.accel
-    nu = held_out.degrees_of_freedom(error)
     model = np.full(error.shape, np.sqrt(budget.model))
     # The poses may scatter more than the step of the encoder permits.
     stage_mps2, stage_kind = by_stage, 'B, uniform within a step'
@@ -176,16 +144,13 @@ def uncertainty(result: CalibrationResult, stated: Mapping[str, Any] | None = No
         gravity_std, gravity_kind = stated['gravity_std_mps2'], 'B, stated'
     elif gravity in _NOT_LOCAL_MPS2:
         gravity_std, gravity_kind = _EARTH_HALF_RANGE_MPS2 / _UNIFORM, 'B, not local: anywhere'
-    fit_freedom = error.shape[1] * int((~poses.check).sum()) - len(fitted.covariance_names)
     inputs = (
-        Input('noise of the mean', 'A, normal', 1e3 * np.mean(held.std_v, axis=0), 'mV',
-              np.inf, by_noise),
+        Input('noise of the mean', 'A, normal', 1e3 * np.mean(held.std_v, axis=0), 'mV', by_noise),
         Input('coefficients', 'A, covariance of the fit', 1e3 * by_coefficients / G0_MPS2, 'mg',
-              max(fit_freedom, 1), by_coefficients),
-        Input('stage angles', stage_kind, np.degrees(stage_rad), '°',
-              np.inf if stage_mps2 is by_stage else nu, stage_mps2),
-        Input('model', 'A, held-out errors', 1e3 * model / G0_MPS2, 'mg', nu, model),
-        Input('local gravity', gravity_kind, gravity_std, 'm/s²', np.inf,
+              by_coefficients),
+        Input('stage angles', stage_kind, np.degrees(stage_rad), '°', stage_mps2),
+        Input('model', 'A, held-out errors', 1e3 * model / G0_MPS2, 'mg', model),
+        Input('local gravity', gravity_kind, gravity_std, 'm/s²',
               np.abs(reference) / gravity * gravity_std),
         *(_surroundings(name, fitted, held, reference, stated) for name in _SURROUNDINGS))
     limit_name, decisions = _decisions(assessment, fitted)
@@ -200,15 +165,15 @@ def _decisions(assessment: Assessment, fitted: Sensor) -> tuple[str, tuple[Decis
     if not limit_mps2:
         limit_mps2, name = held_out.sample_noise_mps2(fitted), 'noise of one sample'
         outcomes = assessment.accel_noise, assessment.tilt_noise
-    accel, tilt = assessment.accel, assessment.tilt
-    figures = (('acceleration', 'mg', 1e3 / G0_MPS2, accel, limit_mps2),
-               ('tilt', '°', float(np.degrees(1.0)), tilt, limit_mps2 * tilt.tilt_per_axis ** 0.5))
-    decisions = []
-    for (quantity, unit, scale, part, limit), outcome in zip(figures, outcomes):
-        if outcome:
-            error, high = scale * part.calibration ** 0.5, scale * part.calibration_high ** 0.5
-            decisions.append(Decision(quantity, unit, error, high - error, scale * limit, outcome))
-    return name, tuple(decisions)
+    tilt_limit_rad = limit_mps2 * assessment.tilt.tilt_per_axis ** 0.5
+    return name, tuple(
+        Decision(quantity, unit, scale * part.calibration ** 0.5,
+                 scale * (part.calibration_high ** 0.5 - part.calibration ** 0.5), scale * limit,
+                 outcome)
+        for quantity, unit, scale, part, limit, outcome in (
+            ('acceleration', 'mg', 1e3 / G0_MPS2, assessment.accel, limit_mps2, outcomes[0]),
+            ('tilt', '°', float(np.degrees(1.0)), assessment.tilt, tilt_limit_rad, outcomes[1]))
+        if outcome)
 
 
 def _surroundings(name: str, fitted: Sensor, held: Poses, reference: np.ndarray,
@@ -230,7 +195,7 @@ def _surroundings(name: str, fitted: Sensor, held: Poses, reference: np.ndarray,
         # What the model does not follow drifts as the datasheet states.
         slope = np.sqrt(slope ** 2 + (G0_MPS2 * fitted.envelope.zero_g_per_k) ** 2
                         + (reference * fitted.envelope.scale_per_k) ** 2)
-    return Input(name, 'B, stated' if key in stated else kind, std, unit, np.inf,
+    return Input(name, 'B, stated' if key in stated else kind, std, unit,
                  np.abs(np.nan_to_num(slope)) * std)
 
 
@@ -243,12 +208,8 @@ def budget_rows(found: Uncertainty) -> list[list[str]]:
         sensitivity = '1' if row.unit == 'mg' else \
             f'{number(part_mg / std if std else 0.0, digits=2)} mg per {row.unit}'
         rows.append([row.name, f'{number(std, digits=2)} {row.unit} ({row.kind})', sensitivity,
-                     f'{part_mg:.3f}', _freedom(row.freedom)])
+                     f'{part_mg:.3f}'])
     return rows
-
-
-def _freedom(value: float) -> str:
-    return f'{value:.0f}' if value < _MANY else '∞'
 
 
 def section(found: Uncertainty | None) -> dict[str, Any] | None:
@@ -262,36 +223,28 @@ def section(found: Uncertainty | None) -> dict[str, Any] | None:
         row.quantity, f'{row.error:.3f} + {row.guard_band:.3f} = '
         f'{row.error + row.guard_band:.3f} {row.unit}',
         f'{number(row.limit, digits=2)} {row.unit}',
-        row.outcome, f'{100 * row.risk:.1f} %' if row.risk >= 1e-3 else '< 0.1 %']
-        for row in found.decisions]
+        row.outcome] for row in found.decisions]
     return {
         'model': MODEL, 'meaning': MEANING, 'rule': RULE, 'limit_name': found.limit_name,
         'pose': f'alpha {alpha:.1f}°, beta {beta:.1f}°, axis {found.axes[axis]}',
         'budget': budget_rows(found), 'decisions': decisions,
         'combined': f'{expanded_mg[pose, axis] / K:.3f} mg',
         'expanded': f'{expanded_mg[pose, axis]:.2f} mg',
-        'freedom': _freedom(found.freedom), 'coverage': f'{100 * found.coverage:.1f} %',
         'range': f'{expanded_mg.min():.2f} to {expanded_mg.max():.2f} mg',
         'inside': f'{int(inside.sum())} of {inside.size}'}
 
 
 SCHEMA_VERSION = '3.2.0'
-"""Version of the schema."""
-NAMESPACES = {'dcc': 'https://ptb.de/dcc', 'si': 'https://ptb.de/si'}
-"""Name spaces of the elements."""
 NOT_STATED = 'not stated'
-"""What stands where the laboratory states nothing."""
-PLACES = ('laboratory', 'customer', 'laboratoryBranch', 'customerBranch', 'other')
-"""Places of a calibration that the schema knows."""
 _LABORATORY = {
     **{f'{who}_{what}': NOT_STATED for who in ('laboratory', 'customer')
        for what in ('name', 'email', 'city')},
     'laboratory_country': 'ZZ', 'customer_country': 'ZZ', 'place': 'other',
     'responsible': NOT_STATED, 'manufacturer': NOT_STATED, 'stage': NOT_STATED, 'identifier': ''}
 """Texts of a laboratory's file, and what stands for those that are missing; ZZ is no country."""
-_FORMS = {'country': ('[A-Z]{2}', 'code of two capitals such as DE'),
-          'place': ('|'.join(PLACES), f'place such as {", ".join(PLACES)}')}
-"""Pattern of a laboratory's texts, and its name in a message, by the end of their keys."""
+_PATTERNS = {'laboratory_country': '[A-Z]{2}', 'customer_country': '[A-Z]{2}',
+             'place': 'laboratory|customer|laboratoryBranch|customerBranch|other'}
+"""What the schema asks of texts."""
 _UNITS = {'V': 'volt', 'rad': 'radian', '°': 'degree', 'K': 'kelvin', 's': 'second', 'm': 'metre'}
 """Units of D-SI; all others count as 1."""
 _ACCELERATION = r'\metre\second\tothe{-2}'
@@ -302,18 +255,17 @@ def read_laboratory(path: str | os.PathLike | None) -> dict[str, Any]:
     node = compose(path) if path is not None else None
     given = yaml.constructor.SafeConstructor().construct_document(node) if node else {}
     known = (*_LABORATORY, *STATED)
-    unknown = [str(name) for name in given if name not in known] if isinstance(given, dict) else \
-        ['no mapping']
-    if unknown:
-        raise UserError(f'{path}: found {", ".join(unknown)}; expected a mapping with some of '
-                        f'{", ".join(known)}')
+    if not isinstance(given, dict) or not set(given) <= set(known):
+        raise UserError(f'{path}: found {", ".join(map(str, given))}; expected a mapping with '
+                        f'some of {", ".join(known)}')
     for name, value in given.items():
-        pattern, form = next((rule for end, rule in _FORMS.items() if name.endswith(end)),
-                             (r'.*\S.*', 'text'))
+        form = 'number such as 1.0e-5' if name in STATED else 'text'
         is_right = isinstance(value, (int, float)) and 0 <= value < math.inf \
-            if name in STATED else isinstance(value, str) and re.fullmatch(pattern, value, re.S)
+            if name in STATED else isinstance(value, str) and value.strip()
+        if is_right and name in _PATTERNS:
+            form = _PATTERNS[name]
+            is_right = bool(re.fullmatch(form, value))
         if not is_right:
-            form = 'number such as 1.0e-5' if name in STATED else form
             raise UserError(f'{path}: {name}: {value!r} is no {form}')
     return {**_LABORATORY, **given}
 
@@ -356,29 +308,26 @@ def write(path: str | os.PathLike, result: CalibrationResult, laboratory: dict[s
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     fitted = result.fitted
     write_text(path, environment.get_template('certificate.xml').render(
-        namespaces=NAMESPACES, schema_version=SCHEMA_VERSION, not_stated=NOT_STATED, k=K,
-        rule=RULE, method=f'{MEANING} {MODEL}', fitted=fitted,
-        provenance=fitted.provenance, step_deg=np.degrees(fitted.stage_resolution_rad),
+        schema_version=SCHEMA_VERSION, not_stated=NOT_STATED, k=K, rule=RULE,
+        method=f'{MEANING} {MODEL}', fitted=fitted, provenance=fitted.provenance,
+        step_deg=np.degrees(fitted.stage_resolution_rad),
         laboratory={name: ' '.join(str(words).split()) for name, words in laboratory.items()},
-        decisions=[_decision(found, row) for row in found.decisions], **_results(fitted, found)))
-
-
-def _decision(found: Uncertainty, row: Decision) -> dict[str, Any]:
-    """State a decision, with the figures that it follows from."""
-    word = {PASS: 'pass', FAIL: 'fail'}.get(
-        row.outcome, 'conditionalPass' if row.error <= row.limit else 'conditionalFail')
-    unit, factor = (_ACCELERATION, 1e-3 * G0_MPS2) if row.unit == 'mg' else (r'\degree', 1.0)
-    figures = (('error of the calibration', row.error, 'basic_measuredValue'),
-               ('guard band', row.guard_band, ''),
-               (f'limit by the {found.limit_name}', row.limit, 'basic_acceptanceLimitUpper'))
-    return {'quantity': row.quantity, 'outcome': row.outcome, 'conformity': word,
-            'figures': [_quantity(name, factor * value, unit, kind=kind)
-                        for name, value, kind in figures]}
+        **_results(fitted, found)))
 
 
 def _results(fitted: Sensor, found: Uncertainty) -> dict[str, list[Any]]:
-    """Return errors, coefficients, budget and conditions as quantities."""
+    """Return decisions, errors, coefficients, budget and conditions as quantities."""
     worst, axis = found.worst
+    decisions = [
+        {'quantity': row.quantity, 'outcome': row.outcome,
+         'conformity': {PASS: 'pass', FAIL: 'fail'}.get(
+             row.outcome, 'conditionalPass' if row.error <= row.limit else 'conditionalFail'),
+         'figures': [_quantity(name, factor * value, unit, kind=kind) for name, value, kind in (
+             ('error of the calibration', row.error, 'basic_measuredValue'),
+             ('guard band', row.guard_band, ''),
+             (f'limit by the {found.limit_name}', row.limit, 'basic_acceptanceLimitUpper'))]}
+        for row in found.decisions for unit, factor in [
+            (_ACCELERATION, 1e-3 * G0_MPS2) if row.unit == 'mg' else (r'\degree', 1.0)]]
     errors = [
         [_quantity('alpha', np.degrees(found.alpha_rad), r'\degree'),
          _quantity('beta', np.degrees(found.beta_rad), r'\degree'),
@@ -394,11 +343,10 @@ def _results(fitted: Sensor, found: Uncertainty) -> dict[str, list[Any]]:
                               factor * row.half_width / Z_90, row.name)
                     for row in compare(fitted, fitted) for unit, factor in [si_unit(row.unit)]]
     budget = [_quantity(cells[0], row.contribution_mps2[worst, axis], _ACCELERATION, None,
-                        f'standard uncertainty {cells[1]}, sensitivity {cells[2]}, degrees of '
-                        f'freedom {cells[4]}')
+                        f'standard uncertainty {cells[1]}, sensitivity {cells[2]}')
               for cells, row in zip(budget_rows(found), found.inputs)]
     conditions = [_quantity('local gravity', fitted.local_gravity_mps2, _ACCELERATION)]
     conditions += [_quantity(f'{name} temperature', value + 273.15, r'\kelvin') for name, value in
                    zip(('lowest', 'highest'), fitted.envelope.temperature_c or ())]
-    return {'errors': errors, 'coefficients': coefficients, 'budget': budget,
-            'conditions': conditions}
+    return {'decisions': decisions, 'errors': errors, 'coefficients': coefficients,
+            'budget': budget, 'conditions': conditions}

@@ -41,8 +41,7 @@ import scipy
 Fit = Callable[[Sensor, Poses], Sensor]
 """A function that fits a nominal sensor to poses and returns the fitted unit."""
 
-_FOLDS = 5
-"""Number of folds where no pose is marked as a check pose; chosen: the usual number."""
+_FOLDS = 5  # Number of folds where no pose is marked as a check pose; chosen: the usual number
 _MAX_ANGLE_STD_RAD = np.radians(1.0)
 """Largest standard deviation of an angle, rad, at which its error counts.
 
@@ -54,23 +53,20 @@ Chosen: it leaves out poses near ±90°, which determine alpha poorly without z.
 class PoseErrors:
     """Errors of a calibrated sensor, measured minus reference, pose by pose."""
 
-    # alpha_rad, beta_rad: Errors of the angles, rad, (k,). NaN where the pose does not determine
-    # the angle.
+    # Errors of the angles, (k,); NaN where the pose does not determine them
     alpha_rad: np.ndarray
     beta_rad: np.ndarray
-    accel_mps2: np.ndarray  # Errors along the measured axes, m/s², (k, m)
-    # Angle between the measured and the reference vertical, rad, (k,). NaN where the pose does not
-    # determine alpha.
-    tilt_rad: np.ndarray
-    force_mps2: np.ndarray  # The measured specific force, m/s², (k, 3)
+    accel_mps2: np.ndarray  # Along the measured axes, (k, m)
+    tilt_rad: np.ndarray  # Angle between measured and reference vertical, (k,)
+    force_mps2: np.ndarray  # The measured specific force, (k, 3)
 
 
 @dataclass(frozen=True)
 class ErrorStatistic:
     """Size of one kind of error over all poses; NaN where no pose shows it."""
 
-    rms: float  # Root mean square
-    largest: float  # Largest magnitude
+    rms: float
+    largest: float  # Magnitude
     interval: tuple[float, float]  # 90 % interval of the rms
 
 
@@ -78,12 +74,11 @@ class ErrorStatistic:
 class HeldOutErrors:
     """Errors of one model over held-out poses."""
 
-    model: str  # Name of the model
-    # tilt_deg, alpha_deg, beta_deg: Errors of the angles, degrees
+    model: str
     tilt_deg: ErrorStatistic
     alpha_deg: ErrorStatistic
     beta_deg: ErrorStatistic
-    accel_mg: ErrorStatistic  # Error of acceleration over the measured axes, mg
+    accel_mg: ErrorStatistic  # Over the measured axes
     errors: PoseErrors  # The errors of all held-out poses
     pose_index: np.ndarray  # Index of each held-out pose among all poses, (k,)
     fitted: tuple[Sensor, ...]  # The fitted sensor of each fold
@@ -129,28 +124,19 @@ def pose_errors(sensor: Sensor, poses: Poses, stage: Sensor | None = None) -> Po
 
 
 def angle_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """
-    Return the angles between pairs of vectors.
-
-    first, second: the vectors, of any length, (k, 3); returns: angles from 0 to π, rad, (k,).
-    """
+    """Return the angles between pairs of vectors, (k, 3), of any length: 0 to π, (k,)."""
     across = np.linalg.norm(np.cross(first, second), axis=1)
     return np.arctan2(across, np.sum(first * second, axis=1))
 
 
 def summarise(model: str, errors: PoseErrors, pose_index: np.ndarray | None = None,
               fitted: Sequence[Sensor] = (), fold: np.ndarray | None = None) -> HeldOutErrors:
-    """
-    Summarise the errors of one model over held-out poses.
-
-    pose_index: index of each pose among all poses, (k,); None is 0 to k − 1; fold: index in
-    `fitted` of the sensor of each pose, (k,); None is 0 for all.
-    """
+    """Summarise the errors of one model; the arrays as in `HeldOutErrors`, None for one fold."""
     count = len(errors.accel_mps2)
     accel_mg = errors.accel_mps2[determining_alpha(errors)] / G0_MPS2 * 1e3
     return HeldOutErrors(
-        model, _statistic(np.degrees(errors.tilt_rad)), _statistic(np.degrees(errors.alpha_rad)),
-        _statistic(np.degrees(errors.beta_rad)), _statistic(accel_mg),
+        model, statistic(np.degrees(errors.tilt_rad)), statistic(np.degrees(errors.alpha_rad)),
+        statistic(np.degrees(errors.beta_rad)), statistic(accel_mg),
         errors, np.arange(count) if pose_index is None else pose_index, tuple(fitted),
         np.zeros(count, int) if fold is None else fold)
 
@@ -165,15 +151,14 @@ def determining_alpha(errors: PoseErrors) -> np.ndarray:
     return has_tilt if has_tilt.any() else np.isfinite(errors.accel_mps2).all(axis=1)
 
 
-def _statistic(values: np.ndarray) -> ErrorStatistic:
-    sizes = np.abs(values[np.isfinite(values)])
-    return ErrorStatistic(_rms(values), float(sizes.max()) if sizes.size else float('nan'),
-                          rms_interval(values))
-
-
-def _rms(values: np.ndarray) -> float:
-    finite = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(finite ** 2))) if finite.size else float('nan')
+def statistic(values: np.ndarray) -> ErrorStatistic:
+    """Return the size of errors, (k,) or (k, m), in the order of the visit."""
+    sizes, nu = np.abs(values[np.isfinite(values)]), degrees_of_freedom(values)
+    if not sizes.size:
+        return ErrorStatistic(np.nan, np.nan, (np.nan, np.nan))
+    rms = float(np.sqrt(np.mean(sizes ** 2)))
+    low, high = (rms * float(np.sqrt(nu / scipy.special.chdtri(nu, p))) for p in (0.05, 0.95))
+    return ErrorStatistic(rms, float(sizes.max()), (low, high))
 
 
 def degrees_of_freedom(values: np.ndarray) -> float:
@@ -205,14 +190,6 @@ def degrees_of_freedom(values: np.ndarray) -> float:
         inflation += 2 * (1 - k / count) * correlation
     freedom = 2 * mean ** 2 / (variance / (count - 1) * inflation)
     return float(np.clip(freedom, 1.0, table.size))
-
-
-def rms_interval(values: np.ndarray) -> tuple[float, float]:
-    """Return the 90 % interval of the rms of correlated errors; see `degrees_of_freedom`."""
-    with np.errstate(invalid='ignore'):
-        rms, nu = _rms(values), degrees_of_freedom(values)
-    low, high = (rms * float(np.sqrt(nu / scipy.special.chdtri(nu, p))) for p in (0.05, 0.95))
-    return low, high
 
 
 def cross_validate(fits: dict[str, Fit], sensor: Sensor, poses: Poses,
@@ -250,23 +227,18 @@ def cross_validate(fits: dict[str, Fit], sensor: Sensor, poses: Poses,
 
 _SAME_POSE_RAD = np.radians(0.5)
 """Largest distance of the joint angles of two visits of the same pose, rad; chosen."""
-_MIN_PAIRS = 6
-"""Smallest number of pairs of visits that show the scatter between visits; chosen."""
+_MIN_PAIRS = 6  # Smallest number of pairs of visits that show the scatter between visits; chosen
 _PROBE_MPS2 = 1e-3 * G0_MPS2
 """Error of each axis, m/s², for which the resulting tilt error is computed: 1 mg."""
-_CHANCE = 0.01
-"""Probability of a model part by chance, if the errors have none; chosen."""
-_UPPER_QUANTILE = 0.95
-"""Probability of the upper end of a 90 % interval."""
+_CHANCE = 0.01  # Probability of a model part by chance, if the errors have none; chosen
+_UPPER_QUANTILE = 0.95  # Probability of the upper end of a 90 % interval
 
 
 @dataclass(frozen=True)
 class ErrorBudget:
     """Parts of a mean square of errors: (m/s²)² per axis for acceleration, rad² for tilt."""
 
-    # Mean square of the held-out errors. By chance it differs from the sum of the parts.
-    measured: float
-    # noise, stage, coefficients, model: The parts, as the module describes them
+    measured: float  # By chance it differs from the sum of the parts
     noise: float
     stage: float
     coefficients: float
@@ -300,16 +272,14 @@ class ErrorBudget:
         return parts[int(np.argmax([getattr(self, part) for part in parts]))]
 
 
-_NAN = float('nan')
-_NO_BUDGET = ErrorBudget(_NAN, _NAN, _NAN, _NAN, _NAN, _NAN)
-"""Budget of a quantity that no pose shows."""
+_NO_BUDGET = ErrorBudget(*(float('nan'),) * 6)  # Budget of a quantity that no pose shows
 
 
 class ErrorBudgets(NamedTuple):
     """The error budgets of one model."""
 
-    accel: ErrorBudget  # Budget of acceleration, (m/s²)² per axis
-    tilt: ErrorBudget  # Budget of tilt, rad²
+    accel: ErrorBudget  # (m/s²)² per axis
+    tilt: ErrorBudget  # rad²
 
 
 def error_budgets(errors: HeldOutErrors, poses: Poses, stage: Sensor | None = None

@@ -18,8 +18,8 @@ from typing import Any
 from adxl_ros.calibrate.fits import linear
 from adxl_ros.calibrate.poses import planes, Poses, reference_force
 from adxl_ros.calibrate.report import acceptance, gum, held_out
-from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
-from adxl_ros.calibrate.result import CalibrationResult, compare, DriftHistory, rounded
+from adxl_ros.calibrate.report.acceptance import Assessment, digits, FAIL, NOT_SHOWN, PASS
+from adxl_ros.calibrate.result import CalibrationResult, compare, history, rounded
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.atomic_write import write_bytes, write_text
@@ -32,10 +32,7 @@ import numpy as np
 
 FILES = ('report.html', 'calibration.png')
 """Files of a report."""
-_PANELS = ((0, 1), (2, 3), (4, 5))
-"""Panels of `_sweep` that stand side by side on the page."""
-_COLOURS = {PASS: 'green', NOT_SHOWN: 'amber', FAIL: 'red'}
-"""Colour of the badge by outcome."""
+_COLOURS = {PASS: 'green', NOT_SHOWN: 'amber', FAIL: 'red'}  # Colour of the badge by outcome
 _PART_COLOURS = {'noise': '#7b8794', 'stage': '#d9930d', 'coefficients': '#1f5fbf',
                  'model': '#c0392b'}
 """Colours of the parts of the error budget."""
@@ -81,20 +78,27 @@ def page(result: CalibrationResult, past: Sequence[Sensor],
     fitted = result.fitted
     errors_of = {errors.model: errors for errors in result.held_out}
     row_of = {row.model: row for row in result.assessments}
-    errors, assessment = errors_of.get(fitted.model), row_of.get(fitted.model)
-    history, rows = DriftHistory.from_store(fitted, past), _coefficients(fitted)
+    errors = result.held_out[-1] if result.held_out else None
+    assessment = result.assessments[-1] if result.assessments else None
+    rows = _coefficients(fitted)
     drawn: dict[str, Figure] = {}
     to_mg = 1e3 / G0_MPS2
     if (fit := result.gravity_fit) is not None:
         drawn['errors'] = _error_figure(
             result.inliers, to_mg * fit.held_out_mps2[:, None], Z_90 * to_mg * fit.expected_mps2,
             'x', 'rest', 'magnitude minus gravity, mg')
-    elif assessment is not None and errors is not None:
+    elif errors is not None and assessment is not None:
         half_mg = np.full(errors.pose_count, Z_90 * to_mg * assessment.accel.expected ** 0.5)
         drawn['errors'] = _error_figure(
             held_out.determining_alpha(errors.errors), to_mg * errors.errors.accel_mps2, half_mg,
             fitted.axes, 'held-out pose', 'error of acceleration, mg')
-    pictures, fault, paper_model = _paper_figures(result)
+    picture, fault, paper_model = '', '', 'physical'
+    try:
+        unit = _paper_sensor(result)
+        picture = html_page.picture_url(_sweep(result.nominal, unit, result.poses))
+        paper_model = unit.model
+    except UserError as error:
+        fault = str(error)
     temperature_c = fitted.envelope.temperature_c
     return html_page.render('adxl_ros.calibrate.report', 'calibration.html', {
         'title': f'Calibration of {fitted.serial}, {fitted.provenance["date"][:10]}',
@@ -111,16 +115,15 @@ def page(result: CalibrationResult, past: Sequence[Sensor],
         'beyond': [row for row in rows if row['outcome'] == _BEYOND],
         'datasheet': fitted.datasheet_name,
         'models': list(errors_of or row_of), 'errors_of': errors_of, 'row_of': row_of,
-        'poses': len(result.poses), 'digits': _digits, 'mg': held_out.rms_mg,
+        'poses': len(result.poses), 'digits': digits, 'mg': held_out.rms_mg,
         'datasheet_mg': 1e3 * acceptance.nonlinearity_mps2(fitted) / G0_MPS2,
         'noise_mg': 1e3 * held_out.sample_noise_mps2(fitted) / G0_MPS2,
         'budget': assessment.accel if assessment and errors else None,
         'part_colours': _PART_COLOURS,
         'gum': gum.section(gum.uncertainty(result, stated)),
-        'history': history.table() if history.sensors else None,
-        'changes': history.changes() if history.sensors else '',
+        'history': history(fitted, past),
         'paper_model': paper_model,
-        'pictures': pictures, 'pictures_fault': fault,
+        'picture': picture, 'picture_fault': fault,
         'report_lines': result.report_lines,
         'provenance': [
             ['serial', fitted.serial], ['model', fitted.model],
@@ -143,7 +146,7 @@ def _tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dic
     tiles = []
     if (fit := result.gravity_fit) is not None:
         used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
-        before, after = (_digits(held_out.rms_mg(float(np.mean(v[used] ** 2))))
+        before, after = (digits(held_out.rms_mg(float(np.mean(v[used] ** 2))))
                          for v in (fit.before_mps2, fit.held_out_mps2))
         tiles = [{'label': 'error of the magnitude of gravity', 'text': f'{before} → {after} mg',
                   'note': f'rms over {len(used)} rests, held out'}]
@@ -151,21 +154,15 @@ def _tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dic
                               ('acceleration error', 'mg', 'accel_mg')):
         statistics = [getattr(errors, name) for errors in result.held_out]
         if statistics and not np.isnan(statistics[-1].rms):
-            before, after = (_digits(statistics[i].rms) for i in (0, -1))
-            low, high = map(_digits, statistics[-1].interval)
+            before, after = (digits(statistics[i].rms) for i in (0, -1))
+            low, high = map(digits, statistics[-1].interval)
             tiles.append({'label': label, 'text': f'{before} → {after} {unit}',
                           'note': f'rms on held-out poses, 90 %: {low} to {high} {unit}'})
     if assessment is not None:
         tiles.append({'label': 'limited by', 'text': assessment.limited_by,
-                      'note': f'calibration error {_digits(assessment.error_mg)} mg, without '
+                      'note': f'calibration error {digits(assessment.error_mg)} mg, without '
                               'noise and stage error of the check'})
     return tiles
-
-
-def _digits(value: float) -> str:
-    """Write a positive value with three digits at most, without an exponent."""
-    decimals = 1 if value >= 10 else 2 if value >= 1 else 3
-    return f'{value:.{decimals}f}' if value >= 5e-4 else '< 0.001'
 
 
 def _sphere(result: CalibrationResult) -> dict[str, Any]:
@@ -190,15 +187,12 @@ def _sphere(result: CalibrationResult) -> dict[str, Any]:
         labels = [f'pose {i}, alpha {alpha:.1f}°, beta {beta:.1f}°' for i, (alpha, beta) in
                   enumerate(np.degrees([poses.alpha_rad, poses.beta_rad]).T, 1)]
     up = force / np.linalg.norm(force, axis=1, keepdims=True)
+    values = np.stack(list(errors.values()), axis=1)
     return {'models': list(errors), 'quantities': quantities, 'poses': [
-        {'u': [round(float(c), 5) for c in up[i]], 'label': label,
-         'held_out': bool(poses.check[i]),
-         'values': [list(map(_number, values[i])) for values in errors.values()]}
+        {'u': np.round(up[i], 5).tolist(), 'label': label, 'held_out': bool(poses.check[i]),
+         'values': [[float(f'{v:.4g}') if np.isfinite(v) else None for v in of_model]
+                    for of_model in values[i]]}
         for i, label in enumerate(labels)]}
-
-
-def _number(value: float) -> float | None:
-    return float(f'{value:.4g}') if np.isfinite(value) else None
 
 
 def _coefficients(fitted: Sensor) -> list[dict[str, Any]]:
@@ -228,16 +222,6 @@ def _coefficients(fitted: Sensor) -> list[dict[str, Any]]:
     return rows
 
 
-def _paper_figures(result: CalibrationResult) -> tuple[list[str], str, str]:
-    """Return the figures of the paper as URLs, else why there are none, and their model."""
-    try:
-        unit = _paper_sensor(result)
-        return [html_page.picture_url(_sweep(result.nominal, unit, result.poses, pair))
-                for pair in _PANELS], '', unit.model
-    except UserError as error:
-        return [], str(error), 'physical'
-
-
 def _error_figure(used: np.ndarray, errors_mg: np.ndarray, half_mg: np.ndarray, names: str,
                   x_label: str, y_label: str) -> Figure:
     """Draw the held-out errors, (k, m), of the poses used with bars of the expected 90 %."""
@@ -247,8 +231,6 @@ def _error_figure(used: np.ndarray, errors_mg: np.ndarray, half_mg: np.ndarray, 
                           xaxis={'title': {'text': x_label}}, yaxis={'title': {'text': y_label}})
 
 
-_FINE_G = np.linspace(-1, 1, 201)
-"""Specific force at which curves are drawn, g."""
 _VERTICAL = np.sin(np.radians(89))
 """Smallest sine of alpha in the plane alpha = 90°; chosen: stages are better than 1°."""
 
@@ -258,7 +240,7 @@ def draw_sweep(path: str | os.PathLike, sensor: Sensor, fitted: Sensor, poses: P
     write_bytes(path, figures.png(_sweep(sensor, fitted, poses)))
 
 
-def _sweep(sensor: Sensor, fitted: Sensor, poses: Poses, panels: Sequence[int] = range(6)) -> Any:
+def _sweep(sensor: Sensor, fitted: Sensor, poses: Poses) -> Any:
     """Draw figures 2 to 8 of the paper for the x and y axes, one row per axis."""
     swept = poses.subset(~poses.check)
     line, regressions = linear.fit(sensor, swept), linear.regress_axes(sensor, swept)
@@ -266,69 +248,40 @@ def _sweep(sensor: Sensor, fitted: Sensor, poses: Poses, panels: Sequence[int] =
     force_g = np.column_stack(reference) / G0_MPS2
     predicted = np.column_stack(signal_chain.static_response(fitted)(
         reference, swept.environment))
-    figure, grid = figures.pyplot().subplots(
-        2, len(panels), figsize=(4.4 * len(panels), 9), layout='constrained', squeeze=False)
-    for d, row in enumerate(grid):
+    figure, grid = figures.pyplot().subplots(2, 4, figsize=(17.6, 9), layout='constrained')
+    for d, (row, regression) in enumerate(zip(grid, regressions)):
         linear_v = line.zero_g_v[d] + line.scale_v_per_g[d] * force_g[:, d]
         deviation_mv, model_mv = (1e3 * (volts[:, d] - linear_v)
                                   for volts in (swept.volts, predicted))
-        for axis, panel in zip(row, panels):
-            _draw_panel(axis, panel, d, fitted.model, swept, force_g, deviation_mv, model_mv,
-                        regressions[d])
-    if len(panels) > 4:
-        figure.suptitle(f'{fitted.serial}: deviation from the linear model, measured and by the '
-                        f'{fitted.model} model (Ang et al. 2007, figures 2 to 8)')
-    return figure
-
-
-def _draw_panel(axis: Any, panel: int, d: int, model: str, poses: Poses, force_g: np.ndarray,
-                deviation_mv: np.ndarray, model_mv: np.ndarray, regression: linear.AxisRegression
-                ) -> None:
-    """
-    Draw one panel for the axis x or y, given by d: figures 2, 3, 4, 5 with 7, 6, or 8.
-
-    force_g, deviation_mv, model_mv: reference of k poses, g, (k, 3), and measured and modelled
-    output minus the linear model, mV, (k,).
-    """
-    vertical = np.abs(np.sin(poses.alpha_rad)) > _VERTICAL
-    name, other = ('x', 'y') if d == 0 else ('y', 'x')
-    along_g, x_label = force_g[:, d], f'{name} reference, g'
-    if panel in (0, 1, 3):
-        y_label = f'{name} output minus linear, mV'
-        title = f'figs. 5, 7: measured ● and {model} model ─' if panel == 3 else \
-            f'fig. {panel + 2}: paths, forth ● and back ◁'
-        backward = np.gradient(poses.beta_rad) < 0
-        chosen = np.flatnonzero(vertical | (panel > 0))
-        for plane in planes(poses.alpha_rad[chosen]):
-            index = chosen[np.sort(plane)]
-            label = f'{np.degrees(poses.alpha_rad[index]).mean():.0f}°'
-            if panel == 3:
-                line, = axis.plot(along_g[index], deviation_mv[index], 'o', ms=3, label=label)
-                axis.plot(along_g[index], model_mv[index], lw=1, color=line.get_color())
-                continue
-            line, = axis.plot(along_g[index], deviation_mv[index], lw=1, label=label)
+        name, other = ('x', 'y') if d == 0 else ('y', 'x')
+        row[0].set(title='figs. 2, 3, 5, 7: forth ●, back ◁, model ─',
+                   xlabel=f'{name} reference, g', ylabel=f'{name} output minus linear, mV')
+        backward = np.gradient(swept.beta_rad) < 0
+        for plane in planes(swept.alpha_rad):
+            index = np.sort(plane)
+            curve, = row[0].plot(force_g[index, d], model_mv[index], lw=1,
+                                 label=f'{np.degrees(swept.alpha_rad[index]).mean():.0f}°')
             for part, marker, fill in ((index[~backward[index]], 'o', None),
                                        (index[backward[index]], '<', 'none')):
-                axis.plot(along_g[part], deviation_mv[part], marker, ms=4,
-                          color=line.get_color(), mfc=fill)
-        axis.legend(title='alpha', fontsize=7)
-    elif panel == 2:
-        axis.plot(force_g[vertical, 1 - d], deviation_mv[vertical], 'o', ms=4,
-                  label='measured (10)')
-        axis.plot(_FINE_G, 1e3 * np.polynomial.polynomial.polyval(_FINE_G, regression.p),
-                  label='quadratic (11)')
-        axis.legend(fontsize=7)
-        x_label, y_label = f'{other} reference, g', f'{name} residual, mV'
-        title = f'fig. 4: residual against {other}, alpha = 90°'
-    else:
-        values, polynomial = (1e3 * regression.plane_bias_v, 1e3 * regression.q) \
-            if panel == 4 else (regression.plane_scale_v_per_g, regression.r)
+                row[0].plot(force_g[part, d], deviation_mv[part], marker, ms=3,
+                            color=curve.get_color(), mfc=fill)
+        row[0].legend(title='alpha', fontsize=7)
+        vertical = np.abs(np.sin(swept.alpha_rad)) > _VERTICAL
         az_g = regression.plane_az_g
-        fine_g = np.linspace(az_g.min(), az_g.max(), 101)
-        axis.plot(az_g, values, 'o', ms=4)
-        axis.plot(fine_g, np.polynomial.polynomial.polyval(fine_g, polynomial))
-        x_label = 'z reference, g'
-        y_label, title = (f'{name} zero-g minus that at 90°, mV',
-                          'fig. 6: zero-g against z (12, 13)') if panel == 4 else \
-            (f'{name} scale factor, V/g', 'fig. 8: scale factor against z (15, 17)')
-    axis.set(xlabel=x_label, ylabel=y_label, title=title)
+        for axis, title, x_label, y_label, x, y, polynomial in (
+                (row[1], f'fig. 4: residual against {other} (10, 11)',
+                 f'{other} reference, g', f'{name} residual, mV', force_g[vertical, 1 - d],
+                 deviation_mv[vertical], 1e3 * regression.p),
+                (row[2], 'fig. 6: zero-g against z (12, 13)', 'z reference, g',
+                 f'{name} zero-g minus that at 90°, mV', az_g, 1e3 * regression.plane_bias_v,
+                 1e3 * regression.q),
+                (row[3], 'fig. 8: scale factor against z (15, 17)', 'z reference, g',
+                 f'{name} scale factor, V/g', az_g, regression.plane_scale_v_per_g,
+                 regression.r)):
+            fine_g = np.linspace(x.min(), x.max(), 101)
+            axis.plot(x, y, 'o', ms=4)
+            axis.plot(fine_g, np.polynomial.polynomial.polyval(fine_g, polynomial))
+            axis.set(title=title, xlabel=x_label, ylabel=y_label)
+    figure.suptitle(f'{fitted.serial}: deviation from the linear model, measured and by the '
+                    f'{fitted.model} model (Ang et al. 2007, figures 2 to 8)')
+    return figure

@@ -39,7 +39,7 @@ def test_fits_have_the_standard_deviations_that_a_plan_predicts(axes, kind):
         poses = swept(rng, truth, per_setting=True, targets=targets)
         fit = full_model.fit_full(sensor, poses)
         spread = np.sqrt(np.diag(fit.fitted.covariance))
-        promised = running_estimate.datasheet_estimate(sensor, 5.0).with_poses(targets)
-        stds = dict(zip(promised.names, promised.std))
+        promised = running_estimate.from_records(sensor, [], 5.0).with_poses(targets)
+        stds = dict(zip(promised.names, np.sqrt(np.diag(promised.covariance))))
         ratios += [s / stds[name] for s, name in zip(spread, fit.fitted.covariance_names)]
     assert np.exp(np.mean(np.log(ratios))) == pytest.approx(1.0, abs=0.15)

@@ -148,7 +148,7 @@ def test_intervals_have_their_coverage_for_correlated_errors(correlation, min_co
         for k in range(1, 230):
             errors[k] = correlation * errors[k - 1] + np.sqrt(1 - correlation ** 2) * noise[k]
         errors = errors[100:]
-        low, high = held_out.rms_interval(errors)
+        low, high = held_out.statistic(errors).interval
         covered += low < 1 < high
         naive += 1 / 1.11 < np.sqrt(np.mean(errors ** 2)) < 1.11
     assert min_coverage < covered / 400 < 0.97
