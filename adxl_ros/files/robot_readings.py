@@ -80,10 +80,7 @@ def _from_table(path: str) -> Readings:
               if name.endswith(('_rad', '_m')) and not name.startswith('base_')}
     base = [f'base_{name}' for name in _BASE]
     base = base if set(base) <= set(table.names) else []
-    names = ['time_s', *joints, *base]
-    blocks = list(table.blocks(names, names))
-    columns = {name: np.concatenate([block.columns[name] for block in blocks]) for name in names}
-
+    columns = table.read(['time_s', *joints, *base])
     times = columns['time_s']
     return Readings(path, {joint: _track(times, columns[name]) for name, joint in joints.items()},
                     _track(times, np.column_stack([columns[name] for name in base]))

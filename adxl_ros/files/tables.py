@@ -215,8 +215,7 @@ def read_pose_table(path: str | os.PathLike) -> PoseTable:
     choices: tuple[tuple[str, ...], ...] = (('start_s', 'stop_s'), ('time_s', 'time_s'), ())
     times = next(names for names in choices if set(names) <= set(table.names))
     names = list(dict.fromkeys([columns[role] for role in pair] + [*times]))
-    blocks = list(table.blocks(names, names))
-    values = {name: np.concatenate([block.columns[name] for block in blocks]) for name in names}
+    values = table.read(names)
     angles = [_radians(table.path, columns[role], values[columns[role]]) for role in pair]
     if pair == ('roll', 'pitch'):
         angles = list(stage_angles(*angles))
