@@ -11,7 +11,7 @@ written, as one table of bytes.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import struct
 
 import numpy as np
@@ -174,38 +174,21 @@ class Table:
 
 
 def tables(raws: Sequence[bytes] | np.ndarray, find: Callable[[bytes], Layout]) -> Iterator[Table]:
-    """Group messages by layout."""
-    if isinstance(raws, np.ndarray):
-        yield from _tables_of_rows(np.arange(len(raws)), raws, find)
-        return
-    sizes = np.array([len(raw) for raw in raws])
+    """Group messages by layout; an array has one of equal length in each row."""
+    sizes = np.full(len(raws), raws.shape[1]) if isinstance(raws, np.ndarray) else \
+        np.array([len(raw) for raw in raws])
     for size in dict.fromkeys(sizes.tolist()):
         rows = np.flatnonzero(sizes == size)
-        data = np.frombuffer(b''.join([raws[i] for i in rows.tolist()]), np.uint8)
-        yield from _tables_of_rows(rows, data.reshape(len(rows), size), find)
-
-
-def _tables_of_rows(rows: np.ndarray, data: np.ndarray, find: Callable[[bytes], Layout]
-                    ) -> Iterator[Table]:
-    """Group messages of one length, (n, size), by layout; `rows` are their indices, (n,)."""
-    while len(rows):
-        layout = find(data[0].tobytes())
-        differs = (data[:, layout.fixed] != data[0, layout.fixed]).any(axis=1)
-        if not differs.any():
-            yield Table(rows, data, layout)
-            return
-        yield Table(rows[~differs], data[~differs], layout)
-        rows, data = rows[differs], data[differs]
-
-
-def joined_tables(parts: Sequence[Sequence[bytes] | np.ndarray],
-                  find: Callable[[bytes], Layout]) -> Iterator[Table]:
-    """Group messages by layout, part by part."""
-    begin = 0
-    for raws in parts:
-        for table in tables(raws, find):
-            yield replace(table, rows=table.rows + begin)
-        begin += len(raws)
+        data = raws if isinstance(raws, np.ndarray) else np.frombuffer(
+            b''.join([raws[i] for i in rows.tolist()]), np.uint8).reshape(len(rows), size)
+        while len(rows):
+            layout = find(data[0].tobytes())
+            differs = (data[:, layout.fixed] != data[0, layout.fixed]).any(axis=1)
+            if not differs.any():
+                yield Table(rows, data, layout)
+                break
+            yield Table(rows[~differs], data[~differs], layout)
+            rows, data = rows[differs], data[differs]
 
 
 def fill(template: bytes, find: Callable[[bytes], Layout], stamp_ns: np.ndarray,

@@ -103,9 +103,9 @@ def _topic(bag: Bag, topic: str) -> str:
 def _joints(bag: Bag, topic: str, epoch_ns: int) -> dict[str, Track]:
     """Return the readings of all joints of a topic."""
     readings: dict[str, tuple[list[np.ndarray], list[np.ndarray]]] = {}
-    parts = [piece.messages[topic] for piece in bag.pieces([topic])]
     try:
-        for table in cdr.joined_tables(parts, cdr.joint_state):
+        for table in (table for piece in bag.pieces([topic])
+                      for table in cdr.tables(piece.messages[topic], cdr.joint_state)):
             names = [text for key, text in table.layout.texts.items() if key != 'frame_id']
             if 'position' not in table.layout.fields:
                 continue
