@@ -151,9 +151,11 @@ def _series(bag: Bag, topic: str, find: Callable[[bytes], cdr.Layout], names: It
     parts = [(piece.log_ns[topic], *_columns(f'{bag.path}: topic {topic}', piece.messages[topic],
                                              find, names, values))
              for piece in bag.pieces([topic])]
-    log_ns, stamp_ns, columns = zip(*parts)
-    return np.concatenate(stamp_ns), np.concatenate(log_ns), {
-        name: np.concatenate([part[name] for part in columns]) for name in names}
+    logs, stamps, columns = zip(*parts)
+    log_ns = np.concatenate(logs)
+    order = np.argsort(log_ns, kind='stable')  # A file that was cut off has no index by time
+    return np.concatenate(stamps)[order], log_ns[order], {
+        name: np.concatenate([part[name] for part in columns])[order] for name in names}
 
 
 def _positions(table: cdr.Table, names: Mapping[str, str]) -> dict[str, np.ndarray]:

@@ -3,9 +3,8 @@
 """
 ROS messages in CDR, the wire format of DDS (OMG DDSI-RTPS, section 10), as arrays.
 
-Messages of one topic usually have the same strings and array lengths, and thus the same layout.
-The first message determines the offsets. All messages with its strings and lengths are read, or
-written, as one table of bytes.
+Messages with the same strings and array lengths have the same layout. They are read, or written,
+as one table of bytes, whose offsets the first one shows.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 import struct
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,8 +27,7 @@ class CdrError(ValueError):
     """A message that does not match its type."""
 
 
-@dataclass(frozen=True)
-class NumberField:
+class NumberField(NamedTuple):
     """Numbers within a message."""
 
     offset: int  # Offset of the first one, bytes
@@ -133,11 +132,7 @@ battery_state = _one_field('voltage', 'f4')
 
 
 def message(stamped_frame: str, *parts: str | int | Sequence[float] | np.ndarray) -> bytes:
-    """
-    Return a message at the stamp 0, little-endian.
-
-    parts: what follows its header: strings, lengths of sequences, and numbers in their own type.
-    """
+    """Return a message at the stamp 0 with strings, lengths and numbers behind its header."""
     data = bytearray(b'\0\1\0\0')
     for part in (np.zeros(2, np.int32), stamped_frame, *parts):
         if isinstance(part, str):
@@ -158,7 +153,7 @@ class Table:
 
     rows: np.ndarray  # Their indices among the messages that were given, (n,)
     data: np.ndarray  # Their bytes, (n, size)
-    layout: Layout  # Where their fields are
+    layout: Layout
 
     def numbers(self, name: str) -> np.ndarray:
         """Return a field of all messages as float64, (n, count)."""
@@ -193,12 +188,7 @@ def tables(raws: Sequence[bytes] | np.ndarray, find: Callable[[bytes], Layout]) 
 
 def fill(template: bytes, find: Callable[[bytes], Layout], stamp_ns: np.ndarray,
          fields: Mapping[str, np.ndarray]) -> np.ndarray:
-    """
-    Return one message for each stamp.
-
-    find: finds the fields of a message; stamp_ns: stamps, ns, (n,); fields: values by field,
-    (n, count); returns: the bytes of the messages, (n, size), each as long as the template.
-    """
+    """Return the bytes, (n, size), of messages with stamps, ns, (n,), and fields, (n, count)."""
     layout = find(template)
     sec, nanosec = np.divmod(stamp_ns, 1_000_000_000)
     values = {'sec': sec, 'nanosec': nanosec, **fields}
