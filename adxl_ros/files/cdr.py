@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 import struct
-from typing import NamedTuple
 
 import numpy as np
 
@@ -27,7 +26,8 @@ class CdrError(ValueError):
     """A message that does not match its type."""
 
 
-class NumberField(NamedTuple):
+@dataclass(frozen=True)
+class NumberField:
     """Numbers within a message."""
 
     offset: int  # Offset of the first one, bytes

@@ -201,14 +201,13 @@ def _outputs(table: Table, names: list[str], values: Mapping[str, np.ndarray]) -
         groups = [stated, *([name for name in own if pattern.search(name)]
                             for pattern in _ACCEL_NAMES)]
         return next(filter(None, map(_by_axis, groups)), [])
-    triples = [names[i:i + 3] for i in range(len(names) - 2)]
-    scatter = []
-    for triple in triples:
+
+    def scatter(triple: list[str]) -> float:
         length = np.linalg.norm([values[name] for name in triple], axis=0)
         median = np.nanmedian(length)
-        scatter.append(np.nanmedian(np.abs(length - median)) / max(median, 1e-12))
-    best = int(np.argmin([*scatter, _CONSTANT]))
-    return [*triples, []][best]
+        return float(np.nanmedian(np.abs(length - median)) / max(median, 1e-12))
+
+    return min((names[i:i + 3] for i in range(len(names) - 2)), key=scatter, default=[])
 
 
 def _by_axis(names: Sequence[str]) -> list[str]:

@@ -170,11 +170,8 @@ ROLES: Mapping[str, Quantity] = {
 }
 """Quantity of each role that a column can have."""
 
-LSB = 'lsb'
-"""Unit of counts, which need the counts of 1 g."""
-
-UNSIGNED = 'u16'
-"""Unit of counts of 16 bits whose sign was lost: 65535 is −1."""
+LSB, UNSIGNED = 'lsb', 'u16'
+"""Units of counts, which need the counts of 1 g: the second lost its sign, so that 65535 is −1."""
 
 
 def signed(values: np.ndarray) -> np.ndarray:
@@ -258,34 +255,24 @@ def unit_in_name(column: str, quantity: Quantity) -> str | None:
 class ReadingOptions:
     """How a recording is to be read."""
 
-    # Topic of the samples in a bag, or message of a ULog file; empty for the only one
-    topic: str = ''
+    topic: str = ''  # Samples in a bag, or message of a ULog file; empty for the only one
     mapping: ColumnMapping | None = None  # Columns of a table; None for those of the package
-    # Counts of 1 g by axis, for columns in LSB: one for all axes, or one each
-    lsb_per_g: tuple[float, ...] = ()
-    lsb_at_0g: tuple[float, ...] = ()  # Counts at 0 g by axis, for columns in LSB; none for 0
+    lsb_per_g: tuple[float, ...] = ()  # Counts of 1 g: one for all axes, or one each
+    lsb_at_0g: tuple[float, ...] = ()  # Counts at 0 g by axis; none for 0
     rate_hz: float | None = None  # Sample rate, Hz, that replaces the stamps; None keeps them
     drop_bad_stamps: bool = False  # Whether samples are left out whose stamp does not increase
-    # How the axes of the file are those of the sensor frame; None where they are
-    mounting: Mounting | None = None
+    mounting: Mounting | None = None  # How the axes of the file are those of the sensor frame
 
 
 AS_IT_IS = ReadingOptions()
-"""Nothing is replaced."""
 
 
 _LISTED_NAMES = 12
 """Largest number of columns that a message names (chosen: some lines of a terminal)."""
-
 _NEAR = 0.25
-"""Largest logarithm of the ratio of a length to that of gravity in its unit (chosen: bias and
-scale errors are smaller, and the units are further apart)."""
-
-_SHORTEST_STEP_S = 5e-5
-"""Shortest step of stamps, s. Chosen: twice the rate of the fastest sensor."""
-
-_LONGEST_STEP_S = 1.05
-"""Longest step of stamps, s. Chosen: 1 Hz, the slowest rate of the package, with jitter."""
+"""Largest logarithm of the ratio of a length to gravity (chosen: above bias and scale errors)."""
+_SHORTEST_STEP_S, _LONGEST_STEP_S = 5e-5, 1.05
+"""Bounds of steps of stamps, s. Chosen: twice the fastest rate; 1 Hz, the slowest, with jitter."""
 
 
 def listed(names: Sequence[str]) -> str:

@@ -3,9 +3,9 @@
 """
 Text tables of any delimiter, decimal mark and header, read in blocks; and CSV files, written.
 
-The first lines show the form of a file, and each block of lines is rewritten to commas and decimal
-points. Pandas parses a block. A block that it refuses is read a second time, field by field, which
-accepts text and quotes, and finds the line and column to name in a message.
+The first lines show the form of a file; blocks of lines are rewritten with commas and decimal
+points. Pandas parses a block. One that it refuses is read again, field by field, which accepts text and
+quotes, and finds the line and column to name in a message.
 """
 
 from __future__ import annotations
@@ -171,7 +171,9 @@ def _by_pandas(data: bytes, rows: int, names: Sequence[str], used: Sequence[str]
             low_memory=False, **options)
     except (ValueError, OverflowError):
         return None
-    return None if len(frame) != rows else {name: frame[index].to_numpy() for name, index in zip(used, indices)}
+    if len(frame) != rows:
+        return None
+    return {name: frame[index].to_numpy() for name, index in zip(used, indices)}
 
 
 def _field_by_field(data: bytes, form: Form, used: Sequence[str], required: Collection[str],
@@ -339,8 +341,7 @@ def csv_writer(path: str | os.PathLike, digits: int | None = None) -> Iterator[A
     """
     Open a new CSV file, and yield a function that appends rows to it.
 
-    The file appears under its name when the block ends without an error. Numbers have all the
-    digits that bring back the same float64, or all but those of the first column are rounded to
+    Numbers have all the digits that bring back the same float64, or those behind the first column
     some significant digits. NaN is written empty.
     """
     with atomic_path(path) as fresh, open(fresh, 'wb') as file:

@@ -393,7 +393,11 @@ class _FlatReader:
         self._require(matrix.size == len(names) ** 2, key, f'{matrix.size} values, but '
                       f'{len(names)} names need {len(names) ** 2}')
         matrix = matrix.reshape(len(names), -1)
-        std = np.sqrt(np.maximum(np.diag(matrix), _SMALLEST_VARIANCE))
+        variances = np.diag(matrix)
+        least = variances.argmin()
+        self._require(variances[least] >= 0, key, f'the variance of {names[least]} is '
+                      f'{variances[least]:g}, not positive')
+        std = np.sqrt(np.maximum(variances, _SMALLEST_VARIANCE))
         correlation = matrix / np.outer(std, std)
         self._require(np.abs(correlation - correlation.T).max() <= _ASYMMETRY, key,
                       'not symmetric')

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a recording holds: samples by column, stamps, references, and what it states of its unit."""
+"""What a recording holds: samples by column, stamps, references, what it states of its unit."""
 
 from __future__ import annotations
 
@@ -265,7 +265,7 @@ _SHORT_SHARE = 0.45
 _EVEN = 0.25
 """A median step from this share of the mean step shows stamps without bursts."""
 _EVEN_STEPS = 0.02
-"""Largest median deviation of even steps, as a share of them (chosen: rate then right to 0.5 %)."""
+"""Largest median deviation of even steps, as a share of them (chosen: rate right to 0.5 %)."""
 _LAG = 64
 """Most samples or bursts over which an uneven rate is taken (chosen: 2 % by a jitter of one)."""
 

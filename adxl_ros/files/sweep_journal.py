@@ -36,7 +36,7 @@ class PoseRecord:
     start_ns: int  # Stamps of the first and the last sample, ns
     stop_ns: int
     samples: int  # Number of samples
-    mean_v: tuple[float, ...]  # Mean output of each axis, and the standard deviation of it, V, (m,)
+    mean_v: tuple[float, ...]  # Mean output of each axis, and its standard deviation, V, (m,)
     std_v: tuple[float, ...]
     temperature_c: float = math.nan  # Means over the rest, °C and V; NaN without readings
     supply_v: float = math.nan
@@ -144,11 +144,7 @@ class Unfinished(NamedTuple):
 
 
 class Journal:
-    """
-    An append-only file of JSON lines: a head that says what is calibrated, then entries.
-
-    The file is locked while it is open, so that two calibrations cannot share it.
-    """
+    """An append-only file of JSON lines, locked while it is open: a head, then entries."""
 
     def __init__(self, path: str | os.PathLike, head: Mapping[str, Any],
                  start_over: bool = False) -> None:
