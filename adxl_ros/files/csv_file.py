@@ -4,8 +4,8 @@
 Text tables of any delimiter, decimal mark and header, read in blocks; and CSV files, written.
 
 The first lines show the form of a file; blocks of lines are rewritten with commas and decimal
-points. Pandas parses a block. One that it refuses is read again, field by field, which accepts text and
-quotes, and finds the line and column to name in a message.
+points. Pandas parses a block. One that it refuses is read again, field by field, which accepts
+text and quotes, and finds the line and column to name in a message.
 """
 
 from __future__ import annotations
